@@ -1,1 +1,1 @@
-"""CaRTS: correct a robot's kinematics from what its camera sees."""
+"""CaRTS: correction of a robot's kinematics from camera images."""

@@ -1,4 +1,4 @@
-"""Intermediate results on disk: a stopped run looks them up when it is started again, and comes to the same end.
+"""Intermediate results on disk, with which a stopped run continues to the same result.
 
 An entry is named by the content of everything that it was computed from, so the order does not matter and a changed
 input finds nothing. A line that a kill or a full disk has cut off is not used, and neither is an altered one.
@@ -22,7 +22,7 @@ Value = TypeVar("Value")
 
 
 class Checkpoint:
-    """A file of intermediate results.
+    """File of intermediate results.
 
     Args:
         path: the file; it is made with the first entry.
@@ -41,7 +41,7 @@ class Checkpoint:
         self.recalled = 0
 
     def value(self, key: str, compute: Callable[[], Value]) -> Value:
-        """What is there under a key, or what is computed and kept there.
+        """The stored value of a key, or else the computed one, which is stored.
 
         Raises:
             OutputError: the file cannot be written.
@@ -59,7 +59,7 @@ class Checkpoint:
         return found
 
     def remove(self) -> None:
-        """Remove the file; the results it was for are written."""
+        """Remove the file after the results are written."""
         remove_file(self._path)
 
     def _read(self) -> dict[str, Any]:
@@ -90,7 +90,7 @@ class Checkpoint:
 
 
 def _encoded(value: Any) -> Any:
-    """As JSON, which has the shortest digits that give the same float64 back."""
+    """The value as JSON; float64 values keep all bits."""
     if isinstance(value, np.ndarray):
         assert value.dtype == np.float64
         return {"array": value.ravel().tolist(), "shape": value.shape}

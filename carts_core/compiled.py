@@ -8,11 +8,11 @@ from typing import Any
 import numba
 
 _SAID = "CARTS_COMPILED_UNCACHED"
-"""Variable of the environment by which child processes know that it was said."""
+"""Environment variable that tells child processes that the warning was printed."""
 
 
 def compiled(function: Callable[..., Any]) -> Any:
-    """`function` compiled by numba, and kept on disk between processes.
+    """`function` compiled by numba, with a cache on disk.
 
     Where neither its folder nor the user's cache can be written to, it is compiled anew in each process, which takes
     some seconds; a line on the standard error says so once.

@@ -1,4 +1,4 @@
-"""What is printed: text of others in full and harmless, wherever it appears.
+"""Console output in which foreign text is complete and harmless.
 
 Names, paths and errors come from files of others. Square brackets in them are no markup, and characters that would
 steer a terminal, or turn the order of what follows, are shown as escapes.
@@ -29,16 +29,16 @@ from rich.text import Text
 T = TypeVar("T")
 
 _BETWEEN_LINES = 10.0
-"""Time between lines of progress in a file or a pipe [s]."""
+"""Interval between lines of progress in a file or a pipe [s]."""
 _KEPT = "\n\t"
 _HIDDEN_CATEGORIES = ("Cc", "Cf", "Cs", "Zl", "Zp")
 """Control, format and surrogate characters, and separators of lines and paragraphs."""
 _MARKDOWN = re.compile(r"([\\`*{}\[\]#|!]|(?<![A-Za-z0-9])_|_(?![A-Za-z0-9]))")
-"""What Markdown takes for its own; an underscore inside a word it leaves alone."""
+"""Characters with a meaning in Markdown; it ignores underscores inside a word."""
 
 
 def visible(text: str) -> str:
-    r"""`text` with every character that a terminal or a page obeys instead of showing as an escape, say `\x1b`."""
+    r"""`text` with control characters as escapes, such as `\x1b`."""
     if text.isascii() and text.isprintable():
         return text
     return "".join(
@@ -50,27 +50,27 @@ def visible(text: str) -> str:
 
 
 def in_markdown(text: str) -> str:
-    """`text` for a page in Markdown: in one line, with nothing in it that Markdown or HTML takes for its own."""
+    """`text` as one line of Markdown, escaped for Markdown and HTML."""
     return _MARKDOWN.sub(r"\\\1", visible(" ".join(text.split())).replace("&", "&amp;").replace("<", "&lt;"))
 
 
 class Terminal(Console):
-    """A console that takes text for text: no markup, no emoji codes, no control characters."""
+    """A console without markup, emoji codes or control characters."""
 
     def render_str(self, text: str, **options: Any) -> Text:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """As in rich, for every string: printed, in a table, or in its title."""
+        """As in rich, for every string that is printed."""
         return super().render_str(visible(text), **{**options, "markup": False, "emoji": False})
 
     def print_error(self, error: BaseException) -> None:
-        """An error that is meant for people."""
+        """Print an error for the user."""
         self.print(Text.assemble(("error:", "bold red"), f" {visible(str(error))}"), soft_wrap=True, highlight=False)
 
 
 class PlainColumn(TextColumn):
-    """A column of a progress bar whose text is no markup."""
+    """A column of a progress bar without markup."""
 
     def render(self, task: Task) -> Text:
-        """The text of a task."""
+        """Text of a task."""
         return Text(visible(self.text_format.format(task=task)), style="progress.description")
 
 
@@ -83,7 +83,7 @@ class Bar(Progress):
         self._printed = -math.inf
 
     def add_task(self, description: str, *args: Any, **fields: Any) -> TaskID:
-        """As in rich; in a file or a pipe, progress is lines on the standard error, the first one at once."""
+        """As in rich; in a file or a pipe, progress is printed as lines on standard error."""
         task = super().add_task(description, *args, **fields)
         self._printed = -math.inf
         self._print(task)
@@ -103,7 +103,7 @@ class Bar(Progress):
 
     @classmethod
     def get_default_columns(cls) -> tuple[ProgressColumn, ...]:
-        """A sign of life, description, bar, share and time."""
+        """Spinner, description, bar, share and time."""
         time_left = TimeRemainingColumn()
         return SpinnerColumn(), PlainColumn("{task.description}"), BarColumn(), TaskProgressColumn(), time_left
 
@@ -117,7 +117,7 @@ def track(
 
 
 class VisibleFormatter(logging.Formatter):
-    """Log lines with what is foreign in them made visible."""
+    """Log formatter that escapes control characters."""
 
     def format(self, record: logging.LogRecord) -> str:
         """The line of a record."""
@@ -125,7 +125,7 @@ class VisibleFormatter(logging.Formatter):
 
 
 def log_to_stderr(form: str = "%(levelname)s %(name)s: %(message)s") -> None:
-    """Warnings and worse of every library go to standard error, made visible."""
+    """Print warnings of all libraries to standard error, escaped."""
     handler = logging.StreamHandler()
     handler.setFormatter(VisibleFormatter(form))
     logging.basicConfig(level=logging.WARNING, handlers=[handler])

@@ -1,4 +1,4 @@
-"""The errors that the project raises on purpose.
+"""Exceptions of the project.
 
 Each message says what was given, what is allowed and what to do.
 """
@@ -10,18 +10,18 @@ _LONGEST = 4000
 
 
 class CartsError(Exception):
-    """Root of every error that is meant to be read by a person."""
+    """Root of all errors with a message for the user."""
 
     def __str__(self) -> str:
         return shortened(super().__str__(), _LONGEST)
 
 
 class RobotError(CartsError):
-    """A URDF, one of its meshes or a joint name is not usable."""
+    """A URDF, one of its meshes or a joint name cannot be used."""
 
 
 class SequenceError(CartsError):
-    """A sequence file, or something it points at, is not usable."""
+    """A sequence file, or a file that it names, cannot be used."""
 
 
 class WeightsError(CartsError):

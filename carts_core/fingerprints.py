@@ -1,4 +1,4 @@
-"""Short texts that change with what they are made of: contents of images, robots, cameras, and the program."""
+"""Fingerprints of inputs: arrays, robots, cameras and source code."""
 
 import hashlib
 from collections.abc import Iterable
@@ -18,7 +18,7 @@ _PROBES = (0.0, 0.1, -0.2)
 
 
 def fingerprint(*parts: bytes | str | float | np.ndarray | Iterable) -> str:
-    """SHA-256 over numbers, texts, arrays (with type and shape), and tuples of these."""
+    """SHA-256 of numbers, texts, arrays (with type and shape), and tuples of these."""
     digest = hashlib.sha256()
     for part in parts:
         if isinstance(part, np.ndarray):
@@ -37,7 +37,7 @@ def fingerprint(*parts: bytes | str | float | np.ndarray | Iterable) -> str:
 
 @cache
 def code_fingerprint(patterns: tuple[str, ...]) -> str:
-    """SHA-256 over modules of the package, named by patterns such as `rendering/**/*.py`."""
+    """SHA-256 of modules of the package, given by patterns such as `rendering/**/*.py`."""
     package = Path(__file__).resolve().parent
     digest = hashlib.sha256()
     for pattern in patterns:
@@ -48,7 +48,7 @@ def code_fingerprint(patterns: tuple[str, ...]) -> str:
 
 
 def robot_fingerprint(robot: Robot) -> str:
-    """Of a robot's joints, how they move its links, and its meshes as they are rendered."""
+    """Fingerprint of a robot's joints, kinematics and meshes."""
     probes = torch.tensor(_PROBES, dtype=torch.float64)[:, None].expand(-1, len(robot.joint_names))
     meshes = [(mesh.link, mesh.vertices, mesh.normals, mesh.faces, mesh.color) for mesh in robot.meshes]
     return fingerprint(
@@ -62,7 +62,7 @@ def robot_fingerprint(robot: Robot) -> str:
 
 
 def calibration_fingerprint(scene: Scene, cameras: Iterable[Camera]) -> str:
-    """Of where arms and cameras are, and of the cameras' intrinsics.
+    """Fingerprint of the poses of arms and cameras, and of the cameras' intrinsics.
 
     Args:
         scene: for its arms.

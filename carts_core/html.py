@@ -1,4 +1,4 @@
-"""Parts of the pages that reports are: tables, sections, figures, and how they look. All text is escaped."""
+"""Components of HTML reports: tables, sections, figures and their style. All text is escaped."""
 
 from dataclasses import dataclass
 from html import escape
@@ -32,11 +32,11 @@ figcaption { color: #4a5058; max-width: 62rem; }
 
 @dataclass(frozen=True)
 class Cell:
-    """What stands in a table's cell."""
+    """A cell of a table."""
 
     text: str
     note: str = ""
-    """Set small below it."""
+    """Small text below the content."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ class Table:
 
 
 def anchor(title: str) -> str:
-    """The name by which a section is linked."""
+    """Anchor of the section for links."""
     return title.lower().replace(" ", "-")
 
 

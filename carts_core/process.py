@@ -6,16 +6,16 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 MOST_THREADS = 4
-"""More threads than this gain nothing on images as small as ours."""
+"""Largest useful number of threads for images of this size."""
 
 _MMAP_THRESHOLD = 1 << 30
-"""Allocations below this come from the heap, which keeps what is freed [bytes]."""
+"""Size below which allocations come from the heap, which keeps freed memory [bytes]."""
 
 _TRIM_THRESHOLD = 1 << 28
-"""Free memory at the end of the heap beyond which some is given back to the system [bytes]."""
+"""Free memory at the end of the heap beyond which it is returned to the system [bytes]."""
 
 _ARENAS = 2
-"""Heaps of malloc. By default each thread gets one of up to 8 per core, and each of them keeps its own largest use."""
+"""Number of malloc's heaps. By default each thread gets one of up to 8 per core, and each keeps its own peak size."""
 
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD, _M_ARENA_MAX = -1, -3, -8
 """Numbers of these parameters in glibc's malloc.h."""
@@ -23,19 +23,19 @@ _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD, _M_ARENA_MAX = -1, -3, -8
 
 @dataclass
 class _Tuned:
-    """Of this process."""
+    """Tuning state of this process."""
 
     core_left_free: bool = False
-    """Whether torch leaves one to others."""
+    """Whether torch leaves a core free."""
     memory_kept: bool = False
-    """Whether malloc keeps memory of images."""
+    """Whether malloc keeps the memory of images."""
 
 
 _TUNED = _Tuned()
 
 
 def tune_process() -> None:
-    """Set up a program, at its start; a library leaves that to its caller.
+    """Tune a program at its start; libraries do not call it.
 
     Freed memory is kept for the next image, which is faster; a server returns it with `return_memory`.
     """
@@ -44,7 +44,7 @@ def tune_process() -> None:
 
 
 def _leave_a_core_free() -> None:
-    """Let torch use all cores but one, four at most, unless `OMP_NUM_THREADS` says otherwise.
+    """Limit torch to all cores but one, four at most, unless `OMP_NUM_THREADS` is set.
 
     Every parallel step of torch waits for its slowest thread. When all cores are asked for and another process (or
     our own web server) holds one of them, each step waits for the scheduler: an iteration of 0.1 s then takes 2.6 s.
@@ -57,7 +57,7 @@ def _leave_a_core_free() -> None:
 
 
 def inference_threads() -> int:
-    """Threads of ONNX Runtime: torch's, or one for every core, four at most, where a core was left free.
+    """Number of threads for ONNX Runtime: torch's, or one per core, four at most, where a core was left free.
 
     Its threads hand out work in small pieces, so that one that has to wait for a core holds up no other: with another
     process on one or on both of two cores, two threads took .73 and .53 of the time of one.
@@ -70,7 +70,7 @@ def inference_threads() -> int:
 
 
 def _keep_memory() -> None:
-    """Have glibc, where that is the C library, keep memory of images instead of returning and asking for it anew.
+    """Make glibc keep the memory of images instead of returning it to the system.
 
     The system hands out memory a page at a time, as it is first written to, and clears every page: a rendering of
     640x480 px took 29 ms with that and 16 ms without, in one run beside other programs. `MALLOC_...` variables of the
@@ -90,12 +90,12 @@ def _keep_memory() -> None:
 
 
 def memory_kept() -> bool:
-    """Whether malloc keeps memory of images, so that a library needs no pool of its own that never shrinks."""
+    """Whether malloc keeps the memory of images, so that libraries need no pool of their own."""
     return _TUNED.memory_kept
 
 
 def return_memory() -> None:
-    """Return freed memory to the system, where glibc is the C library."""
+    """Return freed memory to the system (glibc only)."""
     trim = _of_malloc("malloc_trim")
     if trim is not None:
         trim(0)

@@ -1,4 +1,4 @@
-"""Where the shipped files are: beside the packages in a checkout, inside `carts_core` in a wheel."""
+"""Paths of shipped files: beside the packages in a checkout, inside `carts_core` in a wheel."""
 
 from pathlib import Path
 
@@ -16,7 +16,7 @@ def sample_data_dir() -> Path:
 
 
 def static_dir() -> Path:
-    """Folder with what the page serves: script, style, help, icons."""
+    """Folder with static files of the page: scripts, styles, help, icons."""
     return _shipped("static")
 
 

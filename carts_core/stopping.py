@@ -1,4 +1,4 @@
-"""Ctrl-C, and the signals that end a program in its stead, between two steps and never within one."""
+"""Graceful shutdown on SIGINT, SIGTERM and SIGHUP, between two steps."""
 
 import ctypes
 import os
@@ -15,7 +15,7 @@ _SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP
 
 
 class Stopped(KeyboardInterrupt):
-    """A person or the system asked the program to end.
+    """The program was stopped by the user or the system.
 
     Attributes:
         number: of the signal.
@@ -30,7 +30,7 @@ _NEVER_CUT = (
     *("importlib.", "_frozen_importlib", "llvmlite.", "numba.", "weakref", "_weakref"),
     "carts_core.project.database",
 )
-"""Modules, by the beginning of their names, in which no exception may be raised from outside.
+"""Prefixes of modules in which no exception may be raised from a signal handler.
 
 Numba loads kernels through LLVM, and a project is opened through SQLite, which call back into Python: an exception
 there is lost, and LLVM ends the process with SIGSEGV. In finalizers it is lost, too. A half imported module is useless.
@@ -38,19 +38,19 @@ there is lost, and LLVM ends the process with SIGSEGV. In finalizers it is lost,
 _OURS = ("carts_core", "carts_viewer")
 _INSTALLED = ("<frozen", *(sysconfig.get_path(name) for name in ("stdlib", "platstdlib", "purelib", "platlib")))
 _PATIENCE = 2.0
-"""How long a stop waits for a moment when no library is at work, which could take it for an error of its own [s]."""
+"""Longest wait for a moment without library code on the stack [s]."""
 _AGAIN = 0.02
-"""After how long a signal that has to wait comes again [s]."""
+"""Interval after which a waiting signal is sent again [s]."""
 PARENT = "CARTS_PARENT"
-"""Environment variable that names the process with which a command ends."""
+"""Environment variable with the id of the process with which a command ends."""
 _PR_SET_PDEATHSIG = 1
-"""From Linux's sys/prctl.h."""
+"""Constant of Linux's sys/prctl.h."""
 _POLL = 1.0
-"""Period of the check for the parent, where the system has no signal for its end [s]."""
+"""Interval between checks for the parent, where the system has no signal for its end [s]."""
 
 
 def end_with_parent(parent: int, number: int = signal.SIGTERM) -> None:
-    """Send a signal to this process when its parent ends, by SIGKILL too; at once if it has ended already.
+    """Send a signal to this process when its parent ends, by SIGKILL too; at once if it has already ended.
 
     Linux sends the signal (`prctl(PR_SET_PDEATHSIG)`) when the thread that started this process ends. Elsewhere, a
     thread checks once a second.
@@ -74,7 +74,7 @@ def _signal_at_end(parent: int, number: int) -> None:
 
 
 class _Unfinished:
-    """How many blocks have to be finished first, and the signal that waits for them."""
+    """Number of blocks to be finished, and the signal that waits for them."""
 
     blocks = 0
     waiting: int | None = None
@@ -82,7 +82,7 @@ class _Unfinished:
 
 @contextmanager
 def stopped_by_signals() -> Iterator[None]:
-    """Have SIGTERM and SIGHUP, as Ctrl-C, raise `Stopped` in the main thread while the block runs.
+    """Make SIGTERM and SIGHUP raise `Stopped` in the main thread, as Ctrl-C does, in the block.
 
     One that comes while a library is at work waits for its end, two seconds at most; one that comes while a module is
     imported, a kernel is loaded or an object is finalized waits for that however long it takes. A signal that is
@@ -123,7 +123,7 @@ def stopped_by_signals() -> Iterator[None]:
 
 
 class _Repeated:
-    """Sends signals to this process a moment later, until the end of the block that they are for."""
+    """Sends signals to this process again, until the end of their block."""
 
     def __init__(self) -> None:
         self._lock, self._over = threading.Lock(), False
@@ -151,7 +151,7 @@ class _Repeated:
 
 
 def _may_be_cut(frame: FrameType | None, begin: FrameType) -> bool:
-    """Whether an exception may be raised in a frame; what called the frame `begin` does not count."""
+    """Whether an exception may be raised in a frame; callers of the frame `begin` are not considered."""
     while frame is not None and frame is not begin:
         module = frame.f_globals.get("__name__") or ""
         if frame.f_code.co_name == "__del__" or module.startswith(_NEVER_CUT):
@@ -161,7 +161,7 @@ def _may_be_cut(frame: FrameType | None, begin: FrameType) -> bool:
 
 
 def _is_ours(frame: FrameType | None) -> bool:
-    """Whether a frame runs code of ours, or of who calls us, and none of a library."""
+    """Whether a frame runs code of this project or its caller, not of a library."""
     if frame is None:
         return True
     package = str(frame.f_globals.get("__name__")).partition(".")[0]
@@ -170,7 +170,7 @@ def _is_ours(frame: FrameType | None) -> bool:
 
 @contextmanager
 def finished_first() -> Iterator[None]:
-    """A block that no signal cuts in two: `Stopped` is raised at its end. It should take no longer than a write."""
+    """Block that is not interrupted: `Stopped` is raised at its end. It should take no longer than a write."""
     _Unfinished.blocks += 1
     try:
         yield
@@ -183,7 +183,7 @@ def finished_first() -> Iterator[None]:
 
 @contextmanager
 def when_stopped(what_is_kept: Callable[[], str] | str) -> Iterator[None]:
-    """Say what there is of the work, should the block be stopped: a note on the exception, which the command prints."""
+    """Attach a note on the partial results to `Stopped`; the command prints it."""
     try:
         yield
     except KeyboardInterrupt as stopped:
@@ -192,11 +192,11 @@ def when_stopped(what_is_kept: Callable[[], str] | str) -> Iterator[None]:
 
 
 def exit_status(stopped: KeyboardInterrupt) -> int:
-    """128 + the number of the signal, as shells have it."""
+    """Exit status of a shell: 128 + the number of the signal."""
     return 128 + (stopped.number if isinstance(stopped, Stopped) else signal.SIGINT)
 
 
 def message(stopped: KeyboardInterrupt) -> str:
-    """What to tell the person: by what it was stopped, and what is kept."""
+    """Message for the user: the signal, and which results are kept."""
     by = f"stopped by {stopped}" if isinstance(stopped, Stopped) and stopped.number != signal.SIGINT else "interrupted"
     return "; ".join([by, *getattr(stopped, "__notes__", ())])

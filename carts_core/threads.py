@@ -1,4 +1,4 @@
-"""Results that do not depend on how many threads torch has.
+"""Results that do not depend on torch's number of threads.
 
 Most operations give the same bits however many threads share them: each value is the work of one thread. Sums over a
 whole image are not among them (every thread adds up a part), nor are some kernels that torch, oneDNN and MKL choose by
@@ -15,7 +15,7 @@ from torch import Tensor
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """Run what is inside in the calling thread alone; for a block, or as a decorator, `@one_thread()`."""
+    """Run the block, or decorated function (`@one_thread()`), with one thread of torch."""
     threads = torch.get_num_threads()
     if threads == 1:
         yield

@@ -1,25 +1,26 @@
-"""Words of messages and reports."""
+"""Wording of messages and reports."""
 
 from collections.abc import Iterable
 from difflib import get_close_matches
 from itertools import islice
 
 _LONGEST_COMPARED, _MOST_COMPARED = 100, 200
-"""Misspellings are looked for in names up to this length, and in so many: comparing takes the product of lengths."""
+"""Largest length and number of names among which misspellings are looked for, since the cost is the product of
+lengths."""
 
 
 def counted(number: int, what: str) -> str:
-    """A number of things, such as `1 run` and `2 runs`."""
+    """A number with its noun, such as `1 run` and `2 runs`."""
     return f"{number} {what}{'' if number == 1 else 's'}"
 
 
 def spoken_time(seconds: float) -> str:
-    """A time as people read it: "40 s", "3 min"."""
+    """A rounded duration, such as "40 s" or "3 min"."""
     return f"{seconds:.0f} s" if seconds < 100 else f"{seconds / 60:.0f} min"
 
 
 def listed(names: Iterable[str], most: int = 40) -> str:
-    """Names for an error: joined by commas, the first ones where there are many."""
+    """Names joined by commas, abbreviated if there are many."""
     names = iter(names)
     text = ", ".join(shortened(name) for name in islice(names, most))
     rest = sum(1 for _ in names)
@@ -27,12 +28,12 @@ def listed(names: Iterable[str], most: int = 40) -> str:
 
 
 def shortened(text: str, length: int = 200) -> str:
-    """A text without its middle where it is longer than `length`."""
+    """A text with its middle replaced if it is longer than `length`."""
     return text if len(text) <= length else f"{text[: length - 40]} ... {text[-35:]}"
 
 
 def shown(value: object, length: int = 200) -> str:
-    """A value that somebody gave, as it is quoted in an error: like `repr`, shortened in its middle."""
+    """A value quoted for an error: `repr`, shortened in its middle."""
     return shortened(repr(value), length)
 
 

@@ -1,4 +1,4 @@
-"""What people take away: one module per format."""
+"""Exports, with a function for each format."""
 
 from ..settings import FormatName as FormatName
 from ..settings import Images as Images

@@ -23,7 +23,7 @@ _KINDS: tuple[Parts, ...] = ("arms", "parts", "links")
 
 
 def write_masks(dataset: Dataset, folder: OutputPath, monitor: Monitor) -> None:
-    """Folders `binary`, `arms`, `parts` and `links` with a PNG per view; `labels.json` says what the values mean."""
+    """Write PNG masks into `binary`, `arms`, `parts` and `links`; `labels.json` has the meaning of the values."""
     for view in dataset.views(monitor):
         if dataset.images == "copied":
             dataset.write_image_as(view, folder / "images", view.name)
@@ -40,7 +40,7 @@ Annotation = dict[str, Any]
 
 
 def write_coco(dataset: Dataset, folder: OutputPath, monitor: Monitor) -> None:
-    """Write the dataset in COCO's format; masks lose nothing."""
+    """Write the dataset in COCO's format, with lossless masks."""
 
     def annotations(view: View) -> Iterable[Annotation]:
         for category, mask in dataset.instances(view):
@@ -51,7 +51,7 @@ def write_coco(dataset: Dataset, folder: OutputPath, monitor: Monitor) -> None:
 
 
 def mask_annotation(view: View, category_id: int, mask: Bool[ndarray, "height width"]) -> Annotation:
-    """An object of a view, without its number; the box of one that is not in the image is empty."""
+    """An object of a view, without its id; the box of an invisible one is empty."""
     return {
         "image_id": view.id,
         "category_id": category_id,
@@ -70,7 +70,7 @@ def write_annotations(
     categories: list[dict[str, Any]],
     annotate: Callable[[View], Iterable[Annotation]],
 ) -> None:
-    """Write images, and the file of annotations that CVAT and Datumaro look for under this name.
+    """Write images and an annotation file with the name that CVAT and Datumaro expect.
 
     Args:
         dataset, folder, monitor: what is written where, and who hears of progress.
@@ -105,11 +105,11 @@ def write_annotations(
 
 
 _OUTSIDE, _HIDDEN, _VISIBLE = 0, 1, 2
-"""COCO's words for a keypoint: not labelled, labelled but not visible, labelled and visible."""
+"""Visibility flags of COCO: not labelled, labelled but not visible, labelled and visible."""
 
 
 def write_coco_keypoints(dataset: Dataset, folder: OutputPath, monitor: Monitor) -> None:
-    """Write the keypoints of every arm in COCO's format, with the arm's mask and box; always a category per arm."""
+    """Write the keypoints, mask and box of every arm in COCO's format, with a category per arm."""
     points = {arm.name: keypoints(arm) for arm in dataset.scene.arms}
 
     def annotations(view: View) -> Iterable[Annotation]:
@@ -139,7 +139,7 @@ def _category(category: Category, points: tuple[Keypoint, ...]) -> dict[str, Any
 def _annotations(
     dataset: Dataset, view: View, category: Category, points: tuple[Keypoint, ...]
 ) -> Iterable[Annotation]:
-    """An arm in a view; none where neither a pixel nor a keypoint of it is in the image."""
+    """The annotation of an arm in a view; none if no pixel and no keypoint of it is in the image."""
     mask = dataset.label_image(view, "arms") == category.id
     pixels = project_keypoints(dataset.scene, dataset.state(view.frame), points, view.camera.name).double().numpy()
     values: list[float] = []
@@ -155,7 +155,7 @@ def _annotations(
 
 
 def write_cvat(dataset: Dataset, folder: OutputPath, monitor: Monitor) -> None:
-    """Write the dataset in CVAT's format; masks lose nothing."""
+    """Write the dataset in CVAT's format, with lossless masks."""
     root = ElementTree.Element("annotations")
     _text(root, "version", "1.1")
     _add_meta(root, dataset)
@@ -205,7 +205,7 @@ _IMAGE = 2
 
 
 def write_datumaro(dataset: Dataset, folder: OutputPath, monitor: Monitor) -> None:
-    """Write the dataset in Datumaro's format; masks lose nothing."""
+    """Write the dataset in Datumaro's format, with lossless masks."""
     items = []
     for view in dataset.views(monitor):
         file = dataset.write_image(view, folder / "images" / "default")
@@ -241,13 +241,13 @@ def write_datumaro(dataset: Dataset, folder: OutputPath, monitor: Monitor) -> No
 
 
 _LISTS = ("Main", "Segmentation")
-"""Folders in `ImageSets` where lists of the images stand; there is no split, so each is one list of all."""
+"""Folders in `ImageSets` with lists of the images; each lists all, since there is no split."""
 _MOST_CATEGORIES = 254
-"""0 is the background and 255 is VOC's void."""
+"""Largest number of categories; 0 is the background and 255 is VOC's void."""
 
 
 def write_voc(dataset: Dataset, folder: OutputPath, monitor: Monitor) -> None:
-    """Write the dataset in Pascal VOC's format; label images lose nothing, and images are copies of any kind.
+    """Write the dataset in Pascal VOC's format, with lossless label images; images are copied in their own format.
 
     Raises:
         CartsError: there are more categories than VOC's label images can tell apart.
@@ -331,7 +331,7 @@ fraction (Ultralytics)."""
 
 
 def write_yolo(dataset: Dataset, folder: OutputPath, monitor: Monitor) -> None:
-    """Write the dataset in YOLO's format: a visible part of an arm that stands alone is an object of its own."""
+    """Write the dataset in YOLO's format; every connected visible part of an arm is an object."""
     for view in dataset.views(monitor):
         stem = dataset.stems[view.id - 1]
         dataset.write_image_as(view, folder / "images", stem)

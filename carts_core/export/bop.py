@@ -1,4 +1,4 @@
-"""BOP: the 6D pose of every link in every image, with masks and models, as the benchmark for object poses keeps them.
+"""BOP, the format of the benchmark for object pose estimation: 6D poses of all links, with masks and models.
 
 A scene per camera, `test/000001` and so on; an object is a link of an arm, since an object of BOP is rigid. Lengths are
 in millimetres.
@@ -27,18 +27,18 @@ from .encodings import bounding_box, mask_png
 
 _MM = 1000.0
 _NOWHERE = [-1, -1, -1, -1]
-"""BOP's box of what is not in the image."""
+"""BOP's box of an object that is not in the image."""
 
 
 @dataclass(frozen=True)
 class _Object:
-    """A link as BOP's object."""
+    """A link as an object of BOP."""
 
     id: int
     """From 1."""
     name: str
     link: int
-    """As `View.link_ids` counts."""
+    """Index as in `View.link_ids`."""
     mesh: trimesh.Trimesh
     """In the link's frame [mm]."""
 
@@ -63,7 +63,7 @@ def write_bop(dataset: Dataset, folder: OutputPath, monitor: Monitor) -> None:
 
 
 def _objects(arms: tuple[Arm, ...]) -> Iterator[_Object]:
-    """The links that have a mesh."""
+    """The links with meshes."""
     first, number = 0, 1
     for arm in arms:
         for link, name in enumerate(arm.robot.link_names):
@@ -111,7 +111,7 @@ def _camera(dataset: Dataset, view: View) -> dict[str, Any]:
 def _links(
     dataset: Dataset, view: View, objects: list[_Object], folder: OutputPath
 ) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
-    """Poses of the links that are in the image or behind something there, and how much is seen; writes their masks."""
+    """Poses and visibility of the links that are in the image or occluded there; their masks are written."""
     state, row = dataset.state(view.frame), _row(dataset, view)
     Ts = link_transforms(dataset.scene, state)[row]
     poses: list[dict[str, Any]] = []
@@ -144,7 +144,7 @@ def _links(
 def _silhouette(
     dataset: Dataset, view: View, state: SceneState, Ts: Float[torch.Tensor, "links 4 4"], link: int
 ) -> Bool[np.ndarray, "height width"]:
-    """Where the link would be seen if nothing were before it."""
+    """Silhouette of a link without occlusion."""
     geometry = dataset.renderers[view.camera.name].geometry
     own = geometry.face_links == link
     points = vertices_in_camera(geometry, Ts).mT.contiguous().numpy()

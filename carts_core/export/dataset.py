@@ -29,20 +29,20 @@ T = TypeVar("T")
 
 
 class ExportCancelled(CartsError):
-    """The export was stopped on request; nothing of it is left."""
+    """The export was cancelled; its output is removed."""
 
 
 @dataclass(frozen=True)
 class Monitor:
-    """What an export reports to and asks, between two of its steps."""
+    """Progress and cancellation of an export."""
 
     progress: Callable[[int, int], None] | None = None
-    """Called with the number of steps done and of all."""
+    """Called after each step with the number of done and of all steps."""
     cancelled: Callable[[], bool] | None = None
-    """Asked before every step, for example `threading.Event().is_set`."""
+    """Called before each step, such as `threading.Event().is_set`."""
 
     def track(self, steps: Items[T]) -> Iterator[T]:
-        """The steps one by one, reported when they are done.
+        """The steps one by one, with progress and cancellation.
 
         Raises:
             ExportCancelled: `cancelled` said so.
@@ -61,7 +61,7 @@ class Monitor:
 
 @dataclass(frozen=True)
 class Category:
-    """What a pixel can be."""
+    """Category of pixels."""
 
     id: int
     """From 1; 0 is the background."""
@@ -81,17 +81,17 @@ class View:
     name: str
     """Unique in the export; the stem of every file of this view."""
     link_ids: Int[np.ndarray, "height width"]
-    """Index of the visible link, counted through all arms, -1 for background."""
+    """Index of the visible link through all arms, -1 for background."""
 
     @property
     def painted(self) -> bool:
-        """Whether somebody painted on what the camera shows, so that not all pixels are as the joints say."""
+        """Whether the view has painted masks or parts, so that not all pixels follow from the joint positions."""
         return self.camera.name in self.frame.masks or self.camera.name in self.frame.part_labels
 
 
 @dataclass(frozen=True)
 class Dataset:
-    """What is exported, and how."""
+    """Content and options of an export."""
 
     sequence: Sequence
     frames: tuple[ExportFrame, ...]
@@ -99,11 +99,11 @@ class Dataset:
     """Arms and cameras of the export, with the calibration that masks are rendered with."""
     domain: str
     parts: Parts = "arms"
-    """What gets a category of its own."""
+    """Granularity of the categories."""
     images: Images = "named"
-    """Labels name the recording's own images, or copies of them, or no image is written, where the format allows it."""
+    """Labels refer to the recording's own images, to copies, or no image is written, where the format allows it."""
     frame_rate: float | None = None
-    """Of a video [1/s]; as recorded if None."""
+    """Frame rate of a video [1/s]; as recorded if None."""
 
     def __post_init__(self) -> None:
         if not self.frames:
@@ -137,7 +137,7 @@ class Dataset:
 
     @property
     def categories(self) -> tuple[Category, ...]:
-        """The categories that `parts` asks for."""
+        """The categories for `parts`."""
         return self.categories_of(self.parts)
 
     def categories_of(self, parts: Parts) -> tuple[Category, ...]:
@@ -163,11 +163,11 @@ class Dataset:
         }
 
     def state(self, frame: ExportFrame) -> SceneState:
-        """The scene at a frame's joint positions, seen from where its cameras are."""
+        """The scene at a frame's joint positions and camera poses."""
         return self.scene.state(frame.joint_positions, mounts=self.sequence.mounts(frame.index))
 
     def views(self, monitor: Monitor) -> Iterator[View]:
-        """Every frame through every camera, labelled; a step of `monitor` each.
+        """Labelled views of all frames and cameras; a step of `monitor` each.
 
         Raises:
             CartsError: a mask is of another size than its camera, or of pixels that no arm is near.
@@ -199,7 +199,7 @@ class Dataset:
         return [numbers.index(number) + 1 if number in numbers else 0 for number in self.link_classes.tolist()]
 
     def instances(self, view: View) -> Iterator[tuple[Category, Bool[np.ndarray, "height width"]]]:
-        """The categories that are visible, each with its mask."""
+        """Visible categories with their masks."""
         labels = self.label_image(view)
         for category in self.categories:
             mask = labels == category.id
@@ -222,7 +222,7 @@ class Dataset:
 
     @property
     def remade_cameras(self) -> tuple[str, ...]:
-        """Cameras with images that are no files of the recording; see `files`."""
+        """Cameras with images that are not files of the recording; see `files`."""
         steps = zip(self.steps, self.files, strict=True)
         return tuple(dict.fromkeys(camera.name for (_, _, camera), file in steps if file is None))
 
@@ -260,7 +260,7 @@ class Dataset:
         return name
 
     def write_image_as(self, view: View, folder: OutputPath, stem: str) -> str:
-        """As `write_image` for a format that needs a copy of a given name; the file's name with its suffix."""
+        """As `write_image`, for a format with a given file name; returns the name with its suffix."""
         file = self.files[view.id - 1]
         name = f"{stem}{'.png' if file is None else file.suffix.lower()}"
         if self.images != "none":
@@ -300,7 +300,7 @@ class Dataset:
 def labelled(
     mask: Bool[np.ndarray, "height width"], rendered: Int[np.ndarray, "height width"], where: str
 ) -> Int[np.ndarray, "height width"]:
-    """`rendered` labels cut to `mask`; what it adds gets the label of the nearest rendered pixel.
+    """`rendered` labels restricted to `mask`; additional pixels get the label of the nearest rendered pixel.
 
     Args:
         mask: where arms are visible.
@@ -327,7 +327,7 @@ def labelled(
 
 
 def _nearest(pixels: Bool[np.ndarray, "height width"]) -> Int[np.ndarray, "2 height width"]:
-    """Row and column of the nearest of these pixels, for every pixel."""
+    """Row and column of the nearest True pixel, for every pixel."""
     return np.asarray(distance_transform_edt(~pixels, return_distances=False, return_indices=True))
 
 
@@ -338,7 +338,7 @@ def painted_links(
     classes: Int[np.ndarray, " links"],
     where: str,
 ) -> Int[np.ndarray, "height width"]:
-    """`link_ids` with what was painted as a class: each such pixel gets the nearest rendered link of that class.
+    """`link_ids` with painted classes: each painted pixel gets the nearest rendered link of its class.
 
     Args:
         painted: number of a class, 0 for none.

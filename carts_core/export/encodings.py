@@ -15,7 +15,7 @@ def mask_png(mask: Bool[np.ndarray, "height width"]) -> bytes:
 
 
 def label_png(labels: UInt[np.ndarray, "height width"]) -> bytes:
-    """Labels of 8 or 16 bits as a PNG file whose grey values they are."""
+    """Labels of 8 or 16 bits as grey values of a PNG file."""
     return _png(labels)
 
 
@@ -54,7 +54,7 @@ def bounding_box(mask: Bool[np.ndarray, "height width"]) -> tuple[int, int, int,
 
 
 MIN_POINTS = 3
-"""Readers take fewer points for something else than a polygon."""
+"""Smallest number of points that readers accept as a polygon."""
 
 
 def polygons(mask: Bool[np.ndarray, "height width"]) -> list[Int[np.ndarray, "points 2"]]:
@@ -79,7 +79,8 @@ def polygons(mask: Bool[np.ndarray, "height width"]) -> list[Int[np.ndarray, "po
 
 
 def _with_holes(rim: np.ndarray, holes: list[np.ndarray]) -> np.ndarray:
-    """One closed line along the rim and all holes. The shortest link first: no other hole can lie across it."""
+    """One closed line along the rim and all holes. The shortest link is chosen first, so that it crosses no other
+    hole."""
     while holes:
         distances = [cdist(rim, hole, "sqeuclidean") for hole in holes]
         nearest = min(range(len(holes)), key=lambda index: distances[index].min())
@@ -90,7 +91,7 @@ def _with_holes(rim: np.ndarray, holes: list[np.ndarray]) -> np.ndarray:
 
 
 def _corners(line: np.ndarray) -> np.ndarray:
-    """The closed line without the points in the middle of straight runs."""
+    """The closed line without intermediate points of straight runs."""
     before, after = line - np.roll(line, 1, axis=0), np.roll(line, -1, axis=0) - line
     corners = line[(before != after).any(1)]
     return corners if len(corners) else line[:1]

@@ -1,4 +1,4 @@
-"""Every export format by name, and the one function that runs them."""
+"""Export formats by name, and the export function."""
 
 import json
 from collections.abc import Callable
@@ -31,16 +31,16 @@ from .video import write_video
 
 @dataclass(frozen=True)
 class ExportFormat:
-    """A format that frames can be exported in."""
+    """An export format."""
 
     label: str
-    """For people."""
+    """Label of the format."""
     write: Callable[[Dataset, OutputPath, Monitor], None]
-    """Writes the file, or makes the folder."""
+    """Writes the file or folder."""
     suffix: str = ""
-    """Of the file; empty for a format that is a folder."""
+    """Suffix of the file; empty for a folder."""
     images: bool = False
-    """Whether labels name images, or these lie beside them."""
+    """Whether the format refers to images."""
 
 
 FORMATS: dict[FormatName, ExportFormat] = {
@@ -70,7 +70,7 @@ def export(
     overwrite: bool = False,
     monitor: Monitor | None = None,
 ) -> Path:
-    """Write a dataset in a format; `output` is there whole at the end, or as it was before.
+    """Write a dataset in a format; the output is replaced atomically.
 
     Args:
         dataset: what to write.
@@ -100,7 +100,7 @@ def export(
 
 
 def _summary(dataset: Dataset, name: FormatName) -> str:
-    """What an exported folder says about itself."""
+    """Content of an exported folder, as JSON."""
     views = [
         {
             "name": name,

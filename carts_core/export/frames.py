@@ -17,23 +17,23 @@ from .kinematics import KinematicsRow
 
 @dataclass(frozen=True)
 class ExportFrame(KinematicsRow):
-    """One frame: which one, where the arms are, who says so, and masks where somebody corrected them."""
+    """A frame to export: joint positions, their source, and corrected masks."""
 
     index: int = field(kw_only=True)
     """0-based position in the sequence."""
     review: str | None = field(default=None, kw_only=True)
-    """What a person said of the frame, such as accepted; None where nobody could."""
+    """Review state, such as accepted; None without a project."""
     dice: float | None = field(default=None, kw_only=True)
-    """Dice with the masks that the recording has, the least of its cameras [1]; None where not known."""
+    """Dice with the masks of the recording, the lowest of the cameras [1]; None if not known."""
     masks: Mapping[str, Bool[ndarray, "height width"]] = field(default_factory=dict, kw_only=True)
-    """Camera -> where arms are visible, at the camera's size; a camera without an entry gets the rendered mask."""
+    """Camera -> corrected mask at the camera's size; other cameras get the rendered mask."""
     part_labels: Mapping[str, UInt8[ndarray, "height width"]] = field(default_factory=dict, kw_only=True)
     """Camera -> number of the class (`carts_core.model.parts.PartClass`) that a pixel was painted as, 0 for none. What
     was painted belongs to that part whatever is rendered there, and to the mask."""
 
 
 def measured_frames(sequence: Sequence, indices: Iterable[int]) -> list[ExportFrame]:
-    """Frames with the joint positions that the sequence measured."""
+    """Frames with measured joint positions."""
     return [
         ExportFrame(
             sequence.frame_ids[index],
@@ -46,7 +46,7 @@ def measured_frames(sequence: Sequence, indices: Iterable[int]) -> list[ExportFr
 
 
 def corrected_frames(sequence: Sequence, indices: Iterable[int], rows: Iterable[KinematicsRow]) -> list[ExportFrame]:
-    """Those of the frames `indices` that have a row, with its joint positions.
+    """Frames of `indices` that have a row, with its joint positions.
 
     Raises:
         SequenceError: a row is of a frame that the sequence does not have, or two are of the same.
@@ -70,18 +70,18 @@ def corrected_frames(sequence: Sequence, indices: Iterable[int], rows: Iterable[
 
 
 RenderMask = Callable[[SceneState, str], Bool[np.ndarray, "height width"]]
-"""Pose of the scene and name of a camera -> where arms are rendered, at the camera's size."""
+"""Pose of the scene and name of a camera -> rendered mask at the camera's size."""
 _SOURCES = {
     Source.MEASURED: "measured",
     Source.HAND: "edited",
     Source.OPTIMIZER: "optimized",
     Source.PROPAGATED: "propagated",
 }
-"""As in the tables of `carts optimize`, so that `--keyframes` finds frames that were edited by hand."""
+"""Sources as in the tables of `carts optimize`, so that `--keyframes` finds frames edited by hand."""
 
 
 class _CorrectedMasks(Mapping[str, Bool[np.ndarray, "height width"]]):
-    """Camera -> the corrected mask of a frame, for cameras with a correction; rendered on access."""
+    """Camera -> corrected mask of a frame, rendered on access."""
 
     def __init__(self, render: RenderMask, pose: SceneState, corrections: Mapping[str, MaskCorrection]) -> None:
         self._render, self._pose, self._corrections = render, pose, corrections
@@ -99,7 +99,7 @@ class _CorrectedMasks(Mapping[str, Bool[np.ndarray, "height width"]]):
 def project_frame(
     recording: Sequence, project: ProjectState, index: int, cameras: Iterable[str], render: RenderMask
 ) -> ExportFrame:
-    """A frame as a project has it.
+    """A frame with the corrections of a project.
 
     Args:
         recording: with the project's time offset; corrected or as measured.

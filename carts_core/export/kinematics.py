@@ -21,27 +21,27 @@ from ..optimization.observability import undetermined_joints
 from ..wording import shortened
 
 _SAID = ["verdict", "not_determined"]
-"""Columns of text behind the numbers."""
+"""Text columns after the numbers."""
 JOINED = "; "
-"""Between names of joints in a text."""
+"""Separator of joint names in a text."""
 
 
 @dataclass(frozen=True)
 class KinematicsRow:
-    """Joint positions of one frame and where they come from."""
+    """Joint positions of one frame and their source."""
 
     frame_id: str
     source: str
-    """Who or what made the values: measured, edited, optimized."""
+    """Source of the values: measured, edited, optimized."""
     joint_positions: Mapping[str, np.ndarray]
     """Arm name -> [dofs], [rad, m]."""
     joint_std: Mapping[str, np.ndarray] | None = None
-    """Arm name -> standard deviation of the joint positions [dofs], [rad, m]; NaN, or no entry, where not known."""
+    """Arm name -> standard deviation of the joint positions [dofs], [rad, m]; NaN, or no entry, if not known."""
     verdict: str | None = None
     """Verdict on the mask: good, doubtful or failed; None where it was not assessed."""
 
     def undetermined(self, scene: Scene) -> list[str] | None:
-        """`ARM.JOINT` of the joints that the images leave open; None where no deviation is known."""
+        """`ARM.JOINT` of the joints that the images do not determine; None if no deviation is known."""
         return undetermined_joints(scene, self.joint_std or {})
 
 
@@ -51,7 +51,7 @@ def joint_columns(scene: Scene) -> list[str]:
 
 
 def joint_units(scene: Scene) -> list[str]:
-    """`rad` or `m`, for each of `joint_columns`."""
+    """`rad` or `m` for each of `joint_columns`."""
     return ["m" if kind == "prismatic" else "rad" for arm in scene.arms for kind in arm.robot.joint_types]
 
 
@@ -61,14 +61,14 @@ def position_values(scene: Scene, row: KinematicsRow) -> np.ndarray:
 
 
 def std_values(scene: Scene, row: KinematicsRow) -> np.ndarray:
-    """Standard deviations of a row in the order of `joint_columns`, [columns] [rad, m], NaN where not known."""
+    """Standard deviations of a row in the order of `joint_columns`, [columns] [rad, m], NaN if not known."""
     known = row.joint_std or {}
     unknown = {arm.name: np.full(len(arm.robot.joint_names), math.nan) for arm in scene.arms}
     return np.concatenate([np.asarray(known.get(name, nothing), dtype=np.float64) for name, nothing in unknown.items()])
 
 
 def kinematics_csv(scene: Scene, rows: Iterable[KinematicsRow]) -> str:
-    """The table as text; the columns of standard deviations are there when a row has one."""
+    """The table as text; with standard deviations if any row has them."""
     rows = list(rows)
     with_std, with_verdict = any(row.joint_std is not None for row in rows), any(row.verdict for row in rows)
     text = io.StringIO()

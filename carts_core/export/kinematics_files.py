@@ -28,12 +28,12 @@ def _camera_poses(dataset: Dataset, frames: Sequence[ExportFrame]) -> dict[str, 
 
 
 def write_kinematics_csv(dataset: Dataset, path: OutputPath, monitor: Monitor) -> None:
-    """The table that `read_kinematics_csv` reads, and `carts export --kinematics`."""
+    """Write the table that `read_kinematics_csv` and `carts export --kinematics` read."""
     write_text(path, kinematics_csv(dataset.scene, monitor.track(dataset.frames)))
 
 
 def write_kinematics_npz(dataset: Dataset, path: OutputPath, monitor: Monitor) -> None:
-    """NumPy's archive without pickles.
+    """Write an archive of NumPy without pickles.
 
     Arrays: `frame_id`, `source`, `verdict` (of the mask, empty where it was not assessed), `not_determined` (joints
     that the images leave open, with `; ` between them) and `index` [frames]; `column` (`ARM.JOINT`)
@@ -62,7 +62,8 @@ def write_kinematics_npz(dataset: Dataset, path: OutputPath, monitor: Monitor) -
 
 
 def write_kinematics_json(dataset: Dataset, path: OutputPath, monitor: Monitor) -> None:
-    """JSON: the unit of every `ARM.JOINT`, then the frames with positions and standard deviations, null if unknown."""
+    """Write JSON: the unit of every `ARM.JOINT`, then the frames with positions and standard deviations, null if
+    unknown."""
     columns, moving = joint_columns(dataset.scene), _camera_poses(dataset, dataset.frames)
     frames = [
         {
@@ -94,17 +95,18 @@ def base_frame_transform(arm: Arm, camera: Camera) -> Float[np.ndarray, "4 4"]:
 
 
 def write_dvrk(dataset: Dataset, path: OutputPath, monitor: Monitor) -> None:
-    """Base frames of all arms in the frame of the first exported camera, to be merged into a system's file (2.4)."""
+    """Write base frames of all arms in the frame of the first exported camera, to be merged into a system's file
+    (2.4)."""
     _write(dataset, path, monitor, lambda name, T: {"base_frame": {"reference_frame": name, "transform": T}})
 
 
 def write_dvrk_2_3(dataset: Dataset, path: OutputPath, monitor: Monitor) -> None:
-    """The same for a console's file of 2.3 and earlier."""
+    """Write base frames for a console's file of 2.3 and earlier."""
     _write(dataset, path, monitor, lambda name, T: {"base-frame": {"reference-frame": name, "transform": T}})
 
 
 def write_dvrk_suj(dataset: Dataset, path: OutputPath, monitor: Monitor) -> None:
-    """The same as a file of fixed set-up joints."""
+    """Write base frames as a file of fixed set-up joints."""
     _write(dataset, path, monitor, lambda _, T: {"measured_cp": T})
 
 

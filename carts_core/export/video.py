@@ -21,7 +21,7 @@ _CONTOUR = (80, 255, 120)
 def image_and_mask(
     renderer: Renderer, state: SceneState
 ) -> tuple[UInt8[np.ndarray, "height width 3"], Bool[np.ndarray, "height width"]]:
-    """The first camera's rendering as RGB, and its mask."""
+    """Rendering of the first camera as RGB, and its mask."""
     with torch.no_grad():
         rendering = renderer(state)
     image = (rendering.image[0].movedim(0, -1) * 255.0).to(torch.uint8).numpy()
@@ -34,14 +34,14 @@ def overlay(
     mask: Bool[np.ndarray, "height width"],
     opacity: float,
 ) -> UInt8[np.ndarray, "height width 3"]:
-    """The rendering blended over the frame where the mask is, RGB."""
+    """The rendering blended over the image inside the mask, RGB."""
     return np.where(mask[..., None], cv2.addWeighted(frame, 1.0 - opacity, image, opacity, 0.0), frame)
 
 
 def outlined(
     frame: UInt8[np.ndarray, "height width 3"], mask: Bool[np.ndarray, "height width"]
 ) -> UInt8[np.ndarray, "height width 3"]:
-    """The frame with a bright line along the rim of the mask, RGB."""
+    """The image with a bright outline of the mask, RGB."""
     contours, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
     return cv2.drawContours(frame.copy(), contours, -1, _CONTOUR, 1)
 
@@ -91,7 +91,7 @@ def _picture(dataset: Dataset, view: View) -> UInt8[np.ndarray, "height width 3"
 
 
 def _even(camera: Camera) -> tuple[int, int]:
-    """Width and height [px] as H.264 wants them."""
+    """Even width and height [px], as H.264 requires."""
     return camera.width + camera.width % 2, camera.height + camera.height % 2
 
 

@@ -1,4 +1,4 @@
-"""What is read from files that others made (`reading`), and everything that is written, with its path.
+"""Reading of untrusted files (`reading`), and writing of all outputs and their paths.
 
 No other module opens a file for writing; `tests/files/test_one_writer.py` sees to it.
 """

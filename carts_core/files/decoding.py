@@ -1,4 +1,4 @@
-"""Decoding of untrusted files in a child process whose memory and processor time are bounded.
+"""Decoding of untrusted files in a child process with limited memory and processor time.
 
 Decoders of libraries may need any amount of either for a small file: references that repeat, false sizes, compression.
 A decoder is a module-level function of this package that imports neither torch nor the rest of the application; it runs
@@ -40,13 +40,13 @@ from .reading import GIB, MIB, RefusedFileError
 _SECONDS, _SECONDS_PER_MIB = 2.5, 0.2
 _MEMORY, _MEMORY_PER_BYTE = 320 * MIB, 8
 _COUNTED = 128 * MIB
-"""Bytes of a file that add to the memory of its decoder; larger ones are read in parts."""
+"""File size up to which the memory limit of a decoder grows [bytes]; larger files are read in parts."""
 _PATIENCE = 20
-"""Waiting time allowed for each second of processor time, on a busy machine."""
+"""Waiting time per second of processor time, for busy machines."""
 _IDLE = 10.0
 _MOST_IDLE = 4
 _LARGEST_FILE = GIB
-"""Of a temporary file that a library expands [bytes], beyond a hundred times the size of what is decoded."""
+"""Largest temporary file of a library [bytes], beyond a hundred times the size of the decoded file."""
 _ARRAY, _PATH = 1, 2
 _ENVIRONMENT = {
     # Thread pools and arenas reserve address space that would count as memory.
@@ -58,14 +58,14 @@ _ENVIRONMENT = {
 
 @dataclass(frozen=True)
 class Limits:
-    """Resources of one call of a decoder, beyond those of the interpreter and the libraries that it imports."""
+    """Resource limits of one call, beyond the use of the interpreter and imported libraries."""
 
     seconds: float = _SECONDS
-    """Of processor time [s]."""
+    """Processor time [s]."""
     memory: int = _MEMORY
-    """[bytes]"""
+    """Memory [bytes]."""
     written: int = _LARGEST_FILE
-    """Size of a temporary file [bytes]."""
+    """Largest temporary file [bytes]."""
 
     @staticmethod
     def of(path: Path) -> "Limits":
@@ -80,7 +80,7 @@ class Limits:
 
 
 class DecodingLimitError(CartsError, ValueError):
-    """Decoding needs more memory or time than a file of its size may."""
+    """Decoding exceeds the limits of memory or time."""
 
 
 def decoded(function: Callable[..., Any], path: Path, *arguments: Any) -> Any:
@@ -101,7 +101,7 @@ def decoded(function: Callable[..., Any], path: Path, *arguments: Any) -> Any:
 
 
 def called(function: Callable[..., Any], *arguments: Any, limits: Limits) -> Any:
-    """As `decoded`, within any limits."""
+    """As `decoded`, within given limits."""
     decoder = acquire()
     try:
         return decoder.call(function, *arguments, limits=limits)
@@ -110,13 +110,13 @@ def called(function: Callable[..., Any], *arguments: Any, limits: Limits) -> Any
 
 
 def acquire() -> "Decoder":
-    """A decoder for calls that share what they open; an idle one where there is one."""
+    """A decoder for several calls that share open files; an idle one if available."""
     with _LOCK:
         return _IDLE_DECODERS.pop() if _IDLE_DECODERS else Decoder()
 
 
 def release(decoder: "Decoder") -> None:
-    """Keep an acquired decoder for later calls, or end it where there are enough."""
+    """Return an acquired decoder to the pool, or end it if the pool is full."""
     with _LOCK:
         if len(_IDLE_DECODERS) < _MOST_IDLE:
             _IDLE_DECODERS.append(decoder)
@@ -125,27 +125,27 @@ def release(decoder: "Decoder") -> None:
 
 
 def prepare() -> None:
-    """Start a child that will be needed soon, beside other work."""
+    """Start a child process in advance."""
     decoder = Decoder()
     decoder.start()
     release(decoder)
 
 
 class Decoder:
-    """A child process that runs one decoder after the other; it starts with the first call, and anew after a failure.
+    """Child process that runs decoders one after the other; it starts with the first call, and again after a failure.
 
     Its decoders may keep what they have opened from call to call. Not safe to use from several threads at once.
     """
 
     def __init__(self, *, idle: float = _IDLE) -> None:
-        """`idle` is the time after which a child without work ends [s]."""
+        """`idle` is the time after which an idle child ends [s]."""
         self._idle = idle
         self._process: subprocess.Popen[bytes] | None = None
         self._pipe: Connection | None = None
         self._folder = ""
 
     def call(self, function: Callable[..., Any], *arguments: Any, limits: Limits) -> Any:
-        """The result of a function; errors as those of `decoded`."""
+        """Result of a function; errors as those of `decoded`."""
         request = _packed([os.getcwd(), function.__module__, function.__qualname__, arguments, *vars(limits).values()])
         try:
             if (reply := self._reply(request, limits)) is None:
@@ -178,7 +178,7 @@ class Decoder:
             shutil.rmtree(folder, ignore_errors=True)
 
     def _reply(self, request: bytes, limits: Limits) -> Any:
-        """The child's reply, None where it ended before it got the request.
+        """The child's reply; None if it ended before it received the request.
 
         Raises:
             DecodingLimitError: it was ended by the limits.
@@ -205,7 +205,7 @@ class Decoder:
         raise ValueError(f"its decoder ended with status {status}: it is damaged, or made to do harm")
 
     def start(self) -> None:
-        """Start the child, unless it runs."""
+        """Start the child unless it is running."""
         if self._process is not None:
             return
         here, there = Pipe()
@@ -247,12 +247,12 @@ def _end() -> None:
 
 @cache
 def _spawner() -> ThreadPoolExecutor:
-    """The thread that starts children: Linux ends a child with the thread that started it."""
+    """Thread that starts children, since Linux ends a child with the thread that started it."""
     return ThreadPoolExecutor(1, "carts-decoding")
 
 
 def _forget() -> None:
-    """In a forked process, neither the thread nor the children of its parent are used."""
+    """Drop thread and children of the parent after a fork."""
     _IDLE_DECODERS.clear()
     _spawner.cache_clear()
 
@@ -262,7 +262,7 @@ if hasattr(os, "register_at_fork"):
 
 
 def serve() -> None:
-    """Run decoders for the parent; the command line names its process, a pipe and the longest idle time [s]."""
+    """Entry point of the child; the command line has the parent's process id, a pipe and the longest idle time [s]."""
     parent, descriptor, idle = sys.argv[1:4]
     end_with_parent(int(parent), signal.SIGKILL)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's.
@@ -286,7 +286,7 @@ def _answer(request: bytes) -> bytes:
 
 
 def _described(error: Exception) -> list[Any]:
-    """An error as the name of its kind and its arguments; those of libraries become a `ValueError`."""
+    """Name and arguments of an error; errors of libraries become a `ValueError`."""
     # Extension modules that cannot allocate may end without an exception, which is a `SystemError`.
     if isinstance(error, MemoryError | SystemError) or (isinstance(error, OSError) and error.errno == errno.ENOMEM):
         return ["memory"]

@@ -1,4 +1,4 @@
-"""Headers of encoded images: size, bits, transparency and orientation, known before anything is decoded."""
+"""Headers of encoded images: size, bit depth, transparency and orientation, without decoding."""
 
 import io
 import warnings
@@ -7,21 +7,21 @@ from dataclasses import dataclass
 PNG = b"\x89PNG\r\n\x1a\n"
 JPEG = b"\xff\xd8"
 TIFF = {b"II*\0": "little", b"MM\0*": "big"}
-"""How files begin, and the byte order of these."""
+"""Magic numbers and byte order of TIFF."""
 LARGEST_IMAGE = 40_000_000
-"""Most pixels of an image or of a video's frame; 8K has 33 million."""
+"""Largest number of pixels of an image or video frame; 8K has 33 million."""
 
 _OTHERS = ("TIFF", "BMP", "WEBP", "PPM")
 _START_OF_SCAN = 0xDA
 _NO_FRAME_HEADER = (0xC4, 0xC8, 0xCC)
-"""Markers among those of frame headers, 0xC0 to 0xCF, that are something else."""
+"""Markers between 0xC0 and 0xCF that are no frame headers."""
 _MOST_SCANS = 200
-"""A progressive JPEG is decoded as often as it has scans."""
+"""Largest number of scans of a progressive JPEG, each of which is decoded."""
 _TIFF_TILE = (322, 323)
 _ORIENTATION = 0x0112
 _EXIF = b"Exif\0\0"
 _ALPHA = (4, 6)
-"""Colour types of PNG with transparency; type 3 is a palette."""
+"""PNG colour types with transparency; type 3 is a palette."""
 _PALETTE = 3
 _MOST_TAGS = 1000
 _FAR_TOO_LARGE = (0, LARGEST_IMAGE)
@@ -29,19 +29,19 @@ _FAR_TOO_LARGE = (0, LARGEST_IMAGE)
 
 @dataclass(frozen=True)
 class ImageTraits:
-    """Properties of an encoded image that change what its pixels mean."""
+    """Properties of an encoded image that affect the meaning of its pixels."""
 
     orientation: int = 1
-    """EXIF's, 1 to 8; 1 is upright."""
+    """EXIF orientation, 1 to 8; 1 is upright."""
     turned_already: bool = False
-    """Whether decoders apply the orientation by themselves, as for TIFF."""
+    """Whether decoders apply the orientation themselves, as for TIFF."""
     alpha: bool = False
     palette: bool = False
     lossy: bool = False
 
 
 def image_traits(content: bytes) -> ImageTraits:
-    """Traits of a PNG, JPEG or TIFF image; the usual ones for other kinds and damaged headers.
+    """Traits of a PNG, JPEG or TIFF image; defaults for other kinds and damaged headers.
 
     Args:
         content: of the file, at least its beginning.
@@ -80,7 +80,7 @@ def _jpeg_orientation(content: bytes) -> int:
 
 
 def _tiff_orientation(content: bytes) -> int:
-    """The tag's value in the first directory of a TIFF file, as EXIF data are; 1 without it."""
+    """Orientation tag in the first directory of TIFF or EXIF data; 1 without it."""
     order = TIFF.get(content[:4])
     if order is None:
         return 1
@@ -97,7 +97,7 @@ def _tiff_orientation(content: bytes) -> int:
 
 
 def size_problem(content: bytes) -> str | None:
-    """Why an image is not decoded, in words that follow the file's name; None where it may be.
+    """Reason to refuse an image, as a clause after the file's name; None if it can be decoded.
 
     Args:
         content: of the file: PNG, JPEG, TIFF, BMP, WebP or PPM.
@@ -113,7 +113,7 @@ def size_problem(content: bytes) -> str | None:
 
 
 def pixels_problem(width: int, height: int) -> str | None:
-    """Why an image of this size [px] is not decoded; None where it may be."""
+    """Reason to refuse an image of this size [px]; None if it can be decoded."""
     if width < 1 or height < 1:
         return f"is {width} x {height} pixels"
     if width * height > LARGEST_IMAGE:
@@ -132,7 +132,7 @@ def _size(content: bytes) -> tuple[int, int] | None:
 
 
 def _jpeg_size(content: bytes) -> tuple[int, int] | None:
-    """Width and height in the first frame header, which is the one that decoders take."""
+    """Width and height in the first frame header, which decoders use."""
     position = 2
     while (position := content.find(b"\xff", position)) >= 0 and position + 9 <= len(content):
         marker = content[position + 1]

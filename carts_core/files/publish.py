@@ -24,12 +24,12 @@ _MOST_MARK_BYTES = 10_000
 
 @dataclass(frozen=True)
 class _Mark:
-    """What a staging folder says about itself."""
+    """Content of the mark file of a staging folder."""
 
     output: str
-    """Name of what it becomes."""
+    """Name of the output."""
     key: str | None
-    """What work that can be gone on with was made from."""
+    """Fingerprint of the inputs of resumable work."""
     inode: int
 
 
@@ -38,13 +38,13 @@ class Staging:
     """A locked staging folder."""
 
     parent: int
-    """Descriptor of the folder that it lies in."""
+    """Descriptor of the parent folder."""
     name: str
     descriptor: int
     mark: _Mark
 
     def remove(self) -> None:
-        """Remove it with all that it holds; links in it are removed, not followed.
+        """Remove the folder and its content; links are removed, not followed.
 
         The mark goes last, so what a kill leaves of it is found again.
         """
@@ -60,7 +60,7 @@ class Staging:
             os.rmdir(self.name, dir_fd=self.parent)
 
     def close(self) -> None:
-        """Let go of it."""
+        """Release the lock."""
         os.close(self.descriptor)
 
 
@@ -90,7 +90,7 @@ def make_staging(parent: int, output: str, key: str | None) -> Staging:
 
 
 def leftovers(parent: int, output: str, besides: Staging) -> Iterator[Staging]:
-    """Staging folders of ours for the same output, locked, whose processes have ended.
+    """Locked staging folders for the same output whose processes have ended.
 
     Raises:
         BusyError: a process that has not ended writes the same output.
@@ -121,7 +121,7 @@ def leftovers(parent: int, output: str, besides: Staging) -> Iterator[Staging]:
 
 
 def _remove(folder: int, name: str) -> None:
-    """Remove a file, a link or a folder in an open folder, as far as it can be."""
+    """Remove a file, link or folder in an open folder, ignoring errors."""
     with suppress(OSError):
         found = status(folder, name)
         if found is not None and stat.S_ISDIR(found.st_mode):
@@ -137,7 +137,7 @@ def _write_mark(staging: Staging) -> None:
 
 
 def _read_mark(folder: int) -> _Mark | None:
-    """The mark in an open folder; None if it has none that is its own."""
+    """The mark in an open folder; None without a valid one."""
     own = os.fstat(folder)
     try:
         descriptor = os.open(_MARK, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC, dir_fd=folder)
@@ -149,14 +149,14 @@ def _read_mark(folder: int) -> _Mark | None:
 
 
 MARKER = "export.json"
-"""Every exported folder holds this file; a folder without it is never replaced."""
+"""File that marks a folder as an export; other folders are never replaced."""
 _OLD = "carts-replaced"
-"""Where the earlier output lies between two renames."""
+"""Name of the replaced output between two renames."""
 
 
 @contextmanager
 def published(target: OutputPath | Path, *, overwrite: bool = False, key: str | None = None) -> Iterator[OutputPath]:
-    """Where to write an output, which becomes `target` when the block ends without an exception.
+    """Path for an output that becomes `target` when the block ends without an exception.
 
     It is written in a hidden folder of a random name beside `target`. When the block fails or is interrupted that
     folder is removed; when the process is killed it stays, and the next call for the same target removes it.
@@ -192,7 +192,7 @@ def published(target: OutputPath | Path, *, overwrite: bool = False, key: str | 
 
 @contextmanager
 def published_file(target: OutputPath | Path, *, overwrite: bool = False) -> Iterator[OutputPath]:
-    """Where to write a single file by `write_bytes` or `output_stream`, which have it there whole or not at all.
+    """Path for a single file, to be written by `write_bytes` or `output_stream`, which are atomic.
 
     Args:
         target: the file; no link itself.
@@ -208,7 +208,7 @@ def published_file(target: OutputPath | Path, *, overwrite: bool = False) -> Ite
 
 
 def _take_staging(folder: int, output: OutputPath, key: str | None) -> Staging:
-    """The folder to write in: a new one, or what is left of the same work. What is left of other work is removed."""
+    """A new staging folder, or a leftover one of the same work. Leftovers of other work are removed."""
     taken = make_staging(folder, output.name, key)
     try:
         for left in leftovers(folder, output.name, taken):
@@ -262,7 +262,7 @@ def _is_export(folder: int, name: str) -> bool:
 
 
 def _sync(folder: int, name: str) -> None:
-    """Have an output in an open folder, and everything in it, on disk; its name there will not be the final one."""
+    """Synchronize an output in an open folder, with all its content, to disk."""
     found = status(folder, name)
     if found is not None and not stat.S_ISDIR(found.st_mode):
         _sync_file(folder, name)
@@ -296,7 +296,7 @@ def _move(staging: Staging, folder: int, name: str) -> None:
 
 
 def _exchanged(one: int, other: int, name: str) -> bool:
-    """Let what has a name in two open folders change places in one step, where the system can."""
+    """Exchange two entries of the same name in two open folders atomically, if the system supports it."""
     if not sys.platform.startswith("linux"):
         return False
     exchange = 2  # RENAME_EXCHANGE of renameat2(2)

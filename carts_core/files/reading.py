@@ -1,4 +1,4 @@
-"""What may be read of files that others made: regular files of a bounded size, and nothing nested without end.
+"""Reading of untrusted files: regular files of limited size, and limited nesting.
 
 A recording, a robot and weights come from anywhere. Every read of one goes through this module. Links are followed,
 since people link their data; devices, pipes and sockets are refused, and no file is read further than its kind's limit.
@@ -28,9 +28,9 @@ T = TypeVar("T")
 MIB = 2**20
 GIB = 2**30
 LARGEST_DEPTH = 32
-"""How deeply tables and lists may be nested in TOML, JSON and YAML."""
+"""Largest nesting depth of TOML, JSON and YAML."""
 MOST_YAML_EVENTS = 500_000
-"""Values of a YAML file, and beginnings and ends of its lists and tables."""
+"""Largest number of YAML events: values, and beginnings and ends of lists and tables."""
 MOST_INI_LINES = 10_000
 LARGEST_NAME = 255
 """Longest name of a file or folder [bytes]."""
@@ -41,7 +41,7 @@ LARGEST_WHOLE_NUMBER = 2**63 - 1
 
 @dataclass(frozen=True)
 class Kind:
-    """A kind of file and how large one may be."""
+    """A kind of file with its largest size."""
 
     name: str
     limit: int
@@ -58,9 +58,9 @@ ROBOT = Kind("URDF", 16 * MIB)
 MESH = Kind("mesh", 128 * MIB)
 WEIGHTS = Kind("weights file", 512 * MIB)
 _POINTER = b"version https://git-lfs"
-"""How a pointer of Git LFS begins, which stands for a file that was not fetched."""
+"""Beginning of a Git LFS pointer, which stands for a file that was not fetched."""
 _LARGEST_POINTER = 1024
-"""[bytes]"""
+"""Largest size of a pointer [bytes]."""
 _POINTER_TEXT = "it is a Git LFS pointer, and its content was not fetched; run `git lfs pull` in its repository"
 BAG = Kind("ROS bag", 1024 * GIB)
 VIDEO = Kind("video", 1024 * GIB)
@@ -68,18 +68,18 @@ CACHED = Kind("cached mesh", 256 * MIB)
 
 
 class RefusedFileError(CartsError, OSError):
-    """A file is there, and is not one that is read: special, too large, or nested too deeply.
+    """A file exists but is refused: it is special, too large, or nested too deeply.
 
     It is an OSError too, so that who reads a file names it in an error of their own, as for a file that is missing.
     """
 
 
 class LfsPointerError(RefusedFileError):
-    """A file stands for one that Git LFS has not fetched."""
+    """A file is a Git LFS pointer whose content was not fetched."""
 
 
 def is_regular(path: Path) -> bool:
-    """Whether there is a regular file, directly or by links; False for names that no file can have."""
+    """Whether the path is a regular file, directly or by links; False for impossible names."""
     try:
         return stat.S_ISREG(os.stat(path).st_mode)
     except (OSError, ValueError):
@@ -87,7 +87,7 @@ def is_regular(path: Path) -> bool:
 
 
 def open_regular(path: Path, kind: Kind) -> BufferedReader:
-    """A regular file for reading; opening a pipe or a device neither waits nor has an effect.
+    """Open a regular file for reading; pipes and devices neither block nor take effect.
 
     Raises:
         FileNotFoundError, IsADirectoryError, OSError: as the system says.
@@ -139,7 +139,7 @@ def read_bytes(path: Path, kind: Kind) -> bytes:
 
 
 def read_text(path: Path, kind: Kind) -> str:
-    """The content of a UTF-8 file, without the mark that some programs put at its beginning; line ends are `\\n`.
+    """The content of a UTF-8 file without byte order mark; line ends are `\n`.
 
     Raises:
         FileNotFoundError, IsADirectoryError, OSError, RefusedFileError: as `open_regular`.
@@ -219,11 +219,11 @@ def parse_yaml(text: str) -> Any:
 
 @cache
 def _plain_yaml(parser: Any) -> Any:
-    """A loader without merge keys, whose numbers cost no more than their digits."""
+    """A loader without merge keys, whose numbers are parsed in linear time."""
 
     class PlainLoader(parser):
         def flatten_mapping(self, node: Any) -> None:
-            """Leaves merge keys in place, for which there is no constructor."""
+            """Keep merge keys, for which there is no constructor."""
 
     def whole(loader: Any, node: Any) -> int | str:
         text = loader.construct_scalar(node).replace("_", "")
@@ -241,7 +241,7 @@ def _plain_yaml(parser: Any) -> Any:
 
 
 def parse_ini(text: str) -> configparser.ConfigParser:
-    """INI with its values as they are written, without interpolation.
+    """INI with unchanged values, without interpolation.
 
     Raises:
         ValueError: it is not INI, or has more than `MOST_INI_LINES` lines.
@@ -258,7 +258,7 @@ def parse_ini(text: str) -> configparser.ConfigParser:
 
 
 def typed(value: Any, kind: type[T]) -> T:
-    """Value from `parse_json` or `parse_toml` as a dataclass, or another type, with all of its fields checked.
+    """A value of `parse_json` or `parse_toml` as a dataclass or another type, with all fields checked.
 
     Raises:
         ValueError: a field is missing or of another type; the message names it.
@@ -276,7 +276,7 @@ def _path(kind: type, value: Any) -> Any:
 
 
 def all_finite(root: Any) -> bool:
-    """Whether every number in what `parse_toml` or `parse_json` gave is finite."""
+    """Whether all numbers in a parsed TOML or JSON value are finite."""
     if isinstance(root, dict):
         return all(map(all_finite, root.values()))
     if isinstance(root, list):
@@ -285,7 +285,7 @@ def all_finite(root: Any) -> bool:
 
 
 def check_path(path: str | Path) -> None:
-    """Check that no name in a path is longer than a file's can be.
+    """Check the lengths of a path and of the names in it.
 
     Raises:
         ValueError: a part of the path, or the path, is too long.
@@ -304,7 +304,7 @@ _LONG_KEY = re.compile(rf"(?<![\w-]){_KEY_PART}(?:[ \t]*+\.[ \t]*+{_KEY_PART}){{
 
 
 def _check_values(root: Any) -> None:
-    """Check depth, whole numbers and texts; goes level by level, so depth costs no stack."""
+    """Check depth, whole numbers and texts, level by level without recursion."""
     level = [root]
     for _ in range(LARGEST_DEPTH + 1):
         deeper: list[Any] = []

@@ -15,11 +15,11 @@ from ..errors import OutputError
 from .paths import OutputPath, as_output, explained, kind_of, opened_folder, status
 
 _FORMULA = ("=", "+", "-", "@", "\t", "\r")
-"""What makes a spreadsheet take a cell for a formula."""
+"""Prefixes that spreadsheets interpret as a formula."""
 
 
 def csv_cell(text: str) -> str:
-    """A text as a cell that no spreadsheet takes for a formula: an apostrophe goes before what could be one.
+    """A text as a table cell that spreadsheets do not interpret as a formula: an apostrophe precedes risky ones.
 
     Numbers stay as they are. `text_of_cell` gives the text back.
     """
@@ -28,7 +28,7 @@ def csv_cell(text: str) -> str:
 
 
 def text_of_cell(cell: str) -> str:
-    """What `csv_cell` was given."""
+    """The text of a cell from `csv_cell`."""
     return cell.removeprefix("'")
 
 
@@ -44,11 +44,11 @@ _NEW = os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
 _MODE = 0o666
 _OWN_DESCRIPTORS = Path("/proc/self/fd")
 _NAMELESS = getattr(os, "O_TMPFILE", 0) if _OWN_DESCRIPTORS.is_dir() else 0
-"""Flag for a file that has no name before it is whole, so that a kill leaves nothing; 0 where the system has none."""
+"""Flag for files that get their name when they are complete, so that a kill leaves nothing; 0 if not supported."""
 
 
 def write_bytes(path: OutputPath | Path, content: bytes) -> None:
-    """Write a file, in place of one that is there; folders on the way are made.
+    """Write a file atomically; missing folders are created.
 
     Whoever reads meets the old file or the new one, whole, whenever the process or the machine stops. A link under the
     file's name is replaced itself; what it points at stays as it is.
@@ -66,7 +66,7 @@ def write_text(path: OutputPath | Path, text: str) -> None:
 
 
 def write_new(path: OutputPath | Path, content: bytes) -> bool:
-    """Write a file where nothing is; False, and nothing is changed, where something is.
+    """Write a file unless the path exists; returns whether it was written.
 
     Of several processes that do this at once, one writes the file.
 
@@ -95,7 +95,7 @@ def write_new(path: OutputPath | Path, content: bytes) -> bool:
 
 @contextmanager
 def output_stream(path: OutputPath | Path) -> Iterator[BinaryIO]:
-    """A stream, seekable and readable, which becomes the file when the block ends without an exception.
+    """A seekable and readable stream that becomes the file when the block ends without an exception.
 
     Raises:
         OutputError: as of `write_bytes`.
@@ -125,7 +125,7 @@ def output_stream(path: OutputPath | Path) -> Iterator[BinaryIO]:
 
 
 def append_line(path: OutputPath | Path, line: bytes, *, sync: bool = True) -> None:
-    """Add a line to a file, made if it is missing, and see it on disk; without `sync`, leave that to the system.
+    """Append a line to a file, created if missing, and synchronize it to disk; optional with `sync`.
 
     A last line that was not finished, since the process was killed, is ended first.
 
@@ -148,7 +148,7 @@ def append_line(path: OutputPath | Path, line: bytes, *, sync: bool = True) -> N
 
 
 def remove_file(path: OutputPath | Path) -> None:
-    """Remove a regular file, if it is there.
+    """Remove a regular file, if it exists.
 
     Raises:
         OutputError: it is a link or no file, or may not be removed.
@@ -165,7 +165,7 @@ def remove_file(path: OutputPath | Path) -> None:
 
 
 def set_aside(path: OutputPath | Path) -> Path:
-    """Rename a damaged file to `NAME.damaged-1`, or the next number that is free, so that it is not replaced.
+    """Rename a damaged file to `NAME.damaged-1`, or the next free number, so that it is not overwritten.
 
     Returns:
         Its new path.
@@ -183,7 +183,7 @@ def set_aside(path: OutputPath | Path) -> Path:
 
 
 def holds_file(path: OutputPath | Path) -> bool:
-    """Whether a regular file lies there, reached without a link."""
+    """Whether the path is a regular file, reached without a link."""
     output = as_output(path)
     try:
         with opened_folder(output.parent) as folder:
@@ -194,7 +194,7 @@ def holds_file(path: OutputPath | Path) -> bool:
 
 
 def check_own(folder: int, output: OutputPath) -> None:
-    """See that writing into what bears a name, or removing it, changes nothing that lies elsewhere.
+    """Check that writing to or removing an entry changes no other file.
 
     Raises:
         OutputError: it is a link, has a second name, or is no regular file.
@@ -213,7 +213,7 @@ def _check_replaceable(folder: int, output: OutputPath) -> None:
 
 
 def _new_file(folder: int) -> tuple[int, str | None]:
-    """A new empty file in an open folder, and its name; without a name where the system can."""
+    """A new empty file in an open folder, and its name; None if it can do without."""
     if _NAMELESS:
         # Where a file system cannot, the attempt with a name succeeds, or says what is wrong.
         with suppress(OSError):
@@ -223,7 +223,7 @@ def _new_file(folder: int) -> tuple[int, str | None]:
 
 
 def _named(descriptor: int, folder: int) -> str:
-    """Give a nameless file a random name."""
+    """Give a file without name a random one."""
     name = _random_name()
     os.link(_OWN_DESCRIPTORS / str(descriptor), name, dst_dir_fd=folder, follow_symlinks=True)
     return name
@@ -234,19 +234,19 @@ def _random_name() -> str:
 
 
 _PAUSE = 0.1
-"""Between looks at a lock that others hold [s]."""
+"""Interval between attempts to take a lock [s]."""
 
 _SIGNATURE = b"carts lock: "
 """What the content of a lock file of ours begins with."""
 
 
 class BusyError(OutputError):
-    """Another process writes there at present."""
+    """Another process is writing to the output."""
 
 
 @contextmanager
 def locked_folder(path: OutputPath | Path) -> Iterator[None]:
-    """Hold a folder, made if it is missing, so that no other process of ours writes to it at the same time.
+    """Lock a folder, created if missing, against other processes of carts.
 
     The lock is on the folder itself: no file is made for it, and none can be deleted.
 
@@ -263,7 +263,7 @@ def locked_folder(path: OutputPath | Path) -> Iterator[None]:
 
 @contextmanager
 def one_after_another(path: OutputPath | Path) -> Iterator[None]:
-    """Hold a folder, made if it is missing, after waiting for all others that hold it like this.
+    """Lock a folder, created if missing, after waiting for all other holders.
 
     Raises:
         OutputError: the folder cannot be made, or its file system knows no locks.
@@ -290,7 +290,7 @@ def open_lock(path: OutputPath | Path) -> int:
 
 
 def try_lock(descriptor: int) -> bool:
-    """Lock an open file or folder until it is closed; False if another process, or another opening, holds it.
+    """Lock an open file or folder until it is closed; False if it is locked already.
 
     Raises:
         OSError: the file system knows no locks.

@@ -1,4 +1,4 @@
-"""A recording as its project corrects it: joints as corrected or measured, in the corrected calibration."""
+"""Recordings with the corrections of a project applied: joint positions and calibration."""
 
 from dataclasses import replace
 from typing import Any
@@ -13,7 +13,7 @@ from .state import ProjectState
 from .values import Key, Source
 
 _SOURCE_ORDER = (Source.HAND, Source.PROPAGATED, Source.OPTIMIZER, Source.MEASURED)
-"""Of a frame whose arms come from different sources, the first one of these counts."""
+"""Precedence of sources of a frame whose arms have different ones."""
 
 
 def corrected_sequence(sequence: Sequence, project: ProjectState) -> Sequence:
@@ -46,7 +46,7 @@ def calibrated_scene(scene: Scene, project: ProjectState) -> Scene:
 
 
 def source_of(project: ProjectState, frame: int) -> Source:
-    """Who or what made the joint positions of a frame."""
+    """Source of the joint positions of a frame."""
     sources = {correction.provenance.source for correction in project.joints(frame).values()}
     return next((source for source in _SOURCE_ORDER if source in sources), Source.MEASURED)
 

@@ -39,23 +39,23 @@ def as_number(digest: bytes) -> int:
 
 @dataclass(frozen=True)
 class Seal:
-    """What `seal` says but for the position in the history."""
+    """Content of `seal`, except for the position in the history."""
 
     nonce: bytes
-    """Random, made with the file; tells it from every other project of the sequence."""
+    """Random number that identifies the file."""
     about: bytes
-    """Digest of what never changes: nonce, identity and time of creation."""
+    """Digest of the constants: nonce, identity and time of creation."""
     total: int
     """The sum of all rows' digests."""
 
     @staticmethod
     def of(nonce: bytes, identity: str, created: float, total: int) -> "Seal":
-        """The seal of a project with these."""
+        """Seal of a project with these values."""
         about = blake2b(ascii((nonce, identity, created)).encode(), digest_size=_BYTES).digest()
         return Seal(nonce, about, total % _MODULUS)
 
     def plus(self, change: int) -> "Seal":
-        """The seal with digests added as one number, negative where rows go."""
+        """The seal after adding digests, as one number; negative for removed rows."""
         return replace(self, total=(self.total + change) % _MODULUS)
 
     def row(self, position: int) -> tuple[bytes, bytes, bytes]:
@@ -66,7 +66,7 @@ class Seal:
 
 
 def seal(connection: sqlite3.Connection, nonce: bytes) -> None:
-    """Give every row its digest anew, inside a transaction of the caller's.
+    """Compute the digests of all rows, inside a transaction of the caller.
 
     Args:
         connection: to a project of the present schema.
@@ -86,7 +86,7 @@ def seal(connection: sqlite3.Connection, nonce: bytes) -> None:
 
 
 def check_seal(connection: sqlite3.Connection, total: int) -> Seal:
-    """The seal of a file whose rows were all checked, and whose digests add up to `total`.
+    """The seal of a file whose rows are verified and whose digests add up to `total`.
 
     Raises:
         ProjectError: it does not fit.
@@ -107,7 +107,7 @@ def check_seal(connection: sqlite3.Connection, total: int) -> Seal:
 
 
 def checked_rows(connection: sqlite3.Connection, table: str) -> Iterable[tuple]:
-    """The rows of a table with their digests as numbers in the last column, each checked.
+    """Verified rows of a table, with their digests as numbers in the last column.
 
     Raises:
         ProjectError: a row is not as it was written.
@@ -122,7 +122,7 @@ def checked_rows(connection: sqlite3.Connection, table: str) -> Iterable[tuple]:
 
 
 def verify(connection: sqlite3.Connection) -> Seal:
-    """The seal of a file, with every row checked against it; values are not decoded.
+    """The seal of a file after verification of every row; values are not decoded.
 
     Raises:
         ProjectError: something is not as it was written.
@@ -131,7 +131,7 @@ def verify(connection: sqlite3.Connection) -> Seal:
 
 
 APPLICATION_ID = 0x43415254
-"""Marks an SQLite file as a project of ours ("CART")."""
+"""Marks an SQLite file as a project of carts ("CART")."""
 
 VERSION_1 = """
 CREATE TABLE project (            -- one row
@@ -203,12 +203,12 @@ VERSION_6 = """
 """
 
 MIGRATIONS: tuple[str, ...] = (VERSION_1, VERSION_2, VERSION_3, VERSION_4, VERSION_5, VERSION_6)
-"""Script number n takes a project from schema n to n + 1; a new project runs all of them. Never change one."""
+"""Script number n migrates a project from schema n to n + 1; a new project runs all of them. Never change one."""
 SEALED = 3
-"""The first schema with digests."""
+"""First schema with digests."""
 
 LONGEST_VALUE = 128 * 2**20
-"""What one value of a row may have [bytes]."""
+"""Largest value of a row [bytes]."""
 _LIMITS = {
     sqlite3.SQLITE_LIMIT_LENGTH: LONGEST_VALUE,
     sqlite3.SQLITE_LIMIT_SQL_LENGTH: 1_000_000,
@@ -228,16 +228,16 @@ _NEVER = {
     sqlite3.SQLITE_CREATE_VTABLE,
 }
 _STEPS_BETWEEN_LOOKS = 10_000
-"""Instructions of SQLite's virtual machine, some tens of microseconds."""
+"""Instructions of SQLite's virtual machine between checks of the time limit; some tens of microseconds."""
 _DISK_FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO}
 
 
 class DamagedProject(ProjectError):
-    """A project file is not as carts has written it."""
+    """A project file is not as carts wrote it."""
 
 
 def hardened(connection: sqlite3.Connection) -> sqlite3.Connection:
-    """A connection that runs nothing that the file's own schema asks for, and loads no file but its own."""
+    """Harden a connection: no code from the file's schema runs, and no other file is opened."""
     for limit, value in _LIMITS.items():
         connection.setlimit(limit, value)
     for setting in ("trusted_schema = OFF", "cell_size_check = ON", "mmap_size = 0", "temp_store = MEMORY"):
@@ -247,13 +247,13 @@ def hardened(connection: sqlite3.Connection) -> sqlite3.Connection:
 
 
 def _authorized(action: int, _first: object, _second: object, _schema: object, inside: str | None) -> int:
-    """Deny what we never do, and whatever a trigger or a view other than ours asks for."""
+    """Deny actions that carts never takes, and those requested by a foreign trigger or view."""
     return sqlite3.SQLITE_DENY if action in _NEVER or inside not in (None, "current") else sqlite3.SQLITE_OK
 
 
 @contextmanager
 def time_limit(connection: sqlite3.Connection, seconds: float) -> Iterator[None]:
-    """Interrupt SQLite when the block takes longer [s]: no statement of ours does, a crafted file's may.
+    """Interrupt SQLite when the block takes longer [s], which only crafted files do.
 
     Raises:
         sqlite3.OperationalError: it was interrupted.
@@ -267,7 +267,7 @@ def time_limit(connection: sqlite3.Connection, seconds: float) -> Iterator[None]
 
 
 def empty(identity: SequenceIdentity) -> sqlite3.Connection:
-    """A new project, in memory."""
+    """A new project in memory."""
     connection = hardened(sqlite3.connect(":memory:", isolation_level=None, check_same_thread=False))
     connection.execute(f"PRAGMA application_id = {APPLICATION_ID}")
     with transaction(connection):
@@ -281,7 +281,7 @@ def empty(identity: SequenceIdentity) -> sqlite3.Connection:
 
 
 def migrate(connection: sqlite3.Connection, nonce: bytes) -> None:
-    """Run the scripts that are missing, all or none. With none missing, see whether the file can be written.
+    """Run the missing migrations as one transaction. Without any, check that the file can be written.
 
     Args:
         connection: to a project whose schema and digests were checked.
@@ -297,7 +297,7 @@ def migrate(connection: sqlite3.Connection, nonce: bytes) -> None:
 
 
 def check_version(connection: sqlite3.Connection, path: Path) -> None:
-    """Refuse what is no project, or of a newer version.
+    """Refuse files that are no project, or of a newer version.
 
     Raises:
         ProjectError: it is.
@@ -313,7 +313,7 @@ def check_version(connection: sqlite3.Connection, path: Path) -> None:
 
 
 def check_schema(connection: sqlite3.Connection) -> None:
-    """Compare the schema with ours, as text: no trigger, view or expression of another is ever run.
+    """Compare the schema with the expected one, as text, so that no foreign trigger, view or expression runs.
 
     Raises:
         DamagedProject: it is another.
@@ -332,13 +332,13 @@ def version(connection: sqlite3.Connection) -> int:
 
 
 def not_a_project(path: Path) -> ProjectError:
-    """The error for another file."""
+    """Error for a file that is no project."""
     return ProjectError(f"{path} is not a project of carts; nothing was changed. Name another file.")
 
 
 @contextmanager
 def transaction(connection: sqlite3.Connection) -> Iterator[sqlite3.Connection]:
-    """All or nothing; on disk when the block has ended."""
+    """Transaction that is committed, and on disk, when the block ends without an exception."""
     connection.execute("BEGIN IMMEDIATE")
     try:
         yield connection
@@ -360,7 +360,7 @@ def _schema_of(scripts: tuple[str, ...]) -> frozenset[tuple]:
 
 
 def _statements(script: str) -> Iterator[str]:
-    """The statements of a script, one by one: `executescript` would end our transaction."""
+    """Statements of a script, one by one, since `executescript` would end the transaction."""
     statement = ""
     for line in script.splitlines(keepends=True):
         statement += line

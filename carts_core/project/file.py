@@ -1,4 +1,4 @@
-"""The project file on disk: regular files only, one writer, a checked copy in memory, verified commits.
+"""The project file on disk: file checks, writer lock, verified copy in memory, and verified commits.
 
 The lock covers the bytes that SQLite locks and belongs to the open file (F_OFD_SETLK), so it ends with the process
 and not with another descriptor. Edits go into SQLite's log while the file is open, so any other change of the file is
@@ -34,12 +34,12 @@ _OPEN = os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC | getattr(os, "O_NOCTTY", 0
 
 
 def beside(path: Path, suffix: str) -> Path:
-    """A file of SQLite's beside a project."""
+    """Path of a companion file of SQLite, such as the log."""
     return path.with_name(path.name + suffix)
 
 
 def check_files(path: Path) -> bool:
-    """Check a project and what lies beside it before anything is opened; whether the project is there.
+    """Check a project and its companion files before any is opened; returns whether the project exists.
 
     Raises:
         ProjectError: something is a link, has a second name, or is no regular file; or a journal of another program is
@@ -62,7 +62,7 @@ def check_files(path: Path) -> bool:
 
 
 def open_regular(path: Path, *, write: bool = False) -> int:
-    """A descriptor of a regular file with one name; nothing is followed, nothing waited for.
+    """Descriptor of a regular file with one name; links are not followed, and pipes do not block.
 
     Raises:
         ProjectError: it is something else.
@@ -104,11 +104,11 @@ def _check(found: os.stat_result, path: Path) -> None:
 
 
 _START, _LENGTH = 0x40000000, 512
-"""Bytes of a database on which SQLite's locks lie, whether the file is so long or not."""
+"""Byte range of SQLite's locks, which may lie beyond the end of the file."""
 
 
 def try_lock(descriptor: int) -> bool:
-    """Lock an open project file for writing until it is closed; False if somebody else has it open for writing.
+    """Lock an open project file for writing until it is closed; False if another process holds the lock.
 
     Raises:
         OSError: the file is not open for writing, or its file system knows no locks.
@@ -127,7 +127,7 @@ def try_lock(descriptor: int) -> bool:
 
 
 def holder(path: Path) -> str:
-    """Who has a project open, for people, as far as this system tells."""
+    """The process that has a project open, as text, if the system shows it."""
     own = str(os.getpid())
     with suppress(OSError):
         wanted = os.stat(path, follow_symlinks=False)
@@ -146,12 +146,12 @@ def _is_open_at(entry: Path, wanted: os.stat_result) -> bool:
 
 
 HEADER = 32
-"""Bytes before the first frame."""
+"""Size of the log's header [bytes]."""
 FRAME_HEADER = 24
-"""Bytes before each frame's page."""
+"""Size of a frame's header, before its page [bytes]."""
 _BIG_ENDIAN_MAGIC, _LITTLE_ENDIAN_MAGIC = 0x377F0683, 0x377F0682
 _COVERED = 8
-"""Bytes of a frame's header that its checksum covers, besides its page."""
+"""Bytes of a frame's header that its checksum covers, besides the page."""
 _WORD = 0xFFFFFFFF
 _FRAMES_AT_ONCE = 256
 _PAGE_SIZES = frozenset(1 << n for n in range(9, 17))
@@ -160,16 +160,16 @@ _Sum = tuple[int, int]
 
 @dataclass(frozen=True)
 class Playback:
-    """A database with its log played back."""
+    """A database with its log applied."""
 
     database: bytearray
     damaged: bool
-    """Whether there is more in the log than finished transactions and the beginning of one; for logs that began empty,
-    as ours all do."""
+    """Whether the log has more than finished transactions and the beginning of one. Valid for logs that began empty, as
+    those of carts do."""
 
 
 def played_back(database: bytes, log: bytes) -> Playback:
-    """The database after all transactions that were finished, as SQLite has it.
+    """The database after all finished transactions, as SQLite recovers it.
 
     Args:
         database: content of the database file.
@@ -204,18 +204,18 @@ def played_back(database: bytes, log: bytes) -> Playback:
 
 @dataclass(frozen=True)
 class Mark:
-    """Where the last frame of a finished transaction begins."""
+    """Position of the last frame of a finished transaction."""
 
     start: int = HEADER
     """Offset of the frame in the log [bytes]."""
     running: _Sum | None = None
-    """The checksum before it; None: the header's."""
+    """Checksum before the frame; None stands for the header's."""
     frames: int = 0
-    """0: the log has no transaction yet, 1: this frame."""
+    """Number of transactions before which the search starts: 0 for an empty log, 1 if the frame ends a transaction."""
 
 
 def next_mark(log: bytes, header: bytes, mark: Mark) -> Mark | None:
-    """The last frame of the next transaction, if the frame at `mark` and all after it up to there are whole.
+    """Last frame of the next transaction, if the frame at `mark` and all after it are intact; else None.
 
     Args:
         log: content of the log from `mark.start`.
@@ -245,7 +245,7 @@ def next_mark(log: bytes, header: bytes, mark: Mark) -> Mark | None:
 def _running_sums(
     order: Literal["<", ">"], log: bytes, start: int, page_size: int, running: _Sum
 ) -> Iterator[tuple[int, _Sum]]:
-    """Where each whole frame begins, and the checksum of the log up to its end.
+    """Start of each complete frame, and the checksum of the log up to its end.
 
     Args:
         order: byte order of the words.
@@ -278,7 +278,7 @@ def _words(order: Literal["<", ">"], data: UInt8[np.ndarray, "*rows bytes"]) -> 
 
 @lru_cache(maxsize=8)
 def _weights(words: int) -> tuple[UInt32[np.ndarray, "words 2"], tuple[_Sum, _Sum]]:
-    """What each word adds to the two sums of a checksum, and the matrix that takes the sums before the words along.
+    """Contribution of each word to the two sums of a checksum, and the matrix that propagates earlier sums.
 
     Each pair of words (x, y) takes the sums (s, t) to s' = s + x + t and t' = t + y + s', modulo 2^32. This is linear,
     so that any number of words are two sums of products.
@@ -293,16 +293,16 @@ def _weights(words: int) -> tuple[UInt32[np.ndarray, "words 2"], tuple[_Sum, _Su
 
 
 LARGEST = 768 * 2**20
-"""What a project may have, its log included [bytes]; twice that is held while it is opened."""
+"""Largest size of a project with its log [bytes]; opening needs twice as much memory."""
 _TRIES = 5
 _MAGIC = b"SQLite format 3\0"
 _WRITE_VERSION = slice(18, 20)
-"""Bytes that say whether a database keeps a log; one in memory must not."""
+"""Header bytes for the journal mode (WAL or rollback); a database in memory needs a rollback journal."""
 
 
 @dataclass(frozen=True)
 class Content:
-    """What a project file and its log hold."""
+    """Content of a project file and its log."""
 
     database: bytes
     log: bytes
@@ -310,7 +310,7 @@ class Content:
 
 @dataclass(frozen=True)
 class Copy:
-    """A copy in memory, which nothing was checked of yet.
+    """An unverified copy in memory.
 
     Attributes:
         connection: to it.
@@ -322,7 +322,7 @@ class Copy:
 
 
 def read_files(path: Path) -> Content:
-    """What lies there, at one moment.
+    """Content of project and log at one moment.
 
     Raises:
         ProjectError: it is not there, is no regular file, is too large, or never holds still.
@@ -354,7 +354,7 @@ def read_files(path: Path) -> Content:
 
 
 def open_copy(content: Content, path: Path) -> Copy:
-    """A connection to a copy in memory.
+    """An unverified copy of a project in memory.
 
     Raises:
         ProjectError: it is no project, or of a newer version of carts.
@@ -384,7 +384,7 @@ def open_copy(content: Content, path: Path) -> Copy:
 
 
 def check_copy(copy: Copy) -> None:
-    """See that a copy has our schema and is a sound database, before rows are read.
+    """Check that a copy has the schema of carts and is a sound database, before rows are read.
 
     Raises:
         DamagedProject, sqlite3.Error: it is not.
@@ -401,7 +401,7 @@ def check_copy(copy: Copy) -> None:
 
 
 def verified_seal(path: Path) -> tuple[bytes, bytes, bytes] | None:
-    """What `seal` of the file that lies there now says, if all of it is as it was written; None if it is not."""
+    """The `seal` row of the file on disk, if all of its content is intact; else None."""
     try:
         with database.errors_explained(path):
             copy = open_copy(read_files(path), path)
@@ -414,7 +414,7 @@ def verified_seal(path: Path) -> tuple[bytes, bytes, bytes] | None:
 
 
 def _promised(main: bytearray) -> int:
-    """How many bytes a database has, as its header says."""
+    """Size of a database by its header [bytes]."""
     size = int.from_bytes(main[16:18], "big")
     return int.from_bytes(main[28:32], "big") * (65536 if size == 1 else size)
 
@@ -430,21 +430,21 @@ def _content(descriptor: int, path: Path) -> bytes:
 
 
 Statements = Sequence[tuple[str, Iterable[Sequence[object]]]]
-"""SQL, each with the rows of its parameters."""
+"""SQL statements, each with the rows of its parameters."""
 
 SealRow = tuple[bytes, bytes, bytes]
-"""The row of `seal`."""
+"""Row of the table `seal`."""
 
 LARGEST_LOG = 64 * 2**20
-"""A log beyond this is moved into the file [bytes]."""
+"""Size of the log beyond which it is moved into the file [bytes]."""
 
 
 class LostFile(ProjectError):
-    """The file is not, or may not be, the one that was opened. The text says what happened to it."""
+    """The file on disk is not, or may not be, the opened one. The message says what happened to it."""
 
 
 class ProjectFile:
-    """A project file that this process alone writes to. Made by `locked`.
+    """A project file locked for writing. Made by `locked`.
 
     Attributes:
         path: where it lies.
@@ -458,12 +458,12 @@ class ProjectFile:
         self._connection: sqlite3.Connection | None = None
         self._seal: SealRow = (b"", b"", b"")
         self._left: tuple[object, ...] = ()
-        """What file and log looked like when this process had last written."""
+        """Identity, size and time of file and log after the last write of this process."""
         self._mark, self._header = Mark(), b""
 
     @classmethod
     def locked(cls, path: Path) -> "ProjectFile | None":
-        """Lock an existing project file; None if somebody else has it open for writing.
+        """Lock an existing project file; None if another process has it open for writing.
 
         Raises:
             ProjectError, OSError: it cannot be opened.
@@ -479,7 +479,7 @@ class ProjectFile:
         return None
 
     def connect(self, nonce: bytes, seal: SealRow) -> None:
-        """Have SQLite open the file, whose content was checked, and migrate it.
+        """Open the file, whose content was verified, with SQLite, and migrate it.
 
         Args:
             nonce: for a file of a schema without one.
@@ -509,7 +509,7 @@ class ProjectFile:
         self._check_names()
 
     def commit(self, statements: Statements, seal: SealRow) -> None:
-        """Run statements as one transaction, on disk when this returns.
+        """Run statements as one transaction, which is on disk when this returns.
 
         Args:
             statements: what to do.
@@ -537,7 +537,7 @@ class ProjectFile:
         self._remember()
 
     def checkpoint(self) -> None:
-        """Move the log into the file if it is large, and read that back.
+        """Move a large log into the file, and verify the result.
 
         Raises:
             LostFile: it is not what it should be.
@@ -553,7 +553,7 @@ class ProjectFile:
         self._remember()
 
     def check(self) -> None:
-        """See that file and log are as this process left them.
+        """Check that file and log are unchanged since this process last wrote.
 
         Raises:
             LostFile: they are not.
@@ -565,7 +565,7 @@ class ProjectFile:
             self._remember()
 
     def close(self) -> None:
-        """Move the log into the file, read all of it back, and let others write.
+        """Move the log into the file, verify it, and release the lock.
 
         Raises:
             LostFile: it does not hold what was saved.
@@ -579,7 +579,7 @@ class ProjectFile:
         self._release()
 
     def dismiss(self) -> None:
-        """Close a file that was not written to, or not with success."""
+        """Close a file without edits of this process."""
         if self._connection is not None and _lies_at(self.path, self._descriptor):
             with suppress(sqlite3.Error):
                 self._connection.close()
@@ -587,7 +587,7 @@ class ProjectFile:
         self.abandon()
 
     def abandon(self) -> None:
-        """Let go of a file that is lost, without writing to it again."""
+        """Close a lost file without writing to it again."""
         if self._connection is not None:
             # Closing it would move the log into the file, and remove whatever has the log's name by now.
             ctypes.pythonapi.Py_IncRef(ctypes.py_object(self._connection))
@@ -620,7 +620,7 @@ class ProjectFile:
         self._left = self._look()
 
     def _check_names(self, *, log: bool = True) -> None:
-        """See that both files lie where they lay."""
+        """Check that both files still have their paths."""
         if not _lies_at(self.path, self._descriptor):
             if os.path.lexists(self.path):
                 raise LostFile("was replaced by another file")
@@ -629,14 +629,14 @@ class ProjectFile:
             raise LostFile("has lost the file beside it that holds its newest edits (-wal)")
 
     def _check_content(self) -> None:
-        """Read all of it back."""
+        """Verify the content on disk."""
         with suppress(OSError):
             if verified_seal(self.path) == self._seal:
                 return
         raise LostFile("was changed by something else, and does not hold what was saved in it")
 
     def _check_since(self, *, committed: bool) -> None:
-        """See that nobody wrote to the file, or cut its log, while a transaction was being written to the log."""
+        """Check that no other process changed the file or cut its log during a transaction."""
         self._check_names()
         if _look(self._descriptor) != self._left[0]:
             raise LostFile("was changed by something else while an edit was being saved")

@@ -22,17 +22,17 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class SequenceIdentity:
-    """What stays the same when a recording is moved, or when its calibration or its name are corrected in its file."""
+    """Identity of a recording, which does not change when it is moved or its calibration or name are corrected."""
 
     name: str = field(compare=False)
-    """For people."""
+    """Name of the sequence."""
     frame_ids: tuple[str, ...]
     arms: Mapping[str, tuple[str, ...]]
     """Arm -> names of its joints, in the robot's order."""
     cameras: Mapping[str, tuple[int, int]]
     """Camera -> (width, height) of its images [px]."""
     kinematics_sha256: str
-    """Of the kinematics tables as they lie on disk, line ends aside."""
+    """SHA-256 of the kinematics tables, independent of line ends."""
 
     @staticmethod
     def of(sequence: "Sequence") -> "SequenceIdentity":
@@ -46,13 +46,13 @@ class SequenceIdentity:
         )
 
     def to_json(self) -> str:
-        """As text; `from_json` reads it."""
+        """The identity as JSON text."""
         # `dataclasses.asdict` would copy every frame's id.
         return json.dumps(vars(self))
 
     @staticmethod
     def from_json(text: str) -> "SequenceIdentity":
-        """What `to_json` wrote.
+        """The identity from `to_json`.
 
         Raises:
             ValueError, TypeError, KeyError: it is something else.
@@ -67,7 +67,7 @@ class SequenceIdentity:
         )
 
     def difference(self, other: "SequenceIdentity") -> str | None:
-        """In words, the first thing in which `other` is another recording; None if it is the same."""
+        """First difference to `other`, as a clause; None if they are the same recording."""
         if len(self.frame_ids) != len(other.frame_ids):
             return f"{counted(len(self.frame_ids), 'frame')} against {len(other.frame_ids)}"
         for index, (own, others) in enumerate(zip(self.frame_ids, other.frame_ids, strict=True)):
@@ -98,7 +98,7 @@ def _kinematics_sha256(sequence_file: Path) -> str:
 
 SUFFIX = ".carts"
 _RESCUED = r"\.rescued-\d{8}-\d{6}(?:-\d+)?"
-"""What `rescue_paths` adds to a name."""
+"""Pattern of the suffix from `rescue_paths`."""
 
 
 def data_dir() -> Path:
@@ -124,7 +124,7 @@ def default_path(sequence_file: Path) -> Path:
 
 
 def rescue_paths(path: Path, when: float) -> Iterator[Path]:
-    """Where to put what is rescued of a project: beside it, else among the user's data, else among temporary files."""
+    """Candidate paths of a rescued project: beside it, in the user's data folder, in the temporary folder."""
     stamp = time.strftime("%Y%m%d-%H%M%S", time.localtime(when))
     for folder in (path.parent, data_dir(), Path(tempfile.gettempdir())):
         for number in range(1, 20):
@@ -133,7 +133,7 @@ def rescue_paths(path: Path, when: float) -> Iterator[Path]:
 
 
 def rescued_copies(path: Path) -> list[Path]:
-    """Files beside a project that were made of it when it was lost or damaged, the newest first."""
+    """Rescued copies of a project beside it, the newest first."""
     named = re.compile(re.escape(path.stem) + _RESCUED + re.escape(path.suffix))
     names = os.listdir(path.parent) if path.parent.is_dir() else []
     copies = (path.parent / name for name in sorted(names, reverse=True) if named.fullmatch(name))

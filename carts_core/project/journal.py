@@ -16,7 +16,7 @@ from .values import Edits, Figures, Key, Kind, check_edit, decode
 
 @dataclass
 class Script:
-    """One transaction.
+    """Statements of one transaction.
 
     Attributes:
         statements: SQL, each with the rows of its parameters.
@@ -31,7 +31,7 @@ class Script:
     cut_at: int | None = None
 
     def insert(self, table: str, rows: Iterable[tuple]) -> None:
-        """Add rows, in place of those of the same key."""
+        """Add rows, replacing those with the same key."""
         sealed = [(*row, row_digest(table, row)) for row in rows]
         columns = TABLES[table]
         marks = ", ".join("?" * (len(columns) + 1))
@@ -40,12 +40,12 @@ class Script:
         self.digests += sum(as_number(row[-1]) for row in sealed)
 
     def take_out(self, found: Iterable[tuple[bytes]]) -> None:
-        """Take the digests of rows that go, or are replaced, out of the sum."""
+        """Subtract the digests of removed or replaced rows from the sum."""
         self.digests -= sum(as_number(digest) for (digest,) in found)
 
 
 def load(connection: sqlite3.Connection) -> tuple[ProjectState, Seal]:
-    """The state that a project holds, and its seal. Every row is checked, values that undo brings back included.
+    """State and seal of a project. Every row is verified, including undone values.
 
     Raises:
         DamagedProject, ValueError, TypeError and others of `rescue.UNREADABLE`, ProjectError, sqlite3.Error: something
@@ -88,7 +88,7 @@ def load(connection: sqlite3.Connection) -> tuple[ProjectState, Seal]:
 
 
 def append(memory: sqlite3.Connection, step: Step, edits: Edits, last: int) -> Script:
-    """Add a step at the present position; steps that were undone are forgotten.
+    """Append a step at the present position and remove undone ones.
 
     Args:
         memory: the journal as it is.
@@ -112,7 +112,7 @@ def append(memory: sqlite3.Connection, step: Step, edits: Edits, last: int) -> S
 
 
 def move(memory: sqlite3.Connection, start: int, target: int) -> tuple[Script, dict[Key[Any], Entry | None]]:
-    """Go to another position of the history; gives the entries that may differ there, too (None: not there)."""
+    """Move to another position of the history; also returns the entries that may differ there (None: absent)."""
     touched = memory.execute(
         "SELECT DISTINCT kind, frame, name FROM changes WHERE step > ? AND step <= ?", sorted((start, target))
     ).fetchall()
@@ -129,7 +129,7 @@ def move(memory: sqlite3.Connection, start: int, target: int) -> tuple[Script, d
 
 
 def before(memory: sqlite3.Connection, step: int, position: int) -> tuple[dict[Key[Any], Any], int | None]:
-    """What brings back what a step has changed, and a later step by which some of it is another one now, if any.
+    """Edits that undo a step, and the number of a later step that changed the same keys, if any.
 
     Verdicts are left out: whether one holds again depends on everything else of its frame.
     """
@@ -155,7 +155,7 @@ def before(memory: sqlite3.Connection, step: int, position: int) -> tuple[dict[K
 
 
 def add_figures(memory: sqlite3.Connection, script: Script, figures: Mapping[tuple[int, int], Figures]) -> Script:
-    """Keep figures of (frame, revision), too."""
+    """Add figures of (frame, revision)."""
     for key in figures:
         if script.cut_at is not None and key[1] >= script.cut_at:
             continue
@@ -167,7 +167,7 @@ def add_figures(memory: sqlite3.Connection, script: Script, figures: Mapping[tup
 
 
 def add_remark(memory: sqlite3.Connection, key: Key[Any], entry: Entry) -> Script:
-    """Keep a value as one of a step that is done, in place of what that step set."""
+    """Set a value as part of a done step, replacing that step's own."""
     script, row = Script(), (key.kind.value, int(key.frame), str(key.name), entry.step)
     found = "SELECT digest FROM changes WHERE kind = ? AND frame = ? AND name = ? AND step = ?"
     script.take_out(memory.execute(found, row))
@@ -176,7 +176,7 @@ def add_remark(memory: sqlite3.Connection, key: Key[Any], entry: Entry) -> Scrip
 
 
 def add_export(record: ExportRecord) -> Script:
-    """Add a line to the log of exports."""
+    """Add a row to the log of exports."""
     script = Script()
     script.insert("exports", [(record.time, str(record.format), record.path, int(record.frames), record.settings)])
     return script

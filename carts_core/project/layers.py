@@ -1,4 +1,4 @@
-"""What a person paints over a frame, one 8-bit PNG per layer, so that any image viewer shows it."""
+"""Painted layers of a frame, each an 8-bit PNG."""
 
 import struct
 from dataclasses import dataclass
@@ -35,12 +35,12 @@ class Layer:
         return struct.unpack_from(">II", self.png, len(_HEADER))
 
     def encode(self) -> bytes:
-        """As it is kept."""
+        """The layer as stored."""
         return self.png
 
     @classmethod
     def decode(cls, data: bytes) -> Self:
-        """What `encode` gave.
+        """The layer from `encode`.
 
         Raises:
             ProjectError: it is something else.
@@ -48,7 +48,7 @@ class Layer:
         return cls(bytes(data))
 
     def pixels(self) -> UInt8[np.ndarray, "height width"]:
-        """The PNG's values, not to be written to.
+        """Values of the PNG; read-only.
 
         Raises:
             ProjectError: the PNG is damaged.
@@ -109,7 +109,7 @@ class IgnoreRegion(Layer):
 
 
 class LabelLayer(Layer):
-    """A number per pixel, 0 for none."""
+    """A label image; 0 is no label."""
 
     @classmethod
     def of(cls, labels: UInt8[np.ndarray, "height width"]) -> Self:
@@ -124,25 +124,25 @@ class LabelLayer(Layer):
         return cls(_png(labels))
 
     def labels(self) -> UInt8[np.ndarray, "height width"]:
-        """Number of every pixel, not to be written to."""
+        """Label of every pixel; read-only."""
         return self.pixels()
 
 
 class PartLabels(LabelLayer):
-    """What a person painted a pixel as: the number of a class (`carts_core.model.parts.PartClass`)."""
+    """Painted part classes (numbers of `carts_core.model.parts.PartClass`)."""
 
 
 class ImportedMask(LabelLayer):
-    """What others marked in a frame: the number of a label (`ImportedLabels`) per pixel."""
+    """Imported labels (numbers of `ImportedLabels`) of the pixels of a frame."""
 
     def mask(self) -> Bool[np.ndarray, "height width"]:
-        """Where anything is marked."""
+        """Labelled pixels."""
         return self.pixels() > 0
 
 
 @lru_cache(maxsize=8)
 def _decoded(png: bytes, size: tuple[int, int]) -> UInt8[np.ndarray, "height width"]:
-    """A layer is read several times for each stroke, by the overlay, the scores and the panels."""
+    """Cached decoder, since overlay, scores and panels read a layer several times per stroke."""
     image = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_GRAYSCALE)
     if image is None or image.shape[::-1] != size:
         raise ProjectError("a painted layer is damaged. Undo to before it was painted, or paint it anew.")

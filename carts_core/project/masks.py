@@ -28,16 +28,16 @@ if TYPE_CHECKING:
 
 
 MaskLayer = Literal["imported", "painted"]
-"""Which masks of a project."""
+"""Source of masks in a project."""
 
 _LEFT_OUT = {"ignore", "ignored", "void"}
-"""Labels of pixels of which others have not said whether they show an instrument."""
+"""Labels of pixels that are neither instrument nor background."""
 
 Masks = dict[str, Bool[np.ndarray, "height width"]]
 
 
 def project_masks(layer: MaskLayer, state: ProjectState, recording: Recording) -> GivenMasks:
-    """Masks that a project holds, as they are in this state; its ignore regions are left out.
+    """Masks of a project in this state, without its ignore regions.
 
     Args:
         layer: imported ones, or rendered ones that somebody has corrected with a brush.
@@ -57,7 +57,7 @@ def project_masks(layer: MaskLayer, state: ProjectState, recording: Recording) -
 
 
 def file_masks(source: Path, recording: Recording) -> GivenMasks:
-    """Masks of others, from a file or folder as `read_annotations` takes it; none of them goes into a project.
+    """Masks from a file or folder, as read by `read_annotations`; they are not imported.
 
     Raises:
         SequenceError: it cannot be read.
@@ -78,7 +78,7 @@ def file_masks(source: Path, recording: Recording) -> GivenMasks:
 
 
 def ignored_labels(layer: ImportedMask, names: Sequence[str]) -> Bool[np.ndarray, "height width"]:
-    """Pixels of a layer whose label says that they are to be left out, such as `ignore`."""
+    """Pixels of a layer with a label that is ignored, such as `ignore`."""
     numbers = [number for number, name in enumerate(names, start=1) if name.casefold() in _LEFT_OUT]
     return np.isin(layer.labels(), numbers)
 
@@ -90,7 +90,7 @@ def _labelled(
     names: Sequence[str],
     state: ProjectState | None = None,
 ) -> GivenMasks:
-    """Masks whose pixels have labels; those of an ignore region and of labels such as `ignore` are left out."""
+    """Masks from label images, without ignore regions and ignored labels."""
     cameras = tuple(cameras)
 
     def layers(index: int) -> dict[str, ImportedMask]:
@@ -116,18 +116,18 @@ def _ignored(state: ProjectState, cameras: Iterable[str], index: int) -> Masks:
 
 
 class _Painted:
-    """Masks rendered at the poses that a project has, as somebody corrected them."""
+    """Masks rendered at the poses of a project, with the user's corrections."""
 
     def __init__(self, state: ProjectState, scene: Scene, load: Callable[[int], Frame]) -> None:
         self._state, self._scene, self._load = state, scene, load
         self._renderers: dict[str, Renderer] = {}
 
     def there(self, index: int, camera: str) -> bool:
-        """Whether somebody corrected the mask of a frame."""
+        """Whether the mask of a frame was corrected."""
         return self._state.get(Key.mask_correction(index, camera)) is not None
 
     def masks(self, index: int) -> Masks:
-        """Camera -> mask of a frame, of the cameras whose mask somebody corrected."""
+        """Camera -> mask of a frame, for cameras with a correction."""
         found: Masks = {}
         for camera in self._scene.cameras:
             correction = self._state.get(Key.mask_correction(index, camera.name))
@@ -144,30 +144,30 @@ class _Painted:
 
 
 _SHOWN = 5
-"""Remarks in a sentence."""
+"""Largest number of remarks in a sentence."""
 
 
 @dataclass(frozen=True)
 class ImportReport:
-    """What was imported."""
+    """Report of an import."""
 
     kind: str
-    """The source's format, for people."""
+    """Name of the source's format."""
     masks: int
-    """Images that got a mask."""
+    """Number of images with masks."""
     keypoints: int
-    """Images that got keypoints."""
+    """Number of images with keypoints."""
     labels: tuple[str, ...]
-    """That the masks have."""
+    """Labels of the masks."""
     unknown: tuple[str, ...]
     """Images of the source that belong to no frame."""
     changed: bool
-    """Whether the project changed; False where it had all of it already."""
+    """Whether the project changed."""
     remarks: tuple[str, ...] = ()
-    """What was decided about masks, and annotations that were left out, each with its reason."""
+    """Decisions on masks, and omitted annotations with reasons."""
 
     def sentence(self) -> str:
-        """For people."""
+        """Report as a sentence."""
         parts = [counted(self.masks, "mask")] if self.masks else []
         parts += [f"keypoints of {counted(self.keypoints, 'image')}"] if self.keypoints else []
         labels = f" ({listed(self.labels)})" if self.masks and self.labels else ""
@@ -185,7 +185,7 @@ class ImportReport:
 def import_annotations(
     project: Project, annotations: "Annotations", *, source: str, replace: bool = False
 ) -> ImportReport:
-    """Put annotations into a project. What a person has painted stays as it is; so does the recording's own truth.
+    """Import annotations into a project. Painted layers and the recording's own masks are kept.
 
     Args:
         project: open for writing.
@@ -224,7 +224,7 @@ def import_annotations(
 
 
 def _edits(state: ProjectState, annotations: "Annotations") -> tuple[dict[Key[Any], Any], int, int]:
-    """What changes, and how many images have masks and keypoints; numbers of labels go on from those that are there."""
+    """Edits, and numbers of images with masks and keypoints; new labels are numbered after the existing ones."""
     known = state.get(Key.imported_labels())
     names = [] if known is None else list(known.names)
     edits: dict[Key[Any], Any] = {}

@@ -1,4 +1,4 @@
-"""An open project: edits that are on disk before the call returns, undo and redo, one writer at a time."""
+"""An open project: durable edits, undo and redo, one writer at a time."""
 
 import json
 import logging
@@ -27,28 +27,28 @@ Action = Literal["apply", "undo", "redo", "figures", "export"]
 
 @dataclass(frozen=True)
 class Change:
-    """What has just been saved. The new state is that of the project."""
+    """A saved change. The new state is that of the project."""
 
     action: Action
     step: Step | None
-    """The step that was done or, for "undo", taken back; the furthest one when several were passed."""
+    """The step that was done or, for "undo", taken back; the outermost one of several."""
     keys: frozenset[Key[Any]]
-    """What may have another value now."""
+    """Keys whose values may have changed."""
     frames: tuple[int, ...]
-    """Indices of the frames that it is about, in order; values of the whole project aside."""
+    """Indices of the affected frames, sorted; without values of the whole project."""
 
 
 Listener = Callable[[Change], None]
 
 
 class Listeners:
-    """Functions that are called after each save, in the order in which they came."""
+    """Callbacks that are called after each save, in order of registration."""
 
     def __init__(self) -> None:
         self._listeners: list[Listener] = []
 
     def add(self, listener: Listener) -> Callable[[], None]:
-        """Call a function from now on; what is returned ends this."""
+        """Register a callback; the returned function removes it."""
         self._listeners.append(listener)
 
         def remove() -> None:
@@ -58,7 +58,7 @@ class Listeners:
         return remove
 
     def notify(self, change: Change, project: Path) -> None:
-        """Call them all. One that fails is logged: the edit is saved, so it must not look as if it were not."""
+        """Call all listeners. Errors are logged, since the edit is saved."""
         for listener in tuple(self._listeners):
             try:
                 listener(change)
@@ -67,11 +67,11 @@ class Listeners:
 
 
 LONGEST_NAME = 200
-"""Characters of a step's name."""
+"""Largest length of a step's name [characters]."""
 
 
 class Project:
-    """The corrections of one sequence, in one file. Safe to use from several threads.
+    """The corrections of one sequence, in one file. Thread-safe.
 
     Attributes:
         state: what it says now. An immutable snapshot, which reading needs no lock for.
@@ -95,12 +95,12 @@ class Project:
         self._listeners = Listeners()
         self._store: Store | None = None
         self._incident: str | None = None
-        """Of a store that was closed."""
+        """Incident of the closed store."""
         self.state = self._opened(identity)
 
     @classmethod
     def open(cls, sequence: "Sequence", path: Path | None = None, *, read_only: bool = False) -> Self:
-        """The project of a sequence, begun if there is none; by default at `default_path`.
+        """Open the project of a sequence, created if it is missing; by default at `default_path`.
 
         While another process has it open for writing, it opens read-only; see `writable`. Errors as of the class.
         """
@@ -118,21 +118,22 @@ class Project:
 
     @property
     def writable(self) -> bool:
-        """Whether edits are taken."""
+        """Whether the project accepts edits."""
         return self._store is not None
 
     @property
     def incident(self) -> str | None:
-        """What happened to the file that was opened, for people, and where its edits are now; None if nothing did."""
+        """What happened to the opened file and where its edits are now, as a sentence; None if nothing happened."""
         return self._incident if self._store is None else self._store.incident
 
     @property
     def safe(self) -> bool:
-        """Whether everything that was acknowledged is on disk, as far as was seen; see `check`."""
+        """Whether all acknowledged edits are on disk, as of the last `check`."""
         return self._store is None or self._store.safe
 
     def check(self) -> None:
-        """See that the file is still as it was left; if not, everything is saved to another one, see `incident`.
+        """Check that the file is unchanged since the last write; otherwise everything is saved to another one, see
+        `incident`.
 
         Every edit does this, too.
 
@@ -144,7 +145,7 @@ class Project:
                 self._store.check()
 
     def apply(self, name: str, edits: Edits, figures: Mapping[int, Figures] | None = None) -> Change | None:
-        """Save one gesture as one step of undo. It is on disk when this returns.
+        """Save one gesture as one undo step. It is on disk when this returns.
 
         Args:
             name: for the history, say "Drag PSM1"; shortened to `LONGEST_NAME` characters.
@@ -174,7 +175,7 @@ class Project:
             return self._saved(after.with_figures(known), "apply", step, changed.keys())
 
     def undo(self) -> Change | None:
-        """Take back the last step; None if there is none.
+        """Undo the last step; None if there is none.
 
         Raises:
             ProjectError: it could not be saved.
@@ -183,12 +184,12 @@ class Project:
             return self.go_to(max(self.state.position - 1, 0))
 
     def redo(self) -> Change | None:
-        """Do the step again that was undone last; None if there is none. Errors as `undo`."""
+        """Redo the step that was undone last; None if there is none. Errors as `undo`."""
         with self._edit:
             return self.go_to(min(self.state.position + 1, len(self.state.steps)))
 
     def go_to(self, position: int) -> Change | None:
-        """Undo or redo until so many steps are done; None if they already are.
+        """Undo or redo to a position of the history; None if it is the present one.
 
         Raises:
             ProjectError: the history has no such position, or it could not be saved.
@@ -210,7 +211,7 @@ class Project:
             return self._saved(moved, "undo" if back else "redo", step, entries.keys())
 
     def reverting(self, number: int) -> tuple[Edits, Mapping[int, Figures]]:
-        """The edits that take back one step and leave every later one as it is, with figures as for `apply`.
+        """Edits that undo a single step and keep all later ones, with figures as for `apply`.
 
         Nothing is changed. A frame that becomes what it was before the step has the verdict and figures of then.
 
@@ -240,7 +241,7 @@ class Project:
         return self.state.steps
 
     def record_figures(self, figures: Mapping[int, Figures], state: ProjectState) -> None:
-        """Save figures that were computed for frames as they were in `state`. Not a step of undo.
+        """Save figures that were computed for frames of `state`. Not an undo step.
 
         They come back whenever undo or redo brings those frames back to that state.
 
@@ -259,7 +260,7 @@ class Project:
                 self._saved(self.state.with_figures(known), "figures", frames=[frame for frame, _ in known])
 
     def record_verdict(self, frame: int, verdict: FitVerdict) -> None:
-        """Save what the image says of a frame as it is now; as with figures, this is no step. Errors as there."""
+        """Save the verdict on the present fit of a frame. Not an undo step. Errors as `record_figures`."""
         key = Key.verdict(frame)
         with self._edit:
             check_edit(self.state.identity, key, verdict)
@@ -269,7 +270,7 @@ class Project:
             self._saved(self.state.with_entries({key: entry}), "figures", frames=[frame])
 
     def log_export(self, format: str, path: Path, frames: int, settings: Mapping[str, Any]) -> None:
-        """Save that an export was finished. Not a step of undo.
+        """Log a finished export. Not an undo step.
 
         Args:
             format: its name.
@@ -286,11 +287,11 @@ class Project:
             self._saved(replace(self.state, exports=(*self.state.exports, record)), "export")
 
     def listen(self, listener: Listener) -> Callable[[], None]:
-        """Call `listener` after each save, in order, on the thread that saves, until what this returns is called."""
+        """Call `listener` after each save, in order, on the saving thread, until the returned function is called."""
         return self._listeners.add(listener)
 
     def close(self) -> None:
-        """Let others write. The state can still be read.
+        """Close the file for other writers. The state can still be read.
 
         Raises:
             ProjectError: what was saved is nowhere on disk any more.
@@ -342,7 +343,7 @@ class Project:
 
 
 def read_state(path: Path) -> ProjectState:
-    """State of a project file, whatever sequence it belongs to; the file may be open elsewhere.
+    """State of a project file of any sequence; the file may be open elsewhere.
 
     Raises:
         ProjectError: it is not there, or cannot be read.

@@ -30,13 +30,13 @@ V = TypeVar("V")
 
 @dataclass(frozen=True)
 class Step:
-    """One gesture, which is one step of undo."""
+    """One gesture, which is one undo step."""
 
     number: int
     """From 1, without gaps."""
     name: str
     time: float
-    """When it was made [s since 1970]."""
+    """Time of the step [s since 1970]."""
 
 
 @dataclass(frozen=True)
@@ -44,18 +44,18 @@ class ExportRecord:
     """One finished export."""
 
     time: float
-    """When it was finished [s since 1970]."""
+    """Time of completion [s since 1970]."""
     format: str
     path: str
     frames: int
-    """How many frames it holds."""
+    """Number of exported frames."""
     settings: str
     """JSON text."""
 
 
 @dataclass(frozen=True)
 class Entry:
-    """A value and the step that made it. The value is None where that step removed it."""
+    """A value and the step that set it. The value is None if the step removed it."""
 
     step: int
     value: Any
@@ -63,17 +63,17 @@ class Entry:
 
 @dataclass(frozen=True)
 class Record:
-    """What is known of one frame, or of the whole project."""
+    """Values of one frame, or of the whole project."""
 
     entries: Mapping[Key[Any], Entry]
-    """What differs from the sequence, or once did."""
+    """Values that differ, or once differed, from the sequence."""
     figures: Mapping[int, Figures]
     """By revision; see `ProjectState.revision`."""
 
     # Computed once per record, and records outlive states: whoever asks for all frames again asks for few anew.
     @cached_property
     def review(self) -> Review:
-        """Review state and note. Of a frame that nobody has judged, the state follows what made its joint positions."""
+        """Review state and note. Without a person's review, the state depends on the source of the joint positions."""
         said = next(self._values(Kind.REVIEW), Review())
         if said.state not in UNREVIEWED:
             return said
@@ -81,12 +81,13 @@ class Record:
 
     @cached_property
     def sources(self) -> frozenset[Source]:
-        """Who made the corrected joint positions."""
+        """Sources of the corrected joint positions."""
         return frozenset(correction.provenance.source for correction in self._values(Kind.JOINTS))
 
     @cached_property
     def _optimized(self) -> bool:
-        """Whether its joint positions are those of a run, on it alone or with other frames; a copy has no settings."""
+        """Whether the joint positions are from an optimizer run, alone or with other frames; copies have no
+        settings."""
         made = [correction.provenance for correction in self._values(Kind.JOINTS)]
         by_hand = any(one.source is Source.HAND for one in made)
         return not by_hand and any(one.settings is not None for one in made)
@@ -98,7 +99,7 @@ class Record:
 
     @cached_property
     def is_kept(self) -> bool:
-        """Whether propagation must not change it: a keyframe, or accepted by a person."""
+        """Whether propagation must not change the frame: a keyframe, or accepted by a person."""
         return self.is_keyframe or self.review.state is ReviewState.ACCEPTED
 
     def _values(self, kind: Kind) -> Iterator[Any]:
@@ -107,32 +108,32 @@ class Record:
 
 _EMPTY = Record({}, {})
 _MARKS = (Kind.KEYFRAME, Kind.REVIEW, Kind.VERDICT, Kind.IMPORTED_KEYPOINTS, Kind.IMPORTED_LABELS)
-"""Kinds that say something about frames and do not change how arms fit."""
+"""Kinds that describe frames and do not affect the fit of arms."""
 _ACCEPTED = ReviewState.ACCEPTED
 _ACCEPTED_WITH = {Kind.JOINTS, Kind.MASK_CORRECTION, Kind.PART_LABELS, *CALIBRATION}
-"""Kinds of what somebody who accepts a frame has seen; where one changes, the frame must be accepted again."""
+"""Kinds that invalidate an acceptance when they change."""
 
 
 @dataclass(frozen=True, eq=False)
 class ProjectState:
-    """Everything a project says at one moment. Nothing changes it; an edit makes a new one."""
+    """Immutable snapshot of a project."""
 
     identity: SequenceIdentity
     steps: tuple[Step, ...] = ()
     """The history, oldest first; those after `position` are undone and can be redone."""
     position: int = 0
-    """How many steps are done."""
+    """Number of the done steps."""
     records: Mapping[int, Record] = field(default_factory=dict)
-    """By frame. An edit copies this and the records that it touches, so it must not be one flat table."""
+    """Records by frame. An edit copies this table and the affected records, so it is not one flat table."""
     exports: tuple[ExportRecord, ...] = ()
 
     def get(self, key: Key[V]) -> V | None:
-        """The value under a key; None where it is as the sequence says."""
+        """The value of a key; None where it is as in the sequence."""
         entry = self._record(key.frame).entries.get(key)
         return None if entry is None else entry.value
 
     def changed(self, edits: Edits) -> dict[Key[Any], Any]:
-        """The edits without those that change nothing; a verdict on another pose is another one, whatever it says.
+        """Edits that change something; a verdict on another pose always does.
 
         An accepted frame that becomes another one is not accepted any more, unless an edit says what its review is.
         That belongs to the same step, so undo accepts it again.
@@ -149,7 +150,7 @@ class ProjectState:
         return {**changed, **{key: review for key, review in self._withdrawn(changed).items() if key not in edits}}
 
     def _withdrawn(self, changed: Edits) -> dict[Key[Any], Any]:
-        """Of accepted frames that these changes make other ones: a review that does not accept them any more."""
+        """Reviews that withdraw the acceptance of frames affected by these changes."""
         frames = {key.frame for key in changed if key.kind in _ACCEPTED_WITH}
         if WHOLE_PROJECT in frames:
             frames = set(self.records) - {WHOLE_PROJECT}
@@ -163,7 +164,7 @@ class ProjectState:
         return {key: entry.value for key, entry in entries if key.kind is kind and entry.value is not None}
 
     def joints(self, frame: int) -> dict[str, JointCorrection]:
-        """Corrected joint positions of a frame, for the arms that have some."""
+        """Corrected joint positions of a frame by arm."""
         found = {arm: self.get(Key.joints(frame, arm)) for arm in self.identity.arms}
         return {arm: correction for arm, correction in found.items() if correction is not None}
 
@@ -172,30 +173,31 @@ class ProjectState:
         return self._record(frame).review
 
     def verdict(self, frame: int) -> FitVerdict | None:
-        """What the image said of a frame's fit; None if the fit was not assessed since it changed."""
+        """Verdict on a frame's fit; None if the fit changed since."""
         entry = self._record(frame).entries.get(Key.verdict(frame))
         return None if entry is None or entry.step < self.revision(frame) else entry.value
 
     def remark(self, key: Key[V], value: V) -> Entry:
-        """A value that belongs to the step that has made its frame what it is, so that it comes and goes with it."""
+        """Entry for a value that belongs to the step that last changed its frame, so that undo affects both."""
         known = self._record(key.frame).entries.get(key)
         return Entry(max(self.revision(key.frame), 0 if known is None else known.step), value)
 
     def is_keyframe(self, frame: int) -> bool:
-        """Whether propagation must keep the frame: a person said so, or made its joint positions and said nothing."""
+        """Whether propagation must keep the frame, by user's choice or, by default, for joint positions made by
+        hand."""
         return self._record(frame).is_keyframe
 
     @cached_property
     def kept_frames(self) -> tuple[int, ...]:
-        """Frames that propagation must not change: keyframes and those that a person accepted; in order."""
+        """Frames that propagation must not change, sorted: keyframes and those accepted by a person."""
         return tuple(sorted(i for i, record in self.records.items() if i != WHOLE_PROJECT and record.is_kept))
 
     def figures(self, frame: int) -> Figures | None:
-        """Figures of a frame as it now is; None if they were not computed since it changed."""
+        """Figures of a frame; None if it changed since they were computed."""
         return self._record(frame).figures.get(self.revision(frame))
 
     def revision(self, frame: int) -> int:
-        """The last step that changed what figures of this frame depend on; 0 if none did."""
+        """Last step that changed the inputs of the frame's figures; 0 if none did."""
         entries = self._record(frame).entries.items()
         own = max((entry.step for key, entry in entries if key.kind not in _MARKS), default=0)
         return max(own, self._calibration_revision)
@@ -203,7 +205,7 @@ class ProjectState:
     def regained(
         self, past: "ProjectState", edits: Edits
     ) -> tuple[dict[Key[FitVerdict], FitVerdict], dict[int, Figures]]:
-        """Verdicts and figures of the frames that edits make again what they were in an earlier state."""
+        """Verdicts and figures of frames that edits restore to an earlier state."""
         after = self.after(Step(self.position + 1, "", 0.0), edits)
         changed = {key.frame for key in edits if key.kind not in _MARKS}
         frames = set(past.records) - {WHOLE_PROJECT} if WHOLE_PROJECT in changed else changed
@@ -216,28 +218,28 @@ class ProjectState:
         )
 
     def _fitted(self, frame: int) -> dict[Key[Any], Any]:
-        """All values that a frame's verdict and figures depend on."""
+        """Values that affect a frame's verdict and figures."""
         entries = (*self._record(frame).entries.items(), *self._record(WHOLE_PROJECT).entries.items())
         return {key: e.value for key, e in entries if key.kind not in _MARKS and e.value is not None}
 
     @property
     def undoable(self) -> Step | None:
-        """The step that `Project.undo` takes back."""
+        """The step that `Project.undo` undoes; None if there is none."""
         return self.steps[self.position - 1] if self.position else None
 
     @property
     def redoable(self) -> Step | None:
-        """The step that `Project.redo` does again."""
+        """The step that `Project.redo` redoes; None if there is none."""
         return self.steps[self.position] if self.position < len(self.steps) else None
 
     def after(self, step: Step, edits: Edits) -> "ProjectState":
-        """The state after one more step; what could be redone is gone."""
+        """The state after one more step, without the redoable ones."""
         state = self if self.redoable is None else self._without_undone_steps()
         changed = {key: Entry(step.number, value) for key, value in edits.items()}
         return replace(state.with_entries(changed), steps=(*state.steps, step), position=step.number)
 
     def with_entries(self, changed: Mapping[Key[Any], Entry | None]) -> "ProjectState":
-        """The state with other entries under these keys; None for none."""
+        """The state with other entries under these keys; None removes an entry."""
         by_frame: defaultdict[int, dict[Key[Any], Entry | None]] = defaultdict(dict)
         for key, entry in changed.items():
             by_frame[key.frame][key] = entry
@@ -273,7 +275,7 @@ class ProjectState:
 
 
 def by_revision(state: ProjectState, figures: Mapping[int, Figures]) -> dict[tuple[int, int], Figures]:
-    """Figures of frames by frame and revision in this state.
+    """Figures by frame and revision in this state.
 
     Raises:
         ProjectError: there is no such frame.
@@ -284,7 +286,7 @@ def by_revision(state: ProjectState, figures: Mapping[int, Figures]) -> dict[tup
 
 
 def step_at(state: ProjectState, number: int) -> tuple[Step, ...]:
-    """The step with this number, as a tuple; empty where there is none."""
+    """The step with this number, as a tuple; empty if there is none."""
     return state.steps[max(number - 1, 0) : number]
 
 
@@ -294,14 +296,14 @@ def frames_in(state: ProjectState, review_states: Collection[ReviewState]) -> li
 
 
 def by_hand(state: ProjectState, frame: int) -> bool:
-    """Whether a person has moved the frame's arms, and nobody has said anything about it yet."""
+    """Whether a person moved the frame's arms and the frame is not reviewed."""
     record = state.records.get(frame)
     untouched = record is not None and record.review.state is ReviewState.UNTOUCHED
     return record is not None and untouched and Source.HAND in record.sources
 
 
 def next_unreviewed(state: ProjectState, after: int, step: int = 1, within: range | None = None) -> int | None:
-    """The next frame that nobody has judged, coming round at the end; None if there is none.
+    """The next frame without review, cyclically; None if there is none.
 
     Args:
         state: of the project.
@@ -316,7 +318,7 @@ def next_unreviewed(state: ProjectState, after: int, step: int = 1, within: rang
 
 
 def between_kept(state: ProjectState, frame: int, within: range | None = None) -> range:
-    """From the kept frame before this one to the kept frame after it, both included; see `ProjectState.kept_frames`.
+    """The frames between the neighbouring kept frames, both included; see `ProjectState.kept_frames`.
 
     Where there is none, the sequence's first or last frame takes its place, or that of `within` if the frame is there.
     """
@@ -333,7 +335,7 @@ def worst_first(
     frames: Iterable[int] | None = None,
     badness: Callable[[Figures], float | None] | None = None,
 ) -> list[int]:
-    """Frames by how badly they fit, worst first; those without figures come last, in order.
+    """Frames sorted by decreasing badness of fit; those without figures come last, in order.
 
     Args:
         state: of the project.
@@ -351,7 +353,7 @@ def worst_first(
 
 
 def _badness(state: ProjectState, indices: Iterable[int]) -> dict[int, float]:
-    """Of the frames of which any is known; all by the same measure, the most telling that there is."""
+    """Badness of frames with figures, all by the same measure, the most reliable one available."""
     dice, failure, loss = {}, {}, {}
     for index in indices:
         figures, verdict = state.figures(index), state.verdict(index)

@@ -1,4 +1,4 @@
-"""Opening, committing to and rescuing a project: a file, and a copy of it in memory.
+"""Opening, committing to and rescuing a project, which is a file with a copy in memory.
 
 Everything is checked on the copy first, so a refused file stays as it is. A file that is lost while open is rescued
 from the copy; of a damaged file, what can be read becomes a new project.
@@ -26,14 +26,14 @@ from .state import ProjectState
 from .values import Figures, Key, Kind, check_edit, decode
 
 UNREADABLE = (ValueError, TypeError, KeyError, AttributeError, OverflowError, RecursionError, MemoryError)
-"""What decoding of foreign values raises, besides `ProjectError`."""
+"""Errors of decoding untrusted values, besides `ProjectError`."""
 _LISTED = 5
 _LOST_STEP = "A step whose name was lost to damage"
 
 
 @dataclass
 class Rescued:
-    """A new project in memory, and what happened, for people."""
+    """A rescued project in memory, with a report."""
 
     connection: sqlite3.Connection
     kept: int = 0
@@ -41,14 +41,14 @@ class Rescued:
 
     @property
     def text(self) -> str:
-        """For people."""
+        """Report as a clause."""
         named = ", ".join(self.lost[:_LISTED]) + (" and more" if len(self.lost) > _LISTED else "")
         missing = f"{len(self.lost)} could not ({named})" if self.lost else "what is missing left no trace"
         return f"{counted(self.kept, 'row')} of it could be read, {missing}"
 
 
 def rescue(copy: Copy, identity: SequenceIdentity) -> Rescued | None:
-    """What can be read of a project of this sequence; None if that is nothing."""
+    """Rescue the readable content of a project of this sequence; None if there is none."""
     old = copy.connection
     rescued = Rescued(database.empty(identity))
     tables = {table: list(_rows(copy, table, rescued)) for table in TABLES}
@@ -81,7 +81,7 @@ def _insert(new: sqlite3.Connection, table: str, rows: list[tuple]) -> None:
 
 
 def _rows(copy: Copy, table: str, rescued: Rescued) -> Iterator[tuple]:
-    """The rows that are as they were written, from both ends of the table up to where it cannot be read."""
+    """Intact rows of a table, read from both ends up to unreadable parts."""
     connection, columns = copy.connection, ", ".join(TABLES[table])
     sealed = database.version(connection) >= database.SEALED
     digest = "digest" if sealed else "NULL"
@@ -135,7 +135,7 @@ def _is_figure(identity: SequenceIdentity, row: tuple, rescued: Rescued) -> bool
 
 
 def _position(old: sqlite3.Connection, numbers: list[int]) -> int:
-    """How many of the steps are done; all, where the file does not say so."""
+    """Number of the done steps; all, if the file does not give it."""
     try:
         (position,) = old.execute("SELECT position FROM project").fetchone()
     except (sqlite3.Error, TypeError):
@@ -146,20 +146,20 @@ def _position(old: sqlite3.Connection, numbers: list[int]) -> int:
 _log = logging.getLogger(__name__)
 
 _WRITE_VERSION = slice(18, 20)
-"""Bytes that say whether a database keeps a log."""
+"""Header bytes for the journal mode."""
 _LOG = b"\2\2"
 _TRIES = 3
 
 
 def file_content(memory: sqlite3.Connection) -> bytes:
-    """What a project in memory is as a file."""
+    """File content of a project in memory."""
     content = bytearray(memory.serialize())
     content[_WRITE_VERSION] = _LOG
     return bytes(content)
 
 
 class Store:
-    """An open project that is written to.
+    """A project open for writing.
 
     Attributes:
         memory: the same as the file, in memory.
@@ -179,7 +179,7 @@ class Store:
 
     @property
     def safe(self) -> bool:
-        """Whether everything that was acknowledged is on disk, as far as was seen."""
+        """Whether all acknowledged edits are on disk, as of the last check."""
         return self._file is not None
 
     def commit(self, script: Script) -> None:
@@ -209,7 +209,7 @@ class Store:
         self._guarded(lambda file: file.checkpoint())
 
     def check(self) -> None:
-        """See that the file is still there and as it was left; rescue everything if not.
+        """Check that the file is unchanged since the last write; otherwise rescue everything.
 
         Raises:
             ProjectError: it is lost, and nothing could be rescued to a disk yet.
@@ -217,7 +217,7 @@ class Store:
         self._guarded(lambda file: file.check())
 
     def close(self) -> None:
-        """Close the file, and read back that it holds everything.
+        """Close the file and verify its content.
 
         Raises:
             ProjectError: what was acknowledged is nowhere on disk.
@@ -248,7 +248,7 @@ class Store:
         return self._file
 
     def _rescue(self, what: str) -> None:
-        """Write everything to a new file, and go on with that."""
+        """Write everything to a new file, which takes the place of the lost one."""
         lost = self.path
         if self._file is not None:
             self._what = what
@@ -298,7 +298,7 @@ class Store:
 
 @dataclass(frozen=True)
 class Writable:
-    """A project that is open for writing."""
+    """A project open for writing."""
 
     state: ProjectState
     store: Store
@@ -306,14 +306,14 @@ class Writable:
 
 @dataclass(frozen=True)
 class ReadOnly:
-    """What a project says that somebody else has open for writing."""
+    """A project that another process has open for writing."""
 
     state: ProjectState
     reason: str
 
 
 def open_or_begin(path: Path, identity: SequenceIdentity) -> Writable | ReadOnly:
-    """Open the project of a sequence for writing, or for reading where somebody else writes; begin it if it is missing.
+    """Open the project of a sequence, for reading if another process writes to it; a missing one is created.
 
     Raises:
         DamagedProject: it is damaged; what can be read of it is in a new file by now.
@@ -360,7 +360,7 @@ def _begin(path: Path, identity: SequenceIdentity) -> None:
 def _load(
     path: Path, identity: SequenceIdentity | None, *, keep_what_is_left: bool
 ) -> tuple[sqlite3.Connection, ProjectState, Seal]:
-    """A copy of the file in memory, migrated, and what it says."""
+    """A migrated copy of the file in memory, with its state and seal."""
     content = read_files(path)
     try:
         copy = open_copy(content, path)
@@ -394,7 +394,7 @@ def _checked(copy: Copy) -> tuple[ProjectState, Seal]:
 def _damaged(
     path: Path, identity: SequenceIdentity | None, copy: Copy, error: BaseException, *, keep_what_is_left: bool
 ) -> ProjectError:
-    """The error for a damaged file; what can be read of it is in a new file by then, where that is asked for."""
+    """Error for a damaged file; if requested, the readable content is rescued to a new file first."""
     reason = (
         str(error).rstrip(".") if isinstance(error, ProjectError | sqlite3.Error) else f"unreadable values ({error})"
     )

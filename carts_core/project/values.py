@@ -21,11 +21,11 @@ from .layers import IgnoreRegion, ImportedMask, Layer, MaskCorrection, PartLabel
 _Choice = TypeVar("_Choice", bound=StrEnum)
 
 LONGEST_NOTE = 10_000
-"""Characters."""
+"""Largest length of a note [characters]."""
 
 
 class Source(StrEnum):
-    """Who or what made a value."""
+    """Origin of a value."""
 
     MEASURED = "measured"
     HAND = "hand"
@@ -35,7 +35,7 @@ class Source(StrEnum):
 
 @dataclass(frozen=True)
 class Provenance:
-    """Who or what made a value, and how.
+    """Origin of a value, with settings and weights.
 
     Raises:
         ProjectError: an optimizer's value without settings, settings that are not JSON, or a hash that is none.
@@ -57,7 +57,7 @@ class Provenance:
             raise ProjectError(f"{self.weights_sha256!r} is not a SHA-256 hash. Give 64 hexadecimal digits.")
 
     def _network_known(self, settings: str) -> bool:
-        """Whether it is said which network was run, if one was."""
+        """Whether the network, if one was run, is given."""
         used = json.loads(settings)
         return self.weights_sha256 is not None or (isinstance(used, dict) and used.get("observe") == "masks")
 
@@ -76,15 +76,15 @@ class Provenance:
 
 
 class JsonValue:
-    """A dataclass that is kept as JSON text."""
+    """A dataclass that is stored as JSON text."""
 
     def encode(self) -> str:
-        """As JSON text."""
+        """The value as JSON text."""
         return json.dumps(asdict(self), allow_nan=False)  # pyright: ignore[reportArgumentType]
 
     @classmethod
     def decode(cls, text: str) -> Self:
-        """What `encode` wrote.
+        """The value from `encode`.
 
         Raises:
             ValueError, TypeError, ProjectError: it is something else.
@@ -97,7 +97,7 @@ class JsonValue:
 
 @dataclass(frozen=True)
 class JointCorrection(JsonValue):
-    """Joint positions of one arm in one frame. Any sequences of numbers are taken and kept as tuples.
+    """Joint positions of one arm in one frame. Any sequences of numbers are accepted and stored as tuples.
 
     Raises:
         ProjectError: a number is not finite, or the lengths differ.
@@ -168,7 +168,7 @@ class CorrectedIntrinsics(JsonValue):
 
 @dataclass(frozen=True)
 class TimeOffset(JsonValue):
-    """Time in the kinematics table minus time of the image, in place of the sequence's own; see `TimeMatching`.
+    """Time in the kinematics table minus time of the image, overriding the sequence's; see `TimeMatching`.
 
     Raises:
         ProjectError: it is not finite.
@@ -183,13 +183,13 @@ class TimeOffset(JsonValue):
 
 @dataclass(frozen=True)
 class Keyframe(JsonValue):
-    """Whether a frame is a keyframe, where a person said so; see `ProjectState.is_keyframe`."""
+    """User's choice whether a frame is a keyframe; see `ProjectState.is_keyframe`."""
 
     held: bool
 
 
 class ReviewState(StrEnum):
-    """What a person, or the last run, says about a frame."""
+    """Review state of a frame, set by a person or the last run."""
 
     UNTOUCHED = "untouched"
     OPTIMIZED = "optimized"
@@ -199,7 +199,7 @@ class ReviewState(StrEnum):
 
 
 UNREVIEWED = frozenset({ReviewState.UNTOUCHED, ReviewState.OPTIMIZED})
-"""States in which nobody has judged the frame yet."""
+"""States without a review by a person."""
 
 
 @dataclass(frozen=True)
@@ -221,16 +221,16 @@ class Review(JsonValue):
 
 @dataclass(frozen=True)
 class Figures:
-    """How well a frame's arms fit its image.
+    """Quality of the fit of a frame.
 
     Raises:
         ProjectError: a figure is not finite.
     """
 
     loss: float | None = None
-    """The optimizer's loss; smaller is better."""
+    """Loss of the optimizer; smaller is better."""
     dice: float | None = None
-    """Overlap with the true mask, 0 to 1; None where there is no truth."""
+    """Overlap with the true mask, 0 to 1; None without a true mask."""
 
     def __post_init__(self) -> None:
         for name in ("loss", "dice"):
@@ -241,12 +241,12 @@ class Figures:
 
 @lru_cache(maxsize=1024)
 def _shared_provenance(source: str, settings: str | None, weights_sha256: str | None) -> Provenance:
-    """One object for all frames of a run: settings are long and frames are many."""
+    """The same object for equal provenances, since settings are long and frames are many."""
     return Provenance(Source(source), settings, weights_sha256)
 
 
 def _set(instance: object, name: str, value: object) -> None:
-    """Normalise a field of a frozen dataclass while it is being made."""
+    """Set a field of a frozen dataclass during its construction."""
     object.__setattr__(instance, name, value)
 
 
@@ -295,14 +295,14 @@ def _check_json(text: str) -> None:
 
 @dataclass(frozen=True)
 class ImportedLabels(JsonValue):
-    """What the numbers in imported masks mean.
+    """Label names of imported masks.
 
     Raises:
         ProjectError: there are more than 255 names, or one is no text.
     """
 
     names: tuple[str, ...]
-    """Of label 1 and so on."""
+    """Names of the labels from 1."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "names", tuple(self.names))
@@ -312,7 +312,7 @@ class ImportedLabels(JsonValue):
 
 @dataclass(frozen=True)
 class ImportedKeypoints(JsonValue):
-    """Points that others marked in a frame.
+    """Imported keypoints of a frame.
 
     Raises:
         ProjectError: a place is not finite, or a name is no text.
@@ -336,12 +336,12 @@ class ImportedKeypoints(JsonValue):
 VERDICTS = ("good", "doubtful", "failed")
 """As `carts_core.optimization.Verdict` has them."""
 LONGEST_TEXT = 2_000
-"""Characters."""
+"""Largest length of a text [characters]."""
 
 
 @dataclass(frozen=True)
 class FitVerdict(JsonValue):
-    """How far a frame's fit can be relied on; see `ProjectState.verdict` for how long it holds.
+    """Reliability of a frame's fit; see `ProjectState.verdict` for its lifetime.
 
     Raises:
         ProjectError: there is no such verdict, a text is too long, or the probability is none.
@@ -350,13 +350,13 @@ class FitVerdict(JsonValue):
     verdict: str
     """One of `VERDICTS`."""
     reason: str = ""
-    """For people."""
+    """Reason, as a sentence."""
     remedy: str = ""
-    """What to try, for people; empty where nothing has to be."""
+    """Proposed remedy, as a sentence; empty if none is needed."""
     failure: float = 0.0
     """Probability that the mask is wrong (Dice below 0.9) [1]."""
     cameras: tuple[tuple[str, float], ...] = ()
-    """The same in single cameras, by their names, where there are several."""
+    """Verdicts by camera, where there are several."""
 
     def __post_init__(self) -> None:
         if self.verdict not in VERDICTS:
@@ -373,11 +373,11 @@ class FitVerdict(JsonValue):
 V_co = TypeVar("V_co", covariant=True)
 
 WHOLE_PROJECT = -1
-"""In place of a frame's index, where a value holds for all frames."""
+"""Frame index of values that hold for all frames."""
 
 
 class Kind(StrEnum):
-    """What a value is."""
+    """Kind of a value."""
 
     JOINTS = "joints"
     MASK_CORRECTION = "mask_correction"
@@ -412,7 +412,7 @@ VALUE_TYPES: dict[Kind, type] = {
     Kind.IMPORTED_LABELS: ImportedLabels,
 }
 CALIBRATION = frozenset({Kind.BASE_FRAME, Kind.EXTRINSICS, Kind.INTRINSICS, Kind.TIME_OFFSET})
-"""Kinds of what holds for all frames, and on which depends where their arms are."""
+"""Kinds of values that hold for all frames and affect the pose of their arms."""
 _OF_ARM = {Kind.JOINTS, Kind.BASE_FRAME}
 _MARKS = {Kind.KEYFRAME, Kind.REVIEW, Kind.VERDICT}
 _IMPORTED = {Kind.IMPORTED_MASK, Kind.IMPORTED_KEYPOINTS}
@@ -423,13 +423,13 @@ _OF_NOBODY = {*_MARKS, Kind.TIME_OFFSET, Kind.IMPORTED_LABELS}
 
 @dataclass(frozen=True)
 class Key(Generic[V_co]):
-    """The name of one value. Made by its static methods, which know the value's type."""
+    """Name of one value. Made by its static methods, which know the value's type."""
 
     kind: Kind
     frame: int
     """Index of the frame, or `WHOLE_PROJECT`."""
     name: str
-    """Arm or camera, or nothing."""
+    """Arm or camera; empty for other values."""
 
     @staticmethod
     def joints(frame: int, arm: str) -> "Key[JointCorrection]":
@@ -448,27 +448,27 @@ class Key(Generic[V_co]):
 
     @staticmethod
     def part_labels(frame: int, camera: str) -> "Key[PartLabels]":
-        """Classes that a person gave to pixels."""
+        """Part classes painted by a person."""
         return Key(Kind.PART_LABELS, operator.index(frame), camera)
 
     @staticmethod
     def imported_mask(frame: int, camera: str) -> "Key[ImportedMask]":
-        """Labels that others gave to pixels."""
+        """Imported labels of pixels."""
         return Key(Kind.IMPORTED_MASK, operator.index(frame), camera)
 
     @staticmethod
     def imported_keypoints(frame: int, camera: str) -> "Key[ImportedKeypoints]":
-        """Points that others marked."""
+        """Imported keypoints."""
         return Key(Kind.IMPORTED_KEYPOINTS, operator.index(frame), camera)
 
     @staticmethod
     def imported_labels() -> "Key[ImportedLabels]":
-        """What the numbers in imported masks mean."""
+        """Label names of imported masks."""
         return Key(Kind.IMPORTED_LABELS, WHOLE_PROJECT, "")
 
     @staticmethod
     def keyframe(frame: int) -> "Key[Keyframe]":
-        """Whether a person made the frame a keyframe, or made it none."""
+        """User's choice whether a frame is a keyframe."""
         return Key(Kind.KEYFRAME, operator.index(frame), "")
 
     @staticmethod
@@ -478,7 +478,7 @@ class Key(Generic[V_co]):
 
     @staticmethod
     def verdict(frame: int) -> "Key[FitVerdict]":
-        """What the image says of a frame's fit."""
+        """Verdict on a frame's fit."""
         return Key(Kind.VERDICT, operator.index(frame), "")
 
     @staticmethod
@@ -498,16 +498,16 @@ class Key(Generic[V_co]):
 
     @staticmethod
     def time_offset() -> "Key[TimeOffset]":
-        """How far the clocks of images and kinematics are apart, in all frames."""
+        """Time offset between images and kinematics, in all frames."""
         return Key(Kind.TIME_OFFSET, WHOLE_PROJECT, "")
 
 
 Edits = Mapping[Key[Any], Any]
-"""What one gesture changes: key -> new value, or None to go back to what the sequence says."""
+"""Changes of one gesture: key -> new value, or None to restore the sequence's own."""
 
 
 def decode(kind: Kind, stored: str | bytes | None) -> Any:
-    """The value that a project file keeps under a key of this kind.
+    """Decode a value of this kind from a project file.
 
     Raises:
         ValueError, TypeError, ProjectError: it is something else.
@@ -519,12 +519,12 @@ def decode(kind: Kind, stored: str | bytes | None) -> Any:
 
 @lru_cache(maxsize=1024)
 def _decoded_mark(kind: Kind, stored: str | bytes) -> Any:
-    """One object for all frames of which the same is said."""
+    """The same object for equal marks of many frames."""
     return VALUE_TYPES[kind].decode(stored)
 
 
 def check_edit(identity: SequenceIdentity, key: Key[Any], value: object) -> None:
-    """Check that a key names something of the sequence, and that the value fits it.
+    """Check that a key fits the sequence and the value fits the key.
 
     Raises:
         ProjectError: it does not.
