@@ -157,7 +157,7 @@ def _annotations(
 def write_cvat(dataset: Dataset, folder: OutputPath, monitor: Monitor) -> None:
     """Write the dataset in CVAT's format, with lossless masks."""
     root = ElementTree.Element("annotations")
-    _text(root, "version", "1.1")
+    _texts(root, {"version": "1.1"})
     _add_meta(root, dataset)
     for view in dataset.views(monitor):
         size = {"width": str(view.camera.width), "height": str(view.camera.height)}
@@ -185,19 +185,12 @@ def write_cvat(dataset: Dataset, folder: OutputPath, monitor: Monitor) -> None:
 
 def _add_meta(root: ElementTree.Element, dataset: Dataset) -> None:
     task = ElementTree.SubElement(ElementTree.SubElement(root, "meta"), "task")
-    _text(task, "name", dataset.sequence.name)
-    _text(task, "size", str(len(dataset.steps)))
-    _text(task, "mode", "annotation")
+    _texts(task, {"name": dataset.sequence.name, "size": len(dataset.steps), "mode": "annotation"})
     labels = ElementTree.SubElement(task, "labels")
     for category in dataset.categories:
         label = ElementTree.SubElement(labels, "label")
-        _text(label, "name", category.name)
-        _text(label, "type", "mask")
+        _texts(label, {"name": category.name, "type": "mask"})
         ElementTree.SubElement(label, "attributes")
-
-
-def _text(parent: ElementTree.Element, tag: str, text: str) -> None:
-    ElementTree.SubElement(parent, tag).text = text
 
 
 _IMAGE = 2

@@ -17,13 +17,10 @@ from .writing import BusyError as BusyError
 from .writing import append_line as append_line
 from .writing import csv_cell as csv_cell
 from .writing import holds_file as holds_file
-from .writing import lock_holder as lock_holder
 from .writing import locked_folder as locked_folder
-from .writing import open_lock as open_lock
 from .writing import output_stream as output_stream
 from .writing import remove_file as remove_file
 from .writing import set_aside as set_aside
-from .writing import sign_lock as sign_lock
 from .writing import text_of_cell as text_of_cell
 from .writing import try_lock as try_lock
 from .writing import write_bytes as write_bytes

@@ -11,10 +11,9 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import OutputError
-from ..files import output_path, output_stream
+from ..files import locked_folder, output_path, output_stream
 from ..files.paths import home
 from ..files.reading import CACHED, MESH, open_regular, read_bytes
-from ..files.writing import one_after_another
 from .meshes import Decimation, LinkMesh
 
 _VERSION = 3
@@ -50,7 +49,7 @@ def kept(key: str, make: Callable[[], Made]) -> Made:
         return stored
     with ExitStack() as held:
         with suppress(OutputError):
-            held.enter_context(one_after_another(output_path(cache_dir())))
+            held.enter_context(locked_folder(output_path(cache_dir()), wait=True))
         if (stored := read(key)) is not None:
             return stored
         made = make()

@@ -17,7 +17,7 @@ import struct
 import sys
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import closing, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Literal
@@ -149,13 +149,72 @@ HEADER = 32
 """Size of the log's header [bytes]."""
 FRAME_HEADER = 24
 """Size of a frame's header, before its page [bytes]."""
-_BIG_ENDIAN_MAGIC, _LITTLE_ENDIAN_MAGIC = 0x377F0683, 0x377F0682
+_ORDERS: dict[int, Literal["<", ">"]] = {0x377F0682: "<", 0x377F0683: ">"}
+"""Magic number -> byte order of the words in checksums."""
 _COVERED = 8
 """Bytes of a frame's header that its checksum covers, besides the page."""
 _WORD = 0xFFFFFFFF
 _FRAMES_AT_ONCE = 256
 _PAGE_SIZES = frozenset(1 << n for n in range(9, 17))
 _Sum = tuple[int, int]
+
+
+@dataclass(frozen=True)
+class _Frame:
+    """A frame of a log: the new content of a page."""
+
+    start: int
+    """Offset in the log [bytes]."""
+    before: _Sum
+    """Checksum of the log up to the frame."""
+    page: int
+    """Number of the page, from 1."""
+    pages: int
+    """Size of the database after a transaction that ends with the frame [pages]; 0 for other frames."""
+
+
+@dataclass(frozen=True)
+class _LogHeader:
+    """Header of a log."""
+
+    order: Literal["<", ">"]
+    page_size: int
+    salts: tuple[int, int]
+    checksum: _Sum
+
+    @staticmethod
+    def of(log: bytes) -> "_LogHeader | None":
+        """The header of a log; None if it is damaged."""
+        if len(log) < HEADER:
+            return None
+        magic, _, page_size, _, *salts, first, second = struct.unpack_from(">8I", log)
+        order = _ORDERS.get(magic)
+        if order is None or page_size not in _PAGE_SIZES or _header_sum(order, log) != (first, second):
+            return None
+        return _LogHeader(order, page_size, (salts[0], salts[1]), (first, second))
+
+    def frames(self, log: bytes, start: int, running: _Sum) -> Iterator[_Frame | None]:
+        """The complete frames of a log in order; None, as the last one, for a damaged frame.
+
+        Args:
+            log: content of the log, or of its end.
+            start: offset of the first frame in `log` [bytes].
+            running: checksum of the log before it.
+        """
+        size = FRAME_HEADER + self.page_size
+        weights, ((a, b), (c, d)) = _weights((_COVERED + self.page_size) // 4)
+        while count := min((len(log) - start) // size, _FRAMES_AT_ONCE):
+            frames = np.frombuffer(log, np.uint8, count * size, start).reshape(count, size)
+            covered = np.concatenate((frames[:, :_COVERED], frames[:, FRAME_HEADER:]), axis=1)
+            for x, y in (_words(self.order, covered) @ weights).tolist():
+                before, (s, t) = running, running
+                running = (x + a * s + b * t) & _WORD, (y + c * s + d * t) & _WORD
+                page, pages, *rest = struct.unpack_from(">6I", log, start)
+                if rest != [*self.salts, *running] or page == 0:
+                    yield None
+                    return
+                yield _Frame(start, before, page, pages)
+                start += size
 
 
 @dataclass(frozen=True)
@@ -179,91 +238,40 @@ def played_back(database: bytes, log: bytes) -> Playback:
     if len(log) < HEADER:
         # A header is written at once, before anything else; less of it is a kill in that moment.
         return Playback(result, damaged=False)
-    magic, _, page_size, _, *salts = struct.unpack_from(">6I", log)
-    order = ">" if magic == _BIG_ENDIAN_MAGIC else "<"
-    first = struct.unpack_from(">2I", log, 24)
-    known = magic in (_BIG_ENDIAN_MAGIC, _LITTLE_ENDIAN_MAGIC)
-    if not known or page_size not in _PAGE_SIZES or _header_sum(order, log) != first:
+    header = _LogHeader.of(log)
+    if header is None:
         return Playback(result, damaged=True)
-    unfinished: list[tuple[int, int]] = []
-    for start, running in _running_sums(order, log, HEADER, page_size, first):
-        number, pages, *rest = struct.unpack_from(">6I", log, start)
-        begin = start + FRAME_HEADER
-        if rest != [*salts, *running] or number == 0:
+    unfinished: list[_Frame] = []
+    for frame in header.frames(log, HEADER, header.checksum):
+        if frame is None:
             return Playback(result, damaged=True)
-        unfinished.append((number, begin))
-        if pages:
-            for page, place in unfinished:
-                end = page * page_size
+        unfinished.append(frame)
+        if frame.pages:
+            for one in unfinished:
+                begin, end = one.start + FRAME_HEADER, one.page * header.page_size
                 result.extend(bytes(max(end - len(result), 0)))
-                result[end - page_size : end] = log[place : place + page_size]
+                result[end - header.page_size : end] = log[begin : begin + header.page_size]
             unfinished.clear()
-            del result[pages * page_size :]
+            del result[frame.pages * header.page_size :]
     return Playback(result, damaged=False)
 
 
-@dataclass(frozen=True)
-class Mark:
-    """Position of the last frame of a finished transaction."""
-
-    start: int = HEADER
-    """Offset of the frame in the log [bytes]."""
-    running: _Sum | None = None
-    """Checksum before the frame; None stands for the header's."""
-    frames: int = 0
-    """Number of transactions before which the search starts: 0 for an empty log, 1 if the frame ends a transaction."""
-
-
-def next_mark(log: bytes, header: bytes, mark: Mark) -> Mark | None:
-    """Last frame of the next transaction, if the frame at `mark` and all after it are intact; else None.
+def _next_commit(log: bytes, header: bytes, last: _Frame | None) -> _Frame | None:
+    """Last frame of the next transaction, if the frame `last` and all after it are intact; else None.
 
     Args:
-        log: content of the log from `mark.start`.
+        log: content of the log from `last` on, or without its header.
         header: the log's header.
-        mark: of the transaction before.
+        last: last frame of the transaction before; None in an empty log.
     """
-    if len(header) < HEADER:
+    found = _LogHeader.of(header)
+    if found is None:
         return None
-    magic, _, page_size, _, *salts = struct.unpack_from(">6I", header)
-    if page_size not in _PAGE_SIZES:
-        # Somebody has written over it.
+    frames = found.frames(log, 0, found.checksum if last is None else last.before)
+    if last is not None and next(frames, None) is None:
         return None
-    order = ">" if magic == _BIG_ENDIAN_MAGIC else "<"
-    before: _Sum = mark.running or struct.unpack_from(">2I", header, 24)
-    commits = 0
-    for start, running in _running_sums(order, log, 0, page_size, before):
-        _, pages, *rest = struct.unpack_from(">6I", log, start)
-        if rest != [*salts, *running]:
-            return None
-        commits += bool(pages)
-        if commits > mark.frames:
-            return Mark(mark.start + start, before, 1)
-        before = running
-    return None
-
-
-def _running_sums(
-    order: Literal["<", ">"], log: bytes, start: int, page_size: int, running: _Sum
-) -> Iterator[tuple[int, _Sum]]:
-    """Start of each complete frame, and the checksum of the log up to its end.
-
-    Args:
-        order: byte order of the words.
-        log: content of the log.
-        start: where the first frame begins.
-        page_size: what each frame holds [bytes].
-        running: the checksum before it.
-    """
-    size = FRAME_HEADER + page_size
-    weights, ((a, b), (c, d)) = _weights((_COVERED + page_size) // 4)
-    while count := min((len(log) - start) // size, _FRAMES_AT_ONCE):
-        frames = np.frombuffer(log, np.uint8, count * size, start).reshape(count, size)
-        covered = np.concatenate((frames[:, :_COVERED], frames[:, FRAME_HEADER:]), axis=1)
-        for x, y in (_words(order, covered) @ weights).tolist():
-            s, t = running
-            running = (x + a * s + b * t) & _WORD, (y + c * s + d * t) & _WORD
-            yield start, running
-            start += size
+    end = next((frame for frame in frames if frame is None or frame.pages), None)
+    return None if end is None else replace(end, start=end.start + (HEADER if last is None else last.start))
 
 
 def _header_sum(order: Literal["<", ">"], log: bytes) -> _Sum:
@@ -459,7 +467,9 @@ class ProjectFile:
         self._seal: SealRow = (b"", b"", b"")
         self._left: tuple[object, ...] = ()
         """Identity, size and time of file and log after the last write of this process."""
-        self._mark, self._header = Mark(), b""
+        self._last: _Frame | None = None
+        """Frame of the log that ends the last transaction."""
+        self._header = b""
 
     @classmethod
     def locked(cls, path: Path) -> "ProjectFile | None":
@@ -547,7 +557,7 @@ class ProjectFile:
         with suppress(sqlite3.Error):
             self._usable().execute("PRAGMA wal_checkpoint(TRUNCATE)")
         if os.fstat(self._open_log()).st_size == 0:
-            self._mark, self._header = Mark(), b""
+            self._last, self._header = None, b""
         self._check_names()
         self._check_content()
         self._remember()
@@ -644,11 +654,12 @@ class ProjectFile:
             return
         log = self._open_log()
         header = os.pread(log, HEADER, 0)
-        frames = os.pread(log, max(os.fstat(log).st_size - self._mark.start, 0), self._mark.start)
-        mark = next_mark(frames, header, self._mark)
-        if mark is None or (self._mark.frames and header != self._header):
+        start = HEADER if self._last is None else self._last.start
+        frames = os.pread(log, max(os.fstat(log).st_size - start, 0), start)
+        last = _next_commit(frames, header, self._last)
+        if last is None or (self._last is not None and header != self._header):
             raise LostFile("lost an edit, or what was before it in its log (-wal), while that was being saved")
-        self._mark, self._header = mark, header
+        self._last, self._header = last, header
 
 
 def _look(descriptor: int) -> tuple[int, ...]:

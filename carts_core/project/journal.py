@@ -117,15 +117,17 @@ def move(memory: sqlite3.Connection, start: int, target: int) -> tuple[Script, d
         "SELECT DISTINCT kind, frame, name FROM changes WHERE step > ? AND step <= ?", sorted((start, target))
     ).fetchall()
     entries: dict[Key[Any], Entry | None] = {}
-    for kind, frame, name in touched:
-        row = memory.execute(
-            "SELECT step, value FROM changes WHERE kind = ? AND frame = ? AND name = ? "
-            "AND step <= ? ORDER BY step DESC LIMIT 1",
-            (kind, frame, name, target),
-        ).fetchone()
-        key: Key[Any] = Key(Kind(kind), frame, name)
-        entries[key] = None if row is None else Entry(row[0], decode(key.kind, row[1]))
+    for about in touched:
+        step, value = _newest(memory, about, target)
+        key: Key[Any] = Key(Kind(about[0]), *about[1:])
+        entries[key] = Entry(step, decode(key.kind, value)) if step else None
     return Script(position=target), entries
+
+
+def _newest(memory: sqlite3.Connection, about: tuple[str, int, str], last: int) -> tuple[int, Any]:
+    """Newest step up to `last` that set a key, and the stored value; (0, None) if there is none."""
+    query = "SELECT step, value FROM changes WHERE kind = ? AND frame = ? AND name = ? AND step <= ?"
+    return memory.execute(f"{query} ORDER BY step DESC LIMIT 1", (*about, last)).fetchone() or (0, None)
 
 
 def before(memory: sqlite3.Connection, step: int, position: int) -> tuple[dict[Key[Any], Any], int | None]:
@@ -135,21 +137,12 @@ def before(memory: sqlite3.Connection, step: int, position: int) -> tuple[dict[K
     """
     edits: dict[Key[Any], Any] = {}
     later: list[int] = []
-
-    def newest(about: tuple[str, int, str], last: int) -> tuple[int, Any]:
-        row = memory.execute(
-            "SELECT step, value FROM changes WHERE kind = ? AND frame = ? AND name = ? "
-            "AND step <= ? ORDER BY step DESC LIMIT 1",
-            (*about, last),
-        ).fetchone()
-        return (0, None) if row is None else row
-
     changed = "SELECT kind, frame, name FROM changes WHERE step = ? AND kind != ?"
-    for kind, frame, name in memory.execute(changed, (step, Kind.VERDICT.value)).fetchall():
-        about, key = (kind, frame, name), Key(Kind(kind), frame, name)
-        edits[key] = decode(key.kind, newest(about, step - 1)[1])
-        number, value = newest(about, position)
-        if value != newest(about, step)[1]:
+    for about in memory.execute(changed, (step, Kind.VERDICT.value)).fetchall():
+        key: Key[Any] = Key(Kind(about[0]), *about[1:])
+        edits[key] = decode(key.kind, _newest(memory, about, step - 1)[1])
+        number, value = _newest(memory, about, position)
+        if value != _newest(memory, about, step)[1]:
             later.append(number)
     return edits, min(later, default=None)
 

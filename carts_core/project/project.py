@@ -41,31 +41,6 @@ class Change:
 Listener = Callable[[Change], None]
 
 
-class Listeners:
-    """Callbacks that are called after each save, in order of registration."""
-
-    def __init__(self) -> None:
-        self._listeners: list[Listener] = []
-
-    def add(self, listener: Listener) -> Callable[[], None]:
-        """Register a callback; the returned function removes it."""
-        self._listeners.append(listener)
-
-        def remove() -> None:
-            with suppress(ValueError):
-                self._listeners.remove(listener)
-
-        return remove
-
-    def notify(self, change: Change, project: Path) -> None:
-        """Call all listeners. Errors are logged, since the edit is saved."""
-        for listener in tuple(self._listeners):
-            try:
-                listener(change)
-            except Exception:
-                logging.getLogger(__name__).exception("a listener of project %s failed", project)
-
-
 LONGEST_NAME = 200
 """Largest length of a step's name [characters]."""
 
@@ -92,7 +67,7 @@ class Project:
         self._path = path.parent.resolve() / path.name
         self.read_only_reason = "It was opened read-only." if read_only else None
         self._edit = threading.RLock()
-        self._listeners = Listeners()
+        self._listeners: list[Listener] = []
         self._store: Store | None = None
         self._incident: str | None = None
         """Incident of the closed store."""
@@ -288,7 +263,13 @@ class Project:
 
     def listen(self, listener: Listener) -> Callable[[], None]:
         """Call `listener` after each save, in order, on the saving thread, until the returned function is called."""
-        return self._listeners.add(listener)
+        self._listeners.append(listener)
+
+        def remove() -> None:
+            with suppress(ValueError):
+                self._listeners.remove(listener)
+
+        return remove
 
     def close(self) -> None:
         """Close the file for other writers. The state can still be read.
@@ -338,7 +319,11 @@ class Project:
         self.state = state
         touched = {*frames, *(key.frame for key in keys if key.frame != WHOLE_PROJECT)}
         change = Change(action, step, frozenset(keys), tuple(sorted(touched)))
-        self._listeners.notify(change, self.path)
+        for listener in tuple(self._listeners):
+            try:
+                listener(change)
+            except Exception:  # The edit is saved all the same.
+                logging.getLogger(__name__).exception("a listener of project %s failed", self.path)
         return change
 
 

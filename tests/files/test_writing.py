@@ -14,15 +14,11 @@ from carts_core.files import (
     BusyError,
     append_line,
     holds_file,
-    lock_holder,
     locked_folder,
-    open_lock,
     output_path,
     output_stream,
     published,
     remove_file,
-    sign_lock,
-    try_lock,
     write_bytes,
     write_text,
 )
@@ -88,7 +84,6 @@ def test_what_is_planted_below_an_output_folder_is_not_followed(tmp_path: Path, 
         lambda: append_line(path, b"new"),
         lambda: remove_file(path),
         lambda: locked_folder(path.parent).__enter__(),
-        lambda: sign_lock(open_lock(path), "me"),
         lambda: published(path, overwrite=True).__enter__(),
     ):
         try:
@@ -132,19 +127,6 @@ def test_a_folder_is_locked_for_others_until_the_block_ends(tmp_path: Path) -> N
             pass
     with locked_folder(tmp_path / "out"):
         assert os.listdir(tmp_path / "out") == []
-
-
-def test_a_lock_file_names_its_holder_and_never_overwrites_what_is_not_ours(tmp_path: Path) -> None:
-    (tmp_path / "foreign").write_text(PRECIOUS)
-    for name in ("own", "foreign"):
-        first, second = open_lock(tmp_path / name), open_lock(tmp_path / name)
-        assert try_lock(first) and not try_lock(second)
-        sign_lock(first, "process 7")
-        assert lock_holder(second) == ("process 7" if name == "own" else None)
-        os.close(first)
-        assert try_lock(second)
-        os.close(second)
-    assert (tmp_path / "foreign").read_text() == PRECIOUS
 
 
 def test_a_disk_that_refuses_is_told_in_words(tmp_path: Path) -> None:

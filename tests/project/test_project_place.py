@@ -1,4 +1,4 @@
-"""Where a project is when nobody says so."""
+"""Default paths of project files."""
 
 import os
 from pathlib import Path
@@ -16,7 +16,7 @@ def test_a_project_is_beside_its_sequence(tmp_path: Path) -> None:
 def test_the_shipped_sequence_has_its_project_among_the_users_data(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    assert default_path(sample_sequence()).parent == tmp_path / "data"
+    assert default_path(sample_sequence()).parent == Path(os.environ["CARTS_DATA"])
     monkeypatch.delenv("CARTS_DATA")
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "xdg"))
     assert default_path(sample_sequence()).parent == tmp_path / "xdg" / "carts"
@@ -28,7 +28,7 @@ def test_sequences_of_one_name_in_read_only_folders_have_projects_of_their_own(
     # The superuser may write anywhere, so the system's answer is replaced.
     monkeypatch.setattr(os, "access", lambda path, mode: False)
     first, second = (default_path(tmp_path / folder / "sequence.toml") for folder in ("a", "b"))
-    assert first.parent == second.parent == tmp_path / "data" and first != second
+    assert first.parent == second.parent == Path(os.environ["CARTS_DATA"]) and first != second
     (tmp_path / "a").mkdir()
     (tmp_path / "a" / "sequence.carts").touch()
     assert default_path(tmp_path / "a" / "sequence.toml") == tmp_path / "a" / "sequence.carts"

@@ -153,11 +153,6 @@ _LARGEST_SIDE = 16384
 _FEWEST_CORNERS = 3
 
 
-def is_coco(path: Path) -> bool:
-    """Whether the file name ends with .json."""
-    return path.suffix.lower() == ".json"
-
-
 def read_coco(path: Path, remarks: Counter[str]) -> Iterator[ForeignImage]:
     """The images of a COCO file.
 
@@ -273,11 +268,6 @@ def _why(error: Exception) -> str:
     return f"{error} is missing" if isinstance(error, KeyError) else str(error)
 
 
-def is_cvat(path: Path) -> bool:
-    """Whether the file name ends with .xml."""
-    return path.suffix.lower() == ".xml"
-
-
 def read_cvat(path: Path, remarks: Counter[str]) -> Iterator[ForeignImage]:
     """The images of a CVAT file.
 
@@ -363,11 +353,6 @@ def _cvat_keypoints(image: Element) -> Iterator[tuple[str, tuple[float, float]]]
             yield (label if len(points) == 1 else f"{label}.{number}"), (float(u), float(v))
 
 
-def is_surgpose(path: Path) -> bool:
-    """Whether the file name ends with .yaml."""
-    return path.suffix.lower() in (".yaml", ".yml")
-
-
 def read_surgpose(path: Path, remarks: Counter[str]) -> Iterator[ForeignImage]:
     """The frames of a file of keypoints; without remarks.
 
@@ -417,11 +402,6 @@ _SCENE_PARTS = ("instrument", "clasper", "wrist", "shaft")
 """Prefixes of EndoVis 2018 labels that belong to an instrument; all others are anatomy or thread."""
 
 _Colours = Mapping[tuple[int, int, int], str]
-
-
-def is_mask_folder(path: Path) -> bool:
-    """Whether the path is a folder."""
-    return path.is_dir()
 
 
 def read_mask_folder(path: Path, remarks: Counter[str], *, confined: bool = False) -> Iterator[ForeignImage]:

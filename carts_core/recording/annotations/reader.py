@@ -3,7 +3,6 @@
 import re
 from collections import Counter
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
 import cv2
@@ -19,10 +18,6 @@ from .formats import (
     ForeignImage,
     FrameAnnotation,
     Labels,
-    is_coco,
-    is_cvat,
-    is_mask_folder,
-    is_surgpose,
     read_coco,
     read_cvat,
     read_mask_folder,
@@ -34,19 +29,12 @@ _INSIDE = {"annotations/instances_default.json", "annotations.xml"}
 _OWN_EXPORT = "export.json"
 
 
-@dataclass(frozen=True)
-class _Format:
-    kind: str
-    fits: Callable[[Path], bool]
-    read: Callable[[Path, Counter[str]], Iterator[ForeignImage]]
-
-
-_FORMATS = (
-    _Format("COCO", is_coco, read_coco),
-    _Format("CVAT for images", is_cvat, read_cvat),
-    _Format("keypoints of SurgPose", is_surgpose, read_surgpose),
-    _Format("a folder of masks", is_mask_folder, read_mask_folder),
-)
+_FORMATS: dict[str, tuple[str, Callable[[Path, Counter[str]], Iterator[ForeignImage]]]] = {
+    ".json": ("COCO", read_coco),
+    ".xml": ("CVAT for images", read_cvat),
+    ".yaml": ("keypoints of SurgPose", read_surgpose),
+}
+"""Suffix -> name and reader of a format that is a file."""
 
 
 def read_annotations(
@@ -71,17 +59,21 @@ def read_annotations(
     if not source.exists():
         raise SequenceError(f"{source} is missing. Give the file or folder of the masks or keypoints.")
     place = next((source / name for name in sorted(_INSIDE) if (source / name).is_file()), source)
-    chosen = next((format for format in _FORMATS if format.fits(place)), None)
-    if chosen is None:
+    remarks: Counter[str] = Counter()
+    if place.is_dir():
+        kind, images = "a folder of masks", read_mask_folder(place, remarks, confined=confined)
+    elif place.suffix.lower() in _FORMATS:
+        kind, read = _FORMATS[place.suffix.lower()]
+        images = read(place, remarks)
+    else:
         raise SequenceError(
             f"{source} holds no masks or keypoints that are known. Give a COCO file (.json), a CVAT file (.xml), "
             "keypoints of SurgPose (.yaml), or a folder of PNG masks."
         )
     own = any((folder / _OWN_EXPORT).is_file() for folder in (place, *list(place.parents)[:3]))
-    labels, unknown, remarks = Labels(), [], Counter()
+    labels, unknown = Labels(), []
     reader = _FrameReader(sequence, camera, source.name, labels, unknown, undistorted=own)
-    images = read_mask_folder(place, remarks, confined=confined) if place.is_dir() else chosen.read(place, remarks)
-    return Annotations(chosen.kind, reader.frames(images), labels.names, unknown, remarks)
+    return Annotations(kind, reader.frames(images), labels.names, unknown, remarks)
 
 
 class _FrameReader:

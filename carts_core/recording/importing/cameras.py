@@ -1,7 +1,7 @@
 """Cameras of foreign recordings: folders of images and videos, and the calibrations that belong to them."""
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,7 @@ from ...settings.interchange import ImportOptions
 from ..images import ImageFiles, bits_remark, image_remarks, is_deep
 from ..video import SUFFIXES, Video, index_video
 from .calibrations import Calibration, calibration_from_info, read_calibration
-from .found import FoundCamera, Note
+from .found import FoundCamera, Note, Notes
 
 _SAME_SHAPE = 0.01
 """Largest difference of aspect ratios due to rounding of image sizes [1]."""
@@ -34,7 +34,7 @@ def side_of(name: str) -> str | None:
 
 
 def camera_from_info(
-    camera: FoundCamera, info: Any, options: ImportOptions, notes: list[Note], *, rectified: bool
+    camera: FoundCamera, info: Any, options: ImportOptions, notes: Notes, *, rectified: bool
 ) -> FoundCamera:
     """The camera with the calibration of a `sensor_msgs/CameraInfo`; unchanged if that is uncalibrated.
 
@@ -58,7 +58,7 @@ def camera_from_info(
     return _calibrated(camera, found, what, options, notes, rectified=rectified)
 
 
-def calibration_of(camera: FoundCamera, options: ImportOptions, notes: list[Note], **changes: Any) -> FoundCamera:
+def calibration_of(camera: FoundCamera, options: ImportOptions, notes: Notes, **changes: Any) -> FoundCamera:
     """The camera with the calibration given in the options, and further changes.
 
     Raises:
@@ -68,13 +68,13 @@ def calibration_of(camera: FoundCamera, options: ImportOptions, notes: list[Note
     path = options.calibration.get(camera.name)
     if path is None:
         if camera.intrinsics is not None:
-            notes.append(Note("found", f"calibration of {camera.name}: from the recording."))
+            notes.found(f"calibration of {camera.name}: from the recording.")
         return camera
-    notes.append(Note("found", f"calibration of {camera.name}: from {path}."))
+    notes.found(f"calibration of {camera.name}: from {path}.")
     side = side_of(camera.name) or "left"
     if side_of(path.stem) not in (None, side):
         text = f"{camera.name}: {path.name} is named for the other camera. Check --calibration"
-        notes.append(Note("warning", f"{text} {camera.name} FILE."))
+        notes.warning(f"{text} {camera.name} FILE.")
     rectified = any("rect" in re.split(r"[^a-z]+", part.lower()) or "rectified" in part.lower()
                     for part in camera.images.parts[-2:])  # fmt: skip
     try:
@@ -89,7 +89,7 @@ def _calibrated(
     found: Calibration,
     what: str,
     options: ImportOptions,
-    notes: list[Note],
+    notes: Notes,
     *,
     rectified: bool,
 ) -> FoundCamera:
@@ -99,7 +99,7 @@ def _calibrated(
     if rectified and found.P is not None:
         fx, _, cx, _, _, fy, cy, *_ = found.P.reshape(-1)
         intrinsics, distortion, R = (float(fx), float(fy), float(cx), float(cy)), (), np.eye(3)
-        notes.append(Note("guessed", f"{camera.name}: images are rectified, as their name says; P of {what} is used."))
+        notes.guessed(f"{camera.name}: images are rectified, as their name says; P of {what} is used.")
     size = _given_size(camera, options) or found.size
     calibrated = replace(
         camera,
@@ -121,7 +121,7 @@ def _given_size(camera: FoundCamera, options: ImportOptions) -> tuple[int, int] 
     return int(width), int(height)
 
 
-def _scaled(camera: FoundCamera, size: tuple[int, int], what: str, notes: list[Note]) -> FoundCamera:
+def _scaled(camera: FoundCamera, size: tuple[int, int], what: str, notes: Notes) -> FoundCamera:
     """The camera with intrinsics for images of `size` scaled to its own images.
 
     Raises:
@@ -140,11 +140,11 @@ def _scaled(camera: FoundCamera, size: tuple[int, int], what: str, notes: list[N
     shift = 0.5 - camera.pixel_center
     intrinsics = (fx * x, fy * y, (cx + shift) * x - shift, (cy + shift) * y - shift)
     text = f"{what} is for images of {size[0]} x {size[1]}; it is scaled to {camera.size[0]} x {camera.size[1]}"
-    notes.append(Note("guessed", f"{camera.name}: {text}, as if they were resized and not cropped."))
+    notes.guessed(f"{camera.name}: {text}, as if they were resized and not cropped.")
     return replace(camera, intrinsics=intrinsics)
 
 
-def check_intrinsics(camera: FoundCamera, options: ImportOptions, note: Callable[[Note], None]) -> None:
+def check_intrinsics(camera: FoundCamera, options: ImportOptions, notes: Notes) -> None:
     """Check that a calibration is plausible for the size of the images.
 
     Raises:
@@ -158,7 +158,7 @@ def check_intrinsics(camera: FoundCamera, options: ImportOptions, note: Callable
         return
     text = f"the calibration of {camera.name} has {problem}."
     if camera.name in options.calibration_size and min(fx, fy) > 0:
-        note(Note("warning", f"{camera.name}: {text}"))
+        notes.warning(f"{camera.name}: {text}")
         return
     raise SequenceError(
         f"{text} Give another one (--calibration {camera.name} FILE), or the size of the images that were calibrated "
@@ -167,7 +167,7 @@ def check_intrinsics(camera: FoundCamera, options: ImportOptions, note: Callable
     )
 
 
-def placed_cameras(cameras: tuple[FoundCamera, ...], note: Callable[[Note], None]) -> tuple[FoundCamera, ...]:
+def placed_cameras(cameras: tuple[FoundCamera, ...], notes: Notes) -> tuple[FoundCamera, ...]:
     """Cameras with their poses; the world is the frame of the first camera, or of the left one of a pair.
 
     Where the pose of another one is not stated, it follows from the rectification of both:
@@ -175,10 +175,10 @@ def placed_cameras(cameras: tuple[FoundCamera, ...], note: Callable[[Note], None
     where the first one stands, which leaves it free in hand-eye calibration.
     """
     first = next((camera for camera in cameras if camera.name == "left"), cameras[0])
-    return tuple(camera if camera is first else _placed(camera, first, note) for camera in cameras)
+    return tuple(camera if camera is first else _placed(camera, first, notes) for camera in cameras)
 
 
-def _placed(camera: FoundCamera, first: FoundCamera, note: Callable[[Note], None]) -> FoundCamera:
+def _placed(camera: FoundCamera, first: FoundCamera, notes: Notes) -> FoundCamera:
     if camera.T_camera_world is not None:
         return camera
     lacking = [each.name for each in (first, camera) if each.rectification is None or each.projection is None]
@@ -186,16 +186,13 @@ def _placed(camera: FoundCamera, first: FoundCamera, note: Callable[[Note], None
         T = _from_rectification(first, camera)
         angle = np.degrees(np.arccos(np.clip((np.trace(T[:3, :3]) - 1) / 2, -1, 1)))
         text = f"{1e3 * np.linalg.norm(T[:3, 3]):.2f} mm from {first.name} and turned by {angle:.2f} deg"
-        note(Note("found", f"{camera.name}: {text}, from the rectification of both."))
+        notes.found(f"{camera.name}: {text}, from the rectification of both.")
         return replace(camera, T_camera_world=T)
     why = "" if camera.intrinsics is None else f" ({' and '.join(lacking)}: no rectification and projection)"
-    note(
-        Note(
-            "missing",
-            f"{camera.name}: its pose relative to {first.name} is not known{why}; it stands where {first.name} stands. "
-            f"Give a stereo calibration (--calibration {camera.name} FILE), or click points (New recording, "
-            "carts hand-eye).",
-        )
+    notes.missing(
+        f"{camera.name}: its pose relative to {first.name} is not known{why}; it stands where {first.name} stands. "
+        f"Give a stereo calibration (--calibration {camera.name} FILE), or click points (New recording, "
+        "carts hand-eye)."
     )
     return camera
 
@@ -308,7 +305,7 @@ def common_ids(kinds: Sequence[Images]) -> tuple[str, ...]:
 
 
 def cameras_of(
-    images: dict[str, Images], options: ImportOptions, notes: list[Note], calibrations: dict[str, Path] | None = None
+    images: dict[str, Images], options: ImportOptions, notes: Notes, calibrations: dict[str, Path] | None = None
 ) -> tuple[FoundCamera, ...]:
     """Cameras with their images and their given or found calibrations.
 
@@ -319,9 +316,7 @@ def cameras_of(
     chosen = replace(options, calibration=known)
     cameras = []
     for name, each in images.items():
-        notes.append(
-            Note("found", f"camera {name}: {each.path}, {len(each.ids)} images, {each.size[0]} x {each.size[1]}.")
-        )
+        notes.found(f"camera {name}: {each.path}, {len(each.ids)} images, {each.size[0]} x {each.size[1]}.")
         notes += [Note("guessed", f"{name}: {text}") for text in each.remarks]
         camera = FoundCamera(name, each.size, each.path, each.pattern, bits=each.bits)
         cameras.append(calibration_of(camera, chosen, notes))

@@ -1,7 +1,6 @@
 """Heuristics for the columns of a table: joints of an arm, poses of its tip, times, and their units."""
 
 import re
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -15,7 +14,7 @@ from ...settings.interchange import ImportOptions
 from ..kinematics_table import LENGTH_UNITS, Joint, joints_of
 from .cameras import IMAGE_SUFFIXES
 from .foreign_tables import ForeignTable
-from .found import Note
+from .found import Note, Notes
 from .joint_units import in_si, joints_of_arm, length_unit
 from .logs import ArmLog, track
 from .row_matching import LogRows
@@ -387,7 +386,7 @@ def arm_log(
     found: dict[str, str],
     times: np.ndarray,
     options: ImportOptions,
-    note: Callable[[Note], None],
+    notes: Notes,
     stated: frozenset[str] = frozenset(),
 ) -> ArmLog:
     """The log of one arm, in radians and metres.
@@ -398,7 +397,7 @@ def arm_log(
         found: joint or part of a pose -> column.
         times: of the rows, or positions of their images; NaN for rows of no image.
         options: with units and signs.
-        note: called with what was found and guessed.
+        notes: of the import; some are added.
         stated: columns whose meaning is no guess.
 
     Raises:
@@ -406,7 +405,7 @@ def arm_log(
     """
     other = other_robots(options).get(arm)
     if other is None and not _has_joints(found):
-        return _pose_log(table, arm, found, times, options, note, stated)
+        return _pose_log(table, arm, found, times, options, notes, stated)
     joints = {joint.name: joint for joint in other or joints_of_arm(arm, options)}
     order = [*joints] if other is not None else [*JOINT_NAMES, "jaw"]
     free = {name: Joint(name, name != "insertion", -np.inf, np.inf) for name in order}
@@ -414,9 +413,9 @@ def arm_log(
     columns = [found[joint.name] for joint in chosen]
     raw = np.stack([table.numbers(column).astype(np.float64) for column in columns], 1)
     spoken = [f"{column} {table.units.get(column, '')}".strip() for column in columns]
-    values = in_si(raw, chosen, options, note, arm=arm, columns=spoken, instrument=other is None)
+    values = in_si(raw, chosen, options, notes, arm=arm, columns=spoken, instrument=other is None)
     kind = "found" if stated.issuperset(columns) else "guessed"
-    note(Note(kind, f"{arm}: joints are {', '.join(columns)} (change: --columns {order[0]} COLUMN ...)."))
+    notes.append(Note(kind, f"{arm}: joints are {', '.join(columns)} (change: --columns {order[0]} COLUMN ...)."))
     logged = track([(time, *row) for time, row in zip(times, values, strict=True)])
     if other is not None:
         return ArmLog(arm, joints=logged, names=tuple(joint.name for joint in chosen), si=True)
@@ -432,7 +431,7 @@ def _pose_log(
     found: dict[str, str],
     times: np.ndarray,
     options: ImportOptions,
-    note: Callable[[Note], None],
+    notes: Notes,
     stated: frozenset[str],
 ) -> ArmLog:
     """The log of an arm from poses of its tip."""
@@ -441,12 +440,12 @@ def _pose_log(
     given = options.length_unit or _unit_in_names([f"{column} {table.units.get(column, '')}" for column in columns[:3]])
     unit = given or length_unit(float(np.nanmax(np.abs(values[:, :3]))), _REACH, arm, "the tip's place")
     values[:, :3] *= LENGTH_UNITS[unit]
-    note(Note("found" if given else "guessed", f"{arm}: lengths are in {unit} (change: --length-unit)."))
+    notes.append(Note("found" if given else "guessed", f"{arm}: lengths are in {unit} (change: --length-unit)."))
     poses = track([(time, *row) for time, row in zip(times, values, strict=True)])
     seen = arm in options.base
     frame = "camera, since --base is given" if seen else "arm's base (if it is the camera: --base)"
     kind = "found" if seen and stated.issuperset(columns) else "guessed"
-    note(Note(kind, f"{arm}: the tip's pose is {', '.join(columns)}, in the frame of the {frame}."))
+    notes.append(Note(kind, f"{arm}: the tip's pose is {', '.join(columns)}, in the frame of the {frame}."))
     log = ArmLog(arm, poses=poses if seen else None, local_poses=None if seen else poses, si=True)
     if "jaw" not in found:
         return log

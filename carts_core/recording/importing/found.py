@@ -28,6 +28,26 @@ class Note:
     """A sentence; notes on guesses and missing values name the option that changes them."""
 
 
+class Notes(list[Note]):
+    """Notes of an import, in the order in which they were made."""
+
+    def found(self, text: str) -> None:
+        """Add a note on a value of the recording."""
+        self.append(Note("found", text))
+
+    def guessed(self, text: str) -> None:
+        """Add a note on a guess."""
+        self.append(Note("guessed", text))
+
+    def missing(self, text: str) -> None:
+        """Add a note on a missing value."""
+        self.append(Note("missing", text))
+
+    def warning(self, text: str) -> None:
+        """Add a warning."""
+        self.append(Note("warning", text))
+
+
 @dataclass(frozen=True, eq=False)
 class FoundCamera:
     """A camera and the location of its images."""

@@ -1,7 +1,7 @@
 """Conversion of logged joint positions to radians and metres: units given, named in columns, or fitting the limits."""
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Float
@@ -10,7 +10,7 @@ from ...errors import SequenceError
 from ...model.instruments import robot_file
 from ...settings.interchange import ImportOptions
 from ..kinematics_table import ANGLE_UNITS, LENGTH_UNITS, Joint, fits_roughly, joints_of, misfits
-from .found import FoundArm, Note
+from .found import FoundArm, Note, Notes
 
 _INSERTED = 0.03
 """Insertion [m] that the insertion axis exceeds in most recordings, since the tip is in view."""
@@ -20,7 +20,7 @@ def in_si(
     values: Float[np.ndarray, "rows joints"],
     joints: Sequence[Joint],
     options: ImportOptions,
-    note: Callable[[Note], None],
+    notes: Notes,
     *,
     arm: str,
     columns: Sequence[str] = (),
@@ -32,7 +32,7 @@ def in_si(
         values: of each joint, by rows.
         joints: of the columns.
         options: with `angle_unit`, `length_unit` and `flip`.
-        note: called with the units of a table.
+        notes: of the import; some are added.
         arm: its name, for people.
         columns: names of a table's columns, whose units are guessed; empty for messages, which are in SI units.
         instrument: whether angles can be guessed to be degrees; those of other robots may be shares of their range.
@@ -52,13 +52,13 @@ def in_si(
         angle = options.angle_unit or _angle_unit(*asked, instrument)
         length = options.length_unit or _length_unit(*asked)
         text = f"{arm}: angles are in {angle}, lengths in {length} (change: --angle-unit, --length-unit)."
-        note(Note("found" if options.angle_unit and options.length_unit else "guessed", text))
+        notes.append(Note("found" if options.angle_unit and options.length_unit else "guessed", text))
     result = values.copy()
     for index, joint in enumerate(joints):
         unit = options.units.get(joint.name, angle if joint.revolute else length)
         if columns and not options.units and _is_lerobot_gripper(columns[index]) and not instrument:
             result[:, index] = joint.from_percent(2.0 * values[:, index] - 100.0)
-            note(Note("guessed", f"{arm}: {joint.name} is 0 to 100 of its range (change: --units {joint.name} UNIT)."))
+            notes.guessed(f"{arm}: {joint.name} is 0 to 100 of its range (change: --units {joint.name} UNIT).")
         elif unit == "percent":
             result[:, index] = joint.from_percent(values[:, index])
         else:
@@ -159,7 +159,7 @@ def length_unit(highest: float, limit: float, arm: str, what: str, orders: Seque
     )
 
 
-def check_limits(arm: FoundArm, note: Callable[[Note], None]) -> bool:
+def check_limits(arm: FoundArm, notes: Notes) -> bool:
     """Compare an arm's positions with its robot's limits; a note names violations and remedies.
 
     Returns:
@@ -176,7 +176,7 @@ def check_limits(arm: FoundArm, note: Callable[[Note], None]) -> bool:
     for misfit in found:
         options = dict.fromkeys(_option(misfit.joint.name, text) for text in misfit.remedies)
         remedy = f" Give {' or '.join(options)}." if options else " Check the columns."
-        note(Note("warning", f"{arm.name}: {misfit.sentence()}.{remedy}"))
+        notes.warning(f"{arm.name}: {misfit.sentence()}.{remedy}")
     return not found
 
 

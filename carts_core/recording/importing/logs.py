@@ -1,6 +1,6 @@
 """Logs of arms and of the endoscope: joint positions with times, instrument and base frame."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,7 +16,7 @@ from ...settings.interchange import ImportOptions
 from ...wording import counted
 from ..kinematics_table import Joint
 from .calibrations import read_base_frames
-from .found import FoundArm, FoundMotion, Note
+from .found import FoundArm, FoundMotion, Notes
 from .joint_units import in_si, joints_of_arm
 
 SAME_CYCLE = 2e-3
@@ -75,10 +75,6 @@ class BaseFrame:
     """Base frame in the reference frame of the poses [m]."""
     deviation: float
     """Distance of the base from the estimate in the median row [m]."""
-    largest_deviation: float
-    """Distance in the worst row [m]."""
-    rotation_deviation: float
-    """Rotation from the estimate in the median row [rad]."""
 
 
 def fit_base_frame(
@@ -98,13 +94,10 @@ def fit_base_frame(
             "Check that both topics were recorded at the same time."
         )
     Ts = Ts_reference_tip[known] @ np.linalg.inv(forward(joints[known], geometry))
-    rotations = Rotation.from_matrix(Ts[:, :3, :3])
-    mean = rotations.mean()
     T = np.eye(4)
-    T[:3, :3], T[:3, 3] = mean.as_matrix(), np.median(Ts[:, :3, 3], axis=0)
-    distances = np.linalg.norm(Ts[:, :3, 3] - T[:3, 3], axis=1)
-    turned = np.median((mean.inv() * rotations).magnitude())
-    return BaseFrame(T, float(np.median(distances)), float(distances.max()), float(turned))
+    T[:3, :3] = Rotation.from_matrix(Ts[:, :3, :3]).mean().as_matrix()
+    T[:3, 3] = np.median(Ts[:, :3, 3], axis=0)
+    return BaseFrame(T, float(np.median(np.linalg.norm(Ts[:, :3, 3] - T[:3, 3], axis=1))))
 
 
 def fit_tool_point(
@@ -254,7 +247,7 @@ def transforms(values: Float[np.ndarray, "rows 7"]) -> Float[np.ndarray, "rows 4
     return Ts
 
 
-def arm_from_log(log: ArmLog, options: ImportOptions, note: Callable[[Note], None]) -> FoundArm:
+def arm_from_log(log: ArmLog, options: ImportOptions, notes: Notes) -> FoundArm:
     """Joint positions and base frame of an arm; notes name their sources.
 
     Raises:
@@ -262,28 +255,24 @@ def arm_from_log(log: ArmLog, options: ImportOptions, note: Callable[[Note], Non
     """
     if log.names:
         assert log.joints is not None
-        T_base, base_from = _base_frame(log, options, CLASSIC, note)
+        T_base, base_from = _base_frame(log, options, CLASSIC, notes)
         robot = options.robot[log.name]
         return FoundArm(log.name, log.names, log.joints.values, log.joints.times, robot, T_base, base_from)
-    log = log if log.si else _in_si(log, options, note)
-    log = _at_the_tip(log, options, note)
-    geometry = _geometry(log, options, note)
-    T_camera_base, base_from = _base_frame(log, options, geometry, note)
-    joints = log.joints if log.joints is not None else _solved(log, T_camera_base, geometry, note)
+    log = log if log.si else _in_si(log, options, notes)
+    log = _at_the_tip(log, options, notes)
+    geometry = _geometry(log, options, notes)
+    T_camera_base, base_from = _base_frame(log, options, geometry, notes)
+    joints = log.joints if log.joints is not None else _solved(log, T_camera_base, geometry, notes)
     columns, values = list(JOINT_NAMES), joints.values
     fixed: tuple[str, ...] = ("jaw",)
     if log.jaw is not None:
         jaw = np.interp(joints.times, log.jaw.times, log.jaw.values[:, 0])
         columns, values, fixed = [*columns, "jaw"], np.column_stack([values, jaw]), ()
         if jaw.min() < -0.1:
-            note(
-                Note(
-                    "found", f"{log.name}: the jaw is below 0 while grasping (down to {jaw.min():.2f} rad); drawn shut."
-                )
-            )
+            notes.found(f"{log.name}: the jaw is below 0 while grasping (down to {jaw.min():.2f} rad); drawn shut.")
             values[:, -1] = np.maximum(values[:, -1], 0.0)
     else:
-        note(Note("missing", f"{log.name}: no jaw angle; the jaw is drawn shut."))
+        notes.missing(f"{log.name}: no jaw angle; the jaw is drawn shut.")
     return FoundArm(
         log.name,
         tuple(columns),
@@ -296,7 +285,7 @@ def arm_from_log(log: ArmLog, options: ImportOptions, note: Callable[[Note], Non
     )
 
 
-def _in_si(log: ArmLog, options: ImportOptions, note: Callable[[Note], None]) -> ArmLog:
+def _in_si(log: ArmLog, options: ImportOptions, notes: Notes) -> ArmLog:
     """The log in SI units, by the given units and signs."""
     robot = {joint.name: joint for joint in joints_of_arm(log.name, options)}
 
@@ -304,7 +293,7 @@ def _in_si(log: ArmLog, options: ImportOptions, note: Callable[[Note], None]) ->
         if logged is None:
             return None
         joints = [robot.get(name, Joint(name, name != "insertion", -np.inf, np.inf)) for name in names]
-        return replace(logged, values=in_si(logged.values, joints, options, note, arm=log.name))
+        return replace(logged, values=in_si(logged.values, joints, options, notes, arm=log.name))
 
     return replace(log, joints=applied(log.joints, JOINT_NAMES), jaw=applied(log.jaw, ("jaw",)))
 
@@ -321,7 +310,7 @@ def _checked_rows(log: ArmLog) -> tuple[np.ndarray, np.ndarray] | None:
     return None if len(rows) < _FEWEST_ROWS else (transforms(poses.values[rows]), measured[rows])
 
 
-def _at_the_tip(log: ArmLog, options: ImportOptions, note: Callable[[Note], None]) -> ArmLog:
+def _at_the_tip(log: ArmLog, options: ImportOptions, notes: Notes) -> ArmLog:
     """The log with poses of the tip, where they are those of another point of the tool."""
     if options.tool_point is not None:
         point = np.array([0.0, 0.0, options.tool_point])
@@ -329,7 +318,7 @@ def _at_the_tip(log: ArmLog, options: ImportOptions, note: Callable[[Note], None
         inverted = np.linalg.inv(both[0])
         if _stands_still(inverted, both[1]):
             text = "measured_cp holds inverse transforms (the reference in the tip's frame); they are turned round"
-            note(Note("warning", f"{log.name}: {text}."))
+            notes.warning(f"{log.name}: {text}.")
             return replace(log, poses=_inverse_of(log.poses), local_poses=_inverse_of(log.local_poses))
         fits = [fit_tool_point(*both, geometry) for geometry in CANDIDATES.values()]
         point, moves = min(fits, key=lambda fit: fit[1])
@@ -337,7 +326,7 @@ def _at_the_tip(log: ArmLog, options: ImportOptions, note: Callable[[Note], None
             return log
         x, y, z = 1e3 * point
         text = f"poses are of a point at {x:.1f}, {y:.1f}, {z:.1f} mm from the tip, along the tool's axes x, y, z"
-        note(Note("found", f"{log.name}: {text}; they are brought to the tip (change: --tool-point)."))
+        notes.found(f"{log.name}: {text}; they are brought to the tip (change: --tool-point).")
     else:
         return log
     return replace(log, poses=_moved(log.poses, -point), local_poses=_moved(log.local_poses, -point))
@@ -365,10 +354,10 @@ def _inverse_of(poses: Track | None) -> Track | None:
     return Track(poses.times[there], np.column_stack([Ts[:, :3, 3], Rotation.from_matrix(Ts[:, :3, :3]).as_quat()]))
 
 
-def _geometry(log: ArmLog, options: ImportOptions, note: Callable[[Note], None]) -> PsmGeometry:
+def _geometry(log: ArmLog, options: ImportOptions, notes: Notes) -> PsmGeometry:
     """Lengths of the instrument: as given, as estimated from the recording, or those of a Large Needle Driver."""
     if log.tool:
-        note(Note("found", f"{log.name}: tool_type is {log.tool}."))
+        notes.found(f"{log.name}: tool_type is {log.tool}.")
     chosen = replace(CLASSIC, wrist_length=options.wrist_length) if options.wrist_length is not None else CLASSIC
     if (both := _checked_rows(log)) is None:
         return chosen
@@ -377,30 +366,24 @@ def _geometry(log: ArmLog, options: ImportOptions, note: Callable[[Note], None])
     check = check_instrument(Ts, measured, {**CANDIDATES, name: chosen})
     best = check.fits[check.best]
     if check.decides:
-        note(
-            Note(
-                "found",
-                f"{log.name}: joints and tip poses agree with a {check.best} (the base stands still to "
-                f"{1e3 * best.deviation:.4f} mm).",
-            )
+        notes.found(
+            f"{log.name}: joints and tip poses agree with a {check.best} (the base stands still to "
+            f"{1e3 * best.deviation:.4f} mm)."
         )
         chosen = {**CANDIDATES, name: chosen}[check.best]
     elif (warning := check.warning(name)) is not None:
-        note(Note("warning", f"{log.name}: {warning}"))
+        notes.warning(f"{log.name}: {warning}")
     if chosen.wrist_length != CLASSIC.wrist_length and log.name not in options.robot:
-        note(
-            Note(
-                "warning",
-                f"{log.name}: the shipped robot has a wrist of 9.1 mm and this instrument one of "
-                f"{1e3 * chosen.wrist_length:.1f} mm. Make its robot with carts robot, and give it with --robot "
-                f"{log.name} FILE.urdf.",
-            )
+        notes.warning(
+            f"{log.name}: the shipped robot has a wrist of 9.1 mm and this instrument one of "
+            f"{1e3 * chosen.wrist_length:.1f} mm. Make its robot with carts robot, and give it with --robot "
+            f"{log.name} FILE.urdf."
         )
     return chosen
 
 
 def _base_frame(
-    log: ArmLog, options: ImportOptions, geometry: PsmGeometry, note: Callable[[Note], None]
+    log: ArmLog, options: ImportOptions, geometry: PsmGeometry, notes: Notes
 ) -> tuple[np.ndarray | None, str]:
     """Base frame of the arm in the camera with OpenCV's axes, and its source; None if not known."""
     if (path := options.base.get(log.name)) is not None:
@@ -409,22 +392,17 @@ def _base_frame(
         if not chosen:
             known = ", ".join(frame.arm for frame in frames)
             raise SequenceError(f"{path} has no base frame of {log.name}. It has: {known}. Name another file.")
-        note(Note("found", f"{log.name}: base frame from {path}."))
+        notes.found(f"{log.name}: base frame from {path}.")
         return chosen[0].T_camera_base, str(path)
     T_axes = np.eye(4) if log.opencv_axes else T_DVRK_OPENCV
     if log.poses is not None and (log.joints is not None or log.local_poses is not None):
         T, what = _own_base_frame(log, geometry)
         if T is not None and np.abs(T - np.eye(4)).max() > _SAME_BASE:
-            note(
-                Note(
-                    "found",
-                    f"{log.name}: base frame from {what}; set-up joints are off by some 5 cm unless registered.",
-                )
-            )
+            notes.found(f"{log.name}: base frame from {what}; set-up joints are off by some 5 cm unless registered.")
             return T_axes @ T, what
     if log.setup is not None:
         T = transforms(log.setup.values[len(log.setup.values) // 2][None])[0]
-        note(Note("found", f"{log.name}: base frame from set-up joints, which are off by some 5 cm unless registered."))
+        notes.found(f"{log.name}: base frame from set-up joints, which are off by some 5 cm unless registered.")
         return T_axes @ T, "set-up joints (SUJ)"
     return None, ""
 
@@ -450,9 +428,7 @@ def _own_base_frame(log: ArmLog, geometry: PsmGeometry) -> tuple[np.ndarray | No
     return T, "measured_cp and local/measured_cp"
 
 
-def _solved(
-    log: ArmLog, T_camera_base: np.ndarray | None, geometry: PsmGeometry, note: Callable[[Note], None]
-) -> Track:
+def _solved(log: ArmLog, T_camera_base: np.ndarray | None, geometry: PsmGeometry, notes: Notes) -> Track:
     """Joint positions from poses by inverse kinematics."""
     source = log.local_poses or log.poses
     if source is None:
@@ -468,14 +444,14 @@ def _solved(
     found = inverse(Ts, geometry)
     reached = found.reachable
     for entry in found.unreachable:
-        note(Note("warning", f"{log.name}: poses that no joints reach, left out: {entry}."))
+        notes.warning(f"{log.name}: poses that no joints reach, left out: {entry}.")
     if reached.mean() < _FEWEST_REACHABLE:
         raise SequenceError(
             f"{log.name}: no joint positions reach {int((~reached).sum())} of {counted(len(Ts), 'pose')} "
             f"({found.unreachable[0].reason}). The poses are probably not in the frame of the arm's base, or of "
             f"another unit: name the base frame's file with --base {log.name} FILE, or record local/measured_cp."
         )
-    note(Note("found", f"{log.name}: joint positions by inverse kinematics of {int(reached.sum())} poses."))
+    notes.found(f"{log.name}: joint positions by inverse kinematics of {int(reached.sum())} poses.")
     return Track(source.times[reached], found.joints[reached])
 
 
@@ -483,9 +459,7 @@ _MOVES = 5e-4, 0.1
 """Motion [m], [deg] below which an endoscope counts as static."""
 
 
-def endoscope_motion(
-    poses: Track | None, joints: Track | None, start: float, note: Callable[[Note], None]
-) -> FoundMotion | None:
+def endoscope_motion(poses: Track | None, joints: Track | None, start: float, notes: Notes) -> FoundMotion | None:
     """Pose of the camera over time, in a world with its origin at the first image; None if it is static.
 
     The tip of the ECM counts as the camera, with the dVRK's axes; what the camera's place on the tip differs from that,
@@ -495,7 +469,7 @@ def endoscope_motion(
         poses: of the ECM's tip in some fixed frame.
         joints: of the ECM, in place of poses.
         start: time of the first image [s].
-        note: called with what was found.
+        notes: of the import; some are added.
     """
     chosen = poses if poses is not None else joints
     if chosen is None or len(chosen.times) < 2:
@@ -509,20 +483,14 @@ def endoscope_motion(
     relative = T_DVRK_OPENCV @ np.linalg.inv(Ts[first]) @ Ts @ T_DVRK_OPENCV
     way, turn = _extent(relative)
     if way <= _MOVES[0] and turn <= _MOVES[1]:
-        note(Note("found", "the endoscope (ECM) stands still."))
+        notes.found("the endoscope (ECM) stands still.")
         return None
-    note(
-        Note(
-            "found",
-            f"the endoscope (ECM) moves by up to {1e3 * way:.1f} mm and {turn:.1f} deg; a table has where the cameras "
-            "are. Base frames hold for where it is at the first image.",
-        )
+    notes.found(
+        f"the endoscope (ECM) moves by up to {1e3 * way:.1f} mm and {turn:.1f} deg; a table has where the cameras "
+        "are. Base frames hold for where it is at the first image."
     )
-    note(
-        Note(
-            "guessed",
-            "the camera is taken for the ECM's tip; let carts calibrate find its place there and the base frames.",
-        )
+    notes.guessed(
+        "the camera is taken for the ECM's tip; let carts calibrate find its place there and the base frames."
     )
     return FoundMotion(times, relative)
 

@@ -1,6 +1,5 @@
 """Placing of arms and cameras: frames with kinematics, checks against the view, stand-in calibrations."""
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -15,7 +14,7 @@ from ...model.robot import Robot
 from ...settings.interchange import ImportOptions
 from ...wording import counted
 from .cameras import check_intrinsics, placed_cameras
-from .found import FoundArm, FoundCamera, FoundRecording, Note
+from .found import FoundArm, FoundCamera, FoundRecording, Notes
 from .joint_units import check_limits
 
 _ROWS = 200
@@ -39,7 +38,7 @@ def tips_of(arm: FoundArm) -> Float[np.ndarray, "rows 3"]:
     return robot.forward_kinematics(torch.from_numpy(joints)).numpy()[:, -1, :3, 3]
 
 
-def check_in_view(arm: FoundArm, camera: FoundCamera, note: Callable[[Note], None]) -> None:
+def check_in_view(arm: FoundArm, camera: FoundCamera, notes: Notes) -> None:
     """Warn if a base frame puts the tip out of view and another reading of it puts it in view."""
     if arm.values is None or arm.T_world_base is None or camera.intrinsics is None:
         return
@@ -55,7 +54,7 @@ def check_in_view(arm: FoundArm, camera: FoundCamera, note: Callable[[Note], Non
     fitting = [name for name, T in readings.items() if _in_view(tips, T, camera) >= _IN_VIEW]
     if fitting:
         text = f"{arm.name}: the base frame from {arm.base_from} puts the tip where {camera.name} cannot see it"
-        note(Note("warning", f"{text}; {' or '.join(fitting)} would fit. Correct the file."))
+        notes.warning(f"{text}; {' or '.join(fitting)} would fit. Correct the file.")
 
 
 def _scaled(T: np.ndarray, factor: float) -> np.ndarray:
@@ -77,7 +76,7 @@ def _in_view(tips: np.ndarray, T_camera_base: np.ndarray, camera: FoundCamera) -
     return float(np.mean(inside & (depth > _NEAREST) & (depth < _FARTHEST)))
 
 
-def check_pair(cameras: tuple[FoundCamera, ...], note: Callable[[Note], None]) -> None:
+def check_pair(cameras: tuple[FoundCamera, ...], notes: Notes) -> None:
     """Warn if the right camera of a pair is on the left of the left one."""
     by_name = {camera.name: camera for camera in cameras}
     if not {"left", "right"} <= set(by_name):
@@ -89,7 +88,7 @@ def check_pair(cameras: tuple[FoundCamera, ...], note: Callable[[Note], None]) -
     if T_right_left[0, 3] > abs(T_right_left[1, 3]):
         distance = 1e3 * float(T_right_left[0, 3])
         text = f"the right camera is {distance:.1f} mm at the left of the left one: left and right are swapped, or the"
-        note(Note("warning", f"{text} calibration is the inverse (left in the right one's frame)."))
+        notes.warning(f"{text} calibration is the inverse (left in the right one's frame).")
 
 
 MAX_GAP = 0.1
@@ -116,31 +115,31 @@ def completed(recording: FoundRecording, options: ImportOptions) -> FoundRecordi
         )
     if not recording.frame_ids:
         raise SequenceError(f"{recording.name}: there are no frames ({recording.kind}). Name other images.")
-    notes = list(recording.notes)
-    recording = _frames_with_kinematics(recording, notes.append)
+    notes = Notes(recording.notes)
+    recording = _frames_with_kinematics(recording, notes)
     for camera in recording.cameras:
         if camera.intrinsics is not None:
-            check_intrinsics(camera, options, notes.append)
-    cameras = tuple(_with_intrinsics(camera, notes.append) for camera in recording.cameras)
-    cameras = placed_cameras(cameras, notes.append)
+            check_intrinsics(camera, options, notes)
+    cameras = tuple(_with_intrinsics(camera, notes) for camera in recording.cameras)
+    cameras = placed_cameras(cameras, notes)
     if options.time_offset is not None and all(arm.times is None for arm in recording.arms):
         raise SequenceError(
             f"{recording.name}: --time-offset needs times, and rows are matched with images without any. Give the "
             "images' rate (--frame-rate), or leave it out."
         )
     known = tuple(
-        replace(arm, beyond_limits=not check_limits(arm, notes.append)) if arm.values is not None else arm
+        replace(arm, beyond_limits=not check_limits(arm, notes)) if arm.values is not None else arm
         for arm in recording.arms
     )
-    check_pair(cameras, notes.append)
+    check_pair(cameras, notes)
     for arm in known:
-        check_in_view(arm, cameras[0], notes.append)
+        check_in_view(arm, cameras[0], notes)
     stand_in = FoundArm("PSM1", robot=options.robot.get("PSM1", FoundArm.robot))
-    arms = tuple(_placed(arm, number, notes.append) for number, arm in enumerate(known or (stand_in,)))
+    arms = tuple(_placed(arm, number, notes) for number, arm in enumerate(known or (stand_in,)))
     return replace(recording, cameras=cameras, arms=arms, notes=tuple(notes))
 
 
-def _frames_with_kinematics(recording: FoundRecording, note: Callable[[Note], None]) -> FoundRecording:
+def _frames_with_kinematics(recording: FoundRecording, notes: Notes) -> FoundRecording:
     if recording.frame_times is None:
         return recording
     wanted = recording.frame_times + recording.time_offset
@@ -156,12 +155,7 @@ def _frames_with_kinematics(recording: FoundRecording, note: Callable[[Note], No
         spacing = np.diff(times)
         # A log of one row for each image may be slow throughout.
         if len(spacing) and (long := spacing > max(MAX_GAP, 2.0 * float(np.median(spacing)))).any():
-            note(
-                Note(
-                    "warning",
-                    f"{name}: {counted(int(long.sum()), 'gap')} of up to {spacing.max():.3g} s in the log.",
-                )
-            )
+            notes.warning(f"{name}: {counted(int(long.sum()), 'gap')} of up to {spacing.max():.3g} s in the log.")
     if keep.all():
         return recording
     if not keep.any():
@@ -170,11 +164,8 @@ def _frames_with_kinematics(recording: FoundRecording, note: Callable[[Note], No
             f"{recording.name}: no frame has joint positions within {MAX_GAP} s. Images are from {wanted[0]:.3f} to "
             f"{wanted[-1]:.3f} s, kinematics: {spans}. Clocks or their units differ: give --time-offset or --clock."
         )
-    note(
-        Note(
-            "warning",
-            f"{int((~keep).sum())} of {counted(len(keep), 'frame')} left out: no joint positions within {MAX_GAP} s.",
-        )
+    notes.warning(
+        f"{int((~keep).sum())} of {counted(len(keep), 'frame')} left out: no joint positions within {MAX_GAP} s."
     )
     ids = tuple(frame for frame, kept in zip(recording.frame_ids, keep, strict=True) if kept)
     cameras = []
@@ -185,28 +176,25 @@ def _frames_with_kinematics(recording: FoundRecording, note: Callable[[Note], No
     return replace(recording, frame_ids=ids, frame_times=recording.frame_times[keep], cameras=tuple(cameras))
 
 
-def _with_intrinsics(camera: FoundCamera, note: Callable[[Note], None]) -> FoundCamera:
+def _with_intrinsics(camera: FoundCamera, notes: Notes) -> FoundCamera:
     if camera.intrinsics is not None:
         return camera
     width, height = camera.size
     focal = FOCAL_WIDTHS * width
-    note(
-        Note(
-            "missing",
-            f"{camera.name}: no calibration; a focal length of {focal:.0f} px stands in for it. Give --calibration "
-            f"{camera.name} FILE, or let carts calibrate find it.",
-        )
+    notes.missing(
+        f"{camera.name}: no calibration; a focal length of {focal:.0f} px stands in for it. Give --calibration "
+        f"{camera.name} FILE, or let carts calibrate find it."
     )
     return replace(camera, intrinsics=(focal, focal, width / 2, height / 2), pixel_center=0.5)
 
 
-def _placed(arm: FoundArm, number: int, note: Callable[[Note], None]) -> FoundArm:
+def _placed(arm: FoundArm, number: int, notes: Notes) -> FoundArm:
     if arm.T_world_base is not None:
         return arm
     T = np.eye(4)
     if arm.values is None:
         T[2, 3] = _BEHIND
-        note(Note("missing", f"no kinematics of {arm.name}: it is kept behind the camera, and masks are all there is."))
+        notes.missing(f"no kinematics of {arm.name}: it is kept behind the camera, and masks are all there is.")
         return replace(arm, T_world_base=T, base_from="nothing: behind the camera")
     tip = tips_of(replace(arm, values=np.median(arm.values, axis=0)[None]))[0]
     side = -1.0 if number % 2 == 0 else 1.0
@@ -214,11 +202,8 @@ def _placed(arm: FoundArm, number: int, note: Callable[[Note], None]) -> FoundAr
     turn = Rotation.align_vectors([towards / np.linalg.norm(towards)], [tip / np.linalg.norm(tip)])
     T[:3, :3] = turn[0].as_matrix()
     T[:3, 3] = [0.0, 0.0, max(_DISTANCE, 0.5 * float(np.linalg.norm(tip)))] - T[:3, :3] @ tip
-    note(
-        Note(
-            "missing",
-            f"{arm.name}: no base frame (hand-eye calibration); it is placed before the camera as a stand-in. Give "
-            f"--base {arm.name} FILE, or place it in carts view and refine with carts calibrate.",
-        )
+    notes.missing(
+        f"{arm.name}: no base frame (hand-eye calibration); it is placed before the camera as a stand-in. Give "
+        f"--base {arm.name} FILE, or place it in carts view and refine with carts calibrate."
     )
     return replace(arm, T_world_base=T, base_from="nothing: a stand-in")

@@ -6,7 +6,7 @@ them. Every way is said by a note, and so is what was left out.
 """
 
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import PureWindowsPath
 
@@ -17,7 +17,7 @@ from ...errors import SequenceError
 from ...settings.interchange import SECONDS, Clock, ImportOptions
 from ...wording import counted
 from .cameras import Images
-from .found import FoundArm, Note
+from .found import FoundArm, Note, Notes
 
 _STAMPED_DIGITS = 13
 """Digits from which numbers in image names are times."""
@@ -83,16 +83,14 @@ class RowMatch:
     """Time in the log minus time of the image [s]."""
 
 
-def frame_times(
-    images: Images, ids: tuple[str, ...], options: ImportOptions, note: Callable[[Note], None]
-) -> FrameTimes:
+def frame_times(images: Images, ids: tuple[str, ...], options: ImportOptions, notes: Notes) -> FrameTimes:
     """Times of images: from their names, from the given frame rate, or from a video.
 
     Args:
         images: of the leading camera.
         ids: of the frames that count, in order.
         options: with `frame_rate`.
-        note: called with what was found.
+        notes: of the import; some are added.
     """
     stems = tuple(
         PureWindowsPath(images.pattern.format(frame=frame, domain="")).stem if images.pattern else frame
@@ -102,41 +100,41 @@ def frame_times(
     if images.pattern and all(len(frame) >= _STAMPED_DIGITS for frame in ids):
         numbers = np.array([int(frame) for frame in ids], np.float64)
         clock = guess_clock(numbers)
-        note(Note("guessed", f"names of the images are times in {clock}."))
-        return _without_rate(replace(found, times=numbers * SECONDS[clock], source="the images' names"), options, note)
+        notes.guessed(f"names of the images are times in {clock}.")
+        return _without_rate(replace(found, times=numbers * SECONDS[clock], source="the images' names"), options, notes)
     video = None
     if images.times is not None:
         position = {frame: index for index, frame in enumerate(images.ids)}
         video = images.times[[position[frame] for frame in ids]]
         spacing = np.diff(video)
         if len(spacing) and np.ptp(spacing) > 0.1 * np.median(spacing):
-            note(Note("found", f"times of the images are those of {images.path.name}."))
-            return _without_rate(replace(found, times=video, source=images.path.name), options, note)
+            notes.found(f"times of the images are those of {images.path.name}.")
+            return _without_rate(replace(found, times=video, source=images.path.name), options, notes)
     if options.frame_rate is not None:
-        times = _numbered(ids, note) / options.frame_rate
+        times = _numbered(ids, notes) / options.frame_rate
         if video is not None and len(video) > 1:
             rate = (len(video) - 1) / (video[-1] - video[0])
             if abs(rate / options.frame_rate - 1) > 0.01:
                 text = (
                     f"{images.path.name} has {rate:.4g} images/s; --frame-rate {options.frame_rate:g} is used instead."
                 )
-                note(Note("warning", text))
-        note(Note("found", f"times of the images are those of {options.frame_rate:g} images/s."))
+                notes.warning(text)
+        notes.found(f"times of the images are those of {options.frame_rate:g} images/s.")
         return replace(found, times=times, source="--frame-rate", given=True)
     if video is not None:
-        note(Note("found", f"times of the images are those of {images.path.name}."))
+        notes.found(f"times of the images are those of {images.path.name}.")
         return replace(found, times=video, source=images.path.name, nominal=True)
     return found
 
 
-def _without_rate(found: FrameTimes, options: ImportOptions, note: Callable[[Note], None]) -> FrameTimes:
+def _without_rate(found: FrameTimes, options: ImportOptions, notes: Notes) -> FrameTimes:
     if options.frame_rate is not None:
         text = f"--frame-rate {options.frame_rate:g} is not used: the images have times of their own ({found.source})."
-        note(Note("warning", text))
+        notes.warning(text)
     return found
 
 
-def _numbered(ids: tuple[str, ...], note: Callable[[Note], None]) -> np.ndarray:
+def _numbered(ids: tuple[str, ...], notes: Notes) -> np.ndarray:
     """Images counted from 0, with gaps where single numbers are missing in their names."""
     numbers = np.array([int(frame) for frame in ids], np.float64)
     steps = np.diff(numbers)
@@ -146,7 +144,7 @@ def _numbered(ids: tuple[str, ...], note: Callable[[Note], None]) -> np.ndarray:
         return np.arange(len(ids), dtype=float)
     if places[-1] != len(ids) - 1:
         missing = int(places[-1]) + 1 - len(ids)
-        note(Note("guessed", f"{counted(missing, 'image')} missing in the numbering; they keep their place in time."))
+        notes.guessed(f"{counted(missing, 'image')} missing in the numbering; they keep their place in time.")
     return places
 
 
@@ -179,7 +177,7 @@ def guess_clock(values: np.ndarray, span: float | None = None) -> Clock:
 
 
 def row_seconds(
-    rows: LogRows, clock: Clock | None, note: Callable[[Note], None], span: float | None = None
+    rows: LogRows, clock: Clock | None, notes: Notes, span: float | None = None
 ) -> Float[np.ndarray, " rows"] | None:
     """Times of rows [s]; their unit is guessed if it is not given.
 
@@ -191,7 +189,7 @@ def row_seconds(
     values = rows.times
     if clock is None:
         clock = guess_clock(values, span)
-        note(Note("guessed", f"{rows.name}: times of column {rows.time_column!r} are in {clock} (change: --clock)."))
+        notes.guessed(f"{rows.name}: times of column {rows.time_column!r} are in {clock} (change: --clock).")
     steps = np.diff(values.astype(np.float64))
     if (steps < 0).any():
         row = int(np.flatnonzero(steps < 0)[0]) + 1
@@ -201,31 +199,31 @@ def row_seconds(
         )
     if repeated := int((steps == 0).sum()):
         text = f"{rows.name}: {counted(repeated, 'row')} with the time of the row before; the first of each is used."
-        note(Note("warning", text))
+        notes.warning(text)
     return np.asarray(values, np.float64) * SECONDS[clock]
 
 
-def match_rows(frames: FrameTimes, rows: LogRows, options: ImportOptions, note: Callable[[Note], None]) -> RowMatch:
+def match_rows(frames: FrameTimes, rows: LogRows, options: ImportOptions, notes: Notes) -> RowMatch:
     """Match rows with images.
 
     Args:
         frames: with their times, where known.
         rows: with their times and images, where known.
         options: what was given.
-        note: called with how it is done, and what is left out.
+        notes: of the import; some are added.
 
     Raises:
         SequenceError: neither times, names, numbers nor order decide; it names the option that does.
     """
     explicit = "frame" in options.columns
-    named = _named(frames, rows, note)
+    named = _named(frames, rows, notes)
     if explicit and named is None:
         raise SequenceError(
             f"{rows.name}: column {rows.image_column!r} names no images (theirs are {frames.stems[0]} to "
             f"{frames.stems[-1]}). Name another one: --columns frame COLUMN."
         )
     span = None if frames.times is None or len(frames.times) < 2 else float(frames.times[-1] - frames.times[0])
-    times = row_seconds(rows, options.clock, note, span)
+    times = row_seconds(rows, options.clock, notes, span)
     one_each = named if named is not None and _is_one_each(named, frames) else None
     in_order = one_each is None and named is None and rows.count == len(frames.ids)
     if in_order:
@@ -234,7 +232,7 @@ def match_rows(frames: FrameTimes, rows: LogRows, options: ImportOptions, note: 
         apart = frames.times[0] > times[-1] or frames.times[-1] < times[0]
         own_clock = options.time_offset is None and not frames.given and (apart or frames.nominal)
         if not (own_clock and one_each is not None):
-            return _by_time(frames, rows, times, apart, named, options, note)
+            return _by_time(frames, rows, times, apart, named, options, notes)
     if explicit or named is not None:
         assert named is not None
         if not explicit and one_each is None and _counts_rows(named, rows, times):
@@ -243,9 +241,9 @@ def match_rows(frames: FrameTimes, rows: LogRows, options: ImportOptions, note: 
                 f"{counted(len(frames.ids), 'image')}, so it does not say which row is of which image. Give the "
                 f"images' rate (--frame-rate), or say that it does: --columns frame {rows.image_column!r}."
             )
-        return _by_image(frames, rows, named, times, f"column {rows.image_column!r}", note, stated=explicit)
+        return _by_image(frames, rows, named, times, f"column {rows.image_column!r}", notes, stated=explicit)
     if in_order:
-        return _by_image(frames, rows, np.arange(rows.count), times, "their order", note, stated=False)
+        return _by_image(frames, rows, np.arange(rows.count), times, "their order", notes, stated=False)
     lacking = "the images have no times" if times is not None else "the table has no times"
     raise SequenceError(
         f"the recording has {counted(len(frames.ids), 'image')} and {rows.name} has {counted(rows.count, 'row')}, and "
@@ -261,19 +259,19 @@ def _by_time(
     apart: bool,
     named: np.ndarray | None,
     options: ImportOptions,
-    note: Callable[[Note], None],
+    notes: Notes,
 ) -> RowMatch:
     assert frames.times is not None
     dropped = (
         f"; column {rows.image_column!r} is not used (change: --columns frame COLUMN)" if named is not None else ""
     )
     text = f"rows meet images by time: column {rows.time_column!r} and {frames.source}{dropped}."
-    note(Note("found" if "time" in options.columns else "guessed", text))
+    notes.append(Note("found" if "time" in options.columns else "guessed", text))
     offset = options.time_offset
     if offset is None:
         offset = float(times[0] - frames.times[0]) if apart else 0.0
         text = "the clocks do not overlap: the first row is taken for the time of the first image" if apart else "0 s"
-        note(Note("guessed", f"time offset: {text} (change: --time-offset)."))
+        notes.guessed(f"time offset: {text} (change: --time-offset).")
     return RowMatch(times, False, frames.times, float(offset))
 
 
@@ -283,18 +281,18 @@ def _by_image(
     positions: np.ndarray,
     times: np.ndarray | None,
     how: str,
-    note: Callable[[Note], None],
+    notes: Notes,
     *,
     stated: bool,
 ) -> RowMatch:
     kind = "found" if stated else "guessed"
-    note(Note(kind, f"each row belongs to one image, by {how} (change: --columns frame COLUMN, --frame-rate)."))
+    notes.append(Note(kind, f"each row belongs to one image, by {how} (change: --columns frame COLUMN, --frame-rate)."))
     if unnamed := int((positions < 0).sum()):
-        note(Note("warning", f"{rows.name}: {unnamed} of {counted(len(positions), 'row')} belong to no image."))
+        notes.warning(f"{rows.name}: {unnamed} of {counted(len(positions), 'row')} belong to no image.")
     known = positions[positions >= 0]
     if repeated := len(known) - len(np.unique(known)):
         text = f"{rows.name}: {counted(repeated, 'row')} of an image that has a row already; the first one is used."
-        note(Note("warning", text))
+        notes.warning(text)
     taken = frames.times
     if times is not None and not frames.given:
         own = np.full(len(frames.ids), np.nan)
@@ -303,7 +301,7 @@ def _by_image(
         if len(there) and (np.diff(there) > 0).all():
             taken = own
             if frames.times is not None:
-                note(Note("found", f"times of the images are those of their rows instead of those of {frames.source}."))
+                notes.found(f"times of the images are those of their rows instead of those of {frames.source}.")
     return RowMatch(np.where(positions >= 0, positions.astype(float), np.nan), True, taken)
 
 
@@ -319,14 +317,14 @@ def _is_one_each(named: np.ndarray, frames: FrameTimes) -> bool:
     return len(np.unique(known)) == len(known) and (named < 0).mean() <= _FEW and len(known) >= 0.5 * len(frames.ids)
 
 
-def _named(frames: FrameTimes, rows: LogRows, note: Callable[[Note], None]) -> Int[np.ndarray, " rows"] | None:
+def _named(frames: FrameTimes, rows: LogRows, notes: Notes) -> Int[np.ndarray, " rows"] | None:
     """Index of each row's image, -1 for none; None if fewer than half of the rows or images are matched."""
     if rows.images is None:
         return None
     by_stem = {stem: index for index, stem in enumerate(frames.stems)}
     numbers = [_number(cell) for cell in rows.images.tolist()]
     exact = [by_stem.get(_stem(cell), -1) if isinstance(cell, str) else -1 for cell in rows.images.tolist()]
-    named = np.array(exact if max(exact, default=-1) >= 0 else _numbers_to_positions(numbers, frames, rows, note))
+    named = np.array(exact if max(exact, default=-1) >= 0 else _numbers_to_positions(numbers, frames, rows, notes))
     enough = 2 * (named >= 0).sum() >= min(len(frames.ids), len(named))
     return named if enough else None
 
@@ -343,9 +341,7 @@ def _number(cell: object) -> int | None:
     return int(cell) if isinstance(cell, int | float) and np.isfinite(cell) and cell == int(cell) else None
 
 
-def _numbers_to_positions(
-    numbers: list[int | None], frames: FrameTimes, rows: LogRows, note: Callable[[Note], None]
-) -> list[int]:
+def _numbers_to_positions(numbers: list[int | None], frames: FrameTimes, rows: LogRows, notes: Notes) -> list[int]:
     ids = [int(frame) for frame in frames.ids]
     position = {number: index for index, number in enumerate(ids)}
     known = [number for number in numbers if number is not None]
@@ -363,14 +359,14 @@ def _numbers_to_positions(
             f"first row is taken for the first image (rename the images to begin with {min(known)} if it is not)."
         )
         text = f"{rows.name}: column {rows.image_column!r} counts from {begin}." if frames.counted else text
-        note(Note(kind, text))
+        notes.append(Note(kind, text))
     return [-1 if number is None else position.get(number + shift, -1) for number in numbers]
 
 
 def by_rows(
     arms: Sequence[FoundArm],
     ids: Sequence[str],
-    notes: list[Note],
+    notes: Notes,
     times: Float[np.ndarray, " frames"] | None = None,
 ) -> tuple[tuple[FoundArm, ...], tuple[str, ...], np.ndarray]:
     """Arms whose times are frame numbers, restricted to the frames that all of them have.
@@ -396,7 +392,7 @@ def by_rows(
     if not keep.any():
         raise SequenceError("no frame has joint positions of all arms. Leave an arm out: --arms.")
     if not keep.all():
-        notes.append(Note("warning", f"{int((~keep).sum())} of {len(keep)} frames left out: no joint positions."))
+        notes.warning(f"{int((~keep).sum())} of {len(keep)} frames left out: no joint positions.")
     kept = np.flatnonzero(keep)
     timed = times is not None and bool(np.isfinite(times[kept]).all() and (np.diff(times[kept]) > 0).all())
     result = []

@@ -2,7 +2,7 @@
 
 import os
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,7 @@ from ...settings.interchange import ImportOptions
 from ..image_sources import BAG_SUFFIXES, Bag, decode_message
 from ..importing.cameras import calibration_of, camera_from_info, cameras_of, common_ids, find_images, side_of
 from ..importing.columns import order_of_names, rows_of, strange_names
-from ..importing.found import FoundArm, FoundCamera, FoundMotion, FoundRecording, Note, Source, recording_name
+from ..importing.found import FoundArm, FoundCamera, FoundMotion, FoundRecording, Note, Notes, Source, recording_name
 from ..importing.logs import ArmLog, arm_from_log, endoscope_motion, nearest, track
 from ..importing.row_matching import frame_times
 
@@ -25,13 +25,13 @@ _POSES = ("local/measured_cp", "position_cartesian_local_current", "measured_cp"
 _JOINTS = ("measured_js", "state_joint_current")
 
 
-def read_endoscope(bag: Bag, start: float, note: Callable[[Note], None]) -> FoundMotion | None:
+def read_endoscope(bag: Bag, start: float, notes: Notes) -> FoundMotion | None:
     """Motion of the endoscope; None if it is static.
 
     Args:
         bag: the recording.
         start: time of the first image [s].
-        note: called with what was found.
+        notes: of the import; some are added.
 
     Raises:
         SequenceError: a message is damaged.
@@ -42,9 +42,9 @@ def read_endoscope(bag: Bag, start: float, note: Callable[[Note], None]) -> Foun
             continue
         logged = track(rows_of(bag.rows({found: ("ecm", role)}).get("ecm", []), role, ecm_kinematics.JOINT_NAMES))
         return (
-            endoscope_motion(logged, None, start, note)
+            endoscope_motion(logged, None, start, notes)
             if role == "poses"
-            else endoscope_motion(None, logged, start, note)
+            else endoscope_motion(None, logged, start, notes)
         )
     return None
 
@@ -62,7 +62,7 @@ class SeparateImages:
     times: Float[np.ndarray, " frames"]
     """Times in the clock of the images [s]."""
 
-    def offset(self, arms: tuple[FoundArm, ...], notes: list[Note]) -> float:
+    def offset(self, arms: tuple[FoundArm, ...], notes: Notes) -> float:
         """Default time in the kinematics minus time of the images [s]: 0 for overlapping clocks, else with a common
         start."""
         begin = [float(arm.times[0]) for arm in arms if arm.times is not None]
@@ -70,18 +70,18 @@ class SeparateImages:
         apart = not begin or self.times[0] > max(end) or self.times[-1] < min(begin)
         offset = max(begin) - float(self.times[0]) if begin and apart else 0.0
         text = "the clocks do not overlap: images and kinematics are taken to begin together" if offset else "0 s"
-        notes.append(Note("guessed", f"time offset: {text} (change: --time-offset)."))
+        notes.guessed(f"time offset: {text} (change: --time-offset).")
         return offset
 
 
-def separate_images(path: Path, topics: list[str], options: ImportOptions, notes: list[Note]) -> SeparateImages | None:
+def separate_images(path: Path, topics: list[str], options: ImportOptions, notes: Notes) -> SeparateImages | None:
     """Images given as files or folders; None if none are given or they are topics of the bag.
 
     Args:
         path: of the bag; names are relative to where the command is run, or to its folder.
         topics: of its images.
         options: with the names.
-        notes: what was found is added.
+        notes: of the import; some are added.
 
     Raises:
         SequenceError: some are topics and some are files, they have no times, or cannot be read.
@@ -97,7 +97,7 @@ def separate_images(path: Path, topics: list[str], options: ImportOptions, notes
     if not ids:
         raise SequenceError(f"{path}: no frame has an image of every camera. Number them alike, or import one camera.")
     first = next(iter(images.values()))
-    times = frame_times(first, ids, options, notes.append).times
+    times = frame_times(first, ids, options, notes).times
     if times is None:
         raise SequenceError(f"images in {first.path} have no times. Say how many there are a second: --frame-rate.")
     return SeparateImages(cameras_of(images, options, notes), ids, times)
@@ -129,7 +129,7 @@ def _detect(path: Path) -> bool:
     return (path.suffix in BAG_SUFFIXES and path.is_file()) or (path / "metadata.yaml").is_file()
 
 
-def read_arm_logs(bag: Bag, options: ImportOptions, notes: list[Note]) -> list[ArmLog]:
+def read_arm_logs(bag: Bag, options: ImportOptions, notes: Notes) -> list[ArmLog]:
     """Logs of the arms in a bag by name; notes report joints in another order.
 
     Raises:
@@ -214,7 +214,7 @@ def _preference(topic: str) -> int:
     return next(rank for rank, word in enumerate(_PREFERRED) if word in topic)
 
 
-def _cameras(bag: Bag, options: ImportOptions, notes: list[Note]) -> tuple[tuple[FoundCamera, ...], np.ndarray]:
+def _cameras(bag: Bag, options: ImportOptions, notes: Notes) -> tuple[tuple[FoundCamera, ...], np.ndarray]:
     path, topics = bag.path, _chosen_topics(bag, options)
     times = {name: bag.image_times(topic) for name, topic in topics.items()}
     for name, topic in topics.items():
@@ -231,7 +231,7 @@ def _cameras(bag: Bag, options: ImportOptions, notes: list[Note]) -> tuple[tuple
         record, stamps = times[name]
         chosen = order if name == leader else nearest(frame_times, stamps)
         if name != leader and (late := np.abs(stamps[chosen] - frame_times).max()) > 0.02:
-            notes.append(Note("warning", f"images of {name} are up to {late:.3f} s from those of {leader}."))
+            notes.warning(f"images of {name} are up to {late:.3f} s from those of {leader}.")
         info = _camera_info(bag, topics[name])
         first = decode_message(bag.message(topics[name]), f"{path}, {topics[name]}")
         size = (first.shape[1], first.shape[0])
@@ -239,7 +239,7 @@ def _cameras(bag: Bag, options: ImportOptions, notes: list[Note]) -> tuple[tuple
         camera = FoundCamera(name, size, path)
         found = camera_from_info(camera, info, options, notes, rectified="rect" in topics[name])
         cameras.append(calibration_of(found, options, notes, topic=topics[name], numbers=numbers))
-        notes.append(Note("found", f"camera {name}: {topics[name]}, {len(record)} images, {size[0]} x {size[1]}."))
+        notes.found(f"camera {name}: {topics[name]}, {len(record)} images, {size[0]} x {size[1]}.")
     return tuple(cameras), frame_times
 
 
@@ -257,7 +257,7 @@ def _read(path: Path, options: ImportOptions) -> FoundRecording:
     with Bag(path) as bag:
         if not bag.topics:
             raise SequenceError(f"bag {path} has no messages. Record again, or copy it again.")
-        notes: list[Note] = []
+        notes = Notes()
         beside = separate_images(path, _image_topics(bag), options, notes)
         if beside is None:
             if options.frame_rate is not None:
@@ -273,12 +273,12 @@ def _read(path: Path, options: ImportOptions) -> FoundRecording:
                 f"bag {path} has no kinematics of an arm (looked for /PSM1/measured_js, /PSM1/measured_cp and the "
                 f"names of dVRK 1.x). Its topics are: {known}."
             )
-        arms = tuple(arm_from_log(log, options, notes.append) for log in logs)
+        arms = tuple(arm_from_log(log, options, notes) for log in logs)
         offset = options.time_offset
         if offset is None:
             offset = 0.0 if beside is None else beside.offset(arms, notes)
         first = float(frame_times[0]) + offset if len(frame_times) else 0.0
-        motion = read_endoscope(bag, first, notes.append) if len(frame_times) else None
+        motion = read_endoscope(bag, first, notes) if len(frame_times) else None
     name = recording_name(path)
     return FoundRecording("a ROS bag", name, cameras, arms, ids, frame_times, tuple(notes), offset, motion)
 

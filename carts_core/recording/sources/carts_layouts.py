@@ -17,7 +17,7 @@ from ...settings.interchange import ImportOptions
 from ..images import mask_remarks, read_mask, spread_files
 from ..importing.cameras import Images, cameras_of, common_ids, find_images, image_files
 from ..importing.foreign_tables import read_array, read_foreign_table
-from ..importing.found import FoundArm, FoundCamera, FoundRecording, Note, Source
+from ..importing.found import FoundArm, FoundCamera, FoundRecording, Note, Notes, Source
 from ..importing.joint_units import in_si, joints_of_arm
 from ..importing.row_matching import by_rows, frame_times
 from ..kinematics_table import Joint
@@ -43,9 +43,7 @@ def _ordered(names: Iterable[str]) -> list[str]:
     return sorted(names, key=lambda name: (name not in _FIRST, name))
 
 
-def _domain_images(
-    path: Path, domains: list[str], folder: str, notes: list[Note]
-) -> tuple[Images, tuple[str, ...]] | None:
+def _domain_images(path: Path, domains: list[str], folder: str, notes: Notes) -> tuple[Images, tuple[str, ...]] | None:
     """Images of one camera in all domains under one pattern, and the frames that all domains have."""
     places = [path / domain / folder for domain in domains]
     if not all(image_files(place) for place in places):
@@ -55,30 +53,28 @@ def _domain_images(
         raise SequenceError(f"{path}: images of {folder} have other names or sizes in some domains. Name them alike.")
     ids = common_ids(found)
     if any(len(each.ids) != len(ids) for each in found):
-        notes.append(
-            Note("warning", f"{folder}: {len(ids)} frames are in all of {', '.join(domains)}; others are left out.")
-        )
+        notes.warning(f"{folder}: {len(ids)} frames are in all of {', '.join(domains)}; others are left out.")
     pattern = (
         f"{{domain}}/{folder}/{found[0].pattern}" if len(domains) > 1 else f"{domains[0]}/{folder}/{found[0].pattern}"
     )
     return Images(path, pattern, ids, found[0].size), ids
 
 
-def _with_masks(camera: FoundCamera, folder: Path, ids: tuple[str, ...], notes: list[Note]) -> FoundCamera:
+def _with_masks(camera: FoundCamera, folder: Path, ids: tuple[str, ...], notes: Notes) -> FoundCamera:
     """The camera with the masks of a folder, if they are white on black."""
     if not image_files(folder):
         return camera
     masks = find_images(folder)
     shared = [frame for frame in ids if frame in set(masks.ids)]
     if not shared:
-        notes.append(Note("warning", f"{folder}: no mask is of a frame; they are left out."))
+        notes.warning(f"{folder}: no mask is of a frame; they are left out.")
         return camera
     files = [folder / masks.pattern.format(frame=frame) for frame in shared]
     try:
         for file in spread_files(files):
             read_mask(file)
     except SequenceError as error:
-        notes.append(Note("missing", f"{camera.name}: masks in {folder} are left out: {error}"))
+        notes.missing(f"{camera.name}: masks in {folder} are left out: {error}")
         return camera
     notes += [Note("found", f"{camera.name}: {text}") for text in mask_remarks(files)]
     return replace(camera, masks=str(folder / masks.pattern), sparse_masks=len(shared) < len(ids))
@@ -89,7 +85,7 @@ def _detect_cts(path: Path) -> bool:
 
 
 def _read_cts(path: Path, options: ImportOptions) -> FoundRecording:
-    notes: list[Note] = []
+    notes = Notes()
     domains = _ordered(each.name for each in _subfolders(path) if image_files(each / "images_l"))
     images: dict[str, Images] = {}
     ids: tuple[str, ...] = ()
@@ -134,17 +130,17 @@ def _domains(names: list[str]) -> dict[str, str]:
 
 
 def _timed(
-    arms: list[FoundArm], ids: tuple[str, ...], images: Images, options: ImportOptions, notes: list[Note]
+    arms: list[FoundArm], ids: tuple[str, ...], images: Images, options: ImportOptions, notes: Notes
 ) -> tuple[tuple[FoundArm, ...], np.ndarray | None]:
     """Arms with rows at the times of their images if a frame rate is given, and these times [s]."""
-    times = frame_times(images, ids, options, notes.append).times
+    times = frame_times(images, ids, options, notes).times
     rows = np.arange(len(ids), dtype=float)
     found, _, _ = by_rows([replace(arm, times=rows) for arm in arms], ids, notes, times)
     return found, times
 
 
 def _arm(
-    name: str, values: np.ndarray, ids: tuple[str, ...], file: Path, options: ImportOptions, notes: list[Note]
+    name: str, values: np.ndarray, ids: tuple[str, ...], file: Path, options: ImportOptions, notes: Notes
 ) -> FoundArm:
     """Joint positions of the frames: row n is frame n if no row is missing, else rows are matched in order."""
     if values.shape[1] < 6 or not np.isfinite(values).all():
@@ -163,7 +159,7 @@ def _arm(
     robot = options.robot.get(name, "builtin:psm_lnd")
     known = {joint.name: joint for joint in joints_of_arm(name, options)}
     joints = [known.get(column, Joint(column, column != "insertion", -np.inf, np.inf)) for column in columns]
-    values = in_si(values, joints, options, notes.append, arm=name)
+    values = in_si(values, joints, options, notes, arm=name)
     return FoundArm(name, columns, values[rows], None, robot)
 
 
@@ -172,14 +168,14 @@ def _detect_ambf(path: Path) -> bool:
 
 
 def _read_ambf(path: Path, options: ImportOptions) -> FoundRecording:
-    notes: list[Note] = []
+    notes = Notes()
     images = find_images(path / "images")
     (camera,) = cameras_of({"camera": images}, options, notes)
     if camera.intrinsics is None:
         width, height = images.size
         focal = height / 2 / np.tan(_AMBF_FIELD_OF_VIEW / 2)
         camera = replace(camera, intrinsics=(focal, focal, width / 2, height / 2), pixel_center=0.5)
-        notes.append(Note("guessed", "the camera sees 1.2 rad from top to bottom (change: --calibration camera FILE)."))
+        notes.guessed("the camera sees 1.2 rad from top to bottom (change: --calibration camera FILE).")
     camera = _with_masks(camera, path / "segmentations", images.ids, notes)
     file = path / "kinematics.npy"
     values = read_array(file)
@@ -192,7 +188,7 @@ def _read_ambf(path: Path, options: ImportOptions) -> FoundRecording:
         chosen = options
         if np.abs(joints[:, 2]).max() > _DECIMETRES_FROM and options.length_unit is None:
             chosen = replace(options, length_unit="dm")
-            notes.append(Note("guessed", f"PSM{number + 1}: insertion is in decimetres (change: --length-unit m)."))
+            notes.guessed(f"PSM{number + 1}: insertion is in decimetres (change: --length-unit m).")
         arms.append(_arm(f"PSM{number + 1}", joints, images.ids, file, chosen, notes))
     found, times = _timed(arms, images.ids, images, options, notes)
     return FoundRecording(
@@ -229,7 +225,7 @@ def _read_segstrong(path: Path, options: ImportOptions) -> FoundRecording:
     if not _is_subset(path):
         subsets = ", ".join(str(each.relative_to(path)) for each in _subsets(path))
         raise SequenceError(f"{path} holds several recordings. Import one of them: {subsets}.")
-    notes: list[Note] = []
+    notes = Notes()
     domains = _ordered(
         each.name for each in _subfolders(path) if each.name != "ground_truth" and image_files(each / "left")
     )

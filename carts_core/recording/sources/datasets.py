@@ -18,7 +18,7 @@ from ...files.reading import TABLE, VALUES, parse_yaml, read_text
 from ...settings.interchange import ImportOptions
 from ...wording import listed
 from ..importing.cameras import cameras_of, common_ids, find_images, image_files
-from ..importing.found import FoundArm, FoundCamera, FoundRecording, Note, Source
+from ..importing.found import FoundArm, FoundCamera, FoundRecording, Notes, Source
 from ..importing.logs import ArmLog, arm_from_log, track
 from ..importing.row_matching import by_rows, frame_times
 
@@ -45,7 +45,7 @@ def _detect_surgpose(path: Path) -> bool:
 
 
 def _read_surgpose(path: Path, options: ImportOptions) -> FoundRecording:
-    notes: list[Note] = []
+    notes = Notes()
     folder = _surgpose_folder(path)
     assert folder is not None
     images = {side: find_images(folder / f"{side}_video.mp4") for side in ("left", "right")}
@@ -72,18 +72,18 @@ def _read_surgpose(path: Path, options: ImportOptions) -> FoundRecording:
             ) from error
         if log is None or log.values.shape[1] != 6:
             raise SequenceError(f"{file}: {recorded} needs six joint positions in every frame. Copy it again.")
-        arms.append(arm_from_log(ArmLog(str(rename.get(recorded, recorded)), joints=log), options, notes.append))
-    times = frame_times(images["left"], ids, options, notes.append).times
+        arms.append(arm_from_log(ArmLog(str(rename.get(recorded, recorded)), joints=log), options, notes))
+    times = frame_times(images["left"], ids, options, notes).times
     if len(rows) != len(ids):
         text = f"{file.name} has {len(rows)} rows and there are {len(ids)} images."
-        notes.append(Note("warning", f"{text} Each row is taken for the image of its number; look at the delay."))
+        notes.warning(f"{text} Each row is taken for the image of its number; look at the delay.")
     found, kept_ids, kept = by_rows(arms, ids, notes, times)
     numbered = tuple(replace(camera, numbers=kept) for camera in cameras)
     text = (
         "the kinematics of SurgPose need compensation, its base frames differ from trajectory to trajectory, and "
         "rows of many are up to 71 frames late: estimate the delay with carts time-offset."
     )
-    notes.append(Note("warning", text))
+    notes.warning(text)
     return FoundRecording(
         "a trajectory of SurgPose",
         path.name,
@@ -110,7 +110,7 @@ def _detect_endovis(path: Path) -> bool:
 
 
 def _read_endovis(path: Path, options: ImportOptions) -> FoundRecording:
-    notes: list[Note] = []
+    notes = Notes()
     images = {
         side: find_images(path / f"{side}_frames") for side in ("left", "right") if image_files(path / f"{side}_frames")
     }
@@ -122,11 +122,11 @@ def _read_endovis(path: Path, options: ImportOptions) -> FoundRecording:
         framed = camera.size == (1920, 1080)
         shown = replace(camera, crop=_ENDOVIS_PART, size=_ENDOVIS_PART[2:]) if framed else camera
         cameras.append(_endovis_calibration(shown, path / "camera_calibration.txt", notes))
-    notes.append(Note("missing", "labels of EndoVis are of classes, not 0 and 255, and are left out."))
+    notes.missing("labels of EndoVis are of classes, not 0 and 255, and are left out.")
     return FoundRecording("a sequence of EndoVis", path.name, tuple(cameras), (), ids, None, tuple(notes))
 
 
-def _endovis_calibration(camera: FoundCamera, file: Path, notes: list[Note]) -> FoundCamera:
+def _endovis_calibration(camera: FoundCamera, file: Path, notes: Notes) -> FoundCamera:
     if camera.intrinsics is not None or not file.is_file():
         return camera
     number = 1 if camera.name == "right" else 0
@@ -146,7 +146,7 @@ def _endovis_calibration(camera: FoundCamera, file: Path, notes: list[Note]) -> 
             T[:3, 3] = np.array(values["Extrinsic-T"][:3]) * 1e-3
     except (OSError, ValueError, KeyError) as error:
         raise SequenceError(f"{file} lacks a readable {error}. Copy it again, or give --calibration.") from error
-    notes.append(Note("found", f"calibration of {camera.name}: from {file.name}."))
+    notes.found(f"calibration of {camera.name}: from {file.name}.")
     return replace(camera, intrinsics=(fx, fy, cx, cy), distortion=distortion, T_camera_world=T)
 
 
@@ -185,7 +185,7 @@ def _read_jigsaws(path: Path, options: ImportOptions) -> FoundRecording:
     if not trials:
         raise SequenceError(f"{path} has no kinematics/AllGestures/TRIAL.txt. Give the root of JIGSAWS, or a trial.")
     path = trials[0]
-    notes: list[Note] = []
+    notes = Notes()
     try:
         rows = np.array([line.split() for line in read_text(path, TABLE).splitlines() if line.strip()], np.float64)
     except (OSError, ValueError) as error:
@@ -202,7 +202,7 @@ def _read_jigsaws(path: Path, options: ImportOptions) -> FoundRecording:
     rate = options.frame_rate or _JIGSAWS_RATE
     times = np.arange(len(rows), dtype=float) / rate
     if len(rows) != len(ids):
-        notes.append(Note("warning", f"{path.name} has {len(rows)} rows and there are {len(ids)} images."))
+        notes.warning(f"{path.name} has {len(rows)} rows and there are {len(ids)} images.")
     arms: list[FoundArm] = []
     for arm, first in _JIGSAWS_ARMS.items():
         R = rows[:, first + 3 : first + 12].reshape(-1, 3, 3)
@@ -215,8 +215,8 @@ def _read_jigsaws(path: Path, options: ImportOptions) -> FoundRecording:
         log = ArmLog(
             arm, jaw=jaw, poses=logged if seen else None, local_poses=None if seen else logged, opencv_axes=True
         )
-        arms.append(arm_from_log(log, options, notes.append))
-    taken = frame_times(next(iter(images.values())), ids, replace(options, frame_rate=rate), notes.append).times
+        arms.append(arm_from_log(log, options, notes))
+    taken = frame_times(next(iter(images.values())), ids, replace(options, frame_rate=rate), notes).times
     offset = options.time_offset or 0.0
     return FoundRecording("a trial of JIGSAWS", path.stem, cameras, tuple(arms), ids, taken, tuple(notes), offset)
 

@@ -18,7 +18,7 @@ from ..image_sources import Bag
 from ..importing.cameras import calibration_of, find_images, side_of
 from ..importing.columns import order_of_names
 from ..importing.foreign_tables import ForeignTable, read_foreign_table
-from ..importing.found import FoundCamera, FoundMotion, FoundRecording, Note, Source
+from ..importing.found import FoundCamera, FoundMotion, FoundRecording, Notes, Source
 from ..importing.logs import ArmLog, Track, arm_from_log, nearest, track
 from ..video import SUFFIXES
 from .bag import read_arm_logs, read_endoscope
@@ -71,7 +71,7 @@ def _videos(path: Path) -> list[Path]:
         return []
 
 
-def _streams(path: Path, notes: list[Note]) -> list[_Stream]:
+def _streams(path: Path, notes: Notes) -> list[_Stream]:
     videos = _videos(path)
     if (path / "index.json").is_file():
         index = _json(path / "index.json", "index")
@@ -90,7 +90,7 @@ def _streams(path: Path, notes: list[Note]) -> list[_Stream]:
     return streams
 
 
-def _stream(video: Path, sidecar: Path, notes: list[Note]) -> _Stream:
+def _stream(video: Path, sidecar: Path, notes: Notes) -> _Stream:
     content = _json(sidecar, "sidecar")
     if not isinstance(content, dict):
         raise SequenceError(f"sidecar {sidecar} holds no named values. Copy it again.")
@@ -115,7 +115,7 @@ def _stream(video: Path, sidecar: Path, notes: list[Note]) -> _Stream:
     latency = content.get("estimated_latency_ms")
     latency = float(latency) * 1e-3 if isinstance(latency, int | float) else 0.0
     if (dropped := content.get("frames_dropped")) not in (0, None):
-        notes.append(Note("warning", f"{video.name}: the recorder dropped {dropped} frames."))
+        notes.warning(f"{video.name}: the recorder dropped {dropped} frames.")
     return _checked(_Stream(video, name, numbers, times, layout, latency), sidecar, notes)
 
 
@@ -145,14 +145,14 @@ def _frame_time(frame: dict[str, Any]) -> float:
     raise KeyError("any time in cpu.realtime")
 
 
-def _checked(stream: _Stream, sidecar: Path, notes: list[Note]) -> _Stream:
+def _checked(stream: _Stream, sidecar: Path, notes: Notes) -> _Stream:
     """The stream without frames that are missing in the video, sorted by time."""
     count = len(find_images(stream.video).ids)
     if stream.numbers.max() >= count or len(stream.numbers) < count:
         text = (
             f"{stream.video.name} has {count} frames and its sidecar {len(stream.numbers)}; the common ones are used."
         )
-        notes.append(Note("warning", text))
+        notes.warning(text)
     good = (stream.numbers >= 0) & (stream.numbers < count) & np.isfinite(stream.times)
     if not good.any():
         raise SequenceError(
@@ -165,7 +165,7 @@ def _checked(stream: _Stream, sidecar: Path, notes: list[Note]) -> _Stream:
 
 
 def _cameras(
-    streams: list[_Stream], options: ImportOptions, notes: list[Note]
+    streams: list[_Stream], options: ImportOptions, notes: Notes
 ) -> tuple[tuple[FoundCamera, ...], np.ndarray]:
     parts: dict[str, tuple[_Stream, tuple[int, int, int, int] | None, tuple[int, int]]] = {}
     for stream in streams:
@@ -174,7 +174,7 @@ def _cameras(
         if layout == "undefined" and width >= 3 * height:
             layout = "LR"
             text = f"{stream.video.name} is {width} x {height}: side-by-side stereo, the left camera at the left"
-            notes.append(Note("guessed", f"{text} (its sidecar does not say)."))
+            notes.guessed(f"{text} (its sidecar does not say).")
         if layout in _SIDES:
             half = width // 2
             for position, side in enumerate(_SIDES[layout]):
@@ -188,22 +188,20 @@ def _cameras(
         stream, crop, size = parts[name]
         rows = nearest(leader.times, stream.times)
         if (late := np.abs(stream.times[rows] - leader.times).max()) > _FAR:
-            notes.append(Note("warning", f"images of {name} are up to {late:.3f} s from those of {order[0]}."))
+            notes.warning(f"images of {name} are up to {late:.3f} s from those of {order[0]}.")
         camera = FoundCamera(name, size, stream.video, crop=crop, numbers=stream.numbers[rows])
         cameras.append(calibration_of(camera, options, notes))
         where = "" if crop is None else f", its part from column {crop[0]}"
-        notes.append(Note("found", f"camera {name}: {stream.video.name}{where}, {len(stream.times)} frames."))
+        notes.found(f"camera {name}: {stream.video.name}{where}, {len(stream.times)} frames.")
     return tuple(cameras), leader.times
 
 
-def _logs(
-    path: Path, options: ImportOptions, start: float, notes: list[Note]
-) -> tuple[list[ArmLog], FoundMotion | None]:
+def _logs(path: Path, options: ImportOptions, start: float, notes: Notes) -> tuple[list[ArmLog], FoundMotion | None]:
     bags = [each for each in sorted(path.iterdir()) if (each / "metadata.yaml").is_file()]
     bags += sorted(path.glob("*.mcap"))
     if bags:
         with Bag(bags[0]) as bag:
-            motion = read_endoscope(bag, start, notes.append)
+            motion = read_endoscope(bag, start, notes)
             return read_arm_logs(bag, options, notes), motion
     return _extracted(path, options), None
 
@@ -242,7 +240,7 @@ def _extracted_track(file: Path, role: str) -> Track | None:
 
 
 def _read(path: Path, options: ImportOptions) -> FoundRecording:
-    notes: list[Note] = []
+    notes = Notes()
     streams = _streams(path, notes)
     if not streams:
         raise SequenceError(f"{path} has no videos with sidecars. Record a stream, or copy the session again, whole.")
@@ -253,13 +251,11 @@ def _read(path: Path, options: ImportOptions) -> FoundRecording:
             f"{path} has no kinematics: neither a bag with /PSM1/measured_cp or measured_js nor CSV files extracted "
             "from one (_PSM1_measured_js.csv). Copy the bag's folder too."
         )
-    arms = tuple(arm_from_log(log, options, notes.append) for log in logs)
+    arms = tuple(arm_from_log(log, options, notes) for log in logs)
     latency = max(stream.latency for stream in streams)
     offset = -latency if options.time_offset is None else options.time_offset
     if latency and options.time_offset is None:
-        notes.append(
-            Note("guessed", f"time offset {-latency:.4f} s: the recorder's estimated latency (change: --time-offset).")
-        )
+        notes.guessed(f"time offset {-latency:.4f} s: the recorder's estimated latency (change: --time-offset).")
     ids = tuple(f"{number:06d}" for number in range(len(times)))
     return FoundRecording(
         "a session of the dVRK's recorder", path.name, cameras, arms, ids, times, tuple(notes), offset, motion

@@ -12,7 +12,7 @@ from ...settings.interchange import NO_TABLE, ImportOptions
 from ..importing.cameras import Images, cameras_of, common_ids, find_images, image_files, side_of
 from ..importing.columns import ColumnMeanings, arm_in, arm_log, guess_columns, log_rows, samples
 from ..importing.foreign_tables import TABLE_SUFFIXES, ForeignTable, read_foreign_table
-from ..importing.found import FoundArm, FoundRecording, Note, Source
+from ..importing.found import FoundArm, FoundRecording, Note, Notes, Source
 from ..importing.logs import arm_from_log
 from ..importing.row_matching import FrameTimes, RowMatch, by_rows, frame_times, match_rows, row_seconds
 from ..video import SUFFIXES
@@ -89,7 +89,7 @@ def _images(path: Path, options: ImportOptions) -> dict[str, Images]:
     return {side: find_images(found[0]) for side, found in sorted(named.items())}
 
 
-def _calibrations(path: Path, cameras: list[str], options: ImportOptions, notes: list[Note]) -> dict[str, Path]:
+def _calibrations(path: Path, cameras: list[str], options: ImportOptions, notes: Notes) -> dict[str, Path]:
     """Calibration files of the cameras without a given one: of the same side, or the only one."""
     files = [file for file in _files(path, _CALIBRATION_SUFFIXES) if _looks_like_calibration(file)]
     found: dict[str, Path] = {}
@@ -102,9 +102,7 @@ def _calibrations(path: Path, cameras: list[str], options: ImportOptions, notes:
             found[camera] = (shared or files)[0]
     found = {camera: file for camera, file in found.items() if camera not in options.calibration}
     for camera, file in found.items():
-        notes.append(
-            Note("guessed", f"{file.name} is the calibration of {camera} (change: --calibration {camera} FILE).")
-        )
+        notes.guessed(f"{file.name} is the calibration of {camera} (change: --calibration {camera} FILE).")
     return found
 
 
@@ -146,7 +144,7 @@ def _is_wide(table: ForeignTable) -> bool:
     return len(table) > 1 and sum(values.dtype.kind in "iuf" for values in table.columns.values()) >= len(JOINT_NAMES)
 
 
-def _kinematics(path: Path, options: ImportOptions, notes: list[Note]) -> list[tuple[ForeignTable, ColumnMeanings]]:
+def _kinematics(path: Path, options: ImportOptions, notes: Notes) -> list[tuple[ForeignTable, ColumnMeanings]]:
     """Tables that contain an arm, each another one, with the meanings of their columns.
 
     Raises:
@@ -176,7 +174,7 @@ def _kinematics(path: Path, options: ImportOptions, notes: list[Note]) -> list[t
         if taken := [arm for arm in named.arms if arm in known]:
             text = f"{table.path} has joints or poses of {taken[0] or 'an arm'} too, and is not used"
             remedy = "(change: --kinematics). Call files of other arms by their names, say psm2.csv."
-            notes.append(Note("warning", f"{text} {remedy}"))
+            notes.warning(f"{text} {remedy}")
             continue
         known |= dict.fromkeys(named.arms, table)
         chosen.append((table, named))
@@ -201,7 +199,7 @@ def _of_file(table: ForeignTable, meanings: ColumnMeanings) -> ColumnMeanings:
 
 
 def _frames(
-    path: Path, images: Images, ids: tuple[str, ...], kinematics: list[Path], options: ImportOptions, notes: list[Note]
+    path: Path, images: Images, ids: tuple[str, ...], kinematics: list[Path], options: ImportOptions, notes: Notes
 ) -> FrameTimes:
     """Images with their times: from a table with as many rows as images, else from a video's rate."""
     for file in _tables(path):
@@ -210,18 +208,18 @@ def _frames(
             continue
         meanings = guess_columns(table, replace(options, columns={}, kinematics=None))
         if meanings.time is not None and not meanings.arms and len(table) == len(ids):
-            notes.append(Note("guessed", f"times of the images are in {file.name}."))
-            times = row_seconds(log_rows(table, meanings), None, notes.append)
-            found = frame_times(images, ids, replace(options, frame_rate=None), lambda note: None)
+            notes.guessed(f"times of the images are in {file.name}.")
+            times = row_seconds(log_rows(table, meanings), None, notes)
+            found = frame_times(images, ids, replace(options, frame_rate=None), Notes())
             if options.frame_rate is not None:
                 text = f"--frame-rate {options.frame_rate:g} is not used: the images have times in {file.name}."
-                notes.append(Note("warning", text))
+                notes.warning(text)
             return replace(found, times=times, source=file.name, nominal=False)
-    return frame_times(images, ids, options, notes.append)
+    return frame_times(images, ids, options, notes)
 
 
 def _read(path: Path, options: ImportOptions) -> FoundRecording:
-    notes: list[Note] = []
+    notes = Notes()
     images = _images(path, options)
     cameras = cameras_of(images, options, notes, _calibrations(path, list(images), options, notes))
     ids = common_ids(list(images.values()))
@@ -232,7 +230,7 @@ def _read(path: Path, options: ImportOptions) -> FoundRecording:
                 f"{name}: {len(lacking)} of {len(each.ids)} images left out, since another camera has none of that "
                 f"frame: {shown}. To keep them, import {name} alone: --images {name} {each.path.name}."
             )
-            notes.append(Note("warning", text))
+            notes.warning(text)
     if not ids:
         raise SequenceError(f"{path}: no frame has an image of every camera. Number them alike, or import one camera.")
     found = _kinematics(path, options, notes)
@@ -268,7 +266,7 @@ def _without_kinematics(path: Path, options: ImportOptions) -> Note:
 
 
 def _matched(
-    found: list[tuple[ForeignTable, ColumnMeanings]], frames: FrameTimes, options: ImportOptions, notes: list[Note]
+    found: list[tuple[ForeignTable, ColumnMeanings]], frames: FrameTimes, options: ImportOptions, notes: Notes
 ) -> tuple[tuple[FoundArm, ...], RowMatch]:
     """Arms of all tables, and the common matching of their rows with images.
 
@@ -282,7 +280,7 @@ def _matched(
         notes.append(Note(kind, f"kinematics: {table.path}, {len(table)} rows (change: --kinematics)."))
         notes += [Note("found", f"{table.path.name}: {remark}.") for remark in table.remarks]
         try:
-            match = match_rows(frames, log_rows(table, meanings), options, notes.append)
+            match = match_rows(frames, log_rows(table, meanings), options, notes)
         except SequenceError as error:
             others = [f"{other.path.name}, {len(other)} rows" for other, _ in found if other is not table]
             also = f" Beside it lies {'; '.join(others)}." if others else ""
@@ -300,7 +298,7 @@ def _matched(
 
 
 def _arms(
-    table: ForeignTable, meanings: ColumnMeanings, rows: np.ndarray, options: ImportOptions, notes: list[Note]
+    table: ForeignTable, meanings: ColumnMeanings, rows: np.ndarray, options: ImportOptions, notes: Notes
 ) -> tuple[FoundArm, ...]:
     """Arms with a time for each row; rows without an image are dropped."""
     rename = {recorded: name for name, recorded in options.arms.items()}
@@ -309,8 +307,8 @@ def _arms(
         if options.arms and recorded not in rename and len(meanings.arms) > 1:
             continue
         name = rename.get(recorded) or recorded or next(iter(options.arms), "PSM1")
-        log = arm_log(table, name, found, rows, options, notes.append, meanings.stated)
-        arms.append(arm_from_log(log, options, notes.append))
+        log = arm_log(table, name, found, rows, options, notes, meanings.stated)
+        arms.append(arm_from_log(log, options, notes))
     return tuple(arms)
 
 

@@ -14,7 +14,7 @@ from ...settings.interchange import ImportOptions
 from ..importing.cameras import calibration_of, find_images, side_of
 from ..importing.columns import arm_log, guess_columns, samples
 from ..importing.foreign_tables import ForeignTable, read_parquet
-from ..importing.found import FoundArm, FoundCamera, FoundRecording, Note, Source
+from ..importing.found import FoundArm, FoundCamera, FoundRecording, Notes, Source
 from ..importing.logs import arm_from_log, nearest
 from ..importing.row_matching import by_rows
 
@@ -55,7 +55,7 @@ def _read(path: Path, options: ImportOptions) -> FoundRecording:
         raise SequenceError(
             f"{root / 'meta/info.json'} is no LeRobot description with features and fps ({error!r}). Copy it again."
         ) from error
-    notes: list[Note] = []
+    notes = Notes()
     wanted = _EPISODE.search(path.name)
     cameras = [key for key, value in features.items() if isinstance(value, dict) and value.get("dtype") == "video"]
     episode = _episode(root, info, cameras, int(wanted.group(1)) if wanted else 0, notes)
@@ -63,9 +63,7 @@ def _read(path: Path, options: ImportOptions) -> FoundRecording:
     if not rows:
         raise SequenceError(f"{root}: episode {episode.index} has no rows. Name another one.")
     if (total := info.get("total_episodes", 1)) != 1:
-        notes.append(
-            Note("found", f"episode {episode.index} of {total}; give an episode's .parquet file for another one.")
-        )
+        notes.found(f"episode {episode.index} of {total}; give an episode's .parquet file for another one.")
     ids = tuple(f"{number:06d}" for number in range(rows))
     arms = _arms(root, features, episode, options, notes)
     times = _times(root, episode, rate, notes)
@@ -83,7 +81,7 @@ def _read(path: Path, options: ImportOptions) -> FoundRecording:
     )
 
 
-def _times(root: Path, episode: _Episode, rate: float, notes: list[Note]) -> np.ndarray:
+def _times(root: Path, episode: _Episode, rate: float, notes: Notes) -> np.ndarray:
     """Times of an episode's rows, which are its images [s]: from their column, else from the rate."""
     even = np.arange(len(episode.table)) / rate
     if "timestamp" not in episode.table.columns:
@@ -91,7 +89,7 @@ def _times(root: Path, episode: _Episode, rate: float, notes: list[Note]) -> np.
     times = episode.table.numbers("timestamp").astype(np.float64)
     if times.shape != even.shape or not np.isfinite(times).all() or (np.diff(times) <= 0).any():
         text = "the column timestamp does not increase and is not used; times are those of the rate"
-        notes.append(Note("warning", f"{text}, {rate:g} images/s."))
+        notes.warning(f"{text}, {rate:g} images/s.")
         return even
     times = times - times[0]
     if (late := np.abs(times - even).max()) > 0.5 / rate:
@@ -99,13 +97,13 @@ def _times(root: Path, episode: _Episode, rate: float, notes: list[Note]) -> np.
             f"times of the column timestamp are up to {late:.3f} s from those of {rate:g} images/s. They are used; "
             "row n is taken for image n of the episode."
         )
-        notes.append(Note("warning", text))
+        notes.warning(text)
         return times
     # Numbers of single precision are no better than the rate.
     return even
 
 
-def _episode(root: Path, info: dict[str, Any], cameras: list[str], index: int, notes: list[Note]) -> _Episode:
+def _episode(root: Path, info: dict[str, Any], cameras: list[str], index: int, notes: Notes) -> _Episode:
     chunk = index // max(int(info.get("chunks_size", 1000)), 1)
     old = root / f"data/chunk-{chunk:03d}/episode_{index:06d}.parquet"
     if old.is_file():
@@ -161,7 +159,7 @@ def _names(value: Any) -> list[str]:
 
 
 def _arms(
-    root: Path, features: dict[str, Any], episode: _Episode, options: ImportOptions, notes: list[Note]
+    root: Path, features: dict[str, Any], episode: _Episode, options: ImportOptions, notes: Notes
 ) -> tuple[FoundArm, ...]:
     if _STATE not in features or _STATE not in episode.table.columns:
         raise SequenceError(f"{root} has no feature {_STATE}. Its features are: {', '.join(features)}.")
@@ -188,13 +186,13 @@ def _arms(
         if rename and recorded not in rename:
             continue
         name = rename.get(recorded, recorded or "PSM1")
-        log = arm_log(table, name, columns, times, options, notes.append, meanings.stated)
-        arms.append(arm_from_log(log, options, notes.append))
+        log = arm_log(table, name, columns, times, options, notes, meanings.stated)
+        arms.append(arm_from_log(log, options, notes))
     return tuple(arms)
 
 
 def _cameras(
-    root: Path, episode: _Episode, kept: np.ndarray, times: np.ndarray, options: ImportOptions, notes: list[Note]
+    root: Path, episode: _Episode, kept: np.ndarray, times: np.ndarray, options: ImportOptions, notes: Notes
 ) -> tuple[FoundCamera, ...]:
     rows = len(times)
     chosen = {name: key for name, key in options.images.items()} or {
@@ -213,13 +211,13 @@ def _cameras(
                 f"video {video} has {len(images.ids)} frames, but episode {episode.index} is frames {start} to "
                 f"{start + rows - 1}. Copy it again."
             )
-        notes.append(Note("found", f"camera {name}: {key}, {images.size[0]} x {images.size[1]}."))
+        notes.found(f"camera {name}: {key}, {images.size[0]} x {images.size[1]}.")
         numbers = start + kept
         if start == 0 and len(images.ids) > rows and images.times is not None:
             # A video of this episode alone, with images that have no row.
             numbers = nearest(times, images.times - images.times[0])[kept]
             text = f"{video.name} has {len(images.ids)} images for {rows} rows; rows meet images by time."
-            notes.append(Note("warning", text))
+            notes.warning(text)
         camera = FoundCamera(name, images.size, video, numbers=numbers)
         cameras.append(calibration_of(camera, options, notes))
     return tuple(cameras)

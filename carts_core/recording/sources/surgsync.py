@@ -19,7 +19,7 @@ from ...settings.interchange import ImportOptions
 from ..importing.cameras import Images, cameras_of, common_ids, find_images, image_files
 from ..importing.columns import order_of_names
 from ..importing.foreign_tables import read_foreign_table
-from ..importing.found import FoundArm, FoundCamera, FoundRecording, Note, Source
+from ..importing.found import FoundArm, FoundCamera, FoundRecording, Notes, Source
 from ..importing.logs import ArmLog, Track, arm_from_log, track
 from ..importing.row_matching import by_rows, frame_times
 
@@ -34,7 +34,7 @@ def _detect(path: Path) -> bool:
 
 
 def _read(path: Path, options: ImportOptions) -> FoundRecording:
-    notes: list[Note] = []
+    notes = Notes()
     packed = (path / "video_raw").is_dir()
     images: dict[str, Images] = {}
     for side in ("left", "right"):
@@ -58,10 +58,10 @@ def _read(path: Path, options: ImportOptions) -> FoundRecording:
         tracks = _packed(path, recorded) if packed else _raw(path, recorded, ids)
         if any(found is not None for found in tracks.values()):
             log = ArmLog(rename.get(recorded, recorded), **tracks)
-            arms.append(arm_from_log(log, options, notes.append))
+            arms.append(arm_from_log(log, options, notes))
     if not arms:
         raise SequenceError(f"{path} has no kinematics of {', '.join(_ARMS)}. Copy it again, whole.")
-    times = frame_times(next(iter(images.values())), ids, options, notes.append).times
+    times = frame_times(next(iter(images.values())), ids, options, notes).times
     found, kept_ids, kept = by_rows(arms, ids, notes, times)
     if packed:
         cameras = tuple(replace(camera, numbers=kept) for camera in cameras)
@@ -80,7 +80,7 @@ def _registrations(path: Path) -> dict[str, Path]:
     return {file.name.partition("-")[0]: file for file in files}
 
 
-def _with_extrinsics(camera: FoundCamera, file: Path, notes: list[Note]) -> FoundCamera:
+def _with_extrinsics(camera: FoundCamera, file: Path, notes: Notes) -> FoundCamera:
     """The right camera at its pose of the stereo calibration, if the file has R and T."""
     if camera.name != "right":
         return camera
@@ -89,7 +89,7 @@ def _with_extrinsics(camera: FoundCamera, file: Path, notes: list[Note]) -> Foun
         R = np.array(content["R"], np.float64).reshape(3, 3)
         T = np.array(content["T"], np.float64).reshape(3)
     except (KeyError, TypeError, ValueError):
-        notes.append(Note("warning", f"{file} has no R and T; the right camera is placed by right.yaml alone."))
+        notes.warning(f"{file} has no R and T; the right camera is placed by right.yaml alone.")
         return camera
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = R, T * (1e-3 if np.linalg.norm(T) > 1.0 else 1.0)
