@@ -25,12 +25,12 @@ class Checkpoint:
     """File of intermediate results.
 
     Args:
-        path: the file; it is made with the first entry.
-        made_with: fingerprint of what all entries depend on; a file of another one is replaced.
+        path: the file, created with the first entry.
+        made_with: fingerprint of the common inputs; a file with another one is replaced.
         classes: the frozen dataclasses that values consist of, beside numbers, lists and float64 arrays.
 
     Attributes:
-        recalled: how many values were looked up and not computed.
+        recalled: number of values that were looked up.
     """
 
     def __init__(self, path: OutputPath, made_with: str, classes: Sequence[type]) -> None:

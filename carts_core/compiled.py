@@ -15,7 +15,7 @@ def compiled(function: Callable[..., Any]) -> Any:
     """`function` compiled by numba, with a cache on disk.
 
     Where neither its folder nor the user's cache can be written to, it is compiled anew in each process, which takes
-    some seconds; a line on the standard error says so once.
+    some seconds; a line on standard error announces it once.
     """
     options: dict[str, Any] = {"nogil": True, "fastmath": False, "error_model": "numpy"}
     try:

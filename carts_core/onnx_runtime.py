@@ -24,7 +24,7 @@ def inference_session(graph: bytes, threads: int | None = None, *, fold: bool = 
         ImportError: ONNX Runtime is not installed.
         RuntimeError: it cannot load the graph.
     """
-    # Read by the library when it is loaded.
+    # The library reads it when it is loaded.
     os.environ["ORT_DISABLE_TELEMETRY"] = "1"
     import onnxruntime  # noqa: PLC0415  slow to load, and not needed by torch
 
@@ -40,5 +40,5 @@ def inference_session(graph: bytes, threads: int | None = None, *, fold: bool = 
     left_out = [] if fold else ["ConstantFolding"]
     try:
         return onnxruntime.InferenceSession(graph, options, ["CPUExecutionProvider"], disabled_optimizers=left_out)
-    except Exception as error:  # Its errors have no base class but this.
+    except Exception as error:  # Its errors have no more specific base class.
         raise RuntimeError(str(error)) from error

@@ -101,7 +101,7 @@ def stopped_by_signals() -> Iterator[None]:
         nonlocal since
         since = since or time.monotonic()
         if os.getpid() != owner:
-            # A forked child, which is to end as one that never heard of this.
+            # A forked child ends without the cleanup of its parent.
             signal.signal(number, signal.SIG_DFL)
             os.kill(os.getpid(), number)
         elif _Unfinished.blocks:

@@ -73,7 +73,7 @@ def write_annotations(
     """Write images and an annotation file with the name that CVAT and Datumaro expect.
 
     Args:
-        dataset, folder, monitor: what is written where, and who hears of progress.
+        dataset, folder, monitor: content, output, and progress.
         kind: `instances` or `person_keypoints`, as COCO names its files.
         categories: as COCO has them.
         annotate: the objects of a view, without their numbers.
@@ -117,7 +117,7 @@ def write_coco_keypoints(dataset: Dataset, folder: OutputPath, monitor: Monitor)
             yield from _annotations(dataset, view, category, points[category.arm])
 
     categories = [_category(category, points[category.arm]) for category in dataset.arms]
-    # "person" whoever has the keypoints: CVAT and Datumaro look for no other name.
+    # CVAT and Datumaro expect "person" in the name, whatever the object is.
     write_annotations(dataset, folder, monitor, "person_keypoints", categories, annotations)
 
 
@@ -125,7 +125,7 @@ def _category(category: Category, points: tuple[Keypoint, ...]) -> dict[str, Any
     names = [point.name for point in points]
     tips = [number for number, name in enumerate(names, start=1) if name.endswith(" tip")]
     joints = [number for number in range(1, len(names) + 1) if number not in tips]
-    # The joints lie along the instrument, and every tip hangs on the joint that is nearest to it.
+    # The joints are a chain along the instrument; every tip is connected to its nearest joint.
     skeleton = [*pairwise(joints), *((tip, joints[0]) for tip in tips if joints)]
     return {
         "id": category.id,

@@ -195,7 +195,7 @@ class Dataset:
             ids = {arm.name: arm.id for arm in self.arms}
             return [ids[link.arm] for link in self.links]
         numbers = [one.number for one in part_classes(self.scene.arms)]
-        # Links that nothing shows have a class that need not be there.
+        # Links without a mesh may have no class.
         return [numbers.index(number) + 1 if number in numbers else 0 for number in self.link_classes.tolist()]
 
     def instances(self, view: View) -> Iterator[tuple[Category, Bool[np.ndarray, "height width"]]]:
@@ -303,9 +303,9 @@ def labelled(
     """`rendered` labels restricted to `mask`; additional pixels get the label of the nearest rendered pixel.
 
     Args:
-        mask: where arms are visible.
+        mask: pixels of the arms.
         rendered: labels from 0, -1 for background.
-        where: what errors call the view.
+        where: name of the view in errors.
 
     Raises:
         CartsError: the mask has another size, or nothing is rendered that could name its pixels.
@@ -345,7 +345,7 @@ def painted_links(
         link_ids: labels from 0, -1 for background.
         rendered: the same before a mask was applied.
         classes: number of the class of every link.
-        where: what errors call the view.
+        where: name of the view in errors.
 
     Raises:
         CartsError: the labels have another size, or name a class that no link has.

@@ -60,8 +60,8 @@ MIN_POINTS = 3
 def polygons(mask: Bool[np.ndarray, "height width"]) -> list[Int[np.ndarray, "points 2"]]:
     """One closed polygon per connected part of a mask, through the centres of the pixels on its rim.
 
-    Filled with its edges, as OpenCV does, each gives back the very pixels. A hole is reached through a slit of no
-    width, since a polygon has one rim only.
+    Filled with its edges, as by OpenCV, each gives exactly the pixels of its part. Holes are connected by a slit of
+    zero width, since a polygon has one rim only.
 
     Returns:
         Points (column, row) [px], whole numbers; pixel (0, 0) is at (0, 0).

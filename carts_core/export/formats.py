@@ -73,11 +73,11 @@ def export(
     """Write a dataset in a format; the output is replaced atomically.
 
     Args:
-        dataset: what to write.
+        dataset: content of the export.
         name: one of `FORMATS`.
         output: the folder, or the file, to make. A file's name gets the format's suffix if it has another one.
         overwrite: replace a file, or a folder that an export made.
-        monitor: gets progress and can cancel.
+        monitor: progress and cancellation.
 
     Returns:
         The path that was written.

@@ -134,7 +134,7 @@ def prepare() -> None:
 class Decoder:
     """Child process that runs decoders one after the other; it starts with the first call, and again after a failure.
 
-    Its decoders may keep what they have opened from call to call. Not safe to use from several threads at once.
+    Decoders may keep files open between calls. Not thread-safe.
     """
 
     def __init__(self, *, idle: float = _IDLE) -> None:
@@ -149,7 +149,7 @@ class Decoder:
         request = _packed([os.getcwd(), function.__module__, function.__qualname__, arguments, *vars(limits).values()])
         try:
             if (reply := self._reply(request, limits)) is None:
-                # The child had been idle for so long that it ended when it was asked.
+                # The idle child ended as the request was sent.
                 reply = self._reply(request, limits)
         except BaseException:
             self.close()
@@ -160,7 +160,7 @@ class Decoder:
         if kind == "result":
             return values[0]
         if kind == "system":
-            raise OSError(*values[:2], *map(str, values[2:]))  # With the class that belongs to the number.
+            raise OSError(*values[:2], *map(str, values[2:]))  # Python chooses the subclass by the number.
         if kind == "memory":
             self.close()
             raise _needs_memory(limits)
@@ -265,7 +265,7 @@ def serve() -> None:
     """Entry point of the child; the command line has the parent's process id, a pipe and the longest idle time [s]."""
     parent, descriptor, idle = sys.argv[1:4]
     end_with_parent(int(parent), signal.SIGKILL)
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is handled by the parent.
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     with Connection(int(descriptor)) as pipe, contextlib.suppress(EOFError, ConnectionError):
         while pipe.poll(float(idle)):

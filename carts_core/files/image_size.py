@@ -123,7 +123,7 @@ def pixels_problem(width: int, height: int) -> str | None:
 
 def _size(content: bytes) -> tuple[int, int] | None:
     if content.startswith(PNG):
-        # The header is always the first chunk.
+        # IHDR is always the first chunk.
         header = content[16:24] if content[12:16] == b"IHDR" else b""
         return (int.from_bytes(header[:4], "big"), int.from_bytes(header[4:], "big")) if len(header) == 8 else None
     if content.startswith(JPEG):
@@ -157,9 +157,9 @@ def _other_size(content: bytes) -> tuple[int, int] | None:
         image = Image.open(io.BytesIO(content), formats=_OTHERS)
         tags = getattr(image, "tag_v2", {})
         tile_width, tile_height = (int(tags.get(tag, 0)) for tag in _TIFF_TILE)
-    except Image.DecompressionBombError:  # Pillow does not say how many pixels it has, only that they are far too many.
+    except Image.DecompressionBombError:  # Pillow does not give the number of pixels then.
         return _FAR_TOO_LARGE
     except Exception:  # Pillow raises whatever its format readers raise.
         return None
-    # A tile is decoded whole, however small the image.
+    # Tiles are decoded whole, even those of small images.
     return max(image.width, tile_width), max(image.height, tile_height)

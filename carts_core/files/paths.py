@@ -34,7 +34,7 @@ def name_fault(text: str, most_bytes: int = NAME_BYTES) -> str | None:
     that is too long is not.
 
     Args:
-        text: a foreign name: of a sequence, frame, camera, domain or arm.
+        text: an untrusted name of a sequence, frame, camera, domain or arm.
         most_bytes: its largest length in UTF-8.
     """
     if not text:
@@ -62,7 +62,7 @@ def check_name(text: str, what: str, most_bytes: int = NAME_BYTES) -> str:
 
     Args:
         text: the name.
-        what: what bears it, for the error, such as "camera".
+        what: owner of the name for the error, such as "camera".
         most_bytes: its largest length in UTF-8.
 
     Raises:
@@ -78,15 +78,15 @@ def check_name(text: str, what: str, most_bytes: int = NAME_BYTES) -> str:
 class OutputPath(os.PathLike[str]):
     """A file or folder to write. Made by `output_path` and `/`, which check every name.
 
-    What writes to it follows links on the way to `folder`, which a person named, and none below it.
+    Links are followed on the way to `folder`, which is named by the user, and not below it.
     """
 
     folder: Path
-    """What a person named; it need not exist."""
+    """Folder named by the user; it need not exist."""
     names: tuple[str, ...] = ()
     """The way from there, each the name of one folder or file."""
     draft: bool = False
-    """Below a new folder that nobody reads before it is whole: files there are written once, and synced together."""
+    """Whether it is in an unpublished folder, whose files are written once and synchronized together."""
 
     def __truediv__(self, name: str) -> "OutputPath":
         check_name(name, f"a file or folder in {self.path}", _FILE_BYTES)
@@ -100,7 +100,7 @@ class OutputPath(os.PathLike[str]):
 
     @property
     def path(self) -> Path:
-        """For reading, and for people."""
+        """The path, for reading and for messages."""
         return self.folder.joinpath(*self.names)
 
     @property
@@ -120,8 +120,8 @@ def output_path(folder: Path, *names: str, draft: bool = False) -> OutputPath:
     """The path of a file or folder to write: every such path is made here.
 
     Args:
-        folder: named by a person, on the command line or in the environment; never by a recording.
-        names: the way from there; each may be foreign.
+        folder: named by the user, on the command line or in the environment; never by a recording.
+        names: components below it, which may be untrusted.
         draft: see `OutputPath`.
 
     Raises:
@@ -134,7 +134,7 @@ def output_path(folder: Path, *names: str, draft: bool = False) -> OutputPath:
 
 
 def as_output(path: OutputPath | Path) -> OutputPath:
-    """The last component of a path that a person named as one that no link is followed at."""
+    """An output path whose last component may not be a link."""
     if isinstance(path, OutputPath) and path.names:
         return path
     draft = isinstance(path, OutputPath) and path.draft
@@ -224,7 +224,7 @@ def status(folder: int, name: str) -> os.stat_result | None:
 
 
 def kind_of(found: os.stat_result) -> str:
-    """What something is, for people."""
+    """Kind of an entry, as a noun."""
     names = {stat.S_IFLNK: "a link", stat.S_IFDIR: "a folder", stat.S_IFREG: "a file", stat.S_IFIFO: "a pipe"}
     return names.get(stat.S_IFMT(found.st_mode), "a device or socket")
 
@@ -247,7 +247,7 @@ def _step(folder: int, name: str, path: Path, make: bool) -> int:
 
 
 def _make(folder: Path) -> None:
-    """Make a folder that a person named, and those above it, and have their names on disk."""
+    """Make a folder and missing ones above it, synchronized to disk."""
     if folder.is_dir():
         return
     _make(folder.parent)

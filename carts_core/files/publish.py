@@ -46,7 +46,7 @@ class Staging:
     def remove(self) -> None:
         """Remove the folder and its content; links are removed, not followed.
 
-        The mark goes last, so what a kill leaves of it is found again.
+        The mark is removed last, so that the rest is found again after a kill.
         """
         found = status(self.parent, self.name)
         if found is None or found.st_ino != self.mark.inode:
@@ -73,7 +73,7 @@ def make_staging(parent: int, output: str, key: str | None) -> Staging:
     while True:
         name = f".carts-{secrets.token_hex(16)}"
         os.mkdir(name, 0o700, dir_fd=parent)
-        # Somebody who tidies up may take it away while it is empty and not locked: then make another.
+        # Another process may remove it while it is empty and not locked: then make another.
         with suppress(FileNotFoundError):
             descriptor = open_below(parent, name)
             if try_lock(descriptor):
@@ -104,7 +104,7 @@ def leftovers(parent: int, output: str, besides: Staging) -> Iterator[Staging]:
             continue
         mark = _read_mark(descriptor)
         if mark is None:
-            # Killed before it was marked. This removes empty folders only, and such with an empty mark.
+            # Killed before it was marked. Only empty folders, or with an empty mark, are removed.
             with suppress(OSError):
                 if try_lock(descriptor):
                     found = status(descriptor, _MARK)
@@ -171,7 +171,7 @@ def published(target: OutputPath | Path, *, overwrite: bool = False, key: str | 
         A path with the target's name, for a file or a folder; without `key` it is not there yet.
 
     Raises:
-        OutputError: the target exists and may not be replaced, somebody else is writing it, or the disk refuses.
+        OutputError: the target exists and may not be replaced, another process writes it, or it cannot be written.
     """
     output = as_output(target)
     with explained(output), opened_folder(output.parent, make=True) as folder:
@@ -213,7 +213,7 @@ def _take_staging(folder: int, output: OutputPath, key: str | None) -> Staging:
     try:
         for left in leftovers(folder, output.name, taken):
             if status(left.descriptor, _OLD) is not None and status(folder, output.name) is None:
-                # A kill between the two renames of `_move` took the earlier output away.
+                # A kill between the two renames of `_move` left the earlier output here.
                 os.rename(_OLD, output.name, src_dir_fd=left.descriptor, dst_dir_fd=folder)
             reused = key is not None and left.mark.key == key
             needless, taken = (taken, left) if reused else (left, taken)

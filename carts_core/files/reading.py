@@ -1,7 +1,7 @@
 """Reading of untrusted files: regular files of limited size, and limited nesting.
 
-A recording, a robot and weights come from anywhere. Every read of one goes through this module. Links are followed,
-since people link their data; devices, pipes and sockets are refused, and no file is read further than its kind's limit.
+Recordings, robots and weights are untrusted, and all are read through this module. Links are followed,
+since data are often linked; devices, pipes and sockets are refused, and no file is read beyond its kind's limit.
 """
 
 import configparser
@@ -70,7 +70,7 @@ CACHED = Kind("cached mesh", 256 * MIB)
 class RefusedFileError(CartsError, OSError):
     """A file exists but is refused: it is special, too large, or nested too deeply.
 
-    It is an OSError too, so that who reads a file names it in an error of their own, as for a file that is missing.
+    It is an OSError too, so that callers handle it like a missing file and name the file.
     """
 
 
@@ -130,7 +130,7 @@ def read_bytes(path: Path, kind: Kind) -> bytes:
     """
     with open_regular(path, kind) as file:
         size = os.fstat(file.fileno()).st_size
-        content = file.read(size + 1)  # Reading allocates as much as is asked for.
+        content = file.read(size + 1)  # Reading allocates the requested size.
         if len(content) > size:
             content += file.read(kind.limit + 1 - len(content))
     if len(content) > kind.limit:

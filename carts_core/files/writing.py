@@ -50,7 +50,7 @@ _NAMELESS = getattr(os, "O_TMPFILE", 0) if _OWN_DESCRIPTORS.is_dir() else 0
 def write_bytes(path: OutputPath | Path, content: bytes) -> None:
     """Write a file atomically; missing folders are created.
 
-    Whoever reads meets the old file or the new one, whole, whenever the process or the machine stops. A link under the
+    Readers see the old file or the new one, whole, even if the process or the machine stops. A link under the
     file's name is replaced itself; what it points at stays as it is.
 
     Raises:
@@ -68,7 +68,7 @@ def write_text(path: OutputPath | Path, text: str) -> None:
 def write_new(path: OutputPath | Path, content: bytes) -> bool:
     """Write a file unless the path exists; returns whether it was written.
 
-    Of several processes that do this at once, one writes the file.
+    Exactly one of several concurrent processes writes the file.
 
     Raises:
         OutputError: it cannot be written; nothing is changed then.
@@ -127,7 +127,7 @@ def output_stream(path: OutputPath | Path) -> Iterator[BinaryIO]:
 def append_line(path: OutputPath | Path, line: bytes, *, sync: bool = True) -> None:
     """Append a line to a file, created if missing, and synchronize it to disk; optional with `sync`.
 
-    A last line that was not finished, since the process was killed, is ended first.
+    An incomplete last line, left by a kill, is ended first.
 
     Raises:
         OutputError: it cannot be written, or is a link, has a second name, or is no regular file.
@@ -215,7 +215,7 @@ def _check_replaceable(folder: int, output: OutputPath) -> None:
 def _new_file(folder: int) -> tuple[int, str | None]:
     """A new empty file in an open folder, and its name; None if it can do without."""
     if _NAMELESS:
-        # Where a file system cannot, the attempt with a name succeeds, or says what is wrong.
+        # On file systems without support, the attempt with a name succeeds or reports the error.
         with suppress(OSError):
             return os.open(".", _NAMELESS | os.O_RDWR | os.O_CLOEXEC, _MODE, dir_fd=folder), None
     name = _random_name()

@@ -236,7 +236,7 @@ def played_back(database: bytes, log: bytes) -> Playback:
     """
     result = bytearray(database)
     if len(log) < HEADER:
-        # A header is written at once, before anything else; less of it is a kill in that moment.
+        # The header is written first and at once; an incomplete one means a kill at that moment.
         return Playback(result, damaged=False)
     header = _LogHeader.of(log)
     if header is None:
@@ -322,7 +322,7 @@ class Copy:
 
     Attributes:
         connection: to it.
-        fault: what was seen to be wrong with the files, for people; None if nothing was.
+        fault: damage of the files, as a clause; None if there is none.
     """
 
     connection: sqlite3.Connection
@@ -355,7 +355,7 @@ def read_files(path: Path) -> Content:
             after = os.fstat(descriptor)
         finally:
             os.close(descriptor)
-        # Whoever has it open writes to the log, and to the file itself when that is full or at the end.
+        # A writer appends to the log, and moves it into the file when it is full or closed.
         if (before.st_size, before.st_mtime_ns) == (after.st_size, after.st_mtime_ns):
             return Content(main, log)
     raise ProjectError(f"project {path} is being changed all the time. Try again when that has ended.")
@@ -376,7 +376,7 @@ def open_copy(content: Content, path: Path) -> Copy:
     try:
         patched = played.database
         patched[_WRITE_VERSION] = b"\1\1"
-        # SQLite opens nothing that was cut off; with the rest empty it reads what is there.
+        # SQLite opens no truncated file; filled with zeros, the rest can be read.
         missing = min(_promised(patched), LARGEST) - len(patched)
         patched.extend(bytes(max(missing, 0)))
         memory.deserialize(patched)
@@ -455,7 +455,7 @@ class ProjectFile:
     """A project file locked for writing. Made by `locked`.
 
     Attributes:
-        path: where it lies.
+        path: of the file.
     """
 
     def __init__(self, path: Path, descriptor: int) -> None:
@@ -493,7 +493,7 @@ class ProjectFile:
 
         Args:
             nonce: for a file of a schema without one.
-            seal: what it says when it is migrated.
+            seal: its seal after the migration.
 
         Raises:
             ProjectError: it cannot be written to, or is another file by now.
@@ -509,7 +509,7 @@ class ProjectFile:
                 raise ProjectError(f"project {self.path} cannot be opened for writing. Open it read-only.")
             connection.execute("PRAGMA synchronous = FULL")
             connection.execute("PRAGMA wal_autocheckpoint = 0")
-            # A log of ours begins empty; see wal.py.
+            # Logs of carts begin empty; see `Playback.damaged`.
             connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
             database.migrate(connection, nonce)
             self._log = open_regular(self._log_path)
@@ -522,8 +522,8 @@ class ProjectFile:
         """Run statements as one transaction, which is on disk when this returns.
 
         Args:
-            statements: what to do.
-            seal: what the file says then; one of the statements writes it.
+            statements: SQL to run.
+            seal: seal after the transaction; one of the statements writes it.
 
         Raises:
             LostFile: the file is not the same any more; whether the edit is in it is not known.
@@ -539,7 +539,7 @@ class ProjectFile:
             self._check_since(committed=False)
             if getattr(error.__cause__, "sqlite_errorname", "").startswith(("SQLITE_CORRUPT", "SQLITE_NOTADB")):
                 raise LostFile("was damaged") from error
-            # The log may have grown by what does not count.
+            # The log may have grown by an unfinished transaction.
             self._remember()
             raise
         self._check_since(committed=True)
@@ -570,7 +570,7 @@ class ProjectFile:
         """
         self._check_names()
         if self._look() != self._left:
-            # Somebody may have touched it without changing it.
+            # The file may have been touched without a change.
             self._check_content()
             self._remember()
 
@@ -603,7 +603,7 @@ class ProjectFile:
             ctypes.pythonapi.Py_IncRef(ctypes.py_object(self._connection))
             self._connection = None
         if self._log is not None and not _lies_at(self.path, self._descriptor) and _lies_at(self._log_path, self._log):
-            # Nobody can use it without its file, and SQLite would play it into another one of that name.
+            # It is useless without its file, and SQLite would apply it to another one of that name.
             with suppress(OSError):
                 self._log_path.unlink()
         self._release()

@@ -1,6 +1,6 @@
 """The journal: every step and what it set. The state is the journal read up to a position, so undo moves that.
 
-What writes to it gives a `Script`, since it goes to two places: the file and its copy in memory.
+Changes are returned as a `Script`, which is run on the file and on its copy in memory.
 """
 
 import sqlite3
@@ -20,7 +20,7 @@ class Script:
 
     Attributes:
         statements: SQL, each with the rows of its parameters.
-        digests: what the transaction adds to the sum of all digests.
+        digests: change of the sum of all digests.
         position: in the history, afterwards; None: as before.
         cut_at: rows of this step and later ones are removed first; None: none are.
     """
@@ -133,7 +133,7 @@ def _newest(memory: sqlite3.Connection, about: tuple[str, int, str], last: int) 
 def before(memory: sqlite3.Connection, step: int, position: int) -> tuple[dict[Key[Any], Any], int | None]:
     """Edits that undo a step, and the number of a later step that changed the same keys, if any.
 
-    Verdicts are left out: whether one holds again depends on everything else of its frame.
+    Verdicts are omitted, since their validity depends on all values of their frame.
     """
     edits: dict[Key[Any], Any] = {}
     later: list[int] = []

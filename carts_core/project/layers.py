@@ -57,7 +57,7 @@ class Layer:
 
 
 class MaskCorrection(Layer):
-    """Pixels that a person added to the rendered mask (255) or removed from it (127); 0 elsewhere."""
+    """Pixels added to the rendered mask (255) or removed from it (127); 0 elsewhere."""
 
     @classmethod
     def of(cls, added: Bool[np.ndarray, "height width"], removed: Bool[np.ndarray, "height width"]) -> Self:

@@ -40,9 +40,9 @@ def project_masks(layer: MaskLayer, state: ProjectState, recording: Recording) -
     """Masks of a project in this state, without its ignore regions.
 
     Args:
-        layer: imported ones, or rendered ones that somebody has corrected with a brush.
+        layer: imported masks, or rendered masks corrected with a brush.
         state: of the project.
-        recording: whose project it is.
+        recording: of the project.
     """
     cameras = [camera.name for camera in recording.scene.cameras]
     if layer == "imported":

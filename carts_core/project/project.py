@@ -49,13 +49,13 @@ class Project:
     """The corrections of one sequence, in one file. Thread-safe.
 
     Attributes:
-        state: what it says now. An immutable snapshot, which reading needs no lock for.
-        read_only_reason: for people, why nothing can be saved; None if it can.
+        state: present state, an immutable snapshot that is read without a lock.
+        read_only_reason: why nothing can be saved, as a sentence; None if it can.
 
     Args:
         identity: of the sequence.
-        path: the file; it is made if it is not there and may be written.
-        read_only: do not write. What another process saves later is not seen.
+        path: the file, created if it is missing.
+        read_only: do not write; later edits of other processes are not seen.
 
     Raises:
         ProjectError: the file belongs to another sequence or to a newer version of carts, is not a project, is not
@@ -63,7 +63,7 @@ class Project:
     """
 
     def __init__(self, identity: SequenceIdentity, path: Path, *, read_only: bool = False) -> None:
-        # Links on the way to the file's folder are a matter of the person who names it; the file itself must be none.
+        # Links on the way to the file's folder are the user's; the file itself must be none.
         self._path = path.parent.resolve() / path.name
         self.read_only_reason = "It was opened read-only." if read_only else None
         self._edit = threading.RLock()
@@ -188,7 +188,7 @@ class Project:
     def reverting(self, number: int) -> tuple[Edits, Mapping[int, Figures]]:
         """Edits that undo a single step and keep all later ones, with figures as for `apply`.
 
-        Nothing is changed. A frame that becomes what it was before the step has the verdict and figures of then.
+        Nothing is changed. A frame that is restored to its state before the step regains its verdict and figures.
 
         Args:
             number: of a step that is done.
@@ -225,7 +225,7 @@ class Project:
         """
         with self._edit:
             known = by_revision(state, figures)
-            # The state may be of a branch of the history that was dropped since.
+            # The state may belong to a dropped branch of the history.
             known = {
                 key: value for key, value in known.items() if step_at(state, key[1]) == step_at(self.state, key[1])
             }
@@ -251,7 +251,7 @@ class Project:
             format: its name.
             path: the file or folder that was written.
             frames: how many frames it holds.
-            settings: what JSON can hold.
+            settings: values for JSON.
 
         Raises:
             ProjectError: it could not be saved.

@@ -70,7 +70,7 @@ class Record:
     figures: Mapping[int, Figures]
     """By revision; see `ProjectState.revision`."""
 
-    # Computed once per record, and records outlive states: whoever asks for all frames again asks for few anew.
+    # Computed once per record; records outlive states, so that queries of all frames compute few anew.
     @cached_property
     def review(self) -> Review:
         """Review state and note. Without a person's review, the state depends on the source of the joint positions."""

@@ -164,7 +164,7 @@ class Store:
     Attributes:
         memory: the same as the file, in memory.
         path: the file that edits go to; another one after a rescue.
-        incident: what has happened to the file that was opened, for people; None if nothing has.
+        incident: what happened to the opened file, as a sentence; None if nothing did.
     """
 
     def __init__(self, memory: sqlite3.Connection, seal: Seal, position: int, file: ProjectFile) -> None:
@@ -349,7 +349,7 @@ def read_project(path: Path, identity: SequenceIdentity | None) -> ProjectState:
 
 def _begin(path: Path, identity: SequenceIdentity) -> None:
     try:
-        # Who began it in the same moment has made the same.
+        # A process that creates it at the same time writes the same content.
         write_new(path, file_content(database.empty(identity)))
     except OutputError as error:
         if isinstance(error.__cause__, OSError):
@@ -407,7 +407,7 @@ def _damaged(
         return database.DamagedProject(f"{begin} Nothing of it can be read. Go back to a copy of it.")
     when = time.time()
     with suppress(OSError, OverflowError, ValueError):
-        # The time of the file: whoever tries again finds what was rescued already.
+        # Named by the time of the file, so that another attempt finds the same rescued file.
         when = path.stat().st_mtime
         time.localtime(when)
     target, new = next(rescue_paths(path, when)), False

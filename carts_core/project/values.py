@@ -138,7 +138,7 @@ class CorrectedTransform(JsonValue):
             rigid_transform(self.transform, "the corrected transform")
         except SettingsError as error:
             raise ProjectError(str(error)) from error
-        # Kept to the last bit: what is saved is what was shown.
+        # Stored without rounding.
         _set(self, "transform", tuple(tuple(float(value) for value in row) for row in self.transform))
 
     @property
@@ -262,7 +262,7 @@ def _finite(values: Iterable[float], what: str) -> tuple[float, ...]:
         numbers = tuple(map(float, values))
     except (TypeError, ValueError) as error:
         raise ProjectError(f"{what} must be a list of numbers, not {values!r}.") from error
-    # The sum is quicker to ask, and is finite unless a number is not or all are huge.
+    # The sum is a fast test: it is finite unless a number is not, or all are huge.
     if not math.isfinite(sum(numbers)) and not all(map(math.isfinite, numbers)):
         raise ProjectError(f"{what} are {list(numbers)}. Give finite numbers.")
     return numbers

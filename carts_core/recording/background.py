@@ -64,19 +64,19 @@ def background_of_recording(
 ) -> MeanBackground:
     """The mean background of a recording: see `estimate_background`.
 
-    A pixel of it is known where most of the views that it is the median of have the arms far away, and where many
-    views agree: an arm that is really there, kinematics being off, moves, and is not lit twice the same.
+    A pixel is known where the arms are far away in most of the views that it is the median of, or where many views
+    agree: an arm that is there despite wrong kinematics moves and changes its shading.
 
     Args:
-        scene: with that camera and others.
+        scene: with the camera.
         camera: its name.
-        states: the scene as measured, of each frame that is looked at.
-        image: of the frame at a place in `states`.
+        states: measured state of the scene in each view.
+        image: index in `states` -> image of the frame.
 
     Raises:
         SequenceError: the whole image is covered in every view.
     """
-    # What only reads or imports recordings does without the renderer, and without its compiler in memory.
+    # Imported here, so that reading and importing recordings need neither the renderer nor its compiler.
     from ..rendering import Renderer  # noqa: PLC0415
 
     renderer = Renderer(scene, cameras=[camera])
@@ -156,7 +156,7 @@ def _filled(
     image: UInt8[np.ndarray, "height width 3"], hole: Bool[np.ndarray, "height width"]
 ) -> UInt8[np.ndarray, "height width 3"]:
     """`image` with the pixels that are never seen filled in from their surroundings."""
-    # Next to what is always covered the arm itself may show, where it is off by more than the margin.
+    # Beside always covered pixels the arm itself may be visible, if its error exceeds the margin.
     rim = widen(hole)
     return fill(image, hole if rim.all() else rim)
 

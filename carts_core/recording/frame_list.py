@@ -36,8 +36,8 @@ def expand(pattern: str, key: str, **values: object) -> str:
 
     Args:
         pattern: as written in the sequence file.
-        key: how errors call it.
-        values: what may be filled in.
+        key: its name in errors.
+        values: of the placeholders.
 
     Raises:
         SequenceError: an unknown placeholder, or a number format for an id that is no number.
@@ -137,7 +137,7 @@ class FrameNames:
         else:
             ids = tuple(expand(self.pattern, key, frame=FrameId(cell)) for cell in cells)
         if all(map(str.isdecimal, ids)) and max(map(len, ids)) <= _SHORT and len(set(ids)) == len(ids):
-            return ids  # Numbers have no fault but to be there twice, and an hour has a hundred thousand.
+            return ids  # Fast path: numbers can only be wrong by repetition, and an hour has a hundred thousand.
         lines: dict[str, int] = {}
         for frame_id, line in zip(ids, table.lines, strict=True):
             if not frame_id:
@@ -192,8 +192,8 @@ def list_of_rows(table: Table, names: FrameNames, timestamp: str, section: TomlT
         table: the table.
         names: where it has the frames' ids.
         timestamp: its column with the time [s]; empty for frames without times.
-        section: what describes the table.
-        counted: how errors say how many frames there are.
+        section: table of the sequence file that describes it.
+        counted: number of frames, as a clause for errors.
 
     Raises:
         SequenceError: ids, times or video frame numbers are wrong.

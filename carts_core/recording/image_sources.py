@@ -196,7 +196,7 @@ def decode_message(message: Any, what: str) -> UInt8[np.ndarray, "height width 3
 
     Args:
         message: an `Image` or `CompressedImage`.
-        what: how errors call it.
+        what: its name in errors.
 
     Raises:
         SequenceError: it is damaged or of an encoding that is not known.

@@ -1,6 +1,6 @@
 """Image files and masks: strict decoding, upright orientation, 8 bits, and remarks on every change to stored pixels.
 
-A file that is cut off is an error and not a half grey image.
+A truncated file is an error, not a half grey image.
 """
 
 import hashlib
@@ -60,7 +60,7 @@ class ImageFiles:
 
     Args:
         files: their paths.
-        bits: of a value in files of 16 bits; None takes the bits in use, counted in some of them.
+        bits: bit depth of files of 16 bits; None for the depth in use, measured in some of them.
     """
 
     def __init__(self, files: tuple[Path, ...], bits: int | None = None) -> None:
@@ -114,7 +114,7 @@ def read_image(path: Path, bits: Callable[[], int] | None = None) -> UInt8[np.nd
 
     Args:
         path: of the file.
-        bits: of the values of a file of 16 bits; by default those in use.
+        bits: bit depth of a file of 16 bits; by default the depth in use.
 
     Raises:
         SequenceError: the file is missing, truncated or not an image, or has more bits.
@@ -127,7 +127,7 @@ def decode_image(content: bytes, what: str) -> UInt8[np.ndarray, "height width 3
 
     Args:
         content: PNG, JPEG, TIFF, BMP, WebP or PPM.
-        what: how errors call it.
+        what: its name in errors.
 
     Raises:
         SequenceError: it is damaged, too large or not an image.
@@ -324,7 +324,7 @@ def _raster(content: bytes, what: str, *, colour: bool) -> _Raster:
 
     Args:
         content: of the file.
-        what: how errors call it.
+        what: its name in errors.
         colour: RGB in any case, without transparency.
     """
     if (damage := find_damage(content)) is not None:

@@ -60,7 +60,7 @@ class Table:
         try:
             values = np.fromiter(map(float, self._cells(column, asked_by)), np.float64, len(self))
         except ValueError:
-            # Some cell is no number; this way, which is slower, says which.
+            # A cell is not a number; this slower way finds it.
             values = np.fromiter(map(_number, self._cells(column, asked_by)), np.float64, len(self))
         if (wrong := np.flatnonzero(~np.isfinite(values))).size:
             row, cells = wrong[0], self.text(column, asked_by)
@@ -120,7 +120,7 @@ def _filled_rows(reader: Any, path: Path, what: str) -> tuple[list[tuple[str, ..
     cells = 0
     for row in reader:
         if any(row):
-            rows.append(tuple(row))  # Which Python's collector looks at once, and at a list again and again.
+            rows.append(tuple(row))  # Python's garbage collector untracks tuples, but not lists.
             lines.append(reader.line_num)
             cells += len(row)
             if cells > MOST_CELLS:

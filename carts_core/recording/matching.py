@@ -73,8 +73,8 @@ class RowTimes:
 
         Args:
             frames: with their times.
-            matching: how times are compared.
-            what: the rows hold, for errors.
+            matching: time offset and interpolation.
+            what: content of the rows, for errors.
 
         Raises:
             SequenceError: a frame has no row near enough in time.
@@ -82,7 +82,7 @@ class RowTimes:
         assert self.times is not None and frames.timestamps is not None
         wanted = frames.timestamps + matching.time_offset
         last = len(self.times) - 1
-        # Beyond the ends both are the row at the end.
+        # Outside the range, both are the row at the end.
         after = np.searchsorted(self.times, wanted).clip(0, last)
         before = np.where(self.times[after] > wanted, after - 1, after).clip(0, last)
         to_before, to_after = np.abs(wanted - self.times[before]), np.abs(self.times[after] - wanted)
@@ -157,7 +157,7 @@ class PoseSamples:
             SequenceError: a frame has no row near enough in time.
         """
         found = self.rows.neighbours(frames, matching, "camera poses")
-        # Rows are numbered evenly, so a place among them is a row's number with a fraction.
+        # Fractional row numbers.
         return self._between(found.before + found.share * (found.after - found.before))
 
     def logged_at(self, times: Float[np.ndarray, " times"]) -> Float[np.ndarray, "times 4 4"]:

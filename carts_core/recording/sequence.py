@@ -39,7 +39,7 @@ class ByteCache:
         """The array of `key`, computed by `make` if it is not cached.
 
         Raises:
-            Exception: what `make` raises. Nothing is kept then, and whoever waited for it calls their own `make`.
+            Exception: what `make` raises. Nothing is cached then, and waiting threads call their own `make`.
         """
         with self._changed:
             self._changed.wait_for(lambda: key not in self._making)
@@ -116,7 +116,7 @@ class Sequence:
 
     Attributes:
         path: the sequence file.
-        name: its name for people.
+        name: name of the recording.
         scene: arms and cameras as calibrated, cameras without distortion.
         domains: the variants of every image; the first is the default.
         frame_ids: name of every frame.
@@ -156,20 +156,20 @@ class Sequence:
 
         Args:
             path: the TOML file.
-            progress: called with a line for people now and then.
+            progress: called with a line of progress.
 
         Raises:
             SequenceError: the file or something it points at is missing or wrong.
             RobotError: a robot or one of its meshes is missing or wrong.
         """
-        # Resolved once, here: images that are decoded later are found from any working directory.
+        # Absolute, so that images are found later from any working directory.
         return Sequence(read_description(Path(path).absolute(), progress))
 
     def with_time_offset(self, time_offset: float) -> "Sequence":
         """The same images with joint positions at another time offset; the sequence file is not changed.
 
         Args:
-            time_offset: what to add to an image's time for the time in the kinematics tables [s].
+            time_offset: time in the kinematics tables minus time of the image [s].
 
         Raises:
             SequenceError: rows are not matched by time, or a frame has no row near enough.
@@ -189,7 +189,7 @@ class Sequence:
         """
         corrected = copy(self)
         corrected.scene, corrected.measured = scene, dict(measured)
-        # Where the arms are decides what is background.
+        # The background depends on the poses of the arms.
         corrected._backgrounds, corrected._background_lock = {}, threading.Lock()
         return corrected
 
@@ -407,8 +407,8 @@ LONGEST_STRIDE = 10
 class FrameReader:
     """Reads frames and prefetches their neighbours in the direction of travel into the sequence's cache, on a thread.
 
-    Asking for another frame makes what was planned void. An error in a frame that nobody has asked for yet is dropped;
-    who asks for it reads it again and gets the error. The thread lives while there is something to read.
+    A jump to another frame discards the queue. Errors of prefetched frames are dropped, since reading them again raises
+    them again. The thread ends when the queue is empty.
     """
 
     def __init__(self, sequence: Sequence) -> None:
@@ -447,7 +447,7 @@ class FrameReader:
     def _neighbours(self, index: int, cameras: Collection[str]) -> list[int]:
         """Numbers of the frames to prefetch, the most probable first."""
         sizes = [own.width * own.height for own in self._sequence.scene.cameras if own.name in cameras]
-        # An image, a mask; and no more than half of the cache, or they would push out what was seen last.
+        # Image and mask of each frame, in at most half of the cache, so that recent frames stay.
         ahead = min(AHEAD, CACHE_BYTES // 2 // max(4 * sum(sizes), 1))
         rows = [index + self._stride * count for count in range(1, ahead + 1)] + [index - self._stride]
         return [row for row in rows if 0 <= row < len(self._sequence)]
@@ -468,5 +468,5 @@ class FrameReader:
                 index, domain, cameras = self._plan.popleft()
             try:
                 self._sequence.frame(index, domain, list(cameras))
-            except Exception:  # Whoever asks for this frame meets the same.
+            except Exception:  # Reading the frame again raises it again.
                 continue

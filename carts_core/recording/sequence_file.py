@@ -356,7 +356,7 @@ def read_description(path: Path, progress: Callable[[str], None] | None = None) 
 
     Args:
         path: the TOML file.
-        progress: called with a line for people while robots are loaded.
+        progress: called with a line of progress.
 
     Raises:
         SequenceError: the file or something it points at is missing or wrong.
@@ -451,8 +451,8 @@ def calibrated_sequence_file(
     relative to the file's folder, are changed for the new one; absolute paths stay.
 
     Args:
-        path: a sequence file that was read without an error.
-        folder: where the new one will lie.
+        path: a valid sequence file.
+        folder: of the new file.
         before: the scene that `path` describes.
         after: the same with other base frames, extrinsics or intrinsics.
         command: the `carts` command that found them, for the heading.
@@ -470,7 +470,7 @@ def calibrated_sequence_file(
             if isinstance(value, str):
                 table[key] = moved(value)
             elif isinstance(value, dict):
-                # Patterns by domain; K as a table of numbers has no text in it.
+                # Patterns by domain, or K as a table of numbers.
                 for name, entry in value.items():
                     value[name] = moved(entry) if isinstance(entry, str) else entry
 

@@ -134,7 +134,7 @@ def estimate_time_offset(
     delays = _Delays(sequence, sequence.timestamps, steps, flows)
     found = delays.estimate(present, largest)
     if largest < _WIDEST and (found.at_end or found.explained < _PLAIN):
-        # A motion that nearly repeats itself has peaks beside the best one.
+        # Nearly periodic motion has several peaks.
         return delays.estimate(present, _WIDEST)
     return found
 
@@ -244,13 +244,13 @@ class _Delays:
         if there.mean() < _FEWEST_KNOWN:
             return None
         if self._bases is None:
-            # Once for all offsets, so that these compare.
+            # Normalized once for all offsets, so that they are comparable.
             middle = places[there].mean(0)
             postures = _basis(places[there] - middle)[:, :_POSTURES]
             self._bases = _basis(motion[there]), middle, postures
         moves, middle, postures = self._bases
         X, around = np.nan_to_num(motion) @ moves, np.nan_to_num(places - middle) @ postures
-        # How motion shows in the image depends on where the arms are: a linear function of that as well.
+        # The flow of a motion depends on the posture of the arms; a linear dependence is modelled.
         X = np.concatenate([X, *(X * posture[:, None] for posture in around.T)], 1)
         Y = np.where(there[:, None], self._flows, 0.0)
         inside = [self._blocks == block for block in range(_BLOCKS)]

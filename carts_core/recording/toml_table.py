@@ -79,7 +79,7 @@ class TomlTable:
         if not isinstance(value, accepted) or (isinstance(value, bool) and bool not in kinds and object not in kinds):
             wanted = " or ".join(_KINDS[one] for one in kinds)
             raise self.error(key, f"is {shown(value)}, but must be {wanted}.")
-        # Numbers in tables are checked when they are taken from there, so that the error names their key.
+        # Numbers in nested tables are checked later, when they are taken, so that errors name their key.
         has_tables = isinstance(value, dict) or (isinstance(value, list) and any(isinstance(v, dict) for v in value))
         if not has_tables and not all_finite(value):
             raise self.error(key, f"is {shown(value)}, but must be a finite number.")

@@ -94,7 +94,7 @@ def opened(path: Path, *, parsed: bool = True) -> Iterator[tuple[InputContainer,
 
     Args:
         path: the file.
-        parsed: look into packets for what the container does not say, which takes as long as reading them.
+        parsed: parse packets for data missing in the container, which takes as long as reading them.
 
     Raises:
         SequenceError: it cannot be decoded.
@@ -112,7 +112,7 @@ def open_video(path: Path, *, parsed: bool = True) -> tuple[InputContainer, Vide
     except (FFmpegError, OSError, ValueError) as error:
         raise SequenceError(f"video {path} cannot be decoded ({error}). {_remedy(path)}") from error
     stream = container.streams.best("video")
-    if not isinstance(stream, VideoStream) or stream.codec_context is None:  # None for a codec that nobody knows.
+    if not isinstance(stream, VideoStream) or stream.codec_context is None:  # None for an unknown codec.
         container.close()
         raise SequenceError(f"video {path} cannot be decoded (it has no video stream). {_remedy(path)}")
     if (problem := pixels_problem(stream.width, stream.height)) is not None:
@@ -197,15 +197,15 @@ def _by_packets(path: Path, *, parsed: bool) -> VideoIndex | None:
         try:
             for packet in container.demux(stream):
                 if packet.size == 0 or packet.is_discard or (vp8 and not bytes(packet)[0] & 0x10):
-                    continue  # The end, what an edit list cuts away, and VP8's frames that are only referred to.
+                    continue  # The end, frames outside an edit list, and VP8's invisible reference frames.
                 shown.append(packet.pts)
                 if packet.is_keyframe:
                     keys.append((packet.pts, packet.dts))
         except FFmpegError:
-            pass  # The file is cut off here; the frames before are as good as ever.
+            pass  # The file is truncated here; the frames before are intact.
         time_base = stream.time_base
     pts = sorted(time for time in shown if time is not None)
-    # AVI numbers packets, not pictures: the two agree only while every frame stands alone.
+    # AVI counts packets, not pictures; the counts agree only if every frame is a key frame.
     exact |= len(keys) == len(shown)
     if not exact or not pts or len(set(pts)) != len(shown) or time_base is None:
         return None
@@ -361,13 +361,13 @@ class Video:
         key, seek_to = self._key_frame_before(number)
         if self._last is None or not key - 1 <= self._last < number:
             while not self._jump(key, seek_to):
-                # The key frame is damaged, or seeking does not arrive where it should: begin at the one before.
+                # The key frame is damaged, or seeking is inexact: begin at the key frame before.
                 self._key_frames = tuple(other for other in self._key_frames if other[0] != key)
                 key, seek_to = self._key_frame_before(number)
         for position, frame in self._frames:
             self._last = position
             if position >= key:
-                # Those before a key frame may refer to frames that were not decoded.
+                # Frames before a key frame may refer to frames that were not decoded.
                 self._kept.add(position, frame)
             if position >= number:
                 return frame if position == number else None
@@ -412,7 +412,7 @@ def _file_digest(path: Path, modified: int, size: int) -> str:
 
 
 def _pixels(frame: VideoFrame) -> UInt8[np.ndarray, "height width 3"]:
-    # Without a number of threads swscale starts some for every frame, which takes 20 times as long.
+    # By default swscale starts threads for every frame, which takes 20 times as long.
     return frame.to_ndarray(format="rgb24", threads=1)
 
 

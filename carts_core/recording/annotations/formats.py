@@ -158,7 +158,7 @@ def read_coco(path: Path, remarks: Counter[str]) -> Iterator[ForeignImage]:
 
     Args:
         path: of the file.
-        remarks: annotations that are not usable are added, with the reason, and left out.
+        remarks: reasons for omitted annotations are added.
 
     Raises:
         SequenceError: it is not COCO.
@@ -236,7 +236,7 @@ def _coco_mask(segmentation: Any, height: int, width: int) -> Bool[np.ndarray, "
             raise ValueError(f"a mask is {size[1]} x {size[0]} in an image of {width} x {height} pixels")
         runs = runs_of_text(counts) if isinstance(counts, str) else [int(run) for run in counts]
         return mask_of_runs(runs, height, width, by_columns=True)
-    # Some tools write the only polygon without a list around it.
+    # Some tools write a single polygon without the enclosing list.
     polygons = [segmentation] if all(isinstance(value, int | float) for value in segmentation) else segmentation
     mask = np.zeros((height, width), bool)
     for polygon in polygons:
@@ -273,7 +273,7 @@ def read_cvat(path: Path, remarks: Counter[str]) -> Iterator[ForeignImage]:
 
     Args:
         path: of the file.
-        remarks: shapes that are not usable are added, with the reason, and left out.
+        remarks: reasons for omitted shapes are added.
 
     Raises:
         SequenceError: it is not CVAT's.
@@ -445,7 +445,7 @@ def _files(folder: Path) -> list[Path]:
         found += [Path(place) / name for name in chosen if not name.startswith(".")]
         if len(found) > MOST_IMAGES:
             raise SequenceError(f"{folder} has more than {MOST_IMAGES} masks. Name a folder with fewer.")
-    # Files of one frame follow each other: tools have folders of their own beside one another.
+    # Sorted by frame: each tool has its own sibling folder.
     files = [file for file in found if is_regular(file)]
     return sorted(files, key=lambda file: (file.stem, file.parent.parent.as_posix(), file.as_posix()))
 

@@ -47,9 +47,9 @@ def read_annotations(
 
     Args:
         source: a COCO file, a CVAT file, keypoints of SurgPose, a folder of masks, or the folder of an export.
-        sequence: whose frames they are.
-        camera: whose images they are, where their names do not say it.
-        confined: whether nothing outside of the source is read, neither beside it nor by links in it.
+        sequence: with the frames.
+        camera: of the images, where their names do not contain it.
+        confined: whether files beside the source and links in it are ignored.
 
     Raises:
         SequenceError: it is none of these, or cannot be read; also later, while frames are gone through.
@@ -81,10 +81,10 @@ class _FrameReader:
 
     Args:
         sequence, camera: see `read_annotations`.
-        source: name of the source, which may say the camera.
-        labels: that are numbered meanwhile.
-        unknown: where names of images without a frame are put.
-        undistorted: whether annotations are of undistorted images already.
+        source: name of the source, which may contain the camera.
+        labels: numbered while iterating.
+        unknown: names of images without a frame are added.
+        undistorted: whether the annotated images are undistorted.
     """
 
     def __init__(

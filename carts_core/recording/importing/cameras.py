@@ -42,7 +42,7 @@ def camera_from_info(
         camera: with its images.
         info: message, or None.
         options: may name the size of the images that were calibrated.
-        notes: what was changed is added.
+        notes: of the import; some are added.
         rectified: the images are rectified, so that P holds, and no distortion.
 
     Raises:

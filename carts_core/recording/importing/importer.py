@@ -135,12 +135,12 @@ def import_recording(
 
     Args:
         path: file or folder of the recording.
-        folder: to make; it holds sequence.toml and small tables.
-        options: what the recording does not say.
+        folder: output folder for sequence.toml and its tables.
+        options: values that the recording lacks.
         overwrite: replace an earlier import.
 
     Returns:
-        The sequence file, and what was found.
+        The sequence file, and the content of the recording.
 
     Raises:
         CartsError: it is of no known kind, damaged, or contradicts itself; nothing is written then.

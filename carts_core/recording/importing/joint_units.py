@@ -33,7 +33,7 @@ def in_si(
         joints: of the columns.
         options: with `angle_unit`, `length_unit` and `flip`.
         notes: of the import; some are added.
-        arm: its name, for people.
+        arm: its name, for notes.
         columns: names of a table's columns, whose units are guessed; empty for messages, which are in SI units.
         instrument: whether angles can be guessed to be degrees; those of other robots may be shares of their range.
 
@@ -139,9 +139,9 @@ def length_unit(highest: float, limit: float, arm: str, what: str, orders: Seque
     Args:
         highest: largest magnitude, as logged.
         limit: largest possible magnitude [m].
-        arm: its name, for people.
-        what: the length is of, for people.
-        orders: of the columns that would fit as well, for people.
+        arm: its name, for notes.
+        what: name of the length, for errors.
+        orders: of the columns that would fit as well, for errors.
 
     Raises:
         SequenceError: decimetres or centimetres would fit better than millimetres.

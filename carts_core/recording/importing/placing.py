@@ -104,7 +104,7 @@ _BEHIND = -1.0
 def completed(recording: FoundRecording, options: ImportOptions) -> FoundRecording:
     """The recording restricted to frames with kinematics and completed with defaults; notes list them.
 
-    Joints are compared with the limits of their robots, and base frames with what the cameras see.
+    Joints are compared with the limits of their robots, and base frames with the view of the cameras.
 
     Raises:
         SequenceError: there are no frames, no camera, or no frame has kinematics.
@@ -153,7 +153,7 @@ def _frames_with_kinematics(recording: FoundRecording, notes: Notes) -> FoundRec
         gaps = np.maximum(np.abs(wanted - times[before]), np.abs(times[after] - wanted))
         keep &= gaps <= MAX_GAP
         spacing = np.diff(times)
-        # A log of one row for each image may be slow throughout.
+        # A log with one row per image may have large gaps throughout.
         if len(spacing) and (long := spacing > max(MAX_GAP, 2.0 * float(np.median(spacing)))).any():
             notes.warning(f"{name}: {counted(int(long.sum()), 'gap')} of up to {spacing.max():.3g} s in the log.")
     if keep.all():

@@ -160,7 +160,7 @@ def guess_clock(values: np.ndarray, span: float | None = None) -> Clock:
     largest = float(np.max(np.abs(values))) if len(values) else 0.0
     lasts = float(np.ptp(values)) if len(values) else 0.0
     for unit in _LEAST:
-        # A log of hours counts from its own begin, in a smaller unit.
+        # A log of hours counts from its own start, in a smaller unit.
         if largest >= _LEAST[unit][0] and lasts * SECONDS[unit] < _LONGEST:
             return unit
     step = float(np.median(np.diff(values))) if len(values) > 1 else 0.0
@@ -209,7 +209,7 @@ def match_rows(frames: FrameTimes, rows: LogRows, options: ImportOptions, notes:
     Args:
         frames: with their times, where known.
         rows: with their times and images, where known.
-        options: what was given.
+        options: of the import.
         notes: of the import; some are added.
 
     Raises:
@@ -374,7 +374,7 @@ def by_rows(
     Args:
         arms: `times` are positions in `ids`.
         ids: of all frames.
-        notes: what is left out is added.
+        notes: of the import; some are added.
         times: of the frames [s]; rows get them, so that their delay can be estimated and changed.
 
     Returns:

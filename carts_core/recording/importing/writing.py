@@ -29,14 +29,14 @@ def write_sequence(recording: FoundRecording, folder: Path, *, overwrite: bool =
 
     Args:
         recording: completed (`placing.completed`).
-        folder: to make.
+        folder: output folder.
         overwrite: replace an earlier import.
 
     Returns:
         The sequence file.
 
     Raises:
-        SequenceError: what was found does not make a sequence.
+        SequenceError: the content is not a valid sequence.
         OutputError: the folder is there, or cannot be written to.
     """
     with TemporaryDirectory() as trial:

@@ -161,7 +161,7 @@ def _kinematics(path: Path, options: ImportOptions, notes: Notes) -> list[tuple[
         if not any(meanings.arms for _, meanings in found):
             for file in _tables(path):
                 if file.suffix.lower() in (".csv", ".tsv", ".parquet"):
-                    read_foreign_table(file)  # Whose error is of more use than none at all.
+                    read_foreign_table(file)  # Its error is more useful than none.
             found = [(table, meanings) for table, meanings in found if _is_wide(table)][:1]
     known: dict[str, ForeignTable] = {}
     chosen = []
