@@ -1,13 +1,26 @@
-"""Which pixel belongs to whom, and what files are called."""
+"""Data sets of exports: labels, images and cancellation."""
 
+import os
+import threading
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from awkward import ARMS, CAMERA, all_views, expected_masks
 
 from carts_core.errors import CartsError, SequenceError, SettingsError
-from carts_core.export import Dataset, KinematicsRow, corrected_frames, measured_frames
+from carts_core.export import (
+    FORMATS,
+    Dataset,
+    ExportCancelled,
+    FormatName,
+    KinematicsRow,
+    Monitor,
+    corrected_frames,
+    export,
+    measured_frames,
+)
 from carts_core.export.dataset import labelled
 from carts_core.files import file_name, unique_file_names
 from carts_core.model.parts import part_classes
@@ -132,3 +145,19 @@ def test_a_painted_class_that_no_link_has_is_refused(dataset: Dataset) -> None:
     frame = replace(dataset.frames[0], part_labels={CAMERA: painted})
     with pytest.raises(CartsError, match="painted as class 99"):
         all_views(replace(dataset, frames=(frame,)))
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_a_cancelled_export_leaves_nothing(dataset: Dataset, name: FormatName, tmp_path: Path) -> None:
+    cancel, steps = threading.Event(), []
+
+    def progress(done: int, total: int) -> None:
+        steps.append((done, total))
+        cancel.set()
+
+    folder = tmp_path / "exports"
+    folder.mkdir()
+    with pytest.raises(ExportCancelled):
+        export(dataset, name, folder / "out", monitor=Monitor(progress, cancel.is_set))
+    assert steps == [(1, len(dataset.scene.arms) if name.startswith("dvrk") else 3)]
+    assert os.listdir(folder) == []

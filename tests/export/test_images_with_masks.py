@@ -1,6 +1,8 @@
-"""COCO, YOLO, Pascal VOC and PNG masks, each read back by the library that people read it with."""
+"""Annotation formats and their encodings, read back by their own readers."""
 
 import json
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,9 +14,12 @@ import pytest
 import supervision
 from awkward import ARMS, CAMERA, SOURCES, Masks, all_views, assert_same_masks, expected_masks
 from PIL import Image
+from pycocotools import mask as coco_mask
 from pycocotools.coco import COCO
+from scipy.ndimage import gaussian_filter
 
 from carts_core.export import Dataset, FormatName, Images, export
+from carts_core.export.encodings import MIN_POINTS, polygons, row_runs
 from carts_core.recording import Sequence
 from carts_core.recording.images import read_image
 
@@ -224,3 +229,152 @@ def test_png_masks_come_back_pixel_for_pixel(dataset: Dataset, tmp_path: Path) -
         for value, name in meaning["links"].items():
             arm = next((number for number, arm in enumerate(ARMS, 1) if name.startswith(arm)), 0)
             assert set(np.unique(read["arms"][read["links"] == int(value)])) <= {arm}
+
+
+DATUMARO = "datumaro==1.13.12"
+
+_READER = """
+import sys
+import numpy as np
+import datumaro
+
+format, folder, output = sys.argv[1:]
+dataset = datumaro.Dataset.import_from(folder, format)
+names = [label.name for label in dataset.categories()[datumaro.AnnotationType.label]]
+masks, images = {}, 0
+for item in dataset:
+    images += item.media.data is not None
+    for annotation in item.annotations:
+        if annotation.type == datumaro.AnnotationType.mask:
+            masks[item.id.split("/")[-1] + "|" + names[annotation.label]] = np.asarray(annotation.image, dtype=bool)
+np.savez(output, images=images, keys=np.array(sorted(masks)), masks=np.array([masks[key] for key in sorted(masks)]))
+"""
+
+
+def test_cvat_comes_back_pixel_for_pixel(dataset: Dataset, tmp_path: Path) -> None:
+    root = ElementTree.parse(export(dataset, "cvat", tmp_path / "out") / "annotations.xml").getroot()
+    assert root.findtext("version") == "1.1" and root.findtext("meta/task/size") == "3"
+    assert [label.findtext("name") for label in root.iter("label")] == list(ARMS)
+    masks: Masks = {}
+    for number, image in enumerate(root.iter("image")):
+        assert image.get("id") == str(number) and (dataset.image_folder / image.get("name", "")).is_file()
+        height, width = int(image.get("height", "")), int(image.get("width", ""))
+        for entry in image.iter("mask"):
+            left, top, columns, rows = (int(entry.get(key, "")) for key in ("left", "top", "width", "height"))
+            runs = [int(run) for run in entry.get("rle", "").split(",")]
+            crop = np.repeat(np.arange(len(runs)) % 2 == 1, runs).reshape(rows, columns)
+            mask = np.zeros((height, width), bool)
+            mask[top : top + rows, left : left + columns] = crop
+            masks[Path(image.get("name", "")).stem, entry.get("label", "")] = mask
+    assert_same_masks(masks, expected_masks(dataset))
+
+
+def test_datumaro_comes_back_pixel_for_pixel(dataset: Dataset, tmp_path: Path) -> None:
+    file = export(dataset, "datumaro", tmp_path / "out") / "annotations" / "default.json"
+    content = json.loads(file.read_text(encoding="utf-8"))
+    labels = [label["name"] for label in content["categories"]["label"]["labels"]]
+    assert labels == list(ARMS) and len(content["items"]) == 3
+    masks: Masks = {}
+    for item in content["items"]:
+        assert (dataset.image_folder / item["image"]["path"]).is_file()
+        for annotation in item["annotations"]:
+            masks[Path(item["id"]).name, labels[annotation["label_id"]]] = coco_mask.decode(annotation["rle"]).astype(
+                bool
+            )
+    assert_same_masks(masks, expected_masks(dataset))
+
+
+@pytest.fixture(scope="session")
+def datumaro_python(pytestconfig: pytest.Config) -> Path:
+    """An interpreter that has Datumaro; made once, kept in pytest's cache."""
+    assert pytestconfig.cache is not None
+    folder = Path(pytestconfig.cache.mkdir("datumaro")) / DATUMARO
+    if not (folder / "ready").is_file():
+        subprocess.run([sys.executable, "-m", "venv", "--clear", folder], check=True)
+        pip = [folder / "bin" / "python", "-m", "pip", "install", "-q", DATUMARO]
+        finished = subprocess.run(pip, capture_output=True, text=True, check=False)
+        if finished.returncode:
+            pytest.skip(f"{DATUMARO} cannot be installed here: {finished.stderr[-300:]}")
+        (folder / "ready").touch()
+    return folder / "bin" / "python"
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+@pytest.mark.parametrize("name", ["cvat", "datumaro", "coco", "voc"])
+def test_datumaro_itself_reads_the_very_masks(
+    dataset: Dataset, tmp_path: Path, datumaro_python: Path, name: FormatName
+) -> None:
+    dataset = replace(dataset, images="copied")
+    folder, output = export(dataset, name, tmp_path / "out"), tmp_path / "read.npz"
+    finished = subprocess.run(
+        [datumaro_python, "-c", _READER, name, folder, output], capture_output=True, text=True, check=False
+    )
+    assert finished.returncode == 0, finished.stderr
+    with np.load(output) as read:
+        assert read["images"] == 3
+        masks = {tuple(key.split("|")): mask for key, mask in zip(read["keys"].tolist(), read["masks"], strict=True)}
+    assert_same_masks(masks, expected_masks(dataset))
+
+
+def _filled(mask: np.ndarray) -> np.ndarray:
+    filled = np.zeros(mask.shape, np.uint8)
+    for polygon in polygons(mask):
+        cv2.fillPoly(filled, [polygon.astype(np.int32)], 1)
+    return filled.astype(bool)
+
+
+def _blobs(seed: int) -> np.ndarray:
+    """Random islands with holes, and islands in the holes."""
+    noise = gaussian_filter(np.random.default_rng(seed).standard_normal((90, 120)), 3.0)
+    return np.abs(noise) > 0.6 * noise.std()
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_filling_gives_the_mask_back_within_a_pixel(seed: int) -> None:
+    mask = _blobs(seed)
+    wrong = _filled(mask) != mask
+    # Along a slanted slit a pixel of a hole's rim may be hit; nothing is further than a pixel off.
+    near = cv2.dilate(mask.astype(np.uint8), np.ones((3, 3), np.uint8)).astype(bool)
+    assert not (wrong & ~near).any() and not (wrong & mask).any()
+    assert wrong.mean() < 1e-3
+
+
+def test_every_part_is_one_polygon() -> None:
+    mask = _blobs(1)
+    assert len(polygons(mask)) == cv2.connectedComponents(mask.astype(np.uint8), connectivity=8)[0] - 1
+
+
+@pytest.mark.parametrize(
+    "mask",
+    [
+        np.ones((1, 1), bool),
+        np.ones((1, 5), bool),
+        np.eye(4, dtype=bool),
+        np.pad(np.ones((7, 9), bool), 2),
+        np.pad(np.pad(np.zeros((3, 3), bool), 1, constant_values=True), 1),
+        np.pad(np.pad(np.zeros((3, 6), bool), 4, constant_values=True), 1),
+    ],
+    ids=["pixel", "line", "diagonal", "rectangle", "thin ring", "thick ring"],
+)
+def test_simple_shapes_come_back_exactly(mask: np.ndarray) -> None:
+    assert all(len(polygon) >= MIN_POINTS for polygon in polygons(mask))
+    np.testing.assert_array_equal(_filled(mask), mask)
+
+
+def test_straight_edges_need_corners_only() -> None:
+    (rectangle,) = polygons(np.pad(np.ones((30, 40), bool), 3))
+    assert len(rectangle) == 4
+
+
+def test_an_empty_mask_has_no_polygon() -> None:
+    assert polygons(np.zeros((4, 4), bool)) == []
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_row_runs_alternate_from_outside(seed: int) -> None:
+    mask = _blobs(seed)
+    runs = row_runs(mask)
+    inside = np.arange(len(runs)) % 2 == 1
+    np.testing.assert_array_equal(np.repeat(inside, runs).reshape(mask.shape), mask)
+    assert row_runs(np.ones((2, 2), bool)) == [0, 4]

@@ -1,4 +1,4 @@
-"""Single files: whole or not at all, never through a link, never into what is not ours."""
+"""Writing: whole files, lines, locks and table cells; nothing planted is followed."""
 
 import os
 import stat
@@ -7,18 +7,22 @@ import sys
 from pathlib import Path
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from planted import PLANTED, PRECIOUS, contents, plant, treasure
 
 from carts_core.errors import OutputError
 from carts_core.files import (
     BusyError,
     append_line,
+    csv_cell,
     holds_file,
     locked_folder,
     output_path,
     output_stream,
     published,
     remove_file,
+    text_of_cell,
     write_bytes,
     write_text,
 )
@@ -133,3 +137,19 @@ def test_a_disk_that_refuses_is_told_in_words(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(OutputError, match=r"cannot be written \(Not a directory\).*name a folder you may write to"):
         write_text(tmp_path / "file" / "out", "new")
+
+
+@pytest.mark.parametrize("text", ["=1+1", "+cmd|' /C calc'!A0", "-2+3", "@SUM(A1)", "\tx", "\rx", "-", "'quoted"])
+def test_a_cell_is_no_formula(text: str) -> None:
+    assert csv_cell(text) == f"'{text}"
+
+
+@pytest.mark.parametrize("text", ["001", "-0.5", "+3", "1e-9", "PSM1.yaw", "ü", ""])
+def test_numbers_and_plain_texts_stay_as_they_are(text: str) -> None:
+    assert csv_cell(text) == text
+
+
+@given(st.text())
+def test_a_cell_gives_its_text_back(text: str) -> None:
+    assert text_of_cell(csv_cell(text)) == text
+    assert not csv_cell(text).startswith(("=", "@", "\t", "\r"))

@@ -1,6 +1,8 @@
-"""The file: whom it opens for, where it lies, and what it says to others."""
+"""The project file: its path, lock, content, and readers beside the writer."""
 
 import os
+import socket
+import sqlite3
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -12,8 +14,10 @@ from project_model import HAND, IDENTITY
 from sql_file import rows
 
 from carts_core.errors import ProjectError
-from carts_core.project import CorrectedTransform, JointCorrection, Key, Project, Review, ReviewState
+from carts_core.project import CorrectedTransform, JointCorrection, Key, Project, Review, ReviewState, default_path
+from carts_core.project.file import holder, try_lock
 from carts_core.recording import Sequence
+from carts_core.resources import sample_sequence
 
 ACCEPTED = Review(ReviewState.ACCEPTED, "clean")
 
@@ -126,3 +130,71 @@ def test_a_project_survives_moving_its_folder_and_correcting_the_sequence_file(
     table.write_text(table.read_text().replace("0.1", "0.2", 1))
     with pytest.raises(ProjectError, match="the kinematics tables differ"):
         Project.open(Sequence.open(file))
+
+
+def test_a_project_is_beside_its_sequence(tmp_path: Path) -> None:
+    assert default_path(tmp_path / "sequence.toml") == tmp_path / "sequence.carts"
+
+
+def test_the_shipped_sequence_has_its_project_among_the_users_data(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert default_path(sample_sequence()).parent == Path(os.environ["CARTS_DATA"])
+    monkeypatch.delenv("CARTS_DATA")
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "xdg"))
+    assert default_path(sample_sequence()).parent == tmp_path / "xdg" / "carts"
+
+
+def test_sequences_of_one_name_in_read_only_folders_have_projects_of_their_own(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # The superuser may write anywhere, so the system's answer is replaced.
+    monkeypatch.setattr(os, "access", lambda path, mode: False)
+    first, second = (default_path(tmp_path / folder / "sequence.toml") for folder in ("a", "b"))
+    assert first.parent == second.parent == Path(os.environ["CARTS_DATA"]) and first != second
+    (tmp_path / "a").mkdir()
+    (tmp_path / "a" / "sequence.carts").touch()
+    assert default_path(tmp_path / "a" / "sequence.toml") == tmp_path / "a" / "sequence.carts"
+
+
+NOTE = {Key.review(0): Review(note="a")}
+
+
+def test_one_at_a_time_and_the_next_when_the_first_is_closed(tmp_path: Path) -> None:
+    path = tmp_path / "project"
+    path.touch()
+    first, second = (os.open(path, os.O_RDWR) for _ in range(2))
+    assert try_lock(first) and not try_lock(second)
+    assert holder(path) == f"process {os.getpid()} on {socket.gethostname()}"
+    os.close(first)
+    assert try_lock(second)
+    os.close(second)
+    assert holder(path) == "another process"
+
+
+def test_the_lock_outlives_another_descriptor_of_the_file_that_is_closed(project: Project, project_path: Path) -> None:
+    project_path.read_bytes()
+    with Project(IDENTITY, project_path) as second:
+        assert not second.writable and "open for writing elsewhere" in (second.read_only_reason or "")
+    program = (
+        "import sys; from pathlib import Path; from project_model import IDENTITY;"
+        "from carts_core.project import Project; print(Project(IDENTITY, Path(sys.argv[1])).writable)"
+    )
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(Path(__file__).parent), *sys.path])}
+    command = [sys.executable, "-c", program, str(project_path)]
+    finished = subprocess.run(command, capture_output=True, text=True, check=True, env=environment, timeout=60)
+    assert finished.stdout == "False\n"
+
+
+def test_there_is_no_lock_file_whose_loss_would_let_two_writers_in(project: Project, project_path: Path) -> None:
+    project.apply("Note", NOTE)
+    assert {path.name for path in project_path.parent.iterdir()} == {"small.carts", "small.carts-wal"}
+
+
+def test_other_programs_that_use_sqlite_cannot_write_meanwhile(project: Project, project_path: Path) -> None:
+    with pytest.raises(sqlite3.OperationalError, match="locked"):
+        sqlite3.connect(project_path, timeout=0).execute("DELETE FROM steps")
+    project.apply("Note", NOTE)
+    project.close()
+    with sqlite3.connect(project_path, timeout=0) as connection:
+        assert connection.execute("SELECT count(*) FROM steps").fetchone() == (1,)

@@ -1,16 +1,22 @@
-"""Sequence: what a correct file gives."""
+"""Sequences: frames, paths and the cache."""
 
 import json
+import shutil
 import threading
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from pytest import MonkeyPatch
 
 from carts_core.model.camera import Camera
+from carts_core.model.robot import Robot
 from carts_core.recording import Sequence
 from carts_core.recording.images import read_image
+from carts_core.recording.sequence import ByteCache
+from carts_core.resources import shipped_robot
 
 DVRK = Path(__file__).parents[1] / "sequences" / "dvrk_stereo.toml"
 
@@ -276,3 +282,143 @@ def test_the_real_recording_opens_with_thirty_stereo_frames(shared_dir):
             assert frame.images[camera].shape == (480, 640, 3)
             assert frame.masks[camera].shape == (480, 640)
             assert 0.005 < frame.masks[camera].mean() < 0.5
+
+
+@pytest.fixture
+def cold_cache(tmp_path: Path, monkeypatch: MonkeyPatch) -> None:
+    monkeypatch.delenv("CARTS_CACHE", raising=False)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cold"))
+
+
+@pytest.fixture
+def robot_folder(tmp_path: Path) -> Path:
+    """A copy of the shipped robot."""
+    return Path(shutil.copytree(shipped_robot().parent, tmp_path / "recordings" / "robots" / "mine"))
+
+
+@pytest.mark.usefixtures("cold_cache")
+def test_a_robot_loads_by_a_relative_path_with_an_empty_cache(robot_folder: Path, monkeypatch: MonkeyPatch):
+    monkeypatch.chdir(robot_folder.parent.parent)
+    robot = Robot.load("robots/mine/psm_lnd.urdf")
+    assert len(robot.meshes) == len(Robot.load(shipped_robot()).meshes)
+    assert robot.urdf == robot_folder / "psm_lnd.urdf"
+
+
+@pytest.mark.usefixtures("cold_cache")
+def test_a_sequence_by_a_relative_path_has_its_images_after_the_working_directory_changed(
+    tiny_sequence: Callable[..., Path], robot_folder: Path, tmp_path: Path, monkeypatch: MonkeyPatch
+):
+    mine = "recordings/robots/mine/psm_lnd.urdf"
+    path = tiny_sequence(edit=lambda text: text.replace("builtin:psm_lnd", mine))
+    monkeypatch.chdir(path.parent.parent)
+    sequence = Sequence.open(Path(path.parent.name) / path.name)
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    assert sequence.frame(0).images["left"].any()
+    assert sequence.path == path and sequence.scene.arms[0].robot.urdf == robot_folder / "psm_lnd.urdf"
+
+
+def test_the_described_real_frames_open_by_a_relative_path(shared_dir: Path, monkeypatch: MonkeyPatch):
+    monkeypatch.chdir(Path(__file__).parents[2])
+    sequence = Sequence.open("tests/sequences/dvrk_stereo.toml")
+    assert len(sequence) == 30 and len(sequence.scene.arms[0].robot.meshes) > 5
+
+
+@pytest.mark.usefixtures("cold_cache")
+@pytest.mark.parametrize("layout", ["package beside urdf", "package above", "absolute", "file address"])
+def test_meshes_are_found_as_ros_lays_packages_out(robot_folder: Path, monkeypatch: MonkeyPatch, layout: str):
+    text = (robot_folder / "psm_lnd.urdf").read_text()
+    package = robot_folder.parent / "psm_description"
+    (package / "urdf").mkdir(parents=True)
+    shutil.move(robot_folder / "meshes", package / "meshes")
+    start = {
+        "package beside urdf": "package://psm_description/meshes/",
+        "package above": "package://psm_description/meshes/",
+        "absolute": f"{package}/meshes/",
+        "file address": f"file://{package}/meshes/",
+    }[layout]
+    folder = robot_folder if layout == "package above" else package / "urdf"
+    (folder / "arm.urdf").write_text(text.replace('"meshes/', f'"{start}'))
+    monkeypatch.chdir(folder.parent)
+    assert Robot.load(f"{folder.name}/arm.urdf").meshes
+
+
+def make(size: int):
+    return lambda: np.zeros(size, np.uint8)
+
+
+def never() -> np.ndarray:
+    raise AssertionError("this array should have been kept")
+
+
+def test_what_fits_is_made_once():
+    cache = ByteCache(100)
+    first = cache.get("a", make(60))
+    assert cache.get("b", make(40)).nbytes == 40
+    assert cache.get("a", never) is first
+    assert "b" in cache
+
+
+def test_the_array_that_was_not_used_for_longest_goes_first():
+    cache = ByteCache(100)
+    for key in "abc":
+        cache.get(key, make(30))
+    cache.get("a", never)
+    cache.get("d", make(30))
+    assert [key for key in "abcd" if key in cache] == ["a", "c", "d"]
+    cache.get("e", make(90))
+    assert [key for key in "abcde" if key in cache] == ["e"]
+
+
+def test_one_array_may_be_larger_than_the_limit():
+    cache = ByteCache(10)
+    cache.get("a", make(1000))
+    cache.get("a", never)
+    cache.get("b", make(5))
+    assert "a" not in cache and "b" in cache
+
+
+def test_threads_that_ask_for_one_array_share_it():
+    cache, started, go_on = ByteCache(100), threading.Event(), threading.Event()
+    got: list[np.ndarray] = []
+
+    def slow() -> np.ndarray:
+        started.set()
+        assert go_on.wait(30)
+        return np.ones(4)
+
+    first = threading.Thread(target=lambda: got.append(cache.get("a", slow)))
+    second = threading.Thread(target=lambda: got.append(cache.get("a", never)))
+    first.start()
+    assert started.wait(30)
+    second.start()
+    assert cache.get("b", make(1)).size == 1  # Others are not held up.
+    go_on.set()
+    first.join(30)
+    second.join(30)
+    assert len(got) == 2 and got[0] is got[1]
+
+
+def test_an_error_goes_to_its_maker_and_the_next_one_tries_again():
+    cache, started, go_on = ByteCache(100), threading.Event(), threading.Event()
+    caught: list[Exception] = []
+    got: list[np.ndarray] = []
+
+    def broken() -> np.ndarray:
+        started.set()
+        assert go_on.wait(30)
+        raise ValueError("no disk")
+
+    def first() -> None:
+        with pytest.raises(ValueError, match="no disk") as error:
+            cache.get("a", broken)
+        caught.append(error.value)
+
+    threads = [threading.Thread(target=first), threading.Thread(target=lambda: got.append(cache.get("a", make(3))))]
+    threads[0].start()
+    assert started.wait(30)
+    threads[1].start()
+    go_on.set()
+    for thread in threads:
+        thread.join(30)
+    assert len(caught) == 1 and got[0].size == 3
