@@ -3,8 +3,7 @@
 from .jacobian import JacobianBlock as JacobianBlock
 from .jacobian import Tangents as Tangents
 from .outline import Outline as Outline
-from .rasterizer import visibility_numba as visibility
-from .rasterizer import visibility_torch as visibility_torch
+from .rasterizer import visibility as visibility
 from .renderer import Renderer as Renderer
 from .renderer import Rendering as Rendering
 from .renderer import SurfaceRendering as SurfaceRendering
@@ -19,5 +18,4 @@ __all__ = [
     "Tangents",
     "pick_point",
     "visibility",
-    "visibility_torch",
 ]

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from ..compiled import compiled
 from ..model.parts import NORMALS
-from .points import VisiblePoints
+from .points import VisiblePoints, as_array
 
 _HALF = np.float32(0.5)
 
@@ -34,7 +34,7 @@ def _move(pixel, begin, end, dT, dK, K, point, position, normal, left, top, widt
 
 @compiled
 def _carry(maps, near, speed, down, right, out):
-    """Add to `out` what the neighbours that many pixels down and right bring at that speed; see `motion.py`."""
+    """Add to `out` what the neighbours that many pixels down and right bring at that speed; see `carry_motion`."""
     channels, rows, columns = maps.shape
     for row in range(rows - down):
         for column in range(columns - right):
@@ -153,10 +153,7 @@ def map_jacobian(
     blocks = []
     for unknowns, runs in _families(points, tangents):
         box = _Box.around([points.pixel[run] for _, _, run in runs], inverse_depth, margin)
-        if maps.device.type == "cpu":
-            values = jacobian_compiled(*seen, unknowns, runs, box)
-        else:
-            values = jacobian_torch(*seen, unknowns, box)
+        values = jacobian_of_box(*seen, unknowns, runs, box)
         blocks.append(JacobianBlock(torch.tensor(unknowns, device=maps.device), box.left, box.top, values))
     return tuple(blocks)
 
@@ -207,7 +204,7 @@ class _Box:
         return maps[..., self.top : self.top + self.rows, self.left : self.left + self.columns]
 
 
-def jacobian_compiled(
+def jacobian_of_box(
     points: VisiblePoints,
     position: Float[Tensor, "3 K"],
     facing: Float[Tensor, "3 K"],
@@ -219,73 +216,23 @@ def jacobian_compiled(
     runs: list[_Run],
     box: _Box,
 ) -> Float[Tensor, "g cameras 6 rows columns"]:
-    """The derivative of a box of surface maps by some unknowns, on a CPU."""
-    values = maps.new_zeros(len(unknowns), *maps.shape[:2], box.rows, box.columns)
+    """The derivative of a box of surface maps by some unknowns."""
+    values = np.zeros((len(unknowns), *maps.shape[:2], box.rows, box.columns), np.float32)
     fill_jacobian(
         np.array(unknowns),
         np.array([(view, link, here.start, here.stop) for view, link, here in runs]),
-        points.pixel.numpy(),
-        points.point_link.contiguous().numpy(),
-        position.contiguous().numpy(),
-        facing.contiguous().numpy(),
-        tangents.Ts_camera_link.contiguous().numpy(),
-        tangents.intrinsics.contiguous().numpy(),
-        intrinsics.contiguous().numpy(),
-        maps.numpy(),
-        inverse_depth.numpy(),
+        as_array(points.pixel),
+        as_array(points.point_link),
+        as_array(position),
+        as_array(facing),
+        as_array(tangents.Ts_camera_link),
+        as_array(tangents.intrinsics),
+        as_array(intrinsics),
+        as_array(maps),
+        as_array(inverse_depth),
         box.left,
         box.top,
         NORMALS.start,
-        values.numpy(),
+        values,
     )
-    return values
-
-
-def jacobian_torch(
-    points: VisiblePoints,
-    position: Float[Tensor, "3 K"],
-    facing: Float[Tensor, "3 K"],
-    maps: Float[Tensor, "cameras 6 height width"],
-    inverse_depth: Float[Tensor, "cameras height width"],
-    intrinsics: Float[Tensor, "cameras 4"],
-    tangents: Tangents,
-    unknowns: list[int],
-    box: _Box,
-) -> Float[Tensor, "g cameras 6 rows columns"]:
-    """The same without the compiled kernel, for any device."""
-    view, link = points.owners()
-    pose, K = tangents.Ts_camera_link[unknowns][:, view, link, :3], intrinsics[view].T
-    dK = tangents.intrinsics[unknowns][:, view].movedim(-1, 1)
-    point, one = points.point_link, torch.ones_like(points.point_link[:1])
-    both = torch.stack([torch.cat([point, one]), torch.cat([facing, torch.zeros_like(one)])])
-    dX, turning = (pose @ both.permute(2, 1, 0)).permute(3, 0, 2, 1)
-    depth = position[2]
-    ray = position[:2] / depth
-    velocity = K[:2] * (dX[:, :2] - ray * dX[:, 2:]) / depth + dK[:, :2] * ray + dK[:, 2:]
-    flat = position.new_zeros(len(unknowns), 5, inverse_depth.numel())
-    flat[:, :, points.pixel] = torch.cat([velocity, turning], 1)
-    motion = box.of(flat.view(len(unknowns), 5, *inverse_depth.shape)).transpose(1, 2)
-    values = _carried(box.of(maps), motion[:, :, :2], box.of(inverse_depth))
-    values[:, :, NORMALS] += motion[:, :, 2:]
-    return values
-
-
-def _carried(
-    maps: Float[Tensor, "cameras 6 height width"],
-    velocity: Float[Tensor, "g cameras 2 height width"],
-    inverse_depth: Float[Tensor, "cameras height width"],
-) -> Float[Tensor, "g cameras 6 height width"]:
-    """Change of the maps as adjacent pixels are carried by the nearer one's point; see `motion.py`."""
-    jacobian = maps.new_zeros(len(velocity), *maps.shape)
-    size = maps.shape[2:]
-    for axis, dim in ((0, 3), (1, 2)):
-        length = size[dim - 2] - 1
-        first, second = maps.narrow(dim, 0, length), maps.narrow(dim, 1, length)
-        half = 0.5 * (first - second)
-        first_nearer = inverse_depth.narrow(dim - 1, 0, length) >= inverse_depth.narrow(dim - 1, 1, length)
-        along = velocity[:, :, axis]
-        speed = torch.where(first_nearer, along.narrow(dim, 0, length), along.narrow(dim, 1, length))
-        moved = speed[:, :, None] * half
-        jacobian.narrow(dim + 1, 0, length).add_(moved)
-        jacobian.narrow(dim + 1, 1, length).add_(moved)
-    return jacobian
+    return torch.from_numpy(values).to(maps.device)

@@ -5,18 +5,16 @@ motion of the visible surface point there is sufficient.
 """
 
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cache
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
-from torch.nn import functional
 
 from ..compiled import compiled
-from ..threads import one_thread
 from .jacobian import Tangents
-from .points import VisiblePoints
+from .points import VisiblePoints, as_array
 
 
 @compiled
@@ -110,7 +108,7 @@ def move_along_normal(runs, point, normal, Ts, Ks, dTs, dKs, out):
                 out[unknown, k] = moved
 
 
-_BEHIND = 0.01
+BEHIND = 0.01
 """How much further away what is beside an outline is at least, as a share [1]. With less, folds of a surface count."""
 
 _BLUR = 1.5
@@ -144,35 +142,19 @@ class Outline:
         return float(motion.abs().max()) if len(motion) else 0.0
 
 
-def outline_pixels(inverse_depth: Float[Tensor, "cameras height width"]) -> Bool[Tensor, "cameras height width"]:
-    """Pixels with something much further away beside, above or below them, but for those at the border.
-
-    Args:
-        inverse_depth: 1 / depth [1/m], 0 for background.
-    """
-    least = (1.0 - _BEHIND) * inverse_depth[:, 1:-1, 1:-1]
-    around = (
-        inverse_depth[:, :-2, 1:-1],
-        inverse_depth[:, 2:, 1:-1],
-        inverse_depth[:, 1:-1, :-2],
-        inverse_depth[:, 1:-1, 2:],
-    )
-    rim = torch.zeros_like(least, dtype=torch.bool)
-    for neighbour in around:
-        rim |= neighbour < least
-    rim = functional.pad(rim, (1, 1, 1, 1))
-    rim[:, :BORDER] = rim[:, -BORDER:] = False
-    rim[:, :, :BORDER] = rim[:, :, -BORDER:] = False
-    return rim
-
-
 def outline_faces(
     face_ids: Int[Tensor, "cameras height width"], inverse_depth: Float[Tensor, "cameras height width"]
 ) -> Int[Tensor, "cameras height width"]:
-    """The faces that `outline_pixels` see, -1 elsewhere."""
-    if face_ids.device.type != "cpu":
-        return torch.where(outline_pixels(inverse_depth), face_ids, -1)
-    return torch.from_numpy(keep_outline(face_ids.numpy(), inverse_depth.numpy(), 1.0 - _BEHIND, BORDER))
+    """The faces seen by pixels with something much further away beside, above or below them; -1 elsewhere.
+
+    Pixels nearer than `BORDER` to the border of the image do not count.
+
+    Args:
+        face_ids: index of the visible triangle.
+        inverse_depth: 1 / depth [1/m], 0 for background.
+    """
+    kept = keep_outline(as_array(face_ids), as_array(inverse_depth), 1.0 - BEHIND, BORDER)
+    return torch.from_numpy(kept).to(face_ids.device)
 
 
 def outline_position(
@@ -184,34 +166,9 @@ def outline_position(
         inverse_depth: 1 / depth [1/m], 0 for background.
         pixel: of the outlines, as indices into the flattened images.
     """
-    if pixel.device.type != "cpu":
-        return outline_position_torch(inverse_depth, pixel)
-    radius, kernels = _kernels(pixel.device)
     position, normal = np.empty((2, len(pixel)), np.float32), np.empty((2, len(pixel)), np.float32)
-    side = 2 * radius + 1
-    planes = kernels.view(3, side, side).numpy()
-    place_outline(inverse_depth.numpy(), pixel.numpy(), planes, 1.0 - _BEHIND, position, normal)
-    return torch.from_numpy(position), torch.from_numpy(normal)
-
-
-def outline_position_torch(
-    inverse_depth: Float[Tensor, "cameras height width"], pixel: Int[Tensor, " K"]
-) -> tuple[Float[Tensor, "2 K"], Float[Tensor, "2 K"]]:
-    """The same without the compiled kernel, for any device."""
-    height, width = inverse_depth.shape[1:]
-    radius, kernels = _kernels(inverse_depth.device)
-    reach = torch.arange(-radius, radius + 1, device=pixel.device)
-    around = (reach[:, None] * width + reach).flatten()
-    near = inverse_depth.flatten()
-    nearer = (near[pixel + around[:, None]] >= (1.0 - _BEHIND) * near[pixel]).float()
-    with one_thread():
-        soft, right, down = kernels @ nearer
-    slope = torch.stack([-right, -down])
-    steepness = torch.linalg.vector_norm(slope, dim=0).clamp(min=1e-6)
-    normal = slope / steepness
-    # The outline is where the blurred silhouette is one half; near a thin tip that is nowhere.
-    centre = torch.stack([pixel % width, pixel // width % height])
-    return centre + ((soft - 0.5) / steepness).clamp(-1.0, 1.0) * normal, normal
+    place_outline(as_array(inverse_depth), as_array(pixel), gaussian_kernels(), 1.0 - BEHIND, position, normal)
+    return torch.from_numpy(position).to(pixel.device), torch.from_numpy(normal).to(pixel.device)
 
 
 def normal_motion(
@@ -229,52 +186,27 @@ def normal_motion(
         Ts_camera_link, intrinsics: where links are, and the cameras [m, px].
         tangents: derivatives of both by the unknowns.
     """
-    if normal.device.type != "cpu":
-        return normal_motion_torch(points, normal, Ts_camera_link, intrinsics, tangents)
     runs = [(view, link, here.start, here.stop) for view, link, here in points.runs()]
     motion = np.empty((len(tangents.intrinsics), normal.shape[1]), np.float32)
     move_along_normal(
         np.array(runs, np.int64).reshape(-1, 4),
-        points.point_link.contiguous().numpy(),
-        normal.contiguous().numpy(),
-        Ts_camera_link.contiguous().numpy(),
-        intrinsics.contiguous().numpy(),
-        tangents.Ts_camera_link.contiguous().numpy(),
-        tangents.intrinsics.contiguous().numpy(),
+        as_array(points.point_link),
+        as_array(normal),
+        as_array(Ts_camera_link),
+        as_array(intrinsics),
+        as_array(tangents.Ts_camera_link),
+        as_array(tangents.intrinsics),
         motion,
     )
-    return torch.from_numpy(motion)
+    return torch.from_numpy(motion).to(normal.device)
 
 
-def normal_motion_torch(
-    points: VisiblePoints,
-    normal: Float[Tensor, "2 K"],
-    Ts_camera_link: Float[Tensor, "cameras links 4 4"],
-    intrinsics: Float[Tensor, "cameras 4"],
-    tangents: Tangents,
-) -> Float[Tensor, "unknowns K"]:
-    """The same without the compiled kernel, for any device."""
-    view, link = points.owners()
-    T, K = Ts_camera_link[view, link], intrinsics[view].T
-    point = points.point_link
-    X, Y, Z = (T[:, :3, :3] @ point.T[..., None])[..., 0].T + T[:, :3, 3].T
-    ray = torch.stack([X / Z, Y / Z])
-    # By the position in the camera's frame, and from it by the link's pose, row by row.
-    slope = normal * K[:2] / Z
-    slope = torch.cat([slope, -(slope * ray).sum(0, keepdim=True)])
-    by_pose = slope[:, None] * torch.cat([point, torch.ones_like(point[:1])])
-    by_intrinsics = torch.cat([normal * ray, normal])
-    pose = tangents.Ts_camera_link[:, view, link, :3].flatten(2)
-    return (pose * by_pose.flatten(0, 1).T).sum(-1) + (tangents.intrinsics[:, view] * by_intrinsics.T).sum(-1)
-
-
-@lru_cache(maxsize=4)
-def _kernels(device: torch.device) -> tuple[int, Float[Tensor, "3 n"]]:
-    """Radius and weights of a Gaussian and of its derivatives, right and down."""
+@cache
+def gaussian_kernels() -> Float[np.ndarray, "3 side side"]:
+    """A Gaussian and its derivatives, right and down."""
     radius = BORDER - 1
-    steps = torch.arange(-radius, radius + 1, device=device, dtype=torch.float32)
+    steps = torch.arange(-radius, radius + 1, dtype=torch.float32)
     bell = torch.exp(-0.5 * (steps / _BLUR).square())
     bell = bell / bell.sum()
     tilt = bell * steps / _BLUR**2
-    planes = (torch.outer(bell, bell), torch.outer(bell, tilt), torch.outer(tilt, bell))
-    return radius, torch.stack([plane.flatten() for plane in planes])
+    return torch.stack([torch.outer(bell, bell), torch.outer(bell, tilt), torch.outer(tilt, bell)]).numpy()

@@ -114,19 +114,14 @@ def vertices_in_camera(
     geometry: SceneGeometry, Ts_camera_link: Float[Tensor, "*batch links 4 4"]
 ) -> Float[Tensor, "*batch 3 V"]:
     """All vertices in the frame of a camera [m]."""
-    if Ts_camera_link.device.type != "cpu":
-        return vertices_in_camera_at_once(geometry, Ts_camera_link)
     parts = geometry.vertices.split(geometry.vertex_counts, dim=1)
     Ts = Ts_camera_link.unbind(-3)
     return torch.cat([T[..., :3, :3] @ part + T[..., :3, 3:] for T, part in zip(Ts, parts, strict=True)], -1)
 
 
-def vertices_in_camera_at_once(
-    geometry: SceneGeometry, Ts_camera_link: Float[Tensor, "*batch links 4 4"]
-) -> Float[Tensor, "*batch 3 V"]:
-    """The same in one large operation, as a GPU likes it."""
-    T = Ts_camera_link[..., geometry.vertex_links, :3, :]
-    return ((T[..., :3] @ geometry.vertices.T[..., None]) + T[..., 3:])[..., 0].mT
+def as_array(values: Tensor) -> np.ndarray:
+    """A tensor as compiled kernels take it: on the CPU, in C order; not copied where it is so already."""
+    return values.contiguous().cpu().numpy()
 
 
 def unit(vectors: Float[Tensor, "3 K"]) -> Float[Tensor, "3 K"]:
@@ -277,8 +272,6 @@ class VisiblePoints:
 
     def transformed(self, Ts_camera_link: Float[Tensor, "views links 4 4"]) -> tuple[Tensor, Tensor]:
         """Points and normals in the frames of their cameras, each [3, K], differentiable in the transforms."""
-        if self.point_link.device.type != "cpu":
-            return self.transformed_at_once(Ts_camera_link)
         counts = [count for _, _, count in self.groups]
         points, normals = self.point_link.split(counts, 1), self.normal_link.split(counts, 1)
         moved, turned = [], []
@@ -289,19 +282,6 @@ class VisiblePoints:
         if not moved:
             return self.point_link, self.normal_link
         return torch.cat(moved, 1), torch.cat(turned, 1)
-
-    def transformed_at_once(self, Ts_camera_link: Float[Tensor, "views links 4 4"]) -> tuple[Tensor, Tensor]:
-        """The same in few large operations, as a GPU likes it."""
-        view, link = self.owners()
-        R, t = Ts_camera_link[view, link, :3, :3], Ts_camera_link[view, link, :3, 3]
-        points, normals = torch.stack([self.point_link, self.normal_link]).mT.unsqueeze(-1)
-        return ((R @ points)[..., 0] + t).T, (R @ normals)[..., 0].T
-
-    def owners(self) -> tuple[Int[Tensor, " K"], Int[Tensor, " K"]]:
-        """View and link of each point."""
-        groups = torch.tensor(self.groups, dtype=torch.long, device=self.pixel.device).reshape(-1, 3)
-        view, link = groups[:, :2].repeat_interleave(groups[:, 2], dim=0).T
-        return view, link
 
     def intrinsics(self, intrinsics: Float[Tensor, "views 4"]) -> Float[Tensor, "4 K"]:
         """fx, fy, cx, cy of each point's view."""
@@ -320,54 +300,16 @@ def visible_points(
     intrinsics: Float[Tensor, "views 4"],
 ) -> VisiblePoints:
     """The surface point and the normal that each visible pixel sees."""
-    if face_ids.device.type != "cpu":
-        return visible_points_torch(geometry, face_ids, inverse_depth, Ts_camera_link, intrinsics)
-    pixel, face, point, normal, counts = gather_points(
-        face_ids.numpy(),
-        inverse_depth.numpy(),
-        Ts_camera_link.contiguous().numpy(),
-        intrinsics.contiguous().numpy(),
-        geometry.face_links.numpy(),
-        geometry.face_barycentric.numpy(),
-        geometry.face_normals.numpy(),
+    *found, counts = gather_points(
+        as_array(face_ids),
+        as_array(inverse_depth),
+        as_array(Ts_camera_link),
+        as_array(intrinsics),
+        as_array(geometry.face_links),
+        as_array(geometry.face_barycentric),
+        as_array(geometry.face_normals),
     )
-    groups = _groups(counts, Ts_camera_link.shape[1])
-    return VisiblePoints(
-        torch.from_numpy(pixel), torch.from_numpy(face), groups, torch.from_numpy(point), torch.from_numpy(normal)
-    )
-
-
-def _groups(counts: list[int], links: int) -> tuple[tuple[int, int, int], ...]:
-    return tuple((index // links, index % links, count) for index, count in enumerate(counts) if count)
-
-
-@torch.no_grad()
-def visible_points_torch(
-    geometry: SceneGeometry,
-    face_ids: Int[Tensor, "views height width"],
-    inverse_depth: Float[Tensor, "views height width"],
-    Ts_camera_link: Float[Tensor, "views links 4 4"],
-    intrinsics: Float[Tensor, "views 4"],
-) -> VisiblePoints:
-    """The same without the compiled kernel, for any device."""
-    views, height, width = face_ids.shape
     links = Ts_camera_link.shape[1]
-    pixel = (face_ids.flatten() >= 0).nonzero()[:, 0]
-    face = face_ids.flatten()[pixel].long()
-    view = pixel // (height * width)
-    key, order = (view * links + geometry.face_links[face]).int().sort(stable=True)
-    pixel, face = pixel[order], face[order]
-    view, link = key.long() // links, key.long() % links
-    groups = _groups(torch.bincount(key, minlength=views * links).tolist(), links)
-    fx, fy, cx, cy = intrinsics[view].T
-    inside = pixel % (height * width)
-    depth = 1.0 / inverse_depth.flatten()[pixel]
-    x, y = ((inside % width) + 0.5 - cx) / fx, ((inside // width) + 0.5 - cy) / fy
-    from_link = torch.stack([x * depth, y * depth, depth], 1) - Ts_camera_link[view, link, :3, 3]
-    point_link = (Ts_camera_link[view, link, :3, :3].mT @ from_link[..., None])[..., 0].T
-    maps = geometry.face_barycentric.index_select(1, face).view(2, 4, -1)
-    # A pixel at the rim of its triangle may leave it by a rounding error.
-    weight = ((maps[:, :3] * point_link).sum(1) + maps[:, 3]).clamp(0.0, 1.0)
-    a, b, c = geometry.face_normals.index_select(1, face).view(3, 3, -1)
-    normal = a + weight[0] * (b - a) + weight[1] * (c - a)
-    return VisiblePoints(pixel, face, groups, point_link, unit(normal))
+    groups = tuple((index // links, index % links, count) for index, count in enumerate(counts) if count)
+    pixel, face, point, normal = (torch.from_numpy(values).to(face_ids.device) for values in found)
+    return VisiblePoints(pixel, face, groups, point, normal)

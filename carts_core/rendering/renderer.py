@@ -14,7 +14,7 @@ from ..model.scene import Scene, SceneState
 from .jacobian import JacobianBlock, Tangents, map_jacobian
 from .outline import Outline, normal_motion, outline_faces, outline_position
 from .points import SceneGeometry, link_transforms, phong, vertices_in_camera, visible_points
-from .rasterizer import rasterize, visibility_torch
+from .rasterizer import rasterize
 
 
 class _CarryMotion(torch.autograd.Function):
@@ -131,7 +131,7 @@ class Renderer:
         cameras: names of the cameras to render, in this order; all by default. States are of all cameras of the scene,
             or of these alone where they are fewer.
         window: left, top, width and height [px] of the part of these images that is rendered, all of it by default.
-        device: "cpu" (compiled visibility kernel) or a CUDA device (torch visibility).
+        device: of the images and of all that is differentiable; visibility is always found on the CPU.
     """
 
     def __init__(
@@ -296,20 +296,17 @@ class Renderer:
     @torch.no_grad()
     def _visibility(self, views_T: Tensor, views_K: Tensor) -> tuple[Tensor, Tensor]:
         """Visible triangle and inverse depth [views, height, width]."""
-        vertices = vertices_in_camera(self.geometry, views_T).mT
+        vertices = vertices_in_camera(self.geometry, views_T).mT.cpu()
         size = (self.width, self.height)
-        if self.device.type != "cpu":
-            face_ids, depth = visibility_torch(vertices, self.geometry.faces, views_K, *size)
-            return face_ids, torch.where(face_ids >= 0, 1.0 / depth, 0.0)
         seen = [
             rasterize(points.numpy(), self._faces, intrinsics.tolist(), *size, self._surfaces)
-            for points, intrinsics in zip(vertices, views_K, strict=True)
+            for points, intrinsics in zip(vertices, views_K.cpu(), strict=True)
         ]
         if len(seen) == 1:  # the usual case, without a copy
             face_ids, inverse_depth = (array[None] for array in seen[0])
         else:
             face_ids, inverse_depth = (np.stack(arrays) for arrays in zip(*seen, strict=True))
-        return torch.from_numpy(face_ids), torch.from_numpy(inverse_depth)
+        return torch.from_numpy(face_ids).to(self.device), torch.from_numpy(inverse_depth).to(self.device)
 
 
 def _tangents(Ts: Float[Tensor, "states cameras links 4 4"], intrinsics: Tensor, distance: float) -> Tangents:

@@ -7,7 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from jaxtyping import Float
 from perfect_predictor import PerfectPredictor, with_stage, without
+from torch import Tensor
+from torch.nn import functional
 
 from carts_core.errors import SettingsError
 from carts_core.evaluation import dice, start_positions
@@ -17,7 +20,7 @@ from carts_core.optimization.factors import Linearization, Prior
 from carts_core.optimization.factors.edges import EdgeFactor, align_edges
 from carts_core.optimization.variables import Variables
 from carts_core.recording import Sequence
-from carts_core.rendering import Renderer
+from carts_core.rendering import Outline, Renderer
 from carts_core.resources import sample_sequence
 from carts_core.settings import SurfaceSolver
 from carts_core.settings.stages import AlignEdges
@@ -176,6 +179,33 @@ def test_edges_bring_masks_nearer_to_the_truth(domain: str) -> None:
     assert np.mean(found[8]) > np.mean(found[0]) + 0.001
 
 
+def nearest_ref(edges: EdgeFactor, outline: Outline) -> tuple[Float[Tensor, " K"], Float[Tensor, " K"]]:
+    """See `EdgeFactor._nearest`."""
+    strength = _strength_ref(edges, outline) * edges._expected[:, None]
+    best, last = strength.argmax(0), len(edges._samples) - 1
+    middle = best.clamp(1, last - 1)
+    before, peak, after = (strength.gather(0, (middle + d)[None])[0] for d in (-1, 0, 1))
+    finer = 0.5 * (after - before) / (2.0 * peak - before - after).clamp(min=1e-12)
+    # The strongest one at either end is the flank of an edge further away.
+    found = (best > 0) & (best < last)
+    return edges._samples[middle] + 0.5 * finer.clamp(-0.5, 0.5), found.to(strength)
+
+
+def _strength_ref(edges: EdgeFactor, outline: Outline) -> Float[Tensor, "samples K"]:
+    """Squared change of colour along the normal."""
+    height, width = edges._gradient.shape[2:]
+    scale = 2.0 / (torch.tensor([width, height])[:, None] - 1.0)
+    where = outline.position[:, None] + outline.normal[:, None] * edges._samples[:, None]
+    grid = (where * scale[..., None] - 1.0).movedim(0, -1)
+    strength = torch.zeros_like(where[0])
+    for index, gradient in enumerate(edges._gradient):
+        here = outline.camera == index
+        right, down = functional.grid_sample(gradient[None], grid[:, here][None], align_corners=True)[0].split(3)
+        normal = outline.normal[:, here]
+        strength[:, here] = (right * normal[0] + down * normal[1]).square().sum(0)
+    return strength
+
+
 def test_the_compiled_kernel_finds_the_same_edges_as_torch(sequence: Sequence) -> None:
     frame = sequence.frame(0)
     start = sequence.scene.state({ARM: (frame.truth or {})[ARM] + OFF})
@@ -183,7 +213,7 @@ def test_the_compiled_kernel_finds_the_same_edges_as_torch(sequence: Sequence) -
     device = torch.device("cpu")
     edges = EdgeFactor(sequence.scene, frame.images, variables, {}, working_width=320, dehaze=0.0, device=device)
     outline = edges.near(torch.zeros(len(variables)), torch.ones(1, 360, 480), 0.3)._outline
-    compiled, plain = edges._nearest(outline), edges._nearest_torch(outline)
+    compiled, plain = edges._nearest(outline), nearest_ref(edges, outline)
     assert len(outline.camera) > 500 and 0.2 < float(plain[1].mean()) < 1.0
     # Where two edges are as strong but for the last bits, either may be found.
     same = (compiled[0] - plain[0]).abs() < 1e-3

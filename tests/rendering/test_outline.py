@@ -6,13 +6,14 @@ import numpy as np
 import pytest
 import torch
 from scipy.spatial import KDTree
+from slow_references import normal_motion_ref, outline_pixels_ref, outline_position_ref
 
 from carts_core.model.scene import Scene, SceneState
 from carts_core.optimization import FreeParameters
 from carts_core.optimization.variables import APART, Variables
 from carts_core.rendering import Outline, Renderer
 from carts_core.rendering import outline as outlines
-from carts_core.rendering.outline import BORDER, outline_pixels, outline_position
+from carts_core.rendering.outline import BORDER, outline_position
 
 WIDTH, HEIGHT, FINER = 640, 480, 4
 
@@ -87,9 +88,9 @@ def test_outlines_move_as_they_say(free: str, scene_and_state: tuple[Scene, Scen
 def test_what_is_little_further_away_is_no_outline_and_the_border_has_none() -> None:
     depth = torch.full((1, 40, 50), 0.1)
     depth[:, :, 20:30] = 0.0995
-    assert not outline_pixels(1.0 / depth).any(), "half a percent"
+    assert not outline_pixels_ref(1.0 / depth).any(), "half a percent"
     depth[:, :, 20:30] = 0.09
-    found = outline_pixels(1.0 / depth)[0].nonzero()
+    found = outline_pixels_ref(1.0 / depth)[0].nonzero()
     assert set(found[:, 1].tolist()) == {20, 29}, "of the nearer surface only"
     assert found[:, 0].min() == BORDER and found[:, 0].max() == 39 - BORDER
 
@@ -97,7 +98,7 @@ def test_what_is_little_further_away_is_no_outline_and_the_border_has_none() -> 
 def test_a_straight_outline_is_between_its_pixels() -> None:
     inverse_depth = torch.zeros(1, 40, 50)
     inverse_depth[:, :, :20] = 10.0
-    pixel = outline_pixels(inverse_depth).flatten().nonzero()[:, 0]
+    pixel = outline_pixels_ref(inverse_depth).flatten().nonzero()[:, 0]
     position, normal = outline_position(inverse_depth, pixel)
     assert torch.allclose(position[0], torch.tensor(19.5), atol=0.05)
     assert torch.allclose(position[1], (pixel // 50).float(), atol=1e-4)
@@ -120,10 +121,12 @@ def test_compiled_kernels_find_what_torch_finds(
     zero, renderer = torch.zeros(len(parameters)), Renderer(scene)
     compiled = outline(renderer, parameters, zero)
     monkeypatch.setattr(
-        outlines, "keep_outline", lambda faces, near, *_: np.where(outline_pixels(torch.from_numpy(near)), faces, -1)
+        outlines,
+        "keep_outline",
+        lambda faces, near, *_: np.where(outline_pixels_ref(torch.from_numpy(near)), faces, -1),
     )
-    for name in ("outline_position", "normal_motion"):
-        monkeypatch.setattr(f"carts_core.rendering.renderer.{name}", getattr(outlines, f"{name}_torch"))
+    monkeypatch.setattr("carts_core.rendering.renderer.outline_position", outline_position_ref)
+    monkeypatch.setattr("carts_core.rendering.renderer.normal_motion", normal_motion_ref)
     plain = outline(renderer, parameters, zero)
     assert len(plain.camera) > 500
     assert torch.equal(compiled.camera, plain.camera) and torch.equal(compiled.parts, plain.parts)

@@ -10,7 +10,7 @@ from tiny import tiny_scene
 from carts_core.model.meshes import is_closed
 from carts_core.model.robot import Robot
 from carts_core.recording import Sequence
-from carts_core.rendering import Renderer, visibility, visibility_torch
+from carts_core.rendering import Renderer, visibility
 from carts_core.rendering.points import SceneGeometry, link_transforms, vertices_in_camera
 from carts_core.rendering.rasterizer import rasterize
 from carts_core.resources import sample_sequence
@@ -41,35 +41,6 @@ def test_the_compiled_kernel_sees_what_rays_hit(seed: int, near: float) -> None:
     ids, depth = visibility(vertices, faces, INTRINSICS, WIDTH, HEIGHT)
     assert (ids >= 0).mean() > 0.3
     same_surface(ids, depth, *visibility_ref(torch.tensor(vertices), torch.tensor(faces), INTRINSICS, WIDTH, HEIGHT))
-
-
-@pytest.mark.parametrize("near", [0.1, -0.05])
-@pytest.mark.parametrize("seed", [0, 1, 2])
-def test_the_torch_kernel_agrees_with_the_compiled_one(seed: int, near: float) -> None:
-    vertices, faces = random_triangles(seed, near=near)
-    ids, depth = visibility(vertices, faces, INTRINSICS, WIDTH, HEIGHT)
-    other = visibility_torch(torch.tensor(vertices), torch.tensor(faces), torch.tensor(INTRINSICS), WIDTH, HEIGHT)
-    same_surface(ids, depth, *other)
-
-
-def test_the_torch_kernel_sees_many_views_as_each_alone() -> None:
-    vertices = torch.stack([torch.tensor(random_triangles(seed, near=-0.05)[0]) for seed in range(3)])
-    faces, intrinsics = torch.tensor(random_triangles(0)[1]), torch.tensor([INTRINSICS] * 3)
-    intrinsics[1] *= 1.1
-    together = visibility_torch(vertices, faces, intrinsics, WIDTH, HEIGHT)
-    for view in range(3):
-        alone = visibility_torch(vertices[view], faces, intrinsics[view], WIDTH, HEIGHT)
-        assert (alone[0] >= 0).any()
-        assert all(many[view].equal(one) for many, one in zip(together, alone, strict=True))
-
-
-@pytest.mark.gpu
-def test_the_torch_kernel_gives_the_same_on_a_gpu() -> None:
-    vertices, faces = random_triangles(0)
-    ids, depth = visibility(vertices, faces, INTRINSICS, WIDTH, HEIGHT)
-    points, triangles, intrinsics = (torch.tensor(array).cuda() for array in (vertices, faces, np.array(INTRINSICS)))
-    other_ids, other_depth = visibility_torch(points, triangles, intrinsics, WIDTH, HEIGHT)
-    same_surface(ids, depth, other_ids.cpu(), other_depth.cpu())
 
 
 def test_a_triangle_that_passes_the_camera_keeps_its_visible_part() -> None:

@@ -24,7 +24,7 @@ from ...model.scene import Scene, SceneState
 from ...networks.extractor import FeatureExtractor
 from ...optimization import DescentSolver, FrameOptimizer, SolverSettings, SurfaceSolver
 from ...recording import Sequence
-from ...rendering import Renderer, visibility_torch
+from ...rendering import Renderer
 from ...rendering.points import link_transforms, vertices_in_camera
 from ...rendering.rasterizer import rasterize
 from ...resources import sample_sequence
@@ -316,7 +316,6 @@ def render_figures(sequence: Sequence, runs: int) -> dict[str, float]:
         "visibility, compiled kernel": milliseconds(
             lambda: rasterize(vertices.T.numpy(), faces.numpy(), K.tolist(), *size, surfaces), runs
         ),
-        "visibility, torch (as on a GPU)": milliseconds(lambda: visibility_torch(vertices.T, faces, K, *size), 5),
         "segmentation": milliseconds(lambda: renderer.segment(state), runs),
         "render forward": milliseconds(forward, runs),
         "render forward and backward": milliseconds(both, runs),

@@ -14,6 +14,7 @@ from ...imaging.haze import certainty, dehazed, transmission
 from ...imaging.working_image import attention, pixel_weights, smoothed, stacked_images, working_size
 from ...model.scene import Scene
 from ...rendering import Outline, Renderer
+from ...rendering.points import as_array
 from ...settings.stages import AlignEdges
 from ...threads import total
 from ..solvers import bounded_step
@@ -148,7 +149,6 @@ class EdgeFactor:
         hidden = 1.0 - pixel_weights(scene, ignore, size).to(device)
         self._shown = (1.0 - attention(hidden, math.ceil(_REACH))) * certainty(through)
         self.renderer = Renderer(scene, width=size[0], height=size[1], device=device)
-        self._scale = 2.0 / (torch.tensor(size, device=device)[:, None] - 1.0)
         self._samples = torch.arange(-_REACH, _REACH + 0.5 * _SAMPLING, _SAMPLING, device=device)
         self._expected = torch.exp(-0.5 * (self._samples / _LIKELY).square())
         self._share = torch.tensor(_SHARE, device=device)
@@ -189,36 +189,10 @@ class EdgeFactor:
 
     def _nearest(self, outline: Outline) -> tuple[Float[Tensor, " K"], Float[Tensor, " K"]]:
         """Distance to the edge along the outward normal [px], and 1 where there is one, 0 elsewhere."""
-        if self._gradient.device.type != "cpu":
-            return self._nearest_torch(outline)
         values = outline.camera, outline.position, outline.normal, self._samples, self._expected
-        near = nearest_edges(
-            self._gradient.permute(0, 2, 3, 1).contiguous().numpy(), *(value.contiguous().numpy() for value in values)
-        )
-        return torch.from_numpy(near[0]), torch.from_numpy(near[1])
-
-    def _nearest_torch(self, outline: Outline) -> tuple[Float[Tensor, " K"], Float[Tensor, " K"]]:
-        """The same without the compiled kernel, for any device."""
-        strength = self._strength(outline) * self._expected[:, None]
-        best, last = strength.argmax(0), len(self._samples) - 1
-        middle = best.clamp(1, last - 1)
-        before, peak, after = (strength.gather(0, (middle + d)[None])[0] for d in (-1, 0, 1))
-        finer = 0.5 * (after - before) / (2.0 * peak - before - after).clamp(min=1e-12)
-        # The strongest one at either end is the flank of an edge further away.
-        found = (best > 0) & (best < last)
-        return self._samples[middle] + _SAMPLING * finer.clamp(-0.5, 0.5), found.to(strength)
-
-    def _strength(self, outline: Outline) -> Float[Tensor, "samples K"]:
-        """Squared change of colour along the normal."""
-        where = outline.position[:, None] + outline.normal[:, None] * self._samples[:, None]
-        grid = (where * self._scale[..., None] - 1.0).movedim(0, -1)
-        strength = torch.zeros_like(where[0])
-        for index, gradient in enumerate(self._gradient):
-            here = outline.camera == index
-            right, down = functional.grid_sample(gradient[None], grid[:, here][None], align_corners=True)[0].split(3)
-            normal = outline.normal[:, here]
-            strength[:, here] = (right * normal[0] + down * normal[1]).square().sum(0)
-        return strength
+        near = nearest_edges(as_array(self._gradient.permute(0, 2, 3, 1)), *map(as_array, values))
+        distance, found = (torch.from_numpy(each).to(self._gradient.device) for each in near)
+        return distance, found
 
 
 class LocalEdgeFactor:
