@@ -1,5 +1,5 @@
-"""Many recordings: jobs, who runs them, and what came of them.
+"""Batches of jobs over many recordings: manifest, engines, states and results.
 
 `manifest` reads the jobs, `folder` has their states and results, `engines` runs them side by side.
-What a job does is handed to these as a function; `carts_core.cli.batch_job` has it.
+The function that runs a job is in `carts_core.cli.batch_job`.
 """

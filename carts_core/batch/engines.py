@@ -1,4 +1,4 @@
-"""Engines that run the jobs of a batch: worker processes on this machine, and a Slurm cluster."""
+"""Engines that run the jobs of a batch: worker processes on this machine, or a cluster of dask.distributed."""
 
 import multiprocessing
 import os
@@ -10,40 +10,37 @@ from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from typing import Literal
 
-import dask.config
-from distributed import Client, KilledWorker, LocalCluster, as_completed
-
 from ..errors import SettingsError
 from ..stopping import Stopped, end_with_parent, stopped_by_signals
 from .manifest import Job
 
 ATTEMPTS = 5
-"""How often a job is begun whose worker dies, before it counts as failed."""
+"""Number of attempts at a job whose worker dies, before it counts as failed."""
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What came of a job."""
+    """Outcome of a job."""
 
     job: str
     status: Literal["done", "known", "busy", "failed", "stopped"]
-    """`known`: it was done before; `busy`: another process runs it."""
+    """`known`: done before; `busy`: another process runs it."""
     error: str = ""
     seconds: float = 0.0
 
 
 Work = Callable[[Job], Outcome]
-"""Does a job; what people should know of a failure is in the outcome."""
+"""Runs a job; the outcome describes a failure."""
 
 
 def lost(job: Job) -> Outcome:
-    """Of a job whose worker died every time, with no word."""
+    """Outcome of a job whose worker died in each attempt."""
     return Outcome(job.name, "failed", f"its worker died {ATTEMPTS} times; the machine may lack memory (see its log)")
 
 
 _THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
 _PATIENCE = 10.0
-"""How long a process that is to end may take [s]."""
+"""Time for a process to end [s]."""
 
 
 @dataclass
@@ -51,16 +48,16 @@ class _Worker:
     process: BaseProcess
     connection: Connection
     job: Job | None = None
-    """What it works on."""
+    """Its present job."""
 
 
 class Pool:
-    """Processes that take one job after another.
+    """Worker processes that run one job after another.
 
     Args:
-        work: what is done with a job; a function that can be named.
+        work: function that runs a job; importable by name.
         workers: number of processes.
-        threads: of each.
+        threads: of each process.
     """
 
     def __init__(self, work: Work, workers: int, threads: int) -> None:
@@ -68,7 +65,7 @@ class Pool:
         self._context = multiprocessing.get_context("spawn")
 
     def run(self, jobs: Sequence[Job]) -> Iterator[Outcome]:
-        """Do all jobs; yields what came of each as it is known. Ending it early ends the processes."""
+        """Run all jobs; yields outcomes as they arrive. Closing the iterator ends the processes."""
         waiting, attempts = deque(jobs), dict.fromkeys((job.name for job in jobs), 0)
         workers: list[_Worker] = []
         try:
@@ -111,7 +108,7 @@ class Pool:
 
 
 def _hand(worker: _Worker, waiting: deque[Job], attempts: dict[str, int]) -> None:
-    """Give a job to a worker; one that has died meanwhile is noticed when its answer is awaited."""
+    """Send a job to a worker; a dead worker is noticed when its answer is received."""
     worker.job = waiting.popleft()
     attempts[worker.job.name] += 1
     with suppress(OSError):
@@ -129,7 +126,7 @@ def _end(worker: _Worker) -> None:
 
 @contextmanager
 def _threads_of_children(threads: int) -> Iterator[None]:
-    """Libraries read how many threads they may have when they are loaded, so it is in a child's environment."""
+    """Limit threads of child processes by environment variables, which libraries read when they are loaded."""
     before = {name: os.environ.get(name) for name in _THREADS}
     os.environ.update(dict.fromkeys(_THREADS, str(threads)))
     try:
@@ -143,7 +140,7 @@ def _threads_of_children(threads: int) -> Iterator[None]:
 
 
 def _serve(connection: Connection, work: Callable[[Job], Outcome], parent: int) -> None:
-    """Does jobs until there are no more, or the parent has ended."""
+    """Run jobs until the connection or the parent ends."""
     with stopped_by_signals(), suppress(Stopped):
         end_with_parent(parent)
         while True:
@@ -163,21 +160,25 @@ class Cluster:
     """Workers of dask.distributed, which share a file system with this machine.
 
     Args:
-        work: what is done with a job; a function that can be named.
+        work: function that runs a job; importable by name.
         scheduler: address such as `tcp://10.0.0.1:8786`, or `local` for workers on this machine.
-        workers: number of these.
-        threads: of each.
+        workers: number of local workers.
+        threads: of each worker.
     """
 
     def __init__(self, work: Work, scheduler: str, workers: int, threads: int) -> None:
         self._work, self._scheduler, self._workers, self._threads = work, scheduler, workers, threads
 
     def run(self, jobs: Sequence[Job]) -> Iterator[Outcome]:
-        """Do all jobs; yields what came of each as it is known.
+        """Run all jobs; yields outcomes as they arrive.
 
         Raises:
-            SettingsError: nobody answers at the scheduler's address.
+            SettingsError: the scheduler does not answer.
         """
+        # Optional dependencies, which worker processes on this machine do without.
+        import dask.config  # noqa: PLC0415
+        from distributed import Client, KilledWorker, LocalCluster, as_completed  # noqa: PLC0415
+
         threads = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), self._threads)
         dask.config.set(
             {
@@ -194,7 +195,7 @@ class Cluster:
                 client = held.enter_context(Client(address, timeout="10s"))
             except (OSError, ValueError) as error:
                 raise SettingsError(
-                    f"--scheduler {self._scheduler}: nobody answers ({error}). Start one with `dask scheduler`, and "
+                    f"--scheduler {self._scheduler}: no answer ({error}). Start one with `dask scheduler`, and "
                     "workers with `dask worker ADDRESS --nthreads 1`, or give `local`."
                 ) from error
             futures = {client.submit(self._work, job, key=f"carts-{job.name}", pure=False): job for job in jobs}

@@ -27,36 +27,36 @@ from .manifest import STEPS, Job, Step
 JOB_FILE = "job.json"
 _JOB_FORMAT: Literal["carts-job/1"] = "carts-job/1"
 HEARTBEAT_SECONDS = 10.0
-"""A running job says so this often."""
+"""Interval of the heartbeat of a running job [s]."""
 
 Status = Literal["waiting", "running", "done", "failed", "stopped"]
 
 
 @dataclass(frozen=True)
 class StepState:
-    """What is known of a step."""
+    """State of a finished step."""
 
     key: str
-    """Of what it is made from; a step of another key is taken again."""
+    """Fingerprint of its inputs; a step with another key runs again."""
     seconds: float
-    """It took so long [s]."""
+    """Duration [s]."""
 
 
 @dataclass(frozen=True)
 class JobState:
-    """What is known of a job."""
+    """State of a job."""
 
     status: Status = "waiting"
     steps: Mapping[str, StepState] = field(default_factory=dict)
-    """Those that are done."""
+    """Finished steps."""
     attempts: Annotated[int, msgspec.Meta(ge=0)] = 0
-    """How often it was begun since it was last done or failed; more than once where a worker was lost."""
+    """Number of starts since it last finished or failed; more than one if a worker was lost."""
     error: str = ""
-    """Why it failed."""
+    """Reason of a failure."""
     worker: str = ""
-    """Machine and process that ran it last."""
+    """Machine and process of the last run."""
     heartbeat: float = 0.0
-    """When it was last known to run [s since 1970]."""
+    """Time of the last heartbeat [s since 1970]."""
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,7 @@ class _WrittenState(JobState):
 
 
 def read_state(folder: OutputPath) -> JobState:
-    """What is known of the job of a folder; where its file is damaged, that it has failed by that."""
+    """State of the job of a folder; failed if its file is damaged."""
     try:
         return _read(folder)
     except (OSError, ValueError) as error:
@@ -76,7 +76,7 @@ def read_state(folder: OutputPath) -> JobState:
 
 
 def _read(folder: OutputPath) -> JobState:
-    """What is known of a job.
+    """State of a job.
 
     Raises:
         OSError, ValueError: the file is damaged.
@@ -89,12 +89,12 @@ def _read(folder: OutputPath) -> JobState:
 
 
 def write_state(folder: OutputPath, state: JobState) -> None:
-    """Replace what is known of a job."""
+    """Replace the state of a job."""
     write_text(folder / JOB_FILE, json.dumps({"format": _JOB_FORMAT, **asdict(state)}, indent=1))
 
 
 def present_status(folder: OutputPath) -> tuple[str, JobState]:
-    """The status of a job, `lost` where it should be running and nobody holds it, and all that is known of it."""
+    """Status and state of a job; `lost` if it is marked as running and no process holds its lock."""
     state = read_state(folder)
     if state.status == "running":
         with suppress(BusyError), locked_folder(folder):
@@ -103,10 +103,10 @@ def present_status(folder: OutputPath) -> tuple[str, JobState]:
 
 
 class RunningJob:
-    """A job that this process runs; its state on disk, with a heartbeat.
+    """Job run by this process, with its state on disk.
 
     Attributes:
-        state: what is known of it.
+        state: present state.
     """
 
     def __init__(self, folder: OutputPath) -> None:
@@ -118,19 +118,19 @@ class RunningJob:
             self.state = JobState()
 
     def change(self, **values: object) -> None:
-        """Change what is known."""
+        """Update fields of the state."""
         with self._changing:
             self.state = replace(self.state, heartbeat=time.time(), **values)  # pyright: ignore[reportArgumentType]
             write_state(self._folder, self.state)
 
     def step_done(self, name: str, step: StepState) -> None:
-        """A step was taken."""
+        """Record a finished step."""
         self.change(steps={**self.state.steps, name: step})
 
 
 @contextmanager
 def running(folder: OutputPath) -> Iterator[RunningJob | None]:
-    """Hold a job and keep its heartbeat while the block runs; None where another process runs it."""
+    """Lock a job and write its heartbeat while the block runs; None if another process runs it."""
     with ExitStack() as held:
         try:
             held.enter_context(locked_folder(folder))
@@ -154,21 +154,21 @@ def running(folder: OutputPath) -> Iterator[RunningJob | None]:
 
 
 def this_worker() -> str:
-    """Machine and process, for people."""
+    """Host name and process id."""
     return f"{socket.gethostname()}:{os.getpid()}"
 
 
 FINDINGS_FILE = "findings.json"
 _FINDINGS_FORMAT: Literal["carts-findings/1"] = "carts-findings/1"
 _WORST = 3
-"""Frames of a job that are shown."""
+"""Number of frames of a job with pictures."""
 _WIDTH = 480
-"""Of their pictures, at most [px]."""
+"""Largest width of pictures [px]."""
 
 
 @dataclass(frozen=True)
 class FrameFinding:
-    """The verdict on a frame."""
+    """Verdict on a frame."""
 
     camera: str
     frame: str
@@ -176,14 +176,14 @@ class FrameFinding:
     """`good`, `doubtful` or `failed`."""
     reason: str
     probability: Annotated[float, msgspec.Meta(ge=0, le=1)]
-    """That its mask is wrong [1]."""
+    """Probability that its mask is wrong [1]."""
     picture: str = ""
     """File in the job's folder; empty for frames that are not among the worst."""
 
 
 @dataclass(frozen=True)
 class Findings:
-    """What a job found."""
+    """Results of a job."""
 
     recording: str
     frames: list[FrameFinding] = field(default_factory=list)
@@ -192,7 +192,7 @@ class Findings:
     deviations: dict[str, list[float]] = field(default_factory=dict)
     """`ARM.JOINT` -> reported standard deviation, of each frame that has one [deg, mm]."""
     base_frames: dict[str, list[list[float]]] = field(default_factory=dict)
-    """`ARM in CAMERA` -> T_camera_base, calibrated where that was asked for [4 x 4, m]."""
+    """`ARM in CAMERA` -> T_camera_base, calibrated if that was a step [4 x 4, m]."""
 
 
 @dataclass(frozen=True)
@@ -203,7 +203,7 @@ class _WrittenFindings(Findings):
 
 
 def read_findings(folder: OutputPath) -> Findings | None:
-    """What the job of a folder found; None before it has ended.
+    """Results of the job of a folder; None before it has ended.
 
     Raises:
         OSError, ValueError: the file is damaged.
@@ -221,9 +221,9 @@ def write_findings(job: Job, folder: OutputPath, sequence_file: Path) -> None:
     """Write `findings.json`, and pictures of the worst frames.
 
     Args:
-        job: that is done.
+        job: finished job.
         folder: of the job.
-        sequence_file: with the calibration that its last steps used.
+        sequence_file: with the calibration of its last steps.
     """
     sequence = Sequence.open(sequence_file)
     scene, found = sequence.scene, Findings(str(job.recording))
@@ -271,7 +271,7 @@ def _records(path: Path) -> Mapping[str, Mapping[str, Any]]:
 
 
 def _pictured(folder: OutputPath, sequence: Sequence, part: Path, frames: list[FrameFinding]) -> Iterator[FrameFinding]:
-    """The frames, the worst with pictures: the image with the mask's outline."""
+    """The frames, the worst ones with pictures of the mask's outline in the image."""
     worst = sorted(frames, key=lambda frame: -frame.probability)[:_WORST]
     domain, first = part.parent.name, part.name.split("+")[0]
     masks = part / "masks" / first if "+" in part.name else part / "masks"
@@ -295,12 +295,12 @@ BATCH_FILE = "batch.json"
 _LONGEST_ERROR = 1000
 """Characters."""
 ORDER = ("failed", "lost", "stopped", "running", "waiting", "done")
-"""Statuses, those that need somebody first."""
+"""Statuses, most urgent first."""
 
 
 @dataclass(frozen=True)
 class KnownJob:
-    """What is known of a job."""
+    """A job with its state and results."""
 
     job: Job
     status: str
@@ -308,17 +308,17 @@ class KnownJob:
     state: JobState
     findings: Findings | None
     damage: str = ""
-    """Why its findings cannot be read, for people."""
+    """Reason why its results cannot be read."""
 
     @property
     def error(self) -> str:
-        """The last line of why it failed, or why its findings cannot be read; empty otherwise."""
+        """Last line of its error, or reason why its results cannot be read; empty otherwise."""
         lines = self.state.error.strip().splitlines()
         return lines[-1][:_LONGEST_ERROR] if lines else self.damage
 
 
 def known_jobs(batch: OutputPath, jobs: Rows[Job]) -> list[KnownJob]:
-    """What is known of jobs, in their order."""
+    """States and results of jobs, in their order."""
     return [_known(batch / "jobs" / job.name, job) for job in jobs]
 
 
@@ -334,7 +334,7 @@ def _known(folder: OutputPath, job: Job) -> KnownJob:
 
 
 def most_urgent_first(known: Rows[KnownJob]) -> list[KnownJob]:
-    """Failures first, what is done last."""
+    """Jobs sorted by `ORDER`."""
     return sorted(known, key=lambda entry: ORDER.index(entry.status))
 
 
@@ -358,7 +358,7 @@ class _Batch:
 
 
 def write_jobs(batch: OutputPath, jobs: Rows[Job]) -> None:
-    """Write which jobs a batch has, so that it can be looked at without its manifest."""
+    """Write the list of jobs, for readers without the manifest."""
     rows = [_Row(job.name, str(job.recording.resolve()), job.camera, job.domain, job.steps) for job in jobs]
     write_text(batch / BATCH_FILE, json.dumps(asdict(_Batch("carts-batch-jobs/1", rows)), indent=1))
 

@@ -1,4 +1,4 @@
-"""Which jobs there are: a TOML file that names recordings, cameras, domains, and what is done with each."""
+"""Manifest of a batch: a TOML file with recordings, cameras, domains and steps."""
 
 import glob
 from collections.abc import Iterator, Mapping
@@ -20,18 +20,18 @@ _KEYS = {"recordings", "cameras", "domains", "steps", "options"}
 
 @dataclass(frozen=True)
 class Job:
-    """One recording, as one camera (or some) saw it in one domain, and the steps to be taken with it."""
+    """Steps for one recording in one domain, with one or all cameras."""
 
     name: str
-    """Of its folder; unique in the manifest."""
+    """Name of its folder; unique in the manifest."""
     recording: Path
-    """Sequence file, or what `carts import` reads where `import` is the first step."""
+    """Sequence file, or source of `carts import` if `import` is the first step."""
     camera: str
     """Name, or `all`."""
     domain: str
     """Name; empty for the sequence's first one."""
     steps: tuple[Step, ...]
-    """In this order; a later one works on what the ones before it have made."""
+    """In this order; each one uses the results of those before."""
     options: Mapping[str, tuple[str, ...]]
     """Step -> further options of its command."""
 
@@ -41,7 +41,7 @@ def read_manifest(path: Path, output: Path | None = None) -> list[Job]:
 
     Args:
         path: of the manifest.
-        output: folder of the batch, if there is one. What lies there was made by it, and patterns leave it out.
+        output: folder of the batch, if any; patterns do not match files in it.
 
     Raises:
         SettingsError: it cannot be read, has a key, step or value that is not allowed, or a pattern matches no file.
@@ -109,7 +109,7 @@ def _options(where: str, given: Any, steps: tuple[Step, ...]) -> dict[str, tuple
 
 
 def _recordings(manifest: Path, output: Path | None, where: str, patterns: tuple[str, ...]) -> list[Path]:
-    """Files and folders that patterns match, those of each pattern in the order of their names."""
+    """Files and folders matched by patterns, sorted by name for each pattern."""
     folder, found = manifest.absolute().parent, []
     for pattern in patterns:
         matched = sorted(glob.glob(str(folder / pattern), recursive=True))
@@ -122,7 +122,7 @@ def _recordings(manifest: Path, output: Path | None, where: str, patterns: tuple
 
 
 def _name(recording: Path, domain: str, camera: str) -> str:
-    """The folder of a sequence file tells more than its name, which is often `sequence.toml`."""
+    """Name of a job; of `sequence.toml` files, that of their folder."""
     stem = recording.parent.name if recording.name == "sequence.toml" else recording.stem
     return "-".join(part for part in (stem, domain, camera if camera != "all" else "") if part)
 

@@ -1,4 +1,4 @@
-"""The report over all jobs: one page, with plots and the worst frames beside it, and the same numbers as JSON."""
+"""Report over all jobs as an HTML page with plots and the worst frames, and as JSON."""
 
 import json
 from collections import Counter
@@ -23,7 +23,7 @@ matplotlib.use("Agg")
 matplotlib.rcParams["text.parse_math"] = False
 
 _SHOWN = 24
-"""Worst frames on the page."""
+"""Number of worst frames on the page."""
 _PAGE = Template("""<!doctype html>
 <html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
 <title>$title</title><style>$style
@@ -67,10 +67,10 @@ def write_batch_report(batch: OutputPath, title: str, jobs: Sequence[Job]) -> Pa
 
 
 def _job_table(known: Sequence[KnownJob]) -> Table:
-    """Jobs that need somebody first."""
+    """Table of jobs, most urgent first."""
     counts = Counter(entry.status for entry in known)
     return Table(
-        "What became of the jobs",
+        "Status of the jobs",
         ", ".join(f"{counts[status]} {status}" for status in ORDER if counts[status]),
         ("job", "recording", "status", "seconds", "error"),
         tuple(
@@ -92,15 +92,15 @@ def _verdicts(entry: KnownJob) -> dict[str, int]:
 
 
 def _verdict_table(known: Sequence[KnownJob]) -> Table:
-    """Jobs with the largest share of bad frames first."""
+    """Table of verdicts, sorted by the share of failed frames."""
     counted = [(entry, _verdicts(entry)) for entry in known]
     rows = [(entry.job.name, counts) for entry, counts in counted if sum(counts.values())]
     rows.sort(key=lambda row: (-row[1]["failed"] / sum(row[1].values()), -row[1]["doubtful"] / sum(row[1].values())))
     total = {verdict: sum(counts[verdict] for _, counts in rows) for verdict in _VERDICTS}
     lines = [*([("all jobs", total)] if rows else []), *rows]
     return Table(
-        "How far results can be relied on",
-        "Frames by verdict, as far as their images tell; nothing here knows the truth.",
+        "Reliability of the results",
+        "Frames by verdict, from their images alone, without ground truth.",
         ("job", *_VERDICTS, "frames"),
         tuple(
             (Cell(name), *(Cell(str(counts[verdict])) for verdict in _VERDICTS), Cell(str(sum(counts.values()))))
@@ -110,7 +110,7 @@ def _verdict_table(known: Sequence[KnownJob]) -> Table:
 
 
 def _worst(batch: OutputPath, folder: OutputPath, known: Sequence[KnownJob]) -> str:
-    """Pictures of the frames whose masks are wrong most probably; copied, so that the folder can be sent on its own."""
+    """Gallery of the frames with the largest probability of a wrong mask; pictures are copied into the report."""
     frames: list[tuple[Job, FrameFinding]] = [
         (entry.job, frame)
         for entry in known
@@ -136,7 +136,7 @@ def _worst(batch: OutputPath, folder: OutputPath, known: Sequence[KnownJob]) -> 
 
 
 def _drifts(known: Sequence[KnownJob]) -> list[dict[str, object]]:
-    """Of each base frame in each job: how far it is from that of the job before, in the manifest's order."""
+    """Change of each base frame since the job before, in the manifest's order."""
     found, before = [], {}
     for entry in known:
         for name, rows in (entry.findings.base_frames if entry.findings else {}).items():
@@ -150,7 +150,7 @@ def _drifts(known: Sequence[KnownJob]) -> list[dict[str, object]]:
 def _drift_table(drifts: list[dict[str, object]]) -> Table:
     return Table(
         "Drift of base frames",
-        "How far each arm's base, seen from a camera, is from where it was in the job before, in the manifest's order.",
+        "Change of each arm's base frame in a camera since the job before, in the manifest's order.",
         ("base frame", "job", "turned [deg]", "moved [mm]"),
         tuple(
             (
@@ -200,7 +200,7 @@ def _joint_table(joints: Mapping[str, _Values]) -> Table:
         rows.append((Cell(name), Cell(str(found["frames"])), *map(Cell, texts)))
     return Table(
         "Error of measured joints",
-        "Corrected minus measured, over the frames of all jobs; degrees, or millimetres for joints that slide.",
+        "Corrected minus measured, over the frames of all jobs; degrees, or millimetres for prismatic joints.",
         ("joint", "frames", "mean", "deviation", "median size", "largest", "median reported deviation"),
         tuple(rows),
     )

@@ -1,4 +1,4 @@
-"""A project to review a job in: its recording, with what the job has found as corrections."""
+"""Project for the review of a job: its recording with the results as corrections."""
 
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -16,26 +16,26 @@ from ..recording import Sequence
 from .manifest import Job
 
 _MADE = {"calibrate": "calibration", "import": "recording"}
-"""Step -> folder with the sequence file that it writes; the first one that a job has is that of its results."""
+"""Step -> folder of the sequence file that it writes; the results of a job refer to the first one."""
 
 
 def sequence_file(folder: OutputPath, job: Job) -> Path:
-    """The sequence file that a job's results belong to.
+    """Sequence file of a job's results.
 
     Args:
         folder: of the job.
-        job: which one.
+        job: the job.
     """
     made = [folder / name / "sequence.toml" for step, name in _MADE.items() if step in job.steps]
     return next((path.path for path in made if holds_file(path)), job.recording)
 
 
 def review_project(folder: OutputPath, job: Job) -> Path:
-    """The project to review a job in, begun if it is not there. New results get a new project, the old one stays.
+    """Project for the review of a job, created if missing. New results get a new project; old ones are kept.
 
     Args:
         folder: of the job.
-        job: which one.
+        job: the job.
 
     Raises:
         CartsError: the recording cannot be opened, the results are damaged, or the project cannot be written.

@@ -1,4 +1,4 @@
-"""Metrics, and the evaluation of optimized frames against known masks and kinematics."""
+"""Metrics, and evaluation of results against ground truth."""
 
 from .calibration import FrameResidual as FrameResidual
 from .calibration import calibration_json as calibration_json

@@ -26,11 +26,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class FrameResidual:
-    """One frame, with joints as measured, under both calibrations."""
+    """Residuals of one frame with measured joints, before and after a calibration."""
 
     frame: str
     weight: float
-    """How far it counted, in [0, 1]."""
+    """Weight in the calibration, in [0, 1]."""
     loss_before: float
     loss_after: float
     dice_before: dict[str, float]
@@ -39,7 +39,7 @@ class FrameResidual:
 
 
 def frame_residuals(sequence: Sequence, frames: Frames[Frame], result: CalibrationResult) -> list[FrameResidual]:
-    """Compare the frames that a calibration was made from with the images and, where they are, the masks."""
+    """Residuals of the frames of a calibration: losses, and Dice with masks where given."""
     overlaps = []
     for scene in (sequence.scene, result.scene):
         renderers = {camera: Renderer(scene, cameras=[camera]) for camera in frames[0].images}
@@ -69,7 +69,7 @@ def mean_dice(residuals: Frames[FrameResidual], camera: str) -> tuple[float, flo
 
 
 def calibration_json(before: Scene, result: CalibrationResult, residuals: Frames[FrameResidual]) -> dict[str, Any]:
-    """Both calibrations, their difference, and the residuals; matrices in metres, the rest as the keys say."""
+    """Both calibrations, their difference and the residuals as JSON; matrices in metres, other units in the keys."""
     cameras = zip(before.cameras, result.scene.cameras, strict=True)
     found = result.assessment
     return {
@@ -95,7 +95,7 @@ def calibration_json(before: Scene, result: CalibrationResult, residuals: Frames
 
 
 def moved_frames(before: Scene, after: Scene) -> list[tuple[str, float, float]]:
-    """Every base frame and camera that differs: what it is, by how many degrees, and by how many millimetres."""
+    """Name, rotation [deg] and translation [mm] of each base frame and camera that moved."""
     pairs: list[tuple[Arm | Camera, np.ndarray, np.ndarray]] = []
     for old, new in zip(before.arms, after.arms, strict=True):
         pairs.append((old, old.T_world_base, new.T_world_base))
@@ -112,11 +112,11 @@ def moved_frames(before: Scene, after: Scene) -> list[tuple[str, float, float]]:
 
 
 def beyond_prior(before: Scene, result: CalibrationResult, known: Mapping[str, Float[np.ndarray, "6 6"]]) -> str | None:
-    """Which base frames have moved farther than hand-eye calibration leaves open; None if none has.
+    """Text on base frames that moved farther than the hand-eye calibration allows; None if there are none.
 
     Args:
-        before: with the calibration as it was.
-        result: the new one.
+        before: scene with the calibration before.
+        result: the new calibration.
         known: arm -> covariance of its base frame, as of `HandEyeResult`.
     """
     said = []
@@ -131,17 +131,14 @@ def beyond_prior(before: Scene, result: CalibrationResult, known: Mapping[str, F
 
 
 def remark(before: Scene, result: CalibrationResult) -> str | None:
-    """What to know before the calibration is used; None where only intrinsics changed."""
+    """Warning about the use of a calibration; None if only intrinsics changed."""
     if not any(unknown.change for unknown in result.unknowns):
-        return (
-            "The start was kept: nothing that was tried made these frames fit better, so the calibration is as it was."
-        )
+        return "The start was kept: no other calibration fits these frames better."
     if not moved_frames(before, result.scene):
         return None
     return (
-        "Images can hardly tell a wrong base frame from a joint that is read wrong by the same amount in every frame, "
-        "and not at all where an arm stands still. What moved here may be either: it fits these joint readings, and is "
-        "no more right than they are."
+        "Images hardly distinguish a wrong base frame from a constant joint offset, and not at all for an arm at rest. "
+        "The new calibration fits these joint readings, and includes their offsets."
     )
 
 
@@ -169,11 +166,11 @@ def write_calibration(
     """Write `sequence.toml`, `calibration.json`, `frames.png`, `unknowns.png` and `README.md`.
 
     Args:
-        folder: is made, and written to.
-        target: where the folder will lie in the end; paths in the sequence file are relative to it.
-        sequence: with the calibration as it was.
-        result: the new one.
-        residuals: of the frames that it was made from.
+        folder: output, created if missing.
+        target: final location of the folder, to which paths in the sequence file are relative.
+        sequence: with the calibration before.
+        result: the new calibration.
+        residuals: of its frames.
     """
     text = calibrated_sequence_file(sequence.path, target, sequence.scene, result.scene)
     write_text(folder / "sequence.toml", text)
@@ -191,12 +188,12 @@ def _cameras(residuals: Frames[FrameResidual]) -> list[str]:
 
 def _figure(width: float, height: float) -> "Figure":
     """An empty figure of a size [inch]."""
-    # They take 0.3 s, and nothing else of what is imported with this module draws.
+    # Imported late: it takes 0.3 s.
     import matplotlib  # noqa: PLC0415
     from matplotlib.figure import Figure  # noqa: PLC0415
 
     matplotlib.use("Agg")
-    # Names of frames and cameras are no formulas.
+    # Names of frames and cameras are not formulas.
     matplotlib.rcParams["text.parse_math"] = False
     return Figure(figsize=(width, height), layout="constrained")
 
@@ -305,5 +302,5 @@ def _page(sequence: Sequence, result: CalibrationResult, residuals: Frames[Frame
         ]
         values = [f"{residual.weight:.2f}", f"{residual.loss_before:.4f}", f"{residual.loss_after:.4f}", *scores]
         lines.append(f"| {' | '.join([in_markdown(residual.frame), *values])} |")
-    lines += ["", "A frame whose loss stands out from the others' counts less; its weight says how much.", ""]
+    lines += ["", "Frames with outlying losses have lower weights.", ""]
     return "\n".join(lines)

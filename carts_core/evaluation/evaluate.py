@@ -36,10 +36,10 @@ def dice(a: Bool[np.ndarray, "h w"], b: Bool[np.ndarray, "h w"]) -> float:
 
 
 def normalized_surface_distance(a: Bool[np.ndarray, "h w"], b: Bool[np.ndarray, "h w"], tolerance: float) -> float:
-    """Share of both masks' outlines that lies within `tolerance` [px] of the other's outline, 0 to 1 (NSD).
+    """Normalized surface distance (NSD): share of both outlines within `tolerance` [px] of the other one, in [0, 1].
 
-    An outline is the mask's pixels that have a neighbour (left, right, above, below) outside the mask. The image's
-    border is no outline: there the mask is cut off, not ended. Two masks without outline agree if they are equal.
+    An outline consists of the mask's pixels with a 4-neighbour outside the mask. The image border does not count as
+    outline. Two masks without outline agree if they are equal.
     """
     outlines = [_outline(mask) for mask in (a, b)]
     total = sum(int(outline.sum()) for outline in outlines)
@@ -56,7 +56,7 @@ def normalized_surface_distance(a: Bool[np.ndarray, "h w"], b: Bool[np.ndarray, 
 
 def _outline(mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
     cross = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
-    # OpenCV erodes as if the mask went on beyond the image.
+    # OpenCV extends the mask beyond the border.
     return mask & (cv2.erode(mask.astype(np.uint8), cross) == 0)
 
 
@@ -66,12 +66,12 @@ def joint_mae_deg(
     truth: Mapping[str, Float[np.ndarray, " dofs"]],
     joints: Mapping[str, tuple[str, ...]],
 ) -> float | None:
-    """Mean absolute error [deg] of the named revolute joints over all arms; None where nothing can be compared.
+    """Mean absolute error [deg] of the named revolute joints over all arms; None without ground truth.
 
     Args:
-        scene: whose arms these are.
+        scene: with the arms.
         estimate, truth: arm name -> joint positions [rad, m].
-        joints: arm name -> joints that count.
+        joints: arm name -> joints to compare.
     """
     errors = []
     for arm in scene.arms:
@@ -87,9 +87,9 @@ def joint_std_deg(
     """Mean standard deviation [deg] of the named revolute joints over all arms; None where none is known.
 
     Args:
-        scene: whose arms these are.
+        scene: with the arms.
         joint_std: arm name -> standard deviations [rad, m]; NaN ones do not count.
-        joints: arm name -> joints that count.
+        joints: arm name -> joints to compare.
     """
     values = [
         value for arm in scene.arms for value in _revolute(arm, joint_std[arm.name], joints) if np.isfinite(value)
@@ -104,7 +104,7 @@ def _revolute(arm: Arm, values: Float[np.ndarray, " dofs"], joints: Mapping[str,
 
 @dataclass(frozen=True)
 class FrameScore:
-    """One optimized frame; None where there is no truth."""
+    """Scores of one optimized frame; None without ground truth."""
 
     frame: str
     camera: str
@@ -116,17 +116,17 @@ class FrameScore:
     iterations: int
     seconds: float
     stopped: str
-    """Why the optimization ended, or in sequence mode where the frame's values come from."""
+    """Stop reason, or the source of the frame's values in sequence mode."""
     joint_std_deg: float | None = None
     """Mean standard deviation of measured revolute joints [deg]; None where it is not known."""
     verdict: str | None = None
-    """good, doubtful or failed, of the mask and as far as the image tells; None where it is not assessed."""
+    """Verdict on the mask: good, doubtful or failed; None if not assessed."""
     reason: str | None = None
-    """Of the verdict, one sentence."""
+    """Reason of the verdict, one sentence."""
     not_determined: list[str] | None = None
-    """`ARM.JOINT` of the joints that the images leave open; None where no deviation is known."""
+    """`ARM.JOINT` of undetermined joints; None where no deviation is known."""
     base_frame_gain: float | None = None
-    """What free base frames would explain of the remaining difference [1]; None where it is not known."""
+    """Share of the residual that free base frames would explain [1]; None where not known."""
 
 
 def evaluate(
@@ -143,21 +143,21 @@ def evaluate(
     together: bool = False,
     given: GivenMasks | None = None,
 ) -> Iterator[FrameScore]:
-    """Optimize every frame in every domain and camera, each on its own, and yield its score.
+    """Optimize each frame in each domain and camera, and yield its score.
 
     Args:
-        sequence: with masks, true kinematics, both or neither.
+        sequence: with or without ground truth of masks and kinematics.
         networks: the networks, or another predictor of surface maps.
         frames: positions in the sequence.
-        cameras: names; each is optimized alone, unless `together`.
+        cameras: names; optimized one by one, unless `together`.
         domains: names.
         settings, free: of the optimization.
-        perturb_deg: 0 starts at the measured joint positions. Otherwise the start is the true joint positions (the
-            measured ones where there is no truth) with every measured joint moved by this much; see `perturb`.
-        seed: of the perturbation; the same frame gets the same one in every camera and domain.
-        together: one optimization for all cameras; a frame has a score for each, which share its time.
-        given: masks from elsewhere that `networks` fits: their ignored pixels are not compared, and they are the truth
-            of cameras that the sequence has no masks of.
+        perturb_deg: 0 starts at the measured joint positions. Otherwise starts at the true ones (the measured ones
+            without ground truth) with each measured joint moved by this much; see `perturb`.
+        seed: of the perturbation, which is the same for a frame in all cameras and domains.
+        together: optimize all cameras at once; the time is divided among their scores.
+        given: masks that `networks` fits. Their ignored pixels are not compared, and they serve as ground truth for
+            cameras without masks in the sequence.
     """
     for domain in domains:
         for group in camera_groups(cameras, together):
@@ -196,7 +196,7 @@ def _optimized_score(
     optimizer: FrameOptimizer,
     seconds: float,
 ) -> FrameScore:
-    """The score of a frame at the best iterate of an optimizer that has ended."""
+    """Score of the best iterate of a finished optimizer."""
     best = optimizer.best
     assert best is not None and optimizer.stop_reason is not None
     return frame_score(
@@ -217,14 +217,14 @@ def _optimized_score(
 
 
 def camera_groups(cameras: Names[str], together: bool) -> list[tuple[str, ...]]:
-    """Cameras that take part in one optimization: all of them, or each alone."""
+    """Groups of cameras that are optimized together: all of them, or each alone."""
     return [tuple(cameras)] if together else [(camera,) for camera in cameras]
 
 
 def start_positions(
     sequence: Sequence, frame: Frame, perturb_deg: float, seed: int | tuple[int, ...]
 ) -> dict[str, np.ndarray]:
-    """Where the optimization of a frame starts; see `evaluate`. A seed in a tuple gives all frames the same signs."""
+    """Start of the optimization of a frame; see `evaluate`. A seed in a tuple gives all frames the same signs."""
     if perturb_deg == 0:
         return frame.measured
     origin = {**frame.measured, **(frame.truth or {})}
@@ -250,12 +250,12 @@ def frame_score(
     """Compare an estimate of a frame with the truth.
 
     Args:
-        sequence, frame, camera: what was optimized.
+        sequence, frame, camera: that were optimized.
         renderer: of that camera in full size.
         start: arm name -> joint positions before [rad, m].
         state, joint_positions, joint_std: after.
         iterations, seconds, stopped, base_frame_gain: as in the score.
-        assessment: how far the estimate can be relied on, where it is assessed.
+        assessment: verdict on the estimate, if assessed.
     """
     mask = (frame.masks or {}).get(camera)
     truth = frame.truth or {}
@@ -286,7 +286,7 @@ def frame_score(
 
 
 def mean_score(scores: Names[FrameScore]) -> dict[str, Any]:
-    """Means over frames under the same keys; None where a value cannot be averaged or no frame has it."""
+    """Means over frames under the same keys; None for values that are missing or not numbers."""
     result: dict[str, Any] = {}
     for field in fields(FrameScore):
         values = [value for score in scores if isinstance(value := getattr(score, field.name), (int, float))]
@@ -295,7 +295,7 @@ def mean_score(scores: Names[FrameScore]) -> dict[str, Any]:
 
 
 def to_json(scores: Names[FrameScore]) -> dict[str, Any]:
-    """What `carts evaluate --json` writes."""
+    """Content of `carts evaluate --json`."""
     return {"frames": [asdict(score) for score in scores], "mean": mean_score(scores)}
 
 
@@ -314,9 +314,9 @@ def evaluate_sequence(
     together: bool = False,
     given: GivenMasks | None = None,
 ) -> Iterator[FrameScore]:
-    """As `evaluate`, but the frames of a camera (or all) and domain inform each other; see `SequenceOptimizer`.
+    """As `evaluate`, with sequence mode for the frames of each domain and group of cameras; see `SequenceOptimizer`.
 
-    A perturbation is the same in all frames, as an error of calibration is.
+    The perturbation is the same in all frames, like an error of calibration.
     """
     groups = camera_groups(cameras, together)
     for domain in domains:
@@ -359,14 +359,14 @@ def evaluate_sequence(
 
 @dataclass(frozen=True)
 class Starts:
-    """Frames of cameras in a domain as sequence mode takes them: what is called measured is where it starts."""
+    """Frames as input of sequence mode, with the start as `measured`."""
 
     sequence: Sequence
     domain: str
     cameras: tuple[str, ...]
     perturb_deg: float
     seed: int
-    """Of the perturbation, which is the same in all frames."""
+    """Seed of the perturbation, which is the same in all frames."""
 
     def frame(self, index: int) -> Frame:
         """The frame at a position of the sequence."""

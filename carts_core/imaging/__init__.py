@@ -1,1 +1,1 @@
-"""Pixels, and nothing of robots."""
+"""Images in the working size: resizing, filters, windows and dehazing."""

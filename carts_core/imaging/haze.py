@@ -1,4 +1,4 @@
-"""Smoke and haze taken off images before they are compared.
+"""Removal of smoke and haze from images before they are compared.
 
 Haze adds a grey that varies slowly over the image and takes contrast in the same measure. Tissue reflects little
 in at least one colour, so the darkest colour of the darkest pixel nearby tells how much has been added: the dark
@@ -13,24 +13,24 @@ from torch.nn import functional
 from .working_image import attention, smoothed
 
 _REACH = 1 / 32
-"""How far away the darkest pixel may be, and deviation by which the haze is smoothed [image widths]."""
+"""Radius of the dark channel, and standard deviation of the smoothing of haze [image widths]."""
 
 _COARSER = 4
-"""How many times smaller than the images the haze is estimated [1]."""
+"""Downscaling for the estimate of haze [1]."""
 
 _AIRLIGHT = 0.75
-"""Value of haze that nothing shines through, in every colour [1]."""
+"""Value of opaque haze, in each colour [1]."""
 
 _LEAST = 0.25
-"""Least transmission that is assumed; noise grows by its inverse [1]."""
+"""Smallest transmission; noise grows by its inverse [1]."""
 
 
 def transmission(images: Float[Tensor, "n 3 h w"], share: float) -> Float[Tensor, "n 1 h w"]:
-    """Share of the light behind haze that comes through it, at each pixel; `_LEAST` to 1.
+    """Transmission of haze at each pixel; `_LEAST` to 1.
 
     Args:
         images: RGB in [0, 1].
-        share: of the estimated haze that is taken to be there [1]; 0 for none.
+        share: of the estimated haze that is removed [1]; 0 for none.
     """
     if share == 0:
         return torch.ones_like(images[:, :1])
@@ -42,13 +42,13 @@ def transmission(images: Float[Tensor, "n 3 h w"], share: float) -> Float[Tensor
 
 
 def dehazed(images: Float[Tensor, "n 3 h w"], through: Float[Tensor, "n 1 h w"]) -> Float[Tensor, "n 3 h w"]:
-    """Images, RGB in [0, 1], without the haze that lets that share of the light through."""
+    """Images, RGB in [0, 1], without haze of a transmission."""
     return ((images - _AIRLIGHT) / through + _AIRLIGHT).clamp(0.0, 1.0)
 
 
 def certainty(through: Float[Tensor, "n 1 h w"]) -> Float[Tensor, "n 1 h w"]:
     """Information of a pixel of a dehazed image, as a share of what it would have without haze [1].
 
-    Dehazing has noise grow by the inverse of the transmission, and information is the inverse of its square.
+    Dehazing amplifies noise by the inverse of the transmission, and information is the inverse of its square.
     """
     return through.square()

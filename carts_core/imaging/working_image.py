@@ -18,7 +18,7 @@ from ..model.scene import Scene
 
 @dataclass(frozen=True)
 class Window:
-    """A part of the working image [px]."""
+    """Rectangular part of the working image [px]."""
 
     left: int
     top: int
@@ -32,7 +32,7 @@ class Window:
 
     @staticmethod
     def around(silhouette: Float[Tensor, "cameras h w"], margin: int, multiple: int, size: tuple[int, int]) -> "Window":
-        """What holds the silhouettes of all cameras with a margin, in multiples of a size; all where they are empty."""
+        """Bounding box of all silhouettes with a margin, in multiples of a size; the whole image if they are empty."""
         covered = silhouette.amax(0) > 0
         columns, rows = covered.any(0).nonzero()[:, 0], covered.any(1).nonzero()[:, 0]
         if not len(columns):
@@ -54,26 +54,26 @@ class Window:
         )
 
     def common(self, other: "Window") -> "Window | None":
-        """What lies in both; None if nothing does."""
+        """Intersection with another window; None if it is empty."""
         left, top = max(self.left, other.left), max(self.top, other.top)
         right = min(self.left + self.width, other.left + other.width)
         bottom = min(self.top + self.height, other.top + other.height)
         return Window(left, top, right - left, bottom - top) if left < right and top < bottom else None
 
     def inside(self, outer: "Window") -> "Window":
-        """This window as a part of one that holds it."""
+        """This window relative to one that contains it."""
         return Window(self.left - outer.left, self.top - outer.top, self.width, self.height)
 
     def reduced(self, factor: int) -> "Window":
-        """This part of an image that is so many times smaller."""
+        """This window in an image that is smaller by a factor."""
         return Window(self.left // factor, self.top // factor, self.width // factor, self.height // factor)
 
     def of(self, image: Float[Tensor, "*batch h w"]) -> Float[Tensor, "*batch {self.height} {self.width}"]:
-        """This part of an image."""
+        """Crop of an image."""
         return image[..., self.top : self.top + self.height, self.left : self.left + self.width]
 
     def paste(self, part: Float[Tensor, "*batch h w"], whole: Float[Tensor, "*batch H W"]) -> Tensor:
-        """`whole` with this part of it replaced, in place."""
+        """Replace this part of `whole` in place."""
         self.of(whole)[...] = part
         return whole
 
@@ -103,7 +103,7 @@ def stacked_images(
 def pixel_weights(
     scene: Scene, ignore: Mapping[str, Bool[np.ndarray, "h w"]], size: tuple[int, int]
 ) -> Float[Tensor, "cameras 1 h w"]:
-    """0 where an occluder is known to be, 1 elsewhere, at a size (width, height) [px].
+    """Weights of pixels at a size (width, height) [px]: 0 at known occluders, 1 elsewhere.
 
     Raises:
         SettingsError: a mask is of another size than its camera.
@@ -123,14 +123,14 @@ def pixel_weights(
 
 
 def working_size(scene: Scene, width: int, stride: int) -> tuple[int, int]:
-    """Width and height [px] of the compared images: the first camera's shape, in multiples of the network's stride."""
+    """Width and height [px] of the compared images: the first camera's aspect ratio, in multiples of the stride."""
     camera = scene.cameras[0]
     width = max(round(min(width, camera.width) / stride), 1) * stride
     return width, max(round(width * camera.height / camera.width / stride), 1) * stride
 
 
 def blurred(images: Float[Tensor, "n channels h w"], deviation: float) -> Float[Tensor, "n channels h w"]:
-    """Images under a Gaussian of that deviation [px]; 0 leaves them as they are."""
+    """Images under a Gaussian blur of a standard deviation [px]; unchanged for 0."""
     if deviation == 0:
         return images
     from kornia.filters import filter2d_separable  # noqa: PLC0415 - as below
@@ -147,7 +147,7 @@ def _kernel(deviation: float, device: torch.device) -> Float[Tensor, "1 n"]:
 
 
 def smoothed(images: Float[Tensor, "*batch h w"], deviation: float) -> Float[Tensor, "*batch h w"]:
-    """The same as `blurred`, without autograd, for any number of channels, and much faster on a CPU."""
+    """As `blurred`, without autograd, for any number of channels, and much faster on a CPU."""
     flat = images.reshape(-1, *images.shape[-2:])
     if deviation == 0 or images.device.type != "cpu":
         return blurred(flat[None], deviation).view(images.shape)
@@ -160,7 +160,7 @@ def smoothed(images: Float[Tensor, "*batch h w"], deviation: float) -> Float[Ten
 
 
 def box_mean(image: Float[Tensor, "1 h w"], side: int) -> Float[Tensor, "1 h w"]:
-    """The mean around each pixel, over what a square of an odd side [px] has in common with the image."""
+    """Mean over the part of a square of odd side [px] around each pixel that lies in the image."""
     if image.device.type != "cpu":
         return functional.avg_pool2d(image, side, stride=1, padding=side // 2, count_include_pad=False)
     sums, counts = (
@@ -171,7 +171,7 @@ def box_mean(image: Float[Tensor, "1 h w"], side: int) -> Float[Tensor, "1 h w"]
 
 
 def kernel_radius(deviation: float) -> int:
-    """How far a blur of that deviation [px] reaches [px]."""
+    """Kernel radius of a blur of a standard deviation [px]."""
     return math.ceil(2.5 * deviation)
 
 
@@ -180,7 +180,7 @@ def attention(silhouette: Float[Tensor, "*batch h w"], radius: int) -> Float[Ten
     flat = silhouette.detach().reshape(-1, *silhouette.shape[-2:])
     size = 2 * radius + 1
     if flat.device.type == "cpu":
-        # As fast for a large radius as for a small one.
+        # Its time does not depend on the radius.
         square = np.ones((size, size), np.uint8)
         flat = torch.from_numpy(np.stack([cv2.dilate(image, square) for image in flat.contiguous().numpy()]))
     else:

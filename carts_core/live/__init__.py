@@ -1,4 +1,4 @@
-"""Live streams: sources of frames, a tracker that follows the arms forwards, and where results go."""
+"""Live tracking: sources of frames, the tracker, and sinks of results."""
 
 from .loop import LiveStatistics as LiveStatistics
 from .loop import Results as Results

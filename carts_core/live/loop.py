@@ -1,4 +1,4 @@
-"""From a source through a tracker to whoever wants results, always with the newest frame."""
+"""Live tracking loop: takes the latest frame of a source, tracks it, and passes the result to sinks."""
 
 import time
 from collections import deque
@@ -9,40 +9,40 @@ import numpy as np
 
 from ..model.scene import Scene
 from ..rendering import Renderer
-from .messages import Moment, Newest, ResultMessage, Source, encoded_masks
+from .messages import LatestFrame, Moment, ResultMessage, Source, encoded_masks
 from .tracker import LiveEstimate, LiveTracker, LiveVerdict
 
 _RECENT = 20
-"""Frames that tell how long the next one will take."""
+"""Number of recent frames for the predicted time of the next one."""
 _USUAL = 75
-"""So many of a hundred take no longer than what is expected."""
+"""Percentile of recent times that is the predicted time."""
 _FRESH = 0.01
-"""A frame that has waited for less is always taken [s]."""
+"""Least patience for a waiting frame [s]."""
 
 
 @dataclass(frozen=True)
 class Tracked:
-    """A frame, what came of it, and how old it was then."""
+    """A frame with its estimate and age."""
 
     moment: Moment
     estimate: LiveEstimate
     age: float
-    """Since its arrival [s]."""
+    """Time since its arrival [s]."""
 
 
 Sink = Callable[[Tracked], None]
-"""Gets every result, on the tracker's thread."""
+"""Receives each result on the tracker's thread."""
 
 
 @dataclass
 class LiveStatistics:
-    """How a stream went."""
+    """Statistics of a stream."""
 
     arrived: int = 0
     dropped: int = 0
     verdicts: dict[str, int] = field(default_factory=lambda: dict.fromkeys(LiveVerdict, 0))
     ages: list[float] = field(default_factory=list)
-    """Of the last results that were not lost [s]."""
+    """Ages of the last results that were not lost [s]."""
     began: float = field(default_factory=time.monotonic)
     ended: float = 0.0
 
@@ -57,7 +57,7 @@ class LiveStatistics:
 
     @property
     def tracked(self) -> int:
-        """Frames with a result."""
+        """Number of frames with a result."""
         return sum(self.verdicts.values())
 
     def __str__(self) -> str:
@@ -80,32 +80,32 @@ def follow(
     Args:
         source: of frames.
         tracker: of the arms.
-        sinks: get every result.
-        statistics: to go on with.
+        sinks: of results.
+        statistics: of an earlier part of the stream, to be continued.
 
     Raises:
-        CartsError: what ended the stream, or a frame that does not fit the scene.
+        CartsError: the stream failed, or a frame does not fit the scene.
     """
     statistics = statistics or LiveStatistics()
-    newest, taken = Newest(source), deque[float](maxlen=_RECENT)
+    latest, taken = LatestFrame(source), deque[float](maxlen=_RECENT)
     try:
-        while (moment := newest.take(_patience(list(taken), tracker.live.oldest_seconds))) is not None:
+        while (moment := latest.take(_patience(list(taken), tracker.live.oldest_seconds))) is not None:
             estimate = tracker.track(moment.frame, moment.camera_poses)
             taken.append(estimate.seconds)
             tracked = Tracked(moment, estimate, time.monotonic() - moment.arrived)
             statistics.add(tracked)
-            statistics.arrived, statistics.dropped = newest.arrived, newest.dropped
+            statistics.arrived, statistics.dropped = latest.arrived, latest.dropped
             for sink in sinks:
                 sink(tracked)
     finally:
-        newest.close()
+        latest.close()
         statistics.ended = time.monotonic()
-        statistics.arrived, statistics.dropped = newest.arrived, newest.dropped
+        statistics.arrived, statistics.dropped = latest.arrived, latest.dropped
     return statistics
 
 
 def _patience(taken: Sequence[float], oldest: float) -> float:
-    """How long a frame may have waited if its result is to be no older than `oldest` [s]."""
+    """Longest waiting time of a frame whose result is to be at most `oldest` old [s]."""
     usual = float(np.percentile(taken, _USUAL)) if taken else 0.0
     return max(oldest - usual, _FRESH)
 

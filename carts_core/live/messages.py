@@ -20,7 +20,7 @@ from ..recording import Frame, Sequence
 from ..recording.kinematics_table import PLAUSIBLE
 
 LARGEST = 64 * 2**20
-"""Of a message [bytes]."""
+"""Largest size of a message [bytes]."""
 _LENGTH = struct.Struct(">I")
 
 
@@ -40,28 +40,28 @@ class ImageMessage(msgspec.Struct, forbid_unknown_fields=True):
 
 
 class FrameMessage(msgspec.Struct, tag="frame", forbid_unknown_fields=True):
-    """What a sender says: images, joints, or both."""
+    """Message with images, joint positions, or both."""
 
     time: float
-    """When it was taken, on the sender's clock [s]."""
+    """Time stamp on the sender's clock [s]."""
     joints: dict[str, dict[str, float]] = {}
-    """Arm -> joint -> position [rad, m]; what is left out stays as it was."""
+    """Arm -> joint -> position [rad, m]; omitted joints keep their value."""
     images: dict[str, ImageMessage] = {}
     """Camera -> image; a message without images only changes joints."""
     camera_poses: dict[str, list[list[float]]] = {}
     """Camera -> T_camera_world [4 x 4, m], of a camera that moves; it stays until the next one."""
     id: str = ""
-    """Comes back with the result."""
+    """Returned with the result."""
 
 
 class ResultMessage(msgspec.Struct, tag="result"):
-    """What came of a frame."""
+    """Result of a frame."""
 
     id: str
     time: float
-    """As the sender gave it [s]."""
+    """Time stamp of the frame [s]."""
     age: float
-    """Between the frame's arrival and this message [s]."""
+    """Time from the frame's arrival to this message [s]."""
     verdict: str
     """`good`, `doubtful` or `lost`."""
     effort: str
@@ -75,7 +75,7 @@ class ResultMessage(msgspec.Struct, tag="result"):
 
 
 class ErrorMessage(msgspec.Struct, tag="error"):
-    """Why the connection is closed."""
+    """Reason for closing the connection."""
 
     message: str
 
@@ -84,7 +84,7 @@ _decoder = msgspec.msgpack.Decoder(FrameMessage)
 
 
 def packed(message: msgspec.Struct) -> bytes:
-    """A message as it goes over a socket."""
+    """Message with its length prefix, as sent over a socket."""
     content = msgspec.msgpack.encode(message)
     return _LENGTH.pack(len(content)) + content
 
@@ -93,7 +93,7 @@ def receive(connection: socket.socket) -> FrameMessage | None:
     """The next message of a sender; None at the end.
 
     Raises:
-        StreamError: it is too long, or no message.
+        StreamError: it is too long or not valid.
         OSError: the connection is broken.
     """
     header = _exactly(connection, _LENGTH.size)
@@ -112,7 +112,7 @@ def receive(connection: socket.socket) -> FrameMessage | None:
 
 
 def _exactly(connection: socket.socket, count: int) -> bytes | None:
-    """So many bytes; None where the sender ends before all are there."""
+    """Exactly `count` bytes; None if the connection ends before."""
     parts, missing = [], count
     while missing:
         part = connection.recv(min(missing, 1 << 20))
@@ -127,7 +127,7 @@ def decoded(camera: str, image: ImageMessage) -> UInt8[np.ndarray, "height width
     """An image as RGB.
 
     Raises:
-        StreamError: it is none, or too large.
+        StreamError: it cannot be decoded, or is too large.
     """
     if image.encoding == "rgb8":
         if image.width < 1 or image.height < 1 or len(image.data) != 3 * image.width * image.height:
@@ -154,16 +154,16 @@ class Moment:
 
     frame: Frame
     camera_poses: Mapping[str, np.ndarray] = field(default_factory=dict)
-    """Camera -> T_camera_world [4 x 4, m], where it is not that of the scene."""
+    """Camera -> T_camera_world [4 x 4, m], for cameras that are not at their pose in the scene."""
     arrived: float = field(default_factory=time.monotonic)
-    """On this machine's clock [s]."""
+    """Time of arrival on the monotonic clock [s]."""
 
 
 class Source(Protocol):
-    """Where frames come from. Iterated on a thread of its own."""
+    """Source of frames, iterated on its own thread."""
 
     def __iter__(self) -> Iterator[Moment]:
-        """Frames as they come; ends with the stream, or soon after `close`.
+        """Iterate over frames as they arrive, until the stream ends or `close` is called.
 
         Raises:
             CartsError: the stream is not usable.
@@ -171,17 +171,17 @@ class Source(Protocol):
         ...
 
     def close(self) -> None:
-        """End it; may be called from any thread, more than once."""
+        """Close the source; can be called from any thread, more than once."""
         ...
 
 
 def mounts_of(
     scene: Scene, frame: Frame, camera_poses: Mapping[str, Float[np.ndarray, "4 4"]]
 ) -> dict[str, Float[np.ndarray, "4 4"]]:
-    """Camera -> T_mount_world [m] of a frame, of the cameras that move; poses that were sent count before the frame's.
+    """Camera -> T_mount_world [m] of the cameras that move; poses that were sent override the frame's.
 
     Args:
-        scene: with the cameras' places on their mounts.
+        scene: with the cameras' poses on their mounts.
         frame: of a recording or a stream.
         camera_poses: camera -> T_camera_world [m].
     """
@@ -194,11 +194,11 @@ def mounts_of(
 
 
 class Assembler:
-    """Makes frames of the messages of a stream: joints and camera poses stay until they are replaced.
+    """Assembles frames from messages; joints and camera poses persist until replaced.
 
     Args:
-        sequence: whose arms and cameras these are.
-        cameras: that every frame needs an image of.
+        sequence: with the arms and cameras.
+        cameras: of which each frame needs an image.
     """
 
     def __init__(self, sequence: Sequence, cameras: tuple[str, ...]) -> None:
@@ -210,7 +210,7 @@ class Assembler:
         self._changing = threading.Lock()
 
     def moment(self, message: FrameMessage) -> Moment | None:
-        """The frame that a message completes; None for one without images, or before every arm's joints are known.
+        """Frame completed by a message; None for one without images, or before all joints are known.
 
         Raises:
             StreamError: it has an unknown arm, joint or camera, lacks an image, or one or the time is not usable.
@@ -281,21 +281,21 @@ class Assembler:
 
 
 def _is_rigid(pose: np.ndarray) -> bool:
-    """Whether a 4 x 4 matrix turns and moves, and does nothing else."""
+    """Whether a 4 x 4 matrix is a rigid transform."""
     if not np.isfinite(pose).all() or not np.array_equal(pose[3], [0.0, 0.0, 0.0, 1.0]):
         return False
     rotation = pose[:3, :3]
     return bool(np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4) and np.linalg.det(rotation) > 0)
 
 
-class Newest:
-    """Takes frames from a source on a thread of its own; who asks gets the newest, and those before it are dropped.
+class LatestFrame:
+    """Buffer that keeps only the latest frame of a source, which is read on its own thread.
 
     Args:
-        source: that is read and, in the end, closed.
+        source: is closed with the buffer.
 
     Attributes:
-        arrived, dropped: how many frames.
+        arrived, dropped: numbers of frames.
     """
 
     def __init__(self, source: Source) -> None:
@@ -308,13 +308,13 @@ class Newest:
         self._thread.start()
 
     def take(self, patience: float) -> Moment | None:
-        """The newest frame, waited for; None at the end.
+        """Wait for the latest frame; None at the end of the stream.
 
         Args:
-            patience: a frame that has waited longer is dropped for the next one, unless it is the last one [s].
+            patience: waiting time after which a frame is dropped, unless it is the last one [s].
 
         Raises:
-            CartsError: what ended the source.
+            CartsError: the source failed.
         """
         with self._changed:
             while True:
@@ -329,7 +329,7 @@ class Newest:
                 self._changed.wait(0.5)
 
     def close(self) -> None:
-        """End the source and wait for its thread."""
+        """Close the source and wait for its thread."""
         self._source.close()
         self._thread.join(5.0)
 
@@ -342,7 +342,7 @@ class Newest:
                     self.dropped += self._moment is not None
                     self._moment = moment
                     self._changed.notify()
-        except Exception as found:  # Whoever takes frames gets it.
+        except Exception as found:  # Raised by `take`.
             error = found
         with self._changed:
             self._ended, self._error = True, error

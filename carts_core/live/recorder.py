@@ -1,4 +1,4 @@
-"""A stream on disk: a sequence like any other, with the corrections as its project."""
+"""Recorder of a stream as a sequence, with the corrections as its project."""
 
 import json
 import queue
@@ -24,42 +24,42 @@ from .messages import mounts_of
 from .tracker import LiveVerdict
 
 _WAITING = 32
-"""Frames that wait for the disk; further ones are not recorded."""
+"""Largest number of frames waiting for the disk; further ones are not recorded."""
 _AGAIN = "Fit the frame again, which takes longer than was left live."
 _VERDICTS = {
     LiveVerdict.GOOD: FitVerdict("good", "Fitted live."),
     LiveVerdict.DOUBTFUL: FitVerdict(
         "doubtful",
-        "The image did not fit when it was followed live: this is what the frames before let expect.",
+        "The image did not fit during live tracking, so joints are predicted from the frames before.",
         _AGAIN,
         0.5,
     ),
     LiveVerdict.LOST: FitVerdict(
-        "failed", "The arms were lost when it was followed live, so joints are as measured.", _AGAIN, 1.0
+        "failed", "The arms were lost during live tracking, so joints are as measured.", _AGAIN, 1.0
     ),
 }
-"""What is kept of each; the probabilities are not measured, they put the worst frames first."""
+"""Recorded verdicts; the probabilities are not calibrated, and sort the worst frames first."""
 
 
 class Recorder:
-    """Writes what was tracked, on a thread of its own.
+    """Writes results on its own thread.
 
     The folder gets `images/CAMERA/FRAME.png`, `kinematics.csv` with the measured joints, `corrected.csv` with the
-    corrected ones, `camera_CAMERA.csv` with where each camera's mount was, `sequence.toml`, and at the end the project
-    `sequence.carts`. Each frame is on disk with its row. Where the arms were lost, joints are as measured and the
-    verdict is *failed*.
+    corrected ones, `camera_CAMERA.csv` with the pose of each camera's mount, `sequence.toml`, and at the end the
+    project `sequence.carts`. Each frame is on disk with its row. Where the arms were lost, joints are as measured and
+    the verdict is *failed*.
 
     Args:
-        sequence: whose arms and cameras these are.
+        sequence: with the arms and cameras.
         cameras: that are tracked.
-        folder: to make; it may not be there yet, or has to be empty.
+        folder: new or empty.
         provenance: of the corrections.
 
     Attributes:
-        missed: how many frames were not recorded, since the disk was too slow.
+        missed: number of frames that were not recorded, since the disk was too slow.
 
     Raises:
-        OutputError: the folder holds something, or cannot be written.
+        OutputError: the folder is not empty, or cannot be written.
     """
 
     def __init__(self, sequence: Sequence, cameras: tuple[str, ...], folder: Path, provenance: Provenance) -> None:
@@ -78,14 +78,14 @@ class Recorder:
         self._thread.start()
 
     def __call__(self, tracked: Tracked) -> None:
-        """Record a result, soon."""
+        """Queue a result."""
         try:
             self._waiting.put_nowait(tracked)
         except queue.Full:
             self.missed += 1
 
     def close(self) -> Path | None:
-        """Finish writing; the sequence file, or None where there was no frame.
+        """Finish writing; returns the sequence file, or None without frames.
 
         Raises:
             CartsError: something could not be written.
@@ -95,7 +95,7 @@ class Recorder:
         if self._error is not None:
             raise self._error
         if not self._edits:
-            # Nothing came: the same command is to work again.
+            # Without frames the folder stays empty, so that the same command works again.
             remove_file(self._output / "sequence.toml")
             return None
         path = (self._output / "sequence.toml").path
@@ -116,11 +116,11 @@ class Recorder:
                     self._error = error
 
     def _describe(self) -> None:
-        """Write the sequence file; again when a camera begins to move."""
+        """Write the sequence file, and update it when a camera begins to move."""
         write_text(self._output / "sequence.toml", _sequence_file(self._sequence, self._scene, self._moving))
 
     def _write_mounts(self, number: int, name: str, tracked: Tracked) -> None:
-        """A row for each camera, since any may begin to move."""
+        """Write the mount pose of each camera, since any may begin to move."""
         mounts = mounts_of(self._scene, tracked.moment.frame, tracked.moment.camera_poses)
         for camera in self._scene.cameras:
             path = self._output / _motion_file(camera.name)
@@ -166,7 +166,7 @@ def _motion_file(camera: str) -> str:
 
 
 def _sequence_file(sequence: Sequence, scene: Scene, moving: Collection[str]) -> str:
-    """The description of what is recorded; images have no distortion any more."""
+    """Sequence file of the recording; its images are undistorted."""
     lines = [
         "# Recorded by carts live.",
         'format = "carts-sequence/1"',

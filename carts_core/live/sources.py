@@ -34,16 +34,16 @@ from .messages import (
 
 HOST = "127.0.0.1"
 _WAITING = 8
-"""Results that wait for a slow client; older ones are dropped."""
+"""Largest number of results waiting for a slow client; older ones are dropped."""
 _CLIENTS = 16
 _SILENCE = 10.0
-"""Since a client's last message, after which it makes room for another client where all places are taken [s]."""
+"""Idle time after which a client is disconnected in favour of a new one, if all places are taken [s]."""
 _LINGER = 1.0
-"""For which a sender still gets results when it has ended its side [s]."""
+"""Time for which a sender still gets results after it has closed its side [s]."""
 
 
 class _Client:
-    """One connection: what it is to be sent, and when it last sent a message [s]."""
+    """One connection: queue of outgoing messages, and time of its last message [s]."""
 
     def __init__(self) -> None:
         self.waiting: queue.Queue[bytes | None] = queue.Queue(_WAITING)
@@ -52,14 +52,14 @@ class _Client:
 
 
 class StreamServer:
-    """Listens on 127.0.0.1; a source of frames, and where results go.
+    """Server on 127.0.0.1: a source of frames that returns results.
 
     Args:
-        assembler: makes frames of messages.
-        port: 0 takes a free one.
+        assembler: of messages.
+        port: 0 chooses a free one.
 
     Attributes:
-        port: where it listens.
+        port: of the server.
 
     Raises:
         SettingsError: the port is taken.
@@ -78,12 +78,12 @@ class StreamServer:
         threading.Thread(target=self._accept, name="carts-live-accept", daemon=True).start()
 
     def __iter__(self) -> Iterator[Moment]:
-        """See `Source`; the stream ends with `close` only."""
+        """See `Source`; only `close` ends the stream."""
         while (moment := self._moments.get()) is not None:
             yield moment
 
     def send(self, result: ResultMessage) -> None:
-        """Hand a result to every client; who reads too slowly misses some."""
+        """Send a result to all clients; slow ones miss some."""
         content = packed(result)
         with self._changing:
             for client in self._clients.values():
@@ -119,7 +119,7 @@ class StreamServer:
             threading.Thread(target=self._write, args=(connection, client), daemon=True).start()
 
     def _has_room(self) -> bool:
-        """Whether one more client can be taken, if need be in place of the one that has been silent for longest."""
+        """Whether there is a place for a client; disconnects the one that has been idle for longest if necessary."""
         if len(self._clients) < _CLIENTS:
             return True
         connection, longest = min(self._clients.items(), key=lambda each: each[1].heard)
@@ -158,13 +158,13 @@ class StreamServer:
 
 
 def _refuse(connection: socket.socket) -> None:
-    """Close a connection for which there is no place."""
+    """Refuse a connection with an error message."""
     with connection, suppress(OSError):
         connection.sendall(packed(ErrorMessage(f"{_CLIENTS} clients are connected. Close one, or try again.")))
 
 
 def _put_newest(waiting: queue.Queue, item: object) -> None:
-    """Put something in, in place of the oldest where there is no room."""
+    """Put an item into a queue; drops the oldest one if it is full."""
     while True:
         try:
             waiting.put_nowait(item)
@@ -177,21 +177,21 @@ def _put_newest(waiting: queue.Queue, item: object) -> None:
 _log = logging.getLogger(__name__)
 
 _NAMED = 20
-"""How many frames that are left out are named."""
+"""Largest number of logged unusable frames."""
 _POLL = 0.01
-"""How often a folder is looked at [s]."""
+"""Polling interval of a folder [s]."""
 _SUFFIXES = (".png", ".jpg", ".jpeg")
 
 
 class Replay:
-    """A recording at the speed of the clock; frames whose time has passed are left out.
+    """Real-time replay of a recording; late frames are skipped.
 
     Args:
         sequence: the recording.
-        cameras: whose images are wanted.
-        domain: in which.
-        rate: frames per second, that of the recording's times if None.
-        loops: how often it is shown; time goes on from one to the next.
+        cameras: to replay.
+        domain: to replay.
+        rate: frames per second; that of the recording if None.
+        loops: number of repetitions, with continuing time.
 
     Raises:
         SettingsError: the recording has no times, and no rate is given.
@@ -232,10 +232,10 @@ class Replay:
 
 
 class Camera:
-    """A camera or video that OpenCV opens; joints come from somewhere else.
+    """Camera device or video file, by OpenCV; joints come from another source.
 
     Args:
-        assembler: knows the joints.
+        assembler: with the joints.
         camera: name of the camera in the scene.
         device: number of a device, or a file.
 
@@ -250,7 +250,7 @@ class Camera:
             raise SettingsError(
                 f"OpenCV cannot open {device!r} as a camera or video. Give a device's number or a file."
             )
-        # A device gives frames at its own pace, a file as fast as it is read.
+        # A device sets its own rate; a file is throttled to its frame rate.
         rate = self._capture.get(cv2.CAP_PROP_FPS) if isinstance(device, str) else 0.0
         self._gap = 1.0 / rate if rate > 0 else 0.0
         self._closed = threading.Event()
@@ -278,14 +278,14 @@ class Camera:
 
 
 class Folder:
-    """A folder that fills with `NAME.json` and an image `NAME.png`, or `NAME.CAMERA.png` of each of several cameras.
+    """Watched folder with `NAME.json` and `NAME.png`, or `NAME.CAMERA.png` for each of several cameras.
 
-    The JSON file is a frame message without images. It is written last, so that a name counts once it is there; of
-    several new names only the last counts. What cannot be used is left out, and a warning is logged.
+    The JSON file is a frame message without images, and is written last. Of several new names only the last is read.
+    Unusable frames are skipped with a warning.
 
     Args:
-        assembler: makes frames of it.
-        cameras: whose images are wanted.
+        assembler: of the messages.
+        cameras: to read.
         folder: the folder.
 
     Raises:
@@ -349,18 +349,18 @@ class Folder:
 
 @dataclass(frozen=True)
 class OpenStream:
-    """A source, and a server where there is one, which is closed with it."""
+    """A source with its optional server."""
 
     source: Source
     server: StreamServer | None = None
 
     @property
     def clients(self) -> list[Callable[[ResultMessage], None]]:
-        """Where results go besides."""
+        """Sinks of results over the network."""
         return [] if self.server is None else [self.server.send]
 
     def close(self) -> None:
-        """End it; more than once does no harm."""
+        """Close both; can be called more than once."""
         self.source.close()
         if self.server is not None:
             self.server.close()
@@ -378,12 +378,12 @@ def open_stream(
     """Open a stream of a sequence's arms and cameras.
 
     Args:
-        address: where frames come from.
-        sequence: whose arms and cameras these are.
-        cameras: that every frame needs an image of; a device gives the first one's.
+        address: of the source.
+        sequence: with the arms and cameras.
+        cameras: of which each frame needs an image; a device provides the first one.
         domain: of a replay.
-        rate: of a replay [1/s]; None: as recorded.
-        loops: how often a replay is shown.
+        rate: of a replay [1/s]; as recorded if None.
+        loops: repetitions of a replay.
 
     Raises:
         SettingsError: a device, a folder or a port cannot be used, or a replay has no times.

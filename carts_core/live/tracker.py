@@ -31,17 +31,17 @@ from .messages import mounts_of
 
 
 class LiveVerdict(StrEnum):
-    """How far an estimate can be relied on."""
+    """Reliability of a live estimate."""
 
     GOOD = "good"
     DOUBTFUL = "doubtful"
-    """The image does not fit for the moment: what is shown is what the frames before let expect."""
+    """The image does not fit; the estimate is predicted from earlier frames."""
     LOST = "lost"
-    """Nothing is known but the measured values and what they were off by when the arms were last seen."""
+    """The arms are lost; the estimate is the measured values with the last known correction."""
 
 
 class Effort(StrEnum):
-    """What was done with a frame."""
+    """Computational effort for a frame."""
 
     SMALL = "small"
     FULL = "full"
@@ -50,11 +50,11 @@ class Effort(StrEnum):
 
 @dataclass(frozen=True)
 class LiveEstimate:
-    """One frame, in the light of those before it."""
+    """Estimate of one frame, given those before it."""
 
     frame_id: str
     time: float
-    """When it was taken [s]."""
+    """Time stamp [s]."""
     verdict: LiveVerdict
     effort: Effort
     loss: float
@@ -65,80 +65,80 @@ class LiveEstimate:
     joint_std: Mapping[str, Float[np.ndarray, " dofs"]]
     """Arm name -> standard deviation [rad, m]; NaN where a joint is not free."""
     seconds: float
-    """Spent on it [s]."""
+    """Computation time [s]."""
 
 
 CHANGED = 0.5
-"""Change of small pictures from which they show something else: they correlate by less than a half [1]."""
+"""Change of thumbnails from which they show another scene, a correlation below one half [1]."""
 _SIZE = (32, 24)
-"""Width and height of small pictures [px]."""
+"""Width and height of thumbnails [px]."""
 
 Picture = Float[np.ndarray, "cameras pixels"]
 
 
 def small_picture(frame: Frame) -> Picture:
-    """The images, small and gray, each without its mean."""
+    """Gray thumbnails of the images, each without its mean."""
     small = [cv2.resize(image, _SIZE, interpolation=cv2.INTER_AREA) for image in frame.images.values()]
     pixels = np.stack([image.reshape(_SIZE[0] * _SIZE[1], -1).mean(axis=1) for image in small]).astype(float)
     return pixels - pixels.mean(axis=1, keepdims=True)
 
 
 def change(before: Picture, now: Picture) -> float:
-    """How much pictures have changed, in the camera where they did most [1]: 0.7 where they have nothing in common."""
+    """Largest change of a thumbnail over the cameras [1]; 0.7 for uncorrelated ones."""
     sizes = np.linalg.norm(before, axis=1) + np.linalg.norm(now, axis=1)
     return float((np.linalg.norm(now - before, axis=1) / (sizes + np.sqrt(before.shape[1]))).max())
 
 
 _REMEMBERED = 60
-"""Good fits whose losses tell what is usual."""
+"""Number of good fits whose median loss is the usual one."""
 _LOOKED = 1.0
-"""How often it is seen whether an arm that is out of view is elsewhere in the image [s]."""
+"""Interval of checks for an arm elsewhere in the image [s]."""
 
 
 @dataclass(frozen=True)
 class _Attempt:
-    """So much effort with one frame."""
+    """One attempt to measure a frame."""
 
     effort: Effort
     time: float
-    """When the frame was taken [s]."""
+    """Time stamp of the frame [s]."""
     state: Gaussian
-    """Parts of the error as they are known without this frame."""
+    """Predicted state of the error model."""
     gap: float
-    """Since the frame that this is known from [s]."""
+    """Time since the frame of the filtered state [s]."""
     expected: Gaussian
-    """Correction that follows."""
+    """Predicted correction."""
 
 
 @dataclass(frozen=True)
 class _Recovery:
-    """An attempt on a thread of its own."""
+    """An attempt on its own thread."""
 
     attempt: _Attempt
     picture: Picture
-    """Of its frame, small."""
+    """Thumbnail of its frame."""
     measurement: Future[Measurement]
     dropped: threading.Event
-    """Set to give it up."""
+    """Set to cancel it."""
 
 
 class LiveTracker:
-    """Follows the arms of a scene. One frame at a time; frames may be left out, and times need not be even.
+    """Tracks the arms of a scene frame by frame; frames may be dropped, and times need not be regular.
 
     Args:
         scene: arms and cameras.
         networks: the networks, or another predictor of surface maps.
         settings: noise, weights and working size; the stages are those of `live`.
         model: of the measurement error.
-        live: stages, and what counts as a bad fit.
-        free: what is unknown.
-        backgrounds: of the cameras; what looks like an arm in them is taken for none.
+        live: stages, and thresholds of bad fits.
+        free: unknowns.
+        backgrounds: of the cameras, in which detections are false.
         cameras: names of the cameras that take part, all by default.
-        concurrent: whether a frame that takes more effort gets it on a thread of its own, while those after it are
-            called doubtful or lost; otherwise its result comes that late. `close` ends the thread.
+        concurrent: whether recovery runs on its own thread, while later frames are doubtful or lost; otherwise it
+            delays the result. `close` ends the thread.
 
     Attributes:
-        verdict: on the last frame; lost before the first one.
+        verdict: of the last frame; lost before the first one.
     """
 
     def __init__(
@@ -165,30 +165,30 @@ class LiveTracker:
         self._moving = False
         self._errors: ErrorModel | None = None
         self._filtered: Gaussian | None = None
-        """Of the parts of the error, after the last good frame."""
+        """State of the error model after the last good frame."""
         self._seen = -math.inf
-        """When the last good frame was taken [s]."""
+        """Time stamp of the last good frame [s]."""
         self._searched = self._looked = -math.inf
         self._elsewhere = False
-        """Whether an arm was out of view, and something that looks like one elsewhere, when it was last looked for."""
+        """Whether the last check found an arm out of view and a prediction elsewhere."""
         self._losses: deque[float] = deque(maxlen=_REMEMBERED)
         self._pool = ThreadPoolExecutor(1, "recovery") if concurrent else None
         self._recovery: _Recovery | None = None
         self._gave_up = False
-        """Whether the last search was given up."""
+        """Whether the last search was cancelled."""
 
     def close(self) -> None:
-        """End the thread once it is done with its frame."""
+        """End the thread after its present frame."""
         if self._pool is not None:
             self._pool.shutdown(wait=False, cancel_futures=True)
 
     def track(self, frame: Frame, camera_poses: Mapping[str, Float[np.ndarray, "4 4"]] | None = None) -> LiveEstimate:
-        """The estimate of a frame that is newer than those before.
+        """Estimate the next frame.
 
         Args:
-            frame: images, measured joint positions, and when they were taken.
-            camera_poses: camera name -> T_camera_world [m], where it is not that of the scene. What cameras that move
-                see without arms is not known, so backgrounds are left out then.
+            frame: images, measured joint positions and time stamp.
+            camera_poses: camera name -> T_camera_world [m], for cameras that are not at their pose in the scene.
+                Backgrounds are not used then, since moving cameras have none.
 
         Raises:
             SettingsError: an image is missing or of another size than its camera.
@@ -226,7 +226,7 @@ class LiveTracker:
     def _arm_is_elsewhere(
         self, frame: Frame, variables: Variables, correction: np.ndarray, loss: float, now: float
     ) -> bool:
-        """Whether an arm is out of view where it was found, and something that looks like one is in the image."""
+        """Whether an arm is out of view while one is predicted elsewhere; checked at intervals."""
         if now - self._looked >= _LOOKED:
             solver = self._solvers[Effort.SMALL, self._moving]
             missing = solver.arms_out_of_view(variables, correction)
@@ -235,7 +235,7 @@ class LiveTracker:
         return self._elsewhere
 
     def _known(self, errors: ErrorModel, now: float, effort: Effort = Effort.SMALL) -> _Attempt:
-        """What is known of a frame before it is looked at; a search assumes nothing."""
+        """Prediction for a frame; the prior for a search."""
         state, gap = errors.initial(), math.inf
         if self._filtered is not None and effort is not Effort.SEARCH:
             gap = max(now - self._seen, 1e-3)
@@ -245,7 +245,7 @@ class LiveTracker:
     def _measured(
         self, frame: Frame, variables: Variables, errors: ErrorModel, now: float
     ) -> tuple[_Attempt, Measurement]:
-        """With no more effort than it takes, and no more than the thread that calls is to have."""
+        """Measure with the least effort that fits, and start a recovery if it does not."""
         small, full = (self._solvers[effort, self._moving] for effort in (Effort.SMALL, Effort.FULL))
         found = None
         self._drop_outdated(frame)
@@ -272,9 +272,9 @@ class LiveTracker:
         return found
 
     def _drop_outdated(self, frame: Frame) -> None:
-        """Give up a search in a frame that this one does not resemble: what hid the arms, say, has been taken away."""
+        """Cancel a search in a frame that the present one no longer resembles."""
         running = self._recovery
-        # The one after it runs to its end, or arms that move fast before a plain wall would never be found.
+        # The search after a cancelled one runs to its end, so that fast motion cannot cancel all of them.
         if running is None or running.attempt.effort is not Effort.SEARCH or self._gave_up:
             return
         picture = small_picture(frame)
@@ -283,14 +283,14 @@ class LiveTracker:
             self._recovery, self._searched, self._gave_up = None, -math.inf, True
 
     def _further(self, now: float) -> Effort:
-        """What is tried with a frame that did not fit."""
+        """Next effort for a frame that did not fit."""
         if self._filtered is not None and self.verdict is not LiveVerdict.LOST:
             return Effort.FULL
         early = self._filtered is not None and now - self._searched < self.live.search_seconds
         return Effort.SMALL if early else Effort.SEARCH
 
     def _take_recovered(self, errors: ErrorModel) -> Effort | None:
-        """Use what came of more effort with an earlier frame, unless a later one has fitted since; the effort if so."""
+        """Use the result of a finished recovery, unless a later frame fits; returns its effort if used."""
         if self._recovery is None or not self._recovery.measurement.done():
             return None
         attempt, future = self._recovery.attempt, self._recovery.measurement
@@ -302,9 +302,9 @@ class LiveTracker:
         return attempt.effort
 
     def _fits(self, attempt: _Attempt, measurement: Measurement) -> bool:
-        """Whether what was measured can be relied on; where nothing was known, only a search can."""
+        """Whether a measurement is reliable; without a filtered state only a search can be."""
         if attempt.effort is Effort.SEARCH:
-            # It comes from far off, and ends less close than frames that follow each other.
+            # A search starts far away, and ends less close than tracking.
             return measurement.loss <= self.live.bad_loss
         if self._bad(measurement):
             return False
@@ -319,7 +319,7 @@ class LiveTracker:
         return LiveVerdict.LOST if gone else LiveVerdict.DOUBTFUL
 
     def _take(self, errors: ErrorModel, attempt: _Attempt, measurement: Measurement) -> None:
-        """What a good frame says, for those after it; frames that follow each other fast say much the same."""
+        """Update the filter by a good frame, weighted for the correlation with the one before."""
         share = math.tanh(0.5 * attempt.gap / self._model.correlation_seconds)
         self._filtered = errors.updated(attempt.state, measurement.information.scaled(share))
         self._seen = attempt.time

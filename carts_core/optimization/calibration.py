@@ -37,13 +37,13 @@ from .verdict import Assessment, Verdict, assess_calibration, check_domain, with
 
 
 def calibrated_scene(whole: Scene, part: Scene, variables: Variables, offsets: torch.Tensor) -> Scene:
-    """A scene with the calibration of its calibrated part; what did not move keeps its exact value.
+    """Scene with the calibration of a part of its cameras; unmoved values stay exact.
 
     Args:
         whole: the scene.
         part: the same arms with the cameras that take part.
         variables: the unknowns of `part`.
-        offsets: where they are now, from their start.
+        offsets: of the unknowns from their start.
     """
     start, state = variables.start, variables.state(offsets)
     arms = tuple(
@@ -75,7 +75,7 @@ def _moved(given: np.ndarray, start: SceneState, state: SceneState, name: str, i
 
 
 _TRIED = 4
-"""Most frames in which the network is tried on a rendering of the arms."""
+"""Largest number of frames for the domain check."""
 
 _HELD_INTRINSICS = 0.01
 """Expected error of focal lengths and principal points that are held, as a share of the focal length [1]. It widens
@@ -83,18 +83,18 @@ deviations and moves nothing: they are consider parameters (Schmidt, Application
 problems, 1966)."""
 
 _TOO_FAR = 3.0
-"""Known deviations beyond which a base frame has moved too far [1]."""
+"""Number of known standard deviations beyond which a base frame has moved too far [1]."""
 
 _CORRELATED = SequenceSettings.measurement_noise / SurfaceSolver.noise
-"""How many times larger a deviation is than that of independent pixels, as sequence mode takes it [1]."""
+"""Ratio of a standard deviation to that of independent pixels, as in sequence mode [1]."""
 
 _STANDS = 1e-3
-"""Mounts whose transforms differ by less are at the same place [rad, m]."""
+"""Largest difference of the transforms of a resting mount [rad, m]."""
 
 
 @dataclass(frozen=True)
 class CalibrationIterate:
-    """A calibration on the way. A copy: nothing later changes it."""
+    """One iterate of a calibration; an immutable copy."""
 
     index: int
     """Number of steps before it; 0 is the start."""
@@ -113,26 +113,26 @@ class CalibrationIterate:
 
 @dataclass(frozen=True)
 class UnknownChange:
-    """What became of one unknown."""
+    """Change of one unknown."""
 
     name: str
     unit: str
     """deg, mm, px or %, of all the other values."""
     change: float
     standard_deviation: float
-    """Of the unknown, for all errors that are allowed for: those of the frames, an error that all outlines share,
-    intrinsics that are held, and what an optimization that ends early leaves."""
+    """Standard deviation for all modelled errors: those of the frames, a shared error of outlines, fixed intrinsics,
+    and an early end of the optimization."""
     deviation: float
-    """The part that follows from the curvature, with pixels taken for independent."""
+    """Standard deviation from the curvature alone, for independent pixels."""
     deviation_between_frames: float | None
-    """The part that follows from how much the frames contradict each other: a jackknife; None with one frame."""
+    """Standard deviation from the differences between frames (jackknife); None with one frame."""
     prior_deviation: float
-    """Before any image was used; an unknown whose `deviation` is close to this was not determined."""
+    """Standard deviation of the prior; an unknown whose `deviation` is close to it was not determined."""
 
 
 @dataclass(frozen=True)
 class CalibrationResult:
-    """The best calibration, and the evidence for it."""
+    """Result of a calibration."""
 
     scene: Scene
     """As given, with the new calibration."""
@@ -141,12 +141,12 @@ class CalibrationResult:
     """With joints as measured, like `frame_losses_after`, and under the last observation."""
     frame_losses_after: Float[np.ndarray, " frames"]
     frame_weights: Float[np.ndarray, " frames"]
-    """How far each frame counted, in [0, 1]."""
+    """Weights of the frames, in [0, 1]."""
     stop_reason: StopReason
     assessment: Assessment | None
-    """How far it can be relied on; None where the run was stopped before its end."""
+    """Verdict; None if the run was stopped before its end."""
     beyond: tuple[str, ...] = ()
-    """Arms whose base frame has moved farther than what was known of it allows."""
+    """Arms whose base frame has moved farther than its known covariance allows."""
     deviations: Mapping[tuple[str, str], PoseDeviation] = field(default_factory=dict)
     """(arm, camera) -> standard deviations of the arm's pose before that camera, at the mean of its tips."""
 
@@ -162,13 +162,13 @@ class CalibrationOptimizer:
         frames: observed images and measured joint positions.
         networks: the networks, or another predictor of surface maps.
         settings: the solver; `frame_prior_deg` and `intrinsics_prior` are its own.
-        free: what is unknown. Joints are so in every frame for itself.
+        free: unknowns. Joints are free in each frame separately.
         joint_prior_deg: expected error of free joints [deg].
         ignore: per frame, camera name -> pixels that show an occluder.
         cameras: names of the cameras that take part, all by default.
         backgrounds: of these cameras, where they are known, as of `FrameOptimizer`.
         known_base_frames: arm -> covariance of its base frame's turn and shift in its own axes [rad, m], as of
-            `HandEyeResult`, where it is known better than the settings expect.
+            `HandEyeResult`, where it is known better than the prior of the settings.
 
     Raises:
         SettingsError: no frame, nothing of the calibration is free, another solver, or an image does not fit.
@@ -220,8 +220,8 @@ class CalibrationOptimizer:
         self.best: CalibrationIterate | None = None
         self.stop_reason: StopReason | None = None
         self.assessment: Assessment | None = None
-        """At the end, how far the result can be relied on. What failed keeps the start, and so does what fits worse
-        than the start by any measure. What is doubtful has failed where the network does not know the robot."""
+        """Verdict at the end. A calibration that failed, or fits worse than the start by any measure, is replaced by
+        the start. A doubtful one has failed if the network does not know the robot."""
 
     def cancel(self) -> None:
         """Stop; what was reached stays in `best` and `history`."""
@@ -257,7 +257,7 @@ class CalibrationOptimizer:
         return iterate
 
     def _judged(self, points: Iterator[Point]) -> Iterator[Point]:
-        """The points of the stages, and the start where the images contradict what they end with."""
+        """Points of the stages, followed by the start if the images contradict the result."""
         yield from points
         last, problem = self._best_point, self._problem
         if last is None or problem.present is None:
@@ -277,7 +277,7 @@ class CalibrationOptimizer:
         yield replace(self._fit.evaluate(problem.present), objective_key=(*last.objective_key, "start"))
 
     def _with_knowledge(self, found: Assessment) -> Assessment:
-        """A verdict that takes into account whether the network knows the arms; masks need no network."""
+        """Verdict that accounts for a network that does not know the arms; masks need no network."""
         if found.verdict is not Verdict.DOUBTFUL or self._problem.some_masked:
             return found
         tried = [self._frames[index] for index in spread(len(self._frames), _TRIED)]
@@ -290,7 +290,7 @@ class CalibrationOptimizer:
             yield iterate
 
     def result(self) -> CalibrationResult:
-        """What the best iterate says; evaluates it once more, at the finest stage that was reached.
+        """Result of the best iterate, evaluated once more under the finest descent reached.
 
         Raises:
             SettingsError: no step was made yet.
@@ -316,7 +316,7 @@ class CalibrationOptimizer:
         )
 
     def _moved_too_far(self, arm: str, offsets: torch.Tensor) -> bool:
-        """Whether a base frame has turned or shifted by more than several of its known deviations."""
+        """Whether a base frame has turned or shifted by more than `_TOO_FAR` of its known deviations."""
         rows = [index for index, name in enumerate(self.variables.names) if name.startswith(f"{arm}/base/")]
         moved = offsets[rows].double().cpu().numpy()
         known = with_joint_errors(self._known[arm], self.settings.length_scale)
@@ -332,7 +332,7 @@ class CalibrationOptimizer:
         alone: Float[torch.Tensor, "n n"],
         between: Float[torch.Tensor, "n n"] | None,
     ) -> Float[torch.Tensor, "n n"]:
-        """Of the unknowns, for all errors that are allowed for."""
+        """Covariance of the unknowns for all modelled errors."""
         assert evaluation.outline is not None
         shifts = [alone @ evaluation.outline[:, None], alone @ evaluation.gradient.double().cpu()[:, None]]
         if not self.free.intrinsics:
@@ -340,9 +340,9 @@ class CalibrationOptimizer:
         together = torch.cat(shifts, 1)
         shared = together @ together.T
         if self._known:
-            # Frames that are left out do not show the error of base frames that were known.
+            # The jackknife does not show the error of known base frames.
             shared = shared + alone @ self._problem.prior.precision.double().cpu() @ alone
-        # With one frame nothing but experience says how much neighbouring pixels share their errors.
+        # With one frame the correlation of pixels comes from the settings.
         frames = _CORRELATED**2 * alone if between is None else between
         total = frames + shared
         wider = _widened(frames.diagonal(), shared.diagonal(), len(self._frames)) / total.diagonal().sqrt()
@@ -355,7 +355,7 @@ class CalibrationOptimizer:
         alone: Float[torch.Tensor, "n n"],
         between: Float[torch.Tensor, "n n"] | None,
     ) -> tuple[UnknownChange, ...]:
-        """What became of each unknown, with its deviations."""
+        """Change of each unknown, with its standard deviations."""
         settings = self.settings
         prior = self.variables.expected(settings.prior_deg, settings.frame_prior_deg, settings.intrinsics_prior).cpu()
         known = (offsets.cpu(), total.diagonal().sqrt(), alone.diagonal().sqrt())
@@ -370,7 +370,7 @@ class CalibrationOptimizer:
     def _pose_deviations(
         self, offsets: torch.Tensor, covariance: Float[np.ndarray, "n n"]
     ) -> dict[tuple[str, str], PoseDeviation]:
-        """Of each arm before each camera that takes part, by central differences."""
+        """Standard deviations of each arm's pose before each camera, by central differences."""
         around = self.variables.around(offsets)
         found = {}
         for number, arm in enumerate(self._scene.arms):
@@ -421,7 +421,7 @@ def _widened(
 
 
 def _some_camera_moves(frames: Sequence[Frame]) -> bool:
-    """Whether frames were taken from different places, so that cameras and base frames can be found together."""
+    """Whether a camera moves between frames, so that cameras and base frames are both observable."""
     first = frames[0].mounts
     return any(
         not np.allclose(T, first.get(camera, np.eye(4)), atol=_STANDS)
@@ -431,10 +431,8 @@ def _some_camera_moves(frames: Sequence[Frame]) -> bool:
 
 
 def with_fixed_gauge(scene: Scene, free: FreeParameters) -> FreeParameters:
-    """`free`, with the first camera locked where otherwise moving all cameras and base frames together changed nothing.
-
-    With some base frame or camera fixed there is nothing to lock.
-    """
+    """`free` with the first camera locked if all cameras and base frames are free: their common motion is
+    unobservable."""
     every_base = free.base_frames and (not free.arms or {arm.name for arm in scene.arms} <= set(free.arms))
     names = [camera.name for camera in scene.cameras]
     if not (every_base and free.extrinsics) or set(names) & set(free.locked_cameras):

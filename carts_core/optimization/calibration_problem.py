@@ -26,8 +26,8 @@ from .variables import Variables
 
 @dataclass(frozen=True)
 class Eliminated:
-    """A quadratic model of the shared unknowns, with a frame's own ones at their best (Schur complement). On the CPU,
-    in double precision."""
+    """Quadratic model of the shared unknowns after elimination of a frame's own ones (Schur complement). On the CPU, in
+    double precision."""
 
     gradient: Float[Tensor, " shared"]
     curvature: Float[Tensor, "shared shared"]
@@ -36,7 +36,7 @@ class Eliminated:
     _gain: Float[Tensor, "own shared"]
 
     def own_step(self, shared_step: Float[Tensor, " shared"]) -> Float[Tensor, " own"]:
-        """How the own unknowns move, when the shared ones move by that much."""
+        """Step of the own unknowns for a step of the shared ones."""
         return -(self._step + self._gain @ shared_step.double().cpu())
 
 
@@ -59,11 +59,11 @@ Ignored = Sequence[Mapping[str, Bool[np.ndarray, "h w"]]]
 """Per frame: camera name -> pixels that show an occluder."""
 
 _GOOD = 1.5
-"""A frame whose loss is at most this many times the median counts in full, and less beyond it [1]."""
+"""Multiple of the median loss up to which a frame has full weight [1]."""
 
 
 _ASSESSED, _COMPARED = 12, 4
-"""Most frames that a calibration is assessed by, and that a search compares."""
+"""Largest number of frames for the assessment, and for a search."""
 
 
 @dataclass(frozen=True)
@@ -72,17 +72,17 @@ class CalibrationEvaluation(Evaluation):
 
     frame_losses: Float[Tensor, " frames"]
     frame_weights: Float[Tensor, " frames"]
-    """How far each frame counts, in [0, 1]."""
+    """Weight of each frame, in [0, 1]."""
     frame_gradients: Float[Tensor, "frames n"] | None
     """Each frame's part of the gradient, without the prior."""
     frame_curvatures: Float[Tensor, "frames n n"] | None
     """Each frame's part of the curvature, without the prior."""
     outline: Float[Tensor, " n"] | None
-    """What the gradient is off by for one standard deviation of an error that all outlines share."""
+    """Change of the gradient for one standard deviation of an error that all outlines share."""
 
 
 class _FramePart:
-    """One frame: its problem in its own unknowns (joint offsets) and the shared ones, and where its own ones are."""
+    """Problem of one frame in its own unknowns (joint offsets) and the shared ones, with the value of its own ones."""
 
     def __init__(self, problem: FrameProblem, own: int) -> None:
         self.problem = problem
@@ -90,18 +90,18 @@ class _FramePart:
         self._anchor: tuple[Tensor, Tensor, Eliminated] | None = None
 
     def at(self, shared: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch m"]:
-        """All unknowns of the frame at a calibration, or a batch of them, with joints as measured."""
+        """All unknowns of the frame at one or a batch of calibrations, with measured joints."""
         return torch.cat([shared.new_zeros(*shared.shape[:-1], len(self.own)), shared], -1)
 
     def follow(self, shared: Float[Tensor, " n"]) -> None:
-        """Move the own unknowns to where the anchor's model has them for a calibration."""
+        """Update the own unknowns for a calibration, by the anchored model."""
         if self._anchor is not None and len(self.own):
             at, own, model = self._anchor
             moved = own + model.own_step(shared - at).to(own)
             self.own = self.problem.variables.clamp(torch.cat([moved, shared]))[: len(own)]
 
     def anchor(self, shared: Float[Tensor, " n"], model: Eliminated) -> None:
-        """Remember a model, made at the present own unknowns."""
+        """Anchor a model at the present own unknowns."""
         self._anchor = (shared, self.own, model)
 
     def observe(self, stage: Observe, shared: Float[Tensor, " n"]) -> None:
@@ -140,18 +140,18 @@ class CalibrationProblem:
         scene: with the cameras that take part.
         frames: observed images and measured joint positions.
         predictor: predicts surface maps.
-        free: what is unknown; joints are so in every frame for itself.
+        free: unknowns; joints are free in each frame separately.
         settings: noise, and the prior on the calibration.
         joint_prior_deg: expected error of free joints [deg]; `settings.length_scale` turns it into metres.
         ignore: per frame, pixels that show an occluder.
         backgrounds: of the cameras, where they are known; see `FrameProblem`.
         known_base_frames: arm -> covariance of its base frame's turn and shift in its own axes [rad, m], where it is
-            known better than `settings` expects.
+            known better than the prior of `settings`.
 
     Attributes:
-        variables: the calibration.
-        stage: how many stages have descended so far, less one.
-        present: the one that descended last.
+        variables: unknowns of the calibration.
+        stage: index of the present descent.
+        present: the present descent.
 
     Raises:
         SettingsError: an image is missing or of another size than its camera, or nothing of the calibration is free.
@@ -175,7 +175,7 @@ class CalibrationProblem:
         for index, (frame, start) in enumerate(zip(frames, starts, strict=True)):
             unknowns = Variables(scene, start, free, settings.length_scale)
             own = len(unknowns) - len(self.variables)
-            # The prior of the calibration counts once, so it is none of a frame's.
+            # Shared across frames, so per-frame terms do not include the prior of the calibration.
             precision = torch.zeros_like(unknowns.lower)
             precision[:own] = math.radians(joint_prior_deg) ** -2
             problem = FrameProblem(
@@ -200,11 +200,11 @@ class CalibrationProblem:
         self._lowest, self._begun = math.inf, False
 
     def objective_key(self, blur: float) -> tuple[int, float]:
-        """Which objective it is: one observation, under one blur. Losses compare within it."""
+        """Key of the objective: the observation and the blur. Losses compare within one key."""
         return self._parts[0].problem.objective_key(blur)
 
     def observe(self, stage: Observe, offsets: Float[Tensor, " n"]) -> None:
-        """Observe all frames; those that fit badly count less from here on."""
+        """Observe all frames, and update their weights."""
         if self._losses is not None:
             self._weights = frame_weights(self._losses)
         for part in self._parts:
@@ -212,7 +212,7 @@ class CalibrationProblem:
         self._begun = False
 
     def evaluate(self, offsets: Float[Tensor, " n"], stage: Descend, *, gradient: bool = True) -> CalibrationEvaluation:
-        """Evaluate at a calibration; free joints follow it."""
+        """Evaluate a calibration; free joints follow it."""
         if stage is not self.present or not self._begun:
             self.present, self._lowest, self._begun = stage, math.inf, True
             self.stage += 1
@@ -231,7 +231,7 @@ class CalibrationProblem:
         ]
         combined = self._combined(offsets, evaluations, models, outlines)
         self._losses = combined.frame_losses
-        # What is lowest so far is where the solver steps from, so there the frames' own unknowns step from too.
+        # The solver steps from the lowest point so far, and so do the frames' own unknowns.
         if models and combined.value < self._lowest:
             self._lowest = combined.value
             for part, model in zip(self._parts, models, strict=True):
@@ -239,7 +239,7 @@ class CalibrationProblem:
         return combined
 
     def frame_losses(self, offsets: Float[Tensor, " n"]) -> Float[np.ndarray, " frames"]:
-        """Loss of every frame at a calibration with joints as measured, as of the present stage."""
+        """Loss of each frame at a calibration with measured joints, under the present descent."""
         assert self.present is not None
         at_measured = [
             part.evaluate(offsets, torch.zeros_like(part.own), self.present, gradient=False) for part in self._parts
@@ -257,12 +257,13 @@ class CalibrationProblem:
         return any(part.problem.masked for part in self._parts)
 
     def silhouette_overlap(self, offsets: Float[Tensor, " n"], scale: float) -> float:
-        """Mean overlap of silhouettes and masks (Dice), with joints as measured."""
+        """Mean overlap of silhouettes and masks (Dice), with measured joints."""
         parts = self._some(_COMPARED)
         return float(np.mean([part.problem.silhouette_overlap(part.at(offsets), scale) for part in parts]))
 
     def search_silhouettes(self, stage: SilhouetteSearch) -> Float[Tensor, " n"]:
-        """Where silhouettes of some frames are nearest to their masks. What was expected of the start is void then."""
+        """Offsets whose silhouettes in some frames are nearest to the masks; the prior is replaced by the search
+        range."""
         parts = self._some(_COMPARED)
         compared = [(part, part.problem.silhouettes(stage.scale)) for part in parts]
         distance = float(np.mean([part.problem.distance for part in parts]))
@@ -275,17 +276,17 @@ class CalibrationProblem:
         found, _ = search_silhouettes(distances, deviation, self.variables.clamp, stage)
         if self._given_prior:
             return found
-        # What was searched is known no better than that; what was not, as before.
+        # Searched unknowns get the search range as prior; the others keep theirs.
         wide = torch.where(deviation > 0, deviation, self.prior.marginal_precision.rsqrt().to(deviation))
         self.prior = replace(Prior.around_start(wide.to(found) ** -2), mean=found)
         return found
 
     def _some(self, count: int) -> list[_FramePart]:
-        """Frames evenly spread."""
+        """Evenly spread frames."""
         return [self._parts[index] for index in spread(len(self._parts), count)]
 
     def evidence(self, offsets: Float[Tensor, " n"]) -> list[Evidence]:
-        """What the images of some frames, evenly spread, say of a calibration with joints as measured."""
+        """Evidence of some evenly spread frames on a calibration, with measured joints."""
         losses = [float(loss) for loss in self.frame_losses(offsets)[spread(len(self._parts), _ASSESSED)]]
         parts = zip(self._some(_ASSESSED), losses, strict=True)
         return [part.problem.evidence(part.at(offsets), loss) for part, loss in parts]
@@ -330,8 +331,8 @@ class CalibrationProblem:
 
 
 def with_joint_errors(covariance: Float[np.ndarray, "6 6"], length_scale: float) -> Float[np.ndarray, "6 6"]:
-    """A base frame's covariance [rad, m] in radian-like units, widened for errors that joints have in all frames: they
-    look like an error of the base frame, and points do not tell them apart."""
+    """Covariance of a base frame [rad, m] in radian-like units, widened for constant joint errors, which points cannot
+    distinguish from an error of the base frame."""
     scales = np.repeat([1.0, length_scale], 3)
     return covariance / np.outer(scales, scales) + np.radians(SurfaceSolver.frame_prior_deg) ** 2 * np.eye(6)
 
@@ -339,7 +340,7 @@ def with_joint_errors(covariance: Float[np.ndarray, "6 6"], length_scale: float)
 def _with_base_frames(
     variables: Variables, settings: SurfaceSolver, known: Mapping[str, Float[np.ndarray, "6 6"]] | None
 ) -> Prior:
-    """The prior of the settings, with the covariances of base frames that are known."""
+    """Prior of the settings with known covariances of base frames."""
     prior = variables.prior(settings)
     precision = prior.precision.clone()
     for arm, covariance in (known or {}).items():
@@ -352,8 +353,8 @@ def _with_base_frames(
 
 
 def frame_weights(losses: Float[Tensor, " frames"]) -> Float[Tensor, " frames"]:
-    """How far each frame counts, in [0, 1]: in full up to a multiple of the median loss, and beyond it less, so
-    that a wrong frame (bad kinematics, smoke) does not decide what all share."""
+    """Robust weights of frames, in [0, 1]: 1 up to a multiple of the median loss, and decreasing beyond it, so that
+    outliers (bad kinematics, smoke) have little influence."""
     shown = losses[losses > 0]
     if not len(shown):
         return torch.ones_like(losses)

@@ -21,34 +21,34 @@ class Gaussian:
 
 @dataclass(frozen=True)
 class Information:
-    """What one frame measures of its correction x: a log likelihood of -x.precision.x / 2 + vector.x."""
+    """Measurement of a frame's correction x, with the log likelihood -x.precision.x / 2 + vector.x."""
 
     precision: Float[np.ndarray, "n n"]
-    """[1/rad^2]; may be singular: what the image does not show."""
+    """[1/rad^2]; singular in directions that the image does not determine."""
     vector: Float[np.ndarray, " n"]
     """[1/rad]"""
 
     @staticmethod
     def nothing(n: int) -> "Information":
-        """Of a frame whose image is left out."""
+        """No information, of a frame whose image is left out."""
         return Information(np.zeros((n, n)), np.zeros(n))
 
     @staticmethod
     def known(correction: Float[np.ndarray, " n"], std: Float[np.ndarray, " n"] | float = 0.0) -> "Information":
-        """Of a correction that is known up to a standard deviation [rad]; entries that are NaN are not known."""
+        """Information of a known correction with a standard deviation [rad]; NaN entries are unknown."""
         known = np.isfinite(correction)
         precision = np.where(known, 1.0 / (np.square(std) + 1.0 / _EXACT), 0.0)
         return Information(np.diag(precision), precision * np.where(known, correction, 0.0))
 
     def scaled(self, share: float) -> "Information":
-        """The same with a share of the weight."""
+        """The information times a weight in [0, 1]."""
         return Information(share * self.precision, share * self.vector)
 
     def __add__(self, other: "Information") -> "Information":
         return Information(self.precision + other.precision, self.vector + other.vector)
 
     def mahalanobis(self, expected: Gaussian) -> float:
-        """Squared Mahalanobis distance from what was expected, mean over the directions that were measured [1].
+        """Squared Mahalanobis distance from the prediction, mean over the measured directions [1].
 
         It is the normalized innovation squared of a filter (Bar-Shalom, Li and Kirubarajan, Estimation with
         Applications to Tracking and Navigation, 2001, 5.4), whose degrees of freedom are the rank of the precision:
@@ -66,22 +66,22 @@ class Information:
         return float(difference @ np.linalg.solve(spread, difference)) / measured.shape[1]
 
     def contradicts(self, expected: Gaussian) -> bool:
-        """Whether the correction is three standard deviations off what was expected, on average."""
+        """Whether the correction is three standard deviations from the prediction, on average."""
         return self.mahalanobis(expected) > _CONTRADICTS
 
 
 _CONTRADICTS = 9.0
-"""Mean squared Mahalanobis distance of a contradiction [1]."""
+"""Mean squared Mahalanobis distance from which a measurement contradicts its prediction [1]."""
 
 _MEASURED = 10.0
-"""Precision of a direction below which it was not measured [1/rad^2]: 18 degrees, more than is ever expected."""
+"""Least precision of a measured direction [1/rad^2], a standard deviation of 18 degrees."""
 
 _EXACT = 1e14
-"""Precision of what is known for certain [1/rad^2]."""
+"""Precision of exactly known values [1/rad^2]."""
 
 
 class ErrorModel:
-    """States of n corrections, [3 n]: all constants, all drifts, all noises.
+    """Kalman model of n corrections with the state [3 n]: constants, drifts, noises.
 
     Args:
         settings: of joints; other unknowns have as much less drift and noise as they have a smaller constant.
@@ -100,7 +100,7 @@ class ErrorModel:
         return Gaussian(np.zeros(3 * self._n), np.diag(self._variance))
 
     def predicted(self, state: Gaussian, seconds: float) -> Gaussian:
-        """The state that many seconds later (infinitely many: as if nothing was known)."""
+        """Predicted state after a time [s]; the prior after an infinite one."""
         kept = self._kept(seconds)
         noise = np.diag(self._variance * (1.0 - kept**2))
         return Gaussian(kept * state.mean, kept[:, None] * state.covariance * kept + noise)
@@ -137,7 +137,7 @@ class ErrorModel:
 
 
 def combined(state: Gaussian, information: Information, C: Float[np.ndarray, "m n"] | None = None) -> Gaussian:
-    """The state x after a measurement of C x (of x itself by default)."""
+    """Kalman update of a state x by a measurement of C x (x itself by default)."""
     C = np.eye(len(state.mean)) if C is None else C
     precision, cross = information.precision, state.covariance @ C.T
     # K = P C^T (1 + L C P C^T)^-1 L needs no inverse of L, which may be singular.
@@ -148,7 +148,7 @@ def combined(state: Gaussian, information: Information, C: Float[np.ndarray, "m 
 
 
 def information_shares(gaps: Sequence[float], memory: float) -> list[float]:
-    """Share of each frame's information that counts for the others, because errors of images are alike for a while [1].
+    """Share of each frame's information that counts for the others, since image errors are correlated in time [1].
 
     They are taken for an autoregressive process of first order. The mean of many of its values, a gap apart, is as
     certain as that of (1 - r) / (1 + r) times as many independent ones, with r = exp(-gap / memory). A frame gets the
@@ -165,16 +165,16 @@ def information_shares(gaps: Sequence[float], memory: float) -> list[float]:
 
 
 def remove_measurement(smoothed: Gaussian, own: Information) -> Gaussian:
-    """The smoothed correction of a frame without its own measurement."""
+    """Smoothed correction of a frame without its own measurement."""
     precision = np.linalg.inv(smoothed.covariance)
     values, vectors = np.linalg.eigh(precision - own.precision)
-    # Rounding must not make a direction less certain than nothing.
+    # Rounding must not make a precision negative.
     covariance = vectors @ np.diag(1.0 / np.maximum(values, 1.0)) @ vectors.T
     return Gaussian(covariance @ (precision @ smoothed.mean - own.vector), covariance)
 
 
 class Smoother:
-    """Filters the measurements of frames in the order in which they are visited, and smooths them backwards.
+    """Filters measurements in the order of visits, and smooths them backwards.
 
     Neighbouring frames share errors of their images, so only a share of what a frame measures counts for the others;
     all of it counts for the frame itself.
@@ -198,50 +198,50 @@ class Smoother:
         """States after the first frames of the order; completed when they are needed."""
 
     def expected(self, index: int) -> Gaussian:
-        """The correction of the frame that is next, as the frames before it let expect it."""
+        """Predicted correction of the next frame."""
         return self._errors.correction(self._predicted(len(self._order), index))
 
     def add(self, index: int, measured: Information) -> Gaussian:
-        """Take the measurement of the frame that is next; its correction, given that and the frames before it."""
+        """Add the measurement of the next frame; returns its filtered correction."""
         expected = self.expected(index)
         self._order.append(index)
         self._measured[index] = measured
         return combined(expected, measured)
 
     def replace(self, index: int, measured: Information) -> None:
-        """Take another measurement of a frame that has one."""
+        """Replace the measurement of a frame."""
         self._measured[index] = measured
         del self._filtered[self._order.index(index) :]
 
     def restart(self, index: int) -> None:
-        """Nothing that was found before holds any more from the frame that is next on."""
+        """Start again from the prior at the next frame."""
         self._gaps[index] = inf
         self._shares = self._information_shares()
-        # The frame before it has one neighbour less, and counts more than it did.
+        # The previous frame loses a neighbour, so its share grows.
         del self._filtered[max(len(self._order) - 1, 0) :]
 
     def smoothed(self) -> dict[int, Gaussian]:
-        """Position -> correction of each frame that was measured, given all of them."""
+        """Position -> smoothed correction of each measured frame."""
         self._filter(len(self._order))
         states = self._errors.smoothed(self._filtered, [self._gaps[index] for index in self._order])
         own = {index: self._measured[index].scaled(1.0 - self._shares[index]) for index in self._order}
         return {index: combined(state, own[index]) for index, state in zip(self._order, states, strict=True)}
 
     def cautious(self, correlation_seconds: float) -> "Smoother":
-        """The same measurements, if errors of images were alike for longer [s]."""
+        """Smoother of the same measurements with a longer correlation of image errors [s]."""
         other = Smoother(self._errors, self._gaps, correlation_seconds, self._exact)
         other._order, other._measured = self._order, self._measured
         return other
 
     def _predicted(self, place: int, index: int) -> Gaussian:
-        """The state of the frame at a place in the order, before its measurement."""
+        """Predicted state of the frame at a place in the order."""
         if place == 0:
             return self._errors.initial()
         self._filter(place)
         return self._errors.predicted(self._filtered[place - 1], self._gaps[index])
 
     def _filter(self, count: int) -> None:
-        """Have the filtered states of the first so many frames."""
+        """Filter the first `count` frames."""
         for place in range(len(self._filtered), count):
             index = self._order[place]
             shared = self._measured[index].scaled(self._shares[index])

@@ -17,18 +17,17 @@ from .predictor import FramePredictor
 
 @dataclass(frozen=True)
 class ArmEvidence:
-    """What images say of one arm of a fit, near it; of all cameras together."""
+    """Evidence on one arm of a fit from the pixels near it, of all cameras together."""
 
     residual: float
-    """Squared difference of what is rendered and what the network predicts, conditioned on the fit, as a share of
+    """Squared difference of the rendered and the predicted coverage, the latter conditioned on the fit, relative to
     their mean area [1]."""
     agreement: float
     """Overlap (soft Dice) of both [1]."""
     unconditioned: float
     """The same, the network conditioned on nothing [1]."""
     overlap_with_change: float | None
-    """Overlap (soft Dice) of what is rendered and what differs from the mean background; None where that is not known
-    [1]."""
+    """Overlap (soft Dice) of the rendering and the change against the mean background [1]; None where not known."""
 
 
 _WITHOUT_CHANGE = (0.13, 23.8, 1.5, -3.25, -0.44)
@@ -37,11 +36,11 @@ _WITH_CHANGE = (0.99, 27.9, 0.81, -1.84, -0.42, -2.85)
 logistic regressions over 503 frames of known truth, see docs/explanation/decisions.md; none of them is held out."""
 
 _LEAST_CHANGE, _CHANGE_SLOPE = 0.6, 40.0
-"""Overlap with change that every right fit had, and how fast the log odds rise below it."""
+"""Least overlap with change of all correct fits, and slope of the log odds below it."""
 
 _MASK_MIDDLE, _MASK_SLOPE = 0.8, 22.0
-"""Overlap with a given mask at which a fit is as likely right as wrong, and how fast the log odds fall beyond it: it is
-good from 0.9 on, since the mask is what is wanted, and doubtful below, since a mask may have holes."""
+"""Overlap with a given mask at log odds of 0, and their slope: a fit is good from 0.9 on and doubtful below, since a
+mask may have holes."""
 
 
 def log_odds_of_failure(loss: float, arm: ArmEvidence, masked: bool) -> float:
@@ -49,8 +48,8 @@ def log_odds_of_failure(loss: float, arm: ArmEvidence, masked: bool) -> float:
 
     Args:
         loss: of the fit; see `Evidence.loss`.
-        arm: the evidence on the arm that the image speaks most against.
-        masked: whether it is about given masks.
+        arm: evidence on the arm with the worst fit.
+        masked: whether given masks are the target.
     """
     if masked:
         return _MASK_SLOPE * (_MASK_MIDDLE - arm.agreement)
@@ -64,14 +63,15 @@ def log_odds_of_failure(loss: float, arm: ArmEvidence, masked: bool) -> float:
 
 
 _MARGIN, _NEAR = 16, 8
-"""What the network is shown beyond the arms, and how far from them predictions count [px of the working image]."""
+"""Margin of the network's input around the arms, and distance within which predictions count [px of the working
+image]."""
 
 _SHOWN, _TELLING = 2e-3, 0.3
-"""Share of the images from which an arm is judged by itself, and share of an arm where change has to tell something
-for its change to count [1]."""
+"""Least area of an arm that is assessed alone, as a share of the images, and least share of an arm with informative
+change [1]."""
 
 _PART_SHOWN = 60.0
-"""Pixels of a part from which it is judged by itself [px of the working image]."""
+"""Least area of a part that is assessed alone [px of the working image]."""
 
 OUT_OF_VIEW = 5e-4
 """Share of the images below which no arm is in view [1]."""
@@ -79,40 +79,40 @@ OUT_OF_VIEW = 5e-4
 
 @dataclass(frozen=True)
 class Evidence(ArmEvidence):
-    """What images say of a fit, without any truth: of the whole, and of the arm that speaks most against it."""
+    """Evidence on a fit without ground truth: of all arms, and of the arm with the worst fit."""
 
     area: float
-    """Of the rendered arms, as a share of the images [1]."""
+    """Area of the rendered arms, as a share of the images [1]."""
     start_area: float
     """The same at the start [1]."""
     loss: float
-    """Of the surface factor: its cost per pixel of the arms, without the prior [1]; see `Evaluation.loss`."""
+    """Cost of the surface factor per pixel of the arms, without the prior [1]; see `Evaluation.loss`."""
     predicted: float
     """Share of the rendered arms that the network predicts, conditioned on nothing [1]."""
     changed: float | None
     """Share of the rendered arms that differs from the mean background; None where that is not known [1]."""
     still_in_view: float = 1.0
-    """Of the arms in view at the start, the smallest share that one of them still has of its area then [1]; what
-    another arm hides is in view."""
+    """Smallest ratio of an arm's area to its area at the start, over the arms in view then [1]; parts behind another
+    arm count as in view."""
     elsewhere: float = 0.0
-    """Where an arm is out of view: what is predicted far from the others and differs from the mean background, as a
+    """If an arm is out of view: coverage predicted far from the others that differs from the mean background, as a
     share of the images [1]."""
     parts_predicted: float = 1.0
-    """Of the wrists and of the jaws in view, the smaller share of what is rendered that is predicted as that part [1];
-    1 where hardly any of them is in view, and where masks are given."""
+    """Share of the rendered wrists or jaws that is predicted as that part, the smaller one of both [1]; 1 where hardly
+    any of them is in view, and with given masks."""
     masked: bool = False
-    """Whether what is called predicted are given masks, which count in the whole image."""
+    """Whether the predictions are given masks, which count in the whole image."""
 
 
 @torch.no_grad()
 def evidence(
     images: FrameImages, start: SceneState, end: SceneState, predictor: FramePredictor, loss: float
 ) -> Evidence:
-    """What images say for and against a fit; runs the predictor twice.
+    """Evidence of images for and against a fit; runs the predictor twice.
 
     Args:
         images: of the cameras that take part.
-        start, end: before and after the optimization.
+        start, end: states before and after the optimization.
         predictor: of surface maps.
         loss: of the fit.
     """
@@ -204,12 +204,12 @@ def _around(silhouette: Float[Tensor, "cameras 1 h w"], scale: float) -> Float[T
 def _of_arm(
     here: Tensor, rendered: Tensor, conditioned: Tensor, alone: Tensor, change: tuple[Tensor, Tensor] | None
 ) -> ArmEvidence:
-    """What maps say where `here` weighs them.
+    """Evidence from maps under pixel weights.
 
     Args:
         here: weight of each pixel.
         rendered, conditioned, alone: coverage, as rendered and as predicted with and without a condition.
-        change: how far a pixel tells of change, and what has changed.
+        change: `Change.telling` and `Change.surely`.
     """
     rendered, conditioned, alone = rendered * here, conditioned * here, alone * here
     overlap = None
@@ -245,5 +245,5 @@ def _overlap(one: Float[Tensor, "cameras 1 h w"], other: Float[Tensor, "cameras 
 
 
 def _share(part: Float[Tensor, "cameras 1 h w"], whole: Float[Tensor, "cameras 1 h w"]) -> float:
-    """Share of a map in [0, 1] that another one has too; 0 of an empty one."""
+    """Share of `whole` that `part` covers, both in [0, 1]; 0 of an empty map."""
     return total(part * whole) / max(total(whole), 1e-6)

@@ -29,10 +29,10 @@ from .variables import Variables
 from .verdict import Assessment
 
 BASE_FRAME_GAIN = 0.12
-"""Base frames are suspected if, free, they would explain at least this share of the remaining difference [1]."""
+"""Least share of the residual that free base frames explain from which they are suspected to be wrong [1]."""
 
 _BLUR = 3.0
-"""Under which the linear model is made: it reaches about as far as the blur [px of the working image]."""
+"""Blur of the linear model, which is valid about as far as it reaches [px of the working image]."""
 
 
 @torch.no_grad()
@@ -71,7 +71,7 @@ def base_frame_gain(problem: FrameProblem, offsets: Float[Tensor, " n"], free: F
 
 @dataclass(frozen=True)
 class Iterate:
-    """A point of an optimization, with its rendering. A copy: nothing later changes it."""
+    """One iterate of an optimization with its rendering; an immutable copy."""
 
     index: int
     """Number of steps before it; 0 is the start."""
@@ -90,7 +90,7 @@ class Iterate:
     image: UInt8[np.ndarray, "cameras h w 3"]
     """Rendered arms, RGB."""
     uncertainty: Uncertainty | None
-    """What the images determine; None for losses that cannot say."""
+    """Standard deviations; None for losses without curvature."""
     attention: Float[np.ndarray, "cameras h w"]
     similarity: Float[np.ndarray, "cameras h w"]
     """Of what is compared: cosine of features, or 1 minus the squared difference of surface maps; at most 1."""
@@ -108,7 +108,7 @@ class Iterate:
 
 @dataclass(frozen=True)
 class Progress:
-    """What is kept of every iterate, in a few bytes."""
+    """Scalars of an iterate, kept in the history."""
 
     index: int
     loss: float
@@ -123,9 +123,8 @@ class FrameOptimizer:
     Args:
         scene: arms and cameras.
         frame: observed images and measured joint positions.
-        backgrounds: camera name -> mean background BG_m. A `DescentSolver` needs them all; a `SurfaceSolver` takes
-            what looks like an arm in them for none, and does without where one is missing. `Backgrounds` that serve
-            several frames save time.
+        backgrounds: camera name -> mean background BG_m. A `DescentSolver` needs them all; a `SurfaceSolver` discards
+            false detections in them, and does without where one is missing. `Backgrounds` cache this across frames.
         networks: the networks, or another predictor of surface maps.
         ignore: camera name -> pixels that show an occluder; a `SurfaceSolver` leaves them out.
         start: arm name -> joint positions to start from, the measured ones by default.
@@ -134,7 +133,7 @@ class FrameOptimizer:
         factors: makes further factors over the unknowns, which a `SurfaceSolver` adds to its objective.
         cameras: names of the cameras that take part, all by default.
         live: whether iterates are displayed. If not, a `SurfaceSolver` saves a third of its time: iterates of coarse
-            stages are rendered and rated as coarsely as they are compared. The end is the same.
+            stages are then rendered as coarsely as they are compared. The result is the same.
 
     Raises:
         SettingsError: an image or background is missing or of the wrong size, nothing is free, or factors are
@@ -204,12 +203,12 @@ class FrameOptimizer:
 
     @property
     def assessment(self) -> Assessment | None:
-        """At the end, how far the result can be relied on; None before, and for a solver without `RejectFailed`."""
+        """Verdict at the end; None before, and for a solver without `RejectFailed`."""
         return self._fit.assessment
 
     @property
     def proposed(self) -> dict[str, Bool[np.ndarray, "h w"]]:
-        """Camera name -> pixels that were left out on a proposal of `IgnoreOccluders`."""
+        """Camera name -> pixels of occluders proposed by `IgnoreOccluders`."""
         return self._problem.proposed if isinstance(self._problem, FrameProblem) else {}
 
     def cancel(self) -> None:
@@ -239,9 +238,9 @@ class FrameOptimizer:
             yield iterate
 
     def comparable_losses(self) -> list[float]:
-        """Loss of every iterate so far, all compared with what was observed last.
+        """Losses of all iterates under the last observation.
 
-        What an iterate carries was compared with the observation of its own time, so it only compares within a stage.
+        The loss of an iterate refers to the observation of its stage, and compares within that stage alone.
         """
         problem = self._problem
         if not isinstance(problem, FrameProblem):
@@ -255,7 +254,7 @@ class FrameOptimizer:
         not count. Several cameras count together, so a single one with a wrong pose shows less.
 
         Returns:
-            None before the end, where base frames are free already, or for losses that cannot say.
+            None before the end, if base frames are free already, or for losses without a surface factor.
         """
         ended = self.stop_reason not in (None, StopReason.CANCELLED, StopReason.NOT_OPTIMIZED)
         if not ended or self._free.base_frames or not isinstance(self._problem, FrameProblem):

@@ -23,24 +23,23 @@ from .evidence import Evidence, evidence
 from .factors import Factor, Linearization, Prior
 from .factors.edges import EdgeFactor, align_edges
 from .factors.surface import SurfaceFactor
-from .observability import Evaluation, Uncertainty, uncertainty
+from .observability import Evaluation, Uncertainty, uncertainty, uncertainty_after
 from .observation import FrameImages, Observation, observe
 from .predictor import FramePredictor
 from .variables import Variables
 
 _CONTRADICTS = 0.5
-"""Similarity below which a pixel contradicts the estimate: 1 minus the squared difference of surface maps."""
+"""Similarity (1 minus the squared difference of surface maps) below which a pixel contradicts the estimate [1]."""
 _SMALLEST, _NEAR, _GAP, _RIM = 2, 5, 7, 2
-"""Radii at an image width of 320 px [px]: of what is an outline that is off and no object, of the distance from the
-silhouette, of holes that are closed, and of what is added all around."""
+"""Radii at an image width of 320 px [px]: smallest object, distance from the silhouette, closed holes, and margin."""
 _MOST = 0.5
-"""Part of the silhouette; where more contradicts, the estimate is wrong and not the image."""
+"""Share of the silhouette above which the estimate is wrong, not occluded [1]."""
 
 
 def propose_ignore(
     scene: Scene, silhouette: Float[np.ndarray, "cameras h w"], similarity: Float[np.ndarray, "cameras h w"]
 ) -> dict[str, Bool[np.ndarray, "height width"]]:
-    """Pixels that probably show an occluder: areas at the arms where the prediction differs from the rendering.
+    """Probable occluders: areas at the arms where the prediction differs from the rendering.
 
     An occluder that the network takes for background makes a gap in the arm, one that it takes for an instrument
     sticks out of the arm. Both count, if they touch the silhouette.
@@ -79,23 +78,23 @@ def _disc(radius: float) -> np.ndarray:
 
 
 _COVERED = 0.5
-"""Share of a pixel from which it counts as covered [1]."""
+"""Coverage from which a pixel belongs to a mask [1]."""
 
 _ELITE = 0.1
-"""Share of the candidates that the next ones are drawn around [1]."""
+"""Share of candidates that the next round is drawn around [1]."""
 
 _FIRST = 4
-"""How many times more candidates the first round has."""
+"""Factor on the number of candidates of the first round [1]."""
 
 _LEAST = 0.02
-"""Smallest deviation that is drawn with, as a share of the first one [1]."""
+"""Smallest standard deviation of a round, relative to the first one [1]."""
 
 _HOLD = 0.05
-"""What a candidate costs for being one expected deviation off, on average over the unknowns [px]."""
+"""Cost of a mean squared offset of one standard deviation [px]."""
 
 
 def mask_distances(mask: Bool[np.ndarray, "*cameras h w"]) -> Float[np.ndarray, "*cameras h w"]:
-    """Distance of each pixel to a mask, 0 in it; as far as the image is wide where it is empty [px]."""
+    """Distance of each pixel to a mask, 0 inside; the image's width for an empty mask [px]."""
     flat = mask.reshape(-1, *mask.shape[-2:])
     found = [
         cv2.distanceTransform((~one).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
@@ -111,7 +110,7 @@ def silhouette_distance(
     masks: Bool[np.ndarray, "cameras h w"],
     weight: Bool[np.ndarray, "cameras h w"],
 ) -> Float[np.ndarray, " batch"]:
-    """Mean distance of silhouettes from masks, and of masks from silhouettes, half of each [px].
+    """Symmetric mean distance of silhouettes and masks [px].
 
     Args:
         rendered: silhouettes of a batch of states.
@@ -122,7 +121,7 @@ def silhouette_distance(
     rendered, masks = rendered & weight, masks & weight
     outside = (rendered * to_masks).sum((1, 2, 3)) / rendered.sum((1, 2, 3)).clip(min=1)
     missed = (mask_distances(rendered) * masks).sum((1, 2, 3)) / max(int(masks.sum()), 1)
-    # Nothing in view is as wrong as can be.
+    # An empty silhouette gets the largest distance.
     outside[~rendered.any((1, 2, 3))] = rendered.shape[-1]
     return 0.5 * (outside + missed)
 
@@ -160,13 +159,13 @@ def search_silhouettes(
     clamp: Callable[[Tensor], Tensor],
     stage: SilhouetteSearch,
 ) -> tuple[Float[Tensor, " n"], float]:
-    """The point of the smallest distance that was found, and that distance [px]: cross-entropy method, several starts.
+    """Search for the smallest distance of silhouettes by the cross-entropy method; returns the point and distance [px].
 
     Args:
         distances: between silhouettes and masks at each of a batch of points [px].
-        deviation: how far points are drawn from the start at first.
-        clamp: brings points into their bounds.
-        stage: how many are drawn, and how often.
+        deviation: standard deviation of the first round.
+        clamp: clamps points to their bounds.
+        stage: numbers of starts, rounds and candidates.
     """
     best, lowest = torch.zeros_like(deviation), float("inf")
     for start in range(stage.starts):
@@ -192,11 +191,11 @@ def search_silhouettes(
 
 
 _SHOWN_BLUR = 1.6
-"""Iterates that are displayed are compared under a blur of at most this [px of the working image]."""
+"""Largest blur under which displayed iterates are compared [px of the working image]."""
 
 
 _BESIDE = ThreadPoolExecutor(2, "edges")
-"""Does what needs the images alone while the network runs."""
+"""Extracts image edges while the network runs."""
 
 
 class FrameProblem:
@@ -211,14 +210,13 @@ class FrameProblem:
         ignore: camera name -> pixels that show an occluder.
         prior: of the unknowns; as the settings expect by default.
         factors: further ones over the same unknowns.
-        backgrounds: of the cameras; what is predicted in them as well counts as a false positive.
-        live: whether coarse stages are also compared under a fine blur, for a display. It takes a third
-            more time and changes no step.
+        backgrounds: of the cameras; predictions in them are false positives.
+        live: whether coarse stages are also compared under a fine blur for display, which takes a third more time.
 
     Attributes:
         observation: the last one; stages replace it.
-        observations: how many there were.
-        proposed: camera name -> pixels that were left out on a proposal.
+        observations: their number.
+        proposed: camera name -> pixels of proposed occluders.
 
     Raises:
         SettingsError: an image is missing, or an image or a mask is of another size than its camera.
@@ -289,25 +287,25 @@ class FrameProblem:
             )
         return self._images[scale]
 
-    def treat_background_otherwise(self) -> None:
-        """Replace the empty background where it was taken off the predictions so far, or the other way round."""
+    def toggle_background_mode(self) -> None:
+        """Switch between replacing the empty background and subtracting the predictions in it."""
         self._replaced = not self.images(1.0).replaced
         self._images, self._evidence = {}, None
 
     def reset(self) -> None:
-        """Drop the observation, the proposed ignore mask and the other treatment of the background."""
+        """Drop the observation, the proposed ignore mask and the background mode."""
         if self.proposed or self._replaced is not None:
             self._ignore, self._images, self._edges = self._given_ignore, {}, None
         self._replaced = self._evidence = None
         self._observation, self._factors, self.observations, self.proposed = None, {}, 0, {}
 
     def observe(self, stage: Observe, offsets: Float[Tensor, " n"], *, whole: bool = False) -> None:
-        """Have surface maps of the images predicted, conditioned on the start or on an estimate."""
+        """Predict surface maps, conditioned on the start or on an estimate."""
         state = self.variables.state(self.start if stage.given is Given.START else offsets)
         self.observation = observe(self.images(stage.scale), self.predictor, state, stage, whole=whole)
 
     def ignore_occluders(self, evaluation: Evaluation) -> bool:
-        """Leave out pixels that probably show an occluder, from a fit's evaluation; False if there are none."""
+        """Ignore probable occluders from now on; returns whether there are any."""
         silhouette, similarity = evaluation.silhouette.cpu().numpy(), evaluation.similarity.cpu().numpy()
         self.proposed = propose_ignore(self.scene, silhouette, similarity)
         if self.proposed:
@@ -326,7 +324,7 @@ class FrameProblem:
         return self._factors[key]
 
     def objective_key(self, blur: float) -> tuple[int, float]:
-        """Which objective it is: one observation and, if not live, one blur. Losses compare within it."""
+        """Key of the objective: the observation and, if not live, the blur. Losses compare within one key."""
         return self.observations, 0.0 if self._live else blur
 
     @torch.no_grad()
@@ -339,9 +337,14 @@ class FrameProblem:
         return torch.stack([factor.costs(offsets) for factor in self._other_factors]).sum(0)
 
     def uncertainty_after(self, offsets: Float[Tensor, " n"], evaluation: Evaluation) -> Uncertainty | None:
-        """Deviations where a fit has ended, near an evaluation with a gradient."""
+        """Standard deviations at the end of a fit, from a nearby evaluation with a gradient."""
+        known = evaluation.uncertainty
+        if evaluation.hessian is None or evaluation.common is None or known is None:
+            return None
         start_share = 0.0 if self.predictor.masked else self.settings.start_share
-        return evaluation.final_uncertainty(offsets, self.variables, self.prior, start_share)
+        moved = offsets - self.prior.mean
+        later = uncertainty_after(self.variables, self.prior, evaluation.hessian, evaluation.common, moved, start_share)
+        return known.rescaled(later)
 
     @torch.no_grad()
     def evaluate(self, offsets: Float[Tensor, " n"], stage: Descend, *, gradient: bool = True) -> Evaluation:
@@ -379,19 +382,19 @@ class FrameProblem:
         )
 
     def evidence(self, offsets: Float[Tensor, " n"], loss: float) -> Evidence:
-        """What the images say for and against a point whose loss is known."""
+        """Evidence for and against a point of known loss."""
         if self._evidence is None or not torch.equal(self._evidence[0], offsets):
             start, end = (self.variables.state(at) for at in (self.start, offsets))
             self._evidence = offsets.clone(), evidence(self.images(1.0), start, end, self.predictor, loss)
         return replace(self._evidence[1], loss=loss)
 
     def evidence_at(self, offsets: Float[Tensor, " n"]) -> Evidence:
-        """What the images say for and against a point, under the last observation."""
+        """Evidence for and against a point, with its loss under the last observation."""
         return self.evidence(offsets, self.evaluate(offsets, FINEST, gradient=False).loss)
 
     @property
     def distance(self) -> float:
-        """Of the arms from the cameras at the start [m]."""
+        """Distance of the arms from the cameras at the start [m]."""
         return self.scene.distance(self.variables.start)
 
     @property
@@ -408,7 +411,7 @@ class FrameProblem:
         return self.silhouettes(scale).overlap(self.variables.state(offsets))
 
     def search_silhouettes(self, stage: SilhouetteSearch) -> Float[Tensor, " n"]:
-        """Where silhouettes are nearest to the masks."""
+        """Offsets whose silhouettes are nearest to the masks."""
         compared, variables = self.silhouettes(stage.scale), self.variables
         deviation = variables.spread(stage.joints_deg, stage.frames_deg, self.distance)
         found, _ = search_silhouettes(
@@ -417,7 +420,7 @@ class FrameProblem:
         return found
 
     def _loss(self, factor: SurfaceFactor, compared) -> float:
-        """The cost per pixel of the arms, as rendered and as observed.
+        """Cost per pixel of the arms, averaged over the rendered and the observed area.
 
         The area is weighted as the cost is, so that losses compare between clear and hazy images.
         """
@@ -428,13 +431,13 @@ class FrameProblem:
     def aligned(
         self, stage: AlignEdges, offsets: Float[Tensor, " n"], known: Evaluation
     ) -> tuple[Float[Tensor, " n"], Linearization]:
-        """Outlines drawn to edges from a point whose evaluation is known; see `align_edges`."""
+        """Alignment with edges from an evaluated point; see `align_edges`."""
         assert known.hessian is not None
         model = Linearization(known.value, known.gradient, known.hessian)
         return align_edges(self._edge_factor(), stage, offsets, model, self.observation.whole_coverage())
 
     def edge_distance(self, offsets: Float[Tensor, " n"]) -> float:
-        """How far outlines are from edges at a point; see `EdgeFactor.cost`."""
+        """Distance of outlines from edges at a point; see `EdgeFactor.cost`."""
         return self._edge_factor().near(offsets, self.observation.whole_coverage(), AlignEdges.weight).cost()
 
     def _edge_factor(self) -> EdgeFactor:

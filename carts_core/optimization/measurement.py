@@ -1,9 +1,10 @@
 """Measurements of single frames in a sequence, and checkpoints of them."""
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import CancelledError
-from dataclasses import astuple, dataclass, is_dataclass, replace
-from typing import Any
+from dataclasses import astuple, dataclass, replace
+from functools import partial, wraps
+from typing import Concatenate, ParamSpec, TypeVar
 
 import numpy as np
 import torch
@@ -31,6 +32,9 @@ from .stages import Fit, run_stages
 from .variables import Variables
 from .verdict import Assessment
 
+P = ParamSpec("P")
+Found = TypeVar("Found")
+
 Ignore = Callable[[int], Mapping[str, Bool[np.ndarray, "h w"]]]
 
 _QUICK_SCALE = 1.0
@@ -39,32 +43,65 @@ _QUICK_SCALE = 1.0
 
 @dataclass(frozen=True)
 class Measurement:
-    """What one frame says, at the end of a descent."""
+    """Measurement of one frame at the end of a descent."""
 
     correction: Float[np.ndarray, " n"]
-    """Best for image and prior together [rad]."""
+    """Maximum a posteriori [rad]."""
     information: Information
-    """Of the image alone, linearized there, and scaled for the correlation of neighbouring pixels."""
+    """Information of the image alone, linearized there and scaled for correlated pixels."""
     loss: float
     iterations: int
 
     def left_out(self) -> "Measurement":
-        """Without the information of its image."""
+        """The measurement without the information of its image."""
         return replace(self, information=Information.nothing(len(self.correction)))
 
 
 @dataclass(frozen=True)
 class SolvedAlone:
-    """What the whole solver of single frames makes of one frame, without the others."""
+    """Result of the single-frame solver."""
 
     correction: Float[np.ndarray, " n"]
     """[rad]"""
     uncertainty: Uncertainty | None
-    """With the verdict allowed for; None where it is not known."""
+    """With allowance for the verdict; None where it is not known."""
     loss: float
     iterations: int
     assessment: Assessment | None
     """None for stages without `RejectFailed`."""
+
+
+def sequence_checkpoint(path: OutputPath, made_with: str) -> Checkpoint:
+    """The checkpoint of a `SequenceOptimizer`.
+
+    Args:
+        path: the file.
+        made_with: fingerprint of scene, weights, settings and code; frames and what is expected of them need not be in.
+    """
+    return Checkpoint(path, made_with, (Measurement, Information, Evidence))
+
+
+def _checkpointed(
+    method: "Callable[Concatenate[FrameSolver, Frame, Variables, P], Found]",
+) -> "Callable[Concatenate[FrameSolver, Frame, Variables, P], Found]":
+    """Makes a method of `FrameSolver` look its result up in the solver's checkpoint: the same to the last bit."""
+
+    @wraps(method)
+    def looked_up(
+        self: "FrameSolver", frame: Frame, variables: Variables, *arguments: P.args, **options: P.kwargs
+    ) -> Found:
+        compute = partial(method, self, frame, variables, *arguments, **options)
+        if self._checkpoint is None:
+            return compute()
+        images = [(name, frame.images[name]) for name in sorted(frame.images)]
+        measured = [(name, frame.measured[name]) for name in sorted(frame.measured)]
+        masks = sorted((frame.masks or {}).items())
+        given = [value for value in (*arguments, *options.values()) if not callable(value)]
+        plain = [astuple(value) if isinstance(value, Gaussian) else value for value in given]
+        key = fingerprint(method.__name__, frame.index, images, masks, measured, plain)
+        return self._checkpoint.value(key, compute)
+
+    return looked_up
 
 
 class FrameSolver:
@@ -77,6 +114,7 @@ class FrameSolver:
         model: stages of cold and warm starts, and the noise of a measurement.
         ignore: position of a frame -> camera name -> pixels that show an occluder.
         backgrounds: of the cameras, where they are known.
+        checkpoint: made by `sequence_checkpoint`; keeps what was found.
     """
 
     def __init__(
@@ -87,12 +125,14 @@ class FrameSolver:
         model: SequenceSettings,
         ignore: Ignore,
         backgrounds: Backgrounds | None = None,
+        checkpoint: Checkpoint | None = None,
     ) -> None:
         self._scene, self._predictor, self._settings, self._ignore = scene, predictor, settings, ignore
-        self._backgrounds = backgrounds
+        self._backgrounds, self._checkpoint = backgrounds, checkpoint
         self._share = (settings.noise / model.measurement_noise) ** 2
         self._cold, self._warm, self._wide = model.cold, model.warm, model.wide
 
+    @_checkpointed
     def warm(
         self, frame: Frame, variables: Variables, expected: Gaussian, start: np.ndarray, *, wide: bool = False
     ) -> Measurement:
@@ -107,6 +147,7 @@ class FrameSolver:
         loss = fit.reached.evaluation.stage_loss
         return Measurement(_double(correction), seen.scaled(self._share), loss, fit.used)
 
+    @_checkpointed
     def cold(
         self,
         frame: Frame,
@@ -119,7 +160,7 @@ class FrameSolver:
         """Find the correction from the measured values on; quick in smaller images but for the end.
 
         Raises:
-            CancelledError: `cancelled` has said so, after some evaluation.
+            CancelledError: `cancelled` returned True after an evaluation.
         """
         stages = reduced(self._cold, _QUICK_SCALE) if quick else self._cold
         start = np.zeros(len(variables))
@@ -129,15 +170,16 @@ class FrameSolver:
         return replace(end, iterations=fit.used + end.iterations)
 
     def alone(self, frame: Frame, variables: Variables) -> SolvedAlone | None:
-        """Solve a frame as `FrameOptimizer` does, by the stages of the settings; None if they evaluate nothing."""
+        """Run the stages of the settings, as `FrameOptimizer` does; None if they evaluate nothing."""
         fit = self._run(frame, variables, None, self._settings.stages, np.zeros(len(variables)))
         if fit.best is None:
             return None
         found, used = fit.best.evaluation, fit.used
         return SolvedAlone(_double(fit.best.offsets), found.uncertainty, found.loss, used, fit.assessment)
 
+    @_checkpointed
     def at(self, frame: Frame, variables: Variables, expected: Gaussian, correction: np.ndarray) -> Measurement:
-        """Evaluate a given correction [n], no more."""
+        """Evaluate a given correction [n]."""
         problem = self._problem(frame, variables, _prior(expected, variables))
         offsets = torch.from_numpy(correction).to(variables.lower)
         problem.observe(first_observe(self._warm), offsets)
@@ -145,8 +187,9 @@ class FrameSolver:
         information = _information(offsets, evaluation, problem.prior).scaled(self._share)
         return Measurement(correction, information, evaluation.stage_loss, 0)
 
+    @_checkpointed
     def losses(self, frame: Frame, variables: Variables, corrections: Sequence[np.ndarray]) -> list[float]:
-        """How badly given corrections [n] fit, in a smaller image that is observed conditioned on each."""
+        """Losses of corrections [n] in a smaller image, observed conditioned on each."""
         problem, found = self._problem(frame, variables, None), []
         for correction in corrections:
             offsets = variables.clamp(torch.from_numpy(correction).to(variables.lower))
@@ -154,13 +197,14 @@ class FrameSolver:
             found.append(problem.evaluate(offsets, FINEST, gradient=False).stage_loss)
         return found
 
+    @_checkpointed
     def evidence(self, frame: Frame, variables: Variables, correction: np.ndarray, loss: float) -> Evidence:
-        """What the images say for and against a correction [n] whose loss is known."""
+        """Evidence for and against a correction [n] of known loss."""
         offsets = variables.clamp(torch.from_numpy(correction).to(variables.lower))
         return self._problem(frame, variables, None).evidence(offsets, loss)
 
     def arms_out_of_view(self, variables: Variables, correction: np.ndarray) -> bool:
-        """Whether no pixel of some arm is in view at a correction [n]."""
+        """Whether some arm is out of view at a correction [n]."""
         offsets = variables.clamp(torch.from_numpy(correction).to(variables.lower))
         width, height = working_size(self._scene, self._settings.working_width, 1)
         labels = Renderer(self._scene, width=width, height=height).segment(variables.state(offsets).to("cpu"))
@@ -173,7 +217,7 @@ class FrameSolver:
 
         Args:
             frame, variables: the frame, and its unknowns.
-            correction: where.
+            correction: of the measured values [n].
             free: the unknowns, by kind.
         """
         offsets = variables.clamp(torch.from_numpy(correction).to(variables.lower))
@@ -219,11 +263,11 @@ def _prior(expected: Gaussian, variables: Variables) -> Prior:
 
 
 def _information(offsets: Tensor, evaluation: Evaluation, prior: Prior) -> Information:
-    """Of the image alone: the quadratic model without the prior."""
+    """Information of the image alone: the quadratic model without the prior."""
     assert evaluation.hessian is not None
     known = prior.linearize(offsets)
     precision = _double(evaluation.hessian - known.hessian)
-    # Without what rounding took below 0: information is never negative.
+    # Rounding must not make information negative.
     values, vectors = np.linalg.eigh(0.5 * (precision + precision.T))
     precision = vectors @ np.diag(values.clip(min=0.0)) @ vectors.T
     slope = _double(evaluation.gradient - known.gradient)
@@ -237,81 +281,3 @@ def _of_edges(offsets: Tensor, edges: Linearization) -> Information:
 
 def _double(values: Tensor) -> np.ndarray:
     return values.detach().cpu().double().numpy()
-
-
-def sequence_checkpoint(path: OutputPath, made_with: str) -> Checkpoint:
-    """The checkpoint of a `SequenceOptimizer`.
-
-    Args:
-        path: the file.
-        made_with: fingerprint of scene, weights, settings and code; frames and what is expected of them need not be in.
-    """
-    return Checkpoint(path, made_with, (Measurement, Information, Evidence))
-
-
-class ResumableFrameSolver(FrameSolver):
-    """A `FrameSolver` that looks up in a checkpoint what it has solved before: the same to the last bit.
-
-    Args:
-        solver: that solves what is not there.
-        checkpoint: made by `sequence_checkpoint`.
-    """
-
-    def __init__(self, solver: FrameSolver, checkpoint: Checkpoint) -> None:
-        self._solver, self._checkpoint = solver, checkpoint
-
-    def warm(
-        self, frame: Frame, variables: Variables, expected: Gaussian, start: np.ndarray, *, wide: bool = False
-    ) -> Measurement:
-        """As `FrameSolver.warm`."""
-        key = _key("warm", frame, expected, start, wide)
-        return self._checkpoint.value(key, lambda: self._solver.warm(frame, variables, expected, start, wide=wide))
-
-    def cold(
-        self,
-        frame: Frame,
-        variables: Variables,
-        expected: Gaussian,
-        *,
-        quick: bool = False,
-        cancelled: Callable[[], bool] = lambda: False,
-    ) -> Measurement:
-        """As `FrameSolver.cold`."""
-        key, options = _key("cold", frame, expected, quick), {"quick": quick, "cancelled": cancelled}
-        return self._checkpoint.value(key, lambda: self._solver.cold(frame, variables, expected, **options))
-
-    def alone(self, frame: Frame, variables: Variables) -> SolvedAlone | None:
-        """As `FrameSolver.alone`; frames that failed only, so it is not kept."""
-        return self._solver.alone(frame, variables)
-
-    def at(self, frame: Frame, variables: Variables, expected: Gaussian, correction: np.ndarray) -> Measurement:
-        """As `FrameSolver.at`."""
-        key = _key("at", frame, expected, correction)
-        return self._checkpoint.value(key, lambda: self._solver.at(frame, variables, expected, correction))
-
-    def losses(self, frame: Frame, variables: Variables, corrections: Sequence[np.ndarray]) -> list[float]:
-        """As `FrameSolver.losses`."""
-        key = _key("losses", frame, *corrections)
-        return self._checkpoint.value(key, lambda: self._solver.losses(frame, variables, corrections))
-
-    def evidence(self, frame: Frame, variables: Variables, correction: np.ndarray, loss: float) -> Evidence:
-        """As `FrameSolver.evidence`."""
-        key = _key("evidence", frame, correction, loss)
-        return self._checkpoint.value(key, lambda: self._solver.evidence(frame, variables, correction, loss))
-
-    def base_frame_gain(
-        self, frame: Frame, variables: Variables, correction: np.ndarray, free: FreeParameters
-    ) -> float:
-        """As `FrameSolver.base_frame_gain`; a few frames, so it is not kept."""
-        return self._solver.base_frame_gain(frame, variables, correction, free)
-
-
-def _key(method: str, frame: Frame, *arguments: Any) -> str:
-    images = [(name, frame.images[name]) for name in sorted(frame.images)]
-    measured = [(name, frame.measured[name]) for name in sorted(frame.measured)]
-    masks = sorted((frame.masks or {}).items())
-    return fingerprint(method, frame.index, images, masks, measured, _plain(arguments))
-
-
-def _plain(arguments: Iterable[Any]) -> list[Any]:
-    return [astuple(value) if is_dataclass(value) and not isinstance(value, type) else value for value in arguments]

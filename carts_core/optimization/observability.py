@@ -29,19 +29,19 @@ _OPEN_LENGTH = _OPEN_ANGLE * SurfaceSolver.length_scale
 
 @dataclass(frozen=True)
 class Uncertainty:
-    """How well each unknown is known after an optimization."""
+    """Standard deviations of the unknowns after an optimization."""
 
     names: tuple[str, ...]
     """As in `Variables.names`, such as `PSM1/yaw`."""
     std: tuple[float, ...]
     """Standard deviation [rad], [m] for prismatic joints and translations."""
     expected: tuple[float, ...]
-    """The same before the image was used; at the end of a fit, as large as what it found makes likely."""
+    """Prior standard deviation; at the end of a fit, rescaled by the size of the corrections."""
     left: tuple[float, ...] | None = None
-    """What the image leaves of a deviation as it was expected at the start [1]; None if that is what `expected` is."""
+    """Posterior over prior standard deviation for the prior of the settings [1]; None if `expected` is that prior."""
 
     def observability(self, name: str) -> Observability:
-        """Whether the image determined an unknown: it has become three times as certain, a little, or not at all."""
+        """Whether the image determines an unknown: its deviation falls to a third, a little, or hardly at all."""
         index = self.names.index(name)
         share = self.std[index] / self.expected[index] if self.left is None else self.left[index]
         return "determined" if share < _DETERMINED else "weak" if share < _VISIBLE else "not visible"
@@ -52,7 +52,7 @@ class Uncertainty:
         return np.array([known.get(f"{arm}/{joint}", np.nan) for joint in joints])
 
     def doubted(self, probability: float) -> "Uncertainty":
-        """The same if the fit is wrong with a probability [1]: a wrong fit says nothing beyond what was expected.
+        """Standard deviations if the fit is wrong with a probability [1], and then leaves the prior as it was.
 
         The variance of a mixture of both cases, by the law of total variance.
         """
@@ -64,15 +64,15 @@ class Uncertainty:
         left = None if self.left is None else mixed(self.left, [1.0] * len(self.left))
         return replace(self, std=mixed(self.std, self.expected), left=left)
 
-    def scaled(self, later: "Uncertainty") -> "Uncertainty":
-        """Deviations for errors of another size; what counts as visible stays what it was for errors as expected."""
+    def rescaled(self, later: "Uncertainty") -> "Uncertainty":
+        """Standard deviations under a rescaled prior; observability stays that under the original one."""
         return replace(later, left=tuple(std / given for std, given in zip(self.std, self.expected, strict=True)))
 
 
 def undetermined_joints(
     scene: "Scene", joint_std: Mapping[str, Sequence[float | None] | np.ndarray]
 ) -> list[str] | None:
-    """`ARM.JOINT` of every joint that a fit leaves open: its deviation is above a third of what is expected of a start.
+    """`ARM.JOINT` of each joint whose standard deviation after a fit exceeds a third of the prior's.
 
     Args:
         scene: whose arms these are.
@@ -94,7 +94,7 @@ def undetermined_joints(
 
 
 def fit_words(verdict: str, undetermined: Sequence[str] | None) -> str:
-    """A verdict, which is about the mask, with what is known of the joints: `mask good, 4 joints not determined`.
+    """Verdict on the mask and number of undetermined joints as text: `mask good, 4 joints not determined`.
 
     Args:
         verdict: good, doubtful or failed.
@@ -109,17 +109,17 @@ def fit_words(verdict: str, undetermined: Sequence[str] | None) -> str:
 def uncertainty(
     variables: Variables, prior: Prior, curvature: Float[Tensor, "n n"], common: Float[Tensor, " n"]
 ) -> Uncertainty | None:
-    """For errors of the start as large as expected, from the second derivative of an objective in units of its noise.
+    """Uncertainty under the prior of the settings, from the curvature of an objective in units of its noise.
 
     Args:
         variables: the unknowns.
         prior: of their offsets, before the image was used.
         curvature: J^T J / noise^2 and the prior's precision, per offset.
-        common: what the gradient would be off by for one standard deviation of an error that all pixels share. Pixels
-            cannot average it out, so it comes on top of what their noise does, but never above what was expected.
+        common: change of the gradient for one standard deviation of an error that all pixels share. It does not average
+            out, so its effect is added to that of the noise; the sum never exceeds the prior.
 
     Returns:
-        None where the prior leaves an unknown open.
+        None where the prior does not constrain an unknown.
     """
     if not prior.informs_all:
         return None
@@ -135,7 +135,7 @@ def uncertainty_after(
     moved: Float[Tensor, " n"],
     start_share: float,
 ) -> Uncertainty:
-    """For errors of the start as large as what a fit has corrected makes likely.
+    """Uncertainty under a prior that is rescaled by the size of the corrections.
 
     The fit is the optimum under a prior of the expected size, so more is left of larger errors than its curvature says:
     of an error e of the start, (P + a I) (I + P)^-1 e, where I is the image's information, P the prior's precision and
@@ -169,13 +169,13 @@ def _uncertainty(
 _SQUARES = torch.logspace(-3, 2, 241, dtype=torch.float64)
 """Squares of the scales that `expected_scale` weighs, in steps of 5 % [1]."""
 _SHOWN = 1e-4
-"""Directions of which the image tells less, in units of the prior's precision, tell nothing of the scale [1]."""
+"""Least information of a direction, in units of the prior's precision, that enters the scale [1]."""
 
 
 def expected_scale(
     moved: Float[Tensor, " n"], information: Float[Tensor, "n n"], prior: Float[Tensor, "n n"], start_share: float = 0.0
 ) -> float:
-    """How many times as large as expected the errors of the start probably were, from what a fit has corrected [1].
+    """Ratio of the likely size of the start's errors to the prior's, from the corrections of a fit [1].
 
     Errors of one frame are about as large for joints that it shows as for those that it does not show. The square of
     the scale is lognormal beforehand, of mean 1 and a deviation of 1 of its logarithm; corrections are Gaussian in each
@@ -204,17 +204,17 @@ def expected_scale(
 
 @dataclass(frozen=True)
 class Evaluation:
-    """An objective at one point. Maps are at the resolution of comparison, and nothing carries autograd."""
+    """Objective at one point. Maps are at the resolution of comparison, without autograd."""
 
     value: float
-    """What is descended: the sum of all factors, the prior included."""
+    """Sum of all factors, the prior included."""
     loss: float
     """Without the prior, per pixel of the arms. Comparable among evaluations of one observation, and unless
     the problem is live under one blur."""
     stage_loss: float
-    """The same under the blur that is descended in."""
+    """The same under the blur of the descent."""
     gradient: Float[Tensor, " n"]
-    """Of `value`; zero if it was not asked for."""
+    """Gradient of `value`; zero if not requested."""
     hessian: Float[Tensor, "n n"] | None
     """Gauss-Newton's approximation of the second derivative of `value`; None where there is none."""
     uncertainty: Uncertainty | None
@@ -227,22 +227,4 @@ class Evaluation:
     attention: Float[Tensor, "cameras h w"]
     """Weight of each pixel, in [0, 1]."""
     common: Float[Tensor, " n"] | None = field(default=None, kw_only=True)
-    """What the gradient is off by for one standard deviation of an error that all pixels share; None as the hessian."""
-
-    def final_uncertainty(
-        self, offsets: Float[Tensor, " n"], variables: Variables, prior: Prior, start_share: float
-    ) -> Uncertainty | None:
-        """Deviations where a fit has ended, for errors of the start as large as what it has corrected makes likely.
-
-        Args:
-            offsets: where it has ended, near this point.
-            variables: the unknowns.
-            prior: of their offsets.
-            start_share: share of an error of the start that is left in what the image seems to show [1].
-        """
-        if self.hessian is None or self.common is None or self.uncertainty is None:
-            return None
-        moved = offsets - prior.mean
-        return self.uncertainty.scaled(
-            uncertainty_after(variables, prior, self.hessian, self.common, moved, start_share)
-        )
+    """Change of the gradient for one standard deviation of an error that all pixels share; None as the hessian."""

@@ -25,10 +25,10 @@ HAS_LEFT = 0.3
 
 @dataclass(frozen=True)
 class FrameImages:
-    """Images in one size, and what their pixels are worth. Made by `FrameImages.of`."""
+    """Images in one size with weights of their pixels. Made by `FrameImages.of`."""
 
     scale: float
-    """How many times larger than the working image [1]."""
+    """Size relative to the working image [1]."""
     size: tuple[int, int]
     """Width and height [px]."""
     images: Float[Tensor, "cameras 3 h w"]
@@ -38,14 +38,14 @@ class FrameImages:
     certainty: Float[Tensor, "cameras 1 h w"]
     """Information of a pixel, as a share of what it would have without smoke and haze [1]."""
     explained: Float[Tensor, "cameras 1 h w"] | None
-    """Share of the predicted coverage that is predicted in the empty background, too [1]; None where not known."""
+    """Share of the predicted coverage that the empty background explains [1]; None where not known."""
     change: Change | None
-    """What differs from the empty background; None where that is not known."""
+    """Difference from the empty background; None where that is not known."""
     renderer: Renderer
-    """Of the whole image."""
+    """Renderer of the whole image."""
 
     def area_alone(self, state: SceneState, arm: int) -> int:
-        """Pixels that an arm covers in all images where no other arm hides it.
+        """Number of pixels of an arm in all images, without occlusion by other arms.
 
         Args:
             state: of the scene.
@@ -67,7 +67,7 @@ class FrameImages:
         before: tuple[Int[np.ndarray, "cameras h w"], SceneState],
         after: tuple[Int[np.ndarray, "cameras h w"], SceneState],
     ) -> float:
-        """Share of an arm's area at the start that it still has [1]; what another arm hides is in view.
+        """Area of an arm relative to its area at the start [1]; parts behind another arm count as in view.
 
         Args:
             arm: its position in the scene.
@@ -104,11 +104,11 @@ class FrameImages:
             ignore: camera name -> pixels that show an occluder.
             scale: times the working size [1].
             working_width: width of the working image [px].
-            dehaze: share of smoke and haze that is taken off [1].
+            dehaze: share of smoke and haze that is removed [1].
             predictor: sizes are multiples of its stride; it also sees the backgrounds, once.
             backgrounds: of the cameras, where they are known.
-            replaced: whether what has not changed against them is replaced before the predictor sees it; else what it
-                also sees in them is taken off. By default it is where they would deceive it.
+            replaced: whether unchanged background is replaced before prediction; otherwise predictions in the
+                background are subtracted. By default it is replaced where it causes false detections.
 
         Raises:
             SettingsError: an image is missing, or an image or a mask is of another size than its camera.
@@ -116,7 +116,7 @@ class FrameImages:
         unit, _ = working_size(scene, working_width, predictor.stride)
         size = working_size(scene, round(working_width * scale), predictor.stride)
         stacked = stacked_images(scene, images, size, "image").to(predictor.device)
-        # Given masks know through haze, and before any background, where arms are.
+        # Given masks need neither dehazing nor a background.
         through = transmission(stacked, dehaze if predictor.knows_parts else 0.0)
         explained, change = None, None
         if not predictor.masked and backgrounds is not None and backgrounds.covers(scene):
@@ -141,16 +141,16 @@ class FrameImages:
 
 @dataclass(frozen=True)
 class Observation:
-    """Predicted surface maps in a window of the images, and what their pixels are worth."""
+    """Predicted surface maps in a window of the images, with weights of their pixels."""
 
     images: FrameImages
     """The images that were observed."""
     window: Window
-    """Which part of it [px of these images]."""
+    """Part of the images that is observed [px of these images]."""
     maps: Float[Tensor, "cameras 6 h w"]
     """Predicted surface maps, in the window."""
     weight: Float[Tensor, "cameras 1 h w"]
-    """What each pixel counts: 0 far from the arms and where an occluder is known to be."""
+    """Weight of each pixel: 0 far from the arms and at known occluders."""
     certainty: Float[Tensor, "cameras 1 h w"]
     """Information of a pixel, as a share of what it would have without smoke and haze [1]."""
     knows_parts: bool = True
@@ -160,12 +160,12 @@ class Observation:
 
     @property
     def coverage(self) -> Float[Tensor, "cameras h w"]:
-        """Of all arms, in the window."""
+        """Coverage of all arms, in the window."""
         return self.maps[:, COVERAGE].sum(1)
 
     @cached_property
     def area(self) -> float:
-        """Of the predicted arms, as far as they count [px of the working image]."""
+        """Weighted area of the predicted arms [px of the working image]."""
         return total(self.coverage * (self.weight * self.certainty)[:, 0]) / self.images.scale**2
 
     def whole_coverage(self) -> Float[Tensor, "cameras height width"]:
@@ -183,10 +183,10 @@ def observe(
 
     Args:
         images: of the frame, in the stage's scale.
-        predictor: who predicts.
+        predictor: of surface maps.
         state: that the prediction is conditioned on.
-        stage: how far around its arms.
-        whole: predict the whole image, and have all of it count.
+        stage: margin and attention around its arms.
+        whole: predict and weight the whole image.
     """
     given = images.renderer.surface_maps(state)
     everything = whole or predictor.masked

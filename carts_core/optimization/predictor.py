@@ -22,8 +22,8 @@ class FramePredictor(Protocol):
 
     @property
     def masked(self) -> bool:
-        """Whether given masks say where arms are. Then haze, empty backgrounds and edges of the images do not count,
-        and the whole image does."""
+        """Whether coverage comes from given masks. Then the whole image is compared, without haze, backgrounds and
+        edges."""
         ...
 
     @property
@@ -34,12 +34,12 @@ class FramePredictor(Protocol):
 
     @property
     def device(self) -> torch.device:
-        """Where it computes, and where its predictions are."""
+        """Device of its computations and predictions."""
         ...
 
     @property
     def stride(self) -> int:
-        """Windows and images are multiples of this wide and high [px]."""
+        """Width and height of windows and images are multiples of this [px]."""
         ...
 
     def predict(
@@ -53,26 +53,26 @@ class FramePredictor(Protocol):
         Args:
             images: RGB in [0, 1], whole.
             given: surface maps of the state that the prediction is conditioned on.
-            window: which part is wanted.
+            window: part to predict.
         """
         ...
 
 
 class SurfacePredictor(Protocol):
-    """Has a predictor for each frame."""
+    """Provides a predictor for each frame."""
 
     @property
     def device(self) -> torch.device:
-        """Where all of them compute."""
+        """Device of all predictors."""
         ...
 
     def for_frame(self, frame: Frame, cameras: Sequence[str]) -> FramePredictor:
-        """The predictor of one frame, as some cameras see it."""
+        """Predictor of one frame and some cameras."""
         ...
 
 
 class ImagePredictor:
-    """Base of predictors that need nothing but images, so that one serves all frames."""
+    """Base of predictors that depend on images alone; one serves all frames."""
 
     masked = False
     knows_parts = True
@@ -84,7 +84,7 @@ class ImagePredictor:
 
 @dataclass(frozen=True)
 class NetworkPredictor(ImagePredictor):
-    """The surface network. Two of the same networks are equal, so that what they predict once can be kept."""
+    """The surface network. Predictors with the same network are equal, so predictions can be cached."""
 
     extractor: FeatureExtractor
 
@@ -110,44 +110,44 @@ class NetworkPredictor(ImagePredictor):
 
 
 def predictor_of(source: "FeatureExtractor | SurfacePredictor") -> SurfacePredictor:
-    """A predictor as it is; the networks as one."""
+    """The predictor itself, or the networks as a predictor."""
     return NetworkPredictor(source) if isinstance(source, FeatureExtractor) else source
 
 
 GivenMask = Bool[np.ndarray, "h w"] | Float[np.ndarray, "h w"]
-"""Which share of each pixel the arms cover, all of them together; a soft edge has values between 0 and 1."""
+"""Coverage of each pixel by all arms, in [0, 1]."""
 
 _STRIDE = 8
-"""Windows are multiples of this without a network [px]."""
+"""Stride without a network [px]."""
 
 
 @dataclass(frozen=True, eq=False)
 class GivenMasks:
-    """Masks from elsewhere than the recording, by frame."""
+    """Masks that are not part of the recording, by frame."""
 
     origin: str
-    """What they are called in "frame 7 has no ... of camera left", say "imported mask"."""
+    """Name in messages, such as "imported mask"."""
     masks: Callable[[int], Mapping[str, GivenMask]]
     """Position of a frame -> camera name -> mask in the camera's size, for the cameras that have one."""
     there: Callable[[int, str], bool]
     """Whether a frame, by position, has a mask of a camera."""
     ignored: Callable[[int], Mapping[str, Bool[np.ndarray, "h w"]]] = lambda _: {}
-    """As `masks`: pixels of which it is not known whether they show an arm. Nothing is compared there."""
+    """As `masks`: unlabelled pixels, which are not compared."""
 
     def filled(self, frame: Frame) -> Frame:
-        """The frame with these masks, for cameras that the recording has none of."""
+        """The frame with these masks for cameras without masks in the recording."""
         masks = {**self.masks(frame.index), **(frame.masks or {})}
         whole = {name: np.asarray(mask) >= 0.5 for name, mask in masks.items()}
         return replace(frame, masks=whole or None)
 
 
 class MaskPredictor:
-    """Has each frame's given masks in the place of a network; a `SurfacePredictor`.
+    """Uses given masks in place of a network; a `SurfacePredictor`.
 
     Args:
         network: predicts parts and normals inside the masks, and all of a frame that has no mask; None goes without.
         masks: position of a frame -> camera name -> mask in the camera's size; `Frame.masks` by default.
-        origin: what errors call a mask.
+        origin: name of a mask in errors.
     """
 
     def __init__(
@@ -187,7 +187,7 @@ class MaskPredictor:
 
 @dataclass(frozen=True, eq=False)
 class _FrameMasks:
-    """The masks of one frame: where arms are, and of parts and normals what the network says, if there is one."""
+    """Masks of one frame as coverage, with parts and normals from the network if there is one."""
 
     masks: tuple[Float[np.ndarray, "height width"], ...]
     """In the order of the cameras."""

@@ -20,7 +20,7 @@ from ..recording.background import spread
 from ..settings import FreeParameters, SequenceSettings, SolverSettings, surface_solver
 from .counterfactual import Backgrounds
 from .error_model import ErrorModel, Gaussian, Information, Smoother, combined, remove_measurement
-from .measurement import FrameSolver, Ignore, Measurement, ResumableFrameSolver
+from .measurement import FrameSolver, Ignore, Measurement
 from .predictor import SurfacePredictor, predictor_of
 from .sequence_estimate import (
     FrameEstimate,
@@ -71,15 +71,15 @@ def initial_correction(
     open_frame: Callable[[int], tuple[Frame, Variables]],
     allowance: float,
 ) -> Float[np.ndarray, " n"]:
-    """The correction with the lowest loss, mean over the frames that were solved alone.
+    """Correction with the lowest mean loss over the frames that were solved alone.
 
-    What does not suit the first of them is left out: the error may have jumped on the way to the others.
+    Those that do not fit the first frame are excluded, since the error may have jumped before the others.
 
     Args:
-        corrections: position of each of these frames -> the correction that it measured [rad].
-        solver: compares each correction with each of these frames.
-        open_frame: a frame and its unknowns.
-        allowance: how many times as large as the lowest loss in the first frame one there may be [1].
+        corrections: position of each of these frames -> its measured correction [rad].
+        solver: of single frames.
+        open_frame: loads a frame, with its unknowns.
+        allowance: largest ratio to the lowest loss in the first frame [1].
     """
     candidates = list(corrections.values())
     losses = np.array([solver.losses(*open_frame(index), candidates) for index in corrections])
@@ -92,7 +92,7 @@ GivenPositions = Mapping[int, Mapping[str, ArrayLike]]
 
 
 class Keyframes:
-    """Joint positions that stay as they are, exact or up to a standard deviation.
+    """Fixed joint positions of frames, exact or with a standard deviation.
 
     Args:
         scene: the arms.
@@ -118,14 +118,14 @@ class Keyframes:
         return len(self._positions)
 
     def correction(self, index: int, variables: Variables) -> tuple[Float[np.ndarray, " n"], Information]:
-        """What a frame's measured values are corrected by, NaN for unknowns that are no joints, and how surely."""
+        """Correction of a frame's measured values, NaN for unknowns that are no joints, and its information."""
         given, std = self._positions[index], self._deviations(index)
         correction = variables.joint_offsets([given[arm.name] for arm in self._scene.arms])
         farther = variables.joint_offsets([given[arm.name] + std[arm.name] for arm in self._scene.arms])
         return correction, Information.known(correction, farther - correction)
 
     def as_given(self, estimate: FrameEstimate) -> FrameEstimate:
-        """The estimate of a frame, with the joint positions and deviations that it was given, if it was."""
+        """The estimate with the given joint positions and deviations, if the frame is a keyframe."""
         if estimate.index not in self:
             return estimate
         given = self._positions[estimate.index]
@@ -152,28 +152,27 @@ def _arrays(given: GivenPositions) -> dict[int, dict[str, np.ndarray]]:
 class SequenceOptimizer:
     """Corrects the frames of a sequence one after another.
 
-    A few frames, evenly spread, are solved alone first, and what suits all of them best is where the first frame
-    starts. A later frame starts at the correction that the frames before it let expect, and is held there as firmly as
-    they know it. After the last frame all corrections are smoothed, backwards; a frame whose image contradicts what
-    came of it is visited again. In the end all estimates are assessed. Frames that failed are solved alone, if nothing
-    but joints is free; where the sequence failed, frames that still do keep their measured values. Frames in
-    `keyframes` stay exactly as given, and everything else follows them.
+    A few evenly spread frames are solved alone first; the first frame starts at the correction that fits all of them
+    best. Each later frame starts at its predicted correction, with the covariance of the prediction as prior. After the
+    last frame all corrections are smoothed backwards, and frames whose images contradict the result are visited again.
+    In the end all estimates are assessed. Failed frames are solved alone if only joints are free; if the sequence
+    failed, frames that still fail return to their measured values. Frames in `keyframes` stay as given.
 
     Args:
         scene: arms and cameras.
-        load: the frame at a position of the sequence; its `measured` is what is corrected.
+        load: returns the frame at a position of the sequence; its `measured` values are corrected.
         times: position of each frame to be corrected -> its time [s], or None where times are not known.
         networks: the networks, or another predictor of surface maps.
         settings: noise, weights and working size; the stages are those of `model`.
         model: of the measurement error, and the direction.
         free: what is unknown.
-        keyframes: position -> arm name -> joint positions [rad, m] that a person set.
-        keyframe_std: position -> arm name -> standard deviations [rad, m] of keyframes that an optimizer found and a
-            person accepted: their joints may be guesses. Others, and deviations that are NaN, count as exact.
+        keyframes: position -> arm name -> joint positions [rad, m] set by hand.
+        keyframe_std: position -> arm name -> standard deviations [rad, m] of keyframes that are accepted results of an
+            optimizer. Other keyframes, and NaN deviations, count as exact.
         ignore: position -> camera name -> pixels that show an occluder; none by default.
-        backgrounds: of the cameras, for what the network takes for an arm in them.
+        backgrounds: of the cameras, in which detections are false.
         cameras: names of the cameras that take part, all by default.
-        checkpoint: keeps what was found on disk, for a run that goes on after a stop; see `sequence_checkpoint`.
+        checkpoint: stores intermediate results, so that a stopped run can continue; see `sequence_checkpoint`.
 
     Raises:
         RobotError: a keyframe lacks an arm, or has the wrong number of joint positions.
@@ -207,14 +206,12 @@ class SequenceOptimizer:
         if unknown:
             raise SettingsError(f"keyframe {min(unknown)} is not among the frames. Choose it too, or leave it out.")
         self._solver = FrameSolver(
-            self._scene, self._predictor, self.settings, self.model, ignore or (lambda _: {}), backgrounds
+            self._scene, self._predictor, self.settings, self.model, ignore or (lambda _: {}), backgrounds, checkpoint
         )
-        if checkpoint is not None:
-            self._solver = ResumableFrameSolver(self._solver, checkpoint)
         self._queue, self._frames = list(gaps), len(gaps)
         initial = {self._queue[place] for place in spread(len(self._queue), self.model.initial_frames)}
         initial.update([index for index in self._queue if index in self._keyframes][:1])
-        # A frame that is alone, or that a person began with, needs no others.
+        # A single frame, or a keyframe at the beginning, needs no initial frames.
         alone = len(initial) == 1 or self._queue[0] in self._keyframes
         self._initial_queue = [] if alone else [index for index in self._queue if index in initial]
         self._initial: dict[int, Visit] = {}
@@ -232,28 +229,28 @@ class SequenceOptimizer:
         self._judging: Iterator[FrameEstimate] | None = None
         self.stop_reason: str | None = None
         self.assessment: SequenceAssessment | None = None
-        """How far all frames together can be relied on; None before the end."""
+        """Verdict on the sequence; None before the end."""
 
     @property
     def progress(self) -> tuple[int, int]:
-        """Frames that were visited, and all frames; some are solved before, and contradicted ones again after."""
+        """Number of visited frames and of all frames, without initial and repeated visits."""
         return len(self._visits), self._frames
 
     @property
     def frames_per_second(self) -> float:
-        """Frames that were visited per second spent on them [1/s]."""
+        """Visited frames per second [1/s]."""
         seconds = sum(visit.seconds for visit in self._visits.values())
         return len(self._visits) / seconds if seconds else 0.0
 
     @property
     def seconds_left(self) -> float:
-        """How long the frames that are left will take, if each takes as long as most did so far [s]."""
+        """Remaining time at the median time of a frame [s]."""
         visited, frames = self.progress
         return (frames - visited) * statistics.median([visit.seconds for visit in self._visits.values()] or [0.0])
 
     @property
     def estimates(self) -> dict[int, FrameEstimate]:
-        """Position -> estimate of every frame visited so far, given all of them; ordered as visited."""
+        """Position -> smoothed estimate of each visited frame, in the order of visits."""
         if self._estimates is None:
             corrections = self._smoother.smoothed()
             certain = self._smoother.cautious(self.model.shared_seconds).smoothed()
@@ -310,7 +307,7 @@ class SequenceOptimizer:
         return sequence_base_frame_gain(self._smoother.smoothed(), self._solver, self._open, self._free)
 
     def _solve_alone(self, index: int) -> FrameEstimate | None:
-        """What a frame alone measures; None if it is not usable, which is reported when its turn comes."""
+        """Measurement of a frame alone; None if it is not usable, which is reported at its visit."""
         began = time.perf_counter()
         start = Origin.KEYFRAME if index in self._keyframes else Origin.COLD
         try:
@@ -338,7 +335,7 @@ class SequenceOptimizer:
         else:
             start, measurement, lost = self._measure(frame, variables, expected)
             if self._visits and measurement.information.contradicts(expected):
-                # Image and past contradict each other: where the image fits badly it is wrong, elsewhere the past.
+                # If the image fits badly it is left out; otherwise the prediction is wrong, and the filter restarts.
                 if lost:
                     start, measurement = Origin.CARRIED, measurement.left_out()
                 else:
@@ -353,7 +350,7 @@ class SequenceOptimizer:
         return self._estimate(index, visit, self._smoother.add(index, measurement.information))
 
     def _measure(self, frame: Frame, variables: Variables, expected: Gaussian) -> tuple[Origin, Measurement, bool]:
-        """Start warm, and cold where there is no past or the loss is unusual; the last value says if in vain."""
+        """Warm start, or a cold one for the first frame or an unusual loss; returns whether recovery failed, too."""
         if not self._visits:
             return Origin.COLD, self._first_measurement(frame, variables), False
         losses = [visit.measurement.loss for visit in self._visits.values() if visit.start is not Origin.CARRIED]
@@ -387,7 +384,7 @@ class SequenceOptimizer:
         return frame, Variables(self._scene, state, self._free, self.settings.length_scale)
 
     def _contradicted(self) -> list[tuple[int, Gaussian]]:
-        """Frames whose image does not fit what all frames together say, and what the others say of them."""
+        """Frames whose measurement contradicts the smoothed correction, with the prediction from the other frames."""
         chosen = []
         for index, smoothed in self._smoother.smoothed().items():
             visit = self._visits[index]

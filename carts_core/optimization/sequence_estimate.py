@@ -22,23 +22,23 @@ from .verdict import Assessment, SequenceAssessment, Verdict, assess, assess_seq
 
 
 class Origin(StrEnum):
-    """Where a frame's values come from."""
+    """Source of a frame's values."""
 
     WARM = "warm"
     """An optimization from the neighbour's correction."""
     COLD = "cold"
     """An optimization from the measured values."""
     KEYFRAME = "keyframe"
-    """A person."""
+    """Set by hand."""
     CARRIED = "carried"
-    """The other frames alone: the image contradicts them and is left out."""
+    """Predicted from the other frames; the image contradicts them and is left out."""
     MEASURED = "measured"
-    """Nobody: the sequence failed, and so did this frame of it."""
+    """Measured values, kept because the sequence and this frame failed."""
 
 
 @dataclass(frozen=True)
 class FrameEstimate:
-    """One frame of a sequence, given the measurements of the others."""
+    """Estimate of one frame, given the measurements of the others."""
 
     index: int
     frame_id: str
@@ -48,22 +48,21 @@ class FrameEstimate:
     joint_std: dict[str, Float[np.ndarray, " dofs"]]
     """Arm name -> standard deviation [rad, m]; 0 at a keyframe, NaN where a joint is not free."""
     uncertainty: Uncertainty
-    """Of every unknown, with what was expected of it before any image."""
+    """Standard deviations of all unknowns, with those of the prior."""
     loss: float
-    """Of the surface factor, when the frame was last solved; high where the image does not fit."""
+    """Loss of the surface factor when the frame was last solved."""
     start: Origin
     iterations: int
-    """Steps of the optimization, over all visits."""
+    """Number of optimization steps over all visits."""
     seconds: float
-    """Time spent on the frame, reading included, over all visits [s]."""
+    """Time spent on the frame over all visits, reading included [s]."""
     assessment: Assessment | None = None
-    """How far it can be relied on; None before all frames were visited."""
+    """Verdict; None before all frames are visited."""
 
     def judged(self, assessment: Assessment, scene: Scene) -> "FrameEstimate":
-        """The same with a verdict, and deviations that allow for a wrong fit.
+        """The estimate with a verdict, and deviations that allow for a wrong fit.
 
-        Those that a person gave stay, and those that come from other frames, because this image shows nothing of an arm
-        or was left out.
+        Deviations of keyframes stay, and those that come from other frames.
         """
         if assessment.nothing_there or self.start in (Origin.KEYFRAME, Origin.CARRIED):
             return replace(self, assessment=assessment)
@@ -71,13 +70,13 @@ class FrameEstimate:
         return replace(self, assessment=assessment, uncertainty=known, joint_std=_joint_std(known, scene))
 
     def solved_alone(self, scene: Scene, variables: Variables, found: SolvedAlone, seconds: float) -> "FrameEstimate":
-        """The same frame without the others, and with the verdict on that.
+        """The estimate replaced by the result of the single-frame solver.
 
         Args:
             scene: of the sequence.
             variables: the frame's unknowns.
-            found: their values and deviations, which must be known, and the verdict.
-            seconds: that it has taken, on top of those before [s].
+            found: the result; its uncertainty must be known.
+            seconds: additional time [s].
         """
         assert found.uncertainty is not None
         state, joints = _positions(scene, variables, found.correction)
@@ -97,7 +96,7 @@ class FrameEstimate:
 
 @dataclass(frozen=True)
 class Visit:
-    """What is kept of a frame that was solved."""
+    """Record of a solved frame."""
 
     frame_id: str
     variables: Variables
@@ -106,13 +105,13 @@ class Visit:
     seconds: float
 
     def estimate(self, scene: Scene, index: int, correction: Gaussian, prior: Gaussian) -> FrameEstimate:
-        """The frame with a correction.
+        """Estimate of the frame for a correction.
 
         Args:
             scene: of the sequence.
             index: of the frame in its sequence.
             correction: of the measured values, with its covariance [rad].
-            prior: what was expected of it before any image [rad].
+            prior: of the correction, before any image [rad].
         """
         variables = self.variables
         state, joint_positions = _positions(scene, variables, correction.mean)
@@ -147,9 +146,9 @@ def _positions(
 
 
 _LOOKED_AT = 3
-"""Frames that tell whether base frames are off."""
+"""Number of frames in which base frames are checked."""
 _IN_VAIN = 5
-"""Frames in a row that fail alone as well, after which no more are tried."""
+"""Number of consecutive failures of the single-frame solver after which it is not tried again."""
 
 
 def sequence_base_frame_gain(
@@ -158,12 +157,12 @@ def sequence_base_frame_gain(
     opened: Callable[[int], tuple[Frame, Variables]],
     free: FreeParameters,
 ) -> float:
-    """What free base frames would explain of the residual that is left: the median of a few frames [1].
+    """Share of the residual that free base frames would explain, median of a few frames [1].
 
     Args:
         corrections: position -> the correction of the measured values that was found; at least one.
-        solver: that knows the images.
-        opened: gives the frame at a position, and its unknowns.
+        solver: of single frames.
+        opened: loads the frame at a position, with its unknowns.
         free: the unknowns, by kind.
     """
     indices = sorted(corrections)
@@ -182,15 +181,15 @@ def assessed_estimates(
     *,
     alone: bool,
 ) -> Iterator[FrameEstimate]:
-    """Estimates with their assessments, and again those of frames that failed and were then solved alone.
+    """Assess estimates, then solve failed frames alone; yields each new estimate.
 
     Args:
         estimates: position -> final estimate.
-        corrections: position -> the correction of the measured values that it is.
+        corrections: position -> its correction of the measured values.
         scene: of the sequence.
-        solver: that knows the images.
-        opened: gives the frame at a position, and its unknowns.
-        alone: whether frames that failed are solved alone, too.
+        solver: of single frames.
+        opened: loads the frame at a position, with its unknowns.
+        alone: whether failed frames are solved alone.
     """
     failed = []
     for index, estimate in estimates.items():
@@ -214,7 +213,7 @@ def assessed_estimates(
 def _solved_alone(
     estimate: FrameEstimate, scene: Scene, solver: FrameSolver, opened: Callable[[int], tuple[Frame, Variables]]
 ) -> FrameEstimate:
-    """The estimate of a frame that is solved without the others; as it was, where that fails, too."""
+    """Estimate of a frame solved without the others; the given one if that fails."""
     began = time.perf_counter()
     frame, variables = opened(estimate.index)
     found = solver.alone(frame, variables)
@@ -228,14 +227,14 @@ def _solved_alone(
 def assessed_sequence(
     estimates: Mapping[int, FrameEstimate], visits: Mapping[int, Visit], scene: Scene, prior: Gaussian, keyframes: bool
 ) -> tuple[SequenceAssessment, dict[int, FrameEstimate]]:
-    """The verdict on the whole, and all estimates; where it has failed, frames that failed keep their measured values.
+    """Verdict on the sequence, and its estimates; if it failed, failed frames return to their measured values.
 
     Args:
         estimates: position -> assessed estimate; at least one.
-        visits: what is kept of the frames.
+        visits: records of the frames.
         scene: of the sequence.
-        prior: what is expected of a correction before any image.
-        keyframes: whether a person set some; that counts more than the images, and all estimates stay.
+        prior: of a correction, before any image.
+        keyframes: whether some frames were set by hand; then all estimates stay.
     """
     found = {index: estimate.assessment for index, estimate in estimates.items() if estimate.assessment is not None}
     whole, kept = assess_sequence(list(found.values())), dict(estimates)

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 from torch.optim.adam import adam
 
@@ -12,10 +12,10 @@ from ..settings import DescentSolver
 _FIRST_DAMPING, _LEAST_DAMPING = 1e-2, 1e-4
 _SOFTER, _HARDER = 0.25, 8.0
 _LONGEST_STEP = 0.15
-"""Largest change of an unknown in one step [rad]; beyond it the linear model means nothing."""
+"""Largest change of an unknown in one step [rad]; the linear model is not valid beyond it."""
 
 REJECTIONS = 3
-"""After so many steps in a row that did not lower the objective, there is nothing to be gained [1]."""
+"""Number of rejected steps in a row after which a descent has converged [1]."""
 
 
 @dataclass(frozen=True)
@@ -24,11 +24,11 @@ class Step:
 
     change: Float[Tensor, " n"]
     reduction: float
-    """Of the objective, by its quadratic model [1]."""
+    """Reduction of the objective predicted by its quadratic model [1]."""
 
 
 class LevenbergMarquardt:
-    """Solves for the step that minimizes the damped quadratic model; the damping follows how good the model proved.
+    """Minimizes the damped quadratic model; accepted steps lower the damping, rejected ones raise it.
 
     Args:
         lower, upper: bounds of the unknowns; one that is at a bound and would leave it stays there.
@@ -39,15 +39,15 @@ class LevenbergMarquardt:
         self._damping = _FIRST_DAMPING
 
     def reset(self) -> None:
-        """Begin with the first damping again."""
+        """Restore the initial damping."""
         self._damping = _FIRST_DAMPING
 
     def accepted(self) -> None:
-        """The last step lowered the objective."""
+        """Lower the damping after a step that lowered the objective."""
         self._damping = max(self._damping * _SOFTER, _LEAST_DAMPING)
 
     def rejected(self) -> None:
-        """The last step did not."""
+        """Raise the damping after a step that did not."""
         self._damping *= _HARDER
 
     def step(self, offsets: Float[Tensor, " n"], gradient: Float[Tensor, " n"], hessian: Float[Tensor, "n n"]) -> Step:
@@ -66,29 +66,22 @@ def bounded_step(
     lower: Float[Tensor, " n"],
     upper: Float[Tensor, " n"],
 ) -> Float[Tensor, " n"]:
-    """Where the quadratic model is lowest among the unknowns that may move.
+    """Minimum of the quadratic model over the unknowns that are free to move.
 
     Args:
         offsets: the present point [rad].
         gradient, hessian: of the model there.
         lower, upper: bounds; an unknown at a bound that would leave it stays.
     """
-    free = may_move(offsets, gradient, lower, upper)
+    free = ~(((offsets <= lower) & (gradient > 0)) | ((offsets >= upper) & (gradient < 0)))
     step = torch.zeros_like(gradient, dtype=torch.float64)
     step[free] = torch.linalg.solve(hessian.double()[free][:, free], -gradient.double()[free])
     return step
 
 
 def shortened(step: Float[Tensor, " n"], longest: float) -> Float[Tensor, " n"]:
-    """The step, or as much of it as changes no unknown by more than `longest`."""
+    """The step, scaled down so that no unknown changes by more than `longest`."""
     return step * min(1.0, longest / float(step.abs().max().clamp(min=1e-12)))
-
-
-def may_move(
-    offsets: Float[Tensor, " n"], gradient: Float[Tensor, " n"], lower: Float[Tensor, " n"], upper: Float[Tensor, " n"]
-) -> Bool[Tensor, " n"]:
-    """Unknowns that are not at a bound which the descent would leave."""
-    return ~(((offsets <= lower) & (gradient > 0)) | ((offsets >= upper) & (gradient < 0)))
 
 
 class FirstOrderDescent:
@@ -96,7 +89,7 @@ class FirstOrderDescent:
 
     Args:
         settings: method and schedule.
-        start: where it begins [rad].
+        start: initial values [rad].
         lower, upper: bounds.
     """
 
@@ -110,7 +103,7 @@ class FirstOrderDescent:
 
     @torch.no_grad()
     def step(self, gradient: Float[Tensor, " n"]) -> Float[Tensor, " n"]:
-        """One step; returns where it leads."""
+        """Take one step; returns the new values."""
         if self._normalized:
             gradient = gradient / gradient.abs().max().clamp(min=1e-12)
             self._unknowns.add_(gradient, alpha=-self._rate)

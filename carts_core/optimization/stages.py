@@ -53,7 +53,7 @@ class StopReason(StrEnum):
 
 
 class Problem(Protocol):
-    """What stages work on: one frame, or many that share a calibration."""
+    """Optimization problem of one frame, or of many that share a calibration."""
 
     @property
     def variables(self) -> Variables:
@@ -69,7 +69,7 @@ class Problem(Protocol):
         ...
 
     def objective_key(self, blur: float) -> tuple[int, float]:
-        """Which objective a stage with this blur evaluates. Losses compare among points of the same one."""
+        """Key of the objective that a stage with this blur evaluates; losses compare within one key."""
         ...
 
 
@@ -80,16 +80,16 @@ class Point:
     offsets: Float[Tensor, " n"]
     evaluation: Evaluation
     objective_key: tuple[Any, ...]
-    """Which objective was evaluated. Losses compare among points of the same one."""
+    """Key of the objective; losses compare within one key."""
 
     def improves_on(self, best: "Point | None") -> bool:
-        """Whether it replaces the best point so far: its loss is lower, or both do not compare and it came later."""
+        """Whether its loss is lower than that of the best point so far, or does not compare with it."""
         return best is None or self.objective_key != best.objective_key or self.evaluation.loss < best.evaluation.loss
 
 
 @dataclass
 class Fit:
-    """The state of a run, which every stage takes up and leaves behind.
+    """State of a run, updated by each stage.
 
     Args:
         problem: what is solved.
@@ -106,30 +106,30 @@ class Fit:
     reached: Point | None = None
     """The best point of the last descent."""
     edges: Linearization | None = None
-    """What edges say around the estimate, after `AlignEdges`."""
+    """Quadratic model of the edge factor around the estimate, after `AlignEdges`."""
     restarts: int = 0
-    """How often the estimate has jumped elsewhere; after the first time, descents stop at a smaller tolerance."""
+    """Number of jumps of the estimate; after the first one, descents stop at a smaller tolerance."""
     used: int = 0
     """Evaluations so far."""
     solver: LevenbergMarquardt = field(init=False)
     descent: FirstOrderDescent | None = None
-    """Its state goes on from one `FirstOrder` to the next."""
+    """Kept from one `FirstOrder` stage to the next."""
     losses: list[float] = field(default_factory=list)
-    """Of all points of `FirstOrder` stages."""
+    """Losses of all points of `FirstOrder` stages."""
     assessment: Assessment | None = None
-    """How far the result can be relied on, after `RejectFailed`."""
+    """Verdict on the result, after `RejectFailed`."""
 
     def __post_init__(self) -> None:
         self.solver = LevenbergMarquardt(self.problem.variables.lower, self.problem.variables.upper)
 
     @property
     def exhausted(self) -> bool:
-        """Whether all evaluations are used up."""
+        """Whether the budget of evaluations is spent."""
         return self.used >= self.budget
 
     @property
     def loss(self) -> float:
-        """Of the best point of the last descent [1]; infinite before any."""
+        """Loss of the best point of the last descent [1]; infinite before any."""
         return float("inf") if self.reached is None else self.reached.evaluation.stage_loss
 
     def evaluate(self, stage: Descend | FirstOrder, *, gradient: bool = True) -> Point:
@@ -139,42 +139,23 @@ class Fit:
         return Point(self.offsets, evaluation, (self.restarts, *self.problem.objective_key(stage.blur)))
 
     def jump_to(self, offsets: Float[Tensor, " n"]) -> None:
-        """Go on from elsewhere; later descents then stop at the smaller tolerance."""
+        """Replace the estimate; later descents stop at the smaller tolerance."""
         self.offsets, self.restarts = offsets, self.restarts + 1
         self.solver.reset()
 
     def start_over(self, start: Float[Tensor, " n"]) -> None:
-        """Forget the estimate; the budget is whole again."""
+        """Drop the estimate and restore the budget."""
         self.offsets, self.restarts, self.used = start, 0, 0
         self.reached, self.edges = None, None
         self.solver.reset()
 
-    def snapshot(self) -> "Snapshot":
-        """The estimate as it is now."""
-        return Snapshot(self.offsets, self.reached, self.edges, self.stop_reason)
-
-    def restore(self, snapshot: "Snapshot") -> None:
-        """Go back to an estimate."""
-        self.offsets, self.reached, self.edges = snapshot.offsets, snapshot.reached, snapshot.edges
-        self.stop_reason = snapshot.stop_reason
-
-
-@dataclass(frozen=True)
-class Snapshot:
-    """The estimate at some moment of a run."""
-
-    offsets: Float[Tensor, " n"]
-    reached: Point | None
-    edges: Linearization | None
-    stop_reason: StopReason
-
 
 _SUPPORT = 0.5
-"""Share of an arm's silhouette that has to be observed as an arm, or the arm is lost [1]."""
+"""Least share of an arm's silhouette that is observed as an arm; below it the arm is lost [1]."""
 
 
 def arm_is_lost(problem: FrameProblem, offsets: Float[Tensor, " n"]) -> bool:
-    """Whether an arm that was in sight at the start has left the image, or stands where no arm was observed."""
+    """Whether an arm visible at the start has left the image, or lies where no arm was observed."""
     seen, images = problem.observation, problem.observation.images
     before, after = (problem.variables.state(point) for point in (problem.start, offsets))
     start, end = (images.renderer.segment(state) for state in (before, after))
@@ -194,11 +175,11 @@ def arm_is_lost(problem: FrameProblem, offsets: Float[Tensor, " n"]) -> bool:
 def best_random_start(
     problem: FrameProblem, offsets: Float[Tensor, " n"], stage: RandomRestart, seed: int = 0
 ) -> Float[Tensor, " n"]:
-    """The best of random points, arm by arm, compared with the whole image; that is observed once more for it.
+    """Best of random points, drawn arm by arm and compared with a new observation of the whole image.
 
     Args:
         problem: one frame; its observation is replaced by that of the whole image.
-        offsets: what has been found so far; it and the start are among the candidates.
+        offsets: the present estimate; it and the start are among the candidates.
         stage: how many points, and how far apart.
         seed: of the random numbers.
     """
@@ -219,10 +200,10 @@ def best_random_start(
 
 @torch.no_grad()
 def start_explains_as_well(problem: FrameProblem, offsets: Float[Tensor, " n"], stage: PreferStart) -> bool:
-    """Whether the start explains an observation that is conditioned on it as well as the estimate does, and edges, too.
+    """Whether the start fits an observation conditioned on it, and the edges, as well as the estimate does.
 
-    Where silhouettes differ much it does not, and nothing is observed. Where it does, that observation becomes the
-    problem's. A start is never preferred where a calibration is free: that is thought to be wrong.
+    False, without an observation, where the silhouettes of both differ much. If True, that observation becomes the
+    problem's. Always False where a calibration is free, since its start is expected to be wrong.
     """
     if problem.variables.moves_calibration:
         return False
@@ -245,7 +226,7 @@ def start_explains_as_well(problem: FrameProblem, offsets: Float[Tensor, " n"], 
 
 
 def run_stages(stages: Sequence[Stage], fit: Fit) -> Iterator[Point]:
-    """Run stages one after another; yields every point that is evaluated on the way."""
+    """Run stages in order; yields each evaluated point."""
     for stage in stages:
         if fit.exhausted and not isinstance(stage, RejectFailed):
             continue
@@ -257,13 +238,13 @@ def run_stages(stages: Sequence[Stage], fit: Fit) -> Iterator[Point]:
 
 @singledispatch
 def run_stage(stage: object, fit: Fit) -> Iterator[Point]:
-    """Run one stage; yields every point that is evaluated on the way."""
+    """Run one stage; yields each evaluated point."""
     raise TypeError(f"{stage!r} is no stage")
 
 
 @run_stage.register
 def run_observe(stage: Observe, fit: Fit) -> Iterator[Point]:
-    """Have the surface maps predicted, conditioned on the start or on the estimate."""
+    """Predict surface maps, conditioned on the start or on the estimate."""
     fit.problem.observe(stage, fit.offsets)
     yield from ()
 
@@ -271,7 +252,7 @@ def run_observe(stage: Observe, fit: Fit) -> Iterator[Point]:
 @run_stage.register
 def run_descend(stage: Descend, fit: Fit) -> Iterator[Point]:
     """Levenberg-Marquardt on the objective under one blur, until the predicted reduction is small."""
-    # After a restart nothing is left to later stages.
+    # After a restart no later stage refines the result.
     tolerance = min(stage.tolerance, Descend.tolerance) if fit.restarts else stage.tolerance
     best, rejections = None, 0
     for taken in range(1, stage.steps + 1):
@@ -298,7 +279,7 @@ def run_descend(stage: Descend, fit: Fit) -> Iterator[Point]:
 
 @run_stage.register
 def run_random_restart(stage: RandomRestart, fit: Fit) -> Iterator[Point]:
-    """Where the loss is high or an arm is lost: go on from the best of random points."""
+    """Continue from the best of random points if the loss is high or an arm is lost."""
     problem = _one_frame(fit)
     if fit.loss >= stage.if_loss or arm_is_lost(problem, fit.offsets):
         fit.jump_to(best_random_start(problem, fit.offsets, stage))
@@ -307,7 +288,7 @@ def run_random_restart(stage: RandomRestart, fit: Fit) -> Iterator[Point]:
 
 @run_stage.register
 def run_silhouette_search(stage: SilhouetteSearch, fit: Fit) -> Iterator[Point]:
-    """Where given masks are far off: go on from where silhouettes are nearest to them."""
+    """Continue from the silhouettes nearest to the given masks if the overlap with them is small."""
     problem = fit.problem
     assert isinstance(problem, FrameProblem | CalibrationProblem), "a stage of the surface solver"
     if problem.masked and problem.silhouette_overlap(fit.offsets, stage.scale) < stage.if_overlap:
@@ -317,7 +298,7 @@ def run_silhouette_search(stage: SilhouetteSearch, fit: Fit) -> Iterator[Point]:
 
 @run_stage.register
 def run_align_edges(stage: AlignEdges, fit: Fit) -> Iterator[Point]:
-    """Draw outlines to the image's edges, from the best point of the descent before."""
+    """Align outlines with image edges, from the best point of the last descent."""
     assert fit.reached is not None, "AlignEdges follows a Descend"
     if _one_frame(fit).predictor.masked:
         # The descent has led one step beyond the best point, which nothing would evaluate before the end.
@@ -329,7 +310,7 @@ def run_align_edges(stage: AlignEdges, fit: Fit) -> Iterator[Point]:
 
 @run_stage.register
 def run_prefer_start(stage: PreferStart, fit: Fit) -> Iterator[Point]:
-    """Go back to the start where it explains the image as well."""
+    """Return to the start if it explains the image as well."""
     if start_explains_as_well(_one_frame(fit), fit.offsets, stage):
         fit.offsets, fit.stop_reason = torch.zeros_like(fit.offsets), StopReason.START_KEPT
     yield from ()
@@ -341,40 +322,41 @@ def run_evaluate(stage: Evaluate, fit: Fit) -> Iterator[Point]:
     kept, known = fit.stop_reason is StopReason.START_KEPT, fit.reached
     point = fit.evaluate(FINEST, gradient=kept)
     if known is not None and not kept:
-        # Edges have no deviation of their own: that of the descent before stands.
+        # Edges add no uncertainty model, so the one of the last descent is kept.
         before = known.evaluation
         evaluation = replace(point.evaluation, gradient=before.gradient)
         if isinstance(fit.problem, FrameProblem):
             evaluation = replace(evaluation, uncertainty=fit.problem.uncertainty_after(fit.offsets, before))
         point = replace(point, evaluation=evaluation)
-    # It is what counts in the end, whatever its loss, in which edges have no part.
+    # The last evaluation is the result whatever its loss, since that does not include edges.
     yield replace(point, objective_key=(*point.objective_key, "end"))
 
 
 @run_stage.register
 def run_other_background(stage: OtherBackground, fit: Fit) -> Iterator[Point]:
-    """Where the fit failed: run again with the background treated the other way, and keep the better one."""
+    """Repeat a failed fit with the other background mode, and keep the better one."""
     problem = _one_frame(fit)
     before = problem.evidence_at(fit.offsets)
     known = assess(before)
     if before.overlap_with_change is None or known.verdict is not Verdict.FAILED or known.nothing_there:
         return
-    first_run, observation = fit.snapshot(), problem.observation
-    problem.treat_background_otherwise()
+    first_run = fit.offsets, fit.reached, fit.edges, fit.stop_reason
+    observation = problem.observation
+    problem.toggle_background_mode()
     fit.start_over(problem.start)
     yield from run_stages(stage.then, fit)
     after = problem.evidence_at(fit.offsets)
     overlap = after.overlap_with_change or 0.0
     better = overlap > before.overlap_with_change and assess(after).verdict is not Verdict.FAILED
     if not better:
-        problem.treat_background_otherwise()
+        problem.toggle_background_mode()
         problem.observation = observation
-        fit.restore(first_run)
+        fit.offsets, fit.reached, fit.edges, fit.stop_reason = first_run
 
 
 @run_stage.register
 def run_reject_failed(stage: RejectFailed, fit: Fit) -> Iterator[Point]:
-    """Judge the best point; where it failed, go back to the start if that fits better, or nothing is there."""
+    """Assess the best point; return to the start if it failed and the start fits better, or no arm is there."""
     problem, found = _one_frame(fit), fit.best
     if found is None:
         return
@@ -394,7 +376,7 @@ def run_reject_failed(stage: RejectFailed, fit: Fit) -> Iterator[Point]:
 
 
 def _judged(point: Point, verdict: Assessment) -> Point:
-    """A point with deviations that allow for a wrong fit."""
+    """The point with standard deviations that allow for a wrong fit."""
     if (known := point.evaluation.uncertainty) is None:
         return point
     return replace(point, evaluation=replace(point.evaluation, uncertainty=verdict.of(known)))
@@ -402,7 +384,7 @@ def _judged(point: Point, verdict: Assessment) -> Point:
 
 @run_stage.register
 def run_ignore_occluders(stage: IgnoreOccluders, fit: Fit) -> Iterator[Point]:
-    """Leave out pixels that contradict the fit, and run again."""
+    """Ignore pixels that contradict the fit, and run again."""
     problem = _one_frame(fit)
     if fit.reached is not None and problem.ignore_occluders(fit.reached.evaluation):
         fit.start_over(problem.start)
@@ -419,7 +401,7 @@ def run_first_order(stage: FirstOrder, fit: Fit) -> Iterator[Point]:
         variables = problem.variables
         fit.descent = FirstOrderDescent(settings, fit.offsets, variables.lower, variables.upper)
     end = min(fit.used + math.ceil(stage.share * planned), planned)
-    # The point that the last step leads to is evaluated, too.
+    # The point after the last step is evaluated, too.
     while fit.used < end or fit.used == end == planned:
         point = fit.evaluate(stage)
         fit.losses.append(point.evaluation.loss)

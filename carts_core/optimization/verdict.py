@@ -25,7 +25,7 @@ from .predictor import SurfacePredictor, predictor_of
 
 
 class Verdict(Enum):
-    """How far a fit can be relied on."""
+    """Reliability of a fit."""
 
     GOOD = "good"
     DOUBTFUL = "doubtful"
@@ -33,7 +33,7 @@ class Verdict(Enum):
 
     @classmethod
     def of(cls, probability: float) -> "Verdict":
-        """What a probability of failure [1] alone calls for."""
+        """Verdict for a probability of failure [1] alone."""
         if probability >= _LIKELY:
             return cls.FAILED
         return cls.DOUBTFUL if probability >= _POSSIBLE else cls.GOOD
@@ -41,28 +41,31 @@ class Verdict(Enum):
 
 @dataclass(frozen=True)
 class Assessment:
-    """A verdict, and what speaks for it."""
+    """Verdict on a fit, with its reason."""
 
     verdict: Verdict
     reason: str
-    """One sentence for people."""
+    """Reason as one sentence."""
     remedy: str
-    """What to try, one sentence; empty where nothing has to be."""
+    """Remedy as one sentence; empty if none is needed."""
     probability: float
-    """That the mask is wrong (Dice below 0.9), as calibrated on frames of known truth [1]."""
+    """Probability that the mask is wrong (Dice below 0.9), calibrated on frames with ground truth [1]."""
     evidence: Evidence
     nothing_there: bool = False
-    """Whether no arm is in view or seen at all, so that nothing could be fitted."""
+    """Whether no arm is in view or detected, so that there is nothing to fit."""
 
     @property
     def certain(self) -> bool:
-        """Whether the fit is good, and so likely right that its deviations need not allow for a wrong fit."""
+        """Whether the fit is good with a probability of failure so small that its deviations need not allow for it."""
         return self.verdict is Verdict.GOOD and self.probability < _UNCERTAIN
 
     def of(self, known: Uncertainty) -> Uncertainty:
-        """What is known after the verdict, from what the curvature of the objective says.
+        """Uncertainty that allows for a wrong fit.
 
-        A certain fit is taken at its word, of a failed one nothing is known beyond what was expected before.
+        That of a certain fit stays as it is; that of a failed fit becomes the prior.
+
+        Args:
+            known: from the curvature of the objective.
         """
         if self.certain:
             return known
@@ -70,56 +73,84 @@ class Assessment:
 
 
 _UNCERTAIN, _POSSIBLE, _LIKELY = 0.1, 0.13, 0.5
-"""Probability of failure from which deviations allow for a wrong fit, a fit is doubtful, and it has failed [1]; why, is
-in docs/explanation/decisions.md."""
+"""Probability of failure from which deviations allow for a wrong fit, a fit is doubtful, and it has failed [1]; see
+docs/explanation/decisions.md."""
 
 
-def assess(found: Evidence, *, strict: bool = False) -> Assessment:
-    """The verdict that the evidence calls for.
+def assess(found: Evidence) -> Assessment:
+    """Verdict on the fit of a frame.
 
     Args:
         found: the evidence.
-        strict: whether a fit is doubtful as soon as its deviations allow for a wrong one; so it always is with given
-            masks, whose overlap is the Dice itself.
     """
-    doubtful_from = _UNCERTAIN if strict or found.masked else _POSSIBLE
-    probability = _probability_of_failure(found)
+    what = "given mask" if found.masked else "image"
+    # The overlap with given masks is the Dice itself, so they need no margin.
+    return _assessed(
+        found, _UNCERTAIN if found.masked else _POSSIBLE, f"The {what} contradicts", f"The {what} supports", "fit"
+    )
+
+
+def assess_calibration(frames: Sequence[Evidence]) -> Assessment:
+    """Verdict on a calibration, from the median evidence of its frames with measured joints.
+
+    It is doubtful earlier than a frame: all frames depend on it, and its masks can be right while it is wrong.
+
+    Args:
+        frames: the evidence of each; at least one.
+    """
+    median = median_evidence(frames)
+    what = "given masks" if median.masked else "images"
+    found = _assessed(median, _UNCERTAIN, f"The {what} contradict", f"The {what} support", "calibration")
+    if found.verdict is Verdict.GOOD or found.nothing_there:
+        return found
+    return replace(found, remedy=_CALIBRATION_REMEDY)
+
+
+def _assessed(found: Evidence, doubtful_from: float, contradicts: str, supports: str, subject: str) -> Assessment:
+    """The verdict on a fit or a calibration.
+
+    Args:
+        found: the evidence.
+        doubtful_from: probability of failure from which it is doubtful [1].
+        contradicts, supports: subject and verb of the reasons.
+        subject: "fit" or "calibration".
+    """
+    probability = 1.0 / (1.0 + math.exp(-log_odds_of_failure(found.loss, found, found.masked)))
     for applies, reason, remedy in _NOTHING_THERE:
         if applies(found):
             return Assessment(Verdict.FAILED, reason, remedy, max(probability, _LIKELY), found, True)
-    what = "given mask" if found.masked else "image"
     if probability >= _LIKELY:
-        reason = f"The {what} contradicts the fit: " + _weakest(found)
+        reason = f"{contradicts} the {subject}: " + _weakest(found)
         return Assessment(Verdict.FAILED, reason, _REMEDY_FAILED, probability, found)
     if arm_is_elsewhere(found):
         reason = "An arm is out of view where it was fitted, and something that looks like an arm is elsewhere."
         return Assessment(Verdict.DOUBTFUL, reason, _REMEDY, max(probability, _POSSIBLE), found)
     if probability >= doubtful_from:
-        reason = f"The {what} supports the fit only in part: " + _weakest(found)
+        reason = f"{supports} the {subject} only in part: " + _weakest(found)
         return Assessment(Verdict.DOUBTFUL, reason, _REMEDY, max(probability, _POSSIBLE), found)
     if found.parts_predicted < _PART_UNSEEN:
         reason = "The wrist or the jaws of an arm are not predicted where they were fitted, so only the shaft is."
         return Assessment(Verdict.DOUBTFUL, reason, _REMEDY, max(probability, _POSSIBLE), found)
-    return Assessment(Verdict.GOOD, f"The {what} supports the fit.", "", probability, found)
+    return Assessment(Verdict.GOOD, f"{supports} the {subject}.", "", probability, found)
 
 
 def arm_is_elsewhere(found: Evidence) -> bool:
-    """Whether an arm is out of view where it was fitted, and something that looks like an arm is in the image."""
+    """Whether a fitted arm is out of view while an arm is predicted elsewhere in the image."""
     return found.elsewhere >= _LOOKS_LIKE_ONE
 
 
 _UNSEEN, _AT_RANDOM = 0.05, 0.5
-"""Share of an arm below which nothing of it is predicted, and
-agreement below which a prediction says nothing of the fit [1]."""
+"""Share of an arm below which it is not predicted, and agreement below which a prediction does not support the fit
+[1]."""
 
 _PART_UNSEEN = 0.2
 """Share of the rendered wrists, or jaws, below which they are not predicted [1]."""
 
 _LOOKS_LIKE_ONE = 5e-3
-"""Share of the images from which what looks like an arm may be the one that is out of view [1]."""
+"""Share of the images from which a prediction elsewhere may be the arm out of view [1]."""
 
 _MOST, _MORE = 0.5, 2.0
-"""Share of the images, and multiple of what arms cover as measured, from which a fit follows no mask of arms [1]."""
+"""Share of the images, and multiple of the measured arms' area, above which a given mask is not one of arms [1]."""
 
 _NOTHING_THERE: tuple[tuple[Callable[[Evidence], bool], str, str], ...] = (
     (
@@ -168,9 +199,14 @@ _REMEDY_FAILED = (
     "image of the empty scene in the recording's file (background)."
 )
 
+_CALIBRATION_REMEDY = (
+    "Check that robot, camera and joints are those of the images, start from a pose that is nearer, or give masks "
+    "(--observe masks)."
+)
+
 
 def _weakest(found: Evidence) -> str:
-    """What speaks most against a fit, in words."""
+    """Strongest evidence against a fit, as text."""
     if found.masked:
         return "what is rendered and the given mask differ."
     against = {
@@ -182,45 +218,40 @@ def _weakest(found: Evidence) -> str:
     return min(against, key=lambda reason: against[reason])
 
 
-def _probability_of_failure(found: Evidence) -> float:
-    return 1.0 / (1.0 + math.exp(-log_odds_of_failure(found.loss, found, found.masked)))
-
-
 _TISSUE = 0.75, 0.55, 0.45
-"""What arms are rendered before, RGB."""
+"""Plain background of the rendering that is recognized, RGB."""
 
 _NEAR = 40
-"""How far from the arms as measured predictions count as theirs [px of the working image]."""
+"""Distance from the measured arms within which predictions count as theirs [px of the working image]."""
 
 RECOGNIZED, _ELSEWHERE = 0.95, 0.05
-"""Overlap from which a rendering is recognized as those of training are, and share of an image beyond which predictions
-mislead [1]."""
+"""Least overlap of a rendering of a known robot, and share of an image from which false predictions mislead [1]."""
 
 UNKNOWN_ROBOT_REMEDY = "Give masks (--observe masks, or both), or train for this recording (`carts train`, --weights)."
 
 
 def overlap_below_usual(overlap: float) -> str:
-    """Text on an overlap below `RECOGNIZED`, rounded down so that it reads as less."""
+    """Text on an overlap below `RECOGNIZED`, rounded down."""
     return f"an overlap of {math.floor(1000 * overlap) / 1000:.3f} only ({RECOGNIZED} or more is usual)"
 
 
 @dataclass(frozen=True)
 class DomainCheck:
-    """How well a network knows arms and images, from one frame."""
+    """Check of whether a network knows the arms and images of a recording, from one frame."""
 
     recognized: float | None
-    """Overlap (soft Dice) of what the network predicts of a rendering of the arms before plain tissue, conditioned on
-    nothing, with the arms that were rendered [1]; None where no arm is in view."""
+    """Overlap (soft Dice) of a rendering of the arms before plain tissue with the network's unconditioned prediction in
+    it [1]; None where no arm is in view."""
     elsewhere: float
-    """Share of the image, far from the arms as measured, that the network takes for arms [1]."""
+    """Share of the image, far from the measured arms, that is predicted as arms [1]."""
 
     def warnings(self, where: str, remedy: str = UNKNOWN_ROBOT_REMEDY, *, background: bool = False) -> list[str]:
-        """What people should know before they solve; nothing where all is well.
+        """Warnings before an optimization; empty where the network fits the recording.
 
         Args:
-            where: says which images are meant.
-            remedy: what to do where the network does not know arms or images.
-            background: whether the empty background is known; then what is taken for arms in it does no harm.
+            where: name of the images in messages.
+            remedy: for a network that does not know arms or images.
+            background: whether the empty background is known; then false detections in it do no harm.
         """
         found = []
         if self.recognized is None:
@@ -243,13 +274,13 @@ class DomainCheck:
 def check_domain(
     scene: Scene, frame: Frame, networks: FeatureExtractor | SurfacePredictor, settings: SurfaceSolver | None = None
 ) -> DomainCheck:
-    """Try a network on a frame; it predicts twice.
+    """Check a network on a frame, with two predictions.
 
     Args:
         scene: with the cameras that take part.
         frame: images and measured joint positions.
         networks: the networks, or another predictor of surface maps.
-        settings: working size, and how much haze is taken off.
+        settings: working size and dehazing.
 
     Raises:
         SettingsError: an image is missing, or of another size than its camera.
@@ -283,45 +314,39 @@ def check_domain(
 
 
 _MANY, _MOST_FAILED = 0.1, 0.5
-"""Share of frames not to be relied on from which a sequence is doubtful, and share of failed ones from which it has
-failed [1]."""
+"""Share of unreliable frames from which a sequence is doubtful, and share of failed ones from which it has failed
+[1]."""
 
 _LEVEL = 0.05
-"""Probability that any of the measures is called worse where all differences are chance [1]."""
+"""Family-wise significance level of the tests for worse measures [1]."""
 
 _SCATTER, _SCATTER_FREEDOM = 0.01, 4
-"""Usual deviation of a measure's change from frame to frame, and how many degrees of freedom it counts as [1]: with few
-frames their own scatter is hardly known, and with one frame not at all."""
+"""Prior standard deviation of a measure's change between frames, and its degrees of freedom [1]."""
 
 _BETTER_HIGHER = ("agreement", "unconditioned", "overlap_with_change")
 _BETTER_LOWER = ("residual", "loss")
 
-_CALIBRATION_REMEDY = (
-    "Check that robot, camera and joints are those of the images, start from a pose that is nearer, or give masks "
-    "(--observe masks)."
-)
-
 
 @dataclass(frozen=True)
 class SequenceAssessment:
-    """A verdict on frames that were corrected together."""
+    """Verdict on frames that were corrected together."""
 
     verdict: Verdict
     reason: str
-    """One sentence for people."""
+    """Reason as one sentence."""
     remedy: str
-    """What to try, one sentence; empty where nothing has to be."""
+    """Remedy as one sentence; empty if none is needed."""
     probability: float
-    """Mean of the frames' probabilities that their masks are wrong [1]."""
+    """Mean probability of the frames that their masks are wrong [1]."""
     counts: Mapping[str, int]
     """Verdict -> frames."""
 
 
 def assess_sequence(frames: Sequence[Assessment]) -> SequenceAssessment:
-    """The verdict on a sequence of at least one frame.
+    """Verdict on a sequence of at least one frame.
 
     Args:
-        frames: the verdicts on its frames.
+        frames: verdicts on its frames.
     """
     counts = Counter(frame.verdict for frame in frames)
     named = {verdict.value: counts[verdict] for verdict in Verdict}
@@ -339,28 +364,12 @@ def assess_sequence(frames: Sequence[Assessment]) -> SequenceAssessment:
     return SequenceAssessment(verdict, summary, remedy, probability, named)
 
 
-def assess_calibration(frames: Sequence[Evidence]) -> Assessment:
-    """The verdict on a calibration, from the median evidence of its frames, with joints as measured.
-
-    All frames rely on it, and its masks can be right while it is off, so it is doubtful earlier than a frame.
-
-    Args:
-        frames: the evidence of each; at least one.
-    """
-    found = assess(median_evidence(frames), strict=True)
-    if found.verdict is Verdict.GOOD:
-        return replace(found, reason="The images support the calibration.")
-    reason = found.reason.replace("The image contradicts the fit", "The images contradict the calibration")
-    reason = reason.replace("The image supports the fit only", "The images support the calibration only")
-    return replace(found, reason=reason, remedy=found.remedy if found.nothing_there else _CALIBRATION_REMEDY)
-
-
 def without_knowledge(found: Assessment, known: Sequence[DomainCheck]) -> Assessment:
-    """The verdict on a calibration by a network that may not know the robot: what is doubtful then has failed.
+    """Verdict on a calibration that fails a doubtful one where the network does not know the robot.
 
     Args:
         found: the verdict from the images.
-        known: how well the network knows the arms, in some of the frames.
+        known: domain checks of some of the frames.
     """
     recognized = [one.recognized for one in known if one.recognized is not None]
     if found.verdict is not Verdict.DOUBTFUL or not recognized or float(np.median(recognized)) >= RECOGNIZED:
@@ -373,7 +382,7 @@ def without_knowledge(found: Assessment, known: Sequence[DomainCheck]) -> Assess
 
 
 def median_evidence(frames: Sequence[Evidence]) -> Evidence:
-    """Median over frames, so that a few broken ones decide nothing; what one of them does not know is left out."""
+    """Median over frames; a measure that one of them lacks is None."""
     values = {}
     for field in fields(Evidence):
         known = [value for frame in frames if (value := getattr(frame, field.name)) is not None]
@@ -382,7 +391,7 @@ def median_evidence(frames: Sequence[Evidence]) -> Evidence:
 
 
 def worse_in(before: Sequence[Evidence], after: Sequence[Evidence]) -> list[str]:
-    """Names of the measures that say that frames fit worse than before, beyond chance.
+    """Names of the measures by which frames fit significantly worse than before.
 
     One-sided moderated t-tests (Smyth, Linear models and empirical Bayes methods for assessing differential expression,
     2004) with Holm's correction for several tests (A simple sequentially rejective multiple test procedure, 1979).
@@ -405,7 +414,7 @@ def worse_in(before: Sequence[Evidence], after: Sequence[Evidence]) -> list[str]
 
 
 def _chance(rises: Float[np.ndarray, " frames"]) -> float:
-    """Probability of a mean rise that large where there is none [1]."""
+    """p-value of a mean rise under the hypothesis of none [1]."""
     freedom = len(rises) - 1 + _SCATTER_FREEDOM
     squares = ((rises - rises.mean()) ** 2).sum() + _SCATTER_FREEDOM * _SCATTER**2
     return float(stdtr(freedom, -rises.mean() / np.sqrt(squares / freedom / len(rises))))

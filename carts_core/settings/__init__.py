@@ -1,6 +1,6 @@
-"""What people can set, in plain dataclasses that check their ranges.
+"""Settings as plain dataclasses that check their ranges.
 
-Nothing here imports torch or what needs it, so that the command line knows its options at once.
+Nothing here imports torch, so that the command line starts fast.
 """
 
 from .interchange import FormatName as FormatName

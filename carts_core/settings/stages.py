@@ -7,27 +7,27 @@ from ..errors import SettingsError
 
 
 def require(condition: bool, name: str, value: object, allowed: str) -> None:
-    """See that a setting is in its range.
+    """Check the range of a setting.
 
     Raises:
-        SettingsError: it is not; the message says what was given and what is allowed.
+        SettingsError: it is out of range.
     """
     if not condition:
         raise SettingsError(f"{name} is {value!r}; allowed is {allowed}. Change it, or leave it at its default.")
 
 
 class Given(StrEnum):
-    """Which state the network is conditioned on: its rendering is an input of the network."""
+    """State whose rendering the network is conditioned on."""
 
     START = "start"
-    """Where the run began."""
+    """Start of the run."""
     ESTIMATE = "estimate"
     """The present estimate."""
 
 
 @dataclass(frozen=True)
 class Observe:
-    """Have the network predict the surface map of the images: per pixel the coverage of each part of the arms, and the
+    """Predict the surface map of the images: per pixel the coverage of each part of the arms, and the
     normal (`carts_core.model.parts`). `Descend` and `AlignEdges` never call the network; a `RandomRestart` and a
     `PreferStart` observe once more, and verdicts (`OtherBackground`, `RejectFailed`) need it for their evidence.
     """
@@ -239,7 +239,7 @@ def first_observe(stages: tuple[Stage, ...]) -> Observe:
 
 
 _FAR = Observe(margin=27, attention=27, haze=False)
-"""An observation that has to find arms which are several degrees off."""
+"""Observation for arms that are several degrees off."""
 
 
 def reduced(stages: tuple[Stage, ...], scale: float) -> tuple[Stage, ...]:
@@ -254,10 +254,10 @@ _RESTART = RandomRestart(then=(Descend(blur=8.0), _FAR, Descend(blur=3.0)))
 
 SEARCH: tuple[Stage, ...] = (
     SilhouetteSearch(),
-    # A small image first: a good estimate is there soon.
+    # A small image first, for a fast first estimate.
     Observe(scale=0.75, margin=27, attention=27, haze=False),
     _COARSE,
-    # Conditioned on the start again, so that an error of the first pass is not confirmed by itself.
+    # Conditioned on the start again, so that an error of the first pass does not confirm itself.
     Observe(given=Given.START, margin=27, attention=27, haze=False),
     _MEDIUM,
     _RESTART,
@@ -293,21 +293,20 @@ _WIDE = Observe(margin=27, attention=27)
 """An observation with more room around the arms."""
 
 WARM_WIDE: tuple[Stage, ...] = (_WIDE, Descend(blur=0.8, steps=2), AlignEdges())
-"""As `WARM`, for a frame that may be farther from where it is expected."""
+"""As `WARM`, for a frame that may be farther from its prediction."""
 
 WARM: tuple[Stage, ...] = (
     Observe(scale=0.6, margin=10, attention=10),
     Descend(blur=1.2, steps=1),
     AlignEdges(steps=6),
 )
-"""A frame of a sequence or stream, near where its neighbours let expect it: one small observation, one step, and the
-outlines."""
+"""A frame of a sequence or stream near its prediction: one small observation, one step, and the outlines."""
 
 LIVE_SEARCH: tuple[Stage, ...] = reduced(SEARCH[: SEARCH.index(_RESTART) + 1], 1.0)
 """A frame of a live stream whose arms are lost; `WARM` follows."""
 
 COMPARE: tuple[Stage, ...] = (Observe(scale=1.25, margin=27, attention=27), Evaluate())
-"""How well a given state fits a frame, in a smaller image."""
+"""Comparison of a given state with a frame, in a smaller image."""
 
 CALIBRATION_STAGES: tuple[Stage, ...] = (
     SilhouetteSearch(),

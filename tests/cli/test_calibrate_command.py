@@ -12,7 +12,7 @@ import pytest
 from carts_core.cli.command_line import BAD_INPUT, main
 from carts_core.recording import Sequence, calibrated_sequence_file
 
-CAUTION = "Images can hardly tell a wrong base frame from a joint that is read wrong by the same amount in every frame"
+CAUTION = "Images hardly distinguish a wrong base frame from a constant joint offset"
 QUICK = ["--frames", "spread:2", "--settings", "iterations=3"]
 
 

@@ -71,7 +71,7 @@ def test_errors_lie_within_the_deviations_however_far_off_the_start_was(variable
 
 def test_a_joint_that_the_image_determines_stays_determined_where_all_errors_turn_out_small() -> None:
     before = Uncertainty(("PSM1/yaw", "PSM1/jaw"), (0.01, 0.039), (0.04, 0.04))
-    after = before.scaled(Uncertainty(before.names, (0.008, 0.0149), (0.015, 0.015)))
+    after = before.rescaled(Uncertainty(before.names, (0.008, 0.0149), (0.015, 0.015)))
     assert after.std == (0.008, 0.0149)
     assert [after.observability(name) for name in after.names] == ["determined", "not visible"]
     assert [after.doubted(0.5).observability(name) for name in after.names] == ["weak", "not visible"]

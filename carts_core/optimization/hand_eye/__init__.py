@@ -1,4 +1,4 @@
-"""Hand-eye calibration from points that a person has found in a few images, without any initial pose."""
+"""Hand-eye calibration from points clicked in a few images, without an initial pose."""
 
 from .files import RESULT_FILE as RESULT_FILE
 from .files import HandEyePrior as HandEyePrior

@@ -20,7 +20,7 @@ from .problem import ImagePoint
 from .result import HandEyeResult
 
 RESULT_FILE = "hand_eye.json"
-"""Name of the file with what was found, beside the sequence file."""
+"""Name of the result file beside the sequence file."""
 COLUMNS = ("frame", "camera", "arm", "landmark", "u", "v")
 
 
@@ -59,17 +59,17 @@ def read_points(path: Path, sequence: Sequence) -> list[ImagePoint]:
 
 @dataclass(frozen=True)
 class HandEyePrior:
-    """What a hand-eye calibration leaves open, for one that refines it."""
+    """Uncertainty of a hand-eye calibration, as prior of a refinement."""
 
     base_covariances: Mapping[str, Float[np.ndarray, "6 6"]]
     """As in `HandEyeResult`."""
     free_cameras: tuple[str, ...]
-    """Cameras whose pose was not known before."""
+    """Cameras whose pose was unknown before."""
 
 
 def read_prior(sequence: Sequence) -> HandEyePrior | None:
-    """What the hand-eye calibration that wrote a sequence file leaves open; None where none has, or base frames are no
-    longer those that it found.
+    """Uncertainty of the hand-eye calibration that wrote a sequence file; None if there is none, or base frames have
+    changed since.
 
     Raises:
         SettingsError: `hand_eye.json` beside the sequence file cannot be read.
@@ -145,7 +145,7 @@ def result_json(
 
 
 _STANDS = 1e-3
-"""Mounts whose transforms differ by less are at the same place [rad, m]."""
+"""Largest difference of the transforms of a resting mount [rad, m]."""
 
 
 def mounts_of_points(recording: Sequence, points: Rows[ImagePoint]) -> dict[str, Float[np.ndarray, "4 4"]]:
@@ -170,7 +170,7 @@ def mounts_of_points(recording: Sequence, points: Rows[ImagePoint]) -> dict[str,
 
 
 def moved_cameras(scene: Scene, mounts: Mapping[str, Float[np.ndarray, "4 4"]], *, back: bool = False) -> Scene:
-    """The scene with its cameras where their mounts take them, or, of such a scene, with cameras on their mounts.
+    """Scene with its cameras moved by their mounts, or back.
 
     Args:
         scene: arms and cameras.

@@ -18,7 +18,7 @@ from ...wording import counted
 
 @dataclass(frozen=True)
 class HandEyeSettings:
-    """What is solved for from clicked points, and how exactly a person clicks."""
+    """Free parameters of hand-eye calibration, and the noise of clicked points."""
 
     pixel_error: float = 2.0
     """Expected error of a point [px]."""
@@ -33,12 +33,12 @@ class HandEyeSettings:
 
 
 NEAREST = 1e-3
-"""[m] Depths below this count as this, so that what is behind the camera is far off instead of undefined."""
+"""Smallest depth in projections [m]; points behind the camera are projected at this depth."""
 
 
 @dataclass(frozen=True)
 class ImagePoint:
-    """A landmark of an arm, and where a person has found it."""
+    """A landmark of an arm clicked in an image."""
 
     frame: int
     """Position in the sequence, from 0."""
@@ -52,13 +52,13 @@ class ImagePoint:
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """All points of one arm in one camera, with what the joints say where they are in the arm's base frame."""
+    """All points of one arm in one camera, with their positions in the base frame by forward kinematics."""
 
     camera: int
     """Index into the scene's cameras."""
     arm: int
     rows: tuple[int, ...]
-    """Which of the given points these are."""
+    """Indices of the given points."""
     frames: tuple[int, ...]
     landmarks: tuple[Landmark, ...]
     starts: Float[np.ndarray, "points 3"]
@@ -69,18 +69,18 @@ class View:
 
     @property
     def has_edges(self) -> bool:
-        """Whether some are edges of a shaft."""
+        """Whether some points are edges of a shaft."""
         return any(landmark.kind is LandmarkKind.EDGE for landmark in self.landmarks)
 
     @property
     def is_point(self) -> np.ndarray:
-        """Which of them are points instead of lines [points]."""
+        """Mask of the points that are not lines [points]."""
         return np.array([landmark.kind is LandmarkKind.POINT for landmark in self.landmarks])
 
     def distances(
         self, T_camera_base: Float[np.ndarray, "4 4"], intrinsics: Float[np.ndarray, "4"], side: int = 0
     ) -> Float[np.ndarray, "points 2"]:
-        """How far the landmarks are from where they were found [px]; of lines, the second number is 0.
+        """Distances of the landmarks from their clicked points [px]; for lines, the second number is 0.
 
         Args:
             T_camera_base: pose of the arm.
@@ -106,7 +106,7 @@ def views_of(
     Args:
         scene: arms and cameras.
         measured: arm -> joint positions of all frames [rad, m].
-        points: what a person has found.
+        points: clicked points.
 
     Raises:
         SettingsError: a point names a frame or a landmark that does not exist, or lies at no place.
@@ -150,13 +150,14 @@ def _view(
 def _line_distance(
     start: np.ndarray, end: np.ndarray, pixel: np.ndarray, intrinsics: np.ndarray, landmark: Landmark, side: int
 ) -> float:
-    """From the ray through a pixel to a cylinder's axis, less its radius [px at the depth where they are closest]."""
+    """Distance of the ray through a pixel from a cylinder's axis, less its radius [px at the depth of the nearest
+    point]."""
     ray = np.array([*((pixel - intrinsics[2:]) / intrinsics[:2]), 1.0])
     ray /= np.linalg.norm(ray)
     axis = (end - start) / np.linalg.norm(end - start)
     across = np.cross(ray, axis)
     length = max(float(np.linalg.norm(across)), 1e-9)
-    # The place on the axis that is closest to the ray, which begins at the origin.
+    # The point on the axis that is nearest to the ray from the origin.
     along = float(np.dot(np.cross(ray, start), across)) / length**2
     depth = max(float((start - along * axis)[2]), NEAREST)
     away = float(start @ across) / length
@@ -166,19 +167,19 @@ def _line_distance(
 
 
 FEWEST_POINTS = 4
-"""With three, up to four poses fit equally well."""
+"""Three points allow up to four poses."""
 _RANDOM_SUBSETS = 40
 _KEPT = 4
-"""How many of the best poses are refined."""
+"""Number of best poses that are refined."""
 
 
 def poses_of(
     view: View, intrinsics: Float[np.ndarray, "4"], pixel_error: float
 ) -> list[tuple[float, Float[np.ndarray, "4 4"]]]:
-    """The best few poses T_camera_base with their costs, the best first.
+    """Best poses T_camera_base with their costs, the best first.
 
-    Perspective-n-point (SQPnP, EPnP) on all points, on all but each frame's and each single one, and on random few, so
-    that some subset is free of wrong points; each pose is judged by all points, wrong ones with little weight.
+    Perspective-n-point (SQPnP, EPnP) on all points, on all but one frame's, on all but one, and on random subsets, so
+    that some subset is free of outliers; each pose is rated by the robust cost of all points.
 
     Args:
         view: at least `FEWEST_POINTS` points.
@@ -200,7 +201,7 @@ def robust_cost(scaled: Float[np.ndarray, "points 2"]) -> float:
 
 
 def _subsets(view: View) -> Iterator[Bool[np.ndarray, " points"]]:
-    """Points to be used together: all, all but a few, and random few."""
+    """Subsets of points: all, all but a few, and random ones."""
     points = view.is_point
     yield points
     frames = np.array(view.frames)
@@ -228,7 +229,7 @@ def _perspective(view: View, rows: np.ndarray, intrinsics: np.ndarray) -> Iterat
                 np.ascontiguousarray(view.starts[rows]), pixels, K, None, flags=method
             )
         except cv2.error:
-            # Points that coincide or lie on a line have no pose.
+            # Coincident or collinear points have no pose.
             continue
         for rotation, translation in zip(rotations, translations, strict=True):
             T = np.eye(4)
@@ -238,16 +239,16 @@ def _perspective(view: View, rows: np.ndarray, intrinsics: np.ndarray) -> Iterat
 
 
 class HandEyeProblem:
-    """Poses of arms and cameras around a beginning, as a vector of small turns and shifts at the middle of points.
+    """Least-squares problem in small rotations and translations of arms and cameras about an initial estimate.
 
     Attributes:
         scene: arms and cameras as given.
-        settings: what is free.
-        views: the points that are used.
-        missing: (camera, arm) -> how many more points are needed for it.
+        settings: free parameters.
+        views: used points.
+        missing: (camera, arm) -> number of missing points.
         focal: cameras whose focal length is free; their logarithms are the last unknowns.
-        middles: arm -> middle of its points in its base frame [m].
-        origin: the vector of the beginning, zeros.
+        middles: arm -> centroid of its points in its base frame [m].
+        origin: zeros, the initial estimate.
     """
 
     def __init__(
@@ -268,9 +269,11 @@ class HandEyeProblem:
         self._arms = list(self._T_world_base)
         self._cameras = [view.camera for view in self.views]
         self._free = sorted(free & set(self._cameras) - {self._anchor})
-        focal = sorted(set(self._cameras)) if settings.focal_length else []
-        self.focal = [camera for camera in focal if sum(each == camera for each in self._cameras)]
-        self.middles = self._middle_of_arms()
+        self.focal = sorted(set(self._cameras)) if settings.focal_length else []
+        self.middles = {
+            arm: np.concatenate([view.starts[view.is_point] for view in self.views if view.arm == arm]).mean(0)
+            for arm in self._arms
+        }
         self.origin = np.zeros(6 * len(self._arms) + 6 * len(self._free) + len(self.focal))
         known = sum(2 if point else 1 for view in self.views for point in view.is_point)
         if known < len(self.origin):
@@ -280,10 +283,10 @@ class HandEyeProblem:
             )
 
     def _find_beginning(self, views: list[View], free: set[int]) -> None:
-        """Base frames by the view with most points, then cameras whose pose is not known."""
+        """Initial base frames from the view with most points, then poses of free cameras."""
         self._anchor = _anchor(views, free)
         unknown = free - {self._anchor}
-        # Cameras whose pose is known first: then the others have base frames to be placed by.
+        # Known cameras first: their base frames place the free ones.
         for view in sorted(views, key=lambda view: (view.camera in unknown, -int(view.is_point.sum()))):
             count = int(view.is_point.sum())
             known = view.arm in self._T_world_base
@@ -293,7 +296,7 @@ class HandEyeProblem:
                 continue
             poses = poses_of(view, self._intrinsics[view.camera], self.settings.pixel_error)
             if known:
-                # Cameras of one endoscope look nearly the same way, so where the first one is, is a beginning as well.
+                # Cameras of one endoscope look nearly the same way, so the first one's pose is a start as well.
                 beside = self._T_camera_world[self._anchor] @ self._T_world_base[view.arm]
                 poses.append((0.0, beside))
             if not poses:
@@ -308,11 +311,11 @@ class HandEyeProblem:
                 self._T_camera_world[view.camera] = T_camera_base @ np.linalg.inv(self._T_world_base[view.arm])
                 unknown.discard(view.camera)
         for key in [key for key in self.missing if key[1] in self._T_world_base and key[0] not in unknown]:
-            # Another camera, or another arm in this one, has settled it: these points count as well.
+            # Another camera, or another arm in this one, determines it: these points are used as well.
             del self.missing[key]
 
     def _refined(self, view: View, T: np.ndarray) -> tuple[float, np.ndarray]:
-        """A single view's pose of lowest cost near a beginning."""
+        """Cost and pose of a single view, refined from a start."""
         middle = view.starts[view.is_point].mean(0)
         scale = self.settings.pixel_error
 
@@ -321,13 +324,6 @@ class HandEyeProblem:
 
         fit = least_squares(residuals, np.zeros(6), loss="cauchy", f_scale=2.0, x_scale="jac", max_nfev=50)
         return float(fit.cost), moved(T, fit.x, middle)
-
-    def _middle_of_arms(self) -> dict[int, np.ndarray]:
-        """Arm -> middle of its points in its base frame [m]."""
-        return {
-            arm: np.concatenate([view.starts[view.is_point] for view in self.views if view.arm == arm]).mean(0)
-            for arm in self._arms
-        }
 
     def poses(self, values: np.ndarray) -> tuple[dict[int, np.ndarray], dict[int, np.ndarray], np.ndarray]:
         """T_world_base by arm, T_camera_world by camera, intrinsics."""
@@ -346,11 +342,11 @@ class HandEyeProblem:
         return bases, cameras, intrinsics
 
     def distances(self, values: np.ndarray, sides: Sequence[int] | None = None) -> list[np.ndarray]:
-        """How far the landmarks of each view are from where they were found [px].
+        """Distances of the landmarks of each view from their clicked points [px].
 
         Args:
             values: of the unknowns.
-            sides: of each view, the side of the shaft that its edges are on; the nearer one by default.
+            sides: side of the shaft with the edges of each view; the nearer one by default.
         """
         bases, cameras, intrinsics = self.poses(values)
         return [
@@ -364,7 +360,7 @@ class HandEyeProblem:
 
 
 def moved(T: np.ndarray, step: np.ndarray, middle: np.ndarray) -> np.ndarray:
-    """T turned about where it puts `middle`, by step[:3] [rad], and shifted by step[3:] [m]."""
+    """T rotated about the image of `middle` by step[:3] [rad], and translated by step[3:] [m]."""
     turn = Rotation.from_rotvec(step[:3]).as_matrix()
     place = place_of(T, middle)
     moved = np.eye(4)
@@ -374,13 +370,12 @@ def moved(T: np.ndarray, step: np.ndarray, middle: np.ndarray) -> np.ndarray:
 
 
 def place_of(T: np.ndarray, point: np.ndarray) -> np.ndarray:
-    """Where T puts a point."""
+    """A point transformed by T."""
     return T[:3, :3] @ point + T[:3, 3]
 
 
 def _anchor(views: list[View], free: set[int]) -> int:
-    """The camera that keeps its pose: a known one with most points, one of the free ones if none is known, -1 if no
-    camera has enough."""
+    """Index of the camera that keeps its pose: a known one with most points, else a free one; -1 if none has enough."""
     points: dict[int, int] = {}
     for view in views:
         if (count := int(view.is_point.sum())) >= FEWEST_POINTS:

@@ -15,16 +15,16 @@ from ...model.scene import Scene
 from .problem import HandEyeProblem, HandEyeSettings, ImagePoint, View, place_of, views_of
 
 _OUTLIER = 4.0
-"""Points that are further off than this many expected errors are said to contradict the others."""
+"""Multiple of the expected error beyond which a point contradicts the others [1]."""
 _SINGULAR = 1e-12
-"""Relative to the largest, an eigenvalue of the curvature that says nothing."""
+"""Eigenvalue of the scaled curvature below which a direction is undetermined [1]."""
 _TURN, _SIDEWAYS = slice(0, 3), slice(3, 5)
-"""Of a turn and a shift in a camera's frame."""
+"""Indices of rotation and lateral translation in a camera's frame."""
 
 
 @dataclass(frozen=True)
 class PoseDeviation:
-    """Standard deviations of an arm's pose before a camera, at the middle of its points."""
+    """Standard deviations of an arm's pose in a camera's frame, at the centroid of its points."""
 
     rotation_deg: float
     """[deg], of the worst direction."""
@@ -35,7 +35,7 @@ class PoseDeviation:
 
     @staticmethod
     def of(covariance: Float[np.ndarray, "6 6"]) -> "PoseDeviation":
-        """The deviations of a turn and a shift in the camera's frame.
+        """Standard deviations from the covariance of rotation and translation in the camera's frame.
 
         Args:
             covariance: of both [rad, m].
@@ -50,24 +50,24 @@ class PoseDeviation:
 
 @dataclass(frozen=True, eq=False)
 class HandEyeResult:
-    """Where the arms are according to the points."""
+    """Result of hand-eye calibration."""
 
     scene: Scene
-    """As given, with the base frames, camera poses and focal lengths that were found."""
+    """The given scene with estimated base frames, camera poses and focal lengths."""
     distances: Float[np.ndarray, " points"]
-    """From each given point to where the landmark is now seen [px]; NaN for points that were not used."""
+    """Distance of each point from its projected landmark [px]; NaN for unused points."""
     deviations: Mapping[tuple[str, str], PoseDeviation]
-    """(arm, camera) -> how well the arm's pose before that camera is known."""
+    """(arm, camera) -> standard deviations of the arm's pose in that camera."""
     base_covariances: Mapping[str, Float[np.ndarray, "6 6"]]
-    """Arm -> covariance of the turn and shift of its base frame in its own axes [rad, m]."""
+    """Arm -> covariance of rotation and translation of its base frame in its own axes [rad, m]."""
     focal_deviation: Mapping[str, float]
-    """Camera -> standard deviation of its focal length as a share of it; empty unless it was solved for."""
+    """Camera -> relative standard deviation of its focal length [1]; empty unless it was estimated."""
     contradicting: tuple[int, ...]
-    """Which of the given points do not agree with the others and hardly count."""
+    """Indices of points that contradict the others, and have little weight."""
     noise: float
-    """Standard deviation of a point in each direction [px]: as expected, or larger where the points differ by more."""
+    """Standard deviation of a point in each direction [px]: as expected, or larger if the residuals are."""
     missing: Mapping[tuple[str, str], int] = field(default_factory=dict)
-    """(arm, camera) -> how many more points are needed for it, where it stays as it was."""
+    """(arm, camera) -> number of missing points, for poses that stay as given."""
 
     @property
     def error(self) -> float:
@@ -77,16 +77,17 @@ class HandEyeResult:
 
 
 def result_of(problem: HandEyeProblem, fit: OptimizeResult, count: int) -> HandEyeResult:
-    """What a minimum says.
+    """Result at a minimum.
 
     Raises:
-        SettingsError: the points leave something open.
+        SettingsError: the points leave a direction undetermined.
     """
     bases, cameras, intrinsics = problem.poses(fit.x)
     distances = np.full(count, np.nan)
     for view, found in zip(problem.views, problem.distances(fit.x), strict=True):
         distances[list(view.rows)] = np.linalg.norm(found, axis=-1)
-    excess = _excess(problem, fit)
+    # Variance of the points over the expected one [1].
+    excess = max(2.0 * fit.cost / _spare(problem, fit), 1.0)
     covariance = excess * _inverse_curvature(fit)
     names = [camera.name for camera in problem.scene.cameras]
     arms = [arm.name for arm in problem.scene.arms]
@@ -106,11 +107,6 @@ def result_of(problem: HandEyeProblem, fit: OptimizeResult, count: int) -> HandE
         noise=_noise(problem, fit, excess),
         missing={(arms[arm], names[camera]): more for (camera, arm), more in problem.missing.items()},
     )
-
-
-def _excess(problem: HandEyeProblem, fit: OptimizeResult) -> float:
-    """Variance of the points over the expected one [1], at least 1."""
-    return max(2.0 * fit.cost / _spare(problem, fit), 1.0)
 
 
 def _spare(problem: HandEyeProblem, fit: OptimizeResult) -> int:
@@ -134,7 +130,7 @@ def _noise(problem: HandEyeProblem, fit: OptimizeResult, excess: float) -> float
 
 
 def _inverse_curvature(fit: OptimizeResult) -> np.ndarray:
-    """Covariance of the unknowns for points as exact as expected."""
+    """Covariance of the unknowns for the expected noise of points."""
     information = fit.jac.T @ fit.jac
     scale = np.sqrt(np.maximum(np.diag(information), 1e-300))
     values, vectors = np.linalg.eigh(information / np.outer(scale, scale))
@@ -158,7 +154,7 @@ def _base_covariance(
 
 
 def _deviation(problem: HandEyeProblem, view: View, values: np.ndarray, covariance: np.ndarray) -> PoseDeviation:
-    """How uncertain turn and place of an arm are as this camera sees it."""
+    """Standard deviations of an arm's pose in this camera."""
 
     def seen(step: np.ndarray) -> np.ndarray:
         bases, cameras, _ = problem.poses(step)
@@ -199,11 +195,11 @@ def _differences(function: Callable[[np.ndarray], np.ndarray], at: np.ndarray, s
 
 
 _FOCAL_FACTORS = (1.0, 0.55, 0.75, 1.35, 1.8)
-"""Of the given focal length: where a search for it begins."""
+"""Factors on the given focal length at which its search starts."""
 _COMBINED = 4
-"""Most views with edges of which every combination of sides is tried."""
+"""Largest number of views with edges for which all combinations of sides are tried."""
 _STEPS = 60
-"""Most steps from each beginning."""
+"""Largest number of steps from each start."""
 _TOLERANCE = 1e-12
 """Relative change at which the search ends."""
 
@@ -214,21 +210,20 @@ def solve_hand_eye(
     points: Sequence[ImagePoint],
     settings: HandEyeSettings | None = None,
 ) -> HandEyeResult:
-    """Find where the arms are before the cameras, from points in a few frames; no initial pose is needed.
+    """Estimate base frames from points in a few frames; no initial pose is needed.
 
-    Minimizes Cauchy's loss of the distances in the image, each over `pixel_error`, from several beginnings by
-    perspective-n-point. Which side of a shaft its edges are on is not given, so both are tried. Joint positions are
-    taken as measured. Base frames move, and the cameras in `free_cameras`; where all cameras with points are among
-    these, the one with most points keeps its pose.
+    Minimizes the Cauchy loss of image distances over `pixel_error`, from several perspective-n-point solutions. Both
+    sides of a shaft are tried for its edges. Joint positions are taken as measured. Base frames and the cameras in
+    `free_cameras` are estimated; if all cameras with points are free, the one with most points keeps its pose.
 
     Args:
         scene: arms and cameras; its base frames are not used, those of arms without points stay.
         measured: arm -> joint positions of all frames [rad, m], as `Sequence.measured`.
         points: 3 to 6 frames with three or more points each are good; an arm needs 4 points in one camera.
-        settings: what is free.
+        settings: free parameters.
 
     Raises:
-        SettingsError: no arm has enough points, all lie on each other, or a point names what is not there.
+        SettingsError: no arm has enough points, all coincide, or a point names a missing frame or landmark.
         RobotError: a point or `free_cameras` names an arm or a camera that does not exist.
     """
     settings = settings or HandEyeSettings()
@@ -249,7 +244,7 @@ def solve_hand_eye(
 
 
 def _minimum(problem: HandEyeProblem, start: np.ndarray, sides: Sequence[int] | None = None) -> OptimizeResult:
-    """A minimum near a start; `sides` as in `HandEyeProblem.distances`."""
+    """Minimum near a start; `sides` as in `HandEyeProblem.distances`."""
     return least_squares(
         problem.residuals,
         start,
@@ -276,19 +271,19 @@ def _sides(problem: HandEyeProblem) -> Iterator[tuple[int, ...]]:
 
 
 _LEVEL = 0.01
-"""Probability that a true calibration is said to disagree, by any single point or by all together [1]."""
+"""Significance level at which points disagree with a calibration, singly or together [1]."""
 
 
 @dataclass(frozen=True, eq=False)
 class PointAgreement:
-    """Residuals of points before and after a calibration, and how large the noise of points makes them."""
+    """Residuals of points before and after a calibration, with the limits for noise."""
 
     before: Float[np.ndarray, " points"]
-    """[px], of the calibration from the points; NaN for points that were not used."""
+    """Under the calibration from the points [px]; NaN for unused points."""
     after: Float[np.ndarray, " points"]
     """[px]"""
     limits: Float[np.ndarray, " points"]
-    """Largest residual that noise explains [px]; infinite for points that were not used or contradict the others."""
+    """Largest residual that noise explains [px]; infinite for unused and contradicting points."""
     rms_before: float
     """Root mean square of the residuals of points with a limit [px]."""
     rms_after: float
@@ -302,7 +297,7 @@ class PointAgreement:
 
     @property
     def agrees(self) -> bool:
-        """Whether neither a single point nor all together speak against the calibration."""
+        """Whether the points agree with the calibration, singly and together."""
         return not self.disagreeing and self.rms_after <= max(self.rms_limit, self.rms_before)
 
 
@@ -321,7 +316,7 @@ def agreement_with_points(
     Args:
         scene: with the calibration.
         measured: arm -> joint positions of all frames [rad, m].
-        points: what a person has found.
+        points: clicked points.
         found: the calibration from these points.
 
     Raises:
