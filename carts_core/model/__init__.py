@@ -1,1 +1,1 @@
-"""What is in front of the lens: robots, their kinematics and meshes, cameras, scenes."""
+"""Robots, their kinematics and meshes, cameras, and scenes."""

@@ -1,4 +1,4 @@
-"""A pinhole camera: where it is, how it projects, and how its images lose their distortion."""
+"""Pinhole camera: pose, projection, and undistortion of images."""
 
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -12,7 +12,7 @@ from ..errors import SettingsError
 from ..files.image_size import pixels_problem
 
 HALF_PIXEL = 0.5
-"""Our pixel centres are at +0.5, OpenCV's at 0: OpenCV's principal point is ours minus this [px]."""
+"""Offset of pixel centres: +0.5 here and 0 in OpenCV, so OpenCV's principal point is smaller by this [px]."""
 
 DISTORTION_LENGTHS = (0, 4, 5, 8, 12, 14)
 """How many coefficients OpenCV's distortion models have."""
@@ -20,7 +20,7 @@ DISTORTION_LENGTHS = (0, 4, 5, 8, 12, 14)
 RIGID_TOLERANCE = 1e-3
 """How far R^T R may be from the identity, in any element."""
 EXACT = 1e-9
-"""A rotation that is nearer to rigid than this is taken as it is; others are made rigid."""
+"""Rotations that deviate less than this from rigid ones are not changed; others are projected onto SO(3)."""
 LAST_ROW_TOLERANCE = 1e-6
 """How far the last row may be from 0, 0, 0, 1, as matrices in single precision are."""
 

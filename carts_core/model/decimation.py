@@ -1,4 +1,4 @@
-"""Fewer triangles for a mesh, within a bound on how far its surface moves.
+"""Mesh decimation with a bound on the surface distance.
 
 It runs in a child process with bounded processor time: the library that does it neither looks at signals nor ends in
 good time on every mesh. 300,000 triangles at random take it longer than ten minutes.
@@ -78,7 +78,7 @@ def deviation(
 def _farthest(
     triangles: Float[np.ndarray, "F 3 3"], others: Float[np.ndarray, "G 3 3"], tolerance: float | None
 ) -> float:
-    """The largest distance of samples on some triangles to the surface of others.
+    """Largest distance of samples on some triangles to the surface of others.
 
     The triangles with the nearest samples give upper bounds; where these are largest, all triangles are looked at.
     """

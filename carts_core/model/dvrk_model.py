@@ -34,12 +34,12 @@ class Instrument:
     """An instrument that the tree names."""
 
     number: str
-    """The last six digits of its model number, say `420093`."""
+    """Last six digits of its model number, such as `420093`."""
     name: str
     generation: str
     """Of the arm: `Classic` or `Si`."""
     tip: str
-    """Number of its tip, say `093`."""
+    """Number of its tip, such as `093`."""
     has_tip: bool
     """Whether the tree has the tip's shape; else it draws boxes of 5 mm."""
 

@@ -1,4 +1,4 @@
-"""Where the dVRK's Endoscope Camera Manipulator (ECM) has the tip of its endoscope.
+"""Forward kinematics of the dVRK's Endoscope Camera Manipulator (ECM).
 
 The chain, in modified Denavit-Hartenberg parameters (alpha [rad], a [m], theta [rad], d [m]), which are those of
 jhu-dvrk/sawIntuitiveResearchKit: share/kinematic/ecm.json and ecm-si.json:

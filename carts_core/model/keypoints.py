@@ -28,7 +28,7 @@ class Keypoint:
 
     arm: str
     name: str
-    """Of the point, unique in its arm, for people."""
+    """Name of the point, unique in its arm."""
     link: int
     """Index into `Robot.link_names`."""
     position: tuple[float, float, float]
@@ -125,7 +125,7 @@ _LEAST_SLENDERNESS = 5.0
 
 
 class LandmarkKind(StrEnum):
-    """What a place in the image says about the arm."""
+    """Kind of constraint that a landmark in the image gives."""
 
     POINT = "point"
     """The point is seen exactly there."""
@@ -137,12 +137,12 @@ class LandmarkKind(StrEnum):
 
 @dataclass(frozen=True)
 class Landmark:
-    """A place that a person can find: a point, or a straight line with a thickness."""
+    """Landmark of an arm: a point, or a straight line with a thickness."""
 
     name: str
     kind: LandmarkKind
     hint: str
-    """Where to find it, for people."""
+    """Description of its position, for the page."""
     points: tuple[tuple[int, tuple[float, float, float]], ...]
     """Link and position in its frame [m]. The mean of all for a point, two ends of the axis otherwise."""
     radius: float = 0.0

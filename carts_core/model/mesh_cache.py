@@ -1,4 +1,4 @@
-"""Decimated link meshes on disk, so that a robot loads slowly only once."""
+"""Disk cache of decimated link meshes."""
 
 import hashlib
 import os

@@ -257,14 +257,14 @@ def simplify(
 
 @dataclass(frozen=True)
 class Decimation:
-    """What became of a robot's meshes."""
+    """Summary of the decimation of a robot's meshes."""
 
     before: int
     """Triangles of the files."""
     after: int
     """Triangles that are rendered."""
     deviation: float
-    """How far the surface of a part moved at most [m]."""
+    """Largest surface deviation of a part [m]."""
 
     def __str__(self) -> str:
         if self.deviation == 0.0:
@@ -328,7 +328,7 @@ Parts = Sequence[tuple[int, trimesh.Trimesh, np.ndarray]]
 
 
 def _clustered_parts(parts: Parts, most: int, tolerance: float) -> tuple[Parts, list[float]]:
-    """Meshes with at most so many triangles together, and how far vertices of each moved [m].
+    """Meshes within a total number of triangles, and how far vertices of each moved [m].
 
     Cells grow until few enough triangles are left, so surfaces may move farther than the tolerance.
     """

@@ -33,7 +33,7 @@ class PartClass:
 
     @property
     def name(self) -> str:
-        """For people."""
+        """Name in the page."""
         return f"{self.arm} {self.part}"
 
 

@@ -1,4 +1,4 @@
-"""Wrong kinematics on purpose."""
+"""Perturbation of joint positions."""
 
 from collections.abc import Mapping
 

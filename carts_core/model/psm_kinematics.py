@@ -26,10 +26,10 @@ JOINT_NAMES = ("yaw", "pitch", "insertion", "roll", "wrist_pitch", "wrist_yaw")
 
 ROLL = 3
 _SINGULAR = 1e-9
-"""[m] What is nearer to an axis than this has no direction."""
+"""Distance from an axis below which a direction is undefined [m]."""
 _SHOWN_ROWS = 5
 _LIMIT_TOLERANCE = 1e-9
-"""[rad], [m] Round-off at a limit is not beyond it."""
+"""Tolerance of joint limits for round-off [rad, m]."""
 
 
 @dataclass(frozen=True)
@@ -84,7 +84,7 @@ class Unreachable:
     rows: tuple[int, ...]
     """Counted from 0."""
     reason: str
-    """A clause for people, without a full stop."""
+    """Message without a full stop."""
 
     def __str__(self) -> str:
         shown = ", ".join(str(row) for row in self.rows[:_SHOWN_ROWS])

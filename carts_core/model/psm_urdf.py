@@ -1,4 +1,4 @@
-"""The part of a PSM's URDF that every instrument has: links and joints from the remote centre to its base."""
+"""Common part of the URDFs of PSMs: links and joints from the remote centre to the instrument's base."""
 
 import math
 from collections.abc import Iterator

@@ -213,15 +213,15 @@ def _wrong(element: Element, key: str, source: Path, allowed: str) -> RobotError
 
 
 INSTRUMENT_TOLERANCE = 2e-4
-"""How far decimation may move surfaces of an instrument [m]."""
+"""Largest surface deviation by decimation of an instrument [m]."""
 REACH_TOLERANCE = 1e-3
-"""The same for other robots, a part of their reach [1]."""
+"""Largest surface deviation for other robots, relative to their reach [1]."""
 SLENDER = 0.1
 """Largest width of a shaft, in lengths [1]."""
 
 
 class Robot:
-    """An articulated robot as the scene sees it. Made by `Robot.load`.
+    """Articulated robot with link meshes. Made by `Robot.load`.
 
     Attributes:
         name: the URDF's robot name.
@@ -350,14 +350,14 @@ class Robot:
 
 
 def _mesh_files(model: yourdfpy.URDF, urdf: Path) -> list[Path]:
-    """The mesh files of a URDF that are there."""
+    """Existing mesh files of a URDF."""
     geometries = [visual.geometry for link in model.robot.links for visual in link.visuals]
     names = [each.mesh.filename for each in geometries if each is not None and each.mesh is not None]
     return [path for name in names if is_regular(path := mesh_path(urdf.parent, name))]
 
 
 def _cache_key(model: yourdfpy.URDF, kinematics: Kinematics, urdf: Path, limits: tuple[int, float | None]) -> str:
-    """What link meshes are made from; `limits` are `max_faces` and `tolerance` of `Robot.load`."""
+    """Cache key of link meshes; `limits` are `max_faces` and `tolerance` of `Robot.load`."""
     files = _mesh_files(model, urdf)
     # Meshes in units other than metres were not scaled before.
     units = tuple(metres for file in files if (metres := collada_asset(file)[0]) != 1.0)
@@ -409,7 +409,7 @@ def _prepared_meshes(
 def _tolerance(
     kinematics: Kinematics, link_names: tuple[str, ...], parts: list[tuple[int, trimesh.Trimesh, np.ndarray]]
 ) -> float:
-    """How far surfaces may move [m]: what an endoscope's image cannot show, or little of a robot's reach."""
+    """Largest surface deviation [m]: below an endoscope's resolution, or a share of a robot's reach."""
     if not parts:
         return INSTRUMENT_TOLERANCE
     longest = max((np.sort(mesh.extents) for _, mesh, _ in parts), key=lambda extents: extents[-1])

@@ -1,4 +1,4 @@
-"""What is in front of the lens: arms, cameras, one light, and the state that can be optimized."""
+"""Scene of arms, cameras and a light, and the state that can be optimized."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -17,7 +17,7 @@ from .robot import Robot
 
 @dataclass(frozen=True)
 class Arm:
-    """A robot at its place in the world."""
+    """A robot with its base frame in the world."""
 
     name: str
     robot: Robot
@@ -27,14 +27,14 @@ class Arm:
 
 @dataclass(frozen=True)
 class Light:
-    """One white point light, fixed to the camera (L_d of the paper), and how surfaces answer to it."""
+    """White point light fixed to the camera (L_d of the paper), and the reflection model of surfaces."""
 
     position: tuple[float, float, float] = (0.0, 0.0, -0.02)
     """In the camera's frame [m]; behind the lens by default."""
     ambient: float = 0.25
-    """Share of a surface's colour that is seen without any light."""
+    """Ambient reflection, relative to a surface's colour."""
     diffuse: float = 0.75
-    """Share of a surface's colour that is seen where it faces the light."""
+    """Diffuse reflection, relative to a surface's colour."""
     specular: float = 0.35
     """Brightness of the highlight."""
     shininess: float = 24.0
@@ -43,7 +43,7 @@ class Light:
 
 @dataclass(frozen=True)
 class SceneState:
-    """Every value of a scene that may be free: a point, or a batch of points, in parameter space.
+    """Values of a scene that may be optimized: a point, or a batch of points, in parameter space.
 
     Leaves are tensors that may carry gradients; `*batch` are hypotheses.
     """
@@ -53,15 +53,15 @@ class SceneState:
     T_world_base: Float[Tensor, "*batch arms 4 4"]
     """Base frames (F_B of the paper)."""
     T_camera_world: Float[Tensor, "*batch cameras 4 4"]
-    """Camera extrinsics (C of the paper); of a camera that moves, its place on its mount, `T_camera_mount`."""
+    """Camera extrinsics (C of the paper); of a moving camera, `T_camera_mount`."""
     intrinsics: Float[Tensor, "*batch cameras 4"]
     """fx, fy, cx, cy of the full-size image [px]."""
     T_mount_world: Float[Tensor, "*batch cameras 4 4"]
-    """Where the mounts of cameras are at this moment, as measured; the identity for cameras that stay."""
+    """Measured poses of the camera mounts in this frame; the identity for fixed cameras."""
 
     @property
     def T_view_world(self) -> Float[Tensor, "*batch cameras 4 4"]:
-        """From the world to what each camera sees at this moment."""
+        """Transforms from the world to each camera in this frame."""
         return self.T_camera_world @ self.T_mount_world
 
     def map(self, function) -> "SceneState":
@@ -85,7 +85,7 @@ class SceneState:
 
 @dataclass(frozen=True)
 class Scene:
-    """Arms, cameras and the light; what does not change while a frame is optimized."""
+    """Arms, cameras and the light, which are constant while a frame is optimized."""
 
     arms: tuple[Arm, ...]
     cameras: tuple[Camera, ...]

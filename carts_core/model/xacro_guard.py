@@ -1,4 +1,4 @@
-"""Xacro without Python: expressions of a model are calculated here, since xacro would run any code that they hold.
+"""Safe xacro: evaluates expressions of a model without Python, since xacro would run any code in them.
 
 Xacro hands what stands in `${...}` and `$(eval ...)` to Python's `eval`, and keeps it from little. Here an expression
 is numbers, texts, lists, comparisons, properties and the functions of this module; everything else is refused.
@@ -17,7 +17,7 @@ from ..errors import RobotError
 from ..files.reading import CALIBRATION, ROBOT, parse_yaml, read_text
 
 _LONGEST = 100_000
-"""Longest text or list that an expression may make."""
+"""Longest text or list of an expression."""
 _LARGEST = 2.0**63
 """Largest whole number."""
 _LONGEST_EXPRESSION = 2_000
@@ -98,7 +98,7 @@ def expanded(path: Path, packages: dict[str, str], arguments: dict[str, str]) ->
 
 
 class Expression:
-    """Calculates expressions.
+    """Evaluates expressions.
 
     Args:
         symbols: properties by name.

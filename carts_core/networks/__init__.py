@@ -1,4 +1,4 @@
-"""The feature network: inference, hybrid images and training."""
+"""Inference of the networks, and hybrid images."""
 
 from .extractor import FeatureExtractor as FeatureExtractor
 from .extractor import hybrid as hybrid

@@ -1,4 +1,4 @@
-"""Frozen networks as the optimizer uses them, and hybrid images (mean background with the rendering on top)."""
+"""Frozen networks of the optimizer, and hybrid images (the rendering over the mean background)."""
 
 import hashlib
 from pathlib import Path
@@ -68,14 +68,14 @@ class FeatureExtractor:
 
     @property
     def fingerprint(self) -> str:
-        """Of the networks, and of who runs the surface network: engines differ in the last digits."""
+        """Fingerprint of the networks and the inference engine, as engines differ by round-off."""
         return self.sha256 if self.engine == "torch" else f"{self.sha256} {self.engine}"
 
     @staticmethod
     def load(
         *weights: Path | str, device: str | torch.device = "cpu", inference: Inference = "torch"
     ) -> "FeatureExtractor":
-        """Read weights files; a network that none is given of is the shipped one.
+        """Read weights files; a network without one has the shipped weights.
 
         Args:
             weights: files.
@@ -120,7 +120,7 @@ class FeatureExtractor:
     def surface(
         self, images: Float[Tensor, "batch 3 h w"], given: Float[Tensor, "batch 6 h w"]
     ) -> Float[Tensor, "batch 6 h w"]:
-        """Surface maps of what images show, given those of where the arms are expected.
+        """Predict surface maps of images, given those of the prior poses.
 
         They are where the images are, wherever the network runs. Arguments and errors as `SurfaceNetwork.forward`.
         """

@@ -32,13 +32,13 @@ from ..settings.optimization import Engine, Inference
 from .network import SurfaceNetwork
 
 _VERSION = 1
-"""Of the exported graph; part of its file's name."""
+"""Version of the exported graph, in its file's name."""
 _OPSET = 17
 _AXES = {0: "cameras", 2: "height", 3: "width"}
 
 
 class _Maps(nn.Module):
-    """From an image and a given surface map to a surface map, in one graph."""
+    """Graph from an image and a given surface map to a surface map."""
 
     def __init__(self, network: SurfaceNetwork) -> None:
         super().__init__()
@@ -111,7 +111,7 @@ def _exported(network: SurfaceNetwork) -> bytes:
 
 
 def _keep(path: Path, graph: bytes) -> None:
-    """A cache that cannot be written is no error."""
+    """Write the graph to the cache, ignoring errors."""
     try:
         write_bytes(output_path(path.parent, path.name), graph)
     except OutputError:
@@ -119,12 +119,12 @@ def _keep(path: Path, graph: bytes) -> None:
 
 
 TOLERANCE = 1e-4
-"""Largest difference of two surface maps that count as the same [1]."""
+"""Largest difference between equivalent surface maps [1]."""
 _GAIN = 0.9
-"""Share of torch's time below which another engine is taken [1]."""
+"""Share of torch's time below which another engine is preferred [1]."""
 _ROUNDS = 7
 _MEASUREMENT = 2
-"""Which way of measuring is remembered."""
+"""Version of the measurement in its file's name."""
 _PROBE = 7, 13
 """Height and width of the image that is measured, in strides of the network: a window around an arm."""
 
@@ -134,7 +134,7 @@ Surface = Callable[[Tensor, Tensor], Tensor]
 def surface_engine(
     network: SurfaceNetwork, sha256: str, device: torch.device, wanted: Inference
 ) -> "tuple[Engine, OnnxSurface | None]":
-    """Who runs the network; nothing more is needed for torch.
+    """Select the engine of the network.
 
     Args:
         network: folded.
@@ -169,7 +169,7 @@ def full_precision(device: torch.device) -> AbstractContextManager[None]:
 
 
 def _missing(device: torch.device) -> str | None:
-    """Why ONNX Runtime cannot be used at all; None if it can."""
+    """Reason why ONNX Runtime cannot be used; None if it can."""
     if device.type != "cpu":
         return f"it runs on a CPU only, and the device is {device}"
     absent = [name for name in ("onnxruntime", "onnx") if find_spec(name) is None]
@@ -186,7 +186,7 @@ def _without(wanted: Inference, fault: str) -> tuple[Engine, None]:
 
 
 def _probe(network: SurfaceNetwork) -> tuple[Tensor, Tensor]:
-    """An image and a given surface map, always the same."""
+    """Fixed test image and given surface map."""
     height, width = (strides * network.architecture.stride for strides in _PROBE)
     chance = torch.Generator().manual_seed(0)
     images = torch.rand(1, 3, height, width, generator=chance)
@@ -200,7 +200,7 @@ def _difference(network: SurfaceNetwork, other: Surface) -> float:
 
 
 def _remembered(network: SurfaceNetwork, sha256: str, other: Surface) -> Engine:
-    """The faster one, as it was measured the first time on this machine."""
+    """The faster engine, from a measurement stored on this machine."""
     versions = [version(name) for name in ("torch", "onnxruntime")]
     machine = platform.node(), platform.processor(), torch.get_num_threads(), inference_threads()
     key = fingerprint(_MEASUREMENT, sha256, versions, machine)[:32]
@@ -227,7 +227,7 @@ def _read(path: Path) -> Engine | None:
 
 @torch.no_grad()
 def _times(network: SurfaceNetwork, other: Surface) -> dict[Engine, float]:
-    """Seconds for the probe, each the shortest of some rounds in turn: others at work only lengthen them."""
+    """Shortest of several alternating timings of each engine [s]."""
     images, given = _probe(network)
     engines: dict[Engine, Callable[[], Tensor]] = {
         "torch": lambda: network(images.contiguous(memory_format=torch.channels_last), given).map(),

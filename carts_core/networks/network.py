@@ -1,4 +1,4 @@
-"""The two networks.
+"""Feature network and surface network.
 
 The feature network is a small U-Net whose last layer before the 1x1 head is what ACS compares. The surface network
 predicts a surface map from an image and the surface map of a prior pose.
@@ -38,7 +38,7 @@ class UNet(nn.Module):
     """
 
     kind: ClassVar[str]
-    """What a weights file calls the network."""
+    """Name of the network in weights files."""
 
     def __init__(self, architecture: Architecture, inputs: int) -> None:
         super().__init__()
@@ -53,7 +53,7 @@ class UNet(nn.Module):
         self.decoder = nn.ModuleList(_block(o, o, n) for o, n in zip(widths[:-1], counts, strict=True))
 
     def decoded(self, x: Float[Tensor, "batch inputs h w"]) -> tuple[Tensor, Tensor]:
-        """The finest features, and those at half the resolution that they were made of.
+        """Features at full resolution, and those at half the resolution from which they were computed.
 
         Raises:
             SettingsError: another number of channels, or a size that is no multiple of `architecture.stride`.
@@ -77,7 +77,7 @@ class UNet(nn.Module):
         return standardize(images, block, self.architecture.local_contrast)
 
     def check_input(self, x: Tensor, channels: int) -> None:
-        """See that a tensor has so many channels, and a size that the levels can halve.
+        """Check the number of channels, and that the size can be halved at each level.
 
         Raises:
             SettingsError: it has not.
@@ -196,7 +196,7 @@ _HIDDEN = 24
 
 @dataclass(frozen=True)
 class SurfaceLogits:
-    """A predicted surface map before its coverage is made one of shares; see `carts_core.model.parts`."""
+    """Predicted surface map with logits for its coverage; see `carts_core.model.parts`."""
 
     coverage: Float[Tensor, "batch parts+1 h w"]
     """Log odds of background and of each part."""
@@ -226,7 +226,7 @@ class SurfaceNetwork(UNet):
         self.out = nn.Conv2d(_HIDDEN, len(PARTS) + 1 + 3, 1)
 
     def forward(self, images: Float[Tensor, "batch 3 h w"], given: Float[Tensor, "batch 6 h w"]) -> SurfaceLogits:
-        """What the images show.
+        """Predict surface maps of images.
 
         Args:
             images: RGB in [0, 1]; h and w are multiples of `architecture.stride`.

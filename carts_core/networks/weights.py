@@ -52,7 +52,7 @@ _REMEDY = "Train weights with `carts train`, or reinstall carts to get the shipp
 
 @dataclass(frozen=True)
 class Weights:
-    """What a weights file holds."""
+    """Contents of a weights file."""
 
     network: UNet
     """The trained network, in evaluation mode, not folded."""
@@ -65,7 +65,7 @@ class Weights:
 
 
 def save_weights(network: UNet, path: Path, training: dict, working_size: tuple[int, int]) -> None:
-    """Write a weights file; a reader never sees half of it.
+    """Write a weights file atomically.
 
     Args:
         network: the network whose state is written (batch norms included, so that training can go on from it).

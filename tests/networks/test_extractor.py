@@ -1,3 +1,5 @@
+"""Feature extractor, weights files and hybrid images."""
+
 from pathlib import Path
 
 import pytest
@@ -5,7 +7,7 @@ import torch
 from safetensors.torch import save_file
 
 from carts_core.errors import WeightsError
-from carts_core.networks import FeatureExtractor
+from carts_core.networks import FeatureExtractor, hybrid
 from carts_core.networks.network import FeatureNetwork, SurfaceNetwork
 from carts_core.networks.weights import VERSION, read_weights, save_weights
 from carts_core.settings import Architecture
@@ -130,3 +132,27 @@ def test_a_surface_network_takes_the_place_of_the_shipped_one(tmp_path: Path, sm
 def test_two_files_of_one_kind_are_refused_by_name(small_weights: Path):
     with pytest.raises(WeightsError, match=r"small\.safetensors and .*small\.safetensors both hold a feature network"):
         FeatureExtractor.load(small_weights, small_weights)
+
+
+def test_a_hybrid_shows_the_rendering_inside_the_silhouette_and_the_background_outside():
+    rendering, background = torch.rand(3, 4, 6), torch.rand(3, 4, 6)
+    silhouette = torch.zeros(4, 6)
+    silhouette[1:3, 2:5] = 1
+    rendering = rendering * silhouette
+    image = hybrid(rendering, silhouette, background)
+    inside = silhouette.bool()
+    torch.testing.assert_close(image[:, inside], rendering[:, inside])
+    torch.testing.assert_close(image[:, ~inside], background[:, ~inside])
+
+
+def test_one_background_serves_a_batch_of_hypotheses():
+    assert hybrid(torch.rand(5, 2, 3, 4, 6), torch.rand(5, 2, 4, 6), torch.rand(3, 4, 6)).shape == (5, 2, 3, 4, 6)
+
+
+def test_a_point_that_moves_outwards_takes_the_backgrounds_place():
+    """Where the silhouette grows by a share, so does the rendering, and the background gives way by that share."""
+    silhouette = torch.zeros(1, 1, requires_grad=True)
+    tool = 0.9 * torch.ones(3, 1, 1)
+    hybrid(tool * silhouette, silhouette, torch.full((3, 1, 1), 0.25)).sum().backward()
+    assert silhouette.grad is not None
+    torch.testing.assert_close(silhouette.grad, torch.full((1, 1), 3 * (0.9 - 0.25)))

@@ -1,1 +1,1 @@
-"""Networks of others on our frames: the rows of the paper's table that look at images alone, or at a rendering, too."""
+"""Baselines of the benchmark: segmentation networks with the image, or image and rendering, as input."""

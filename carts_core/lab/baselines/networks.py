@@ -74,7 +74,7 @@ _HEADS = (1, 2, 4, 8)
 
 
 class Baseline(nn.Module):
-    """A network that says where instruments are.
+    """Baseline segmentation network.
 
     Args:
         settings: which, and how large.
@@ -163,7 +163,7 @@ def _swin_options(settings: BaselineNetwork) -> dict[str, Any]:
 
 
 def _made(settings: BaselineNetwork, make: Any) -> Any:
-    """What `make` gives, an encoder that timm does not know said in words."""
+    """Result of `make`; an encoder that timm does not have is reported as an error."""
     import timm  # noqa: PLC0415
 
     if not timm.is_model(settings.timm_encoder):
@@ -187,7 +187,7 @@ _REMEDY = "Train one with `carts baseline`."
 
 @dataclass(frozen=True)
 class TrainedBaseline:
-    """What a weights file holds."""
+    """Contents of a weights file."""
 
     network: Baseline
     """In evaluation mode."""
@@ -202,7 +202,7 @@ class TrainedBaseline:
 
 
 def save_baseline(network: Baseline, path: OutputPath, training: dict[str, Any]) -> None:
-    """Write a weights file; a reader never sees half of it."""
+    """Write a weights file atomically."""
     metadata = {
         "format": FORMAT,
         "version": _VERSION,

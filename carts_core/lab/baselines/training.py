@@ -54,7 +54,7 @@ def augmentation(name: Augmentation, rng: np.random.Generator) -> Change:
 
 
 def smoked(image: UInt8[Tensor, "3 h w"], rng: np.random.Generator) -> UInt8[Tensor, "3 h w"]:
-    """An image of five with a flat layer of smoke from the diamond-square algorithm, the others as they are."""
+    """Add a flat layer of diamond-square smoke to every fifth image on average."""
     if rng.random() >= SMOKE_SHARE:
         return image
     height, width = image.shape[1:]
@@ -179,17 +179,17 @@ class TrainingFrames:
 
 
 def missing_chunks(folder: OutputPath, count: int) -> list[int]:
-    """Numbers of the files that have to be made for so many frames."""
+    """Numbers of the missing files for a number of frames."""
     return [chunk for chunk in range(chunks_of(count)) if not holds_file(_file(folder, chunk))]
 
 
 def chunks_of(count: int) -> int:
-    """Files that hold so many frames."""
+    """Number of files for a number of frames."""
     return -(-count // CHUNK)
 
 
 def make_chunk(folder: OutputPath, chunk: int, seed: int, progress: Callable[[int], None] = lambda done: None) -> None:
-    """Make one file of frames; it depends on the seed and its number only.
+    """Write one file of frames; its contents depend on the seed and its number only.
 
     Args:
         folder: where it is written.
@@ -238,14 +238,14 @@ def _read(path: Path) -> tuple[Tensor, Tensor, Tensor]:
 
 WEIGHTS_FILE = "baseline.safetensors"
 VALIDATION = 100
-"""The last so many frames are not learned from."""
+"""Number of validation frames, the last ones."""
 _MAY_CHANGE = ("steps", "minutes", "checkpoint_every", "threads", "device")
 _LOG_EVERY = 20
 
 
 @dataclass(frozen=True)
 class BaselineResult:
-    """What a finished run leaves behind."""
+    """Files and metrics of a finished run."""
 
     weights: Path
     steps: int
@@ -258,7 +258,7 @@ class BaselineResult:
 def prepare_frames(
     folder: OutputPath, training: BaselineTraining, say: Callable[[str], None] = lambda line: None
 ) -> TrainingFrames:
-    """The training frames in a folder, which all baselines may share; those that are not there are made.
+    """Training frames in a folder that baselines may share; missing ones are generated.
 
     Raises:
         OutputError: the folder cannot be written to.
@@ -278,7 +278,7 @@ def train_baseline(
     output: Path,
     say: Callable[[str], None] = lambda line: None,
 ) -> BaselineResult:
-    """Train a baseline, or go on with the run that `output` holds.
+    """Train a baseline, or resume the run in `output`.
 
     Args:
         network: which, and how large.

@@ -22,12 +22,12 @@ SHARE = 0.3
 """Part of the visible instruments that is covered."""
 _SENSOR = dataclasses.replace(SensorConfig(), vignette=0.0)
 _SURROUNDINGS = 0.3
-"""Reflectance of what else is in the picture, from which the light is guessed."""
+"""Reflectance of the surroundings, from which the light is estimated."""
 
 
 @dataclass(frozen=True)
 class Occluded:
-    """A picture with occluders in it."""
+    """Image with occluders."""
 
     image: UInt8[np.ndarray, "h w 3"]
     hidden: Bool[np.ndarray, "h w"]
@@ -209,7 +209,7 @@ _STAND_INS = ("double_fenestrated_grasper", "clip_applier", "maryland_bipolar_fo
 
 
 def wrong_inputs(frames: int, cameras: int, *, built_in: bool) -> tuple[str, ...]:
-    """Those that a recording can have.
+    """Kinds of wrong inputs that a recording allows.
 
     Args:
         frames: of the recording.
@@ -232,7 +232,7 @@ def with_other_instruments(scene: Scene, index: int) -> Scene:
 
 
 def misled(recording: Recording, kind: str, index: int, camera: str) -> Frame:
-    """A frame in the regular domain with something wrong about it.
+    """Frame of the regular domain whose image contradicts its kinematics.
 
     Its masks are those of the image that is shown, so the estimate can be scored as any other.
 

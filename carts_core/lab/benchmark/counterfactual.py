@@ -74,7 +74,7 @@ class RealSurface:
         self._T_world_camera = np.diag([1.0, -1.0, -1.0, 1.0])
         self._T_world_camera[2, 3] = DISTANCE
         self.lens: np.ndarray = self._T_world_camera[:3, 3]
-        """The lens, in the world."""
+        """Position of the lens in the world [m]."""
         camera = scene.cameras[0]
         fx, fy, cx, cy = camera.intrinsics
         rows, columns = np.indices((camera.height, camera.width)) + 0.5
@@ -247,5 +247,5 @@ class Counterfactual:
 
 @cache
 def _relief(seed: int) -> Tissue:
-    """In whose hollows blood gathers; nothing else of it is seen."""
+    """Invisible relief; blood gathers in its hollows."""
     return grow_tissue("muscle", 256, 1024, SynthesisConfig(seed=seed).rng("tissue"))

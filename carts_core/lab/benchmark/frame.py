@@ -37,12 +37,12 @@ from .scope import METHODS, Run
 from .sources import Recording
 
 _SEED = 0
-"""Of the signs of errors made on purpose."""
+"""Seed of the signs of initial offsets."""
 
 
 @dataclass(frozen=True)
 class Truth:
-    """What the estimates of one frame are compared with, in one camera.
+    """Truth of a frame in one camera.
 
     Attributes:
         camera: its name.
@@ -59,7 +59,7 @@ class Truth:
     hidden: Bool[np.ndarray, "h w"] | None = None
 
     def score_mask(self, mask: Bool[np.ndarray, "h w"], seconds: float) -> Score:
-        """The score of a mask without kinematics."""
+        """Score of a mask without kinematics."""
         return Score(None, *self._overlap(mask), None, None, None, seconds, self._wide(mask))
 
     def score(
@@ -449,7 +449,7 @@ def segment_rendered(run: Run, scene: Scene, frame: Frame, extractor: FeatureExt
 
 
 class _Rendering:
-    """What is rendered of the measured joint positions, at the network's size."""
+    """Rendering at the measured joint positions, at the network's size."""
 
     def __init__(self, scene: Scene, camera: str, size: tuple[int, int]) -> None:
         self._scene = scene.with_cameras([camera])

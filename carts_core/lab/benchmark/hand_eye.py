@@ -84,9 +84,9 @@ class ArmViews:
     """Views of the arm from one camera that stands still, each in another pose."""
 
     scene: Scene
-    """With the true base frame and camera."""
+    """Scene with the true base frame and camera."""
     frames: tuple[Frame, ...]
-    """With masks; measured joint positions are true."""
+    """Frames with masks; measured joint positions are exact."""
 
 
 def arm_views(folder: Path, count: int, seed: int, room: UInt8[np.ndarray, "h w 3"] | None = None) -> ArmViews:
@@ -159,7 +159,7 @@ def _rays(
 
 _VIEWS = 10
 _STARTS = 10
-"""Of each condition, before it can be called met."""
+"""Least number of starts of each condition for a verdict on its target."""
 _FREE = FreeParameters(joints=False, base_frames=True)
 _CODE = ("lab/benchmark/hand_eye.py", "lab/benchmark/rooms.py")
 
@@ -170,11 +170,11 @@ class HandEyeCondition:
 
     name: str
     angle_deg: float
-    """How far the base frame is turned at the start [deg]."""
+    """Rotation of the base frame at the start [deg]."""
     distance: float
-    """And moved [m]."""
+    """Translation of the base frame at the start [m]."""
     masks: bool
-    """Whether masks are the target; otherwise what the network sees."""
+    """Whether masks are fitted; otherwise predictions of the network."""
     most_deg: float
     most_distance: float
     """[m]"""
@@ -189,20 +189,20 @@ CONDITIONS = (
 
 @dataclass(frozen=True)
 class HandEyeRun:
-    """What came of one start."""
+    """Result of one start."""
 
     condition: str
     seed: int
-    """Of the views and the start."""
+    """Seed of the views and the start."""
     angle_deg: float
-    """Of the base frame that was found against the true one [deg]."""
+    """Rotation error of the base frame [deg]."""
     distance: float
-    """Between their origins [m]."""
+    """Translation error of the base frame [m]."""
     verdict: str
 
 
 def known_hand_eye(path: OutputPath, extractor: FeatureExtractor) -> list[HandEyeRun]:
-    """Runs that this code and these weights have written to `path`; none if there are no such."""
+    """Stored runs of this code and these weights."""
     try:
         stored = parse_json(read_bytes(path.path, VALUES))
         return [HandEyeRun(**run) for run in stored["runs"]] if stored["of"] == _of(extractor) else []
@@ -213,7 +213,7 @@ def known_hand_eye(path: OutputPath, extractor: FeatureExtractor) -> list[HandEy
 def measure_hand_eye(
     path: OutputPath, extractor: FeatureExtractor, starts: int, say: Callable[[str], None] = lambda line: None
 ) -> list[HandEyeRun]:
-    """Calibrate from so many starts of each condition that are not in `path` yet, and write them there one by one."""
+    """Calibrate from the missing starts of each condition, and append each result to `path`."""
     runs = known_hand_eye(path, extractor)
     done = {(run.condition, run.seed) for run in runs}
     for condition in CONDITIONS:
@@ -226,7 +226,7 @@ def measure_hand_eye(
 
 
 def hand_eye_table(runs: list[HandEyeRun]) -> Table | None:
-    """How many starts ended near enough, and the verdicts on the others."""
+    """Table of success rates and verdicts by condition."""
     rows = []
     for condition in CONDITIONS:
         if found := [run for run in runs if run.condition == condition.name]:
@@ -249,7 +249,7 @@ def hand_eye_table(runs: list[HandEyeRun]) -> Table | None:
 
 
 def hand_eye_targets(runs: list[HandEyeRun]) -> list[Target]:
-    """The lines of the table of targets about hand-eye calibration."""
+    """Targets of hand-eye calibration."""
     found = []
     for condition in CONDITIONS:
         own = [run for run in runs if run.condition == condition.name]

@@ -34,9 +34,9 @@ from ...wording import counted
 from .scope import METHODS, Run, Scope
 
 TOLERANCE = 2.0
-"""Of the normalized surface distance [px]."""
+"""Tolerance of the normalized surface distance [px]."""
 WIDE_TOLERANCE = 5.0
-"""Of a second one [px]."""
+"""Tolerance of the second normalized surface distance [px]."""
 _MEASURED = (
     "*.py",
     "imaging/**/*.py",
@@ -85,15 +85,15 @@ BEST_OF = (30, 50)
 
 @dataclass(frozen=True)
 class Score:
-    """How good one estimate is."""
+    """Scores of an estimate."""
 
     loss: float | None
-    """None for a method without one, and where losses do not compare from one iterate to the next."""
+    """Loss; None for a method without one, and where losses of iterates are not comparable."""
     dice: float
     nsd: float
     """Normalized surface distance within `TOLERANCE`."""
     joint_mae_deg: float | None
-    """Over measured revolute joints; None without true joint positions."""
+    """Mean absolute error of measured revolute joints [deg]; None without true joint positions."""
     visible_joint_mae_deg: float | None
     """The same over those that the image determines; None where the optimizer does not report which."""
     tip_depth_mm: float | None
@@ -108,26 +108,26 @@ class Score:
 
 @dataclass(frozen=True)
 class Measurement:
-    """One run's result."""
+    """Result of a run."""
 
     run: Run
     final: Score
-    """Of what the method returns."""
+    """Score of the method's result."""
     trace: tuple[Score, ...]
-    """Of every iterate, the start first; empty for a method without iterates."""
+    """Scores of all iterates, the start first; empty for a method without iterates."""
     best: tuple[int, ...]
     """For each iterate, the place of the one that the optimizer held for the best when it had come there. Losses of a
     coarse and a fine stage need not compare, so only the optimizer knows."""
     stopped: str
-    """Why the optimization ended."""
+    """Reason why the optimization ended."""
     machine: str
-    """What it ran on, for people."""
+    """Description of the machine."""
     before: Score | None = None
-    """Of the start, where iterates are not followed, or do not begin with it."""
+    """Score of the start, where the trace does not begin with it."""
     verdict: str | None = None
-    """`good`, `doubtful` or `failed`, where the method says so."""
+    """`good`, `doubtful` or `failed`, where the method assesses its result."""
     probability: float | None = None
-    """That the mask is wrong, as the verdict has it [1]."""
+    """Probability that the mask is wrong [1]."""
     within: tuple[int, int, int] | None = None
     """Joint positions with a truth and a deviation; those that err by at most one deviation; by at most two."""
 
@@ -147,7 +147,7 @@ class Measurement:
         return self.start is not None and self.final.dice < self.start.dice - 0.01
 
     def best_of(self, iterations: int) -> Score | None:
-        """What would have been returned after so many steps; None where the run was cut before them.
+        """Best score within a number of steps; None where the run was cut before.
 
         Its `seconds` are those of all these steps.
         """
@@ -240,11 +240,11 @@ class ResultsFile:
                 self.unreadable += 1
 
     def find(self, run: Run, fingerprint: str) -> Measurement | None:
-        """The measurement of a run under exactly these settings, weights and code; None if it is not there."""
+        """Stored measurement of a run under the same settings, weights and code; None without one."""
         return self._known.get((run, fingerprint))
 
     def append(self, measurement: Measurement, fingerprint: str, **also: str) -> None:
-        """Add a measurement and see it on disk.
+        """Append a measurement, and flush it to disk.
 
         Args:
             measurement: what was measured.
@@ -281,7 +281,7 @@ def on_gpu(text: str) -> bool:
 
 
 def milliseconds(work: Callable[[], object], runs: int) -> float:
-    """Median duration of `work` [ms], after two calls that do not count."""
+    """Median duration of `work` [ms], after two warm-up calls."""
     for _ in range(2):
         work()
     times = []
@@ -352,7 +352,7 @@ _RUNS = 10
 
 
 def known_stages(path: OutputPath, extractor: FeatureExtractor) -> dict[str, float]:
-    """Figures that this machine and this code have written to `path`; none if there are no such."""
+    """Stored times of this machine and this code."""
     try:
         stored = parse_json(read_bytes(path.path, VALUES))
         return stored["ms"] if stored["of"] == _of(extractor) else {}

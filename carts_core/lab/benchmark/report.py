@@ -92,7 +92,7 @@ _BARS = ("#9aa0a6", "#d0d3d6", "#c9a227", "#e0905c", "#b3541e", "#1f5fa8")
 
 
 def write_figures(data: Measurements, folder: OutputPath) -> dict[str, Path]:
-    """Draw every plot that the measurements allow; returns its caption -> its file."""
+    """Draw all plots for which there are measurements; returns caption -> file."""
     made: dict[str, Path] = {}
     for name, caption, draw in (
         ("domains", "Dice by method and domain, from the measured kinematics. Lines: standard deviation.", _domains),
@@ -277,7 +277,7 @@ def _mae(score: Score) -> float | None:
 
 @dataclass(frozen=True)
 class Facts:
-    """What the report says about its origin."""
+    """Provenance of the report."""
 
     scope: str
     """`quick` or `full`."""

@@ -1,4 +1,4 @@
-"""Rooms without instruments, made or photographed, and recorded instruments composited into them."""
+"""Backgrounds without instruments, synthetic or photographed, and compositing of recorded instruments."""
 
 import dataclasses
 import zlib

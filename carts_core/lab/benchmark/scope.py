@@ -151,7 +151,7 @@ class Method:
     """One way from images and measured kinematics to a mask."""
 
     label: str
-    """For people."""
+    """Label in tables."""
     settings: Callable[[int], SolverSettings] | None
     """From the number of steps in the paper's setting to the optimizer's settings; None takes the network's own mask
     and looks at no kinematics."""

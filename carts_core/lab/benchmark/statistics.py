@@ -26,13 +26,13 @@ class Spread:
 
     @staticmethod
     def of(values: Iterable[float | None]) -> "Spread | None":
-        """Over the values that are known; None where there are none."""
+        """Spread of the known values; None without any."""
         known = [value for value in values if value is not None]
         return Spread(float(np.mean(known)), float(np.std(known)), len(known)) if known else None
 
 
 class Measurements:
-    """What is known, and a way to ask for a part of it."""
+    """Measurements, and selections of them."""
 
     def __init__(self, measurements: Iterable[Measurement]) -> None:
         self.all = list(measurements)
@@ -103,7 +103,7 @@ def _usual(source: str) -> bool:
 
 
 def scores(measurements: Iterable[Measurement], iterations: int | None = None) -> list[Score]:
-    """What each method returned, or its best of the first so many steps."""
+    """Final scores of measurements, or the best ones of a number of steps."""
     found = (entry.final if iterations is None else entry.best_of(iterations) for entry in measurements)
     return [score for score in found if score is not None]
 
@@ -118,13 +118,13 @@ DOMAIN_LABELS = {
     OCCLUSION: "occlusion",
 }
 SHORT_LABELS = {"paper": "paper's setting", "ours": "ours"}
-"""Of the methods that are followed through iterations and errors."""
+"""Labels of methods in tables by iterations and errors."""
 NOTHING = "–"
-"""In place of a number that is not there."""
+"""Placeholder for a missing number."""
 
 
 def begun(error_deg: float | None) -> str:
-    """Where a run started."""
+    """Start of a run, for tables."""
     return "as measured" if error_deg is None else f"{error_deg:g}°"
 
 
@@ -202,7 +202,7 @@ class Target:
     """None where it is open: nothing was measured, or nothing that misses it, but not all that it asks for."""
     reference: str
     basis: str
-    """What it was computed from."""
+    """Data that it was computed from."""
 
 
 def make_target(

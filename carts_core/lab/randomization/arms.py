@@ -68,7 +68,7 @@ class Body(Protocol):
 
 
 class RobotGeometry:
-    """What placing and shading need to know about a robot.
+    """Properties of a robot for placing and shading.
 
     Attributes:
         vertices, normals: of all parts, each in the frame of its link [V, 3].
@@ -157,7 +157,7 @@ class Variant:
     geometries: tuple[RobotGeometry, ...]
     """The arms that the camera observes."""
     rendered: tuple[RobotGeometry, ...]
-    """The arms as the optimizer knows them: the same, or of slightly other proportions, as models are."""
+    """Arms of the optimizer's model: equal, or with slightly different proportions, as real models have."""
     renderer: Renderer
     """The optimizer's renderer of `rendered`, for hybrid images."""
 

@@ -150,7 +150,7 @@ def foil(rng: np.random.Generator, width: int, height: int) -> Image:
 
 
 def drape(rng: np.random.Generator, width: int, height: int) -> Image:
-    """Cloth that hangs or lies in folds."""
+    """Cloth in folds."""
     y, x = np.mgrid[:height, :width].astype(np.float32)
     angle, period = rng.uniform(0, np.pi), np.exp(rng.uniform(np.log(14), np.log(90)))
     warp = rng.uniform(0.2, 1.0) * period * smooth_noise(rng, width, height, rng.uniform(2, 6), 2)

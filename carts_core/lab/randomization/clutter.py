@@ -302,7 +302,7 @@ def cast_shadow(rng: np.random.Generator, image: Image, coverage: Float[np.ndarr
 def contact_shadow(
     rng: np.random.Generator, image: Image, coverage: Float[np.ndarray, "h w"], darkness: float
 ) -> Image:
-    """A crisp shadow right beside the arms, about as dark and as grey as they are, so that only shape tells it apart.
+    """Sharp shadow beside the arms with similar brightness and colour, which only differs in shape.
 
     Args:
         rng: random numbers.

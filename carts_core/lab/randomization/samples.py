@@ -43,7 +43,7 @@ _CONTACT = 0.4
 
 @dataclass(frozen=True)
 class Observation:
-    """An observed image and everything that it was made of."""
+    """Observed image with the scene that it was rendered from."""
 
     image: Float[np.ndarray, "h w 3"]
     """RGB in [0, 1]."""
@@ -51,7 +51,7 @@ class Observation:
     placements: list[Placement]
     """Where the arms are."""
     claimed: list[Placement]
-    """Where arms are said to be: the same, but for arms that are not there."""
+    """Given poses of the arms: equal to the true ones, except for absent arms."""
     intrinsics: Intrinsics
     view: GBuffer
     """What each pixel's centre sees."""
@@ -120,7 +120,7 @@ class Observer:
         return variant
 
     def _visible_placements(self, variant: Variant) -> tuple[Intrinsics, list[Placement], GBuffer]:
-        """Arms of which the camera sees neither too little nor too much; after some tries, whatever it sees."""
+        """Arms whose visible area is within bounds, or the last ones drawn after some attempts."""
         settings, rng = self.settings, self.rng
         size = settings.width, settings.height
         tries = 0

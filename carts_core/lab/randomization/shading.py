@@ -223,7 +223,7 @@ def _light(gbuffer, view, n_v, roughness, base, body, position, radiance) -> np.
 
 
 def _random_lights(rng: np.random.Generator, distance: float) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Position [m] and radiance of some lights: one or two at the lens, others anywhere on the camera's side."""
+    """Positions [m] and radiances of the lights: one or two at the lens, others on the camera's side."""
     lights = []
     at_lens = rng.integers(1, 3)
     for index in range(at_lens + rng.integers(0, 3)):

@@ -101,7 +101,7 @@ class Bleeding:
         return _FILM_DEPTH * (0.25 * smoothstep(above, -0.05, 0.10) + smoothstep(above, 0.0, 1.0))
 
     def _wet_normal(self, surface: Surface, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """Pools lie flatter than the tissue under them, with small waves."""
+        """Pools are flatter than the tissue below, with small waves."""
         slope = np.stack([sample(self._waves[..., axis], x, y) for axis in (0, 1)], axis=-1)
         waves = np.concatenate([-0.35 * slope, np.zeros((*slope.shape[:-1], 1))], axis=-1)
         soft = cv2.GaussianBlur(surface.normal.astype(np.float32), (0, 0), surface.normal.shape[1] / 60)
@@ -110,7 +110,7 @@ class Bleeding:
 
 
 def _level_of(field: np.ndarray, share: float) -> float:
-    """The level above which a share of the field lies; far above all of it when that share is none."""
+    """Level above which a share of the field lies; above its maximum for a share of 0."""
     return float(np.quantile(field, 1.0 - share)) if share > 0 else float(field.max()) + 10.0
 
 

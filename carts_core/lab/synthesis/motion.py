@@ -261,7 +261,7 @@ def enlargement(config: EndoscopeConfig) -> float:
 
 
 def small_world(config: SynthesisConfig) -> SynthesisConfig:
-    """The settings with the camera as it stands in the world that is traced."""
+    """Settings with the camera at the scale of the traced scene."""
     endoscope, scale = config.endoscope, enlargement(config.endoscope)
     small = replace(endoscope, distance=endoscope.distance / scale, baseline=endoscope.baseline / scale)
     return replace(config, endoscope=small)
@@ -286,7 +286,7 @@ def measurement_error(robot: Robot, error: MeasurementError) -> MeasurementError
 def plan_arm(
     robot: Robot, tissues: Sequence[Tissue], camera: Camera, config: SynthesisConfig, scale: float
 ) -> tuple[Arm, Float[np.ndarray, "frames dofs"]]:
-    """Where the arm stands, and its true joint positions [rad, m]; its tip is at work in the middle of the picture.
+    """Pose of the arm and its true joint positions [rad, m], with the tip near the image centre.
 
     Args:
         robot: of the arm.

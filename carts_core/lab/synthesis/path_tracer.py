@@ -255,7 +255,7 @@ def _without_specks(image: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w
 
 
 _DARK = 0.3
-"""Parts of a darker colour than this are plastic; so is the longest part of the shaft, whatever the URDF paints it."""
+"""Parts darker than this are rendered as plastic, and so is the longest part of the shaft."""
 
 
 @dataclass(frozen=True)

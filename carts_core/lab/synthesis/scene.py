@@ -63,7 +63,7 @@ _REMOTE_CENTRES_CAMERA = ((-0.092, 0.062, 0.006), (0.098, -0.010, 0.002))
 """Where the instruments pass the body wall, in the left camera's frame [m]."""
 
 WORK_POINTS = ((-0.011, -0.001, 0.014), (0.012, 0.002, 0.014))
-"""What the instruments point at when their joints stand in the middle, in the world [m]."""
+"""Points of the world that the instruments point at with centred joints [m]."""
 
 
 def place_cameras(config: EndoscopeConfig) -> tuple[Camera, ...]:
@@ -157,12 +157,12 @@ _KINDS = {
     "fat": _Kind((0.56, 0.36, 0.145), (0.46, 0.20, 0.085), (0.45, 0.15, 0.11), 0.26, 0.0022, 0.0016, 9, 0.38),
 }
 KINDS = tuple(_KINDS)
-"""Names of the kinds of tissue that `grow_tissue` knows."""
+"""Kinds of tissue of `grow_tissue`."""
 
 
 @dataclass(frozen=True)
 class Tissue:
-    """A patch of tissue around the world's origin, z up. Row r, column c of a field lies at y, x from -EXTENT / 2."""
+    """Patch of tissue around the world's origin, z up; rows and columns of fields are y and x from -EXTENT / 2."""
 
     heights: Float[np.ndarray, "n n"]
     """Height above z = 0 [m] at the grid's points."""

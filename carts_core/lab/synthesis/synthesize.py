@@ -89,7 +89,7 @@ def write_table(
 def write_sequence_file(
     path: OutputPath, config: SynthesisConfig, output: Path, arms: Sequence[Arm], cameras: Sequence[Camera]
 ) -> None:
-    """The sequence file that ties the others together; `output` is the folder that it will lie in."""
+    """Write the sequence file; `output` is its final folder."""
     domains = ", ".join(f'"{domain}"' for domain in config.domains)
     sections = [
         'format = "carts-sequence/1"\n'
@@ -185,7 +185,7 @@ def synthesize(config: SynthesisConfig, output: OutputPath | Path | str, progres
 
 
 def _write_sequence(config: SynthesisConfig, work: OutputPath, output: Path, report: Progress) -> None:
-    """Write into `work` what is not there yet; `output` is where it will lie in the end."""
+    """Write missing files into `work`; `output` is their final folder."""
     frames = config.motion.frames
     report("tissue, robots and motion", 0, frames)
     tissue, other = _grow_tissues(config)
@@ -231,7 +231,7 @@ class _Tracing:
         self._gains: list[float] = []
 
     def trace(self, folder: OutputPath, frame: int) -> None:
-        """All pictures of one frame. Its masks come last: they say that the frame is complete."""
+        """Write all images of a frame; its masks, written last, mark it complete."""
         masks = []
         for number, camera in enumerate(self._cameras):
             view, mask = self._view(frame, number)

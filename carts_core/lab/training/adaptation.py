@@ -107,7 +107,7 @@ class Judgement:
         return found
 
     def lines(self) -> list[str]:
-        """The figures before and after, for people."""
+        """Summary of metrics before and after."""
         (before, after), (was, now) = self.made, self.own
         count = len(was.tips)
         return [
@@ -162,7 +162,7 @@ def judge(
 
 @dataclass(frozen=True)
 class MadeImage:
-    """A made image of arms at known joint positions."""
+    """Synthetic image of arms at known joint positions."""
 
     scene: Scene
     frame: Frame
@@ -295,7 +295,7 @@ class Offer:
     worse: list[str]
     """What became worse."""
     lines: list[str]
-    """Figures before and after, for people."""
+    """Summary of metrics before and after."""
 
 
 def adapted_to(recording: Path, output: Path, given: TrainingConfig) -> TrainingConfig:
@@ -354,7 +354,7 @@ def _write_backgrounds(sequence: Sequence, output: Path) -> int:
 
 
 def gain(before: dict[str, float], now: dict[str, float]) -> str:
-    """What a run has reached, for people; figures are those of the surface network's validation."""
+    """Summary of a run's progress from two validations of the surface network."""
     share = (1 - now["dice"]) / (1 - before["dice"]) if before["dice"] < 1 else np.nan
     dice = f"Dice {before['dice']:.3f} -> {now['dice']:.3f}, {share:.0%} of the error is left"
     parts = ", ".join(f"{part} {before[f'dice_{part}']:.3f} -> {now[f'dice_{part}']:.3f}" for part in PARTS)

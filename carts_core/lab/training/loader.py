@@ -27,7 +27,7 @@ _MEMORY = 300
 
 
 class _Samples(Dataset):
-    """The samples of a run by number, so that a run that goes on has those that it would have had.
+    """Training samples by number, so that a resumed run has the same samples as an uninterrupted one.
 
     With one worker, or none, `reuse` has every so manieth sample made, and the others chosen of the newest `_MEMORY`
     made ones. With several, batches are dealt to them in turn, and each chooses of its own.
@@ -77,7 +77,7 @@ class _Samples(Dataset):
 
 
 def _outlive_signals(closing: Event, parent: int, worker: int) -> None:
-    """Signals to the whole process group stop the parent, which ends its workers once it has kept its work."""
+    """Ignore signals of the process group: the parent ends its workers after saving."""
     end_with_parent(parent, signal.SIGKILL)
 
     def end_if_closing(*_: object) -> None:
@@ -123,7 +123,7 @@ def _stream(loader: DataLoader) -> Generator[Batch]:
 
 
 def validation_set(config: TrainingConfig) -> Batch:
-    """The same samples every time, from random numbers that training never sees."""
+    """Validation samples, from a fixed stream of random numbers that training does not use."""
     task = task_of(config.network)
     generator = task.generator(config, (config.seed, VALIDATION_STREAM))
     samples = [task.tensors(generator(number)) for number in range(config.validation_samples)]

@@ -96,7 +96,7 @@ class Checkpoint:
 
 
 def load_checkpoint(folder: Path) -> Checkpoint | None:
-    """The checkpoint of a run, None if there is none yet.
+    """Checkpoint of a run; None before the first one.
 
     Raises:
         WeightsError: the file is there and cannot be read.

@@ -21,19 +21,19 @@ Batch = tuple[Tensor, ...]
 
 
 class Task(Protocol):
-    """A network, what it learns from, and how well it does; without state, so that workers can make their own."""
+    """Network, samples, loss and validation of a training; stateless, so that workers can create their own."""
 
     columns: ClassVar[dict[str, str]]
     """Validation figures: name -> heading in the report."""
     score: ClassVar[str]
-    """The figure that tells whether a network has become better; higher is better."""
+    """Name of the metric by which networks are compared; higher is better."""
 
     def network(self, config: TrainingConfig) -> nn.Module:
         """A network with random weights."""
         ...
 
     def generator(self, config: TrainingConfig, stream: Sequence[int]) -> Callable[[int], Any]:
-        """Makes the sample of a number, counted from 0; every stream of a seed has others."""
+        """Returns a generator of samples by number, counted from 0; streams of a seed are independent."""
         ...
 
     def flipped(self, sample: Any, horizontally: bool, vertically: bool) -> Any:
@@ -231,7 +231,7 @@ class FeatureTask:
         return validate(network, batch[0].float() / 255, batch[1])
 
     def worse(self, now: dict[str, float], first: dict[str, float]) -> bool:
-        """See `Task`; the score says all."""
+        """See `Task`; only the score counts."""
         return False
 
     @torch.no_grad()
@@ -345,7 +345,7 @@ class SurfaceTask:
         }
 
     def worse(self, now: dict[str, float], first: dict[str, float]) -> bool:
-        """Whether a part is seen worse than at the start, or tips are farther off."""
+        """Whether the Dice of a part or the tip error is worse than at the start."""
         # Runs of earlier versions have no such figures.
         names = [name for name in (f"dice_{part}" for part in PARTS) if name in first]
         parts = any(now[name] < first[name] - _PART_WORSE for name in names)
@@ -392,7 +392,7 @@ def tip_error(seen: Float[Tensor, "n channels h w"], surface: Float[Tensor, "n c
 
 
 def _middle(parts: Tensor) -> Tensor | None:
-    """Middle of the shaft, or of the arm where no shaft is seen; None without any."""
+    """Centre of the shaft, or of the arm where no shaft is visible; None without either."""
     pixels = (parts[0] if parts[0].any() else parts.any(0)).nonzero()
     return pixels.float().mean(0) if len(pixels) else None
 
@@ -409,7 +409,7 @@ def _floats(batch: Batch) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _seen(network: SurfaceNetwork, images: Tensor, given: Tensor) -> Tensor:
-    """What the network sees in many images, where these are; it may be on another device."""
+    """Predicted surface maps of many images, on their device; the network may be on another one."""
     device = next(network.parameters()).device
     parts = zip(images.split(_AT_ONCE), given.split(_AT_ONCE), strict=True)
     return torch.cat([network(image.to(device), known.to(device)).map().to(images.device) for image, known in parts])
@@ -428,5 +428,5 @@ def _colors(channels: Float[Tensor, "3 h w"]) -> np.ndarray:
 
 
 def task_of(network: NetworkName) -> Task:
-    """How the network of that name is trained."""
+    """Task of a network."""
     return FeatureTask() if network == "feature" else SurfaceTask()

@@ -27,7 +27,7 @@ from .tasks import Batch, task_of
 
 
 def grow(larger: Network, trained: nn.Module) -> Network:
-    """Put the weights of a trained network into a larger one of the same kind, so that it gives the same output.
+    """Copy the weights of a trained network into a larger one of the same kind, with the same output.
 
     New channels keep their random weights, but no trained channel reads them yet; new convolutions at the end of a
     block pass trained channels on unchanged.
@@ -79,7 +79,7 @@ def _embed_convolution(name: str, layer: nn.Conv2d, old: nn.Conv2d | None, befor
 
 
 def _pass_through(layer: nn.BatchNorm2d, before: nn.BatchNorm2d) -> None:
-    """Undo the normalisation of what the ReLU after `before` lets through, taken to be normally distributed."""
+    """Invert the normalization for ReLU outputs of `before`, assuming normally distributed inputs."""
     kept = before.num_features
     shift, scale = before.bias, before.weight.abs().clamp(min=1e-6)
     ratio = shift / scale
@@ -105,7 +105,7 @@ def _put(name: str, own: Tensor, theirs: Tensor) -> None:
 
 @dataclass(frozen=True)
 class TrainingProgress:
-    """Where a run stands; one per logged step."""
+    """Progress of a run, once per logged step."""
 
     step: int
     """Steps done."""
@@ -116,14 +116,14 @@ class TrainingProgress:
     seconds_per_step: float
     """Wall time per step [s]."""
     validation: dict[str, float] | None
-    """The newest validation."""
+    """Newest validation."""
     first: dict[str, float] | None
-    """The first one of the run, wherever that was interrupted since."""
+    """First validation of the run, across interruptions."""
 
 
 @dataclass(frozen=True)
 class TrainingResult:
-    """What a finished run leaves behind."""
+    """Files and metrics of a finished run."""
 
     weights: Path
     """Weights file, ready for `FeatureExtractor.load`."""
@@ -242,10 +242,10 @@ _MAY_CHANGE = (
 def train(
     config: TrainingConfig, output: Path, progress: Callable[[TrainingProgress], None] | None = None
 ) -> TrainingResult:
-    """Train a feature network, or go on with the run that `output` holds.
+    """Train a network, or resume the run in `output`.
 
-    The run writes `checkpoint.safetensors` now and then, `features.safetensors` after every validation, and
-    `report/` at the end. After a kill the same call goes on from the last checkpoint.
+    The run writes `checkpoint.safetensors` periodically, the weights after every validation, and `report/` at the
+    end. After a kill the same call resumes from the last checkpoint.
 
     Raises:
         SettingsError: `output` holds a run with other settings.

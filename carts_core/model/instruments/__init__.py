@@ -1,4 +1,4 @@
-"""Instruments that are built in: made from a few numbers when they are named, as `builtin:NAME`."""
+"""Built-in instruments: URDFs and meshes generated from dimensions, named `builtin:NAME`."""
 
 from .builtin import SCHEME as SCHEME
 from .builtin import SHIPPED as SHIPPED

@@ -54,7 +54,7 @@ def robot_file(robot: Path | str) -> Path:
 
 @cache
 def builtin_urdf(name: str) -> Path:
-    """The URDF of a built-in robot; its files are made, or made again where the cache holds others.
+    """URDF of a built-in robot; its files are generated, or replaced where those in the cache differ.
 
     Raises:
         RobotError: there is no such robot.
@@ -76,7 +76,7 @@ def builtin_urdf(name: str) -> Path:
 
 @cache
 def _scratch() -> TemporaryDirectory:
-    """Where files lie until the program ends."""
+    """Temporary folder that is removed when the program ends."""
     return TemporaryDirectory(prefix="carts-")
 
 

@@ -4,11 +4,9 @@ Wrist lengths are those of the dVRK's tool files. Shapes are ours: simple ones o
 """
 
 from dataclasses import dataclass
-from typing import Literal
 
 from .shapes import ClipApplier, Electrode, Hub, Jaws, Scissors, Tip
 
-Generation = Literal["classic", "si"]
 SI_SUFFIX = "_si"
 
 _SLIM = Hub(2.4, 2.0)
