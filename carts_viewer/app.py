@@ -242,7 +242,7 @@ class ViewerApp:
 
     @property
     def queue(self) -> Tab:
-        """Where intents go: the first tab, whether or not a page shows it."""
+        """The first tab, which takes intents whether or not a page shows it."""
         return self.tabs.first
 
     @property

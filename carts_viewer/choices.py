@@ -39,7 +39,7 @@ class Compare:
 
     @property
     def share(self) -> float:
-        """Of the picture's width that shows the other pose, 0..1."""
+        """Share of the picture's width that shows the other pose, 0..1."""
         return 1.0 if self.peek else self.swipe if self.against is not None else 0.0
 
 
@@ -96,7 +96,7 @@ class JointRange:
 
 
 def joint_range(arm: Arm, joint: int) -> JointRange:
-    """Of the joint with this index."""
+    """Range of the joint with this index."""
     lower, upper = (float(value) for value in arm.robot.joint_limits[joint])
     revolute = arm.robot.joint_types[joint] == "revolute"
     # A joint without limits gets a slider with ends all the same: once round, or a metre, either way.
@@ -143,7 +143,7 @@ class Target:
 
     @staticmethod
     def of(observed: Observed, project: ProjectState, recording: Recording) -> "Target":
-        """What is chosen, with the masks that a project holds now."""
+        """The target of a choice, with the present masks of a project."""
         if observed.what == "network" or observed.masks == "recording":
             return Target(observed)
         return Target(observed, project_masks(observed.masks, project, recording))
@@ -170,7 +170,7 @@ class Preset:
     meaning: str
     """When to use it, as text for the user."""
     changes: Callable[[SurfaceSolver], dict[str, Any]]
-    """What differs from the default settings of a solver of surface maps; others have no presets but the default."""
+    """Changes to the default settings of a solver of surface maps; other solvers have the default alone."""
 
 
 PRESETS = {

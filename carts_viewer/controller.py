@@ -147,7 +147,7 @@ _BEGINNING = (
 _COMMON = ("jobs", "solve", "export", "networks", "network", "asked_network", "problems")
 """Fields of the background's state that all tabs share."""
 WATCH_EVERY = 1.0
-"""How often the project's file is checked while nothing is edited [s]."""
+"""Interval between checks of the project's file while nothing is edited [s]."""
 
 
 class Controller:

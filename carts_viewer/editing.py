@@ -27,7 +27,7 @@ class Person:
     present: bool = True
     """Whether their tab is open."""
     index: int = 0
-    """Of the frame that they are on."""
+    """Index of the frame that they are on."""
     undone: list[int] = field(default_factory=list)
     """Steps by which they took back others, which redo takes back in turn, the newest last."""
 
@@ -234,7 +234,7 @@ class Editor:
 
     @property
     def gesture(self) -> object:
-        """Of the draft; None without one."""
+        """Gesture of the draft; None without one."""
         return self._gesture
 
     @property
@@ -286,7 +286,7 @@ class Editor:
         self.people.claim(self.person)
 
     def overdue_in(self) -> float | None:
-        """How long until the draft should be saved even if its gesture does not end [s]; None without one."""
+        """Time until the draft is saved even if its gesture does not end [s]; None without one."""
         if self._view is None or not self.project.writable:
             return None
         return max(0.0, self._changed_at + LONGEST_DRAFT - time.monotonic())

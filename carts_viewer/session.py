@@ -131,7 +131,7 @@ class Session:
         }
 
     def target(self, observed: Observed, project: ProjectState | None = None) -> Target:
-        """What is chosen to be fitted, with the masks of a state of the project, by default the present one."""
+        """Target of a choice, with the masks of a state of the project, by default the present one."""
         return Target.of(observed, self.editor.view if project is None else project, self.sequence)
 
     def measured(self, frame: Frame) -> SceneState:
@@ -145,7 +145,7 @@ class Session:
         provenance: Provenance,
         joint_std: Mapping[str, Float[np.ndarray, " dofs"]] | None = None,
     ) -> dict[Key[Any], Any]:
-        """What a project must change so that the frame's pose is this state.
+        """Edits that give the frame this pose.
 
         What is as it was saved keeps its provenance, and what is as measured needs no correction.
 
@@ -177,7 +177,7 @@ class Session:
         return edits
 
     def saved(self, index: int) -> Edits:
-        """What brings joints, verdict and review of a frame, and the calibration, back to as they are saved now."""
+        """Edits that restore the saved joints, verdict and review of a frame, and the calibration."""
         arms = [arm.name for arm in self.scene.arms]
         cameras = [camera.name for camera in self.scene.cameras]
         keys: list[Key[Any]] = [make(name) for make in (Key.extrinsics, Key.intrinsics) for name in cameras]
@@ -205,7 +205,7 @@ class Session:
         return self.with_joints(self.measured(frame), values)
 
     def joint_range(self, arm: str, joint: int) -> JointRange:
-        """What the joint with this index of this arm may be set to.
+        """Range of a joint of an arm, by its index.
 
         Raises:
             RobotError: no such arm.
@@ -279,7 +279,7 @@ class Storage:
     scratch: tempfile.TemporaryDirectory | None = None
     """The folder of a project that ends with the viewer."""
     hint: str | None = None
-    """Of what else there is of the project."""
+    """Hint at rescued copies of the project."""
 
     @property
     def kept(self) -> bool:

@@ -69,7 +69,7 @@ Frames = range
 
 
 class Phase(StrEnum):
-    """What the optimizer is doing."""
+    """Phase of the run."""
 
     IDLE = "idle"
     RUNNING = "running"
@@ -96,7 +96,7 @@ def _tensors(scene: SceneState) -> tuple[torch.Tensor, ...]:
 
 @dataclass(frozen=True)
 class Scores:
-    """How close a pose is to the truth; None where the frame has none."""
+    """Scores of a pose against the truth; None without one."""
 
     dice: float | None = None
     """Overlap of the rendered and the true mask in the shown camera, 0..1."""
@@ -143,7 +143,7 @@ class RunState:
     reason: str | None = None
     """Reason for the end of the run, as text for the user."""
     start: SceneState | None = None
-    """Where the run began."""
+    """Pose at the start of the run."""
     base_frame_gain: float | None = None
     """The share of the remaining residual that free base frames would explain [1]; None where it is not known."""
 
@@ -155,12 +155,12 @@ class ExportState:
     format: str
     """Text for the user."""
     frames: int
-    """How many frames are exported."""
+    """Number of exported frames."""
     done: int = 0
     total: int = 0
     """Steps of the export; 0 until the first is done."""
     path: Path | None = None
-    """What was written; None while it is being written."""
+    """Path of the finished export; None before."""
 
 
 @dataclass(frozen=True)
@@ -175,9 +175,9 @@ class LiveState:
     busy: bool = False
     """Whether no frame has come yet."""
     verdict: str = "lost"
-    """Of the shown frame: good, doubtful or lost."""
+    """Verdict on the shown frame: good, doubtful or lost."""
     age: float = 0.0
-    """Of the shown result when it was there [s]."""
+    """Latency of the shown result [s]."""
 
 
 @dataclass(frozen=True)
@@ -208,7 +208,7 @@ class ViewState:
     settings: SolverSettings
     free: FreeParameters
     project: ProjectState
-    """What is saved, and `unsaved` what is not."""
+    """Saved state of the project, with the draft of an unsaved gesture."""
     unsaved: bool = False
     """Whether the last step of `project` is a gesture that is not saved yet."""
     solver: SolverName = SolverName.SURFACE
@@ -220,7 +220,7 @@ class ViewState:
     time_error: str | None = None
     """Why the time offset that is being typed cannot be used."""
     observed: Observed = field(default_factory=Observed)
-    """What runs fit."""
+    """Target of runs."""
     every_camera: bool = True
     """Whether a run uses all cameras or only the shown one."""
     compare: Compare = field(default_factory=Compare)
@@ -228,7 +228,7 @@ class ViewState:
     filter: FrameFilter = field(default_factory=FrameFilter)
     """The frame filter."""
     reach: Reach = Reach.NEAR
-    """How far the joints' sliders reach."""
+    """Range of the joints' sliders."""
     range: tuple[int, int] | None = None
     """First and last frame of the part that is played, solved and optimized; None: the whole sequence."""
     beside: bool = True
@@ -245,9 +245,9 @@ class ViewState:
     keypoints: KeypointState = field(default_factory=KeypointState)
     brush: Brush = field(default_factory=Brush)
     maps: Maps | None = None
-    """Of the shown pose, frame and domain; None until needed."""
+    """Maps of the shown pose, frame and domain; None until needed."""
     scores: Scores | None = None
-    """Of the shown pose; None until they are computed, which is after its picture has been sent."""
+    """Scores of the shown pose; None until computed, after its picture was sent."""
     networks: tuple[str, ...] = ()
     """Networks that can be chosen: that of the beginning, and those that were adapted to the recording."""
     network: str = ""
@@ -291,7 +291,7 @@ class ViewState:
 
     @property
     def verdict(self) -> FitVerdict | None:
-        """What the image says of the shown pose; None where it was not asked."""
+        """Verdict on the shown pose; None where it was not assessed."""
         return None if self.streaming else self.project.verdict(self.index)
 
     @property
@@ -301,7 +301,7 @@ class ViewState:
 
     @property
     def undoable(self) -> int:
-        """How many steps can be taken back."""
+        """Number of steps that can be undone."""
         return self.project.position
 
     @property
@@ -311,12 +311,12 @@ class ViewState:
 
     @property
     def review(self) -> Review:
-        """Of the shown frame."""
+        """Review of the shown frame."""
         return self.project.review(self.index)
 
     @property
     def mask_correction(self) -> MaskCorrection | None:
-        """What was painted on the mask of the shown frame and camera."""
+        """Mask correction of the shown frame and camera."""
         return self.mask_correction_of(self.camera)
 
     @property
@@ -325,11 +325,11 @@ class ViewState:
         return self.ignore_region_of(self.camera)
 
     def mask_correction_of(self, camera: str) -> MaskCorrection | None:
-        """What was painted on the mask of the shown frame in a camera."""
+        """Mask correction of the shown frame in a camera."""
         return None if self.streaming else self.project.get(Key.mask_correction(self.index, camera))
 
     def part_labels_of(self, camera: str) -> PartLabels | None:
-        """What pixels of the shown frame were painted as in a camera."""
+        """Painted part labels of the shown frame in a camera."""
         return None if self.streaming else self.project.get(Key.part_labels(self.index, camera))
 
     def ignore_region_of(self, camera: str) -> IgnoreRegion | None:

@@ -42,7 +42,7 @@ class Asked(Generic[T]):
 
 
 class IntentQueue(Generic[T]):
-    """Where intents wait, in the order of their newest version. Any thread may put, the worker takes."""
+    """Queue of intents in the order of their newest version. Any thread may put, the worker takes."""
 
     def __init__(self) -> None:
         self._waiting: dict[Hashable, Asked[T]] = {}
@@ -93,7 +93,7 @@ AWAY = 20.0
 
 
 class View:
-    """What the page of a tab is made of.
+    """Widgets, scene and display of a tab's page.
 
     Attributes:
         page: the tab's widgets and scene.
@@ -170,7 +170,7 @@ class Tab:
         self._left_at = time.monotonic()
 
     def away_in(self) -> float | None:
-        """How long until `leave` is due [s]; None: it is not."""
+        """Time until `leave` is due [s]; None where it is not."""
         return None if self._left_at is None else max(0.0, self._left_at + AWAY - time.monotonic())
 
     def leave(self) -> None:
@@ -189,7 +189,7 @@ class Tab:
         return self.view is not None and self._pictured is not None
 
     def picture_wait(self) -> float | None:
-        """How long until a picture should be sent [s]; None: there is nothing to send."""
+        """Time until the next picture should be sent [s]; None without one."""
         if self.view is None or self._pictured is self.controller.state:
             return None
         return self.view.display.ready_in()

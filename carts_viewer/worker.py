@@ -155,7 +155,7 @@ class Worker:
             self._rest.notify_all()
 
     def _wait_time(self) -> float | None:
-        """How long to wait for an intent: not while there is work, and no longer than a picture waits for its page."""
+        """Time to wait for an intent [s]: none while there is work, at most until a page takes its next picture."""
         waits = [self._tabs.background.wait_time()]
         for tab in self._tabs:
             waits += [tab.controller.wait_time(), tab.picture_wait()]

@@ -1,4 +1,4 @@
-"""What intents about the picture do: which frame, domain, camera and layer are shown, and playing."""
+"""Browsing: the shown frame, domain, camera and layer, and playback."""
 
 import logging
 import time
@@ -9,7 +9,7 @@ from typing import Any
 from carts_core.errors import SequenceError
 from carts_core.project import Key, TimeOffset
 from carts_viewer.actions import intents
-from carts_viewer.actions.context import Context, OpenRun, clamped, finite, one_of, unknown
+from carts_viewer.actions.context import Context, OpenRun, clamped, finite, one_of, unknown_intent
 from carts_viewer.choices import Against, Reach
 from carts_viewer.state import RunState
 
@@ -27,17 +27,11 @@ class BrowsingHandler:
         self._session = context.session
         self._next_frame_at = 0.0
 
-    @singledispatchmethod
-    def handle(self, intent: intents.Browsing) -> None:
-        """Carry out an intent.
-
-        Raises:
-            CartsError: the intent cannot be carried out; the state stays valid.
-        """
-        raise unknown(intent)
+    handle = singledispatchmethod(unknown_intent)
+    """Carries out an intent; raises `CartsError` where it cannot, and the state stays valid."""
 
     def wait_time(self) -> float | None:
-        """How long until the next frame is due [s]; None when nothing plays."""
+        """Time until the next frame is due [s]; None without playback."""
         return max(0.0, self._next_frame_at - time.monotonic()) if self._context.state.playing else None
 
     def advance(self) -> None:

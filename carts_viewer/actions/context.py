@@ -153,7 +153,7 @@ class Context:
 
     @staticmethod
     def _truths(state: ViewState) -> tuple[object, ...]:
-        """What scores depend on besides the pose: the corrected mask, and masks of others."""
+        """Masks that scores depend on: the corrected mask and imported masks."""
         record = state.project.records.get(state.index)
         entries = {} if record is None else record.entries
         others = [entry.value for key, entry in entries.items() if key.kind is Kind.IMPORTED_MASK]
@@ -228,3 +228,12 @@ def one_of(asked: str | None, now: str, known: Collection[str], what: str) -> st
 def unknown(intent: Intent) -> CartsError:
     """The error for an intent that nothing handles."""
     return CartsError(f"The viewer does not know what to do with {type(intent).__name__}; this is a bug.")
+
+
+def unknown_intent(handler: object, intent: Intent) -> None:
+    """Default of the handlers' `handle`, for intents that they have no method for.
+
+    Raises:
+        CartsError: always.
+    """
+    raise unknown(intent)

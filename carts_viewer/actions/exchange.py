@@ -20,7 +20,7 @@ from carts_core.project.calibrated import calibrated_scene
 from carts_core.project.values import UNREVIEWED
 from carts_core.recording.annotations import read_annotations
 from carts_viewer.actions import intents
-from carts_viewer.actions.context import Context, OpenRun, unknown
+from carts_viewer.actions.context import Context, OpenRun, unknown_intent
 from carts_viewer.picture.layers import Layer
 from carts_viewer.state import ExportState
 
@@ -34,7 +34,7 @@ FRAME_CHOICES = {
 }
 """Choices of the frames to export, as review states."""
 PARTS_CHOICES: tuple[Parts, ...] = ("arms", "parts", "links")
-"""What may get a category of its own."""
+"""Choices of the granularity of categories."""
 _STEMS = {
     "csv": "kinematics",
     "npz": "kinematics",
@@ -43,9 +43,9 @@ _STEMS = {
     "dvrk-2.3": "base_frames",
     "dvrk-suj": "suj",
 }
-"""How a file is called where the format's own name would say nothing."""
+"""File names of formats whose own name is not descriptive."""
 _BIT = 0.05
-"""How long the page waits for an export at a time [s]; a step that takes longer is finished."""
+"""Time slice of an export [s]; a longer step is finished."""
 
 
 Deliver = Callable[[int, str, bytes], None]
@@ -63,14 +63,8 @@ class ExportingHandler:
         self._job: CooperativeThread[Path] | None = None
         self._intent: intents.Export | None = None
 
-    @singledispatchmethod
-    def handle(self, intent: intents.Exporting) -> None:
-        """Carry out an intent.
-
-        Raises:
-            CartsError: the intent cannot be carried out; the state stays valid.
-        """
-        raise unknown(intent)
+    handle = singledispatchmethod(unknown_intent)
+    """Carries out an intent; raises `CartsError` where it cannot, and the state stays valid."""
 
     def wait_time(self) -> float | None:
         """0 while there is something to write; None when there is not."""
@@ -190,7 +184,7 @@ def shown_mask(context: Context) -> tuple[str, bytes]:
 
 
 def free_path(project: Path, stem: str, intent: intents.Export) -> OutputPath:
-    """Where an export goes: into a folder beside the project, under a name that nothing has yet."""
+    """Path of a new export, in a folder beside the project."""
     folder, suffix = output_path(project.parent, f"{project.stem}_exports"), FORMATS[intent.format].suffix
     number, path = 1, folder / f"{stem}{suffix}"
     while os.path.lexists(path):
@@ -200,7 +194,7 @@ def free_path(project: Path, stem: str, intent: intents.Export) -> OutputPath:
 
 
 LARGEST = 512 * 2**20
-"""What may pass through the page's memory [bytes]."""
+"""Largest download [bytes]."""
 _COMPRESSED = {".png", ".jpg", ".mp4", ".npz"}
 
 

@@ -230,13 +230,13 @@ class DragLink(Posing):
     """The same as long as the pointer is down."""
     camera: str
     start: tuple[float, float]
-    """Where the pointer took hold of the link [px]."""
+    """Start of the drag [px]."""
     end: tuple[float, float]
-    """Where the pointer is now [px]."""
+    """Present position of the pointer [px]."""
 
     @property
     def key(self) -> Hashable:
-        """Of one gesture only the newest place matters."""
+        """One slot per gesture."""
         return (DragLink, self.gesture)
 
 
@@ -466,7 +466,7 @@ class ShowUnreviewed(Annotation):
 
 @dataclass(frozen=True)
 class ShowWorse(Annotation):
-    """Of the frames that are neither accepted nor rejected, show the one that comes next in order of badness."""
+    """Show the next worst frame that is neither accepted nor rejected."""
 
     step: int = 1
     """1 to the next one, which is less bad; -1 to one that is worse."""
@@ -581,7 +581,7 @@ class Calibrate(Jobs):
     """Fit base frames, and cameras where they are free, to some frames of the sequence together."""
 
     frames: int = 20
-    """How many, spread evenly."""
+    """Number of frames, spread evenly."""
 
 
 @dataclass(frozen=True)
@@ -653,7 +653,7 @@ class Export(Exporting):
     frames: str
     """Which ones, one of `exchange.FRAME_CHOICES`."""
     parts: Parts = "arms"
-    """What gets a category of its own."""
+    """Granularity of the categories."""
     images: bool = False
     """Copy the images beside their labels; otherwise labels name those of the recording, where the format allows it."""
     shown_camera: bool = False

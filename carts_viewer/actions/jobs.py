@@ -1,4 +1,4 @@
-"""What intents about jobs do: one after the other is started, followed, stopped and remembered."""
+"""The queue of jobs: one after the other is started, followed, stopped and recorded."""
 
 import time
 from collections.abc import Generator
@@ -10,7 +10,7 @@ from carts_core.errors import CartsError
 from carts_core.project import frames_in
 from carts_core.project.state import UNREVIEWED
 from carts_viewer.actions import intents
-from carts_viewer.actions.context import Context, OpenRun, unknown
+from carts_viewer.actions.context import Context, OpenRun, unknown_intent
 from carts_viewer.actions.exchange import ExportingHandler
 from carts_viewer.actions.frame_filter import found
 from carts_viewer.actions.sequence import PropagatingHandler
@@ -91,14 +91,8 @@ class JobsHandler:
         self._requester = requester
         self.handle(intent)
 
-    @singledispatchmethod
-    def handle(self, intent: intents.Intent) -> None:
-        """Carry out an intent.
-
-        Raises:
-            CartsError: the intent cannot be carried out; the state stays valid.
-        """
-        raise unknown(intent)
+    handle = singledispatchmethod(unknown_intent)
+    """Carries out an intent; raises `CartsError` where it cannot, and the state stays valid."""
 
     def wait_time(self) -> float | None:
         """0 while there is something to do; None when there is not."""

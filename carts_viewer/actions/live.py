@@ -49,7 +49,7 @@ class LiveRun:
 
     @property
     def port(self) -> int | None:
-        """Where joints, or frames, may be sent to; None where nothing may be."""
+        """Port that receives joints or frames; None without one."""
         return None if self._stream.server is None else self._stream.server.port
 
     def take(self) -> Tracked | None:
@@ -157,7 +157,7 @@ class LiveHandler:
         raise CartsError("A live stream is shown, which cannot be edited. Press Stop (Live) first.")
 
     def wait_time(self) -> float | None:
-        """How long until a result is looked for [s]; None while no stream is shown."""
+        """Time until the next check for a result [s]; None without a stream."""
         return _LOOK_EVERY if self.active else None
 
     def advance(self) -> None:

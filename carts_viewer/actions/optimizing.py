@@ -1,4 +1,4 @@
-"""What intents about the optimizer do: a run on the shown frame, its settings, and what it may move."""
+"""The optimizer: runs on the shown frame, solver settings, and free parameters."""
 
 from dataclasses import replace
 from functools import singledispatchmethod
@@ -11,7 +11,7 @@ from carts_core.settings import SolverName, SurfaceSolver
 from carts_core.settings import solver as named_solver
 from carts_core.settings.serialization import changed
 from carts_viewer.actions import intents
-from carts_viewer.actions.context import Context, unknown
+from carts_viewer.actions.context import Context, unknown_intent
 from carts_viewer.choices import NETWORK, PRESETS, Observed
 from carts_viewer.jobs.comparison import FitCheck
 from carts_viewer.jobs.optimizers import ActiveRun, OptimizerFactory, scene_at
@@ -42,14 +42,8 @@ class OptimizingHandler:
         self._before: Edits | None = None
         """Edits that restore the frame to the start of the last run."""
 
-    @singledispatchmethod
-    def handle(self, intent: intents.Optimizing) -> None:
-        """Carry out an intent.
-
-        Raises:
-            CartsError: the intent cannot be carried out; the state stays valid.
-        """
-        raise unknown(intent)
+    handle = singledispatchmethod(unknown_intent)
+    """Carries out an intent; raises `CartsError` where it cannot, and the state stays valid."""
 
     @property
     def active(self) -> bool:

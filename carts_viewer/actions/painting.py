@@ -13,7 +13,7 @@ from carts_core.model.parts import part_classes
 from carts_core.project import Edits, Key, Kind, ProjectState
 from carts_core.segmentation import Prompt, Segmenter
 from carts_viewer.actions import intents
-from carts_viewer.actions.context import Context, OpenRun, clamped, unknown
+from carts_viewer.actions.context import Context, OpenRun, clamped, unknown_intent
 from carts_viewer.picture.layers import Layer
 from carts_viewer.picture.strokes import DIAMETERS, Mask, Stroke, Target, Tool, corrected, ignored, relabelled
 
@@ -35,14 +35,8 @@ class PaintingHandler:
         self._prompting = Prompting(segmenter)
         self._session = context.session
 
-    @singledispatchmethod
-    def handle(self, intent: intents.Painting) -> None:
-        """Carry out an intent.
-
-        Raises:
-            CartsError: the intent cannot be carried out; the state stays valid.
-        """
-        raise unknown(intent)
+    handle = singledispatchmethod(unknown_intent)
+    """Carries out an intent; raises `CartsError` where it cannot, and the state stays valid."""
 
     @handle.register
     def _(self, intent: intents.NextObject) -> None:
@@ -99,7 +93,7 @@ class PaintingHandler:
         self._change(_CLEARED[target], {make(state.index, state.camera): None for make in painted})
 
     def _edits(self, stroke: Stroke) -> Edits:
-        """What a stroke, or a prompt, changes: the ignore region, or the mask and which part a pixel is."""
+        """Edits of a stroke or a prompt: ignore region, or mask and part labels."""
         project, place = self._session.editor.view, (stroke.frame, stroke.camera)
         mask, labels, region = Key.mask_correction(*place), Key.part_labels(*place), Key.ignore_region(*place)
 
@@ -126,7 +120,7 @@ class PaintingHandler:
         return frame.images[stroke.camera]
 
     def _step(self, stroke: Stroke) -> str:
-        """What the history calls a stroke."""
+        """Name of a stroke in the history."""
         if stroke.prompt:
             return "Segment by a prompt"
         if stroke.label and not stroke.erase and stroke.target is Target.MASK:
@@ -205,7 +199,7 @@ class Prompting:
         keys: tuple[Key[Any], ...],
         changed: Callable[[Layers, Mask, bool], Edits],
     ) -> Edits:
-        """What a click or a box changes.
+        """Edits of a click or a box.
 
         Args:
             stroke: one point, or two corners of a box.

@@ -9,7 +9,7 @@ from carts_core.model.scene import SceneState
 from carts_core.optimization.keypoints import Pin, fit_keypoints
 from carts_core.project import Key
 from carts_viewer.actions import intents
-from carts_viewer.actions.context import Context, OpenRun, clamped, finite, unknown
+from carts_viewer.actions.context import Context, OpenRun, clamped, finite, unknown_intent
 
 LARGEST_PERTURBATION = 30.0
 """[deg and mm]."""
@@ -23,14 +23,8 @@ class PosingHandler:
         self._open_run = run
         self._session = context.session
 
-    @singledispatchmethod
-    def handle(self, intent: intents.Posing) -> None:
-        """Carry out an intent.
-
-        Raises:
-            CartsError: the intent cannot be carried out; the state stays valid.
-        """
-        raise unknown(intent)
+    handle = singledispatchmethod(unknown_intent)
+    """Carries out an intent; raises `CartsError` where it cannot, and the state stays valid."""
 
     @handle.register
     def _(self, intent: intents.SetJoint) -> None:
@@ -87,7 +81,7 @@ class PosingHandler:
 
 
 _REACH = 15.0
-"""How far from the arm a link can be taken [px]."""
+"""Largest distance from the arm at which a link can be grabbed [px]."""
 _LEAST = 0.5
 """A pointer that has moved less was only pressed [px]."""
 
@@ -106,7 +100,7 @@ class DraggingHandler:
         self._frame = 0
         self._start: SceneState | None = None
         self._point: Keypoint | None = None
-        """What is dragged; None where nothing was under the pointer."""
+        """The dragged point; None where no arm was under the pointer."""
 
     def handle(self, intent: intents.DragLink) -> None:
         """Carry out an intent.

@@ -15,7 +15,7 @@ from carts_core.optimization.keypoints import Pin, fit_keypoints
 from carts_core.project import Change, Key, Review, ReviewState, Source, next_unreviewed, worst_first
 from carts_core.project.values import LONGEST_NOTE
 from carts_viewer.actions import intents
-from carts_viewer.actions.context import Context, OpenRun, clamped, unknown
+from carts_viewer.actions.context import Context, OpenRun, clamped, unknown_intent
 from carts_viewer.actions.frame_filter import FrameFilter, found
 from carts_viewer.picture.overlay import labelled_keypoints
 
@@ -53,14 +53,8 @@ class AnnotatingHandler:
         self._worst: int | None = None
         """The frame that `ShowWorse` went to last; None after anything else has shown another one."""
 
-    @singledispatchmethod
-    def handle(self, intent: intents.Annotation) -> None:
-        """Carry out an intent.
-
-        Raises:
-            CartsError: the intent cannot be carried out; the state stays valid.
-        """
-        raise unknown(intent)
+    handle = singledispatchmethod(unknown_intent)
+    """Carries out an intent; raises `CartsError` where it cannot, and the state stays valid."""
 
     def released(self) -> None:
         """The pointer was let go of."""
@@ -243,14 +237,8 @@ class FindingHandler:
         self._open_run = run
         self._show = show
 
-    @singledispatchmethod
-    def handle(self, intent: intents.Finding) -> None:
-        """Carry out an intent.
-
-        Raises:
-            CartsError: the intent cannot be carried out; the state stays valid.
-        """
-        raise unknown(intent)
+    handle = singledispatchmethod(unknown_intent)
+    """Carries out an intent; raises `CartsError` where it cannot, and the state stays valid."""
 
     @handle.register
     def _(self, intent: intents.SetFilter) -> None:

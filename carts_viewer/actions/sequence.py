@@ -11,8 +11,9 @@ from carts_core.errors import CartsError, ProjectError
 from carts_core.optimization import FrameEstimate
 from carts_core.project import Figures, Key, Keyframe, ProjectState, between_kept
 from carts_core.project.values import WHOLE_PROJECT
+from carts_core.wording import counted
 from carts_viewer.actions import intents
-from carts_viewer.actions.context import Context, OpenRun, unknown
+from carts_viewer.actions.context import Context, OpenRun, unknown_intent
 from carts_viewer.jobs.comparison import Comparison, Outcome, unchecked
 from carts_viewer.jobs.optimizers import OptimizerFactory, SequenceRun
 from carts_viewer.state import ListedFrame, SolveState
@@ -34,14 +35,8 @@ class PropagatingHandler:
         self._before: ProjectState = context.session.editor.view
         """The project at the start of the run."""
 
-    @singledispatchmethod
-    def handle(self, intent: intents.Propagating) -> None:
-        """Carry out an intent.
-
-        Raises:
-            CartsError: the intent cannot be carried out; the state stays valid.
-        """
-        raise unknown(intent)
+    handle = singledispatchmethod(unknown_intent)
+    """Carries out an intent; raises `CartsError` where it cannot, and the state stays valid."""
 
     def wait_time(self) -> float | None:
         """0 while frames are being solved; None when they are not."""
@@ -206,7 +201,7 @@ class PropagatingHandler:
             first, last = (self._session.sequence.frame_ids[index] for index in (min(figures), max(figures)))
             self._session.editor.apply(f"Solve {len(figures)} frames, {first} to {last}", edits, figures)
             self._context.refresh()
-        solved = f"{len(figures)} frame{'' if len(figures) == 1 else 's'} solved, one step of undo"
+        solved = f"{counted(len(figures), 'frame')} solved, one step of undo"
         text = f"{'Stopped: ' if run.cancelled else ''}{solved}"
         return f"{text}; {len(self._held)} kept as they were, because they would fit worse" if self._held else text
 
@@ -240,7 +235,7 @@ class PropagatingHandler:
 
 
 def _deviations(project: ProjectState, index: int) -> dict[str, np.ndarray]:
-    """Of a kept frame's joint positions [rad, m], by arm; those that a person set have none."""
+    """Standard deviations of a kept frame's joint positions [rad, m], by arm; none for positions set by hand."""
     known = {arm: value.standard_deviations for arm, value in project.joints(index).items()}
     return {arm: np.array(values, np.float64) for arm, values in known.items() if values is not None}
 
@@ -252,14 +247,8 @@ class MarkingHandler:
         self._context = context
         self._open_run = run
 
-    @singledispatchmethod
-    def handle(self, intent: intents.Marking) -> None:
-        """Carry out an intent.
-
-        Raises:
-            CartsError: the intent cannot be carried out; the state stays valid.
-        """
-        raise unknown(intent)
+    handle = singledispatchmethod(unknown_intent)
+    """Carries out an intent; raises `CartsError` where it cannot, and the state stays valid."""
 
     @handle.register
     def _(self, intent: intents.HoldKeyframe) -> None:

@@ -25,7 +25,7 @@ _WORSE_LOSS, _WORSE_FAILURE, _WORSE_DICE = 1.1, 0.02, 0.005
 
 @dataclass(frozen=True)
 class Fit:
-    """How well a pose fits the images of its frame."""
+    """Fit of a pose to the images of its frame."""
 
     verdict: FitVerdict
     loss: float
@@ -183,12 +183,12 @@ class Comparison:
 
 
 def _joints_alone(state: ViewState) -> FreeParameters:
-    """What a run on one frame of many may move: the calibration is that of all frames."""
+    """Free parameters of a run on one of many frames, which share the calibration."""
     return replace(state.free, base_frames=False, extrinsics=False, intrinsics=False)
 
 
 def solved_edits(estimate: FrameEstimate, run: SequenceRun) -> Edits:
-    """What a project must change so that a frame is as it was solved."""
+    """Edits that apply the solved pose of a frame."""
     edits: dict[Key[Any], Any] = {}
     for arm, std in estimate.joint_std.items():
         # An arm that was not free stays as it is.

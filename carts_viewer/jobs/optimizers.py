@@ -68,11 +68,11 @@ class Optimizer(Protocol):
 
     @property
     def history(self) -> list[Progress]:
-        """What is kept of every iterate."""
+        """Progress of every iterate."""
         ...
 
     def comparable_losses(self) -> list[float]:
-        """Of all iterates, compared with the last observation, so that they compare."""
+        """Losses of all iterates against the last observation, which makes them comparable."""
         ...
 
 
@@ -118,11 +118,11 @@ class ActiveRun:
 
     @property
     def stages(self) -> tuple[int, ...]:
-        """Of each iterate the stage, within which losses compare."""
+        """Stage of each iterate; losses are comparable within a stage."""
         return tuple(progress.stage for progress in self._optimizer.history)
 
     def comparable_losses(self) -> tuple[float, ...]:
-        """Of all iterates, compared with the last observation, so that they compare."""
+        """Losses of all iterates against the last observation, which makes them comparable."""
         return tuple(self._optimizer.comparable_losses())
 
     def base_frame_gain(self) -> float | None:
@@ -169,7 +169,7 @@ class SequenceRun:
         self._optimizer.cancel()
 
     def estimates(self) -> dict[int, FrameEstimate]:
-        """Of every frame that was visited, in the light of all of them."""
+        """Estimate of every visited frame, smoothed over all of them."""
         return self._optimizer.estimates
 
     @property

@@ -152,7 +152,7 @@ def _count(project: ProjectState, states: Container[ReviewState]) -> int:
 
 
 def _calibration_edits(before: Scene, after: Scene, provenance: Provenance) -> dict[Key[Any], Any]:
-    """What a project must change so that it has this calibration."""
+    """Edits that give a project this calibration."""
     edits: dict[Key[Any], Any] = {}
     for old, new in zip(before.arms, after.arms, strict=True):
         if (old.T_world_base != new.T_world_base).any():

@@ -85,7 +85,7 @@ class ExportPanel:
         self._result.content = f'<p class="carts-caption" role="status">{text}</p>'
 
     def _intent(self) -> intents.Export:
-        """What the widgets say; the controller refuses what they cannot say."""
+        """The export that the widgets describe; the controller checks it."""
         return intents.Export(
             self._formats.get(self._format.value, self._format.value),  # type: ignore[arg-type]
             self._frames.value,

@@ -29,7 +29,7 @@ _GROWTH = 1.25
 _BEGIN, _END = "<!-- keys: written by python -m carts_viewer.panels.help -->", "<!-- end of keys -->"
 
 Special = Literal["perturb", "view"]
-"""What is more than an intent: `perturb` depends on fields of the page, `view` happens in the tab alone."""
+"""Shortcuts that are no intent: `perturb` depends on fields of the page, `view` happens in the tab alone."""
 
 
 @dataclass(frozen=True)
@@ -115,7 +115,7 @@ _POINTER = (
     ("Ctrl+drag", "Drag a link of an arm; its joints follow"),
     ("Shift+click", "Say where a keypoint of the arm is; Shift+drag takes it along"),
 )
-"""What the pointer does on the picture while a key is held."""
+"""Actions of the pointer on the picture with a modifier key."""
 
 
 def key_groups() -> list[tuple[str, list[tuple[str, str]]]]:

@@ -17,7 +17,7 @@ from carts_viewer.transport.document import escaped
 from carts_viewer.transport.tab_page import TabPage
 
 _STEP = 0.05
-"""Of the sliders [deg] and [mm]."""
+"""Step of the sliders [deg] and [mm]."""
 
 
 class JointsPanel:

@@ -1,4 +1,4 @@
-"""Where the panels are on the page: browsing, overlay and joints on the left, tabs on the right."""
+"""Layout of the panels: browsing, overlay and joints on the left, tabs on the right."""
 
 import viser
 
@@ -21,7 +21,7 @@ from carts_viewer.state import ViewState
 from carts_viewer.transport.tab_page import TabPage
 
 _WIDTH = 312.0
-"""Of either side [px]."""
+"""Width of either side [px]."""
 
 
 def choose_theme(gui: viser.GuiApi, *, light: bool) -> None:

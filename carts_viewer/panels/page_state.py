@@ -1,4 +1,4 @@
-"""What the page's own scripts draw over the picture: cameras with their fit, keypoints, clicks, the frame."""
+"""State for the page's scripts: cameras with their fit, keypoints, clicked points, and the frame."""
 
 import math
 from collections.abc import Mapping
@@ -77,7 +77,7 @@ class PageState:
 
 
 def remembered(state: ViewState) -> dict[str, Any]:
-    """What a browser keeps of the choices made in it, for the next time."""
+    """Choices that a browser stores."""
     return {
         "layer": str(state.layer),
         "opacity": state.opacity,
@@ -88,7 +88,7 @@ def remembered(state: ViewState) -> dict[str, Any]:
 
 
 def chosen(settings: Mapping[str, Any], state: ViewState) -> list[intents.Intent]:
-    """What brings back what `remembered` has kept, as far as it makes sense; no page of ours sends anything else."""
+    """Intents that restore the valid choices of `remembered`."""
     found: list[intents.Intent] = []
     layer, reach, beside = (settings.get(name) for name in ("layer", "reach", "beside"))
     # What an imported mask, or a truth, shows is not there in every recording.

@@ -92,7 +92,7 @@ class PaintPanel:
             self._page.call("setBrush", message)
 
     def _message(self, state: ViewState) -> dict[str, object]:
-        """What a page must know to draw strokes by itself."""
+        """State for the page's script that draws strokes."""
         camera, brush = self._scene.camera(state.camera), state.brush
         add, erase = (ADDED_COLOR, REMOVED_COLOR) if brush.target is Target.MASK else (IGNORED_COLOR, (255, 255, 255))
         label = brush.label if brush.target is Target.MASK else 0
@@ -118,7 +118,7 @@ def _press(button: viser.GuiButtonHandle, on: bool) -> None:
 
 
 def _counts(state: ViewState) -> str:
-    """How many pixels of which colour there are."""
+    """Numbers of painted pixels by colour, as HTML."""
     correction, region = state.mask_correction, state.ignore_region
     added, removed = (0, 0) if correction is None else (correction.added().sum(), correction.removed().sum())
     ignored = 0 if region is None else region.region().sum()

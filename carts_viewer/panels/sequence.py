@@ -5,6 +5,7 @@ import viser
 from carts_core.optimization import BASE_FRAME_GAIN
 from carts_core.project import ProjectState, between_kept
 from carts_core.settings import Direction
+from carts_core.wording import counted
 from carts_viewer.actions import intents
 from carts_viewer.jobs.job_list import Job, JobState
 from carts_viewer.panels.inputs import Emit, on_click, on_input, write
@@ -46,7 +47,7 @@ class CalibrationHint:
         self._text.visible = bool(self._text.content)
 
     def _progress_line(self, job: Job | None) -> str:
-        """How a calibration goes, or what came of one that this tab has seen going, as HTML."""
+        """Progress of a calibration, or result of one that this tab has followed, as HTML."""
         if job is None:
             return ""
         text, title = escaped(job.text), f"<b>{escaped(job.title)}</b>"
@@ -70,7 +71,7 @@ def newest_calibration(jobs: tuple[Job, ...]) -> Job | None:
 
 
 def calibration_line(gain: float | None) -> str:
-    """That base frames may be wrong, if the residual of a run says so, and what to do, as HTML.
+    """Warning of wrong base frames with its remedy, as HTML; empty for a small gain.
 
     Args:
         gain: what free base frames would explain of that residual [1]; None where it is not known.
@@ -191,21 +192,17 @@ class KeyframesPanel:
             return f"{name} needs a kept frame; none is kept {'yet' if state.range is None else 'in the range'}"
         where = f"{name}, {escaped(self._ids[frames[0]])} to {escaped(self._ids[frames[-1]])}"
         return f"{where}: " + (
-            f"{_frames(count)} would be fitted, {len(frames) - count} kept" if count else "every frame is kept"
+            f"{counted(count, 'frame')} would be fitted, {len(frames) - count} kept" if count else "every frame is kept"
         )
 
     def _all_here(self, state: ViewState) -> str:
         count = len(state.part) - len(set(state.project.kept_frames) & set(state.part))
         self._open = count > 0
         return f"<b>{whole_label(state)}</b>: " + (
-            f"{_frames(count)} would be fitted" if count else "every frame is kept"
+            f"{counted(count, 'frame')} would be fitted" if count else "every frame is kept"
         )
 
 
 def whole_label(state: ViewState) -> str:
-    """What solving all frames, or those of the range, is called."""
+    """Label of solving all frames, or those of the range."""
     return "Solve all" if state.range is None else "Solve range"
-
-
-def _frames(count: int) -> str:
-    return f"{count} frame{'' if count == 1 else 's'}"

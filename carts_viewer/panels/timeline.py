@@ -54,7 +54,7 @@ class Traces:
 
     @property
     def names(self) -> list[str]:
-        """What can be drawn, with its unit."""
+        """Names of the curves, with units."""
         return [*_FIGURES, *self._joints]
 
     def measure(self, sequence: Sequence) -> bool:
@@ -113,7 +113,7 @@ def _extremes(values: np.ndarray, edges: np.ndarray) -> list[list[float | None]]
 HEIGHT = 64
 """[px]; shown smaller, so that they stay sharp where a CSS pixel is more than one of the screen."""
 _MOST = 4000
-"""How many are kept, some 3 kB each; those that were not asked for the longest go first."""
+"""Number of cached thumbnails of some 3 kB; the least recently used go first."""
 _QUALITY = 70
 _PATH = re.compile(r"(\d{1,4})/(\d{1,4})/(\d{1,9})\.jpg")
 
@@ -193,7 +193,7 @@ _FULL = 0.2
 """1 - Dice, and probability of failure, that fill the height of a bar [1]."""
 _MOST_OPEN = 255
 _MOST_IDS = 5000
-"""Of longer sequences, frames are named by their number."""
+"""Longest sequence with names of frames; frames of longer ones are named by number."""
 
 
 class TimelineData:

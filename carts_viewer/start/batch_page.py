@@ -17,7 +17,7 @@ from carts_viewer.start.host import Host
 from carts_viewer.transport.document import alert, button, escaped
 
 _SECONDS = 5.0
-"""How often jobs are looked at again while some run."""
+"""Interval between updates while jobs run [s]."""
 _WORST = 12
 _SHOWN = 500
 """Jobs that are listed."""

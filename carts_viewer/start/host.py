@@ -1,4 +1,4 @@
-"""What the site offers its places: the page, allowed folders, navigation, and a file browser."""
+"""Interfaces of the site and of its places, and a file browser."""
 
 import time
 from collections.abc import Callable
@@ -13,7 +13,7 @@ from carts_viewer.transport.page import Page
 
 
 class Place(Protocol):
-    """What a page shows at one time. Everything but the constructor is called on the site's thread."""
+    """A view of the site, such as the start page. Everything but the constructor is called on the site's thread."""
 
     def show(self) -> None:
         """Update the document."""

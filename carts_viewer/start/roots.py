@@ -9,7 +9,7 @@ from pathlib import Path
 from carts_core.errors import SettingsError
 
 MOST_ENTRIES = 2000
-"""Of a folder that are listed."""
+"""Largest number of listed entries of a folder."""
 
 
 @dataclass(frozen=True)

@@ -29,7 +29,7 @@ from carts_viewer.wizard.draft import DraftSummary, delete_draft, drafts
 
 _KEPT = 24
 _WIDTH = 320
-"""Of a thumbnail [px]."""
+"""Width of a thumbnail [px]."""
 _DONE = frozenset({ReviewState.ACCEPTED, ReviewState.REJECTED})
 _Count = Annotated[int, msgspec.Meta(ge=0)]
 
@@ -53,7 +53,7 @@ class RecentProject:
 
     @property
     def thumbnail(self) -> Path:
-        """Where its picture is, if there is one."""
+        """Path of its thumbnail, which may be missing."""
         return _folder() / f"{sha256(self.sequence.encode()).hexdigest()[:16]}.jpg"
 
 
@@ -109,7 +109,7 @@ def _read_numbers(path: Path, stamp: tuple[float, float]) -> tuple[int, int]:
 
 
 def _numbers(state: ProjectState) -> tuple[int, int]:
-    """How many frames are reviewed, and how many are corrected."""
+    """Numbers of reviewed and of corrected frames."""
     frames = range(len(state.identity.frame_ids))
     reviewed = sum(state.review(index).state in _DONE for index in frames)
     return reviewed, sum(bool(state.joints(index)) for index in frames)

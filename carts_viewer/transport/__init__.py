@@ -1,1 +1,1 @@
-"""What goes over the wire, and everything that reaches into private parts of viser and websockets."""
+"""Communication with tabs, and all use of private parts of viser and websockets."""

@@ -20,7 +20,7 @@ _LONGEST = 4096
 
 
 class Document:
-    """What lies over the page in all tabs; nothing at first."""
+    """A document over the page in all tabs; empty at first."""
 
     def __init__(self, page: Page) -> None:
         self._page = page

@@ -61,7 +61,7 @@ class Guard:
         self._session = secrets.token_urlsafe(32)
 
     def url(self, port: int) -> str:
-        """Where to open the page, with the token if there is one."""
+        """Address of the page, with the token if there is one."""
         if self.token is None:
             return f"http://{_bracketed(self._host)}:{port}"
         host = _own_address() if _is_wildcard(self._host) else self._host
@@ -171,7 +171,7 @@ def _bracketed(host: str) -> str:
 
 
 def _hostname(host: str) -> str | None:
-    """Of what a `Host` header says; None for what is more, or less, than a name and a port."""
+    """Host name in a `Host` header; None where it is not a name with an optional port."""
     try:
         parts = urlsplit(f"//{host}")
         _ = parts.port  # Raises when it is none.

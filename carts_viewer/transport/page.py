@@ -30,7 +30,7 @@ from carts_viewer.transport.tab_page import call
 from carts_viewer.transport.viser_private import element_id, list_icons_once, on_sent, queue_safely, value_of
 
 _TITLE, _LOADER, _CLIENT = "<title>Viser</title>", "<script data-p=", 'e.type="module";'
-"""What is replaced in it: its title, the script that unpacks the client, and there the client's own element."""
+"""Replaced parts of viser's page: its title, the script that unpacks the client, and the client's own element."""
 
 
 def index_of_viser(head: str, nonce: str) -> str:
@@ -49,7 +49,7 @@ def index_of_viser(head: str, nonce: str) -> str:
 
 @functools.cache
 def _parts() -> tuple[str, str]:
-    """Of the page, before and after its title."""
+    """The parts of the page before and after its title."""
     index = Path(viser.__file__).parent / "client" / "build" / "index.html"
     text = index.read_text(encoding="utf-8")
     if any(text.count(part) != 1 for part in (_TITLE, _LOADER, _CLIENT)):
@@ -64,7 +64,7 @@ def _parts() -> tuple[str, str]:
 
 MEDIA = "/media/"
 _MOST = 256
-"""How many are kept; the oldest go first."""
+"""Number of pictures kept; the oldest go first."""
 
 
 class Media:
@@ -142,7 +142,7 @@ class Page:
         self._guard = Guard(host)
         self._title = title
         self.key_groups: list[Any] = []
-        """What the sheet of keys lists: names of groups, each with pairs of key and meaning."""
+        """Content of the sheet of keys: groups with pairs of key and meaning."""
         self.project = ""
         """Name of the recording that is shown; empty while none is."""
         self.media = Media()

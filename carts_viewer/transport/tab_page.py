@@ -11,7 +11,7 @@ from carts_viewer.transport.viser_private import command_id, element_id, run_scr
 
 
 class TabPage:
-    """What one tab shows.
+    """The page of one tab.
 
     Attributes:
         client: the tab's connection.
@@ -39,7 +39,7 @@ class TabPage:
             callback(key)
 
     def atomic(self) -> AbstractContextManager[None]:
-        """What is sent inside is shown at once."""
+        """Context in which messages are collected and applied at once."""
         return self.client.atomic()
 
     def flush(self) -> None:

@@ -42,7 +42,7 @@ class Progress:
     text: str
     """Text for the user."""
     share: float
-    """Of its stages, in [0, 1]."""
+    """Share of its stages, in [0, 1]."""
     scene: Scene | None = None
     """With the calibration so far."""
     result: CalibrationResult | None = None
@@ -157,7 +157,7 @@ class PoseReport:
     shift_mm: float
     """At the mean of the tips in the clicked frames [mm]."""
     deviation: PoseDeviation
-    """Of the new pose."""
+    """Uncertainty of the new pose."""
 
 
 @dataclass(frozen=True)
@@ -234,7 +234,7 @@ def _objection(
 
 
 def _poses(result: CalibrationResult, clicking: Clicking, points: Rows[ImagePoint]) -> tuple[PoseReport, ...]:
-    """How far each arm moved before each camera."""
+    """Motion of each arm in each camera."""
     frames = sorted({point.frame for point in points})
     poses = []
     for (name, camera), deviation in result.deviations.items():
@@ -312,7 +312,7 @@ def calibrated_recording(
 
 
 def target_folder(roots: Roots, source: Path, name: str) -> Path:
-    """Where the sequence of a recording is written: beside it, or in it where it is an allowed folder itself.
+    """Folder for the sequence of a recording: beside it, or in it where it is an allowed folder itself.
 
     Raises:
         SettingsError: the name cannot be part of a path.

@@ -97,7 +97,7 @@ class Guess:
     problems: Mapping[str, str] = field(default_factory=dict)
     """"images NAME", "calibration NAME", "kinematics", "columns" or "recording" -> problem of that part."""
     table: ForeignTable | None = None
-    """Of the kinematics, where they are a table of named columns."""
+    """Table of the kinematics, where its columns have names."""
     meanings: ColumnMeanings | None = None
     trials: tuple[Path, ...] = ()
     """Recordings in the folder, of which one has to be chosen."""
@@ -161,7 +161,7 @@ def _images_alone(source: Path, options: ImportOptions) -> FoundRecording | None
 
 
 def _problems_of_parts(source: Path, options: ImportOptions) -> dict[str, str]:
-    """What is wrong with each file that a person has named."""
+    """Problems of the files that the user has chosen."""
     found: dict[str, str] = {}
 
     def attempt(place: str, work: Callable[[], object]) -> None:
@@ -198,7 +198,7 @@ def _place_of(message: str, options: ImportOptions) -> str:
 
 
 def estimated_delay(recording: FoundRecording) -> TimeOffsetEstimate:
-    """What the motion in images and table says.
+    """Time offset estimated from the motion in images and table.
 
     Raises:
         CartsError: what was found does not make a sequence whose rows have times.

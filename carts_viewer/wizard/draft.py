@@ -42,7 +42,7 @@ class Draft:
     source: str = ""
     """Folder or file of the recording; empty before it is chosen."""
     name: str = ""
-    """Of the sequence; by default that of the source."""
+    """Name of the sequence; by default that of the source."""
     options: ImportOptions = field(default_factory=ImportOptions)
     points: tuple[ImagePoint, ...] = ()
     """In the order in which they were clicked."""
@@ -116,7 +116,7 @@ class DraftFile:
         self.key = key or secrets.token_hex(8)
 
     def read(self) -> Draft:
-        """What it holds; an empty draft before anything was written.
+        """The draft; an empty one before anything was written.
 
         Raises:
             SettingsError: it is damaged.
@@ -256,7 +256,7 @@ def picked(draft: Draft, part: str, path: Path, found: Mapping[str, Path]) -> Dr
 
 
 def _new_import(draft: Draft) -> Draft:
-    """What was calibrated before does not hold for other files; points in images stay."""
+    """The draft without its calibration, which other files make void; clicked points stay."""
     return draft.uncalibrated()
 
 

@@ -44,7 +44,7 @@ _OPACITY = 0.9
 
 
 class FramePicture:
-    """What lies behind the document at its side."""
+    """Picture beside the document: image, overlay and clicked points."""
 
     def __init__(self, page: Page, sequence: Sequence) -> None:
         self._page = page
@@ -187,7 +187,7 @@ def _residuals(draft: Draft, clicking: Clicking) -> str:
 
 
 def _asked(clicking: Clicking, prompt: ClickPrompt | None, points: Rows[ImagePoint]) -> str:
-    """What to click now; nothing once there is enough."""
+    """HTML of the next prompt."""
     if prompt is None:
         return "<h2>Points</h2><p>All points are there. More can be chosen below.</p>" + _other(clicking, prompt)
     arms = f"{prompt.arm}: " if len(clicking.sequence.scene.arms) > 1 else ""
@@ -221,7 +221,7 @@ def _other(clicking: Clicking, prompt: ClickPrompt | None) -> str:
 
 
 def _known(draft: Draft, clicking: Clicking) -> str:
-    """How well the arms are known, and which points do not fit."""
+    """HTML of the uncertainty of the calibration, and of contradicting points."""
     focal = check_box("focal_length", draft.focal_length, "Find the focal length, too")
     if clicking.result is None:
         text = clicking.problem if draft.points else "An outline follows the arm from the fourth point on."
@@ -249,7 +249,7 @@ def _known(draft: Draft, clicking: Clicking) -> str:
 
 
 def _rms(draft: Draft, result: HandEyeResult) -> float:
-    """Of the points that agree with each other [px], after the calibration if there is one."""
+    """RMS residual of the consistent points [px], after the calibration if there is one."""
     if draft.report is None:
         return result.error
     agreeing = [row for row in range(len(draft.points)) if row not in result.contradicting]
@@ -304,7 +304,7 @@ def _save(draft: Draft, clicking: Clicking, folder: str) -> str:
 
 
 _WIDTH = 340.0
-"""Of the document at the side [px]; `static/document.css` has it, too."""
+"""Width of the document at the side [px], as in `static/document.css`."""
 
 Report = Callable[[Callable[[Draft], Draft]], None]
 """Called on the site's thread with what a calibration makes of the draft."""
@@ -447,7 +447,7 @@ class HandEyeStep:
             self._solved = wanted
 
     def prompt(self, draft: Draft) -> ClickPrompt | None:
-        """What is to be clicked now; None if nothing is."""
+        """The next prompt; None without one."""
         return self._wanted or self._clicking.next_prompt(draft.points, self._skipped)
 
     def _skip(self, prompts: set[ClickPrompt]) -> None:

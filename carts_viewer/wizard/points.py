@@ -78,7 +78,7 @@ class Clicking:
         return tuple(landmarks(self.sequence.scene.arm(arm)))
 
     def hint(self, arm: str, landmark: str) -> str:
-        """Where to find a landmark."""
+        """Description of a landmark."""
         return landmarks(self.sequence.scene.arm(arm))[landmark].hint
 
 

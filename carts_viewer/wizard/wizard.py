@@ -58,7 +58,7 @@ class RecordingPlace:
 
     @property
     def prompt(self) -> ClickPrompt | None:
-        """What is to be clicked now; None if nothing is."""
+        """The next prompt; None without one."""
         return None if self._step is None else self._step.prompt(self._draft)
 
     @property
@@ -221,7 +221,7 @@ class RecordingPlace:
         )
 
     def _guessed(self) -> Guess:
-        """What the files hold; read again only when something about them was changed."""
+        """Content of the files, cached until the choices change."""
         if self._guess is None:
             if not self._pictures:
                 self._host.document.show(f"<h1>{escaped(self._draft.name)}</h1><p>Reading the recording …</p>")

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import settings
+from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule, run_state_machine_as_test
 from many_actions import check_after_each_of_10000_actions
@@ -237,7 +237,14 @@ def machine(tiny_sequence: Callable[..., Path], untrained_weights: Path) -> type
 
 def test_the_app_says_what_the_model_says_after_every_action(machine: type[RuleBasedStateMachine]) -> None:
     run_state_machine_as_test(
-        machine, settings=settings(max_examples=10, stateful_step_count=30, deadline=None, derandomize=True)
+        machine,
+        settings=settings(
+            max_examples=10,
+            stateful_step_count=30,
+            deadline=None,
+            derandomize=True,
+            suppress_health_check=[HealthCheck.too_slow],
+        ),
     )
 
 

@@ -122,7 +122,7 @@ def test_a_dragged_slider_ends_with_the_overlay_of_its_last_value(
     assert math.degrees(final) < slider.max - 5.5
     assert app.state.undoable == 1
     # The whole drag is one step of undo, and the next drag is another.
-    tab.page.wait_for_timeout(300)
+    eventually(lambda: app.state.unsaved, lambda unsaved: not unsaved)
     tab.page.mouse.move(x - 10, y)
     tab.page.mouse.down()
     tab.page.mouse.move(x + 5, y)

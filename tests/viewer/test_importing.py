@@ -7,6 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from viewer_canvas import eventually
 from viewer_desk import Desk
 from viewer_tab import Tab
 
@@ -141,7 +142,7 @@ def test_somebody_types_where_the_masks_are_and_sees_them(
     field = label.locator("xpath=ancestor::div[1]/following-sibling::div//input")
     field.fill("theirs.json")
     field.press("Tab")
-    tab.page.wait_for_timeout(300)
+    eventually(lambda: tab.find("From").value, lambda value: value == "theirs.json")
     tab.button("Import masks")
     tab.page.get_by_text("Imported 2 masks and keypoints of 2 images from COCO (grasper).").wait_for(timeout=30_000)
     tab.page.locator(".carts-legend").get_by_text("grasper").wait_for(timeout=30_000)

@@ -55,8 +55,7 @@ def test_two_cameras_lie_beside_each_other_and_a_click_chooses_one(
     width = "document.querySelector('.carts-point circle').getBoundingClientRect().width"
     before, shown = tab.page.evaluate(width), tab.page.evaluate("carts.imageOnScreen(1).width")
     tab.page.evaluate("carts.zoomAt(4, 0.5, 0.5)")
-    tab.page.wait_for_timeout(200)
-    assert tab.page.evaluate("carts.imageOnScreen(1).width") > 3 * shown
+    wait_in(tab.page, f"carts.imageOnScreen(1)?.width > {3 * shown}")
     assert tab.page.evaluate(width) == pytest.approx(before, abs=0.5)
 
 
@@ -307,7 +306,6 @@ def test_the_3d_view_shows_the_arms_whole_with_grid_axes_and_the_measured_arms(
     tab.place_in_viewer.put(intents.Perturb(6.0, 0))
     app.wait_until_shown()
     tab.page.keyboard.press("v")
-    tab.page.wait_for_timeout(1500)
     strip, canvas = (tab.page.locator(name).first.bounding_box() for name in (".carts-strip", "canvas"))
     assert strip is not None and canvas is not None
 
@@ -316,7 +314,7 @@ def test_the_3d_view_shows_the_arms_whole_with_grid_axes_and_the_measured_arms(
         bottom = strip["y"] - canvas["y"]
         return len(places) >= 3 and all(0 < x < canvas["width"] and 40 < y < bottom for x, y in places)
 
-    assert seen_whole()
+    eventually(seen_whole, bool)
     # Fit brings it back from anywhere.
     tab.page.mouse.move(canvas["x"] + 560, canvas["y"] + 300)
     tab.page.mouse.down(button="right")
@@ -330,9 +328,10 @@ def test_the_3d_view_shows_the_arms_whole_with_grid_axes_and_the_measured_arms(
     for name in ("Grid", "Measured"):
         before = tab.canvas.screenshot().astype(int)
         tab.page.get_by_role("button", name=name, exact=True).click()
-        tab.page.wait_for_timeout(700)
-        changed = np.abs(before - tab.canvas.screenshot()).max(axis=-1) > 12
-        assert changed.sum() > 150, name
+        eventually(
+            lambda before=before: (np.abs(before - tab.canvas.screenshot()).max(axis=-1) > 12).sum(),
+            lambda count: count > 150,
+        )
     axes = "Object.keys(window.__viserMutable.nodeRefFromName).filter(name => name.endsWith('/axes')).length"
     assert tab.page.evaluate(axes) == 2
     tab.page.keyboard.press("v")
@@ -348,6 +347,5 @@ def test_every_text_can_be_read_in_the_light_and_in_the_dark(
         expect(tab.page.locator(f"html[data-mantine-color-scheme={scheme}]")).to_have_count(1)
         for name in ("Optimize", "Review", "Values", "Jobs", "Live", "Export", "Help"):
             tab.page.get_by_role("tab", name=name, exact=True).click()
-            tab.page.wait_for_timeout(200)
-            assert hardly_legible(tab.page) == [], (scheme, name)
+            eventually(lambda: hardly_legible(tab.page), lambda found: not found)
         tab.page.get_by_role("button", name="Light or dark").click()

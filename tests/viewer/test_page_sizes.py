@@ -30,11 +30,14 @@ def test_no_number_table_or_label_is_cut_off_in_any_tab(
         # On a phone all panels are one sheet below the picture, which makes room for it; the tabs are above the rest.
         tab.page.get_by_role("button", name="All controls").click()
         tab.page.get_by_text("Optimize · Review").click()
-        tab.page.wait_for_timeout(400)
-        sheet = tab.page.get_by_role("tab", name="Review", exact=True).bounding_box()
-        canvas, image = tab.page.locator("canvas").first.bounding_box(), tab.page.evaluate("carts.imageOnScreen()")
-        assert sheet is not None and canvas is not None
-        assert canvas["y"] + image["top"] + image["height"] < sheet["y"] < window[1] / 2
+
+        def image_above_sheet() -> bool:
+            sheet = tab.page.get_by_role("tab", name="Review", exact=True).bounding_box()
+            canvas, image = tab.page.locator("canvas").first.bounding_box(), tab.page.evaluate("carts.imageOnScreen()")
+            assert sheet is not None and canvas is not None
+            return canvas["y"] + image["top"] + image["height"] < sheet["y"] < window[1] / 2
+
+        eventually(image_above_sheet, bool)
     tab.place_in_viewer.put(intents.Export("csv", "All"))
     tab.page.get_by_text("Paint", exact=True).first.click()
     found = {}
@@ -42,8 +45,7 @@ def test_no_number_table_or_label_is_cut_off_in_any_tab(
         tab.page.get_by_role("tab", name=name, exact=True).click()
         for folder in FOLDERS.get(name, ()):
             tab.page.get_by_text(folder, exact=True).click()
-        tab.page.wait_for_timeout(150)
-        found[name] = cut_off(tab.page)
+        found[name] = eventually(lambda: cut_off(tab.page), lambda cut: not cut)
     assert found == {name: [] for name in TABS}
 
 
@@ -59,8 +61,7 @@ def test_the_curves_of_a_run_leave_the_panel_as_wide_as_it_is(
     tab.place_in_viewer.put(intents.Run())
     eventually(lambda: tab.state.verdict, bool, timeout=120)
     tab.page.locator(".uplot").first.wait_for(state="visible")
-    tab.page.wait_for_timeout(1000)
-    assert cut_off(tab.page) == []
+    eventually(lambda: cut_off(tab.page), lambda cut: not cut)
 
 
 def test_what_is_cut_off_is_found(open_viewer: Callable[..., ViewerApp], open_tab: Callable[..., Tab]) -> None:
