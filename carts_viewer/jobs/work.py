@@ -257,7 +257,9 @@ class _Training:
         """Ask the process to save and end, without waiting for it."""
         if self._process.poll() is None:
             self._process.terminate()
-            threading.Thread(target=self._reap, daemon=True).start()
+            # A thread never starts while the interpreter ends; training then ends with its parent.
+            if not sys.is_finalizing():
+                threading.Thread(target=self._reap, daemon=True).start()
 
     def _reap(self) -> None:
         try:

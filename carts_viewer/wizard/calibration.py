@@ -216,7 +216,7 @@ def _objection(
 ) -> str:
     """Why the points speak against the calibration; empty where they agree."""
     before, after, limits = compared.before, compared.after, compared.limits
-    if compared.disagreeing:
+    if compared.disagreeing and not compared.agrees:
         worst = max(compared.disagreeing, key=lambda row: after[row] / limits[row])
         return (
             f"{len(compared.disagreeing)} of {counted(len(points), 'point')} moved farther from the clicks than their "

@@ -30,7 +30,7 @@ SMALL = (
     "--steps 2 --batch-size 1 --workers 1 --threads 1 --validation-samples 2 --images.width 64 --images.height 48 "
     "--images.field-width 64 --fits 1"
 ).split()
-OVER = 120.0
+OVER = 240.0
 """Time for a small run on a busy machine [s]."""
 
 
@@ -177,6 +177,14 @@ def test_training_that_is_cancelled_ends_and_goes_on_in_its_folder(
     at_desk.do(intents.RepeatJob(2))
     assert at_desk.state.jobs[-1].options == AdaptOptions(1, 2)
     at_desk.do(intents.CancelJob(3))
+
+
+def test_a_program_that_ends_while_it_trains_does_not_hang(tiny_sequence: Callable[..., Path], tmp_path: Path) -> None:
+    program = (
+        "import pathlib, sys; from carts_viewer.jobs.work import adapt\n"
+        "training = adapt(pathlib.Path(sys.argv[1]), pathlib.Path(sys.argv[2]), 1.0); next(training)"
+    )
+    subprocess.run([sys.executable, "-c", program, tiny_sequence(frames=2), tmp_path / "run"], check=True, timeout=OVER)
 
 
 def test_training_that_fails_says_why(at_desk: Desk, monkeypatch: pytest.MonkeyPatch) -> None:
