@@ -120,14 +120,14 @@ def move(memory: sqlite3.Connection, start: int, target: int) -> tuple[Script, d
     for about in touched:
         step, value = _newest(memory, about, target)
         key: Key[Any] = Key(Kind(about[0]), *about[1:])
-        entries[key] = Entry(step, decode(key.kind, value)) if step else None
+        entries[key] = Entry(step, decode(key.kind, value)) if step >= 0 else None
     return Script(position=target), entries
 
 
 def _newest(memory: sqlite3.Connection, about: tuple[str, int, str], last: int) -> tuple[int, Any]:
-    """Newest step up to `last` that set a key, and the stored value; (0, None) if there is none."""
+    """Newest step up to `last` that set a key, and the stored value; (-1, None) if there is none."""
     query = "SELECT step, value FROM changes WHERE kind = ? AND frame = ? AND name = ? AND step <= ?"
-    return memory.execute(f"{query} ORDER BY step DESC LIMIT 1", (*about, last)).fetchone() or (0, None)
+    return memory.execute(f"{query} ORDER BY step DESC LIMIT 1", (*about, last)).fetchone() or (-1, None)
 
 
 def before(memory: sqlite3.Connection, step: int, position: int) -> tuple[dict[Key[Any], Any], int | None]:

@@ -301,7 +301,7 @@ class PointAgreement:
     def agrees(self) -> bool:
         """Whether most points agree with the calibration singly, and all of them together."""
         most = _MOST_DISAGREEING * np.isfinite(self.limits).sum()
-        return len(self.disagreeing) <= most and self.rms_after <= max(self.rms_limit, self.rms_before)
+        return bool(len(self.disagreeing) <= most and self.rms_after <= max(self.rms_limit, self.rms_before))
 
 
 def agreement_with_points(
