@@ -38,10 +38,10 @@ def shown(value: object, length: int = 200) -> str:
 
 
 def closest(name: str, known: Iterable[str]) -> str:
-    """` Did you mean 'X'?` when one of `known` resembles `name`, else nothing."""
+    """` Did you mean 'X'?` when one of `known` resembles `name`, else nothing. A number resembles only itself."""
     known, number = list(known), name.lstrip("0")
     same = [one for one in known if one.casefold() == name.casefold()]
     same = same or [one for one in known if name.isdecimal() and one.lstrip("0") == number]
-    if len(name) <= _LONGEST_COMPARED:
+    if len(name) <= _LONGEST_COMPARED and not name.isdecimal():
         same = same or get_close_matches(name, known[:_MOST_COMPARED], n=1, cutoff=0.5)
     return f" Did you mean {same[0]!r}?" if same else ""

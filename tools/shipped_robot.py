@@ -19,6 +19,7 @@ from trimesh.exchange.ply import export_ply
 
 from carts_core.errors import RobotError
 from carts_core.files import output_path, write_bytes, write_text
+from carts_core.model.instruments import shapes
 from carts_core.resources import shipped_robot
 
 Point2 = tuple[float, float]
@@ -63,38 +64,16 @@ def cylinder(
 
 def loft(rings: Float[np.ndarray, "rings n 3"]) -> Manifold:
     """The solid through a stack of star-shaped rings of equally many points [mm], closed by flat ends."""
-    rings = np.asarray(rings, dtype=float)
-    count, n, _ = rings.shape
-    vertices = np.concatenate([rings.reshape(-1, 3), rings[0].mean(0)[None], rings[-1].mean(0)[None]])
-    first, last = count * n, count * n + 1
-    i, j = np.arange(n), (np.arange(n) + 1) % n
-    faces = [np.stack([np.full(n, first), j, i], 1)]
-    for k in range(count - 1):
-        a, b = k * n, (k + 1) * n
-        faces += [np.stack([a + i, a + j, b + j], 1), np.stack([a + i, b + j, b + i], 1)]
-    faces.append(np.stack([np.full(n, last), (count - 1) * n + i, (count - 1) * n + j], 1))
-    triangles = np.concatenate(faces)
-    if _signed_volume(vertices, triangles) < 0:
-        triangles = triangles[:, ::-1]
-    return Manifold(Mesh(vertices.astype(np.float32), np.ascontiguousarray(triangles, np.uint32)))
+    return _manifold(shapes.loft(rings))
 
 
 def cable(path: Sequence[Sequence[float]] | Float[np.ndarray, "n 3"], radius: float, sides: int = 6) -> Manifold:
-    """A round rope along a polyline [mm]; its cross-section is carried along without twist."""
-    points = np.asarray(path, dtype=float)
-    steps = np.diff(points, axis=0)
-    steps /= np.linalg.norm(steps, axis=1, keepdims=True)
-    tangents = np.concatenate([steps[:1], steps[:-1] + steps[1:], steps[-1:]])
-    tangents /= np.linalg.norm(tangents, axis=1, keepdims=True)
-    normal = np.cross(tangents[0], np.eye(3)[np.argmin(np.abs(tangents[0]))])
-    angles = np.arange(sides) * (2 * np.pi / sides)
-    rings = []
-    for point, tangent in zip(points, tangents, strict=True):
-        normal = normal - (normal @ tangent) * tangent
-        normal /= np.linalg.norm(normal)
-        binormal = np.cross(tangent, normal)
-        rings.append(point + radius * (np.outer(np.cos(angles), normal) + np.outer(np.sin(angles), binormal)))
-    return loft(np.array(rings))
+    """A round rope along a polyline [mm]."""
+    return _manifold(shapes.wire(np.asarray(path, dtype=float), radius, sides))
+
+
+def _manifold(solid: shapes.Solid) -> Manifold:
+    return Manifold(Mesh(solid.vertices.astype(np.float32), np.ascontiguousarray(solid.faces, np.uint32)))
 
 
 def pulley(
@@ -171,11 +150,6 @@ def _counter_clockwise(outline: Sequence[Point2] | Float[np.ndarray, "n 2"]) -> 
     x, y = points.T
     area = np.sum(x * np.roll(y, -1) - np.roll(x, -1) * y)
     return points if area > 0 else points[::-1]
-
-
-def _signed_volume(vertices: np.ndarray, faces: np.ndarray) -> float:
-    a, b, c = (vertices[faces[:, k]] for k in range(3))
-    return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6)
 
 
 TUBE_RADIUS = 4.2

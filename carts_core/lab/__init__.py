@@ -1,1 +1,1 @@
-"""What makes networks and figures; nobody who uses the library imports it."""
+"""Training, synthesis and benchmarks; not imported by the rest of the library."""

@@ -16,7 +16,7 @@ from ..errors import RobotError
 from ..imports import deferred
 from ..wording import listed, shown
 
-with deferred("matplotlib", "pyplot"):  # for its solvers' plots, which nobody asks for here: .2 s
+with deferred("matplotlib", "pyplot"):  # only its solvers' plots need it; .2 s
     import pytorch_kinematics
 
 NO_LIMIT = 1e3

@@ -43,7 +43,7 @@ def kept(key: str, make: Callable[[], Made]) -> Made:
     """What is stored under `key`, made and stored if nothing is.
 
     Of many processes that open a robot at once, as in a batch, one makes it, and the others wait for that and have it;
-    where the cache cannot be written to or locked, nobody waits.
+    where the cache cannot be written to or locked, none waits.
     """
     if (stored := read(key)) is not None:
         return stored

@@ -179,8 +179,8 @@ def _session(path: Path) -> "InferenceSession":
         raise WeightsError(f"segmenter file {path} cannot be read ({shortened(str(error))}). {_REMEDY}") from error
     if content[:2] == b"PK" or content[:1] == b"\x80":
         raise WeightsError(
-            f"segmenter file {path} is a PyTorch file, which may run code of whoever made it when it is loaded. Export "
-            f"it as ONNX. {_REMEDY}"
+            f"segmenter file {path} is a PyTorch file, whose code may run when it is loaded. Export it as ONNX. "
+            f"{_REMEDY}"
         )
     try:
         return inference_session(content, fold=False)

@@ -77,8 +77,8 @@ def live_text(live: LiveState) -> str:
         return f'<div class="carts-verdict unknown" role="status"><b>Live</b> {escaped(live.text)}</div>'
     reason = {
         "good": "The arms are followed.",
-        "doubtful": "The image does not fit for the moment; shown is what the frames before let expect.",
-        "lost": "The arms are not found; shown are the measured joints with the last known correction.",
+        "doubtful": "The image does not support the fit; the prediction from earlier frames is shown.",
+        "lost": "The arms are not found; the measured joints with the last known correction are shown.",
     }[live.verdict]
     style = {"good": "good", "doubtful": "doubtful", "lost": "failed"}[live.verdict]
     age = f"{1000.0 * live.age:.0f} ms after the frame"

@@ -45,7 +45,7 @@ class JobsPanel:
                 min=1,
                 max=LARGEST_CALIBRATION,
                 step=1,
-                hint="Spread evenly over the whole sequence, whatever the range",
+                hint="Spread evenly over the whole sequence, independent of the range",
             )
             calibrate = gui.add_button("Calibrate", icon=viser.Icon.RULER_MEASURE, color="gray")
             self._minutes = gui.add_number(

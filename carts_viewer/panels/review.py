@@ -132,7 +132,7 @@ class FindPanel:
                     min=0.0,
                     max=1.0,
                     step=0.01,
-                    hint="Frames that overlap the true mask by less, 0 to 1; 1: whatever it is",
+                    hint="Frames that overlap the true mask by less, 0 to 1; 1 shows all frames",
                 ),
                 "note": gui.add_text("Note has", ""),
             }
