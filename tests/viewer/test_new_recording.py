@@ -126,10 +126,10 @@ def test_two_folders_a_table_and_calibrations_become_a_sequence_with_its_arm_in_
     visitor.press("Stop")
     visitor.reads("Stopped; the calibration from your points is as it was.", 120)
     visitor.press("Save and open")
+    app = eventually(lambda: visitor.site.app, lambda now: now is not None, 120)
+    assert app is not None
     wait_in(visitor.page, "window.__viserMutable?.nodeRefFromName['/overlay']")
-    visitor.site.wait()
-    assert visitor.site.app is not None
-    saved = visitor.site.app.sequence
+    saved = app.sequence
     assert saved.path == root / "day 3_sequence" / "sequence.toml"
     overlap = [agreement(saved.scene, made, camera) for camera in ("left", "right")]
     assert min(overlap) > 0.85, overlap
@@ -307,10 +307,10 @@ def test_real_stereo_frames_without_any_hand_eye_are_calibrated_within_25_clicks
     print(f"{visitor.clicks} clicks, Dice {scores}")
     assert scores["left"] >= 0.94 and scores["right"] >= 0.95, scores
     visitor.press("Save and open")
+    app = eventually(lambda: visitor.site.app, lambda now: now is not None, 120)
+    assert app is not None
     wait_in(visitor.page, "window.__viserMutable?.nodeRefFromName['/overlay']")
-    visitor.site.wait()
-    assert visitor.site.app is not None
-    saved = visitor.site.app.sequence.scene
+    saved = app.sequence.scene
     assert masks_agreement(saved, reference, "left") == pytest.approx(scores["left"], abs=0.002)
 
 
