@@ -12,6 +12,7 @@ from scipy.special import chdtri
 
 from ...errors import SettingsError
 from ...model.scene import Scene
+from ...settings import SurfaceSolver
 from .problem import HandEyeProblem, HandEyeSettings, ImagePoint, View, place_of, views_of
 
 _OUTLIER = 4.0
@@ -313,8 +314,10 @@ def agreement_with_points(
     """Compare a calibration with points.
 
     Where a calibration is true, squared residuals over the variance of a point follow a chi-square distribution, with
-    two degrees of freedom for a point and one for a line. A single point is tested at a level that is divided by the
-    number of points (Bonferroni), and the sum over all points at the same level.
+    two degrees of freedom for a point and one for a line. The variance is that of clicks and of measured joint
+    positions (`SurfaceSolver.frame_prior_deg`, as calibration assumes), which points from few frames cannot tell from
+    the pose. A single point is tested at a level that is divided by the number of points (Bonferroni), and the sum over
+    all points at the same level.
 
     Args:
         scene: with the calibration.
@@ -327,15 +330,41 @@ def agreement_with_points(
         RobotError: a point names an arm or a camera that does not exist.
     """
     after, freedom = np.full(len(points), np.nan), np.ones(len(points))
-    for view in views_of(scene, measured, points):
-        camera, arm = scene.cameras[view.camera], scene.arms[view.arm]
-        distances = view.distances(camera.T_camera_world @ arm.T_world_base, np.array(camera.intrinsics))
-        after[list(view.rows)] = np.linalg.norm(distances, axis=-1)
+    for view, residuals in _residuals(scene, measured, points):
+        after[list(view.rows)] = np.linalg.norm(residuals, axis=-1)
         freedom[list(view.rows)] += view.is_point
+    variance = found.noise**2 + _variance_of_joints(scene, measured, points) / freedom
     counted = np.setdiff1d(np.flatnonzero(np.isfinite(found.distances)), found.contradicting)
     limits = np.full(len(points), np.inf)
-    limits[counted] = found.noise * np.sqrt(chdtri(freedom[counted], _LEVEL / len(counted)))
-    rms_limit = found.noise * np.sqrt(chdtri(freedom[counted].sum(), _LEVEL) / len(counted))
+    limits[counted] = np.sqrt(variance[counted] * chdtri(freedom[counted], _LEVEL / len(counted)))
+    degrees = freedom[counted].sum()
+    rms_limit = np.sqrt((variance * freedom)[counted].sum() / degrees * chdtri(degrees, _LEVEL) / len(counted))
     before = found.distances
     rms_before, rms_after = (float(np.sqrt((each[counted] ** 2).mean())) for each in (before, after))
     return PointAgreement(before, after, limits, rms_before, rms_after, float(rms_limit))
+
+
+def _residuals(
+    scene: Scene, measured: Mapping[str, Float[np.ndarray, "frames dofs"]], points: Sequence[ImagePoint]
+) -> Iterator[tuple[View, Float[np.ndarray, "points 2"]]]:
+    """Residuals of the points of each view under a calibration [px]."""
+    for view in views_of(scene, measured, points):
+        camera, arm = scene.cameras[view.camera], scene.arms[view.arm]
+        yield view, view.distances(camera.T_camera_world @ arm.T_world_base, np.array(camera.intrinsics))
+
+
+def _variance_of_joints(
+    scene: Scene, measured: Mapping[str, Float[np.ndarray, "frames dofs"]], points: Sequence[ImagePoint]
+) -> Float[np.ndarray, " points"]:
+    """Variance of residuals from errors of measured joint positions, summed over both axes [px^2]."""
+    expected = np.radians(SurfaceSolver.frame_prior_deg)
+    variance = np.zeros(len(points))
+    for arm in scene.arms:
+        for joint, kind in enumerate(arm.robot.joint_types):
+            error = np.zeros(len(arm.robot.joint_names))
+            error[joint] = expected * (SurfaceSolver.length_scale if kind == "prismatic" else 1.0)
+            moved = {**measured, arm.name: np.asarray(measured[arm.name]) + error}
+            pairs = zip(_residuals(scene, measured, points), _residuals(scene, moved, points), strict=True)
+            for (view, before), (_, after) in pairs:
+                variance[list(view.rows)] += ((after - before) ** 2).sum(-1)
+    return variance
