@@ -20,6 +20,7 @@ extensions = [
     "sphinx_copybutton",
     "sphinx_design",
     "generated_pages",
+    "offline_math",
 ]
 source_suffix = {".md": "markdown"}
 exclude_patterns = ["_build", "_ext", "requirements*"]
@@ -41,10 +42,12 @@ python_maximum_signature_line_length = 88
 
 copybutton_exclude = ".linenos, .gp, .go"
 
+html_math_renderer = "mathml"
 html_theme = "furo"
 html_title = f"CaRTS {release}"
 html_static_path = ["_static"]
 html_css_files = ["site.css"]
 html_favicon = "../static/icon.svg"
+html_logo = "../static/logo.svg"
 html_show_sourcelink = False
 html_copy_source = False

@@ -31,6 +31,8 @@ LARGEST_GROWTH, LARGEST_REST = 0.15, 0.2
 """Growth after the second minute, and what stays after the last tab left beyond the start, that pass [1]."""
 _SETTLED = 15.0
 """From the tabs' coming to the start of the measurement [s]."""
+_WATCHED, _IDLE, _LONGEST_WORK = 10.0, 0.05, 120
+"""Interval [s] and share of a core [1] below which a server is idle, and the largest number of intervals."""
 _PACE = 0.2
 """Longest time between two actions [s]."""
 
@@ -80,7 +82,9 @@ class Soak:
     minutes: list[float] = field(default_factory=list)
     """At the end of each minute of actions."""
     rest: float = 0.0
-    """Some time after the last tab left."""
+    """Some time after the last tab left and the server's work ended."""
+    worked: float = 0.0
+    """From the last tab's leaving to the end of the server's work [s]."""
     actions: int = 0
 
     @property
@@ -190,7 +194,7 @@ def soak(
         sequence: Sequence file of 640x480 px with a camera `left`.
         minutes: Duration of the actions.
         tabs: Number of tabs.
-        rest: From the last tab's leaving to the last measurement [min].
+        rest: From the end of the server's work, after the last tab has left, to the last measurement [min].
         only: Kinds of action, of `KINDS`.
         seed: Of the actions.
         python: Interpreter of the server; another one measures another checkout.
@@ -221,9 +225,28 @@ def soak(
         seen.minutes.append(_megabytes(process))
         for tab in opened:
             tab.close()
+        left = time.monotonic()
+        _wait_until_idle(process)
+        seen.worked = time.monotonic() - left
         time.sleep(60 * rest)
         seen.rest = _megabytes(process)
     return seen
+
+
+def _wait_until_idle(process: int) -> None:
+    """Wait until a process hardly computes: clicks wait for the server, and jobs go on without a tab."""
+    before = _ticks(process)
+    for _ in range(_LONGEST_WORK):
+        time.sleep(_WATCHED)
+        now = _ticks(process)
+        if now - before < _IDLE * _WATCHED * os.sysconf("SC_CLK_TCK"):
+            return
+        before = now
+
+
+def _ticks(process: int) -> int:
+    fields = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
+    return int(fields[11]) + int(fields[12])
 
 
 def _megabytes(process: int) -> float:
@@ -237,7 +260,7 @@ def main() -> None:
     parser.add_argument("sequence", nargs="?", type=Path, default=sample_sequence())
     parser.add_argument("--minutes", type=float, default=10.0)
     parser.add_argument("--tabs", type=int, default=5)
-    parser.add_argument("--rest", type=float, default=1.0, help="from the last tab's leaving to the last figure [min]")
+    parser.add_argument("--rest", type=float, default=1.0, help="from the end of work to the last figure [min]")
     parser.add_argument("--only", nargs="+", choices=list(KINDS), default=list(KINDS), help="kinds of action")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--python", default=sys.executable, help="interpreter of the server")
@@ -245,7 +268,8 @@ def main() -> None:
     options = {name: getattr(given, name) for name in ("minutes", "tabs", "rest", "seed", "python")}
     seen = soak(given.sequence, only=tuple(given.only), **options)
     print(f"start {seen.start:.0f} MB; growth after the second minute {seen.growth:+.0%}")
-    print(f"{given.rest:g} min after the last tab left: {seen.rest:.0f} MB, {seen.kept:+.0%} of the start")
+    print(f"the server worked for {seen.worked:.0f} s after the last tab had left")
+    print(f"{given.rest:g} min later: {seen.rest:.0f} MB, {seen.kept:+.0%} of the start")
     if seen.growth > LARGEST_GROWTH or seen.kept > LARGEST_REST:
         raise SystemExit(1)
 
