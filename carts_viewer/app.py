@@ -4,12 +4,11 @@ import logging
 from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Unpack
+from typing import Any, Unpack
 
 from carts_core.errors import CartsError
 from carts_core.model.camera import Camera
 from carts_core.model.parts import part_classes
-from carts_core.project import ReviewState
 from carts_core.recording import Sequence
 from carts_viewer.actions import intents
 from carts_viewer.jobs.optimizers import NetworkOptions, OptimizerFactory
@@ -17,130 +16,112 @@ from carts_viewer.panels.help import key_groups
 from carts_viewer.panels.layout import choose_theme
 from carts_viewer.panels.timeline import Thumbnails
 from carts_viewer.picture.overlay import OverlayRenderer
-from carts_viewer.picture.strokes import read_stroke
+from carts_viewer.picture.strokes import Painted, read_stroke
 from carts_viewer.session import Storage, open_storage
 from carts_viewer.state import ViewState
-from carts_viewer.tabs import Hello, IntentQueue, Tab, Tabs, View, read_hello
+from carts_viewer.tabs import IntentQueue, Tab, Tabs, View
+from carts_viewer.transport import events
 from carts_viewer.transport.guard import check_address
 from carts_viewer.transport.page import Page
 from carts_viewer.worker import Worker
 
 _log = logging.getLogger(__name__)
-_LONGEST = 2000
-"""Characters."""
-_DO: dict[str, intents.Intent] = {
-    "previous": intents.MoveFrame(-1),
-    "next": intents.MoveFrame(1),
-    "accept": intents.AcceptAndNext(),
-    "work": intents.SetReview(ReviewState.NEEDS_WORK),
-    "peek": intents.Peek(True),
-    "look": intents.Peek(False),
-    "reject": intents.SetReview(ReviewState.REJECTED),
-}
+_EVENTS = (
+    events.Hello
+    | events.Theme
+    | events.Trace
+    | events.Pressed
+    | events.Pointed
+    | events.Dragged
+    | Painted
+    | intents.AcceptAndNext
+    | intents.Drawn
+    | intents.MoveFrame
+    | intents.Peek
+    | intents.Released
+    | intents.SetRange
+    | intents.SetReview
+    | intents.ShowCamera
+    | intents.ShowFrame
+)
+"""What the page's scripts report; handlers clamp the values of intents, or refuse them."""
 
 
 class Listening:
-    """Dispatches browser events to tabs; invalid ones are ignored."""
+    """Dispatches events of the page to tabs; invalid ones are ignored."""
 
     def __init__(self, page: Page, tabs: Tabs, worker: Worker, sequence: Sequence) -> None:
         self._page, self._tabs, self._worker, self._sequence = page, tabs, worker, sequence
         self._classes = max((one.number for one in part_classes(sequence.scene.arms)), default=0)
-        page.on("asked", self._answer)
+        page.listen(_EVENTS, self._dispatch)
         page.on_disconnect(lambda client_id: worker.call(lambda: tabs.detach(client_id)))
-        page.on("drawn", self._drawn)
-        page.on("released", lambda client_id: self._put(client_id, intents.Released()))
-        page.on("pointed", self._pointed)
-        page.on("dragged", self._dragged)
-        page.on("activated", self._activated)
-        page.on("painted", self._painted)
-        page.on("pressed", self._pressed)
-        page.on("picked", self._picked)
 
-    def _put(self, client_id: int, intent: intents.Intent) -> None:
-        tab = self._tabs.of_client(client_id)
-        if tab is not None:
-            tab.put(intent)
+    def _dispatch(self, client_id: int, event: Any) -> None:
+        client, tab = self._page.server.get_clients().get(client_id), self._tabs.of_client(client_id)
+        if isinstance(event, events.Theme) and client is not None:
+            choose_theme(client.gui, light=event.light)
+        elif isinstance(event, events.Hello) and tab is None:
+            self._worker.call(lambda: self._come(client_id, event))
+        elif tab is not None and (view := tab.view) is not None:
+            self._act(client_id, tab, view, event)
 
-    def _answer(self, client_id: int, text: str) -> None:
-        kind, _, rest = text[:_LONGEST].partition(" ")
-        client = self._page.server.get_clients().get(client_id)
-        if kind == "hello" and client is not None and self._tabs.of_client(client_id) is None:
-            hello = read_hello(rest)
-            if hello is not None:
-                self._worker.call(lambda: self._come(client_id, hello))
-        elif kind == "theme" and client is not None:
-            choose_theme(client.gui, light=rest == "light")
-        elif kind == "trace" and (tab := self._tabs.of_client(client_id)) is not None and tab.view is not None:
-            tab.view.layout.timeline.answer(rest)
-        elif kind == "range":
-            self._put(client_id, intents.SetRange(_range(rest)))
-        elif kind == "do" and rest in _DO:
-            self._put(client_id, _DO[rest])
+    def _act(self, client_id: int, tab: Tab, view: View, event: Any) -> None:
+        match event:
+            case events.Trace():
+                view.layout.timeline.answer(event)
+            case events.Pressed():
+                view.page.press(event.key)
+            case events.Pointed() if (camera := self._camera(event.camera)) is not None:
+                tab.put(intents.PointAt(*_pixel(event.at, camera), camera.name))
+            case events.Dragged() if (camera := self._camera(event.camera)) is not None:
+                start, end = _pixel(event.start, camera), _pixel(event.end, camera)
+                tab.put(intents.DragLink(event.gesture, camera.name, start, end))
+            case Painted():
+                self._paint(client_id, tab, event)
+            case intents.Intent():
+                if isinstance(event, intents.Drawn):
+                    view.display.drawn()
+                tab.put(event)
 
-    def _come(self, client_id: int, hello: Hello) -> None:
+    def _come(self, client_id: int, hello: events.Hello) -> None:
         # A page repeats its greeting until it is answered, and may have closed by now.
         client = self._page.server.get_clients().get(client_id)
         if client is not None and self._tabs.of_client(client_id) is None:
             self._tabs.attach(client, hello)
 
-    def _drawn(self, client_id: int) -> None:
-        tab = self._tabs.of_client(client_id)
-        view: View | None = None if tab is None else tab.view
-        if tab is not None and view is not None:
-            view.display.drawn()
-            tab.put(intents.Drawn())
-
-    def _pointed(self, client_id: int, u: float, v: float, index: float) -> None:
-        camera = self._camera(index)
-        if camera is not None:
-            self._put(client_id, intents.PointAt(u * camera.width, v * camera.height, camera.name))
-
-    def _dragged(self, client_id: int, gesture: float, *places: float) -> None:
-        *shares, index = places
-        camera = self._camera(index)
-        if camera is not None:
-            size = camera.width, camera.height
-            start, end = ((u * size[0], v * size[1]) for u, v in (shares[:2], shares[2:]))
-            self._put(client_id, intents.DragLink(gesture, camera.name, start, end))
-
-    def _activated(self, client_id: int, index: float) -> None:
-        camera = self._camera(index)
-        if camera is not None:
-            self._put(client_id, intents.ShowCamera(camera.name))
-
-    def _camera(self, index: float) -> Camera | None:
+    def _camera(self, index: int) -> Camera | None:
         """The camera with this index; None where a tab names none."""
         cameras = self._sequence.scene.cameras
-        return cameras[int(index)] if index in range(len(cameras)) else None
+        return cameras[index] if 0 <= index < len(cameras) else None
 
-    def _picked(self, client_id: int, index: float) -> None:
-        self._put(client_id, intents.ShowFrame(int(min(max(index, 0.0), 1e9))))
-
-    def _pressed(self, client_id: int, key: str) -> None:
-        tab = self._tabs.of_client(client_id)
-        view: View | None = None if tab is None else tab.view
-        if view is not None:
-            view.page.press(key)
-
-    def _painted(self, client_id: int, text: str) -> None:
+    def _paint(self, client_id: int, tab: Tab, painted: Painted) -> None:
         try:
             cameras = {camera.name: camera for camera in self._sequence.scene.cameras}
-            stroke = read_stroke(text, len(self._sequence), cameras, self._classes)
+            stroke = read_stroke(painted, len(self._sequence), cameras, self._classes)
         except CartsError as error:
             # The viewer's own page sends no such strokes.
             _log.info("Refused: %s", error)
         else:
-            self._put(client_id, intents.Paint(client_id, stroke))
+            tab.put(intents.Paint(client_id, stroke))
 
 
-def _range(text: str) -> tuple[int, int] | None:
-    """First and last frame, from what a tab says; None where these are no two numbers."""
-    numbers = [int(part) for part in text.split() if part.isdecimal() and len(part) < 10]
-    return (numbers[0], numbers[1]) if len(numbers) == 2 else None
+def _pixel(at: tuple[float, float], camera: Camera) -> tuple[float, float]:
+    return at[0] * camera.width, at[1] * camera.height
 
 
-Report = Callable[[str], None]
-"""Called with a line for the user about long operations."""
+class ViewerOptions(NetworkOptions, total=False):
+    """Options of a viewer."""
+
+    host: str
+    """Address to listen on, 127.0.0.1 by default; one that other computers can reach makes the url carry a token."""
+    port: int
+    """Port to listen on, 8080 by default; 0 picks a free port, a busy one moves up to the next free one."""
+    report: Callable[[str], None]
+    """Called with a line for the user about long operations."""
+    page: Page | None
+    """An empty page that is served already, and stays when the viewer is closed; None to serve a new one."""
+    folders: tuple[Path, ...]
+    """Folders that masks may be imported from, besides the sequence's own folder."""
 
 
 class ViewerApp:
@@ -162,12 +143,12 @@ class ViewerApp:
         *,
         host: str = "127.0.0.1",
         port: int = 8080,
-        report: Report = lambda line: None,
+        report: Callable[[str], None] = lambda line: None,
         page: Page | None = None,
         folders: tuple[Path, ...] = (),
         **networks: Unpack[NetworkOptions],
     ) -> None:
-        """Start serving an open sequence with its project, which is closed with the viewer; the rest as in `open`."""
+        """Start serving an open sequence with its project, which is closed with the viewer; see `ViewerOptions`."""
         self._report = report
         self._own_page = page is None
         self._closed = False
@@ -193,34 +174,19 @@ class ViewerApp:
         self._worker.start(self._prepare)
 
     @classmethod
-    def open(
-        cls,
-        path: Path,
-        *,
-        project: Path | None = None,
-        host: str = "127.0.0.1",
-        port: int = 8080,
-        report: Report = lambda line: None,
-        page: Page | None = None,
-        folders: tuple[Path, ...] = (),
-        **networks: Unpack[NetworkOptions],
-    ) -> "ViewerApp":
+    def open(cls, path: Path, *, project: Path | None = None, **options: Unpack[ViewerOptions]) -> "ViewerApp":
         """Open a sequence file and serve its viewer.
 
         Args:
             path: The sequence file.
             project: The project file, begun if it is not there; None for the default place.
-            host: The address to listen on; one that other computers can reach makes the url carry a token.
-            port: 0 picks a free port; a busy one moves up to the next free one.
-            report: Called with a line about what takes long.
-            page: An empty page that is served already, and stays when the viewer is closed; None to serve a new one.
-            folders: From where masks may be imported, besides the sequence's own folder.
-            networks: Options of the networks.
+            options: See `ViewerOptions`.
 
         Raises:
             CartsError: the sequence, its robot, its project or an option is not usable.
         """
-        check_address(host, port)
+        report = options.get("report", lambda line: None)
+        check_address(options.get("host", "127.0.0.1"), options.get("port", 8080))
         report(f"Opening {path}")
         sequence = Sequence.open(path, progress=report)
         storage = open_storage(sequence, project)
@@ -229,7 +195,7 @@ class ViewerApp:
         if storage.notice is not None:
             report(storage.notice)
         try:
-            return cls(sequence, storage, host=host, port=port, report=report, page=page, folders=folders, **networks)
+            return cls(sequence, storage, **options)
         except BaseException:
             storage.close()
             raise
@@ -265,6 +231,11 @@ class ViewerApp:
     def notice(self) -> str | None:
         """Message about where corrections are kept, see `Storage.notice`; None without one."""
         return self._storage.notice
+
+    @property
+    def incident(self) -> str | None:
+        """Where corrections are kept instead, or why they are not; None where all is well."""
+        return self.project.incident
 
     def close(self) -> None:
         """Save what is under way, stop the worker and the server; closing again does nothing.

@@ -4,14 +4,12 @@ Runs on the worker's thread alone; independent of threads and widgets.
 """
 
 import time
-from collections.abc import Callable
 from contextlib import suppress
-from typing import Any
 
 from carts_core.errors import CartsError
 from carts_viewer.actions import intents
 from carts_viewer.actions.browsing import BrowsingHandler
-from carts_viewer.actions.context import Context, unknown
+from carts_viewer.actions.context import Context, Handler
 from carts_viewer.actions.exchange import Deliver, ExportingHandler, ImportingHandler, shown_mask
 from carts_viewer.actions.jobs import JobRequester, JobsHandler
 from carts_viewer.actions.live import LiveHandler
@@ -25,16 +23,6 @@ from carts_viewer.jobs.optimizers import OptimizerFactory
 from carts_viewer.picture.overlay import OverlayRenderer
 from carts_viewer.session import Session
 from carts_viewer.state import ViewState
-
-
-class NoRun:
-    """Stands for the run of a shown frame, of which the background has none."""
-
-    def end(self, reason: str | None) -> None:
-        """There is none."""
-
-    def forget(self) -> None:
-        """There is none."""
 
 
 class Background:
@@ -57,17 +45,9 @@ class Background:
             deliver: sends a file to a tab.
         """
         self._context = context = Context(state, session, renderer)
-        self._propagating = PropagatingHandler(context, NoRun(), optimizers)
-        self._exporting = ExportingHandler(context, NoRun(), deliver)
-        self._jobs = JobsHandler(context, NoRun(), optimizers, self._propagating, self._exporting)
-        # What takes long is queued; the rest of its kind is done at once.
-        self._kinds: dict[type[intents.Intent], Callable[[Any, JobRequester], None]] = {
-            intents.Solve: self._jobs.ask,
-            intents.Export: self._jobs.ask,
-            intents.Jobs: self._jobs.ask,
-            intents.Propagating: lambda intent, _: self._propagating.handle(intent),
-            intents.Exporting: lambda intent, _: self._exporting.handle(intent),
-        }
+        self._propagating = PropagatingHandler(context, optimizers)
+        self._exporting = ExportingHandler(context, deliver)
+        self._jobs = JobsHandler(context, optimizers, self._propagating, self._exporting)
 
     @property
     def state(self) -> ViewState:
@@ -76,7 +56,7 @@ class Background:
 
     def takes(self, intent: intents.Intent) -> bool:
         """Whether an intent is one for the background."""
-        return isinstance(intent, tuple(self._kinds))
+        return any(handler.takes(intent) for handler in (self._jobs, self._propagating, self._exporting))
 
     def handle(self, intent: intents.Intent, person: Person, state: ViewState) -> None:
         """Carry out an intent of a user.
@@ -90,10 +70,11 @@ class Background:
             CartsError: the intent cannot be carried out.
         """
         self._context.refresh()
-        handle = next((handle for kind, handle in self._kinds.items() if isinstance(intent, kind)), None)
-        if handle is None:
-            raise unknown(intent)
-        handle(intent, JobRequester(person, state))
+        # What takes long is queued; the rest is done at once.
+        if self._jobs.takes(intent):
+            self._jobs.ask(intent, JobRequester(person, state))
+        else:
+            (self._exporting if self._exporting.takes(intent) else self._propagating).handle(intent)
         self._jobs.settle()
 
     def wait_time(self) -> float | None:
@@ -150,7 +131,7 @@ WATCH_EVERY = 1.0
 """Interval between checks of the project's file while nothing is edited [s]."""
 
 
-class Controller:
+class Controller(Handler):
     """Holds the state and changes it: at once in `handle`, bit by bit in `advance`."""
 
     def __init__(
@@ -171,34 +152,29 @@ class Controller:
             background: takes what takes long.
             deliver: sends a file to a tab.
         """
-        self._context = context = Context(state, session, renderer)
+        context = Context(state, session, renderer)
+        self._optimizing = OptimizingHandler(context, optimizers)
+        super().__init__(context)
         self._background = background
         self._editor = session.editor
         self._watch_at = 0.0
         self._incident: str | None = None
-        self._optimizing = run = OptimizingHandler(context, optimizers)
-        self._browsing = BrowsingHandler(context, run)
-        self._live = LiveHandler(context, run, optimizers, self._browsing.show)
-        self._annotating = AnnotatingHandler(context, run, self._browsing.show)
-        self._handlers: dict[type[intents.Intent], Callable[[Any], None]] = {
-            intents.Browsing: self._browsing.handle,
-            intents.DragLink: DraggingHandler(context, run).handle,
-            intents.Posing: PosingHandler(context, run).handle,
-            intents.Optimizing: self._optimizing.handle,
-            intents.Annotation: self._annotating.handle,
-            intents.Marking: MarkingHandler(context, run).handle,
-            intents.ExportMask: lambda intent: deliver(intent.client_id, *shown_mask(context)),
-            intents.Painting: PaintingHandler(context, run, optimizers.segmenter).handle,
-            intents.ImportMasks: ImportingHandler(context, run).handle,
-            intents.Live: self._live.handle,
-            intents.Finding: FindingHandler(context, run, self._browsing.show).handle,
-            intents.Refresh: lambda _: context.change(),
-            # Nothing to do: it has woken the worker, which now may send the next overlay.
-            intents.Drawn: lambda _: None,
-            intents.Released: lambda _: self._released(),
-            intents.SetName: lambda intent: self._name(intent.name),
-            intents.DismissError: lambda _: context.change(error=None),
-        }
+        self._browsing = BrowsingHandler(context)
+        self._live = LiveHandler(context, optimizers, self._browsing.show)
+        self._annotating = AnnotatingHandler(context, self._browsing.show)
+        self._handlers = (
+            self._browsing,
+            self._optimizing,
+            self._annotating,
+            self._live,
+            DraggingHandler(context),
+            PosingHandler(context),
+            MarkingHandler(context),
+            PaintingHandler(context, optimizers.segmenter),
+            ImportingHandler(context),
+            FindingHandler(context, self._browsing.show),
+        )
+        self._deliver = deliver
         self._share()
 
     @property
@@ -212,15 +188,12 @@ class Controller:
         Raises:
             CartsError: the intent cannot be carried out; the state stays valid.
         """
-        if self._live.takes(intent):
+        if self._live.replaces(intent):
             return
         if self._background.takes(intent):
             self._hand_on(intent)
             return
-        handle = next((handle for kind, handle in self._handlers.items() if isinstance(intent, kind)), None)
-        if handle is None:
-            raise unknown(intent)
-        handle(intent)
+        next((handler for handler in self._handlers if handler.takes(intent)), super()).handle(intent)
 
     def _hand_on(self, intent: intents.Intent) -> None:
         """Pass an intent to the background, after saving the edits of this tab."""
@@ -252,10 +225,22 @@ class Controller:
         """Copy the shared fields of the background's state."""
         self._context.change(**{name: getattr(self._background.state, name) for name in _COMMON})
 
-    def _name(self, name: str) -> None:
-        chosen = " ".join(name.split())[:LONGEST_NAME]
+    def _on_SetName(self, intent: intents.SetName) -> None:
+        chosen = " ".join(intent.name.split())[:LONGEST_NAME]
         self._editor.person.chosen = chosen
         self._context.change(name=chosen)
+
+    def _on_Refresh(self, intent: intents.Refresh) -> None:
+        self._context.change()
+
+    def _on_Drawn(self, intent: intents.Drawn) -> None:
+        """Nothing to do: it has woken the worker, which now may send the next overlay."""
+
+    def _on_DismissError(self, intent: intents.DismissError) -> None:
+        self._context.change(error=None)
+
+    def _on_ExportMask(self, intent: intents.ExportMask) -> None:
+        self._deliver(intent.client_id, *shown_mask(self._context))
 
     def wait_time(self) -> float | None:
         """Time until work is due without a request [s]; None for ever."""
@@ -334,7 +319,7 @@ class Controller:
         if not self._live.active:
             self._optimizing.map()
 
-    def _released(self) -> None:
+    def _on_Released(self, intent: intents.Released) -> None:
         self._annotating.released()
         if self._context.state.time_error is not None:
             # The value is final once the field is left.

@@ -12,42 +12,27 @@ from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from types import FrameType
-from typing import TYPE_CHECKING, Any, TextIO, TypeVar, Unpack
+from typing import TYPE_CHECKING, Any, TextIO, Unpack
 
 from carts_core.console import log_to_stderr, visible
 from carts_core.errors import CartsError
 from carts_core.files import write_text
-from carts_viewer.app import ViewerApp
-from carts_viewer.jobs.optimizers import NetworkOptions
-from carts_viewer.transport.guard import check_address
+from carts_viewer.app import ViewerApp, ViewerOptions
 
 if TYPE_CHECKING:
     from carts_viewer.start.site import Site
 
 
-Served = TypeVar("Served", ViewerApp, "Site")
-
-
 def serve(
-    sequence_path: Path,
-    *,
-    project: Path | None = None,
-    folders: Sequence[Path] = (),
-    host: str = "127.0.0.1",
-    port: int = 8080,
-    open_browser: bool = False,
-    **networks: Unpack[NetworkOptions],
+    sequence: Path, *, project: Path | None = None, open_browser: bool = False, **options: Unpack[ViewerOptions]
 ) -> None:
     """Serve the viewer of a sequence until Ctrl-C, SIGTERM or SIGHUP, then save; prints where it is.
 
     Args:
-        sequence_path: The sequence file.
+        sequence: The sequence file.
         project: The project file, begun if it is not there; None for the default place.
-        folders: From where masks may be imported, besides the sequence's own folder.
-        host: The address to listen on; one that other computers can reach makes the url carry a token.
-        port: 0 picks a free port; a busy one moves up to the next free one.
         open_browser: Open the page in the default browser.
-        networks: Options of the networks.
+        options: See `ViewerOptions`.
 
     Raises:
         SystemExit: after a message on stderr, with code 2 when the sequence or an option is not usable, and with code 1
@@ -55,39 +40,22 @@ def serve(
     """
     began = time.monotonic()
     _serve(
-        lambda: ViewerApp.open(
-            sequence_path,
-            project=project,
-            host=host,
-            port=port,
-            report=_say_doing,
-            folders=tuple(folders),
-            **networks,
-        ),
+        lambda: ViewerApp.open(sequence, project=project, report=_say_doing, **options),
         lambda: f"Ready after {time.monotonic() - began:.1f} s.",
-        lambda app: app.project.incident,
         open_browser=open_browser,
     )
 
 
 def serve_site(
-    folders: Sequence[Path],
-    *,
-    host: str = "127.0.0.1",
-    port: int = 8080,
-    open_browser: bool = False,
-    batch: Path | None = None,
-    **networks: Unpack[NetworkOptions],
+    folders: Sequence[Path], *, batch: Path | None = None, open_browser: bool = False, **options: Unpack[ViewerOptions]
 ) -> None:
     """Serve the start page, or a batch, until Ctrl-C, SIGTERM or SIGHUP, then save; prints where it is.
 
     Args:
         folders: What the page may look into, and nothing outside.
-        host: The address to listen on; one that other computers can reach makes the url carry a token.
-        port: 0 picks a free port; a busy one moves up to the next free one.
-        open_browser: Open the page in the default browser.
         batch: Folder of the batch that is shown first; None for the start page.
-        networks: Options of the networks.
+        open_browser: Open the page in the default browser.
+        options: See `ViewerOptions`.
 
     Raises:
         SystemExit: as `serve`.
@@ -95,31 +63,13 @@ def serve_site(
     # A viewer of one sequence does without.
     from carts_viewer.start.site import Site  # noqa: PLC0415
 
-    def opened() -> Site:
-        check_address(host, port)
-        return Site(folders, host=host, port=port, report=_say_doing, batch=batch, **networks)
-
-    _serve(opened, lambda: "Ready.", lambda site: site.incident, open_browser=open_browser)
+    _serve(
+        lambda: Site(folders, batch=batch, report=_say_doing, **options), lambda: "Ready.", open_browser=open_browser
+    )
 
 
-def _serve(
-    opened: Callable[[], Served],
-    ready: Callable[[], str],
-    incident: Callable[[Served], str | None],
-    *,
-    open_browser: bool,
-) -> None:
-    """Open, serve, save and close.
-
-    Args:
-        opened: Opens it.
-        ready: What to say when it is open.
-        incident: Where corrections are kept instead, or why they are not; None where all is well.
-        open_browser: Open the page in the default browser.
-
-    Raises:
-        SystemExit: see `serve`.
-    """
+def _serve(opened: "Callable[[], ViewerApp | Site]", ready: Callable[[], str], *, open_browser: bool) -> None:
+    """Open, serve, save and close; `ready` gives what is said when it is open. Errors as `serve`."""
     log_to_stderr()
     with EndRequest() as end:
         try:
@@ -135,22 +85,14 @@ def _serve(
                 end.wait()
             _say("\nClosing.")
         finally:
-            _close(served, lambda: incident(served))
+            _close(served)
 
 
-def _close(served: "ViewerApp | Site", incident: Callable[[], str | None]) -> None:
-    """Save and close.
-
-    Args:
-        served: What is open.
-        incident: Where corrections are kept instead, or why they are not; None where all is well.
-
-    Raises:
-        SystemExit: see `serve`.
-    """
+def _close(served: "ViewerApp | Site") -> None:
+    """Save and close. Errors as `serve`."""
     try:
         served.close()
-        problem = incident()
+        problem = served.incident
     except CartsError as error:
         problem = f"error: {error}"
     if problem is not None:

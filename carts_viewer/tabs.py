@@ -1,13 +1,11 @@
 """Tabs: the queue of intents, the state and view of each tab, and what all tabs share."""
 
-import json
-import logging
 import threading
 import time
-from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Hashable, Iterable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import Generic, TypeVar
 
 import viser
 
@@ -18,7 +16,7 @@ from carts_viewer.actions import intents
 from carts_viewer.actions.exchange import Deliver
 from carts_viewer.actions.intents import Intent
 from carts_viewer.controller import Background, Controller
-from carts_viewer.editing import LONGEST_NAME, People, Person
+from carts_viewer.editing import People, Person
 from carts_viewer.jobs.optimizers import OptimizerFactory
 from carts_viewer.panels.layout import Layout, choose_theme
 from carts_viewer.panels.page_state import chosen
@@ -28,6 +26,7 @@ from carts_viewer.picture.overlay import OverlayRenderer
 from carts_viewer.picture.scene_view import SceneView
 from carts_viewer.session import Session, Storage
 from carts_viewer.state import ViewState
+from carts_viewer.transport.events import Hello
 from carts_viewer.transport.tab_page import TabPage
 
 T = TypeVar("T", bound=Hashable)
@@ -230,42 +229,8 @@ class Tab:
             self.session.close()
 
 
-_log = logging.getLogger(__name__)
 _KEPT = 8
 """Tabs that are kept after their pages closed."""
-_LONGEST_KEY = 64
-"""Characters."""
-
-
-@dataclass(frozen=True)
-class Hello:
-    """Greeting of a page: name of its tab, and the frame, camera and domain to show."""
-
-    key: str
-    name: str = ""
-    light: bool = False
-    frame: int | None = None
-    """From 0."""
-    camera: str | None = None
-    domain: str | None = None
-    settings: Mapping[str, Any] = field(default_factory=dict)
-    """What was chosen there earlier, see `page_state.remembered`; anything, if the page is not the viewer's."""
-
-
-def read_hello(text: str) -> Hello | None:
-    """The greeting of a page, as far as it is valid; None without the name of its tab."""
-    try:
-        said: dict[str, Any] = json.loads(text)
-        key, name = str(said["tab"])[:_LONGEST_KEY], " ".join(str(said.get("name") or "").split())[:LONGEST_NAME]
-        frame = None if said.get("frame") is None else int(said["frame"])
-    except (ValueError, TypeError, KeyError, AttributeError, OverflowError, RecursionError):
-        _log.info("Refused: a tab does not say who it is: %.100s", text)
-        return None
-    camera, domain = (None if said.get(what) is None else str(said[what]) for what in ("camera", "domain"))
-    settings = said.get("settings")
-    return Hello(
-        key, name, said.get("theme") == "light", frame, camera, domain, settings if isinstance(settings, dict) else {}
-    )
 
 
 class Tabs:
@@ -320,9 +285,9 @@ class Tabs:
         Raises:
             CartsError: a place could not be given up.
         """
-        known = next((tab for tab in self._tabs if tab.key == hello.key), None)
+        known = next((tab for tab in self._tabs if tab.key == hello.tab), None)
         tab = known or next((tab for tab in self._tabs if tab.key is None), None) or self._add()
-        tab.key = hello.key
+        tab.key = hello.tab
         if hello.name:
             tab.controller.handle(intents.SetName(hello.name))
         if known is None:

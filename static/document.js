@@ -58,7 +58,7 @@
     return body.childNodes;
   }
 
-  const say = (name, value) => window.carts.report("chosen", JSON.stringify([name, value]));
+  const say = (name, value) => window.carts.report("Chosen", { name, value });
 
   function release() {
     held = false;
@@ -112,7 +112,7 @@
     const frame = canvas().getBoundingClientRect();
     const u = (event.clientX - frame.left - image.left) / image.width;
     const v = (event.clientY - frame.top - image.top) / image.height;
-    if (u >= 0 && u <= 1 && v >= 0 && v <= 1) window.carts.report("clicked", `${u} ${v}`);
+    if (u >= 0 && u <= 1 && v >= 0 && v <= 1) window.carts.report("Clicked", { at: [u, v] });
   }, { capture: true });
 
   window.carts.showDocument = showDocument;

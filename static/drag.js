@@ -10,7 +10,8 @@
   function send() {
     if (!held) return;
     held.waiting = false;
-    window.carts.report("dragged", [held.gesture, ...held.from, ...held.to, held.camera].join(" "));
+    const { gesture, camera, start, end } = held;
+    window.carts.report("Dragged", { gesture, camera, start, end });
   }
 
   setInterval(send, 2000); // a pointer that rests with its button down is still dragging
@@ -24,14 +25,14 @@
     if (event.button !== 0 || !(event.ctrlKey || event.metaKey) || !isPicture(event)) return;
     const at = window.carts.imageAt(event);
     if (!at) return;
-    held = { gesture: Date.now(), camera: at[0], from: [at[1], at[2]], to: [at[1], at[2]], waiting: false };
+    held = { gesture: Date.now(), camera: at[0], start: [at[1], at[2]], end: [at[1], at[2]], waiting: false };
     cursor("grabbing");
     send();
   }, { capture: true });
   window.addEventListener("pointermove", (event) => {
     const at = held && window.carts.imageAt(event, held.camera);
     if (!at) return;
-    held.to = [at[1], at[2]];
+    held.end = [at[1], at[2]];
     if (!held.waiting) {
       held.waiting = true;
       setTimeout(send, PAUSE);

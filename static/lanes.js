@@ -69,9 +69,7 @@
     if (key === asked) return;
     asked = key;
     clearTimeout(timer);
-    timer = setTimeout(() => {
-      window.carts.report("asked", `trace ${JSON.stringify({ name: chosen, first, last, columns })}`);
-    }, WAIT);
+    timer = setTimeout(() => window.carts.report("Trace", { name: chosen, first, last, columns }), WAIT);
   }
 
   function limits() {

@@ -330,7 +330,7 @@
     };
     let last = null;
     let pointing = null; // index of the camera in whose image something is dragged
-    let place = null;
+    let place = null; // what is to be reported
     let pressed = null; // where the picture was pressed, and nothing else began
     let latest = null; // where something is dragged to
     // A pointer that rests with its button down is still dragging; without reports its edit would be saved.
@@ -340,8 +340,8 @@
       const found = imageAt(event, pointing);
       if (!found) return;
       latest = event;
-      if (!place) setTimeout(() => { report("pointed", place.join(" ")); place = null; }, 33);
-      place = [found[1], found[2], found[0]];
+      if (!place) setTimeout(() => { report("Pointed", place); place = null; }, 33);
+      place = { camera: found[0], at: [found[1], found[2]] };
     };
     window.addEventListener("wheel", (event) => {
       if (!inPicture(event)) return;
@@ -380,7 +380,7 @@
       const frame = target?.closest("[data-frame]");
       if (!frame) return;
       event.preventDefault();
-      report("picked", frame.dataset.frame);
+      report("ShowFrame", { index: Number(frame.dataset.frame) });
     }, { capture: true });
     window.addEventListener("dblclick", (event) => { if (inPicture(event) && !painting(event)) showEndoscope(); }, { capture: true });
   }
@@ -392,15 +392,15 @@
 
   /** Choose the camera that edits are about. */
   function activate(index) {
-    if (index !== shown.active) report("activated", String(index));
+    if (index !== shown.active) report("ShowCamera", { camera: shown.names[index] });
   }
 
-  /** Put a new text into one of the invisible fields that the server listens to. */
-  function report(field, text = "") {
+  /** Report an event to the server (`transport/events.py`, `app.py`). Two events never have the same text. */
+  function report(type, values = {}) {
     reports += 1;
     viser()?.sendMessage({
-      type: "GuiUpdateMessage", uuid: window.cartsConfiguration[field],
-      updates: { value: `${tab} ${reports} ${text}`.trim() },
+      type: "GuiUpdateMessage", uuid: window.cartsConfiguration.channel,
+      updates: { value: JSON.stringify([tab, reports, { type, ...values }]) },
     });
   }
 
@@ -412,7 +412,7 @@
   const letGo = () => {
     if (!grabbed) return;
     grabbed = false;
-    setTimeout(() => { if (pressing) grabbed = true; else report("released"); }, HELD_BACK);
+    setTimeout(() => { if (pressing) grabbed = true; else report("Released"); }, HELD_BACK);
   };
   window.addEventListener("pointerdown", (event) => {
     pressing = true;
@@ -435,7 +435,7 @@
     viser()?.nodeRefFromName[OVERLAY]?.traverse((child) => { texture ??= child.material?.map ?? null; });
     if (texture && texture.uuid !== drawnTexture) {
       drawnTexture = texture.uuid;
-      report("drawn");
+      report("Drawn");
     }
   }
 

@@ -79,8 +79,7 @@
     pending.push(stroke);
     const { number, frame, camera, target, label, erase, polygon, prompt, diameter } = stroke;
     const points = stroke.points.map((point) => point.map((value) => Math.round(value * 10) / 10));
-    const message = { number, frame, camera, target, label, erase, polygon, prompt, diameter, points };
-    window.carts.report("painted", JSON.stringify(message));
+    window.carts.report("Painted", { number, frame, camera, target, label, erase, polygon, prompt, diameter, points });
   }
 
   function drop() {
@@ -143,7 +142,7 @@
     } else if (key === "enter" && !(active() && brush.tool === "prompt")) {
       return; // presses whatever button has the focus
     } else {
-      window.carts.report("pressed", key);
+      window.carts.report("Pressed", { key });
     }
     event.preventDefault();
     event.stopPropagation();

@@ -4,7 +4,6 @@
   "use strict";
 
   const make = window.cartsElement;
-  const ask = (text) => window.carts.report("asked", text);
   const remembered = (key) => { try { return JSON.parse(sessionStorage.getItem(key)); } catch { return null; } };
   const wanted = () => localStorage.getItem("carts-theme") ?? "dark"; // pictures are judged best before a dark wall
 
@@ -20,7 +19,7 @@
     const light = documented ? wanted() === "light" : root.dataset.mantineColorScheme === "light";
     localStorage.setItem("carts-theme", light ? "dark" : "light");
     dress();
-    if (!documented) ask(`theme ${wanted()}`);
+    if (!documented) window.carts.report("Theme", { light: wanted() === "light" });
   }
 
   // ---- Who this tab is, and where -----------------------------------------------------------------------------------
@@ -66,7 +65,7 @@
     const { problem, ...place } = linked();
     const name = localStorage.getItem("carts-name") ?? "";
     const settings = JSON.parse(localStorage.getItem("carts-settings") ?? "{}");
-    ask(`hello ${JSON.stringify({ tab: key, name, theme: wanted(), settings, ...place })}`);
+    window.carts.report("Hello", { tab: key, name, light: wanted() === "light", settings, ...place });
     if (problem && asked === 1) tell(problem);
   }
   setInterval(sayHello, 150);
@@ -191,7 +190,7 @@
   // ---- The other pose, as long as a key is held --------------------------------------------------------------------------
 
   let peeking = false;
-  const peek = (on) => { if (on !== peeking) { peeking = on; ask(on ? "do peek" : "do look"); } };
+  const peek = (on) => { if (on !== peeking) { peeking = on; window.carts.report("Peek", { on }); } };
   window.addEventListener("keydown", (event) => {
     const typing = event.target instanceof Element && event.target.closest("input:not([readonly]), textarea");
     if (event.key === "." && !typing) { peek(true); event.preventDefault(); }
@@ -203,6 +202,10 @@
 
   const small = matchMedia("(max-width: 36em)");
   let bar = null;
+  const ACTIONS = {
+    previous: ["MoveFrame", { by: -1 }], next: ["MoveFrame", { by: 1 }], accept: ["AcceptAndNext"],
+    work: ["SetReview", { state: "needs work" }], reject: ["SetReview", { state: "rejected" }],
+  };
 
   function buildBar() {
     if (!small.matches || bar || !window.__viserMutable?.canvas) return;
@@ -215,7 +218,7 @@
     bar.addEventListener("click", (event) => {
       const name = event.target.closest?.("button")?.dataset.do;
       if (name === "controls") document.body.classList.toggle("carts-controls");
-      else if (name) ask(`do ${name}`);
+      else if (name) window.carts.report(...ACTIONS[name]);
     });
     document.body.append(bar);
   }

@@ -70,8 +70,8 @@
     canvas.addEventListener("wheel", zoom, { passive: false });
     canvas.addEventListener("dblclick", () => { view = [0, frames]; dirty = true; });
     const actions = {
-      first: () => window.carts.report("pressed", "("), last: () => window.carts.report("pressed", ")"),
-      whole: () => window.carts.report("asked", "range none"),
+      first: () => window.carts.report("Pressed", { key: "(" }), last: () => window.carts.report("Pressed", { key: ")" }),
+      whole: () => window.carts.report("SetRange", { frames: null }),
       legend: () => {
         const card = strip.querySelector(".carts-strip-legend");
         card.hidden = !card.hidden;
@@ -141,7 +141,7 @@
 
   function go(frame) {
     if (frame === wanted) return;
-    if (wanted === null) setTimeout(() => { window.carts.report("picked", String(wanted)); wanted = null; }, 33);
+    if (wanted === null) setTimeout(() => { window.carts.report("ShowFrame", { index: wanted }); wanted = null; }, 33);
     wanted = frame;
   }
 
@@ -171,7 +171,7 @@
     if (rangeTimer === null) return;
     clearTimeout(rangeTimer);
     rangeTimer = null;
-    window.carts.report("asked", `range ${range[0]} ${range[1]}`);
+    window.carts.report("SetRange", { frames: range });
   }
 
   function move(event) {

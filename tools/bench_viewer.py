@@ -58,7 +58,7 @@ def slider_latency(app: ViewerApp, *, drags: int = 4, seconds: float = 4.0, draw
     name = next(iter(arm))
     times: list[float] = []
     stale = False
-    with RawTab(app.url, app.page.drawn_id if draws else None, key=_KEY) as tab:
+    with RawTab(app.url, draws=draws, key=_KEY) as tab:
         slider = app.page.element_id(app.view.layout.joints.slider(name, 0))
         shown = _record_pictures(app, name)
         app.wait_until_shown()
@@ -96,10 +96,10 @@ def frame_latency(app: ViewerApp, *, moves: int = 120, frames: int = 8, pause: f
     count = min(frames, len(app.sequence)) - 1
     app.queue.put(intents.ShowFrame(0))
     times: list[float] = []
-    with RawTab(app.url, app.page.drawn_id, key=_KEY) as tab:
-        forth, back = (app.view.page.command_id(label) for label in ("Next frame", "Previous frame (back)"))
-        lap = [forth] * count + [back] * count
+    with RawTab(app.url, draws=True, key=_KEY) as tab:
         app.wait_until_shown()
+        forth, back = tab.find("Next frame"), tab.find("Previous frame (back)")
+        lap = [forth] * count + [back] * count
         for number in range(len(lap) + moves):
             seen, pressed = len(tab.overlays), time.perf_counter()
             tab.press(lap[number % len(lap)])

@@ -39,8 +39,8 @@ class RawTab:
     def __init__(
         self,
         url: str,
-        drawn: str | None = None,
         *,
+        draws: bool = False,
         keep: int | None = None,
         origin: str | None = None,
         hello: bool = True,
@@ -49,24 +49,24 @@ class RawTab:
         """
         Args:
             url: The page's address.
-            drawn: Id of the field in which a tab says that it has drawn an overlay; None for a tab that never says so.
+            draws: Whether it reports that overlays are drawn.
             keep: How many overlays to remember; None for all.
             origin: The header of this name; None for none, as programs do.
             hello: Whether it asks for its place in the viewer, as our page does, and waits for it.
             key: What it calls itself then; None for a name of its own.
         """
         self._url = url.replace("http://", "ws://")
-        self._drawn = drawn
+        self._draws = draws
         self._origin = None if origin is None else Origin(origin)
         self._loop = asyncio.new_event_loop()
         self._thread = threading.Thread(target=self._loop.run_forever, daemon=True)
         self._connection: ClientConnection | None = None
-        self._drawings = 0
+        self._reports = itertools.count(1)
         self._joined = threading.Event()
         self._hello = hello
         self.key = key or f"raw {next(_NUMBERS)}"
         """What the tab calls itself."""
-        self._asked: str | None = None
+        self._channel: str | None = None
         self._saying: asyncio.Task[None] | None = None
         self.overlays: deque[tuple[float, bytes]] = deque(maxlen=keep)
         """Time of arrival [s, perf_counter] and PNG of every overlay."""
@@ -99,9 +99,13 @@ class RawTab:
         """
         self.send(_update(element, value))
 
-    def acknowledge(self, drawn: str) -> None:
-        """Say from now on in the field of this id that overlays are drawn."""
-        self._drawn = drawn
+    def report(self, kind: str, **values: Any) -> None:
+        """Report an event, as our page does; errors as `set`."""
+        self.send(self._report(kind, **values))
+
+    def find(self, label: str) -> str:
+        """Id of the widget or command with this label."""
+        return next(element for element, widget in self.widgets.items() if widget.get("label") == label)
 
     def press(self, command: str) -> None:
         """Trigger the command of a key; errors as `set`."""
@@ -163,14 +167,9 @@ class RawTab:
 
     async def _say_hello(self) -> None:
         """Ask for a place until there is one."""
-        count = 0
         while not self._joined.is_set() and self.connected:
-            count += 1
-            if self._asked is not None:
-                said = json.dumps({"tab": self.key})
-                await self._push(
-                    msgspec.msgpack.encode(_update(self._asked, f"{self.key.replace(' ', '')} {count} hello {said}"))
-                )
+            if self._channel is not None:
+                await self._push(msgspec.msgpack.encode(self._report("Hello", tab=self.key)))
             await asyncio.sleep(0.1)
 
     async def _note(self, message: dict[str, Any], arrived: float) -> None:
@@ -182,8 +181,8 @@ class RawTab:
                 self._saying = asyncio.create_task(self._say_hello())
         if message["type"] == "RunJavascriptMessage" and '"setPage"' in message["source"]:
             self._joined.set()
-        if props.get("label") == "asked":
-            self._asked = message["uuid"]
+        if props.get("label") == "channel":
+            self._channel = message["uuid"]
         if message["type"] == "GuiUpdateMessage" and "value" in updates:
             self.values[message["uuid"]] = updates["value"]
         if "uuid" in message:
@@ -191,10 +190,13 @@ class RawTab:
             self.widgets.setdefault(message["uuid"], {}).update({**known, **props, **updates})
         if message.get("name") == OVERLAY and "_data" in (updates or props):
             self.overlays.append((arrived, (updates or props)["_data"]))
-            self._drawings += 1
-            if self._drawn is not None:
-                drawn = _update(self._drawn, f"{id(self)} {self._drawings}")
-                await self._push(msgspec.msgpack.encode(drawn))
+            if self._draws:
+                await self._push(msgspec.msgpack.encode(self._report("Drawn")))
+
+    def _report(self, kind: str, **values: Any) -> dict[str, Any]:
+        """The message of an event."""
+        assert self._channel is not None
+        return _update(self._channel, json.dumps([self.key, next(self._reports), {"type": kind, **values}]))
 
 
 def _update(element: str, value: Any) -> dict[str, Any]:

@@ -6,7 +6,6 @@ Bisects by kind of action with `--only`. The server is a process of its own, so 
 """
 
 import argparse
-import json
 import os
 import random
 import re
@@ -102,9 +101,8 @@ class RandomTab:
     """A tab that does things at random, whatever the page shows."""
 
     def __init__(self, url: str, key: str, dice: random.Random) -> None:
-        self._dice, self._count, self._key = dice, 0, key
-        self.tab = RawTab(url, keep=1, key=key).__enter__()
-        self.tab.acknowledge(self._id("drawn"))
+        self._dice, self._count = dice, 0
+        self.tab = RawTab(url, draws=True, keep=1, key=key).__enter__()
 
     def act(self, kind: str, frames: int) -> None:
         """Do something of this kind."""
@@ -115,7 +113,7 @@ class RandomTab:
         element, widget = self._dice.choice(offered)
         if "value" in widget:
             self.tab.set(element, self._value(widget))
-            self._say("released", "")
+            self.tab.report("Released")
         else:
             self.tab.press(element)
 
@@ -123,13 +121,6 @@ class RandomTab:
         """Leave."""
         with suppress(ConnectionClosed, TimeoutError, RuntimeError):
             self.tab.__exit__()
-
-    def _id(self, label: str) -> str:
-        return next(i for i, widget in self.tab.widgets.items() if widget.get("label") == label)
-
-    def _say(self, label: str, text: str) -> None:
-        self._count += 1
-        self.tab.set(self._id(label), f"{self._key} {self._count} {text}")
 
     def _value(self, widget: dict[str, Any]) -> object:
         value, dice = widget["value"], self._dice
@@ -144,9 +135,10 @@ class RandomTab:
 
     def _paint(self, frames: int, *, prompt: bool) -> None:
         dice = self._dice
+        self._count += 1
         points = [[dice.uniform(0, 640), dice.uniform(0, 480)] for _ in range(1 if prompt else dice.randrange(3, 60))]
         stroke = {
-            "number": self._count + 1,
+            "number": self._count,
             "frame": dice.randrange(frames),
             "camera": "left",
             "target": dice.choice(["Mask", "Ignore region"]),
@@ -156,7 +148,7 @@ class RandomTab:
             "points": points,
             "prompt": prompt,
         }
-        self._say("painted", json.dumps(stroke))
+        self.tab.report("Painted", **stroke)
 
 
 @contextmanager

@@ -3,13 +3,12 @@
 import logging
 import time
 from dataclasses import replace
-from functools import singledispatchmethod
 from typing import Any
 
 from carts_core.errors import SequenceError
 from carts_core.project import Key, TimeOffset
 from carts_viewer.actions import intents
-from carts_viewer.actions.context import Context, OpenRun, clamped, finite, one_of, unknown_intent
+from carts_viewer.actions.context import Context, Handler, clamped, finite, one_of
 from carts_viewer.choices import Against, Reach
 from carts_viewer.state import RunState
 
@@ -18,17 +17,12 @@ SPEEDS = (0.5, 60.0)
 """Slowest and fastest playing [frames/s]."""
 
 
-class BrowsingHandler:
+class BrowsingHandler(Handler):
     """The handler that chooses what is shown."""
 
-    def __init__(self, context: Context, run: OpenRun) -> None:
-        self._context = context
-        self._open_run = run
-        self._session = context.session
+    def __init__(self, context: Context) -> None:
+        super().__init__(context)
         self._next_frame_at = 0.0
-
-    handle = singledispatchmethod(unknown_intent)
-    """Carries out an intent; raises `CartsError` where it cannot, and the state stays valid."""
 
     def wait_time(self) -> float | None:
         """Time until the next frame is due [s]; None without playback."""
@@ -63,39 +57,35 @@ class BrowsingHandler:
         if not again and (index, domain, camera) == (state.index, state.domain, state.camera):
             return
         if (index, domain) != (state.index, state.domain) or (camera != state.camera and not state.every_camera):
-            self._open_run.end("Stopped: another image is shown")
+            self._context.end_run("Stopped: another image is shown")
         frame = self._session.frame(index, domain, camera)
         if index != state.index:
             context.leave_frame()
-            self._open_run.forget()
+            if context.run is not None:
+                context.run.forget()
             keypoints = replace(context.state.keypoints, pins=(), residuals=())
             context.change(run=RunState(), keypoints=keypoints)
         context.change(index=index, domain=domain, camera=camera, frame=frame, scores=None, maps=None)
         context.change(error=None, notice=None)
         context.refresh()
 
-    @handle.register
-    def _(self, intent: intents.ShowFrame) -> None:
+    def _on_ShowFrame(self, intent: intents.ShowFrame) -> None:
         self._context.change(playing=False)
         self.show(index=intent.index)
 
-    @handle.register
-    def _(self, intent: intents.MoveFrame) -> None:
+    def _on_MoveFrame(self, intent: intents.MoveFrame) -> None:
         self._context.change(playing=False)
         self.show(index=self._context.state.index + intent.by)
 
-    @handle.register
-    def _(self, intent: intents.Play) -> None:
+    def _on_Play(self, intent: intents.Play) -> None:
         on = not self._context.state.playing if intent.on is None else intent.on
         self._next_frame_at = time.monotonic()
         self._context.change(playing=on)
 
-    @handle.register
-    def _(self, intent: intents.SetSpeed) -> None:
+    def _on_SetSpeed(self, intent: intents.SetSpeed) -> None:
         self._context.change(fps=clamped(intent.fps, *SPEEDS))
 
-    @handle.register
-    def _(self, intent: intents.SetTimeOffset) -> None:
+    def _on_SetTimeOffset(self, intent: intents.SetTimeOffset) -> None:
         seconds, sequence = finite(intent.seconds), self._session.sequence
         try:
             sequence.with_time_offset(seconds)
@@ -108,35 +98,29 @@ class BrowsingHandler:
             _log.info("%s %s", text, error)
             self._context.change(time_error=text)
             return
-        self._open_run.end("Stopped: the time offset was changed")
+        self._context.end_run("Stopped: the time offset was changed")
         self._context.change(time_error=None)
         gesture = intents.SetTimeOffset
         self._context.edit("Time offset", {Key.time_offset(): TimeOffset(seconds)}, gesture=gesture)
 
-    @handle.register
-    def _(self, intent: intents.ShowDomain) -> None:
+    def _on_ShowDomain(self, intent: intents.ShowDomain) -> None:
         self.show(domain=intent.domain)
 
-    @handle.register
-    def _(self, intent: intents.ShowCamera) -> None:
+    def _on_ShowCamera(self, intent: intents.ShowCamera) -> None:
         self.show(camera=intent.camera)
 
-    @handle.register
-    def _(self, intent: intents.ShowBeside) -> None:
+    def _on_ShowBeside(self, intent: intents.ShowBeside) -> None:
         self._context.change(beside=not self._context.state.beside if intent.on is None else intent.on)
 
-    @handle.register
-    def _(self, intent: intents.SetReach) -> None:
+    def _on_SetReach(self, intent: intents.SetReach) -> None:
         self._context.change(reach=Reach(intent.reach))
 
-    @handle.register
-    def _(self, intent: intents.SetRange) -> None:
+    def _on_SetRange(self, intent: intents.SetRange) -> None:
         end = len(self._session.sequence) - 1
         first, last = sorted(min(max(int(one), 0), end) for one in intent.frames or (0, end))
         self._context.change(range=None if (first, last) == (0, end) else (first, last))
 
-    @handle.register
-    def _(self, intent: intents.MarkRange) -> None:
+    def _on_MarkRange(self, intent: intents.MarkRange) -> None:
         index, end = self._context.state.index, len(self._session.sequence) - 1
         first, last = self._context.state.range or (0, end)
         # An end before the beginning begins anew there, with the rest of the sequence.
@@ -145,25 +129,20 @@ class BrowsingHandler:
         else:
             self.handle(intents.SetRange((index, last if last >= index else end)))
 
-    @handle.register
-    def _(self, intent: intents.CompareWith) -> None:
+    def _on_CompareWith(self, intent: intents.CompareWith) -> None:
         self._compare(against=None if intent.against is None else Against(intent.against))
 
-    @handle.register
-    def _(self, intent: intents.SetSwipe) -> None:
+    def _on_SetSwipe(self, intent: intents.SetSwipe) -> None:
         self._compare(swipe=clamped(intent.share, 0.0, 1.0))
 
-    @handle.register
-    def _(self, intent: intents.Peek) -> None:
+    def _on_Peek(self, intent: intents.Peek) -> None:
         self._compare(peek=bool(intent.on))
 
     def _compare(self, **changes: Any) -> None:
         self._context.change(compare=replace(self._context.state.compare, **changes))
 
-    @handle.register
-    def _(self, intent: intents.ShowLayer) -> None:
+    def _on_ShowLayer(self, intent: intents.ShowLayer) -> None:
         self._context.change(layer=intent.layer)
 
-    @handle.register
-    def _(self, intent: intents.SetOpacity) -> None:
+    def _on_SetOpacity(self, intent: intents.SetOpacity) -> None:
         self._context.change(opacity=clamped(intent.opacity, 0.0, 1.0))

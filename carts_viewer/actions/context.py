@@ -17,17 +17,10 @@ from carts_viewer.state import Maps, ViewState
 
 
 class OpenRun(Protocol):
-    """The run of the optimizer on the shown frame, as other handlers see it."""
+    """The run of the optimizer on the shown frame."""
 
     def end(self, reason: str | None) -> None:
-        """End the run, if there is one, and save where it is.
-
-        Args:
-            reason: text for the user; None without one.
-
-        Raises:
-            ProjectError: it could not be saved.
-        """
+        """End the run, if there is one, and save where it is; `reason` is text for the user."""
 
     def forget(self) -> None:
         """Forget the start of the run, since another frame is shown."""
@@ -40,7 +33,10 @@ class Context:
         state: what the page shows.
         session: the recording and its project.
         renderer: renders poses.
+        run: the run on the shown frame; None in the background.
     """
+
+    run: OpenRun | None = None
 
     def __init__(self, state: ViewState, session: Session, renderer: OverlayRenderer) -> None:
         self.state = state
@@ -58,6 +54,18 @@ class Context:
     def change(self, **changes: Any) -> None:
         """Replace fields of the state."""
         self.state = replace(self.state, **changes)
+
+    def end_run(self, reason: str | None) -> None:
+        """End the run on the shown frame, if there is one, and save where it is.
+
+        Args:
+            reason: text for the user; None without one.
+
+        Raises:
+            ProjectError: it could not be saved.
+        """
+        if self.run is not None:
+            self.run.end(reason)
 
     def set_pose(
         self, name: str, scene: SceneState, *, gesture: object = None, source: Source = Source.HAND, pins: bool = False
@@ -225,15 +233,22 @@ def one_of(asked: str | None, now: str, known: Collection[str], what: str) -> st
     return asked
 
 
-def unknown(intent: Intent) -> CartsError:
-    """The error for an intent that nothing handles."""
-    return CartsError(f"The viewer does not know what to do with {type(intent).__name__}; this is a bug.")
+class Handler:
+    """Carries out intents, each by the method `_on_NAME` of its class, as `ast.NodeVisitor` does."""
 
+    def __init__(self, context: Context) -> None:
+        self._context, self._session = context, context.session
 
-def unknown_intent(handler: object, intent: Intent) -> None:
-    """Default of the handlers' `handle`, for intents that they have no method for.
+    def handle(self, intent: Intent) -> None:
+        """Carry out an intent.
 
-    Raises:
-        CartsError: always.
-    """
-    raise unknown(intent)
+        Raises:
+            CartsError: it cannot be carried out; the state stays valid.
+        """
+        if not self.takes(intent):
+            raise CartsError(f"The viewer does not know what to do with {type(intent).__name__}; this is a bug.")
+        getattr(self, f"_on_{type(intent).__name__}")(intent)
+
+    def takes(self, intent: Intent) -> bool:
+        """Whether there is a method for an intent."""
+        return hasattr(self, f"_on_{type(intent).__name__}")

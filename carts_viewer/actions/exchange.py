@@ -8,7 +8,7 @@ import time
 import zipfile
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
-from functools import lru_cache, singledispatchmethod
+from functools import lru_cache
 from pathlib import Path
 from typing import Generic, TypeVar
 
@@ -20,7 +20,7 @@ from carts_core.project.calibrated import calibrated_scene
 from carts_core.project.values import UNREVIEWED
 from carts_core.recording.annotations import read_annotations
 from carts_viewer.actions import intents
-from carts_viewer.actions.context import Context, OpenRun, unknown_intent
+from carts_viewer.actions.context import Context, Handler
 from carts_viewer.picture.layers import Layer
 from carts_viewer.state import ExportState
 
@@ -52,19 +52,14 @@ Deliver = Callable[[int, str, bytes], None]
 """Sends a file to a tab: client id, file name, content."""
 
 
-class ExportingHandler:
+class ExportingHandler(Handler):
     """Handler of exports and downloads."""
 
-    def __init__(self, context: Context, run: OpenRun, deliver: Deliver) -> None:
-        self._context = context
-        self._open_run = run
+    def __init__(self, context: Context, deliver: Deliver) -> None:
+        super().__init__(context)
         self._deliver = deliver
-        self._session = context.session
         self._job: CooperativeThread[Path] | None = None
         self._intent: intents.Export | None = None
-
-    handle = singledispatchmethod(unknown_intent)
-    """Carries out an intent; raises `CartsError` where it cannot, and the state stays valid."""
 
     def wait_time(self) -> float | None:
         """0 while there is something to write; None when there is not."""
@@ -104,13 +99,12 @@ class ExportingHandler:
 
     # ---- Intents ---------------------------------------------------------------------------------------------------
 
-    @handle.register
-    def _(self, intent: intents.Export) -> None:
+    def _on_Export(self, intent: intents.Export) -> None:
         if self._job is not None:
             raise CartsError("Something is being exported already. Wait, or cancel that first.")
         if intent.format not in FORMATS or intent.frames not in FRAME_CHOICES or intent.parts not in PARTS_CHOICES:
             raise SettingsError(f"There is no export of {intent.frames!r} as {intent.format!r} by {intent.parts!r}.")
-        self._open_run.end("Stopped: frames are exported")
+        self._context.end_run("Stopped: frames are exported")
         self._context.save()
         make, count = self._dataset(intent)
         target = free_path(self._session.editor.project.path, _STEMS.get(intent.format, intent.format), intent)
@@ -118,12 +112,10 @@ class ExportingHandler:
         self._job = CooperativeThread(lambda monitor: export(make(monitor), intent.format, target, monitor=monitor))
         self._context.change(export=ExportState(FORMATS[intent.format].label, count), error=None)
 
-    @handle.register
-    def _(self, intent: intents.CancelExport) -> None:
+    def _on_CancelExport(self, intent: intents.CancelExport) -> None:
         self.cancel()
 
-    @handle.register
-    def _(self, intent: intents.Download) -> None:
+    def _on_Download(self, intent: intents.Download) -> None:
         export_state = self._context.state.export
         if export_state is None or export_state.path is None:
             raise CartsError("Nothing has been exported yet.")
@@ -338,21 +330,10 @@ class CooperativeThread(Generic[T]):
 _LONGEST = 4096
 
 
-class ImportingHandler:
+class ImportingHandler(Handler):
     """Handler of imported masks and keypoints."""
 
-    def __init__(self, context: Context, run: OpenRun) -> None:
-        self._context = context
-        self._open_run = run
-        self._session = context.session
-
-    def handle(self, intent: intents.ImportMasks) -> None:
-        """Import masks and show them.
-
-        Raises:
-            CartsError: it is outside of the allowed folders, cannot be read, or would replace something; nothing is
-                changed then.
-        """
+    def _on_ImportMasks(self, intent: intents.ImportMasks) -> None:
         session = self._session
         place = intent.place.strip()[:_LONGEST]
         if not place:
@@ -360,7 +341,7 @@ class ImportingHandler:
         # As the folder is known by itself, whatever links lead to it.
         path = session.roots.checked(session.sequence.path.parent.resolve() / Path(place))
         found = read_annotations(path, session.sequence, intent.camera, confined=True)
-        self._open_run.end("Stopped: masks were imported")
+        self._context.end_run("Stopped: masks were imported")
         self._context.save()
         report = import_annotations(session.editor.project, found, source=path.name, replace=intent.replace)
         session.editor.claim()

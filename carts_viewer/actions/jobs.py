@@ -3,14 +3,15 @@
 import time
 from collections.abc import Generator
 from dataclasses import asdict, dataclass, replace
-from functools import singledispatchmethod
 from typing import Any
+
+import msgspec
 
 from carts_core.errors import CartsError
 from carts_core.project import frames_in
 from carts_core.project.state import UNREVIEWED
 from carts_viewer.actions import intents
-from carts_viewer.actions.context import Context, OpenRun, unknown_intent
+from carts_viewer.actions.context import Context, Handler
 from carts_viewer.actions.exchange import ExportingHandler
 from carts_viewer.actions.frame_filter import found
 from carts_viewer.actions.sequence import PropagatingHandler
@@ -20,6 +21,7 @@ from carts_viewer.jobs.comparison import Comparison
 from carts_viewer.jobs.job_list import (
     AdaptOptions,
     CalibrateOptions,
+    ExportOptions,
     Job,
     JobList,
     JobState,
@@ -51,19 +53,17 @@ class JobRequester:
         context.change(**{name: getattr(self.state, name) for name in _CHOICES})
 
 
-class JobsHandler:
+class JobsHandler(Handler):
     """Queues, starts, follows and stops jobs."""
 
     def __init__(
         self,
         context: Context,
-        run: OpenRun,
         optimizers: OptimizerFactory,
         propagating: PropagatingHandler,
         exporting: ExportingHandler,
     ) -> None:
-        self._context = context
-        self._open_run = run
+        super().__init__(context)
         self._optimizers = optimizers
         self._propagating, self._exporting = propagating, exporting
         self._comparison = Comparison(context.session, context.renderer, optimizers)
@@ -91,9 +91,6 @@ class JobsHandler:
         self._requester = requester
         self.handle(intent)
 
-    handle = singledispatchmethod(unknown_intent)
-    """Carries out an intent; raises `CartsError` where it cannot, and the state stays valid."""
-
     def wait_time(self) -> float | None:
         """0 while there is something to do; None when there is not."""
         active = any(job.state in (JobState.WAITING, JobState.RUNNING) for job in self._list.jobs)
@@ -101,43 +98,35 @@ class JobsHandler:
 
     # ---- Intents ---------------------------------------------------------------------------------------------------
 
-    @handle.register
-    def _(self, intent: intents.Solve) -> None:
+    def _on_Solve(self, intent: intents.Solve) -> None:
         state = self._choices
-        self._queue("solve", {**asdict(intent), "at": state.index, "range": state.range})
+        self._queue("solve", {**msgspec.structs.asdict(intent), "at": state.index, "range": state.range})
 
-    @handle.register
-    def _(self, intent: intents.Export) -> None:
-        self._queue("export", asdict(intent))
+    def _on_Export(self, intent: intents.Export) -> None:
+        self._queue("export", msgspec.structs.asdict(intent))
 
-    @handle.register
-    def _(self, intent: intents.OptimizeFrames) -> None:
+    def _on_OptimizeFrames(self, intent: intents.OptimizeFrames) -> None:
         self._queue("optimize", {"frames": self._frames(intent.frames)})
 
-    @handle.register
-    def _(self, intent: intents.Calibrate) -> None:
-        self._queue("calibrate", asdict(intent))
+    def _on_Calibrate(self, intent: intents.Calibrate) -> None:
+        self._queue("calibrate", msgspec.structs.asdict(intent))
 
-    @handle.register
-    def _(self, intent: intents.Adapt) -> None:
+    def _on_Adapt(self, intent: intents.Adapt) -> None:
         if not self._context.session.editor.project.writable:
             raise CartsError("The project is read-only here, so no network can be kept beside it.")
-        self._queue("adapt", {**asdict(intent), "folder": self._networks.next_number()})
+        self._queue("adapt", {**msgspec.structs.asdict(intent), "folder": self._networks.next_number()})
 
-    @handle.register
-    def _(self, intent: intents.UseNetwork) -> None:
+    def _on_UseNetwork(self, intent: intents.UseNetwork) -> None:
         self._networks.use(intent.name)
         self._publish()
 
-    @handle.register
-    def _(self, intent: intents.AnswerNetwork) -> None:
+    def _on_AnswerNetwork(self, intent: intents.AnswerNetwork) -> None:
         try:
             self._networks.answer(intent.accepted)
         finally:
             self._publish()
 
-    @handle.register
-    def _(self, intent: intents.AnswerJobs) -> None:
+    def _on_AnswerJobs(self, intent: intents.AnswerJobs) -> None:
         for job in self._list.jobs:
             if job.state is JobState.ASKED and intent.accepted:
                 self._list.accept(job.number, self._safe_options(job))
@@ -145,16 +134,14 @@ class JobsHandler:
                 self._end(job, JobState.CANCELLED, "Discarded; it did not run.")
         self._publish()
 
-    @handle.register
-    def _(self, intent: intents.CancelJob) -> None:
+    def _on_CancelJob(self, intent: intents.CancelJob) -> None:
         job = self._list.find(intent.number)
         if job.state is JobState.RUNNING:
             self._stop(job)
         if not job.over:
             self._end(job, JobState.CANCELLED, "Cancelled; what was saved is kept.")
 
-    @handle.register
-    def _(self, intent: intents.RepeatJob) -> None:
+    def _on_RepeatJob(self, intent: intents.RepeatJob) -> None:
         job = self._list.find(intent.number)
         if not job.over:
             raise CartsError("This job has not ended yet.")
@@ -163,8 +150,7 @@ class JobsHandler:
             options = replace(options, first=job.done if job.state is not JobState.DONE else 0)
         self._queue(job.kind, asdict(options))
 
-    @handle.register
-    def _(self, intent: intents.ForgetJobs) -> None:
+    def _on_ForgetJobs(self, intent: intents.ForgetJobs) -> None:
         self._list.forget()
         self._publish()
 
@@ -228,10 +214,10 @@ class JobsHandler:
             match job.options:
                 case SolveOptions() as options:
                     self._propagating.solve(options.whole, options.at, job.frames)
-                case intents.Export() as export:
-                    self._exporting.handle(export)
+                case ExportOptions() as options:
+                    self._exporting.handle(intents.Export(**asdict(options)))
                 case _:
-                    self._open_run.end("Stopped: a job was started")
+                    self._context.end_run("Stopped: a job was started")
                     self._work = self._own(job.options)
         except Exception as error:
             self._end(job, JobState.FAILED, str(error))

@@ -13,7 +13,7 @@ from carts_core.optimization import Backgrounds
 from carts_core.project import Provenance, Source
 from carts_core.settings.live import StreamAddress, StreamKind
 from carts_viewer.actions import intents
-from carts_viewer.actions.context import Context, OpenRun, unknown
+from carts_viewer.actions.context import Context, Handler
 from carts_viewer.jobs.optimizers import OptimizerFactory, scene_at
 from carts_viewer.state import LiveState, Pose
 
@@ -88,7 +88,8 @@ _TELL_EVERY = 0.5
 """Interval between updates of the statistics [s]."""
 _FOR_EVER = 1_000_000
 ALLOWED = (
-    intents.Live,
+    intents.StartLive,
+    intents.StopLive,
     intents.ShowLayer,
     intents.SetOpacity,
     intents.ShowBeside,
@@ -112,12 +113,12 @@ class Show(Protocol):
         """As `BrowsingHandler.show`."""
 
 
-class LiveHandler:
+class LiveHandler(Handler):
     """Handler of live streams, which are shown in place of the recording."""
 
-    def __init__(self, context: Context, run: OpenRun, optimizers: OptimizerFactory, show: Show) -> None:
-        self._context, self._open_run, self._optimizers, self._show = context, run, optimizers, show
-        self._session = context.session
+    def __init__(self, context: Context, optimizers: OptimizerFactory, show: Show) -> None:
+        super().__init__(context)
+        self._optimizers, self._show = optimizers, show
         self._live: LiveRun | None = None
         self._tell_at = 0.0
 
@@ -126,21 +127,10 @@ class LiveHandler:
         """Whether a stream is shown."""
         return self._live is not None
 
-    def handle(self, intent: intents.Live) -> None:
-        """Carry out an intent.
+    def _on_StopLive(self, intent: intents.StopLive) -> None:
+        self.stop("Stopped.")
 
-        Raises:
-            CartsError: the stream cannot be opened, or what was recorded not be written.
-        """
-        match intent:
-            case intents.StartLive():
-                self._start(intent)
-            case intents.StopLive():
-                self.stop("Stopped.")
-            case _:
-                raise unknown(intent)
-
-    def takes(self, intent: intents.Intent) -> bool:
+    def replaces(self, intent: intents.Intent) -> bool:
         """Whether an intent is dealt with here because a stream is shown.
 
         Raises:
@@ -200,13 +190,13 @@ class LiveHandler:
         if run.recorder is not None:
             self._context.change(live=replace(state, on=False, text=f"{text} {_written(run.recorder.close())}"))
 
-    def _start(self, intent: intents.StartLive) -> None:
+    def _on_StartLive(self, intent: intents.StartLive) -> None:
         context, session = self._context, self._session
         address = StreamAddress.parse(intent.source, intent.joints_port)
         if address.kind in (StreamKind.VIDEO, StreamKind.FOLDER):
             raise CartsError(f"{address.kind} is followed by the command line: carts live SEQUENCE --source {address}")
         self.stop("Stopped.")
-        self._open_run.end("Stopped: a live stream was started")
+        self._context.end_run("Stopped: a live stream was started")
         context.save()
         context.change(playing=False, error=None)
         extractor = self._optimizers.prepare()

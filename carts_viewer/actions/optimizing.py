@@ -1,7 +1,6 @@
 """The optimizer: runs on the shown frame, solver settings, and free parameters."""
 
 from dataclasses import replace
-from functools import singledispatchmethod
 from typing import Any
 
 from carts_core.errors import CartsError, SettingsError
@@ -11,10 +10,10 @@ from carts_core.settings import SolverName, SurfaceSolver
 from carts_core.settings import solver as named_solver
 from carts_core.settings.serialization import changed
 from carts_viewer.actions import intents
-from carts_viewer.actions.context import Context, unknown_intent
+from carts_viewer.actions.context import Context, Handler
 from carts_viewer.choices import NETWORK, PRESETS, Observed
 from carts_viewer.jobs.comparison import FitCheck
-from carts_viewer.jobs.optimizers import ActiveRun, OptimizerFactory, scene_at
+from carts_viewer.jobs.optimizers import ActiveRun, FrameTask, OptimizerFactory, scene_at
 from carts_viewer.picture.layers import Layer
 from carts_viewer.state import Curves, Maps, Phase, RunState, Scores
 
@@ -28,12 +27,12 @@ _REASONS = {
 }
 
 
-class OptimizingHandler:
+class OptimizingHandler(Handler):
     """The handler that drives the optimizer, an iteration at a time."""
 
     def __init__(self, context: Context, optimizers: OptimizerFactory) -> None:
-        self._context = context
-        self._session = context.session
+        super().__init__(context)
+        context.run = self
         self._optimizers = optimizers
         self._check = FitCheck(context.session, optimizers)
         self._run: ActiveRun | None = None
@@ -41,9 +40,6 @@ class OptimizingHandler:
         """Target of the last run."""
         self._before: Edits | None = None
         """Edits that restore the frame to the start of the last run."""
-
-    handle = singledispatchmethod(unknown_intent)
-    """Carries out an intent; raises `CartsError` where it cannot, and the state stays valid."""
 
     @property
     def active(self) -> bool:
@@ -90,7 +86,7 @@ class OptimizingHandler:
             return
         try:
             run = self._make((state.camera,))
-            iterate = run.step()
+            iterate = run.optimizer.step()
         except CartsError:
             # Without weights, say, there is nothing to show, and trying again with every picture would not help.
             self._context.change(layer=Layer.MASK)
@@ -99,31 +95,26 @@ class OptimizingHandler:
 
     # ---- Intents ---------------------------------------------------------------------------------------------------
 
-    @handle.register
-    def _(self, intent: intents.Run) -> None:
+    def _on_Run(self, intent: intents.Run) -> None:
         if self._run is None:
             self._start()
         self._set(phase=Phase.RUNNING, reason=None)
 
-    @handle.register
-    def _(self, intent: intents.Pause) -> None:
+    def _on_Pause(self, intent: intents.Pause) -> None:
         if self._context.state.run.phase is Phase.RUNNING:
             self._set(phase=Phase.PAUSED)
 
-    @handle.register
-    def _(self, intent: intents.RunOrPause) -> None:
+    def _on_RunOrPause(self, intent: intents.RunOrPause) -> None:
         self.handle(intents.Pause() if self._context.state.run.phase is Phase.RUNNING else intents.Run())
 
-    @handle.register
-    def _(self, intent: intents.Step) -> None:
+    def _on_Step(self, intent: intents.Step) -> None:
         if self._run is None:
             self._start()
             self._iterate()
         self._set(phase=Phase.PAUSED, reason=None)
         self._iterate()
 
-    @handle.register
-    def _(self, intent: intents.Reset) -> None:
+    def _on_Reset(self, intent: intents.Reset) -> None:
         if self._run is not None:
             # Nothing of the run was saved yet, so there is nothing to take back.
             self._session.editor.drop()
@@ -132,8 +123,7 @@ class OptimizingHandler:
         if self._before is not None:
             self._context.edit("Reset to the start of the run", self._before)
 
-    @handle.register
-    def _(self, intent: intents.SetSetting) -> None:
+    def _on_SetSetting(self, intent: intents.SetSetting) -> None:
         state = self._context.state
         settings, solver = state.settings, state.solver
         try:
@@ -148,8 +138,7 @@ class OptimizingHandler:
         self.end("Settings changed; Run starts anew from here")
         self._context.change(settings=settings, solver=solver, settings_error=None, settings_field=None, maps=None)
 
-    @handle.register
-    def _(self, intent: intents.ResetSettings) -> None:
+    def _on_ResetSettings(self, intent: intents.ResetSettings) -> None:
         preset = PRESETS.get(intent.preset)
         if preset is None:
             raise SettingsError(f"There is no preset {intent.preset!r}; there are: {', '.join(PRESETS)}.")
@@ -160,25 +149,21 @@ class OptimizingHandler:
         self.end("Settings changed; Run starts anew from here")
         self._context.change(settings=settings, settings_error=None, settings_field=None, maps=None)
 
-    @handle.register
-    def _(self, intent: intents.SetFreeJoint) -> None:
+    def _on_SetFreeJoint(self, intent: intents.SetFreeJoint) -> None:
         name = f"{intent.arm}/{intent.joint}"
         locked = {*self._context.state.free.locked_joints} - {name}
         self._set_free(locked_joints=tuple(sorted(locked if intent.on else {*locked, name})))
 
-    @handle.register
-    def _(self, intent: intents.SetFreeGroup) -> None:
+    def _on_SetFreeGroup(self, intent: intents.SetFreeGroup) -> None:
         if intent.group not in ("base_frames", "extrinsics", "intrinsics"):
             raise SettingsError(f"There is no group of parameters called {intent.group!r}.")
         self._set_free(**{intent.group: intent.on})
 
-    @handle.register
-    def _(self, intent: intents.SetCameras) -> None:
+    def _on_SetCameras(self, intent: intents.SetCameras) -> None:
         self.end("Cameras changed; Run starts anew from here")
         self._context.change(every_camera=intent.every)
 
-    @handle.register
-    def _(self, intent: intents.SetObserved) -> None:
+    def _on_SetObserved(self, intent: intents.SetObserved) -> None:
         observed = Observed(intent.what, intent.masks)  # type: ignore[arg-type]
         self.end("What is fitted was changed; Run starts anew from here")
         self._context.change(observed=observed, maps=None)
@@ -186,14 +171,21 @@ class OptimizingHandler:
     # ---- The run ---------------------------------------------------------------------------------------------------
 
     def _make(self, cameras: tuple[str, ...]) -> ActiveRun:
-        state = self._context.state
-        sequence, self._target = self._session.sequence, self._session.target(state.observed)
-        ignore = self._session.ignored(state.index, cameras, self._target)
-        optimizer = self._optimizers.make(
-            sequence, state.index, state.domain, cameras, state.pose, state.settings, state.free, self._target, ignore
+        state, target = self._context.state, self._session.target(self._context.state.observed)
+        self._target, ignore = target, self._session.ignored(state.index, cameras, target)
+        task = FrameTask(
+            self._session.sequence,
+            state.index,
+            state.domain,
+            cameras,
+            state.pose,
+            state.settings,
+            state.free,
+            target,
+            ignore,
         )
-        provenance = self._optimizers.provenance(cameras, state.settings, state.free, self._target)
-        return ActiveRun(optimizer, self._session.scene, state.pose, cameras, provenance, state.free)
+        provenance = self._optimizers.provenance(cameras, state.settings, state.free, target)
+        return ActiveRun(self._optimizers.make(task), task, provenance)
 
     def _start(self) -> None:
         if self._context.state.settings_error is not None:
@@ -220,23 +212,23 @@ class OptimizingHandler:
         run = self._run
         if run is None:
             return
-        iterate = run.step()
+        iterate = run.optimizer.step()
         if iterate is None:
-            best, reason = run.best(), run.stop_reason
+            best, reason = run.optimizer.best, run.optimizer.stop_reason
             if best is not None:
                 self._accept(run, best, self._verdict(run, best))
                 curves = self._context.state.run.curves
-                self._set(curves=replace(curves, loss=run.comparable_losses(), comparable=True))
+                self._set(curves=replace(curves, loss=tuple(run.optimizer.comparable_losses()), comparable=True))
             self.end(_REASONS.get(reason or "", reason))
-            self._set(base_frame_gain=run.base_frame_gain())
+            self._set(base_frame_gain=run.optimizer.base_frame_gain())
             return
         self._accept(run, iterate)
         self._context.score()
-        curves, best = self._context.state.run.curves, run.best()
+        curves, best = self._context.state.run.curves, run.optimizer.best
         self._set(
             curves=Curves(
                 (*curves.loss, float(iterate.loss)),
-                run.stages,
+                tuple(progress.stage for progress in run.optimizer.history),
                 False,
                 (*curves.scores, self._context.state.scores or Scores()),
                 (*curves.seconds, float(iterate.seconds)),
@@ -257,8 +249,7 @@ class OptimizingHandler:
             return own
         return found
 
-    @handle.register
-    def _(self, intent: intents.Assess) -> None:
+    def _on_Assess(self, intent: intents.Assess) -> None:
         self.end("Stopped: the fit was checked")
         self._optimizers.report("comparing with the images")
         state = self._context.state

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from functools import singledispatchmethod
 from typing import Any
 
 import numpy as np
@@ -13,7 +12,7 @@ from carts_core.model.parts import part_classes
 from carts_core.project import Edits, Key, Kind, ProjectState
 from carts_core.segmentation import Prompt, Segmenter
 from carts_viewer.actions import intents
-from carts_viewer.actions.context import Context, OpenRun, clamped, unknown_intent
+from carts_viewer.actions.context import Context, Handler, clamped
 from carts_viewer.picture.layers import Layer
 from carts_viewer.picture.strokes import DIAMETERS, Mask, Stroke, Target, Tool, corrected, ignored, relabelled
 
@@ -26,38 +25,28 @@ _STEPS = {
 _CLEARED = {Target.MASK: "Clear the mask correction", Target.IGNORE: "Clear the ignore region"}
 
 
-class PaintingHandler:
+class PaintingHandler(Handler):
     """Handler of painting."""
 
-    def __init__(self, context: Context, run: OpenRun, segmenter: Callable[[], Segmenter]) -> None:
-        self._context = context
-        self._open_run = run
+    def __init__(self, context: Context, segmenter: Callable[[], Segmenter]) -> None:
+        super().__init__(context)
         self._prompting = Prompting(segmenter)
-        self._session = context.session
 
-    handle = singledispatchmethod(unknown_intent)
-    """Carries out an intent; raises `CartsError` where it cannot, and the state stays valid."""
-
-    @handle.register
-    def _(self, intent: intents.NextObject) -> None:
+    def _on_NextObject(self, intent: intents.NextObject) -> None:
         self._prompting.finish()
 
-    @handle.register
-    def _(self, intent: intents.SetTool) -> None:
+    def _on_SetTool(self, intent: intents.SetTool) -> None:
         self._prompting.finish()
         self._hold(tool=intent.tool)
 
-    @handle.register
-    def _(self, intent: intents.ToggleTool) -> None:
+    def _on_ToggleTool(self, intent: intents.ToggleTool) -> None:
         self._hold(tool=Tool.OFF if self._context.state.brush.tool is intent.tool else intent.tool)
 
-    @handle.register
-    def _(self, intent: intents.SetTarget) -> None:
+    def _on_SetTarget(self, intent: intents.SetTarget) -> None:
         other = Target.IGNORE if self._context.state.brush.target is Target.MASK else Target.MASK
         self._hold(target=intent.target or other)
 
-    @handle.register
-    def _(self, intent: intents.SetPaintClass) -> None:
+    def _on_SetPaintClass(self, intent: intents.SetPaintClass) -> None:
         known = {0, *(one.number for one in part_classes(self._session.scene.arms))}
         if intent.number not in known:
             raise CartsError(f"There is no class {intent.number!r} to paint; there are: {sorted(known)}.")
@@ -66,18 +55,15 @@ class PaintingHandler:
             # The layer of parts shows the painted classes.
             self._context.change(layer=Layer.PARTS)
 
-    @handle.register
-    def _(self, intent: intents.SetDiameter) -> None:
+    def _on_SetDiameter(self, intent: intents.SetDiameter) -> None:
         self._hold(diameter=round(clamped(intent.diameter, *DIAMETERS)))
 
-    @handle.register
-    def _(self, intent: intents.ScaleBrush) -> None:
+    def _on_ScaleBrush(self, intent: intents.ScaleBrush) -> None:
         now = self._context.state.brush.diameter
         by = max(1, round(abs(now * intent.factor - now)))
         self.handle(intents.SetDiameter(now + by if intent.factor > 1 else now - by))
 
-    @handle.register
-    def _(self, intent: intents.Paint) -> None:
+    def _on_Paint(self, intent: intents.Paint) -> None:
         stroke = intent.stroke
         painted = {**self._context.state.brush.painted, intent.client_id: stroke.number}
         try:
@@ -85,8 +71,7 @@ class PaintingHandler:
         finally:
             self._hold(painted=painted)
 
-    @handle.register
-    def _(self, intent: intents.ClearLayer) -> None:
+    def _on_ClearLayer(self, intent: intents.ClearLayer) -> None:
         state = self._context.state
         target = intent.target or state.brush.target
         painted = (Key.mask_correction, Key.part_labels) if target is Target.MASK else (Key.ignore_region,)
@@ -133,7 +118,7 @@ class PaintingHandler:
         view = self._session.editor.view
         changed = {key: layer for key, layer in edits.items() if view.get(key) != layer}
         if changed:
-            self._open_run.end("Stopped: something was painted; Run starts anew from here")
+            self._context.end_run("Stopped: something was painted; Run starts anew from here")
             self._context.edit(name, changed, loss=self._loss(next(iter(changed))))
 
     def _loss(self, key: Key[Any]) -> float | None:

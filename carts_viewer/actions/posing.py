@@ -1,7 +1,6 @@
 """Moving arms by hand: sliders, nudges, perturbations, and dragging a link in the picture."""
 
 import math
-from functools import singledispatchmethod
 
 from carts_core.errors import CartsError
 from carts_core.model.keypoints import Keypoint, project_keypoints
@@ -9,25 +8,16 @@ from carts_core.model.scene import SceneState
 from carts_core.optimization.keypoints import Pin, fit_keypoints
 from carts_core.project import Key
 from carts_viewer.actions import intents
-from carts_viewer.actions.context import Context, OpenRun, clamped, finite, unknown_intent
+from carts_viewer.actions.context import Context, Handler, clamped, finite
 
 LARGEST_PERTURBATION = 30.0
 """[deg and mm]."""
 
 
-class PosingHandler:
+class PosingHandler(Handler):
     """The handler that moves joints by hand."""
 
-    def __init__(self, context: Context, run: OpenRun) -> None:
-        self._context = context
-        self._open_run = run
-        self._session = context.session
-
-    handle = singledispatchmethod(unknown_intent)
-    """Carries out an intent; raises `CartsError` where it cannot, and the state stays valid."""
-
-    @handle.register
-    def _(self, intent: intents.SetJoint) -> None:
+    def _on_SetJoint(self, intent: intents.SetJoint) -> None:
         value = finite(intent.value)
         scene = self._session.with_joint(self._context.state.pose.scene, intent.arm, intent.joint, value)
         self._context.change(joint=(intent.arm, intent.joint))
@@ -35,8 +25,7 @@ class PosingHandler:
         gesture = (intents.SetJoint, intent.arm, intent.joint)
         self._set_pose(f"Move {self._joint_name()}", scene, gesture=gesture)
 
-    @handle.register
-    def _(self, intent: intents.ChooseJoint) -> None:
+    def _on_ChooseJoint(self, intent: intents.ChooseJoint) -> None:
         joints = [(arm.name, joint) for arm in self._session.scene.arms for joint in range(len(arm.robot.joint_names))]
         following = joints[(joints.index(self._joint()) + 1) % len(joints)]
         chosen = intent.joint or following
@@ -44,8 +33,7 @@ class PosingHandler:
             raise CartsError(f"There is no joint {chosen!r}.")
         self._context.change(joint=chosen)
 
-    @handle.register
-    def _(self, intent: intents.Nudge) -> None:
+    def _on_Nudge(self, intent: intents.Nudge) -> None:
         arm, joint = self._joint()
         pose = self._context.state.pose.scene
         by = clamped(intent.by, -LARGEST_PERTURBATION, LARGEST_PERTURBATION)
@@ -53,22 +41,20 @@ class PosingHandler:
         now = self._session.joints(pose)[arm][joint]
         self._set_pose(f"Nudge {self._joint_name()}", self._session.with_joint(pose, arm, joint, now + step))
 
-    @handle.register
-    def _(self, intent: intents.BackToMeasured) -> None:
-        self._open_run.end("Stopped: the pose was changed by hand")
+    def _on_BackToMeasured(self, intent: intents.BackToMeasured) -> None:
+        self._context.end_run("Stopped: the pose was changed by hand")
         names = [arm.name for arm in self._session.scene.arms] if intent.arm is None else [intent.arm]
         index = self._context.state.index
         self._context.edit("Back to measured", {Key.joints(index, name): None for name in names})
 
-    @handle.register
-    def _(self, intent: intents.Perturb) -> None:
+    def _on_Perturb(self, intent: intents.Perturb) -> None:
         degrees = clamped(intent.degrees, 0.0, LARGEST_PERTURBATION)
         state = self._context.state
         scene = self._session.perturbed(state.pose.scene, state.index, degrees, intent.seed)
         self._set_pose(f"Perturb by {degrees:g}°", scene)
 
     def _set_pose(self, name: str, scene: SceneState, gesture: object = None) -> None:
-        self._open_run.end("Stopped: the pose was changed by hand")
+        self._context.end_run("Stopped: the pose was changed by hand")
         self._context.set_pose(name, scene, gesture=gesture)
 
     def _joint(self) -> tuple[str, int]:
@@ -86,28 +72,22 @@ _LEAST = 0.5
 """A pointer that has moved less was only pressed [px]."""
 
 
-class DraggingHandler:
+class DraggingHandler(Handler):
     """The handler that moves a link to where the pointer drags it.
 
     Every place of a gesture starts from the pose in which the link was taken, so that the way there does not matter and
     dragging it back undoes it.
     """
 
-    def __init__(self, context: Context, run: OpenRun) -> None:
-        self._context = context
-        self._open_run = run
+    def __init__(self, context: Context) -> None:
+        super().__init__(context)
         self._gesture: float | None = None
         self._frame = 0
         self._start: SceneState | None = None
         self._point: Keypoint | None = None
         """The dragged point; None where no arm was under the pointer."""
 
-    def handle(self, intent: intents.DragLink) -> None:
-        """Carry out an intent.
-
-        Raises:
-            CartsError: the intent cannot be carried out; the state stays valid.
-        """
+    def _on_DragLink(self, intent: intents.DragLink) -> None:
         if not all(map(math.isfinite, (*intent.start, *intent.end))):
             raise CartsError(f"{intent.start} to {intent.end} are no places in the image.")
         if intent.gesture != self._gesture:
@@ -125,7 +105,7 @@ class DraggingHandler:
         # Not the point but what the pointer has done to it, or a link that was taken beside its outline would jump.
         pixel = _within(u + moved[0], camera.width), _within(v + moved[1], camera.height)
         fit = fit_keypoints(scene, start, [Pin(point, camera.name, pixel)])
-        self._open_run.end("Stopped: the pose was changed by hand")
+        self._context.end_run("Stopped: the pose was changed by hand")
         link = point.name.removesuffix("_link").replace("_", " ")
         context.set_pose(f"Drag {point.arm} {link}", fit.state, gesture=gesture)
 

@@ -3,7 +3,6 @@
 import math
 from collections.abc import Callable
 from dataclasses import fields, replace
-from functools import singledispatchmethod
 from typing import Any
 
 import torch
@@ -15,7 +14,7 @@ from carts_core.optimization.keypoints import Pin, fit_keypoints
 from carts_core.project import Change, Key, Review, ReviewState, Source, next_unreviewed, worst_first
 from carts_core.project.values import LONGEST_NOTE
 from carts_viewer.actions import intents
-from carts_viewer.actions.context import Context, OpenRun, clamped, unknown_intent
+from carts_viewer.actions.context import Context, Handler, clamped
 from carts_viewer.actions.frame_filter import FrameFilter, found
 from carts_viewer.picture.overlay import labelled_keypoints
 
@@ -29,20 +28,17 @@ _REVIEW_STEPS = {
 }
 
 
-class AnnotatingHandler:
+class AnnotatingHandler(Handler):
     """Handler of history, review, copied corrections and keypoints."""
 
-    def __init__(self, context: Context, run: OpenRun, show: Callable[..., None]) -> None:
+    def __init__(self, context: Context, show: Callable[..., None]) -> None:
         """
         Args:
             context: the state, and the way into the project.
-            run: ends when the frame is edited.
             show: `BrowsingHandler.show`.
         """
-        self._context = context
-        self._open_run = run
+        super().__init__(context)
         self._show = show
-        self._session = context.session
         self._keypoints = labelled_keypoints(context.session.scene)
         self._held: str | None = None
         """The keypoint that is dragged."""
@@ -53,32 +49,26 @@ class AnnotatingHandler:
         self._worst: int | None = None
         """The frame that `ShowWorse` went to last; None after anything else has shown another one."""
 
-    handle = singledispatchmethod(unknown_intent)
-    """Carries out an intent; raises `CartsError` where it cannot, and the state stays valid."""
-
     def released(self) -> None:
         """The pointer was let go of."""
         self._held = None
 
     # ---- History ---------------------------------------------------------------------------------------------------
 
-    @handle.register
-    def _(self, intent: intents.Undo) -> None:
+    def _on_Undo(self, intent: intents.Undo) -> None:
         self._finish("Stopped by undo")
         self._changed(self._session.editor.undo())
 
-    @handle.register
-    def _(self, intent: intents.Redo) -> None:
+    def _on_Redo(self, intent: intents.Redo) -> None:
         self._finish("Stopped by redo")
         self._changed(self._session.editor.redo())
 
-    @handle.register
-    def _(self, intent: intents.GoToStep) -> None:
+    def _on_GoToStep(self, intent: intents.GoToStep) -> None:
         self._finish("Stopped by undo")
         self._changed(self._session.editor.go_to(intent.position))
 
     def _finish(self, reason: str) -> None:
-        self._open_run.end(reason)
+        self._context.end_run(reason)
         self._context.save()
 
     def _changed(self, change: Change | None) -> None:
@@ -90,18 +80,15 @@ class AnnotatingHandler:
 
     # ---- Review ----------------------------------------------------------------------------------------------------
 
-    @handle.register
-    def _(self, intent: intents.SetReview) -> None:
+    def _on_SetReview(self, intent: intents.SetReview) -> None:
         self._review(intent.state)
 
-    @handle.register
-    def _(self, intent: intents.SetNote) -> None:
+    def _on_SetNote(self, intent: intents.SetNote) -> None:
         state = self._context.state
         review = Review(state.review.state, str(intent.note)[:LONGEST_NOTE])
         self._mark("Note", review, gesture=(intents.SetNote, state.index))
 
-    @handle.register
-    def _(self, intent: intents.AcceptAndNext) -> None:
+    def _on_AcceptAndNext(self, intent: intents.AcceptAndNext) -> None:
         self._context.change(notice=None)
         self._review(ReviewState.ACCEPTED)
         state = self._context.state
@@ -115,16 +102,14 @@ class AnnotatingHandler:
         count = len(within or range(len(self._session.sequence)))
         self._context.change(notice=f"All {count} frames{where} are reviewed.")
 
-    @handle.register
-    def _(self, intent: intents.ShowUnreviewed) -> None:
+    def _on_ShowUnreviewed(self, intent: intents.ShowUnreviewed) -> None:
         state = self._context.state
         index = next_unreviewed(state.project, state.index, 1 if intent.step > 0 else -1)
         if index is None:
             raise CartsError("Every frame has been reviewed.")
         self._go(index)
 
-    @handle.register
-    def _(self, intent: intents.ShowWorse) -> None:
+    def _on_ShowWorse(self, intent: intents.ShowWorse) -> None:
         state = self._context.state
         project = state.project
         frames = range(len(project.identity.frame_ids))
@@ -144,7 +129,7 @@ class AnnotatingHandler:
 
     def _mark(self, name: str, review: Review, *, gesture: object = None) -> None:
         """Set the review of the shown frame, which ends a run."""
-        self._open_run.end("Stopped: the frame was reviewed")
+        self._context.end_run("Stopped: the frame was reviewed")
         # What says nothing is none, so that clearing what is clear is no step.
         edits = {Key.review(self._context.state.index): None if review == Review() else review}
         self._context.edit(name, edits, gesture=gesture)
@@ -155,8 +140,7 @@ class AnnotatingHandler:
 
     # ---- Corrections -----------------------------------------------------------------------------------------------
 
-    @handle.register
-    def _(self, intent: intents.CopyCorrection) -> None:
+    def _on_CopyCorrection(self, intent: intents.CopyCorrection) -> None:
         state = self._context.state
         index = state.index + (1 if intent.step > 0 else -1)
         if not 0 <= index < len(self._session.sequence):
@@ -164,27 +148,23 @@ class AnnotatingHandler:
             raise CartsError(f"There is no frame {side} frame {state.frame.frame_id} to copy from.")
         source = self._session.sequence.frame(index, cameras=[])
         scene = self._session.copied(state.frame, source)
-        self._open_run.end("Stopped: the pose was changed by hand")
+        self._context.end_run("Stopped: the pose was changed by hand")
         self._context.set_pose(f"Copy from frame {source.frame_id}", scene, source=Source.PROPAGATED)
 
-    @handle.register
-    def _(self, intent: intents.ShowKeypoints) -> None:
+    def _on_ShowKeypoints(self, intent: intents.ShowKeypoints) -> None:
         shown = self._context.state.keypoints
         self._context.change(keypoints=replace(shown, shown=not shown.shown if intent.on is None else intent.on))
 
-    @handle.register
-    def _(self, intent: intents.ChooseKeypoint) -> None:
+    def _on_ChooseKeypoint(self, intent: intents.ChooseKeypoint) -> None:
         if intent.label is not None and intent.label not in self._keypoints:
             raise CartsError(f"There is no keypoint {intent.label!r}; there are: {', '.join(self._keypoints)}.")
         self._context.change(keypoints=replace(self._context.state.keypoints, chosen=intent.label))
 
-    @handle.register
-    def _(self, intent: intents.ForgetPins) -> None:
+    def _on_ForgetPins(self, intent: intents.ForgetPins) -> None:
         self._context.forget_pins()
 
-    @handle.register
-    def _(self, intent: intents.PointAt) -> None:
-        self._open_run.end("Stopped: the pose was changed by hand")
+    def _on_PointAt(self, intent: intents.PointAt) -> None:
+        self._context.end_run("Stopped: the pose was changed by hand")
         state = self._context.state
         camera = self._session.scene.camera(intent.camera or state.camera)
         if not (math.isfinite(intent.u) and math.isfinite(intent.v)):
@@ -229,30 +209,23 @@ _STEPS = {
 }
 
 
-class FindingHandler:
+class FindingHandler(Handler):
     """Handler of the frame filter."""
 
-    def __init__(self, context: Context, run: OpenRun, show: Callable[..., None]) -> None:
-        self._context = context
-        self._open_run = run
+    def __init__(self, context: Context, show: Callable[..., None]) -> None:
+        super().__init__(context)
         self._show = show
 
-    handle = singledispatchmethod(unknown_intent)
-    """Carries out an intent; raises `CartsError` where it cannot, and the state stays valid."""
-
-    @handle.register
-    def _(self, intent: intents.SetFilter) -> None:
+    def _on_SetFilter(self, intent: intents.SetFilter) -> None:
         if intent.name not in [field.name for field in fields(FrameFilter)]:
             raise CartsError(f"Frames cannot be looked for by {intent.name!r}.")
         value: Any = clamped(intent.value, 0.0, 1.0) if intent.name == "dice" else str(intent.value)[:_LONGEST]
         self._context.change(filter=replace(self._context.state.filter, **{intent.name: value}))
 
-    @handle.register
-    def _(self, intent: intents.ClearFilter) -> None:
+    def _on_ClearFilter(self, intent: intents.ClearFilter) -> None:
         self._context.change(filter=FrameFilter())
 
-    @handle.register
-    def _(self, intent: intents.ShowFound) -> None:
+    def _on_ShowFound(self, intent: intents.ShowFound) -> None:
         state = self._context.state
         frames = self._found()
         if intent.step > 0:
@@ -262,10 +235,9 @@ class FindingHandler:
         self._context.change(playing=False)
         self._show(index=index)
 
-    @handle.register
-    def _(self, intent: intents.ReviewFound) -> None:
+    def _on_ReviewFound(self, intent: intents.ReviewFound) -> None:
         frames, project = self._found(), self._context.session.editor.view
-        self._open_run.end("Stopped: many frames were reviewed")
+        self._context.end_run("Stopped: many frames were reviewed")
         edits: dict[Key[Any], Any] = {}
         for index in frames:
             review = Review(intent.state, project.review(index).note)

@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
-from functools import singledispatchmethod
 from typing import Any
 
 import numpy as np
@@ -13,19 +12,17 @@ from carts_core.project import Figures, Key, Keyframe, ProjectState, between_kep
 from carts_core.project.values import WHOLE_PROJECT
 from carts_core.wording import counted
 from carts_viewer.actions import intents
-from carts_viewer.actions.context import Context, OpenRun, unknown_intent
+from carts_viewer.actions.context import Context, Handler
 from carts_viewer.jobs.comparison import Comparison, Outcome, unchecked
 from carts_viewer.jobs.optimizers import OptimizerFactory, SequenceRun
 from carts_viewer.state import ListedFrame, SolveState
 
 
-class PropagatingHandler:
+class PropagatingHandler(Handler):
     """Handler of sequence mode: solves many frames, one at a time."""
 
-    def __init__(self, context: Context, run: OpenRun, optimizers: OptimizerFactory) -> None:
-        self._context = context
-        self._open_run = run
-        self._session = context.session
+    def __init__(self, context: Context, optimizers: OptimizerFactory) -> None:
+        super().__init__(context)
         self._optimizers = optimizers
         self._comparison = Comparison(context.session, context.renderer, optimizers)
         self._held: dict[int, Outcome] = {}
@@ -34,9 +31,6 @@ class PropagatingHandler:
         self._work: Iterator[None] = iter(())
         self._before: ProjectState = context.session.editor.view
         """The project at the start of the run."""
-
-    handle = singledispatchmethod(unknown_intent)
-    """Carries out an intent; raises `CartsError` where it cannot, and the state stays valid."""
 
     def wait_time(self) -> float | None:
         """0 while frames are being solved; None when they are not."""
@@ -77,7 +71,7 @@ class PropagatingHandler:
         project = self._session.editor.project
         if not project.writable:
             raise ProjectError(f"Solved frames could not be saved: {project.read_only_reason}")
-        self._open_run.end("Stopped: many frames are solved together")
+        self._context.end_run("Stopped: many frames are solved together")
         self._context.save()
         view = self._session.editor.view
         everything = range(len(self._session.sequence))
@@ -108,8 +102,7 @@ class PropagatingHandler:
         self._work = self._bits(self._run)
         self._context.change(busy=None, solve=SolveState(frames, text="Estimating the first frame"))
 
-    @handle.register
-    def _(self, intent: intents.StopSolving) -> None:
+    def _on_StopSolving(self, intent: intents.StopSolving) -> None:
         self.finish()
 
     # ---- The run ---------------------------------------------------------------------------------------------------
@@ -136,23 +129,24 @@ class PropagatingHandler:
     def _bits(self, run: SequenceRun) -> Iterator[None]:
         outcomes: dict[int, Outcome] = {}
         try:
-            while run.step():
+            while run.optimizer.step() is not None:
                 self._check_calibration()
-                self._report(done=run.done, text=run.status())
+                self._report(done=run.optimizer.progress[0], text=run.status())
                 yield
-            for number, (index, estimate) in enumerate(run.estimates().items(), start=1):
+            visited = run.optimizer.progress[0]
+            for number, (index, estimate) in enumerate(run.optimizer.estimates.items(), start=1):
                 if run.cancelled:
                     break
                 if self._solved(estimate):
                     outcomes[index] = self._comparison.outcome(estimate, run, self._before, self._context.state)
                     self._context.change(busy=None)
                     self._check_calibration()
-                self._report(compared=number, text=f"Comparing with how it was, frame {number} of {run.done}")
+                self._report(compared=number, text=f"Comparing with how it was, frame {number} of {visited}")
                 yield
             if outcomes and not run.cancelled:
                 self._report(text="Checking the calibration")
                 yield
-                gain = run.base_frame_gain()
+                gain = run.optimizer.base_frame_gain()
                 self._report(base_frame_gain=gain, calibration=self._before.records.get(WHOLE_PROJECT))
         finally:
             # An image that is missing in the end does not cost what was solved before it.
@@ -182,7 +176,7 @@ class PropagatingHandler:
         figures: dict[int, Figures] = {}
         listed: list[ListedFrame] = []
         self._held = {}
-        for index, estimate in run.estimates().items():
+        for index, estimate in run.optimizer.estimates.items():
             if not self._solved(estimate):
                 continue
             outcome = outcomes.get(index) or unchecked(estimate, run)
@@ -205,14 +199,13 @@ class PropagatingHandler:
         text = f"{'Stopped: ' if run.cancelled else ''}{solved}"
         return f"{text}; {len(self._held)} kept as they were, because they would fit worse" if self._held else text
 
-    @handle.register
-    def _(self, intent: intents.TakeSolved) -> None:
+    def _on_TakeSolved(self, intent: intents.TakeSolved) -> None:
         now = self._session.editor.view
         taken = {i: outcome for i, outcome in self._held.items() if intent.index is None or i == intent.index}
         taken = {i: outcome for i, outcome in taken.items() if now.joints(i) == self._before.joints(i)}
         if not taken:
             raise CartsError("There is nothing to take: the frame was changed meanwhile, or its list is gone.")
-        self._open_run.end("Stopped: solved frames are taken")
+        self._context.end_run("Stopped: solved frames are taken")
         self._context.save()
         edits: dict[Key[Any], Any] = {}
         for index, outcome in taken.items():
@@ -224,8 +217,7 @@ class PropagatingHandler:
         self._report(listed=tuple(replace(f, taken=f.taken or f.index in taken) for f in listed))
         self._context.refresh()
 
-    @handle.register
-    def _(self, intent: intents.DropSolved) -> None:
+    def _on_DropSolved(self, intent: intents.DropSolved) -> None:
         self._held = {}
         self._report(listed=())
 
@@ -240,26 +232,17 @@ def _deviations(project: ProjectState, index: int) -> dict[str, np.ndarray]:
     return {arm: np.array(values, np.float64) for arm, values in known.items() if values is not None}
 
 
-class MarkingHandler:
+class MarkingHandler(Handler):
     """The handler that marks keyframes."""
 
-    def __init__(self, context: Context, run: OpenRun) -> None:
-        self._context = context
-        self._open_run = run
-
-    handle = singledispatchmethod(unknown_intent)
-    """Carries out an intent; raises `CartsError` where it cannot, and the state stays valid."""
-
-    @handle.register
-    def _(self, intent: intents.HoldKeyframe) -> None:
+    def _on_HoldKeyframe(self, intent: intents.HoldKeyframe) -> None:
         state = self._context.state
         on = not state.project.is_keyframe(state.index) if intent.on is None else bool(intent.on)
-        self._open_run.end("Stopped: the frame was marked")
+        self._context.end_run("Stopped: the frame was marked")
         name = "Make a keyframe" if on else "Make no keyframe"
         self._context.edit(name, {Key.keyframe(state.index): Keyframe(on)})
 
-    @handle.register
-    def _(self, intent: intents.SetDirection) -> None:
+    def _on_SetDirection(self, intent: intents.SetDirection) -> None:
         if intent.direction not in ("forward", "backward"):
             raise CartsError(f"There is no direction {intent.direction!r}.")
         self._context.change(direction=intent.direction)

@@ -12,7 +12,7 @@ from carts_core.project import Edits, Figures, FitVerdict, Key, ProjectState, Pr
 from carts_core.project.values import VERDICTS
 from carts_core.recording import Frame
 from carts_viewer.choices import Target
-from carts_viewer.jobs.optimizers import ActiveRun, OptimizerFactory, SequenceRun
+from carts_viewer.jobs.optimizers import ActiveRun, FrameTask, OptimizerFactory, SequenceRun
 from carts_viewer.picture.overlay import OverlayRenderer
 from carts_viewer.session import Session, joint_correction
 from carts_viewer.state import Pose, ViewState
@@ -64,7 +64,8 @@ class FitCheck:
         found: dict[str, tuple[Assessment, float]] = {}
         for name in target.seen(sequence, index, domain, cameras) or cameras:
             ignore = self._session.ignored(index, [name], target)
-            found[name] = self._optimizers.assess(sequence, index, domain, [name], pose, settings, target, ignore)
+            task = FrameTask(sequence, index, domain, (name,), pose, settings, FreeParameters(), target, ignore)
+            found[name] = self._optimizers.assess(task)
         # Cameras that see no arm are left out, unless none sees any.
         seeing = {name: one for name, one in found.items() if one[0].evidence.area >= _OUT_OF_VIEW} or found
         loss = sum(loss for _, loss in seeing.values()) / len(seeing)
@@ -167,16 +168,15 @@ class Comparison:
     def _steps(
         self, frame: Frame, start: Pose, state: ViewState, target: Target, provenance: Provenance
     ) -> Iterator[tuple[Fit, Edits] | None]:
-        session, cameras = self._session, [camera.name for camera in self._session.scene.cameras]
-        cameras = target.seen(session.sequence, frame.index, state.domain, cameras) or cameras
-        free, ignore = _joints_alone(state), session.ignored(frame.index, cameras, target)
-        optimizer = self._optimizers.make(
-            session.sequence, frame.index, state.domain, cameras, start, state.settings, free, target, ignore
-        )
-        run = ActiveRun(optimizer, session.scene, start, tuple(cameras), provenance, free)
-        while run.step() is not None:
+        session, names = self._session, [camera.name for camera in self._session.scene.cameras]
+        cameras = tuple(target.seen(session.sequence, frame.index, state.domain, names) or names)
+        ignore = session.ignored(frame.index, cameras, target)
+        free, settings = _joints_alone(state), state.settings
+        task = FrameTask(session.sequence, frame.index, state.domain, cameras, start, settings, free, target, ignore)
+        run = ActiveRun(self._optimizers.make(task), task, provenance)
+        while run.optimizer.step() is not None:
             yield None
-        best = run.best()
+        best = run.optimizer.best
         assert best is not None
         pose = run.pose(best)
         yield self._fit(frame, pose, state, target), session.edits(frame, pose.scene, provenance, best.joint_std())

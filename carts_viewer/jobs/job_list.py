@@ -12,10 +12,9 @@ from typing import Annotated, Any
 import msgspec
 
 from carts_core.errors import CartsError
-from carts_core.export import FORMATS
+from carts_core.export import FORMATS, FormatName, Parts
 from carts_core.files import output_path, write_text
 from carts_core.files.reading import Kind, parse_json, read_text, typed
-from carts_viewer.actions import intents
 from carts_viewer.jobs.companions import Decisions, damage
 
 _KEPT = 50
@@ -77,13 +76,25 @@ class AdaptOptions:
     """Number of the folder of the network."""
 
 
-Options = SolveOptions | OptimizeOptions | CalibrateOptions | AdaptOptions | intents.Export
+@dataclass(frozen=True)
+class ExportOptions:
+    """Options of an export, as in `intents.Export`."""
+
+    format: FormatName
+    frames: str
+    parts: Parts = "arms"
+    images: bool = False
+    shown_camera: bool = False
+    range: tuple[int, int] | None = None
+
+
+Options = SolveOptions | OptimizeOptions | CalibrateOptions | AdaptOptions | ExportOptions
 _KINDS: dict[str, type[Options]] = {
     "solve": SolveOptions,
     "optimize": OptimizeOptions,
     "calibrate": CalibrateOptions,
     "adapt": AdaptOptions,
-    "export": intents.Export,
+    "export": ExportOptions,
 }
 
 
@@ -112,7 +123,7 @@ def read_options(kind: str, values: Mapping[str, Any], frames: int) -> Options:
         case AdaptOptions():
             minutes = _within(options.minutes, 1, LONGEST_TRAINING)
             return AdaptOptions(minutes, _within(options.folder, 1, _LARGEST_FOLDER))
-        case intents.Export():
+        case ExportOptions():
             return replace(options, range=_range(options.range, last))
 
 
@@ -142,7 +153,7 @@ def job_title(options: Options, frame_ids: Sequence[str]) -> str:
             return f"Calibrate on {frames} frames"
         case AdaptOptions(minutes=minutes):
             return f"Adapt the network to this recording, {minutes} minutes of processor time at most"
-        case intents.Export():
+        case ExportOptions():
             label = FORMATS[options.format].label if options.format in FORMATS else options.format
             return f"Export {options.frames.lower()[:40]} as {label}" + (f", {between}" if between else "")
 

@@ -1,7 +1,7 @@
 """Optimizers of the viewer: networks, runs on single frames, runs on many frames, and assessments of poses."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Protocol, TypedDict, Unpack
 
@@ -17,14 +17,12 @@ from carts_core.networks.weights import read_weights
 from carts_core.optimization import (
     Assessment,
     Backgrounds,
-    FrameEstimate,
     FrameOptimizer,
     FreeParameters,
     Iterate,
     MaskPredictor,
     NetworkPredictor,
     Progress,
-    SequenceAssessment,
     SequenceOptimizer,
     SequenceSettings,
     SolverSettings,
@@ -76,58 +74,41 @@ class Optimizer(Protocol):
         ...
 
 
+@dataclass(frozen=True, eq=False)
+class FrameTask:
+    """A frame that is optimized, or assessed."""
+
+    sequence: Recording
+    index: int
+    domain: str
+    cameras: tuple[str, ...]
+    pose: Pose
+    """Where to start."""
+    settings: SolverSettings
+    free: FreeParameters
+    target: Target
+    ignore: Mapping[str, Bool[np.ndarray, "height width"]]
+    """Camera -> pixels that show an occluder."""
+
+
 class ActiveRun:
-    """One run on one frame: the optimizer and its start."""
+    """One run on one frame."""
 
-    def __init__(
-        self,
-        optimizer: Optimizer,
-        scene: Scene,
-        start: Pose,
-        cameras: tuple[str, ...],
-        provenance: Provenance,
-        free: FreeParameters,
-    ) -> None:
-        self._free = free
-        self.start = start
-        self.provenance = provenance
-        self.cameras = cameras
-        self._optimizer = optimizer
-        self._rows = [[camera.name for camera in scene.cameras].index(name) for name in cameras]
-
-    @property
-    def stop_reason(self) -> str | None:
-        """Reason for the end of the run; None before."""
-        return self._optimizer.stop_reason
-
-    def step(self) -> Iterate | None:
-        """The next iterate; None when there are no more."""
-        return self._optimizer.step()
-
-    def best(self) -> Iterate | None:
-        """The best iterate so far: of the present observation, the one of the lowest loss; at the end, the last."""
-        return self._optimizer.best
+    def __init__(self, optimizer: Optimizer, task: FrameTask, provenance: Provenance) -> None:
+        self.optimizer, self.provenance = optimizer, provenance
+        self.start, self.cameras, self._free = task.pose, task.cameras, task.free
+        names = [camera.name for camera in task.sequence.scene.cameras]
+        self._rows = [names.index(name) for name in task.cameras]
 
     def verdict(self) -> FitVerdict | None:
         """At the end, how far the result can be relied on; None where the solver does not assess it."""
-        found = self._optimizer.assessment
+        found = self.optimizer.assessment
         if found is None:
             return None
-        kept = " The start was kept." if self.stop_reason in (StopReason.FAILED, StopReason.START_KEPT) else ""
+        kept = (
+            " The start was kept." if self.optimizer.stop_reason in (StopReason.FAILED, StopReason.START_KEPT) else ""
+        )
         return FitVerdict(found.verdict.value, f"{found.reason}{kept}", found.remedy, found.probability)
-
-    @property
-    def stages(self) -> tuple[int, ...]:
-        """Stage of each iterate; losses are comparable within a stage."""
-        return tuple(progress.stage for progress in self._optimizer.history)
-
-    def comparable_losses(self) -> tuple[float, ...]:
-        """Losses of all iterates against the last observation, which makes them comparable."""
-        return tuple(self._optimizer.comparable_losses())
-
-    def base_frame_gain(self) -> float | None:
-        """At the end, the share of the residual that free base frames would explain [1]; None if not known."""
-        return self._optimizer.base_frame_gain()
 
     def pose(self, iterate: Iterate) -> Pose:
         """An iterate's state, which knows the run's cameras only, as a pose of the whole scene.
@@ -150,47 +131,24 @@ class SequenceRun:
     """One run on many frames: the optimizer and its provenance."""
 
     def __init__(self, optimizer: SequenceOptimizer, provenance: Provenance) -> None:
-        self.provenance = provenance
+        self.optimizer, self.provenance = optimizer, provenance
         self.cancelled = False
-        self._optimizer = optimizer
-
-    @property
-    def done(self) -> int:
-        """Frames that were visited."""
-        return self._optimizer.progress[0]
-
-    def step(self) -> bool:
-        """Visit the next frame; False when there are no more."""
-        return self._optimizer.step() is not None
 
     def cancel(self) -> None:
-        """Stop; what was reached stays in `estimates`."""
+        """Stop; what was reached stays in the optimizer's `estimates`."""
         self.cancelled = True
-        self._optimizer.cancel()
-
-    def estimates(self) -> dict[int, FrameEstimate]:
-        """Estimate of every visited frame, smoothed over all of them."""
-        return self._optimizer.estimates
-
-    @property
-    def assessment(self) -> SequenceAssessment | None:
-        """At the end, how far all frames together can be relied on; None before, and of a run that was stopped."""
-        return self._optimizer.assessment
-
-    def base_frame_gain(self) -> float | None:
-        """At the end, what free base frames would explain of what is left [1]; None where it is not known."""
-        return self._optimizer.base_frame_gain()
+        self.optimizer.cancel()
 
     def status(self) -> str:
         """Progress, as text for the user."""
-        done, total = self._optimizer.progress
+        done, total = self.optimizer.progress
         if done == 0:
             return "Solving a few frames alone, for a first estimate of the error of all"
         if done == total:
             return f"All {total} frames estimated, revising those that disagree and judging the fit"
         if done < 2 < total:
             return f"Frame {done} of {total}"  # The first takes longer than others.
-        return f"Frame {done} of {total}, about {spoken_time(self._optimizer.seconds_left)} left"
+        return f"Frame {done} of {total}, about {spoken_time(self.optimizer.seconds_left)} left"
 
 
 REMEDY = "Fit masks (Fit to), or adapt the network to this recording."
@@ -323,88 +281,45 @@ class OptimizerFactory:
         observed = target.observed
         return {} if observed.what == "network" else {"observe": observed.what, "masks": observed.masks}
 
-    def make(
-        self,
-        sequence: Recording,
-        index: int,
-        domain: str,
-        cameras: Sequence[str],
-        pose: Pose,
-        settings: SolverSettings,
-        free: FreeParameters,
-        target: Target,
-        ignore: Mapping[str, Bool[np.ndarray, "height width"]],
-    ) -> Optimizer:
-        """An optimizer that starts at the pose and fits the target; `ignore` says which pixels of which camera show an
-        occluder.
+    def make(self, task: FrameTask) -> Optimizer:
+        """An optimizer of a frame.
 
         Raises:
             CartsError: weights, an image, a mask or a setting is not usable.
         """
-        predictor = self.predictor(target)
+        predictor = self.predictor(task.target)
         self.report("Preparing the frame")
-        if target.observed.what != "network" and not isinstance(settings, SurfaceSolver):
+        if task.target.observed.what != "network" and not isinstance(task.settings, SurfaceSolver):
             raise SettingsError(
                 "The chosen solver compares features of images, so it cannot fit masks. Choose the solver Surface "
                 "maps, or fit what the network sees."
             )
-        return self._frame_optimizer(sequence, index, domain, cameras, pose, settings, free, ignore, predictor)
+        return self._frame_optimizer(task, predictor)
 
-    def assess(
-        self,
-        sequence: Recording,
-        index: int,
-        domain: str,
-        cameras: Sequence[str],
-        pose: Pose,
-        settings: SolverSettings,
-        target: Target,
-        ignore: Mapping[str, Bool[np.ndarray, "height width"]],
-    ) -> tuple[Assessment, float]:
-        """Assessment and loss of a pose, without moving it. Arguments and errors as in `make`."""
-        surface = settings if isinstance(settings, SurfaceSolver) else SurfaceSolver()
-        optimizer = self._frame_optimizer(
-            sequence,
-            index,
-            domain,
-            cameras,
-            pose,
-            replace(surface, stages=NONE),
-            FreeParameters(),
-            ignore,
-            self.predictor(target),
-        )
+    def assess(self, task: FrameTask) -> tuple[Assessment, float]:
+        """Assessment and loss of a pose, without moving it; errors as in `make`."""
+        surface = task.settings if isinstance(task.settings, SurfaceSolver) else SurfaceSolver()
+        held = replace(task, settings=replace(surface, stages=NONE), free=FreeParameters())
+        optimizer = self._frame_optimizer(held, self.predictor(task.target))
         for _ in optimizer:
             pass
         assert optimizer.assessment is not None and optimizer.best is not None
         return optimizer.assessment, float(optimizer.best.loss)
 
     @staticmethod
-    def _frame_optimizer(
-        sequence: Recording,
-        index: int,
-        domain: str,
-        cameras: Sequence[str],
-        pose: Pose,
-        settings: SolverSettings,
-        free: FreeParameters,
-        ignore: Mapping[str, Bool[np.ndarray, "height width"]],
-        predictor: FeatureExtractor | MaskPredictor,
-    ) -> FrameOptimizer:
-        frame = sequence.frame(index, domain, list(cameras))
-        backgrounds = Backgrounds.of(sequence, cameras, domain, required=settings.needs_background)
-        scene = scene_at(sequence.scene, pose.scene)
-        start = {arm.name: values.numpy() for arm, values in zip(scene.arms, pose.scene.joint_positions, strict=True)}
+    def _frame_optimizer(task: FrameTask, predictor: FeatureExtractor | MaskPredictor) -> FrameOptimizer:
+        sequence, joints, cameras = task.sequence, task.pose.scene.joint_positions, list(task.cameras)
+        scene = scene_at(sequence.scene, task.pose.scene)
         return FrameOptimizer(
             scene,
-            frame,
-            backgrounds,
+            sequence.frame(task.index, task.domain, cameras),
+            Backgrounds.of(sequence, cameras, task.domain, required=task.settings.needs_background),
             predictor,
-            ignore=ignore,
-            start=start,
-            settings=settings,
-            free=free,
-            cameras=list(cameras),
+            ignore=task.ignore,
+            start={arm.name: values.numpy() for arm, values in zip(scene.arms, joints, strict=True)},
+            settings=task.settings,
+            free=task.free,
+            cameras=cameras,
         )
 
     def make_sequence(

@@ -2,7 +2,6 @@
 
 import asyncio
 import http
-import json
 import re
 import threading
 from collections import OrderedDict
@@ -28,6 +27,7 @@ from carts_viewer.panels.inputs import humanized
 from carts_viewer.picture.layers import small_jpeg
 from carts_viewer.session import Session
 from carts_viewer.state import ViewState
+from carts_viewer.transport.events import Trace
 from carts_viewer.transport.guard import response
 from carts_viewer.transport.tab_page import TabPage
 
@@ -227,16 +227,11 @@ class TimelineData:
             message = {"whole": False, "codes": changed, "solving": solving, "traced": traced}
             self._page.call("setTimeline", message)
 
-    def answer(self, text: str) -> None:
-        """Send a curve that the tab asks for, `{"name", "first", "last", "columns"}`; nonsense is not answered."""
-        try:
-            asked = json.loads(text)
-            name, numbers = str(asked["name"]), [int(asked[key]) for key in ("first", "last", "columns")]
-        except (ValueError, TypeError, KeyError, OverflowError, RecursionError):
-            return
-        found = self._traces.between(name, *numbers)
+    def answer(self, trace: Trace) -> None:
+        """Send a curve that the tab asks for, if there is one."""
+        found = self._traces.between(trace.name, trace.first, trace.last, trace.columns)
         if found is not None:
-            self._page.call("setTrace", {"name": name, **found})
+            self._page.call("setTrace", {"name": trace.name, **found})
 
     def _whole(self) -> dict[str, Any]:
         codes = [number for pair in list(self._codes.items()) for number in pair]

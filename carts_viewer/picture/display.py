@@ -1,6 +1,5 @@
 """Sends states to a tab: pictures and values that changed, as fast as the tab draws."""
 
-import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -43,7 +42,7 @@ class PageDisplay:
 
     def drawn(self) -> None:
         """The tab has drawn the newest picture; any thread may say so."""
-        self._rate_limit.drawn(self._page.client.client_id)
+        self._rate_limit.drawn()
 
     def ready_in(self) -> float:
         """How long until the page can take another picture [s]; 0 when it can now."""
@@ -162,35 +161,23 @@ def _draw_paint(
 
 LONGEST_WAIT = 0.08
 """After this long the next picture is sent whether the last one was drawn or not [s]."""
-_REMEMBERED = 3.0
 
 
 class RateLimit:
-    """Keeps count of what was sent and which tabs have drawn it. Safe to use from several threads."""
+    """When the next picture may be sent: once the tab has drawn the last one, or after `LONGEST_WAIT`."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
-        self._lock = threading.Lock()
-        self._sent_at = float("-inf")
-        self._drawn_at: dict[int, float] = {}
+        self._sent_at = self._drawn_at = float("-inf")
 
     def sent(self) -> None:
-        """A picture has been sent to all tabs."""
-        with self._lock:
-            self._sent_at = self._clock()
+        """A picture has been sent."""
+        self._sent_at = self._clock()
 
-    def drawn(self, tab: int) -> None:
-        """A tab has drawn the newest picture."""
-        with self._lock:
-            self._drawn_at[tab] = self._clock()
+    def drawn(self) -> None:
+        """The tab has drawn the newest picture. Any thread may say so."""
+        self._drawn_at = self._clock()
 
     def ready_in(self) -> float:
         """How long until the next picture may be sent [s], 0 when it may now."""
-        with self._lock:
-            now = self._clock()
-            # Only tabs that have lately drawn anything are waited for: the others are hidden or gone.
-            for tab, drawn_at in list(self._drawn_at.items()):
-                if now - drawn_at > _REMEMBERED and self._sent_at > drawn_at:
-                    del self._drawn_at[tab]
-            waiting = not self._drawn_at or any(drawn < self._sent_at for drawn in self._drawn_at.values())
-            return max(0.0, self._sent_at + LONGEST_WAIT - now) if waiting else 0.0
+        return max(0.0, self._sent_at + LONGEST_WAIT - self._clock()) if self._drawn_at < self._sent_at else 0.0

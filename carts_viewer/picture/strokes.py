@@ -1,29 +1,29 @@
 """Strokes over a frame: tools, parsing of strokes from a browser, and their effect on painted layers."""
 
-import json
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
-from typing import Any
+from typing import Annotated
 
 import cv2
+import msgspec
 import numpy as np
 from jaxtyping import Bool, Float
 
 from carts_core.errors import SettingsError
 from carts_core.model.camera import Camera
 from carts_core.project import IgnoreRegion, MaskCorrection, PartLabels
+from carts_viewer.transport.events import Event
 
 DIAMETERS = (1, 300)
 """Thinnest and thickest brush [px]."""
 LONGEST_STROKE = 20_000
 """Points; the page begins another stroke there."""
-_LONGEST_TEXT = 32 * LONGEST_STROKE
 _FRACTION_BITS = 4
 """OpenCV draws to 1/16 of a pixel."""
 
 Mask = Bool[np.ndarray, "height width"]
+_Count = Annotated[int, msgspec.Meta(ge=0, lt=2**53)]
 
 
 class Tool(StrEnum):
@@ -93,11 +93,26 @@ class Stroke:
         return canvas.astype(bool)
 
 
-def read_stroke(text: str, frames: int, cameras: Mapping[str, Camera], classes: int = 0) -> Stroke:
-    """A stroke as a browser sends it, JSON text, which is not trusted.
+class Painted(Event):
+    """A stroke as a tab reports it."""
+
+    number: _Count
+    frame: _Count
+    camera: str
+    target: Target
+    erase: bool
+    polygon: bool
+    diameter: Annotated[float, msgspec.Meta(gt=0)]
+    points: Annotated[list[tuple[float, float]], msgspec.Meta(min_length=1, max_length=LONGEST_STROKE)]
+    label: _Count = 0
+    prompt: bool = False
+
+
+def read_stroke(painted: Painted, frames: int, cameras: Mapping[str, Camera], classes: int = 0) -> Stroke:
+    """A stroke over a frame of a recording.
 
     Args:
-        text: what came.
+        painted: what a tab reports.
         frames: how many frames there are.
         cameras: by name.
         classes: the highest number of a class.
@@ -106,30 +121,26 @@ def read_stroke(text: str, frames: int, cameras: Mapping[str, Camera], classes: 
         SettingsError: it is no stroke over one of these frames and cameras. Points beyond the image and a brush that
             is too thick are clamped instead.
     """
-    if len(text) > _LONGEST_TEXT:
+    camera, count = cameras.get(painted.camera), len(painted.points)
+    shaped = count <= 2 if painted.prompt else count >= 3 or not painted.polygon
+    if camera is None or painted.frame >= frames or painted.label > classes or not shaped:
         raise SettingsError(
-            f"a stroke of {len(text)} characters came; at most {_LONGEST_TEXT} are taken. Draw it in parts."
+            f"what came is no stroke over one of {frames} frames of {', '.join(cameras)}. Draw it with the page of "
+            "this viewer."
         )
-    try:
-        values = json.loads(text)
-        camera = cameras[values["camera"]]
-        return Stroke(
-            number=_whole(values["number"], 2**53),
-            frame=_whole(values["frame"], frames),
-            camera=camera.name,
-            target=Target(values["target"]),
-            erase=values["erase"] is True,
-            polygon=values["polygon"] is True,
-            diameter=_diameter(values["diameter"]),
-            points=_points(values["points"], camera, *_counts(values)),
-            label=_whole(values.get("label", 0), classes + 1),
-            prompt=values.get("prompt") is True,
-        )
-    except (KeyError, TypeError, ValueError, OverflowError, RecursionError) as error:
-        raise SettingsError(
-            f"what came is no stroke over one of {frames} frames of {', '.join(cameras)} "
-            f"({type(error).__name__}: {str(error)[:200]}). Draw it with the page of this viewer."
-        ) from error
+    size = np.array([camera.width, camera.height], float)
+    return Stroke(
+        number=painted.number,
+        frame=painted.frame,
+        camera=camera.name,
+        target=painted.target,
+        erase=painted.erase,
+        polygon=painted.polygon,
+        diameter=round(min(max(painted.diameter, DIAMETERS[0]), DIAMETERS[1])),
+        points=np.clip(np.array(painted.points, float), -size, 2 * size),
+        label=painted.label,
+        prompt=painted.prompt,
+    )
 
 
 def corrected(old: MaskCorrection | None, stroke: Mask, rendered: Mask, *, erase: bool) -> MaskCorrection | None:
@@ -163,32 +174,3 @@ def ignored(old: IgnoreRegion | None, stroke: Mask, *, erase: bool) -> IgnoreReg
     region = np.zeros_like(stroke) if old is None else old.region()
     region = region & ~stroke if erase else region | stroke
     return IgnoreRegion.of(region) if region.any() else None
-
-
-def _whole(value: Any, end: int) -> int:
-    if type(value) is not int or not 0 <= value < end:
-        raise ValueError(f"{value!r:.40} is not a whole number from 0 to {end - 1}")
-    return value
-
-
-def _diameter(value: Any) -> int:
-    if type(value) not in (int, float) or not math.isfinite(value) or value <= 0:
-        raise ValueError(f"{value!r:.40} is no diameter")
-    return round(min(max(value, DIAMETERS[0]), DIAMETERS[1]))
-
-
-def _counts(values: Mapping[str, Any]) -> tuple[int, int]:
-    """How many points it must have, and may."""
-    if values.get("prompt") is True:
-        return 1, 2
-    return 3 if values["polygon"] is True else 1, LONGEST_STROKE
-
-
-def _points(value: Any, camera: Camera, fewest: int, most: int) -> Float[np.ndarray, "points 2"]:
-    if not isinstance(value, list) or not fewest <= len(value) <= most:
-        raise ValueError(f"not a list of {fewest} to {most} points")
-    points = np.array(value, float)
-    if points.shape != (len(value), 2) or not np.isfinite(points).all():
-        raise ValueError("a point is not a pair of finite numbers")
-    size = np.array([camera.width, camera.height], float)
-    return np.clip(points, -size, 2 * size)

@@ -7,21 +7,20 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from carts_core.batch.folder import ORDER, KnownJob, known_jobs, most_urgent_first, read_jobs
+from carts_core.batch.folder import ORDER, FrameFinding, KnownJob, known_jobs, most_urgent_first, read_jobs
 from carts_core.batch.review import review_project, sequence_file
 from carts_core.errors import CartsError, SettingsError
 from carts_core.files import output_path
 from carts_core.files.reading import IMAGE, read_bytes
 from carts_core.recording import Sequence
 from carts_viewer.start.host import Host
-from carts_viewer.transport.document import alert, button, escaped
+from carts_viewer.transport.document import render
 
 _SECONDS = 5.0
 """Interval between updates while jobs run [s]."""
 _WORST = 12
 _SHOWN = 500
 """Jobs that are listed."""
-_VERDICTS = ("good", "doubtful", "failed")
 _SEPARATOR = "\n"
 """Between a job and a frame in what a button says; neither has one in its name."""
 
@@ -44,17 +43,17 @@ class BatchPage:
         """Bring the document up to date, now and as long as jobs run."""
         known = most_urgent_first(known_jobs(self._batch, self._jobs))
         counts = Counter(entry.status for entry in known)
-        summary = ", ".join(f"{counts[status]} {status}" for status in ORDER if counts[status])
-        problem = alert(self._problem)
-        more = f"<p>{len(known) - _SHOWN} more are not listed.</p>" if len(known) > _SHOWN else ""
-        rows = "".join(map(_row, known[:_SHOWN]))
-        self._site.document.show(
-            f"<h1>Batch {escaped(self._batch.path.name)}</h1><p>{escaped(summary)}</p>"
-            f'<div class="bar">{button("back", "All recordings")}{button("refresh", "Look again")}</div>{problem}'
-            f'<h2>Jobs</h2><div class="jobs" data-scroll="jobs"><table><thead><tr><th>Job</th><th>Status</th>'
-            f"<th>Good</th><th>Doubtful</th><th>Failed</th><th></th></tr></thead><tbody>{rows}</tbody></table></div>"
-            f"{more}{self._worst(known)}"
+        content = render(
+            "batch.html",
+            name=self._batch.path.name,
+            summary=", ".join(f"{counts[status]} {status}" for status in ORDER if counts[status]),
+            problem=self._problem,
+            known=known,
+            most=_SHOWN,
+            worst=self._worst(known),
+            separator=_SEPARATOR,
         )
+        self._site.document.show(content)
         if counts["running"]:
             self._look_again()
 
@@ -98,24 +97,16 @@ class BatchPage:
         frames = list(Sequence.open(path).frame_ids) if frame_id else []
         self._site.open_sequence(path, project=project, frame=frames.index(frame_id) if frame_id in frames else None)
 
-    def _worst(self, known: list[KnownJob]) -> str:
+    def _worst(self, known: list[KnownJob]) -> list[tuple[float, KnownJob, FrameFinding, str]]:
+        """Frames with pictures that are most probably wrong: probability, job, frame, and address of its picture."""
         found = [
             (frame.probability, entry, frame)
             for entry in known
             for frame in (entry.findings.frames if entry.findings else ())
             if frame.picture
         ]
-        cards = []
-        for probability, entry, frame in sorted(found, key=lambda each: -each[0])[:_WORST]:
-            address = self._published(entry, frame.picture)
-            open_it = button("review", "Open", f"{entry.job.name}{_SEPARATOR}{frame.frame}", kind="main")
-            picture = f'<img src="{address}" alt="">' if address else '<div class="blank"></div>'
-            cards.append(
-                f'<div class="card">{picture}<div><b>{escaped(frame.verdict)}: {escaped(entry.job.name)}</b>'
-                f'<small title="{escaped(frame.reason)}">frame {escaped(frame.frame)}, {escaped(frame.camera)}, wrong '
-                f'with a probability of {probability:.2f}</small><div class="bar">{open_it}</div></div></div>'
-            )
-        return f'<h2>Worst frames</h2><div class="cards">{"".join(cards)}</div>' if cards else ""
+        worst = sorted(found, key=lambda each: -each[0])[:_WORST]
+        return [(each, entry, frame, self._published(entry, frame.picture)) for each, entry, frame in worst]
 
     def _published(self, entry: KnownJob, name: str) -> str:
         """The address of a picture of a job; empty where it cannot be read."""
@@ -132,18 +123,3 @@ class BatchPage:
                 self._site.post(lambda: None if self._closed.is_set() else self.show())
 
         threading.Thread(target=wait, name="carts-batch-page", daemon=True).start()
-
-
-def _row(entry: KnownJob) -> str:
-    frames = entry.findings.frames if entry.findings else ()
-    counts = Counter(frame.verdict for frame in frames)
-    numbers = "".join(
-        f'<td data-label="{verdict.capitalize()}">{counts[verdict] if frames else "–"}</td>' for verdict in _VERDICTS
-    )
-    error = f"<br><small>{escaped(entry.error)}</small>" if entry.error else ""
-    open_it = button("review", "Open", entry.job.name) if entry.findings else ""
-    status = escaped(entry.status)
-    return (
-        f"<tr><td>{escaped(entry.job.name)}<br><small>{escaped(entry.job.recording)}</small></td>"
-        f'<td><span class="status {status}">{status}</span>{error}</td>{numbers}<td>{open_it}</td></tr>'
-    )

@@ -2,6 +2,7 @@
 
 import os
 import stat
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,6 +24,17 @@ class Entry:
     """[bytes]"""
     changed: float
     """[s since 1970]"""
+
+    @property
+    def about(self) -> str:
+        """Size and day of a file."""
+        size, unit = float(self.size), "B"
+        for unit in ("B", "KB", "MB", "GB"):
+            if size < 1000 or unit == "GB":
+                break
+            size /= 1000
+        day = time.strftime("%Y-%m-%d", time.localtime(self.changed))
+        return f"{size:.{0 if unit in ('B', 'KB') else 1}f} {unit} · {day}"
 
 
 class Roots:
@@ -52,19 +64,19 @@ class Roots:
         root = next((root for root in self.folders if path == root or path.is_relative_to(root)), None)
         if "\x00" in str(text) or not path.is_absolute() or ".." in path.parts or root is None:
             raise SettingsError(f"{text} is outside of the allowed folders. Start carts view with --root for another.")
-        place = root
+        step = root
         try:
             for part in path.relative_to(root).parts:
-                place = place / part
+                step = step / part
                 if part.startswith("."):
-                    raise SettingsError(f"{place} is hidden. Choose another, or start carts view with --root {place}.")
-                mode = os.lstat(place).st_mode
+                    raise SettingsError(f"{step} is hidden. Choose another, or start carts view with --root {step}.")
+                mode = os.lstat(step).st_mode
                 if stat.S_ISLNK(mode):
-                    raise SettingsError(f"{place} is a link, and links are not followed. Choose the folder itself.")
+                    raise SettingsError(f"{step} is a link, and links are not followed. Choose the folder itself.")
                 if not (stat.S_ISDIR(mode) or stat.S_ISREG(mode)):
-                    raise SettingsError(f"{place} is neither a folder nor a file. Choose another.")
+                    raise SettingsError(f"{step} is neither a folder nor a file. Choose another.")
         except OSError as error:
-            raise SettingsError(f"{place} cannot be opened ({error.strerror}). Choose another.") from error
+            raise SettingsError(f"{step} cannot be opened ({error.strerror}). Choose another.") from error
         return path
 
     def entries(self, folder: Path) -> list[Entry]:

@@ -1,4 +1,4 @@
-"""One server that goes from place to place: the start page, a new recording, and the viewer of a sequence."""
+"""One server for the start page, a new recording, a batch, and the viewer of a sequence."""
 
 import gc
 import logging
@@ -16,15 +16,16 @@ from carts_core.networks import FeatureExtractor
 from carts_core.process import return_memory
 from carts_core.resources import sample_sequence
 from carts_viewer.actions import intents
-from carts_viewer.app import ViewerApp
+from carts_viewer.app import ViewerApp, ViewerOptions
 from carts_viewer.jobs.optimizers import NetworkOptions, OptimizerFactory
 from carts_viewer.start.batch_page import BatchPage
-from carts_viewer.start.host import Place
+from carts_viewer.start.host import SitePage
 from carts_viewer.start.roots import Roots
 from carts_viewer.start.start_page import StartPage, remember
-from carts_viewer.transport.document import Document, escaped
+from carts_viewer.transport.document import Document, render
+from carts_viewer.transport.events import Chosen, Clicked
 from carts_viewer.transport.page import Page
-from carts_viewer.wizard.wizard import RecordingPlace
+from carts_viewer.wizard.wizard import RecordingWizard
 
 _log = logging.getLogger(__name__)
 
@@ -36,44 +37,32 @@ class Site:
         page: the page.
         document: what lies over it.
         roots: the allowed folders.
-        place: what is shown; None while a sequence is open.
+        shown: the shown page; None while a sequence is open.
         app: the viewer of the open sequence, if there is one.
         url: where the page is.
         incident: where corrections of a sequence that was left are kept instead, if they are not in its project.
     """
 
-    def __init__(
-        self,
-        folders: Sequence[Path],
-        *,
-        host: str = "127.0.0.1",
-        port: int = 8080,
-        report: Callable[[str], None] = lambda line: None,
-        batch: Path | None = None,
-        **networks: Unpack[NetworkOptions],
-    ) -> None:
+    def __init__(self, folders: Sequence[Path], *, batch: Path | None = None, **options: Unpack[ViewerOptions]) -> None:
         """Start serving the start page, or a batch.
 
         Args:
             folders: the allowed folders.
             batch: folder of the batch that is shown first.
-            host: the address to listen on; one that other computers can reach makes the url carry a token.
-            port: 0 picks a free port; a busy one moves up to the next free one.
-            report: called with a line about long operations.
-            networks: options of the networks.
+            options: see `ViewerOptions`; without `page` and `folders`.
 
         Raises:
             SettingsError: a folder is not there, or the address is not usable.
         """
         self.roots = Roots(folders)
-        self._networks = networks
-        self._report = report
-        self.page = Page(host=host, port=port, title="CaRTS")
+        self.page = Page(host=options.get("host", "127.0.0.1"), port=options.get("port", 8080), title="CaRTS")
         self.document = Document(self.page)
+        self._report = options.get("report", lambda line: None)
+        self._options: ViewerOptions = {**options, "page": self.page, "folders": self.roots.folders}
         self.url = self.page.url
         self.app: ViewerApp | None = None
         self.incident: str | None = None
-        self.place: Place | None = None
+        self.shown: SitePage | None = None
         self._listening = False
         self._jobs: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
         self._thread = threading.Thread(target=self._work, name="carts-site", daemon=True)
@@ -119,7 +108,8 @@ class Site:
 
     def load_networks(self) -> FeatureExtractor:
         """Load the networks; see `Host.load_networks`."""
-        return OptimizerFactory(report=self._report, **self._networks).prepare()
+        networks = {name: value for name, value in self._options.items() if name in NetworkOptions.__annotations__}
+        return OptimizerFactory(report=self._report, **networks).prepare()  # pyright: ignore[reportArgumentType]
 
     def show_start(self, problem: str = "") -> None:
         """Go to the start page."""
@@ -127,7 +117,7 @@ class Site:
 
     def show_recording(self, draft: str | None = None) -> None:
         """Go to New recording: a new one, or a draft that is there."""
-        self._go(lambda: RecordingPlace(self, draft))
+        self._go(lambda: RecordingWizard(self, draft))
 
     def open_sample(self) -> None:
         """Open the shipped sequence."""
@@ -142,19 +132,12 @@ class Site:
 
     def open_sequence(self, path: Path, *, project: Path | None = None, frame: int | None = None) -> None:
         """See `Host.open_sequence`."""
-        self.document.show(f"<h1>Opening {escaped(path.name)}</h1><p>This takes a few seconds.</p>")
+        self.document.show(render("message.html", title=f"Opening {path.name}", text="This takes a few seconds."))
         try:
             self._leave()
             self._listening = False
             self.page.clear(f"{path.stem} · CaRTS")
-            app = ViewerApp.open(
-                path,
-                project=project,
-                report=self._report,
-                page=self.page,
-                folders=self.roots.folders,
-                **self._networks,
-            )
+            app = ViewerApp.open(path, project=project, **self._options)
         except CartsError as error:
             self._report(str(error))
             self.show_start(str(error))
@@ -169,47 +152,41 @@ class Site:
         self.document.show("")
         self.page.reload()
 
-    def _go(self, make: Callable[[], Place]) -> None:
-        """Leave what is shown for another place."""
+    def _go(self, make: Callable[[], SitePage]) -> None:
+        """Leave what is shown for another page."""
         self._leave()
         again = not self._listening
         if again:
             self.page.clear("CaRTS")
             gui = self.page.server.gui
             gui.configure_theme(dark_mode=True, show_share_button=False, show_logo=False)
-            self.document.on_chosen(lambda name, value: self.post(lambda: self._chosen(name, value)))
-            self.page.on(
-                "clicked", lambda _, u, v: self.post(lambda: self._with_place(lambda place: place.click(u, v)))
-            )
+            self.page.listen(Chosen | Clicked, lambda _, event: self.post(lambda: self._dispatch(event)))
             self._listening = True
-        self.place = make()
-        self.place.show()
+        self.shown = make()
+        self.shown.show()
         if again:
             self.page.reload()
 
-    def _chosen(self, name: str, value: str) -> None:
-        self._with_place(lambda place: place.choose(name, value))
-
-    def _clicked(self, u: float, v: float) -> None:
-        self._with_place(lambda place: place.click(u, v))
-
-    def _with_place(self, work: Callable[[Place], None]) -> None:
-        place = self.place
-        if place is None:
+    def _dispatch(self, event: Chosen | Clicked) -> None:
+        page = self.shown
+        if page is None:
             return
         try:
-            work(place)
+            if isinstance(event, Chosen):
+                page.choose(event.name, event.value)
+            else:
+                page.click(*event.at)
         except CartsError as error:
-            place.fail(error)
+            page.fail(error)
         except Exception as error:
             _log.exception("The page met an unexpected error")
-            place.fail(error)
+            page.fail(error)
 
     def _leave(self) -> None:
-        place, self.place = self.place, None
+        page, self.shown = self.shown, None
         app, self.app = self.app, None
-        if place is not None:
-            place.close()
+        if page is not None:
+            page.close()
         if app is not None:
             try:
                 app.close()

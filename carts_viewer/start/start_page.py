@@ -24,8 +24,8 @@ from carts_viewer.jobs.companions import damage
 from carts_viewer.picture.layers import small_jpeg
 from carts_viewer.start.host import FileBrowser, Host
 from carts_viewer.start.roots import Entry
-from carts_viewer.transport.document import alert, button, escaped
-from carts_viewer.wizard.draft import DraftSummary, delete_draft, drafts
+from carts_viewer.transport.document import render
+from carts_viewer.wizard.draft import delete_draft, drafts
 
 _KEPT = 24
 _WIDTH = 320
@@ -176,18 +176,18 @@ class StartPage:
     def show(self) -> None:
         """Update the document."""
         projects = recent_projects()
-        cards = "".join(self._card(project) for project in projects)
-        shown = f'<h2>Recent</h2><div class="cards">{cards}</div>' if projects else ""
-        problem = alert(self._problem)
-        half_made = drafts()
-        unfinished = "".join(_draft_row(draft) for draft in half_made)
-        unfinished = f'<h2>Not finished</h2><div class="files">{unfinished}</div>' if half_made else ""
-        self._site.document.show(
-            "<h1>CaRTS</h1><p>Correct a surgical robot's kinematics from its endoscope image.</p>"
-            f'<div class="bar">{button("new", "New recording", kind="main")}{button("open", "Open a sequence file …")}'
-            f"{button('open-batch', 'Open a batch …')}</div>{problem}{self._open()}{unfinished}{shown}"
-            f'<h2>To try</h2><div class="cards">{self._sample(projects)}</div>'
+        sample = sample_sequence()
+        known = next((thumbnail(project) for project in projects if project.sequence == str(sample)), None)
+        content = render(
+            "start.html",
+            problem=self._problem,
+            browser=self._browser,
+            drafts=drafts(),
+            cards=[self._card(project) for project in projects],
+            sample=self._published(known if known is not None else _first_image(sample)),
+            ago=_ago,
         )
+        self._site.document.show(content)
 
     def choose(self, name: str, value: str) -> None:
         """Carry out a choice."""
@@ -232,48 +232,17 @@ class StartPage:
     def close(self) -> None:
         """Nothing to close."""
 
-    def _open(self) -> str:
-        return "" if self._browser is None else f"<h2>Open</h2>{self._browser.html()}"
-
-    def _card(self, project: RecentProject) -> str:
+    def _card(self, project: RecentProject) -> tuple[RecentProject, str, str]:
+        """A project as it is now, why that is not known, and the address of its picture."""
+        picture = self._published(thumbnail(project))
         try:
-            now = up_to_date(project)
-            share = now.reviewed / max(now.frames, 1)
-            progress = (
-                f'<progress max="1" value="{share:.3f}"></progress><small>{now.reviewed} of {now.frames} frames '
-                f"reviewed, {now.corrected} corrected · {_ago(now.changed)}</small>"
-            )
+            return up_to_date(project), "", picture
         except CartsError as error:
-            progress = f"<small>Progress unknown: {escaped(str(error))}</small>"
-        actions = button("recent", "Open", project.sequence, kind="main") + button(
-            "forget", "Remove from this list", project.sequence, kind="quiet"
-        )
-        return (
-            f'<div class="card">{self._picture(thumbnail(project))}<div><b>{escaped(project.name)}</b>'
-            f'<small title="{escaped(project.sequence)}">{escaped(project.sequence)}</small>{progress}'
-            f'<div class="bar">{actions}</div></div></div>'
-        )
+            return project, str(error), picture
 
-    def _sample(self, projects: list[RecentProject]) -> str:
-        path = sample_sequence()
-        known = next((thumbnail(project) for project in projects if project.sequence == str(path)), None)
-        picture = known if known is not None else _first_image(path)
-        return (
-            f'<div class="card">{self._picture(picture)}<div><b>The shipped sample</b>'
-            "<small>Two arms with their true positions</small>"
-            f'<div class="bar">{button("sample", "Open the sample", kind="main")}</div></div></div>'
-        )
-
-    def _picture(self, jpeg: bytes | None) -> str:
-        if jpeg is None:
-            return '<div class="blank"></div>'
-        return f'<img src="{self._site.page.media.publish(jpeg)}" alt="">'
-
-
-def _draft_row(draft: DraftSummary) -> str:
-    delete = button("delete-draft", "Delete", draft.key, kind="quiet")
-    go_on = button("draft", f"Go on with {draft.name or 'an import without a name'}", draft.key)
-    return f'<div class="bar" style="padding: 0 10px">{go_on}<small>{_ago(draft.changed)}</small>{delete}</div>'
+    def _published(self, jpeg: bytes | None) -> str:
+        """The address of a picture; empty without one."""
+        return "" if jpeg is None else self._site.page.media.publish(jpeg)
 
 
 @cache

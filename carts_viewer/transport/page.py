@@ -1,7 +1,7 @@
 """The page: a guarded viser server, the scripts and styles in it, and the messages of its tabs.
 
-- The server is guarded (`guard.py`), and serves `static/` and pictures. - A tab writes what happened there into
-invisible fields, behind its own name and a counter (`_FIELDS`).
+The server is guarded (`guard.py`), and serves `static/` and pictures. A tab reports its events (`events.py`) as the
+value of one invisible field.
 """
 
 import contextlib
@@ -11,15 +11,16 @@ import html
 import http
 import io
 import json
-import math
+import logging
 import mimetypes
 import secrets
 import threading
 from collections import OrderedDict
-from collections.abc import Awaitable, Callable, Sequence
+from collections.abc import Awaitable, Callable
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import viser
 from websockets.http11 import Request, Response
 
@@ -27,8 +28,9 @@ from carts_core.errors import CartsError
 from carts_core.resources import static_dir
 from carts_viewer.transport.guard import PAGES, Guard, check_address, gated, refusal, response
 from carts_viewer.transport.tab_page import call
-from carts_viewer.transport.viser_private import element_id, list_icons_once, on_sent, queue_safely, value_of
+from carts_viewer.transport.viser_private import element_id, list_icons_once, queue_safely, value_of
 
+_log = logging.getLogger(__name__)
 _TITLE, _LOADER, _CLIENT = "<title>Viser</title>", "<script data-p=", 'e.type="module";'
 """Replaced parts of viser's page: its title, the script that unpacks the client, and the client's own element."""
 
@@ -97,21 +99,6 @@ OWN_KEYS = ("[", "]", "(", ")", "escape", "enter")
 """Keys that viser's shortcuts do not know, or that our script must hear first."""
 
 _THUMBNAIL = "/thumbnail/"
-_FIELDS: dict[str, int | None] = {
-    "drawn": 0,  # A new overlay was drawn.
-    "released": 0,  # A slider was let go of, or a field left.
-    "picked": 1,  # Index of a frame.
-    "activated": 1,  # Index of the camera whose image was chosen.
-    "clicked": 2,  # u, v: shares of the image's width and height, from its upper left corner.
-    "pointed": 3,  # u, v, index of the camera.
-    "dragged": 6,  # Number of the gesture, the same while the pointer is down; u, v at its start and now; camera.
-    "painted": None,  # A stroke as JSON.
-    "pressed": None,  # A key of `OWN_KEYS`.
-    "asked": None,  # A request in words.
-    "chosen": None,  # A choice in a document over the page.
-}
-"""Invisible fields for the events of a tab: how many numbers an event has, None for a text."""
-
 _SCRIPTS = ("page", "paint", "marks", "loupe", "drag", "lanes", "timeline", "tour", "shell", "document")
 """Files of `static/`, in the order in which they run."""
 
@@ -154,8 +141,7 @@ class Page:
         with gated(self._respond, self._refuse), contextlib.redirect_stdout(io.StringIO()):
             self.server = viser.ViserServer(host=host, port=port, verbose=False)
         self.url = self._guard.url(self.server.get_port())
-        self._fields: dict[str, viser.GuiTextHandle] = {}
-        self._add_fields()
+        self._add_channel()
         self._orient()
         self._name = secrets.token_hex(8)
         self.server.on_client_connect(lambda client: call(client, "meet", self._name))
@@ -170,9 +156,9 @@ class Page:
         for callback in list(self._farewells):
             callback(client.client_id)
 
-    def _add_fields(self) -> None:
-        """Invisible fields into which a tab writes what happened there; each does not know of the others."""
-        self._fields = {name: self.server.gui.add_text(name, "", visible=False) for name in _FIELDS}
+    def _add_channel(self) -> None:
+        """Invisible field whose value is the newest event of a tab, with the tab's own name and count of its events."""
+        self._channel = self.server.gui.add_text("channel", "", visible=False)
 
     def clear(self, title: str) -> None:
         """Take away all widgets, commands, nodes and callbacks; tabs must be reloaded when others are there.
@@ -187,7 +173,7 @@ class Page:
         self.thumbnail = None
         self.server.gui.reset()
         self.server.scene.reset()
-        self._add_fields()
+        self._add_channel()
         self._orient()
 
     def _orient(self) -> None:
@@ -210,28 +196,25 @@ class Page:
         with contextlib.redirect_stdout(io.StringIO()):
             self.server.stop()
 
-    def on(self, event: str, callback: Callable[..., None]) -> None:
-        """Call `callback(client_id, *values)` on the event loop for an event of a tab.
+    def listen(self, kinds: Any, callback: Callable[[int, Any], None]) -> None:
+        """Call `callback(client_id, event)` on the event loop for events of a tab, until the page is cleared.
 
-        The values are finite numbers or a text, as `_FIELDS` says; a tab can send any.
+        Args:
+            kinds: Union of the structs that are decoded; anything else is refused.
+            callback: Takes an event, of which the types of its values alone are checked.
         """
-        field, count = self._fields[event], _FIELDS[event]
+        decoder, channel = msgspec.json.Decoder(tuple[str, int, kinds]), self._channel
 
-        @field.on_update
+        @channel.on_update
         async def _(update: viser.GuiEvent) -> None:
-            text = _payload(field.value)
-            values = _values(text, count)
-            if update.client_id is not None and values is not None:
-                callback(update.client_id, *values)
-
-    def on_chosen(self, callback: Callable[[str], None]) -> None:
-        """Call `callback(text)` on the event loop for every choice in a document; any text."""
-        on_sent(self._fields["chosen"], lambda value: callback(_payload(value)))
-
-    @property
-    def drawn_id(self) -> str:
-        """The `id` of the field in which a tab says that it has drawn an overlay."""
-        return element_id(self._fields["drawn"])
+            if update.client_id is None:
+                return
+            try:
+                event = decoder.decode(channel.value)[2]
+            except (msgspec.DecodeError, ValueError, RecursionError) as error:
+                _log.info("Refused an event of a tab: %.200s", error)
+                return
+            callback(update.client_id, event)
 
     def element_id(self, handle: Any) -> str:
         """The `id` that a GUI element's input carries in the page (for tests and scripts)."""
@@ -279,9 +262,14 @@ class Page:
         return response(http.HTTPStatus.OK, kind, file.read_bytes())
 
     def _index(self, nonce: str) -> bytes:
-        ids = {name: element_id(field) for name, field in self._fields.items()}
-        said = {"keys": OWN_KEYS, "keyGroups": self.key_groups, "project": self.project, "server": self._name}
-        configuration = html.escape(json.dumps({**ids, **said}), quote=True)
+        said = {
+            "channel": element_id(self._channel),
+            "keys": OWN_KEYS,
+            "keyGroups": self.key_groups,
+            "project": self.project,
+            "server": self._name,
+        }
+        configuration = html.escape(json.dumps(said), quote=True)
         head = (
             f"<title>{html.escape(self._title)}</title>"
             '<link rel="icon" href="/static/icon.svg" />'
@@ -291,20 +279,3 @@ class Page:
         )
         scripts = "".join(f'<script src="/static/{name}.js" defer></script>' for name in _SCRIPTS)
         return index_of_viser(head + scripts, nonce).encode()
-
-
-def _values(text: str, count: int | None) -> Sequence[str | float] | None:
-    """The values of an event, see `_FIELDS`; None where it has none such."""
-    if count is None:
-        return [text] if text else None
-    try:
-        numbers = [float(part) for part in text.split()]
-    except ValueError:
-        return None
-    return numbers if len(numbers) == count and all(map(math.isfinite, numbers)) else None
-
-
-def _payload(value: object) -> str:
-    """Content of a field behind the tab's own name and a counter."""
-    parts = str(value).split(maxsplit=2)
-    return parts[2] if len(parts) == 3 else ""

@@ -7,7 +7,7 @@ from typing import Any
 
 import viser
 
-from carts_viewer.transport.viser_private import command_id, element_id, run_script, widgets
+from carts_viewer.transport.viser_private import element_id, run_script, widgets
 
 
 class TabPage:
@@ -53,10 +53,6 @@ class TabPage:
     def find(self, label: str) -> Any:
         """The widget with this label (for tests and scripts)."""
         return next(handle for handle in widgets(self.gui) if getattr(handle, "label", None) == label)
-
-    def command_id(self, label: str) -> str:
-        """The id by which the tab triggers the command with this label (for tests and scripts)."""
-        return command_id(self.gui, label)
 
     def row(self, *handles: viser.GuiButtonHandle, weights: Sequence[float] | None = None) -> None:
         """Lay out consecutive buttons of the current container side by side.

@@ -55,16 +55,6 @@ def value_of(server: viser.ViserServer, element: str) -> Any:
     return None
 
 
-def command_id(gui: viser.GuiApi, label: str) -> str:
-    """The id by which a tab triggers the command with this label.
-
-    Raises:
-        StopIteration: there is no such command.
-    """
-    commands = gui._command_handle_from_uuid
-    return next(element for element, command in commands.items() if command.label == label)
-
-
 def image_file(handle: viser.ImageHandle) -> bytes:
     """The PNG or JPEG file that an image was last sent as."""
     return handle._data

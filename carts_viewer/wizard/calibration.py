@@ -36,7 +36,7 @@ FRAMES = 20
 
 
 @dataclass(frozen=True)
-class Progress:
+class CalibrationProgress:
     """Progress of a calibration."""
 
     text: str
@@ -52,7 +52,7 @@ class Progress:
     ended: bool = False
 
 
-STOPPED = Progress("Stopped; the calibration from your points is as it was.", 0.0, ended=True)
+STOPPED = CalibrationProgress("Stopped; the calibration from your points is as it was.", 0.0, ended=True)
 """End of a stopped calibration."""
 
 
@@ -66,7 +66,7 @@ class CalibrationJob:
         *,
         known: HandEyePrior,
         load_networks: Callable[[], FeatureExtractor],
-        report: Callable[[Progress], None],
+        report: Callable[[CalibrationProgress], None],
     ) -> None:
         """Begin.
 
@@ -105,16 +105,16 @@ class CalibrationJob:
         try:
             result = self._calibrate()
         except CartsError as error:
-            self._report(Progress("", 0.0, error=str(error), ended=True))
+            self._report(CalibrationProgress("", 0.0, error=str(error), ended=True))
         except Exception as error:
-            self._report(Progress("", 0.0, error=f"The calibration failed: {error!r}", ended=True))
+            self._report(CalibrationProgress("", 0.0, error=f"The calibration failed: {error!r}", ended=True))
         else:
             self._report(result)
 
-    def _calibrate(self) -> Progress:
-        self._report(Progress("Loading the networks", 0.0))
+    def _calibrate(self) -> CalibrationProgress:
+        self._report(CalibrationProgress("Loading the networks", 0.0))
         extractor = self._load_networks()
-        self._report(Progress("Reading images", 0.0))
+        self._report(CalibrationProgress("Reading images", 0.0))
         frames = []
         for index in spread(len(self._sequence), FRAMES):
             if self.cancelled:
@@ -131,11 +131,11 @@ class CalibrationJob:
                 return STOPPED
             last = iterate
             text = f"Stage {iterate.stage + 1} of {iterate.stages}, step {iterate.index + 1}, loss {iterate.loss:.4f}"
-            self._report(Progress(text, iterate.stage / iterate.stages, iterate.scene))
+            self._report(CalibrationProgress(text, iterate.stage / iterate.stages, iterate.scene))
         if last is None:
-            return Progress("", 0.0, error="The calibration made no step.", ended=True)
+            return CalibrationProgress("", 0.0, error="The calibration made no step.", ended=True)
         result = optimizer.result()
-        return Progress("Calibrated", 1.0, result.scene, result, ended=True)
+        return CalibrationProgress("Calibrated", 1.0, result.scene, result, ended=True)
 
 
 def as_plain(scene: Scene) -> dict[str, Any]:

@@ -12,7 +12,7 @@ import numpy as np
 from carts_core.errors import SettingsError
 from carts_core.model.scene import Scene
 from carts_core.optimization import CalibrationResult, StopReason
-from carts_core.optimization.hand_eye import HandEyePrior, HandEyeResult, ImagePoint, PoseDeviation
+from carts_core.optimization.hand_eye import HandEyePrior, HandEyeResult, ImagePoint
 from carts_core.recording import Sequence
 from carts_core.recording.importing.found import FoundRecording
 from carts_core.recording.importing.writing import write_sequence
@@ -22,13 +22,13 @@ from carts_viewer.picture.layers import Rgba
 from carts_viewer.picture.overlay import OverlayRenderer
 from carts_viewer.picture.scene_view import SceneView
 from carts_viewer.start.host import Host
-from carts_viewer.transport.document import alert, button, check_box, choices, escaped, text_field
+from carts_viewer.transport.document import render
 from carts_viewer.transport.page import Page
 from carts_viewer.wizard.calibration import (
     FRAMES,
     STOPPED,
     CalibrationJob,
-    Progress,
+    CalibrationProgress,
     as_plain,
     calibrated_recording,
     calibrated_scene,
@@ -101,7 +101,7 @@ def hand_eye_panel(
     draft: Draft,
     clicking: Clicking,
     prompt: ClickPrompt | None,
-    progress: Progress | None,
+    progress: CalibrationProgress | None,
     problem: str,
     folder: str,
     undoable: bool,
@@ -117,134 +117,26 @@ def hand_eye_panel(
         folder: where the sequence would be saved.
         undoable: whether there is something to undo.
     """
-    running = progress is not None and not progress.ended
-    failed = problem or ("" if progress is None else progress.error)
-    undo = button("undo", "Undo", kind="quiet", disabled=not undoable or running)
-    head = (
-        f'<h1>Hand-eye</h1><div class="bar">{button("back", "← Check", kind="quiet", disabled=running)}{undo}'
-        f"{button('leave', 'All recordings', kind='quiet', disabled=running)}</div>{alert(failed)}"
-    )
-    if running:
-        assert progress is not None
-        return head + _running(progress)
-    asked = _asked(clicking, prompt, draft.points)
-    parts = [_calibration(draft, clicking), asked, _known(draft, clicking), _refine(draft, clicking, progress)]
-    return head + "".join(parts) + _save(draft, clicking, folder)
-
-
-def _running(progress: Progress) -> str:
-    return (
-        f"<h2>Calibrating over {FRAMES} frames</h2><progress max='1' value='{progress.share:.2f}'></progress>"
-        f"<p>{escaped(progress.text)}</p>{button('cancel', 'Stop')}"
-    )
-
-
-def _calibration(draft: Draft, clicking: Clicking) -> str:
-    """Figures of a calibration, and the choice whether one that the points speak against is kept."""
-    report = draft.report
-    if report is None:
-        return ""
-    verdict = f"<b>{escaped(report.verdict.capitalize())}.</b> " if report.verdict else ""
-    if draft.offered is not None:
-        title = "Calibration not kept"
-        choice = (
-            f'<div class="note guessed">{escaped(report.objection)} The outline shows this calibration. Keep it if '
-            "these clicks are wrong.</div>"
-            f"<div class='bar'>{button('keep', 'Keep anyway')}{button('discard', 'Discard')}</div>"
-        )
-    else:
-        title, choice = "Calibrated", ""
-        if report.objection:
-            choice = f'<div class="note guessed">Kept by choice. {escaped(report.objection)}</div>'
-    poses = "".join(
-        f"<tr><td>{escaped(pose.arm)}, {escaped(pose.camera)}</td><td>{pose.turn_deg:.2f}°</td>"
-        f"<td>{pose.shift_mm:.1f} mm</td></tr>"
-        for pose in report.poses
-    )
-    return (
-        f"<h2>{title}</h2>{choice}<p>{verdict}{escaped(report.reason)}</p>"
-        f"<p>Loss {report.loss_before:.4f} → {report.loss_after:.4f}</p>"
-        f"<table><tr><th></th><th>turn</th><th>shift of the tip</th></tr>{poses}</table>{_residuals(draft, clicking)}"
-    )
-
-
-def _residuals(draft: Draft, clicking: Clicking) -> str:
-    """The residual of each point before and after the calibration."""
-    report = draft.report
-    assert report is not None
-    cameras, arms = clicking.sequence.scene.cameras, clicking.sequence.scene.arms
-    rows = []
-    for row, (point, old, new) in enumerate(zip(draft.points, report.before, report.after, strict=True)):
-        name = point.landmark if len(arms) == 1 else f"{point.arm}: {point.landmark}"
-        place = f"frame {clicking.sequence.frame_ids[point.frame]}" + (f", {point.camera}" if len(cameras) > 1 else "")
-        values = "".join(f"<td>{'–' if value is None else f'{value:.1f}'}</td>" for value in (old, new))
-        wrong = ' class="wrong"' if row in report.disagreeing else ""
-        rows.append(f"<tr{wrong}><td class='name'>{escaped(name)} <small>{escaped(place)}</small></td>{values}</tr>")
-    return (
-        "<details open><summary>Residuals of points [px]</summary>"
-        f"<table><tr><th></th><th>before</th><th>after</th></tr>{''.join(rows)}</table></details>"
-    )
-
-
-def _asked(clicking: Clicking, prompt: ClickPrompt | None, points: Rows[ImagePoint]) -> str:
-    """HTML of the next prompt."""
-    if prompt is None:
-        return "<h2>Points</h2><p>All points are there. More can be chosen below.</p>" + _other(clicking, prompt)
-    arms = f"{prompt.arm}: " if len(clicking.sequence.scene.arms) > 1 else ""
-    done = len({(p.camera, p.frame, p.arm, p.landmark) for p in points})
-    frame = clicking.sequence.frame_ids[prompt.frame]
-    return (
-        f"<h2>Click the {escaped(arms + prompt.landmark)}</h2>"
-        f"<p>{escaped(clicking.hint(prompt.arm, prompt.landmark))}</p>"
-        f'<p class="quiet-text">Camera {escaped(prompt.camera)}, frame {escaped(frame)} · '
-        f"{counted(done, 'point')} so far, {len(clicking.plan)} are good. Zoom with the wheel.</p>"
-        f'<div class="bar">{button("skip", "Not visible")}{button("skip-frame", "Other frame")}</div>'
-        f"{_other(clicking, prompt)}"
-    )
-
-
-def _other(clicking: Clicking, prompt: ClickPrompt | None) -> str:
-    """Any camera, frame and landmark."""
-    scene, sequence = clicking.sequence.scene, clicking.sequence
-    at = prompt or clicking.plan[-1]
-    cameras = {camera.name: camera.name for camera in scene.cameras}
-    arms = {arm.name: arm.name for arm in scene.arms}
-    frames = {str(index): name for index, name in enumerate(sequence.frame_ids[:2000])}
-    names = {name: name for name in clicking.names(at.arm)}
-    lists = [
-        choices("look camera", cameras, at.camera) if len(cameras) > 1 else "",
-        choices("look frame", frames, str(at.frame)),
-        choices("look arm", arms, at.arm) if len(arms) > 1 else "",
-        choices("look landmark", names, at.landmark),
-    ]
-    return f"<details><summary>Choose what to click</summary><div class='bar'>{''.join(lists)}</div></details>"
-
-
-def _known(draft: Draft, clicking: Clicking) -> str:
-    """HTML of the uncertainty of the calibration, and of contradicting points."""
-    focal = check_box("focal_length", draft.focal_length, "Find the focal length, too")
-    if clicking.result is None:
-        text = clicking.problem if draft.points else "An outline follows the arm from the fourth point on."
-        return f"<h2>Uncertainty</h2><p>{escaped(text)}</p>{focal}"
-    result, report = clicking.result, draft.report
-    deviations = result.deviations
+    report, result = draft.report, clicking.result
+    deviations = {} if result is None else result.deviations
     if report is not None:
         deviations = {(pose.arm, pose.camera): pose.deviation for pose in report.poses}
-    rows = "".join(_deviation(*key, deviation) for key, deviation in deviations.items())
-    lengths = "".join(
-        f"<p>Focal length of {escaped(camera)}: {result.scene.camera(camera).intrinsics[0]:.0f} px "
-        f"± {100 * share:.0f} %</p>"
-        for camera, share in result.focal_deviation.items()
-    )
-    missing = "".join(
-        f"<p>{escaped(arm)} in {escaped(camera)}: {counted(more, 'more point')} needed.</p>"
-        for (arm, camera), more in result.missing.items()
-    )
-    return (
-        f"<h2>Uncertainty</h2><p>{'Of the calibration from points' if report is None else 'Of the new calibration'}; "
-        f"RMS residual of points <b>{_rms(draft, result):.1f} px</b>.</p>"
-        f"<table><tr><th></th><th>sideways</th><th>in depth</th><th>turn</th></tr>{rows}</table>"
-        f"{lengths}{missing}{_wrong(draft, clicking, result)}{focal}"
+    return render(
+        "hand_eye.html",
+        draft=draft,
+        clicking=clicking,
+        prompt=prompt,
+        progress=progress,
+        running=progress is not None and not progress.ended,
+        problem=problem,
+        folder=folder,
+        undoable=undoable,
+        calibration_frames=FRAMES,
+        done=len({(p.camera, p.frame, p.arm, p.landmark) for p in draft.points}),
+        frames={str(index): name for index, name in enumerate(clicking.sequence.frame_ids[:2000])},
+        deviations=deviations,
+        rms=None if result is None else _rms(draft, result),
+        counted=counted,
     )
 
 
@@ -257,56 +149,10 @@ def _rms(draft: Draft, result: HandEyeResult) -> float:
     return math.sqrt(sum(value**2 for value in values) / max(len(values), 1))
 
 
-def _deviation(arm: str, camera: str, deviation: PoseDeviation) -> str:
-    return (
-        f"<tr><td>{escaped(arm)}, {escaped(camera)}</td><td>± {deviation.sideways_mm:.1f} mm</td>"
-        f"<td>± {deviation.depth_mm:.1f} mm</td><td>± {deviation.rotation_deg:.1f}°</td></tr>"
-    )
-
-
-def _wrong(draft: Draft, clicking: Clicking, result: HandEyeResult) -> str:
-    """Points that contradict the others, each with a way to take it back."""
-    parts = []
-    for row in result.contradicting:
-        point = draft.points[row]
-        where = f"{point.landmark} in frame {clicking.sequence.frame_ids[point.frame]} ({point.camera})"
-        parts.append(
-            f'<div class="note">The {escaped(where)} is {result.distances[row]:.0f} px off and hardly counts. '
-            f"{button('remove-point', 'Remove it', str(row), kind='quiet')}</div>"
-        )
-    return "".join(parts)
-
-
-def _refine(draft: Draft, clicking: Clicking, progress: Progress | None) -> str:
-    done = ""
-    if progress is not None and progress.ended and not progress.error:
-        done = f'<div class="note good">{escaped(progress.text)}</div>'
-    elif draft.calibration is not None and draft.report is None:
-        done = '<div class="note good">Calibrated</div>'
-    begin = button("calibrate", "Calibrate", kind="main", disabled=clicking.result is None)
-    return (
-        "<h2>Refine</h2><p>Fits base frames and cameras to what the network sees in 20 frames. Takes a minute or two."
-        f"</p><div class='bar'>{begin}</div>{done}"
-    )
-
-
-def _save(draft: Draft, clicking: Clicking, folder: str) -> str:
-    ready = clicking.result is not None or draft.calibration is not None
-    remark = "" if ready else "<p class='quiet-text'>Without points the arm stays at a stand-in.</p>"
-    if draft.offered is not None:
-        remark = "<p class='quiet-text'>Saves the calibration from the points, since the new one is not kept.</p>"
-    begin = button("save", "Save and open", kind="main" if draft.calibration is not None else "")
-    return (
-        f"<h2>Save</h2><div class='bar'>{text_field('name', draft.name, label='Name')}</div>"
-        f"<p class='quiet-text'>To <code>{escaped(folder)}</code></p>{remark}"
-        f"<div class='bar'>{begin}</div>"
-    )
-
-
 _WIDTH = 340.0
 """Width of the document at the side [px], as in `static/document.css`."""
 
-Report = Callable[[Callable[[Draft], Draft]], None]
+Calibrated = Callable[[Callable[[Draft], Draft]], None]
 """Called on the site's thread with what a calibration makes of the draft."""
 
 
@@ -317,7 +163,7 @@ class HandEyeStep:
         problem: what went wrong last; empty without one.
     """
 
-    def __init__(self, host: Host, recording: FoundRecording, draft: Draft, report: Report) -> None:
+    def __init__(self, host: Host, recording: FoundRecording, draft: Draft, report: Calibrated) -> None:
         """
         Args:
             host: where it is shown.
@@ -336,7 +182,7 @@ class HandEyeStep:
         self._skipped: frozenset[ClickPrompt] = frozenset()
         self._wanted: ClickPrompt | None = None
         self._job: CalibrationJob | None = None
-        self._progress: Progress | None = None
+        self._progress: CalibrationProgress | None = None
         panel = host.page.server.gui.main_panel
         panel.dock_left()
         panel.set_width(_WIDTH)
@@ -388,7 +234,7 @@ class HandEyeStep:
         if name == "cancel" and self._job is not None:
             self._job.cancel()
             if self._running():
-                self._progress = Progress("Stopping …", 1.0)
+                self._progress = CalibrationProgress("Stopping …", 1.0)
         if self._running():
             return draft
         if name == "skip" and prompt is not None:
@@ -493,9 +339,9 @@ class HandEyeStep:
     def _calibrate(self) -> None:
         if self._clicking.result is None:
             raise SettingsError(self._clicking.problem or "Click points first.")
-        self._progress = Progress("Beginning", 0.0)
+        self._progress = CalibrationProgress("Beginning", 0.0)
 
-        def report(progress: Progress) -> None:
+        def report(progress: CalibrationProgress) -> None:
             self._host.post(lambda: self._proceed(progress))
 
         self._job = CalibrationJob(
@@ -506,7 +352,7 @@ class HandEyeStep:
             report=report,
         )
 
-    def _proceed(self, progress: Progress) -> None:
+    def _proceed(self, progress: CalibrationProgress) -> None:
         if self._job is not None and self._job.cancelled:
             if not progress.ended:
                 return
@@ -521,7 +367,7 @@ class HandEyeStep:
         if result.stop_reason in (StopReason.FAILED, StopReason.START_KEPT):
             text = f"The calibration from your points is as it was, with a loss of {report.loss_before:.4f}."
             verdict = f" {report.verdict.capitalize()}: {report.reason}" if report.verdict else ""
-            self._progress = Progress("", 0.0, error=text + verdict, ended=True)
+            self._progress = CalibrationProgress("", 0.0, error=text + verdict, ended=True)
             return draft
         self._progress, found = None, as_plain(result.scene)
         draft = draft.uncalibrated(report=report)

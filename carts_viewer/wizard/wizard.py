@@ -11,7 +11,7 @@ from carts_core.recording import TimeOffsetEstimate
 from carts_core.recording.video import SUFFIXES
 from carts_viewer.start.host import FileBrowser, Host
 from carts_viewer.start.roots import Entry
-from carts_viewer.transport.document import alert, button, escaped
+from carts_viewer.transport.document import render
 from carts_viewer.wizard.check import Guess, check_form, estimated_delay, guess, opened, previews
 from carts_viewer.wizard.draft import Draft, DraftFile, Step, changed, picked
 from carts_viewer.wizard.hand_eye import HandEyeStep
@@ -30,7 +30,7 @@ _PURPOSES = {
 _MOST_UNDO = 200
 
 
-class RecordingPlace:
+class RecordingWizard:
     """A draft, and the page that shows it."""
 
     def __init__(self, host: Host, key: str | None = None) -> None:
@@ -77,7 +77,7 @@ class RecordingPlace:
                 self._leave_hand_eye()
                 self._problem = f"The points or the calibration of this import do not fit the recording: {error}"
                 self._change(self._draft.uncalibrated(step=Step.CHECK))
-        self._host.document.show(self._browsing() if self._browser is not None else self._checking())
+        self._host.document.show(self._page())
 
     def choose(self, name: str, value: str) -> None:
         """Carry out a choice."""
@@ -107,7 +107,7 @@ class RecordingPlace:
         elif name == "trial":
             if (trial := next((each for each in self._guessed().trials if str(each) == value), None)) is not None:
                 self._set(picked(self._draft, "source", self._host.roots.checked(trial), {}))
-        elif (draft := changed(self._draft, name, value, self._guessed_columns())) is not None:
+        elif (draft := changed(self._draft, name, value, self._guess.columns if self._guess else {})) is not None:
             self._set(draft)
         self.show()
 
@@ -185,57 +185,34 @@ class RecordingPlace:
         self._set(picked(self._draft, self._part, path, found))
         self._browser = None
 
-    def _guessed_columns(self) -> dict[str, str]:
-        meanings = None if self._guess is None else self._guess.meanings
-        return {} if meanings is None else next(iter(meanings.arms.values()), {})
-
-    def _browsing(self) -> str:
-        back = (
-            button("close-browser", "← Back", kind="quiet")
-            if self._draft.source
-            else button("leave", "← All recordings", kind="quiet")
-        )
-        assert self._browser is not None
-        head = f"{_steps(Step.FILES)}<h1>New recording</h1><div class='bar'>{back}</div>"
-        return f"{head}{alert(self._problem)}{self._browser.html()}"
-
-    def _checking(self) -> str:
+    def _page(self) -> str:
+        """HTML of the steps Files and Check."""
+        values = {"steps": Step, "browser": self._browser, "draft": self._draft, "problem": self._problem}
+        if self._browser is not None:
+            return render("recording.html", step=Step.FILES, **values)
         found = self._guessed()
-        ready = found.recording is not None and not found.problems
-        go_on = button("continue", "Continue to hand-eye", kind="main", disabled=not ready)
-        bar = "".join(
-            [
-                button("leave", "← All recordings", kind="quiet"),
-                button("change", "Other folder …", "source", kind="quiet"),
-                button("undo", "Undo", kind="quiet", disabled=not self._undo),
-                button("delete", "Delete this import", kind="quiet"),
-                f'<span class="far">{go_on}</span>',
-            ]
-        )
-        recording = found.recording
-        what = "" if recording is None else f"{recording.kind}, {len(recording.frame_ids)} frames"
-        return (
-            f"{_steps(Step.CHECK)}<h1>{escaped(self._draft.name)}</h1><p class='quiet-text'><code>"
-            f"{escaped(self._draft.source)}</code> · {escaped(what)}</p><div class='bar'>{bar}</div>"
-            f"{alert(self._problem)}{check_form(self._draft, found, self._pictures, self._delay)}"
-        )
+        form = check_form(self._draft, found, self._pictures, self._delay)
+        return render("recording.html", step=Step.CHECK, guess=found, form=form, undoable=bool(self._undo), **values)
 
     def _guessed(self) -> Guess:
         """Content of the files, cached until the choices change."""
         if self._guess is None:
             if not self._pictures:
-                self._host.document.show(f"<h1>{escaped(self._draft.name)}</h1><p>Reading the recording …</p>")
+                self._tell(self._draft.name, "Reading the recording …")
             self._guess, self._pictures = guess(self._draft), {}
             if self._guess.recording is not None:
                 with suppress(CartsError):
                     self._add_pictures(self._guess)
         return self._guess
 
+    def _tell(self, title: str, text: str, place: str = "page") -> None:
+        self._host.document.show(render("message.html", title=title, text=text), place)
+
     def _estimate_delay(self) -> None:
         """Compare the motion in images and table."""
         recording = self._guessed().recording
         if recording is not None:
-            self._host.document.show("<h1>Time</h1><p>Comparing the motion in the images with the table …</p>")
+            self._tell("Time", "Comparing the motion in the images with the table …")
             self._delay = estimated_delay(recording)
 
     def _accept_delay(self) -> None:
@@ -258,7 +235,7 @@ class RecordingPlace:
             try:
                 if found.recording is None or found.problems:
                     raise SettingsError(next(iter(found.problems.values()), "the recording cannot be read."))
-                self._host.document.show("<h1>Hand-eye</h1><p>Opening the images …</p>", "side")
+                self._tell("Hand-eye", "Opening the images …", "side")
                 self._step = HandEyeStep(self._host, found.recording, self._draft, self._calibrated)
             except CartsError as error:
                 self._problem = str(error)
@@ -286,8 +263,3 @@ class RecordingPlace:
         if self._step is not None and self._draft.step is Step.HAND_EYE:
             self._set(draft_change(self._draft))
             self.show()
-
-
-def _steps(now: Step) -> str:
-    entries = "".join(f"<li{' aria-current=step' if step is now else ''}>{step}</li>" for step in Step)
-    return f'<ol class="steps">{entries}</ol>'

@@ -121,7 +121,7 @@ def test_a_recording_outside_of_the_allowed_folders_is_not_opened(batch: Path, t
     assert is_batch(batch) and len(known_jobs(output_path(batch), read_jobs(batch))) == 2
     with Site([batch.parent], port=0, batch=batch) as site:
         site.wait()
-        place = site.place
+        place = site.shown
         assert place is not None
         site.post(lambda: site._chosen("review", content["jobs"][0]["name"]))
         site.wait()

@@ -22,7 +22,7 @@ from carts_viewer.start.site import Site
 from carts_viewer.wizard import calibration, hand_eye
 from carts_viewer.wizard.calibration import CalibrationJob
 from carts_viewer.wizard.draft import Draft, DraftFile, Step
-from carts_viewer.wizard.wizard import RecordingPlace
+from carts_viewer.wizard.wizard import RecordingWizard
 
 CALIBRATE, STOP = ("calibrate", ""), ("cancel", "")
 
@@ -79,10 +79,10 @@ def site(tiny_sequence: Callable[..., Path], tmp_path: Path) -> Iterator[Site]:
         yield opened
 
 
-def place_of(site: Site) -> RecordingPlace:
+def place_of(site: Site) -> RecordingWizard:
     site.wait()
-    assert isinstance(site.place, RecordingPlace) and 'role="alert"' not in site.document.content
-    return site.place
+    assert isinstance(site.shown, RecordingWizard) and 'role="alert"' not in site.document.content
+    return site.shown
 
 
 def ended(site: Site, text: str) -> Draft:
@@ -121,7 +121,7 @@ def test_a_calibration_is_stopped_at_any_moment(
 
     def pressed() -> None:
         site.post(lambda: place.choose(*STOP))
-        assert site.place is place
+        assert site.shown is place
         eventually(lambda: jobs[-1].cancelled, bool)
 
     def spread(count: int, _: int) -> Iterator[int]:

@@ -7,7 +7,8 @@ from playwright.sync_api import Browser
 from playwright.sync_api import Page as Tab
 from viewer_canvas import eventually
 
-from carts_viewer.transport.document import Document, button, text_field
+from carts_viewer.transport.document import Document
+from carts_viewer.transport.events import Chosen
 from carts_viewer.transport.page import Page
 
 pytestmark = pytest.mark.browser
@@ -29,13 +30,16 @@ def opened(browser: Browser) -> Iterator[tuple[Document, Tab]]:
 
 
 def show(document: Document, step: int) -> None:
-    document.show(f"<p>step {step}</p>{text_field('name', 'old')}{button('stop', 'Stop')}")
+    document.show(
+        f"<p>step {step}</p><input type='text' data-do='name' value='old'>"
+        "<button type='button' data-do='stop'>Stop</button>"
+    )
 
 
 def test_a_button_that_is_written_anew_while_it_is_pressed_is_pressed(opened: tuple[Document, Tab]) -> None:
     document, tab = opened
     chosen: list[tuple[str, str]] = []
-    document.on_chosen(lambda name, value: chosen.append((name, value)))
+    document.page.listen(Chosen, lambda _, event: chosen.append((event.name, event.value)))
     tab.locator("main button").hover()
     tab.mouse.down()
     show(document, 2)

@@ -35,7 +35,7 @@ from carts_core.rendering import Renderer
 from carts_viewer.start.site import Site
 from carts_viewer.wizard.calibration import CalibrationJob
 from carts_viewer.wizard.draft import Draft, DraftFile, Step
-from carts_viewer.wizard.wizard import RecordingPlace
+from carts_viewer.wizard.wizard import RecordingWizard
 
 pytestmark = pytest.mark.browser
 SHIFT = np.array([[0.0, 0.0, HALF_PIXEL], [0.0, 0.0, HALF_PIXEL], [0.0, 0.0, 0.0]])
@@ -56,10 +56,10 @@ def visit(browser: Browser) -> Iterator[Callable[[Path], Visitor]]:
         yield make
 
 
-def place_of(visitor: Visitor) -> RecordingPlace:
+def place_of(visitor: Visitor) -> RecordingWizard:
     visitor.site.wait()
-    assert isinstance(visitor.site.place, RecordingPlace)
-    return visitor.site.place
+    assert isinstance(visitor.site.shown, RecordingWizard)
+    return visitor.site.shown
 
 
 def click_what_is_asked_for(visitor: Visitor, scene: Scene, measured: dict[str, np.ndarray], noise: float) -> None:

@@ -119,7 +119,7 @@ def test_the_optimizer_is_given_the_ignore_region_of_its_cameras(desk: Desk, mon
     make = OptimizerFactory.make
 
     def watched(self: OptimizerFactory, *arguments: Any) -> Any:
-        given.append(arguments[-1])
+        given.append(arguments[-1].ignore)
         return make(self, *arguments)
 
     monkeypatch.setattr(OptimizerFactory, "make", watched)

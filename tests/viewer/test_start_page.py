@@ -16,9 +16,9 @@ from carts_viewer.actions import intents
 from carts_viewer.start.roots import Roots
 from carts_viewer.start.site import Site
 from carts_viewer.start.start_page import StartPage, forget, recent_projects, thumbnail
-from carts_viewer.transport.document import button, choices, escaped
+from carts_viewer.transport.document import escaped, render
 from carts_viewer.wizard.draft import Draft, DraftFile, Step, delete_draft, drafts
-from carts_viewer.wizard.wizard import RecordingPlace
+from carts_viewer.wizard.wizard import RecordingWizard
 
 
 @pytest.fixture
@@ -93,15 +93,15 @@ def test_a_sequence_is_opened_left_and_remembered_with_its_picture(
 ) -> None:
     with site:
         site.wait()
-        assert isinstance(site.place, StartPage) and recent_projects() == []
+        assert isinstance(site.shown, StartPage) and recent_projects() == []
         path = tiny_sequence(frames=3)
         site.post(lambda: site.open_sequence(path))
         site.wait(120)
-        assert site.app is not None and site.place is None
+        assert site.app is not None and site.shown is None
         assert [project.sequence for project in recent_projects()] == [str(path)]
         site.post(site.show_start)
         site.wait(120)
-        assert site.app is None and isinstance(site.place, StartPage)
+        assert site.app is None and isinstance(site.shown, StartPage)
         project = recent_projects()[0]
         assert (project.name, project.frames, project.reviewed, project.corrected) == ("tiny", 3, 0, 0)
         assert (thumbnail(project) or b"")[:2] == b"\xff\xd8"
@@ -140,7 +140,7 @@ def test_a_card_has_the_numbers_of_its_project_whatever_program_changed_it(
             # Also while it is open elsewhere.
             assert "1 of 3 frames reviewed, 3 corrected" in card()
         assert "1 of 3 frames reviewed, 3 corrected" in card()
-        place = site.place
+        place = site.shown
         assert place is not None
         site.post(lambda: place.choose("recent", str(path)))
         site.wait(120)
@@ -158,7 +158,7 @@ def test_a_sequence_that_cannot_be_opened_leads_back_with_the_reason(site: Site,
     with site:
         site.post(lambda: site.open_sequence(tmp_path / "labs" / "bad.toml"))
         site.wait(120)
-        assert isinstance(site.place, StartPage) and site.app is None
+        assert isinstance(site.shown, StartPage) and site.app is None
         assert "bad.toml" in site.document.content and 'role="alert"' in site.document.content
 
 
@@ -166,13 +166,13 @@ def test_only_a_listed_recent_sequence_is_opened_by_its_card(site: Site, tiny_se
     path = tiny_sequence(frames=2)
     with site:
         site.wait()
-        assert site.place is not None
-        place = site.place
+        assert site.shown is not None
+        place = site.shown
         site.post(lambda: place.choose("recent", str(path)))
         site.post(lambda: place.choose("pick", str(path)))
         site.post(lambda: place.choose("nonsense", "x" * 100))
         site.wait()
-        assert site.app is None and site.place is place
+        assert site.app is None and site.shown is place
 
 
 def test_a_damaged_list_of_recent_sequences_is_an_empty_one(tmp_path: Path) -> None:
@@ -219,26 +219,26 @@ def test_an_import_that_was_begun_is_gone_on_with_by_another_server(site: Site, 
     with site:
         site.post(site.show_recording)
         site.wait()
-        place = site.place
-        assert isinstance(place, RecordingPlace)
+        place = site.shown
+        assert isinstance(place, RecordingWizard)
         site.post(lambda: place.choose("pick", str(tmp_path / "labs" / "rec")))
         site.wait()
         assert place.draft.step is Step.CHECK and 'role="alert"' in site.document.content
     with Site([tmp_path / "labs"], port=0) as again:
         again.wait()
         key = drafts()[0].key
-        assert again.place is not None
-        start = again.place
+        assert again.shown is not None
+        start = again.shown
         again.post(lambda: start.choose("draft", key))
         again.wait()
-        assert isinstance(again.place, RecordingPlace) and again.place.draft == place.draft
-        resumed = again.place
+        assert isinstance(again.shown, RecordingWizard) and again.shown.draft == place.draft
+        resumed = again.shown
         again.post(lambda: resumed.choose("delete", ""))
         again.wait()
-        assert drafts() == [] and isinstance(again.place, StartPage)
+        assert drafts() == [] and isinstance(again.shown, StartPage)
 
 
 def test_what_is_foreign_is_escaped_in_documents() -> None:
     nasty = "<img src=x onerror=alert(1)>\"'&"
-    for text in (escaped(nasty), button("a", nasty, nasty), choices("a", {nasty: nasty}, nasty)):
+    for text in (escaped(nasty), render("message.html", title=nasty, text=nasty)):
         assert "<img" not in text and "onerror=alert(1)>" not in text and "\"'&" not in text

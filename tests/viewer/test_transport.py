@@ -18,7 +18,6 @@ USED = {
         "viser._messages",
         "_impl",
         "_gui_input_handle_from_uuid",
-        "_command_handle_from_uuid",
         "_data",
         "_websock_connection",
         "viser.infra._infra",

@@ -1,7 +1,6 @@
 """Somebody at work in a tab without a browser, who notes what the page has called saved."""
 
 import html
-import json
 import random
 import re
 import time
@@ -89,17 +88,17 @@ class Client:
             # this edit), so that an old value cannot pass for a new one and each is a step.
             life, edit = divmod(number, 10**6)
             value = 5.0 - 0.002 * ((edit + 211 * life) % 5000)
-            self._ask(self.ids.joint, value, "Move PSM1 yaw", lambda state: _has_joint(state, frame, value))
+            self._set(self.ids.joint, value, "Move PSM1 yaw", lambda state: _has_joint(state, frame, value))
         elif dice < 0.6:
             note = f"note {number}"
-            self._ask(self.ids.note, note, "Note", lambda state: state.review(frame).note == note)
+            self._set(self.ids.note, note, "Note", lambda state: state.review(frame).note == note)
         elif dice < 0.7:
             # Accepting what is accepted is no step, so both are asked for.
             for element, name, wanted in (
                 (self.ids.accept, "Accept", ReviewState.ACCEPTED),
                 (self.ids.reject, "Reject", ReviewState.REJECTED),
             ):
-                self._ask(
+                self._set(
                     element, True, name, lambda state, wanted=wanted: state.review(frame).state is wanted, optional=True
                 )
         elif dice < 0.85:
@@ -133,16 +132,18 @@ class Client:
             "diameter": 1,
             "points": [[column + 0.5, row + 0.5]],
         }
-        text = f"client {next(self.unique)} {json.dumps(stroke)}"
-        self._ask(self.ids.painted, text, name, holds, optional=optional)
+        self._ask(lambda: self.tab.report("Painted", **stroke), name, holds, optional=optional)
         self.strokes += 1
 
-    def _ask(self, element: str, value: object, name: str, holds: Holds, *, optional: bool = False) -> None:
+    def _set(self, element: str, value: object, name: str, holds: Holds, *, optional: bool = False) -> None:
+        self._ask(lambda: self.tab.set(element, value), name, holds, optional=optional)
+
+    def _ask(self, edit: Callable[[], None], name: str, holds: Holds, *, optional: bool = False) -> None:
         """Edit the frame, let go, and wait until the page says that it is saved."""
         before, _ = self._position() or (0, "")
         expected = f"{name}, frame {self.frame + 1:03d}"
-        self.tab.set(element, value)
-        self.tab.set(self.ids.released, f"client {next(self.unique)}")
+        edit()
+        self.tab.report("Released")
         step = self._until(lambda: self._saved(before, expected), 0.5 if optional else 20.0)
         if step is not None:
             self.seen.append(Acknowledged(step, expected, holds))

@@ -24,8 +24,6 @@ class Widgets(NamedTuple):
     """Where the app is, and the ids of its widgets."""
 
     url: str
-    released: str
-    painted: str
     saved: str
     result: str
     """Of the export that was finished last."""
@@ -60,8 +58,6 @@ def open_and_tell(sequence: Path, weights: Path, tell: Connection) -> ViewerApp:
     (exports,) = (panel for panel in app.view.display._panels if isinstance(panel, ExportPanel))
     labels = "Note", "Accept", "Reject", "Run", "Format", "Export", "Go to"
     found = [
-        app.page._fields["released"],
-        app.page._fields["painted"],
         saved._text,
         exports._result,
         app.view.page.find("Frame"),

@@ -116,7 +116,7 @@ class Visitor:
             error.add_note("Errors of the page: " + ("\n".join(self._errors) or "none"))
             working = sys._current_frames().get(self.site._thread.ident or 0)
             error.add_note("The site's thread:\n" + "".join(traceback.format_stack(working)[-8:]))
-            error.add_note(f"The site shows {type(self.site.place).__name__}: {self.site.document.content[:300]}")
+            error.add_note(f"The site shows {type(self.site.shown).__name__}: {self.site.document.content[:300]}")
             error.add_note(f"The page shows: {self.page.locator('main').inner_text(timeout=5e3)[:300]}")
             connected = self.page.evaluate("Boolean(window.carts.connected())")
             error.add_note(f"It is connected: {connected}; it draws: {self.page.evaluate(_DRAWS)}")

@@ -1,0 +1,81 @@
+"""Events that a tab reports, besides intents: decoded by type, and otherwise not trusted."""
+
+from typing import Annotated, Any, dataclass_transform
+
+import msgspec
+
+_Text = Annotated[str, msgspec.Meta(max_length=4096)]
+_Key = Annotated[str, msgspec.Meta(max_length=64)]
+_Point = tuple[float, float]
+"""u, v: shares of an image's width and height, from its upper left corner."""
+
+
+@dataclass_transform(frozen_default=True)
+class Event(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_field="type", tag=True):
+    """An event of a tab, or what follows from one."""
+
+
+class Hello(Event):
+    """A page asks for its place: name of its tab and user, and the frame, camera and domain to show."""
+
+    tab: _Key
+    name: _Text = ""
+    light: bool = False
+    frame: int | None = None
+    """From 0."""
+    camera: _Text | None = None
+    domain: _Text | None = None
+    settings: dict[str, Any] = {}
+    """Choices that the browser has stored, see `page_state.remembered`."""
+
+
+class Theme(Event):
+    """Light or dark was chosen."""
+
+    light: bool
+
+
+class Trace(Event):
+    """A curve of the timeline is asked for."""
+
+    name: _Text
+    first: int
+    last: int
+    """One after the last frame."""
+    columns: int
+
+
+class Pressed(Event):
+    """A key of `page.OWN_KEYS` was pressed."""
+
+    key: _Key
+
+
+class Pointed(Event):
+    """A keypoint is placed in the image of a camera, by its index."""
+
+    camera: int
+    at: _Point
+
+
+class Dragged(Event):
+    """A link is dragged."""
+
+    gesture: float
+    """The same as long as the pointer is down."""
+    camera: int
+    start: _Point
+    end: _Point
+
+
+class Clicked(Event):
+    """The shown image was clicked."""
+
+    at: _Point
+
+
+class Chosen(Event):
+    """Something was chosen in a document over the page."""
+
+    name: _Text
+    value: _Text
