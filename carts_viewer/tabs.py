@@ -18,6 +18,7 @@ from carts_viewer.actions.intents import Intent
 from carts_viewer.controller import Background, Controller
 from carts_viewer.editing import People, Person
 from carts_viewer.jobs.optimizers import OptimizerFactory
+from carts_viewer.panels.inputs import PanelPage
 from carts_viewer.panels.layout import Layout, choose_theme
 from carts_viewer.panels.page_state import chosen
 from carts_viewer.picture.display import PageDisplay
@@ -27,7 +28,6 @@ from carts_viewer.picture.scene_view import SceneView
 from carts_viewer.session import Session, Storage
 from carts_viewer.state import ViewState
 from carts_viewer.transport.events import Hello
-from carts_viewer.transport.tab_page import TabPage
 
 T = TypeVar("T", bound=Hashable)
 
@@ -112,9 +112,9 @@ class View:
         waits: Callable[[Hashable], bool],
     ) -> None:
         """Build widgets and scene in a tab that shows nothing yet."""
-        self.page = TabPage(client)
+        self.page = PanelPage(client, emit, waits)
         with self.page.atomic():
-            self.layout = Layout(self.page, session, storage, state, emit, waits)
+            self.layout = Layout(self.page, session, storage, state)
             self.scene = SceneView(self.page.scene, session.scene, state.pose.scene, state.camera)
         self.display = PageDisplay(self.page, session, renderer, self.scene, self.layout.panels)
 

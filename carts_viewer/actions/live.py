@@ -188,7 +188,9 @@ class LiveHandler(Handler):
             # After the frame, so that no frame of the stream is shown as one of the recording.
             self._context.change(live=replace(state, on=False, text=text), scores=None, maps=None)
         if run.recorder is not None:
-            self._context.change(live=replace(state, on=False, text=f"{text} {_written(run.recorder.close())}"))
+            path = run.recorder.close()
+            kept = "Nothing was recorded." if path is None else f"Recorded: carts view {path}"
+            self._context.change(live=replace(state, on=False, text=f"{text} {kept}"))
 
     def _on_StartLive(self, intent: intents.StartLive) -> None:
         context, session = self._context, self._session
@@ -217,7 +219,8 @@ class LiveHandler(Handler):
             raise
         self._live = LiveRun(stream, tracker, Results(scene.with_cameras(cameras)), recorder)
         self._tell_at = 0.0
-        waits = "Waiting for the first frame." if self._live.port is None else _waits(self._live.port)
+        port = self._live.port
+        waits = f"Waiting for {'the first frame' if port is None else f'messages on port {port} of 127.0.0.1'}."
         context.change(live=LiveState(source=str(address), text=waits, busy=True), scores=None, maps=None, busy=None)
 
     def _folder(self) -> Path:
@@ -251,11 +254,3 @@ class LiveHandler(Handler):
             scores=None,
             maps=None,
         )
-
-
-def _waits(port: int) -> str:
-    return f"Waiting for messages on port {port} of 127.0.0.1."
-
-
-def _written(path: Path | None) -> str:
-    return "Nothing was recorded." if path is None else f"Recorded: carts view {path}"

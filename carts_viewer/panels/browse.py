@@ -12,13 +12,12 @@ from carts_viewer.actions import intents
 from carts_viewer.actions.browsing import SPEEDS
 from carts_viewer.actions.frame_filter import SOLVED, copied
 from carts_viewer.choices import Against
-from carts_viewer.panels.inputs import Emit, Waits, humanized, on_click, on_input, swatch, write
+from carts_viewer.panels.inputs import PanelPage, humanized, swatch, write
 from carts_viewer.picture.layers import ARM_COLORS, TRUTH_COLORS, Layer, label_color
 from carts_viewer.picture.overlay import with_imported
 from carts_viewer.session import Session
 from carts_viewer.state import Scores, ViewState
 from carts_viewer.transport.document import escaped
-from carts_viewer.transport.tab_page import TabPage
 
 _SOURCES = {
     Source.MEASURED: "joints as measured",
@@ -31,11 +30,11 @@ _SOURCES = {
 class BrowsePanel:
     """Frame slider, transport buttons, domain and camera."""
 
-    def __init__(self, page: TabPage, session: Session, emit: Emit, waits: Waits) -> None:
+    def __init__(self, page: PanelPage, session: Session) -> None:
         gui = page.gui
         sequence = session.sequence
         self._session = session
-        self._waits = waits
+        self._waits = page.waits
         self._count = len(sequence)
         stamps = sequence.timestamps
         self._began = 0.0 if stamps is None else float(stamps[0])
@@ -44,9 +43,9 @@ class BrowsePanel:
         with gui.add_folder("Sequence"):
             # A slider needs two ends even for a sequence of a single frame.
             self._frame = gui.add_slider("Frame", 1, max(self._count, 2), 1, 1, disabled=self._count == 1)
-            back = gui.add_button("", icon=viser.Icon.CHEVRON_LEFT, color="gray", hint="Previous frame (B)")
-            self._play = gui.add_button("Play", icon=viser.Icon.PLAYER_PLAY, color="gray")
-            forward = gui.add_button("", icon=viser.Icon.CHEVRON_RIGHT, color="gray", hint="Next frame (N)")
+            back = page.button("", intents.MoveFrame(-1), icon=viser.Icon.CHEVRON_LEFT, hint="Previous frame (B)")
+            self._play = page.button("Play", intents.Play(), icon=viser.Icon.PLAYER_PLAY)
+            forward = page.button("", intents.MoveFrame(1), icon=viser.Icon.CHEVRON_RIGHT, hint="Next frame (N)")
             page.row(back, self._play, forward, weights=(1, 2, 1))
             self._speed = gui.add_number("Frames/s", 10.0, min=SPEEDS[0], max=SPEEDS[1], step=0.5)
             self._domains = {humanized(name): name for name in sequence.domains}
@@ -69,14 +68,11 @@ class BrowsePanel:
                 )
             self._error = gui.add_html("", visible=False)
             self._caption = gui.add_html("")
-        on_input(self._frame, lambda value: intents.ShowFrame(int(value) - 1), emit)
-        on_click(back, lambda _: intents.MoveFrame(-1), emit)
-        on_click(forward, lambda _: intents.MoveFrame(1), emit)
-        on_click(self._play, lambda _: intents.Play(), emit)
-        on_input(self._speed, intents.SetSpeed, emit)
-        on_input(self._offset, intents.SetTimeOffset, emit)
-        on_input(self._domain, lambda label: intents.ShowDomain(self._domains[label]), emit)
-        on_input(self._camera, intents.ShowCamera, emit)
+        page.on_input(self._frame, lambda value: intents.ShowFrame(int(value) - 1))
+        page.on_input(self._speed, intents.SetSpeed)
+        page.on_input(self._offset, intents.SetTimeOffset)
+        page.on_input(self._domain, lambda label: intents.ShowDomain(self._domains[label]))
+        page.on_input(self._camera, intents.ShowCamera)
 
     def show(self, state: ViewState) -> None:
         """Update the widgets."""
@@ -142,9 +138,9 @@ _RAMPS = {
 class OverlayPanel:
     """Layer and opacity, with a legend and the fit to the truth."""
 
-    def __init__(self, page: TabPage, session: Session, state: ViewState, emit: Emit, waits: Waits) -> None:
+    def __init__(self, page: PanelPage, session: Session, state: ViewState) -> None:
         gui = page.gui
-        self._waits, self._session = waits, session
+        self._waits, self._session = page.waits, session
         self._arms = [arm.name for arm in session.scene.arms]
         self._classes = part_classes(session.scene.arms)
         with gui.add_folder("Overlay"):
@@ -155,10 +151,10 @@ class OverlayPanel:
                 "Compare with", [_NOTHING, *map(str, Against)], hint="Hold . to see only the other pose"
             )
             self._swipe = gui.add_slider("Swipe %", 0, 100, 1, 50, visible=False)
-        on_input(self._layer, lambda value: intents.ShowLayer(Layer(value)), emit)
-        on_input(self._against, lambda name: intents.CompareWith(None if name == _NOTHING else Against(name)), emit)
-        on_input(self._swipe, lambda value: intents.SetSwipe(value / 100), emit)
-        on_input(self._opacity, lambda value: intents.SetOpacity(value / 100), emit)
+        page.on_input(self._layer, lambda value: intents.ShowLayer(Layer(value)))
+        page.on_input(self._against, lambda name: intents.CompareWith(None if name == _NOTHING else Against(name)))
+        page.on_input(self._swipe, lambda value: intents.SetSwipe(value / 100))
+        page.on_input(self._opacity, lambda value: intents.SetOpacity(value / 100))
 
     def show(self, state: ViewState) -> None:
         """Update the widgets."""

@@ -6,11 +6,10 @@ from carts_core.export import FORMATS, FormatName
 from carts_core.project import Key, ProjectState, ReviewState
 from carts_viewer.actions import intents
 from carts_viewer.actions.exchange import FRAME_CHOICES, export_warnings, frames_within
-from carts_viewer.panels.inputs import Emit, on_click, on_input
+from carts_viewer.panels.inputs import PanelPage
 from carts_viewer.session import Session, Storage
 from carts_viewer.state import ViewState
 from carts_viewer.transport.document import escaped
-from carts_viewer.transport.tab_page import TabPage
 
 _PARTS = {"Arm": "arms", "Part": "parts", "Link": "links"}
 _DVRK = ("dvrk", "dvrk-2.3", "dvrk-suj")
@@ -26,7 +25,7 @@ _NOT_KEPT = "This project ends with the viewer, and its exports with it: downloa
 class ExportPanel:
     """The mask of this frame, or frames in any format, with progress, a way to stop it and where it is."""
 
-    def __init__(self, page: TabPage, session: Session, storage: Storage, emit: Emit) -> None:
+    def __init__(self, page: PanelPage, session: Session, storage: Storage) -> None:
         gui = page.gui
         cameras = len(session.scene.cameras)
         self._camera_names = [camera.name for camera in session.scene.cameras]
@@ -44,20 +43,16 @@ class ExportPanel:
             self._parts = gui.add_dropdown("Category per", list(_PARTS))
             self._images = gui.add_checkbox("Copy images", False)
             self._count = gui.add_html("")
-            self._export = gui.add_button("Export", icon=viser.Icon.FILE_EXPORT, color="teal")
+            self._export = page.button("Export", lambda _: self._intent(), icon=viser.Icon.FILE_EXPORT, color="teal")
             self._progress = gui.add_progress_bar(0.0, visible=False)
-            self._cancel = gui.add_button("Cancel export", icon=viser.Icon.X, color="gray", visible=False)
+            self._cancel = page.button("Cancel export", intents.CancelExport(), icon=viser.Icon.X, visible=False)
             self._result = gui.add_html("", visible=False)
-            self._download = gui.add_button("Download it", icon=viser.Icon.DOWNLOAD, color="gray", visible=False)
+            self._download = page.button("Download it", intents.Download, icon=viser.Icon.DOWNLOAD, visible=False)
         with gui.add_folder("This frame"):
             gui.add_html('<p class="carts-caption">Mask of the shown camera: 255 is arm, 0 background.</p>')
-            mask = gui.add_button("Export mask", icon=viser.Icon.PHOTO_DOWN, color="gray")
-        on_click(mask, intents.ExportMask, emit)
-        on_click(self._export, lambda _: self._intent(), emit)
-        on_click(self._cancel, lambda _: intents.CancelExport(), emit)
-        on_click(self._download, intents.Download, emit)
+            page.button("Export mask", intents.ExportMask, icon=viser.Icon.PHOTO_DOWN)
         for widget in (self._format, self._frames, self._within, self._cameras):
-            on_input(widget, lambda _: intents.Refresh(), emit)
+            page.on_input(widget, lambda _: intents.Refresh())
 
     def show(self, state: ViewState) -> None:
         """Update the widgets."""
@@ -121,7 +116,7 @@ _HINT = "Path in the recording's folder: a COCO (.json) or CVAT (.xml) file, key
 class ImportPanel:
     """A path, a camera, a button, and what was imported last."""
 
-    def __init__(self, page: TabPage, session: Session, emit: Emit) -> None:
+    def __init__(self, page: PanelPage, session: Session) -> None:
         gui = page.gui
         cameras = [camera.name for camera in session.scene.cameras]
         with gui.add_folder("Masks of others", expand_by_default=False):
@@ -130,9 +125,8 @@ class ImportPanel:
                 "Camera", [_BY_NAME, *cameras], visible=len(cameras) > 1, hint="Whose images the masks are of"
             )
             self._replace = gui.add_checkbox("Replace", False, hint="Replace what was imported before")
-            self._import = gui.add_button("Import masks", icon=viser.Icon.FILE_IMPORT, color="gray")
+            self._import = page.button("Import masks", lambda _: self._intent(), icon=viser.Icon.FILE_IMPORT)
             self._text = gui.add_html("")
-        on_click(self._import, lambda _: self._intent(), emit)
 
     def _intent(self) -> intents.ImportMasks:
         camera = None if self._camera.value == _BY_NAME else self._camera.value

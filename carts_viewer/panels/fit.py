@@ -5,11 +5,10 @@ import viser
 from carts_core.optimization import Verdict, fit_words, undetermined_joints
 from carts_core.project import FitVerdict
 from carts_viewer.actions import intents
-from carts_viewer.panels.inputs import Emit, on_click, on_input
+from carts_viewer.panels.inputs import PanelPage
 from carts_viewer.session import Session
 from carts_viewer.state import LiveState, Phase, ViewState
 from carts_viewer.transport.document import escaped
-from carts_viewer.transport.tab_page import TabPage
 
 _REPLAY, _SOCKET, _CAMERA = "Replay", "Socket", "Camera"
 _PORT = 7000
@@ -19,7 +18,7 @@ _RATE = 30.0
 class LivePanel:
     """Starts and stops a stream that is shown in the place of the recording."""
 
-    def __init__(self, page: TabPage, emit: Emit) -> None:
+    def __init__(self, page: PanelPage) -> None:
         gui = page.gui
         with gui.add_folder("Follow a live stream"):
             self._source = gui.add_dropdown(
@@ -38,12 +37,10 @@ class LivePanel:
             self._record = gui.add_checkbox(
                 "Record", False, hint="Keep images, joints and corrections in a new folder beside the project"
             )
-            self._start = gui.add_button("Start", icon=viser.Icon.PLAYER_RECORD, color="teal")
-            self._stop = gui.add_button("Stop", icon=viser.Icon.PLAYER_STOP, color="gray")
+            self._start = page.button("Start", lambda _: self._intent(), icon=viser.Icon.PLAYER_RECORD, color="teal")
+            self._stop = page.button("Stop", intents.StopLive(), icon=viser.Icon.PLAYER_STOP)
             self._text = gui.add_html("")
-        on_click(self._start, lambda _: self._intent(), emit)
-        on_click(self._stop, lambda _: intents.StopLive(), emit)
-        on_input(self._source, lambda _: intents.Refresh(), emit)
+        page.on_input(self._source, lambda _: intents.Refresh())
 
     def _intent(self) -> intents.StartLive:
         port = int(self._port.value)
@@ -94,18 +91,17 @@ _MEANING = (
 class FitPanel:
     """The verdict, always in view, and a button that asks the images for one."""
 
-    def __init__(self, page: TabPage, session: Session, emit: Emit) -> None:
+    def __init__(self, page: PanelPage, session: Session) -> None:
         gui = page.gui
         self._scene = session.scene
         self._cameras = [camera.name for camera in session.scene.cameras]
         self._text = gui.add_html("")
-        self._check = gui.add_button(
+        self._check = page.button(
             "Check the fit",
+            intents.Assess(),
             icon=viser.Icon.STETHOSCOPE,
-            color="gray",
             hint="Compare the arms as they are with the images of all cameras, and move nothing",
         )
-        on_click(self._check, lambda _: intents.Assess(), emit)
 
     def show(self, state: ViewState) -> None:
         """Bring the verdict up to date."""

@@ -16,11 +16,10 @@ from carts_core.files import write_text
 from carts_core.project import ReviewState
 from carts_core.resources import static_dir
 from carts_viewer.actions import intents
-from carts_viewer.panels.inputs import Emit
+from carts_viewer.panels.inputs import PanelPage
 from carts_viewer.picture.layers import Layer
 from carts_viewer.picture.strokes import Tool
 from carts_viewer.transport.page import OWN_KEYS
-from carts_viewer.transport.tab_page import TabPage
 from carts_viewer.transport.viser_private import element_id
 
 FINE, COARSE = 0.1, 1.0
@@ -269,7 +268,7 @@ HINTS = {
 """By label."""
 
 
-def explain(page: TabPage) -> list[str]:
+def explain(page: PanelPage) -> list[str]:
     """Give all controls of a tab their hints; gives the labels of those that have none, now or before.
 
     viser shows hints over fields alone, so the page's script shows those of buttons and over labels.
@@ -291,7 +290,7 @@ def explain(page: TabPage) -> list[str]:
 class HelpPanel:
     """Registers the shortcuts and explains everything in a few words."""
 
-    def __init__(self, page: TabPage, perturb: Callable[[], intents.Intent], emit: Emit) -> None:
+    def __init__(self, page: PanelPage, perturb: Callable[[], intents.Intent]) -> None:
         gui = page.gui
         own = {}
         for shortcut in shortcuts():
@@ -299,22 +298,22 @@ class HelpPanel:
             # viser shows the keys that it listens to itself.
             described = shortcut.key if hotkey is None else None
             command = gui.add_command(shortcut.label, description=described, hotkey=hotkey, modifier=shortcut.modifier)  # type: ignore[arg-type]
-            _listen(page, command, shortcut, perturb, emit)
+            _listen(page, command, shortcut, perturb)
             if hotkey is None and isinstance(shortcut.action, intents.Intent):
                 own[shortcut.hotkey] = shortcut.action
-        page.on_pressed(lambda key: emit(own[key]) if key in own else None)
+        page.on_pressed(lambda key: page.emit(own[key]) if key in own else None)
         text = (static_dir() / "help.md").read_text(encoding="utf-8")
         gui.add_markdown(text.replace("{shortcuts}", key_table()))
 
 
 def _listen(
-    page: TabPage, command: viser.CommandHandle, shortcut: Shortcut, perturb: Callable[[], intents.Intent], emit: Emit
+    page: PanelPage, command: viser.CommandHandle, shortcut: Shortcut, perturb: Callable[[], intents.Intent]
 ) -> None:
     @command.on_trigger
     async def _(event: viser.CommandEvent) -> None:
         if isinstance(shortcut.action, intents.Intent):
-            emit(shortcut.action)
+            page.emit(shortcut.action)
         elif shortcut.action == "perturb":
-            emit(perturb())
+            page.emit(perturb())
         else:
             page.call("toggleView")

@@ -9,14 +9,8 @@ import viser
 from carts_viewer.actions.intents import Intent, Refresh
 from carts_viewer.state import ViewState
 from carts_viewer.transport.document import escaped
+from carts_viewer.transport.tab_page import TabPage
 from carts_viewer.transport.viser_private import on_sent
-
-Emit = Callable[[Intent], None]
-"""Hands an intent to the worker; never blocks."""
-
-
-Waits = Callable[[Hashable], bool]
-"""Whether an intent of this key waits for the worker; then its widget is ahead of the state and must not be set."""
 
 
 class Panel(Protocol):
@@ -26,23 +20,48 @@ class Panel(Protocol):
         """Update the widgets."""
 
 
-def on_input(handle: Any, intent: Callable[[Any], Intent], emit: Emit) -> None:
-    """When a person changes the widget, emit what `intent` makes of the new value.
+class PanelPage(TabPage):
+    """A tab's page, whose widgets ask for intents.
 
-    Our own writes, numbers that are not finite and choices that do not exist are not input.
+    Attributes:
+        emit: hands an intent to the worker; never blocks.
+        waits: whether an intent of this key waits for the worker; its widget is ahead of the state then.
     """
-    # What no page of ours would send is not acted upon, but every tab has seen it and must be set right.
-    on_sent(handle, lambda value: emit(intent(value) if valid(handle, value) else Refresh()))
 
+    def __init__(
+        self, client: viser.ClientHandle, emit: Callable[[Intent], None], waits: Callable[[Hashable], bool]
+    ) -> None:
+        super().__init__(client)
+        self.emit, self.waits = emit, waits
 
-def on_click(handle: viser.GuiButtonHandle, intent: Callable[[int], Intent], emit: Emit) -> None:
-    """When a person presses the button, emit what `intent` makes of the number of their tab."""
+    def button(
+        self, label: str, intent: Intent | Callable[[int], Intent], *, color: Any = "gray", **options: Any
+    ) -> viser.GuiButtonHandle:
+        """Add a button to the current container.
 
-    @handle.on_click
-    async def _(event: viser.GuiEvent) -> None:
-        # A tab can send a click on a button that is greyed out, so what a click may do is decided by the controller.
-        if event.client_id is not None:
-            emit(intent(event.client_id))
+        Args:
+            label: of the button.
+            intent: emitted when a person presses it, or what makes it of the number of their tab.
+            color: of viser's.
+            options: of `viser.GuiApi.add_button`.
+        """
+        handle = self.gui.add_button(label, color=color, **options)
+
+        @handle.on_click
+        async def _(event: viser.GuiEvent) -> None:
+            # A tab can send a click on a disabled button, so what a click may do is decided by the controller.
+            if event.client_id is not None:
+                self.emit(intent if isinstance(intent, Intent) else intent(event.client_id))
+
+        return handle
+
+    def on_input(self, handle: Any, intent: Callable[[Any], Intent]) -> None:
+        """When a person changes the widget, emit what `intent` makes of the new value.
+
+        Our own writes, numbers that are not finite and choices that do not exist are not input.
+        """
+        # What no page of ours would send is not acted upon, but every tab has seen it and must be set right.
+        on_sent(handle, lambda value: self.emit(intent(value) if valid(handle, value) else Refresh()))
 
 
 def valid(handle: Any, value: Any) -> bool:

@@ -8,11 +8,10 @@ from carts_core.wording import spoken_time
 from carts_viewer.actions import intents
 from carts_viewer.jobs.job_list import LARGEST_CALIBRATION, LONGEST_TRAINING, Job, JobState
 from carts_viewer.jobs.networks import STARTED
-from carts_viewer.panels.inputs import Emit, on_click, on_input, write
+from carts_viewer.panels.inputs import PanelPage, write
 from carts_viewer.panels.sequence import newest_calibration, whole_label
 from carts_viewer.state import ViewState
 from carts_viewer.transport.document import escaped
-from carts_viewer.transport.tab_page import TabPage
 
 _NONE = "None"
 _LISTED = 5
@@ -24,21 +23,30 @@ _FRAMES = {_UNREVIEWED: "unreviewed", "Found (Review, Find)": "found", _RANGE: "
 class JobsPanel:
     """Queues jobs and shows how they go."""
 
-    def __init__(self, page: TabPage, emit: Emit) -> None:
+    def __init__(self, page: PanelPage) -> None:
         gui = page.gui
         self._numbers: dict[str, int] = {}
         self._ranged = False
         self._asked = gui.add_html("", visible=False)
-        self._run = gui.add_button("Run jobs", icon=viser.Icon.CHECK, color="teal", visible=False)
-        self._discard = gui.add_button("Discard jobs", icon=viser.Icon.X, color="gray", visible=False)
+        self._run = page.button(
+            "Run jobs", intents.AnswerJobs(True), icon=viser.Icon.CHECK, color="teal", visible=False
+        )
+        self._discard = page.button("Discard jobs", intents.AnswerJobs(False), icon=viser.Icon.X, visible=False)
         page.row(self._run, self._discard)
         self._asked_network = gui.add_html("", visible=False)
-        self._accept = gui.add_button("Accept network", icon=viser.Icon.CHECK, color="teal", visible=False)
-        self._refuse = gui.add_button("Refuse network", icon=viser.Icon.X, color="gray", visible=False)
+        self._accept = page.button(
+            "Accept network", intents.AnswerNetwork(True), icon=viser.Icon.CHECK, color="teal", visible=False
+        )
+        self._refuse = page.button("Refuse network", intents.AnswerNetwork(False), icon=viser.Icon.X, visible=False)
         page.row(self._accept, self._refuse)
         with gui.add_folder("New job"):
             self._frames = gui.add_dropdown("Which frames", list(_FRAMES))
-            optimize = gui.add_button("Optimize each alone", icon=viser.Icon.PLAYER_PLAY, color="teal")
+            page.button(
+                "Optimize each alone",
+                lambda _: intents.OptimizeFrames(_FRAMES.get(self._frames.value, "unreviewed")),
+                icon=viser.Icon.PLAYER_PLAY,
+                color="teal",
+            )
             self._count = gui.add_number(
                 "Calibrate on [frames]",
                 intents.Calibrate().frames,
@@ -47,7 +55,7 @@ class JobsPanel:
                 step=1,
                 hint="Spread evenly over the whole sequence, independent of the range",
             )
-            calibrate = gui.add_button("Calibrate", icon=viser.Icon.RULER_MEASURE, color="gray")
+            page.button("Calibrate", lambda _: intents.Calibrate(int(self._count.value)), icon=viser.Icon.RULER_MEASURE)
             self._minutes = gui.add_number(
                 "Adapt for [min]",
                 intents.Adapt().minutes,
@@ -56,10 +64,10 @@ class JobsPanel:
                 step=1,
                 hint="Processor time at most; it ends when it no longer gains",
             )
-            adapt = gui.add_button(
+            page.button(
                 "Adapt the network",
+                lambda _: intents.Adapt(int(self._minutes.value)),
                 icon=viser.Icon.SCHOOL,
-                color="gray",
                 hint="Train it for the robots, cameras, distances and empty backgrounds of this recording",
             )
             gui.add_html(
@@ -70,30 +78,28 @@ class JobsPanel:
                 "and exports queue up here, too.</p>"
             )
         self._network = gui.add_dropdown("Network", [STARTED], visible=False, hint="Used in all tabs; saved")
-        self._newest = gui.add_button("Use the newest network", icon=viser.Icon.CHECK, color="teal", visible=False)
+        self._newest = page.button(
+            "Use the newest network",
+            lambda _: intents.UseNetwork(self._network.options[-1]),
+            icon=viser.Icon.CHECK,
+            color="teal",
+            visible=False,
+        )
         with gui.add_folder("Jobs"):
             self._list = gui.add_html("")
-            self._solve = gui.add_button("Solve all", icon=viser.Icon.ARROWS_HORIZONTAL, color="teal", visible=False)
+            self._solve = page.button(
+                "Solve all", intents.Solve(whole=True), icon=viser.Icon.ARROWS_HORIZONTAL, color="teal", visible=False
+            )
             self._chosen = gui.add_dropdown("Job", [_NONE])
-            self._cancel = gui.add_button("Cancel", icon=viser.Icon.X, color="gray")
-            self._again = gui.add_button("Start again", icon=viser.Icon.REFRESH, color="gray")
-            self._forget = gui.add_button("Clear ended", color="gray")
+            self._cancel = page.button("Cancel", lambda _: intents.CancelJob(self._number()), icon=viser.Icon.X)
+            self._again = page.button(
+                "Start again", lambda _: intents.RepeatJob(self._number()), icon=viser.Icon.REFRESH
+            )
+            self._forget = page.button("Clear ended", intents.ForgetJobs())
             page.row(self._cancel, self._again)
             self._log = gui.add_html("")
-        on_click(self._run, lambda _: intents.AnswerJobs(True), emit)
-        on_click(self._discard, lambda _: intents.AnswerJobs(False), emit)
-        on_click(self._accept, lambda _: intents.AnswerNetwork(True), emit)
-        on_click(self._refuse, lambda _: intents.AnswerNetwork(False), emit)
-        on_click(optimize, lambda _: intents.OptimizeFrames(_FRAMES.get(self._frames.value, "unreviewed")), emit)  # type: ignore[arg-type]
-        on_click(calibrate, lambda _: intents.Calibrate(int(self._count.value)), emit)
-        on_click(adapt, lambda _: intents.Adapt(int(self._minutes.value)), emit)
-        on_input(self._network, intents.UseNetwork, emit)
-        on_click(self._newest, lambda _: intents.UseNetwork(self._network.options[-1]), emit)
-        on_click(self._solve, lambda _: intents.Solve(whole=True), emit)
-        on_click(self._cancel, lambda _: intents.CancelJob(self._number()), emit)
-        on_click(self._again, lambda _: intents.RepeatJob(self._number()), emit)
-        on_click(self._forget, lambda _: intents.ForgetJobs(), emit)
-        on_input(self._chosen, lambda _: intents.Refresh(), emit)
+        page.on_input(self._network, intents.UseNetwork)
+        page.on_input(self._chosen, lambda _: intents.Refresh())
 
     def show(self, state: ViewState) -> None:
         """Bring the list up to date; the newest job is chosen when it comes."""

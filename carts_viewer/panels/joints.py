@@ -1,7 +1,6 @@
 """Panels of joint positions: sliders, a table of values, and keypoints."""
 
 import math
-from collections.abc import Callable
 
 import viser
 
@@ -9,12 +8,11 @@ from carts_core.settings import SurfaceSolver
 from carts_viewer.actions import intents
 from carts_viewer.actions.posing import LARGEST_PERTURBATION
 from carts_viewer.choices import JointRange, Reach
-from carts_viewer.panels.inputs import Emit, Waits, humanized, on_click, on_input, valid, write
+from carts_viewer.panels.inputs import PanelPage, humanized, valid, write
 from carts_viewer.picture.overlay import labelled_keypoints
 from carts_viewer.session import Session
 from carts_viewer.state import ViewState
 from carts_viewer.transport.document import escaped
-from carts_viewer.transport.tab_page import TabPage
 
 _STEP = 0.05
 """Step of the sliders [deg] and [mm]."""
@@ -23,38 +21,38 @@ _STEP = 0.05
 class JointsPanel:
     """One tab per arm with its joints, and the buttons that concern all arms."""
 
-    def __init__(self, page: TabPage, session: Session, state: ViewState, emit: Emit, waits: Waits) -> None:
+    def __init__(self, page: PanelPage, session: Session, state: ViewState) -> None:
         """
         Args:
             page: Where to build the widgets, in the current container.
             session: The open sequence.
             state: The state to begin with.
-            emit: Takes the intents.
-            waits: Whether a slider is ahead of the state.
         """
         gui = page.gui
         self._session = session
-        self._waits = waits
+        self._waits = page.waits
         self._page = page
         self._sliders: dict[tuple[str, int], tuple[JointRange, viser.GuiSliderHandle[float]]] = {}
         tabs = gui.add_tab_group()
         for arm in session.scene.arms:
             with tabs.add_tab(arm.name, viser.Icon.GRAIN):
-                self._add_arm(page, arm.name, state, emit)
+                self._add_arm(page, arm.name, state)
         self._reach = gui.add_dropdown(
             "Slider range",
             [str(reach) for reach in Reach],
             initial_value=str(state.reach),
             hint="How far the sliders reach from the measured values [° or mm]",
         )
-        perturb = gui.add_button("Perturb all joints", color="gray")
+        page.button("Perturb all joints", lambda _: self.perturb())
         self._degrees = gui.add_number("By [°, mm]", 2.0, min=0.0, max=LARGEST_PERTURBATION, step=0.5)
         self._seed = gui.add_number("Seed", 0, min=0, max=2**31 - 1, step=1)
         page.columns([self._degrees, self._seed], narrow_labels=True)
         back = "All back to measured" if len(session.scene.arms) > 1 else "Back to measured"
-        measured = gui.add_button(back, icon=viser.Icon.HISTORY, color="gray")
-        before = gui.add_button("Copy previous", color="gray", hint="Correct by as much as the previous frame is")
-        after = gui.add_button("Copy next", color="gray", hint="Correct by as much as the next frame is")
+        page.button(back, intents.BackToMeasured(), icon=viser.Icon.HISTORY)
+        before = page.button(
+            "Copy previous", intents.CopyCorrection(-1), hint="Correct by as much as the previous frame is"
+        )
+        after = page.button("Copy next", intents.CopyCorrection(1), hint="Correct by as much as the next frame is")
         page.row(before, after)
         self._names = {
             f"{limits.arm} {humanized(limits.joint)}": (limits.arm, number)
@@ -62,12 +60,8 @@ class JointsPanel:
             for number, limits in enumerate(limits for limits in session.ranges if limits.arm == arm.name)
         }
         self._nudged = gui.add_dropdown("Nudge (I, O)", list(self._names), hint="The joint that the keys I and O move")
-        on_click(perturb, lambda _: self.perturb(), emit)
-        on_click(measured, lambda _: intents.BackToMeasured(), emit)
-        on_click(before, lambda _: intents.CopyCorrection(-1), emit)
-        on_click(after, lambda _: intents.CopyCorrection(1), emit)
-        on_input(self._reach, lambda name: intents.SetReach(Reach(name)), emit)
-        on_input(self._nudged, lambda name: intents.ChooseJoint(self._names[name]), emit)
+        page.on_input(self._reach, lambda name: intents.SetReach(Reach(name)))
+        page.on_input(self._nudged, lambda name: intents.ChooseJoint(self._names[name]))
 
     def perturb(self) -> intents.Perturb:
         """The perturbation that the fields describe."""
@@ -91,7 +85,7 @@ class JointsPanel:
         if state.joint is not None:
             write(self._nudged, next(name for name, joint in self._names.items() if joint == state.joint))
 
-    def _add_arm(self, page: TabPage, arm: str, state: ViewState, emit: Emit) -> None:
+    def _add_arm(self, page: PanelPage, arm: str, state: ViewState) -> None:
         gui = page.gui
         joints = self._session.joints(state.pose.scene)[arm]
         for joint, limits in enumerate(limits for limits in self._session.ranges if limits.arm == arm):
@@ -105,18 +99,13 @@ class JointsPanel:
                 label, math.floor(min(low, value)), math.ceil(max(high, value)), _STEP, round(value, 2), hint=hint
             )
             self._sliders[arm, joint] = (limits, slider)
-            on_input(slider, self._intent(arm, joint, limits), emit)
-        if len(self._session.scene.arms) > 1:
-            reset = gui.add_button(
-                f"{arm} back to measured",
-                icon=viser.Icon.HISTORY,
-                color="gray",
-                hint=f"Forget the corrections of {arm} in this frame",
+            page.on_input(
+                slider,
+                lambda shown, joint=joint, limits=limits: intents.SetJoint(arm, joint, limits.from_shown(shown)),
             )
-            on_click(reset, lambda _: intents.BackToMeasured(arm), emit)
-
-    def _intent(self, arm: str, joint: int, limits: JointRange) -> Callable[[float], intents.Intent]:
-        return lambda shown: intents.SetJoint(arm, joint, limits.from_shown(shown))
+        if len(self._session.scene.arms) > 1:
+            hint = f"Forget the corrections of {arm} in this frame"
+            page.button(f"{arm} back to measured", intents.BackToMeasured(arm), icon=viser.Icon.HISTORY, hint=hint)
 
     @staticmethod
     def _place(
@@ -221,7 +210,7 @@ _NEAREST = "Nearest to the pointer"
 class KeypointsPanel:
     """The keypoint to place by a click or a drag, and the residuals of those that were placed."""
 
-    def __init__(self, page: TabPage, session: Session, emit: Emit) -> None:
+    def __init__(self, page: PanelPage, session: Session) -> None:
         gui = page.gui
         self._labels = {point: label for label, point in labelled_keypoints(session.scene).items()}
         with gui.add_folder("Keypoints"):
@@ -234,10 +223,9 @@ class KeypointsPanel:
             self._chosen = gui.add_dropdown("Keypoint", options)
             self._shown = gui.add_checkbox("Show keypoints", False)
             self._residuals = gui.add_html("")
-            self._forget = gui.add_button("Forget the clicks", icon=viser.Icon.X, color="gray", visible=False)
-        on_input(self._chosen, lambda label: intents.ChooseKeypoint(None if label == _NEAREST else label), emit)
-        on_input(self._shown, lambda on: intents.ShowKeypoints(bool(on)), emit)
-        on_click(self._forget, lambda _: intents.ForgetPins(), emit)
+            self._forget = page.button("Forget the clicks", intents.ForgetPins(), icon=viser.Icon.X, visible=False)
+        page.on_input(self._chosen, lambda label: intents.ChooseKeypoint(None if label == _NEAREST else label))
+        page.on_input(self._shown, lambda on: intents.ShowKeypoints(bool(on)))
 
     def show(self, state: ViewState) -> None:
         """Update the widgets."""

@@ -6,7 +6,7 @@ from carts_viewer.panels.browse import BrowsePanel, OverlayPanel
 from carts_viewer.panels.exchange import ExportPanel, ImportPanel
 from carts_viewer.panels.fit import FitPanel, LivePanel
 from carts_viewer.panels.help import HelpPanel, explain
-from carts_viewer.panels.inputs import Emit, Panel, Waits
+from carts_viewer.panels.inputs import Panel, PanelPage
 from carts_viewer.panels.jobs import JobsPanel
 from carts_viewer.panels.joints import JointsPanel, KeypointsPanel, ValuesPanel
 from carts_viewer.panels.optimize import CurvesPanel, FreePanel, OptimizePanel, SettingsPanel
@@ -18,7 +18,6 @@ from carts_viewer.panels.sequence import KeyframesPanel
 from carts_viewer.panels.timeline import TimelineData
 from carts_viewer.session import Session, Storage
 from carts_viewer.state import ViewState
-from carts_viewer.transport.tab_page import TabPage
 
 _WIDTH = 312.0
 """Width of either side [px]."""
@@ -38,9 +37,7 @@ class Layout:
         timeline: what the strip below the picture shows.
     """
 
-    def __init__(
-        self, page: TabPage, session: Session, storage: Storage, state: ViewState, emit: Emit, waits: Waits
-    ) -> None:
+    def __init__(self, page: PanelPage, session: Session, storage: Storage, state: ViewState) -> None:
         """Build the panels.
 
         Args:
@@ -48,43 +45,41 @@ class Layout:
             session: the open sequence.
             storage: its project.
             state: what is shown first.
-            emit: takes the intents.
-            waits: whether an intent waits for the worker.
         """
         gui = page.gui
         gui.set_panel_label("CaRTS")
         gui.main_panel.dock_left()
         gui.main_panel.set_width(_WIDTH)
         panels: list[Panel] = [
-            SavedPanel(page, storage, emit),
-            MessagePanel(page, emit),
-            FitPanel(page, session, emit),
-            BrowsePanel(page, session, emit, waits),
-            OverlayPanel(page, session, state, emit, waits),
-            PaintPanel(page, session, state, emit, waits),
+            SavedPanel(page, storage),
+            MessagePanel(page),
+            FitPanel(page, session),
+            BrowsePanel(page, session),
+            OverlayPanel(page, session, state),
+            PaintPanel(page, session, state),
         ]
         with gui.add_folder("Joints"):
-            self.joints = JointsPanel(page, session, state, emit, waits)
+            self.joints = JointsPanel(page, session, state)
         right = gui.add_panel()
         with right.add_tab("Optimize"):
             panels += [
-                OptimizePanel(page, session, state, emit),
-                SettingsPanel(page, state, emit),
+                OptimizePanel(page, session, state),
+                SettingsPanel(page, state),
                 CurvesPanel(gui),
-                FreePanel(page, session, state, emit),
+                FreePanel(page, session, state),
             ]
         with right.add_tab("Review"):
-            panels += _review(page, session, state, emit, waits)
+            panels += _review(page, session, state)
         with right.add_tab("Values"):
             panels.append(ValuesPanel(gui, session))
         with right.add_tab("Jobs"):
-            panels.append(JobsPanel(page, emit))
+            panels.append(JobsPanel(page))
         with right.add_tab("Live"):
-            panels.append(LivePanel(page, emit))
+            panels.append(LivePanel(page))
         with right.add_tab("Export"):
-            panels.append(ExportPanel(page, session, storage, emit))
+            panels.append(ExportPanel(page, session, storage))
         with right.add_tab("Help"):
-            HelpPanel(page, self.joints.perturb, emit)
+            HelpPanel(page, self.joints.perturb)
         explain(page)
         right.dock_right()
         right.set_width(_WIDTH)
@@ -92,14 +87,14 @@ class Layout:
         self.panels = [*panels, self.joints, PageState(page, session), self.timeline]
 
 
-def _review(page: TabPage, session: Session, state: ViewState, emit: Emit, waits: Waits) -> list[Panel]:
+def _review(page: PanelPage, session: Session, state: ViewState) -> list[Panel]:
     """Panels of reviews, keyframes, imports and history."""
     return [
-        ReviewPanel(page, emit, waits),
-        KeyframesPanel(page, session, emit),
-        KeypointsPanel(page, session, emit),
-        ImportPanel(page, session, emit),
-        FindPanel(page, session, emit, waits),
-        HistoryPanel(page, emit),
-        PeoplePanel(page, state, emit, waits),
+        ReviewPanel(page),
+        KeyframesPanel(page, session),
+        KeypointsPanel(page, session),
+        ImportPanel(page, session),
+        FindPanel(page, session),
+        HistoryPanel(page),
+        PeoplePanel(page, state),
     ]

@@ -16,12 +16,11 @@ from carts_core.settings import DescentSolver, SolverName, SurfaceSolver
 from carts_core.settings.serialization import field_docstrings
 from carts_viewer.actions import intents
 from carts_viewer.choices import PRESETS
-from carts_viewer.panels.inputs import Emit, humanized, on_click, on_input, write
+from carts_viewer.panels.inputs import PanelPage, humanized, write
 from carts_viewer.panels.sequence import CalibrationHint
 from carts_viewer.session import Session
 from carts_viewer.state import Curves, Phase, ViewState
 from carts_viewer.transport.document import escaped
-from carts_viewer.transport.tab_page import TabPage
 
 SOLVER_LABELS = {
     SolverName.SURFACE: "Surface maps (default)",
@@ -52,19 +51,21 @@ _BEFORE_RUN = {
 class OptimizePanel:
     """The buttons that drive a run, and its state in words."""
 
-    def __init__(self, page: TabPage, session: Session, state: ViewState, emit: Emit) -> None:
+    def __init__(self, page: PanelPage, session: Session, state: ViewState) -> None:
         gui = page.gui
         self._session = session
-        self._run = gui.add_button("Run", icon=viser.Icon.PLAYER_PLAY, color="teal")
-        self._pause = gui.add_button("Pause", icon=viser.Icon.PLAYER_PAUSE, color="gray", disabled=True)
+        self._run = page.button("Run", intents.Run(), icon=viser.Icon.PLAYER_PLAY, color="teal")
+        self._pause = page.button("Pause", intents.Pause(), icon=viser.Icon.PLAYER_PAUSE, disabled=True)
         page.row(self._run, self._pause)
-        self._step = gui.add_button("Step", icon=viser.Icon.PLAYER_SKIP_FORWARD, color="gray")
-        self._reset = gui.add_button("Reset", icon=viser.Icon.PLAYER_TRACK_PREV, color="gray")
+        self._step = page.button("Step", intents.Step(), icon=viser.Icon.PLAYER_SKIP_FORWARD)
+        self._reset = page.button("Reset", intents.Reset(), icon=viser.Icon.PLAYER_TRACK_PREV)
         page.row(self._step, self._reset)
         self._status = gui.add_html("")
-        self._calibration = CalibrationHint(page, session, emit)
+        self._calibration = CalibrationHint(page, session)
         self._unfamiliar = gui.add_html("", visible=False)
-        self._adapt = gui.add_button("Adapt the network to this recording", icon=viser.Icon.SCHOOL, visible=False)
+        self._adapt = page.button(
+            "Adapt the network to this recording", intents.Adapt(), icon=viser.Icon.SCHOOL, visible=False, color=None
+        )
         self._solvers = {label: name for name, label in SOLVER_LABELS.items()}
         self._solver = gui.add_dropdown("Solver", list(self._solvers), initial_value=SOLVER_LABELS[state.solver])
         self._observed = gui.add_dropdown("Fit to", list(OBSERVED))
@@ -76,15 +77,10 @@ class OptimizePanel:
         )
         cameras = [camera.name for camera in session.scene.cameras]
         self._cameras = gui.add_dropdown("Cameras", ["All cameras", "Shown camera"], visible=len(cameras) > 1)
-        on_click(self._run, lambda _: intents.Run(), emit)
-        on_click(self._pause, lambda _: intents.Pause(), emit)
-        on_click(self._step, lambda _: intents.Step(), emit)
-        on_click(self._adapt, lambda _: intents.Adapt(), emit)
-        on_click(self._reset, lambda _: intents.Reset(), emit)
-        on_input(self._solver, lambda label: intents.SetSetting("solver", self._solvers[label]), emit)
-        on_input(self._observed, lambda what: intents.SetObserved(OBSERVED[what], MASKS[self._masks.value]), emit)
-        on_input(self._masks, lambda masks: intents.SetObserved(OBSERVED[self._observed.value], MASKS[masks]), emit)
-        on_input(self._cameras, lambda label: intents.SetCameras(label == "All cameras"), emit)
+        page.on_input(self._solver, lambda label: intents.SetSetting("solver", self._solvers[label]))
+        page.on_input(self._observed, lambda what: intents.SetObserved(OBSERVED[what], MASKS[self._masks.value]))
+        page.on_input(self._masks, lambda masks: intents.SetObserved(OBSERVED[self._observed.value], MASKS[masks]))
+        page.on_input(self._cameras, lambda label: intents.SetCameras(label == "All cameras"))
 
     def show(self, state: ViewState) -> None:
         """Update the widgets."""
@@ -168,7 +164,7 @@ class SettingsPanel:
     Stages are not edited here: a settings file holds them (`carts evaluate --settings`).
     """
 
-    def __init__(self, page: TabPage, state: ViewState, emit: Emit) -> None:
+    def __init__(self, page: PanelPage, state: ViewState) -> None:
         gui = page.gui
         self._gui = gui
         self._widgets: dict[type, dict[str, Any]] = {}
@@ -179,16 +175,17 @@ class SettingsPanel:
         advanced = gui.add_button("Advanced settings", icon=viser.Icon.ADJUSTMENTS, color="gray")
         self._window = gui.add_panel(visible=False)
         with self._window.add_tab("Solver settings"):
-            reset = gui.add_button("Reset all to the preset", icon=viser.Icon.HISTORY, color="gray")
+            reset = page.button(
+                "Reset all to the preset", lambda _: intents.ResetSettings(self._preset.value), icon=viser.Icon.HISTORY
+            )
             close = gui.add_button("Close", icon=viser.Icon.X, color="gray")
             page.row(reset, close, weights=(2, 1))
             self._folder = gui.add_folder("Of the chosen solver")
             with self._folder:
                 for example in (SurfaceSolver(), DescentSolver()):
-                    self._add(example, type(state.settings), emit)
+                    self._add(page, example, type(state.settings))
         self._window.float(x=40, y=60, width=400, height=620)
-        on_input(self._preset, intents.ResetSettings, emit)
-        on_click(reset, lambda _: intents.ResetSettings(self._preset.value), emit)
+        page.on_input(self._preset, intents.ResetSettings)
 
         @advanced.on_click
         async def _(_: viser.GuiEvent) -> None:
@@ -208,7 +205,7 @@ class SettingsPanel:
                 if chosen and state.settings_error is None:
                     write(widget, getattr(state.settings, name))
 
-    def _add(self, example: Any, shown: type, emit: Emit) -> None:
+    def _add(self, page: PanelPage, example: Any, shown: type) -> None:
         kind = type(example)
         self._widgets[kind] = {
             field.name: _widget(self._gui, kind, field.name, getattr(example, field.name))
@@ -217,7 +214,7 @@ class SettingsPanel:
         }
         for name, widget in self._widgets[kind].items():
             widget.visible = kind is shown
-            on_input(widget, _setter(name), emit)
+            page.on_input(widget, lambda value, name=name: intents.SetSetting(name, value))
 
     def _show_error(self, state: ViewState) -> None:
         """Say what is wrong right below the field that it is about."""
@@ -234,7 +231,7 @@ class SettingsPanel:
 class FreePanel:
     """Which joints and which calibration the optimizer may move."""
 
-    def __init__(self, page: TabPage, session: Session, state: ViewState, emit: Emit) -> None:
+    def __init__(self, page: PanelPage, session: Session, state: ViewState) -> None:
         gui = page.gui
         self._joints: dict[tuple[str, str], Any] = {}
         self._groups: dict[str, Any] = {}
@@ -245,13 +242,13 @@ class FreePanel:
                     hint = f"Let the optimizer move this joint of {arm.name}"
                     box = gui.add_checkbox(humanized(joint), is_free(state, arm.name, joint), hint=hint)
                     self._joints[arm.name, joint] = box
-                    on_input(box, _free_joint(arm.name, joint), emit)
+                    page.on_input(box, lambda on, arm=arm.name, joint=joint: intents.SetFreeJoint(arm, joint, bool(on)))
                 page.columns([self._joints[arm.name, joint] for joint in arm.robot.joint_names])
             gui.add_html('<p class="carts-caption"><b>Calibration</b></p>')
             for name, label in _GROUPS.items():
                 box = gui.add_checkbox(label, getattr(state.free, name))
                 self._groups[name] = box
-                on_input(box, _free_group(name), emit)
+                page.on_input(box, lambda on, name=name: intents.SetFreeGroup(name, bool(on)))
             page.columns(list(self._groups.values()))
 
     def show(self, state: ViewState) -> None:
@@ -284,18 +281,6 @@ def _widget(gui: Any, kind: type, name: str, value: Any) -> Any:
         return gui.add_checkbox(label, value, hint=hint)
     step = 1 if isinstance(value, int) else 10.0 ** (math.floor(math.log10(value)) - 1 if value > 0 else -5)
     return gui.add_number(label, value, step=step, hint=hint)
-
-
-def _setter(name: str):
-    return lambda value: intents.SetSetting(name, value)
-
-
-def _free_joint(arm: str, joint: str):
-    return lambda on: intents.SetFreeJoint(arm, joint, bool(on))
-
-
-def _free_group(name: str):
-    return lambda on: intents.SetFreeGroup(name, bool(on))
 
 
 _TEAL, _BLUE, _ORANGE, _GRAY = "#14b8a6", "#3b82f6", "#f97316", "#8a9696"

@@ -5,12 +5,11 @@ import viser
 from carts_core.model.parts import part_classes
 from carts_core.settings import DescentSolver
 from carts_viewer.actions import intents
-from carts_viewer.panels.inputs import Emit, Waits, on_click, on_input, swatch, write
+from carts_viewer.panels.inputs import PanelPage, swatch, write
 from carts_viewer.picture.layers import ADDED_COLOR, IGNORED_COLOR, REMOVED_COLOR, label_color
 from carts_viewer.picture.strokes import DIAMETERS, Target, Tool
 from carts_viewer.session import Session
 from carts_viewer.state import ViewState
-from carts_viewer.transport.tab_page import TabPage
 
 _ICONS = {
     Tool.OFF: viser.Icon.POINTER,
@@ -36,16 +35,21 @@ _MOVING = "<b>Right-drag</b> moves the picture, <b>wheel</b> zooms."
 class PaintPanel:
     """Tools and layers; it also sends the chosen tool to the tab."""
 
-    def __init__(self, page: TabPage, session: Session, state: ViewState, emit: Emit, waits: Waits) -> None:
+    def __init__(self, page: PanelPage, session: Session, state: ViewState) -> None:
         gui = page.gui
-        self._page, self._scene, self._waits = page, session.scene, waits
+        self._page, self._scene, self._waits = page, session.scene, page.waits
         self._classes = {_ANY: 0} | {one.name: one.number for one in part_classes(session.scene.arms)}
         self._sent: dict[str, object] = self._message(state)
         with gui.add_folder("Paint", expand_by_default=False):
-            self._tools = {tool: gui.add_button(str(tool), icon=icon) for tool, icon in _ICONS.items()}
+            self._tools = {
+                tool: page.button(str(tool), intents.SetTool(tool), icon=icon, color=None)
+                for tool, icon in _ICONS.items()
+            }
             for first in range(0, len(Tool), 2):
                 page.row(*list(self._tools.values())[first : first + 2])
-            self._targets = {target: gui.add_button(str(target)) for target in Target}
+            self._targets = {
+                target: page.button(str(target), intents.SetTarget(target), color=None) for target in Target
+            }
             page.row(*self._targets.values(), weights=(2, 3))
             self._class = gui.add_dropdown(
                 "Class",
@@ -55,14 +59,9 @@ class PaintPanel:
             )
             self._size = gui.add_slider("Size [px]", *DIAMETERS, 1, state.brush.diameter)
             self._text = gui.add_html("")
-            self._clear = gui.add_button("Clear", icon=viser.Icon.TRASH, color="gray")
-        for tool, button in self._tools.items():
-            on_click(button, lambda _, tool=tool: intents.SetTool(tool), emit)
-        for target, button in self._targets.items():
-            on_click(button, lambda _, target=target: intents.SetTarget(target), emit)
-        on_input(self._class, lambda name: intents.SetPaintClass(self._classes[name]), emit)
-        on_input(self._size, intents.SetDiameter, emit)
-        on_click(self._clear, lambda _: intents.ClearLayer(), emit)
+            self._clear = page.button("Clear", intents.ClearLayer(), icon=viser.Icon.TRASH)
+        page.on_input(self._class, lambda name: intents.SetPaintClass(self._classes[name]))
+        page.on_input(self._size, intents.SetDiameter)
         page.call("setBrush", self._sent)
 
     def show(self, state: ViewState) -> None:

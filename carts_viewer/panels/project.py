@@ -4,12 +4,11 @@ import viser
 
 from carts_viewer.actions import intents
 from carts_viewer.editing import LONGEST_NAME
-from carts_viewer.panels.inputs import Emit, Waits, on_click, on_input, write
+from carts_viewer.panels.inputs import PanelPage, write
 from carts_viewer.panels.jobs import jobs_question, network_question
 from carts_viewer.session import Storage
 from carts_viewer.state import ViewState
 from carts_viewer.transport.document import escaped
-from carts_viewer.transport.tab_page import TabPage
 
 _LISTED = 60
 """Steps in the list, around the present one."""
@@ -18,17 +17,15 @@ _LISTED = 60
 class SavedPanel:
     """Whether everything is saved, a banner where it is not or in another file, and undo and redo, always at hand."""
 
-    def __init__(self, page: TabPage, storage: Storage, emit: Emit) -> None:
+    def __init__(self, page: PanelPage, storage: Storage) -> None:
         gui = page.gui
         self._storage = storage
         self._notice = gui.add_html("", visible=False)
         self._noticed: str | None = None
         self._text = gui.add_html("")
-        self._undo = gui.add_button("Undo", icon=viser.Icon.ARROW_BACK_UP, color="gray")
-        self._redo = gui.add_button("Redo", icon=viser.Icon.ARROW_FORWARD_UP, color="gray")
+        self._undo = page.button("Undo", intents.Undo(), icon=viser.Icon.ARROW_BACK_UP)
+        self._redo = page.button("Redo", intents.Redo(), icon=viser.Icon.ARROW_FORWARD_UP)
         page.row(self._undo, self._redo)
-        on_click(self._undo, lambda _: intents.Undo(), emit)
-        on_click(self._redo, lambda _: intents.Redo(), emit)
 
     def show(self, state: ViewState) -> None:
         """Bring the line and the buttons up to date."""
@@ -57,13 +54,13 @@ class SavedPanel:
 class HistoryPanel:
     """The list of steps."""
 
-    def __init__(self, page: TabPage, emit: Emit) -> None:
+    def __init__(self, page: PanelPage) -> None:
         gui = page.gui
         self._positions: dict[str, int] = {}
         with gui.add_folder("History"):
             self._steps = gui.add_dropdown("Go to", ["As measured"], hint="All steps; choose one to go back or forth")
             page.columns([self._steps], 1, narrow_labels=True)
-        on_input(self._steps, lambda label: intents.GoToStep(self._positions[label]), emit)
+        page.on_input(self._steps, lambda label: intents.GoToStep(self._positions[label]))
 
     def show(self, state: ViewState) -> None:
         """Bring the list up to date."""
@@ -83,9 +80,9 @@ class HistoryPanel:
 class PeoplePanel:
     """Name of the user, other users with their frames, and a button that copies the link."""
 
-    def __init__(self, page: TabPage, state: ViewState, emit: Emit, waits: Waits) -> None:
+    def __init__(self, page: PanelPage, state: ViewState) -> None:
         gui = page.gui
-        self._waits = waits
+        self._waits = page.waits
         with gui.add_folder("People"):
             self._name = gui.add_text(
                 "Your name",
@@ -97,7 +94,7 @@ class PeoplePanel:
             link = gui.add_button(
                 "Copy link", icon=viser.Icon.LINK, color="gray", hint="Opens this frame, camera and domain"
             )
-        on_input(self._name, lambda name: intents.SetName(str(name)), emit)
+        page.on_input(self._name, lambda name: intents.SetName(str(name)))
 
         @link.on_click
         async def _(event: viser.GuiEvent) -> None:
@@ -120,13 +117,12 @@ class PeoplePanel:
 class MessagePanel:
     """The newest error, until it is dismissed or something else works."""
 
-    def __init__(self, page: TabPage, emit: Emit) -> None:
+    def __init__(self, page: PanelPage) -> None:
         self._page = page
         self._shown: str | None = None
         self._notes: list[viser.NotificationHandle] = []
         self._text = page.gui.add_html("", visible=False)
-        self._dismiss = page.gui.add_button("Dismiss", icon=viser.Icon.X, color="red", visible=False)
-        on_click(self._dismiss, lambda _: intents.DismissError(), emit)
+        self._dismiss = page.button("Dismiss", intents.DismissError(), icon=viser.Icon.X, color="red", visible=False)
 
     def show(self, state: ViewState) -> None:
         """Bring the message up to date."""

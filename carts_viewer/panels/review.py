@@ -17,11 +17,10 @@ from carts_viewer.actions.frame_filter import (
     found,
     review_name,
 )
-from carts_viewer.panels.inputs import Emit, Waits, on_click, on_input, write
+from carts_viewer.panels.inputs import PanelPage, write
 from carts_viewer.session import Session
 from carts_viewer.state import ViewState
 from carts_viewer.transport.document import escaped
-from carts_viewer.transport.tab_page import TabPage
 
 _COLORS = {
     ReviewState.UNTOUCHED: "#6b7280",
@@ -38,37 +37,27 @@ _COLORS = {
 class ReviewPanel:
     """Review state and note of the shown frame, where to go next, and how many frames are in which state."""
 
-    def __init__(self, page: TabPage, emit: Emit, waits: Waits) -> None:
+    def __init__(self, page: PanelPage) -> None:
         gui = page.gui
-        self._waits = waits
+        self._waits = page.waits
         self._counted: ProjectState | None = None
         with gui.add_folder("Review"):
             self._state = gui.add_html("")
-            self._accept = accept = gui.add_button("Accept + next", icon=viser.Icon.CHECK, color="gray")
-            keep = gui.add_button("Accept", color="gray")
+            self._accept = accept = page.button("Accept + next", intents.AcceptAndNext(), icon=viser.Icon.CHECK)
+            keep = page.button("Accept", intents.SetReview(ReviewState.ACCEPTED))
             page.row(accept, keep, weights=(3, 2))
-            work = gui.add_button("Needs work", color="gray")
-            reject = gui.add_button("Reject", color="gray")
-            clear = gui.add_button("Clear", color="gray", hint="Clear the review of this frame (Shift+G)")
+            work = page.button("Needs work", intents.SetReview(ReviewState.NEEDS_WORK))
+            reject = page.button("Reject", intents.SetReview(ReviewState.REJECTED))
+            hint = "Clear the review of this frame (Shift+G)"
+            clear = page.button("Clear", intents.SetReview(ReviewState.UNTOUCHED), hint=hint)
             page.row(work, reject, clear, weights=(11, 7.65, 7.35))
             self._note = gui.add_text("Note", "")
-            previous = gui.add_button("Previous worst", color="gray")
-            following = gui.add_button("Next worst", color="gray")
+            previous = page.button("Previous worst", intents.ShowWorse(-1))
+            following = page.button("Next worst", intents.ShowWorse(1))
             page.row(previous, following, weights=(5, 4))
-            unreviewed = gui.add_button("Next unreviewed", icon=viser.Icon.CHEVRON_RIGHT, color="gray")
+            page.button("Next unreviewed", intents.ShowUnreviewed(1), icon=viser.Icon.CHEVRON_RIGHT)
             self._counts = gui.add_html("")
-        on_click(accept, lambda _: intents.AcceptAndNext(), emit)
-        for button, state in (
-            (keep, ReviewState.ACCEPTED),
-            (work, ReviewState.NEEDS_WORK),
-            (reject, ReviewState.REJECTED),
-            (clear, ReviewState.UNTOUCHED),
-        ):
-            on_click(button, lambda _, state=state: intents.SetReview(state), emit)
-        on_click(previous, lambda _: intents.ShowWorse(-1), emit)
-        on_click(following, lambda _: intents.ShowWorse(1), emit)
-        on_click(unreviewed, lambda _: intents.ShowUnreviewed(1), emit)
-        on_input(self._note, intents.SetNote, emit)
+        page.on_input(self._note, intents.SetNote)
 
     def show(self, state: ViewState) -> None:
         """Update the widgets."""
@@ -112,9 +101,9 @@ _BULK = {"Accept all": ReviewState.ACCEPTED, "Reject all": ReviewState.REJECTED,
 class FindPanel:
     """Conditions, the frames that meet them as links, and buttons for all of those."""
 
-    def __init__(self, page: TabPage, session: Session, emit: Emit, waits: Waits) -> None:
+    def __init__(self, page: PanelPage, session: Session) -> None:
         gui = page.gui
-        self._waits = waits
+        self._waits = page.waits
         self._ids = session.sequence.frame_ids
         self._known: tuple[ProjectState | None, FrameFilter] = (None, FrameFilter())
         with gui.add_folder("Find", expand_by_default=False):
@@ -137,20 +126,15 @@ class FindPanel:
                 "note": gui.add_text("Note has", ""),
             }
             self._list = gui.add_html("")
-            before = gui.add_button("Previous", icon=viser.Icon.CHEVRON_LEFT, color="gray")
-            after = gui.add_button("Next", icon=viser.Icon.CHEVRON_RIGHT, color="gray")
+            before = page.button("Previous", intents.ShowFound(-1), icon=viser.Icon.CHEVRON_LEFT)
+            after = page.button("Next", intents.ShowFound(1), icon=viser.Icon.CHEVRON_RIGHT)
             page.row(before, after)
-            self._bulk = [gui.add_button(name, color="gray") for name in _BULK]
-            clear = gui.add_button("Clear", color="gray", hint="Forget these conditions")
+            self._bulk = [page.button(name, intents.ReviewFound(state)) for name, state in _BULK.items()]
+            clear = page.button("Clear", intents.ClearFilter(), hint="Forget these conditions")
             page.row(*self._bulk[:2])
             page.row(self._bulk[2], clear)
         for name, widget in self._widgets.items():
-            on_input(widget, lambda value, name=name: intents.SetFilter(name, value), emit)
-        on_click(before, lambda _: intents.ShowFound(-1), emit)
-        on_click(after, lambda _: intents.ShowFound(1), emit)
-        on_click(clear, lambda _: intents.ClearFilter(), emit)
-        for button, state in zip(self._bulk, _BULK.values(), strict=True):
-            on_click(button, lambda _, state=state: intents.ReviewFound(state), emit)
+            page.on_input(widget, lambda value, name=name: intents.SetFilter(name, value))
 
     def show(self, state: ViewState) -> None:
         """Bring conditions and frames up to date; a gesture that is not finished changes nothing."""

@@ -8,27 +8,25 @@ from carts_core.settings import Direction
 from carts_core.wording import counted
 from carts_viewer.actions import intents
 from carts_viewer.jobs.job_list import Job, JobState
-from carts_viewer.panels.inputs import Emit, on_click, on_input, write
+from carts_viewer.panels.inputs import PanelPage, write
 from carts_viewer.session import Session
 from carts_viewer.state import ViewState
 from carts_viewer.transport.document import escaped
-from carts_viewer.transport.tab_page import TabPage
 
 
 class CalibrationHint:
     """Stands below what found the suspicion, and is not there without one."""
 
-    def __init__(self, page: TabPage, session: Session, emit: Emit) -> None:
+    def __init__(self, page: PanelPage, session: Session) -> None:
         frames = min(intents.Calibrate().frames, len(session.sequence))
         self._text = page.gui.add_html("", visible=False)
-        self._calibrate = page.gui.add_button(
+        self._calibrate = page.button(
             f"Calibrate on {frames} frames",
-            color="gray",
+            intents.Calibrate(frames),
             visible=False,
             hint="A job: the page stays usable. One step of undo. Jobs, Calibrate takes another number of frames.",
         )
         self._watched: int | None = None
-        on_click(self._calibrate, lambda _: intents.Calibrate(frames), emit)
 
     def show(self, gain: float | None, state: ViewState) -> None:
         """Bring it up to date.
@@ -97,7 +95,7 @@ _DIRECTIONS: dict[str, Direction] = {"First frame": "forward", "Last frame": "ba
 class KeyframesPanel:
     """Marks keyframes and solves between them, with progress and a way to stop."""
 
-    def __init__(self, page: TabPage, session: Session, emit: Emit) -> None:
+    def __init__(self, page: PanelPage, session: Session) -> None:
         gui = page.gui
         self._ids = session.sequence.frame_ids
         self._seen: tuple[ProjectState | None, int, tuple[int, int] | None] = (None, -1, None)
@@ -108,26 +106,24 @@ class KeyframesPanel:
                 "Keyframe", False, hint="Solving leaves it as it is. Frames that you made or accepted are kept, too."
             )
             self._text = gui.add_html("")
-            self._between = gui.add_button("Solve between", icon=viser.Icon.ARROWS_HORIZONTAL, color="teal")
-            self._all = gui.add_button("Solve all", color="gray")
+            self._between = page.button(
+                "Solve between", intents.Solve(), icon=viser.Icon.ARROWS_HORIZONTAL, color="teal"
+            )
+            self._all = page.button("Solve all", intents.Solve(whole=True))
             page.row(self._between, self._all, weights=(13, 10))
             self._direction = gui.add_dropdown("Begin at", list(_DIRECTIONS))
-            self._calibration = CalibrationHint(page, session, emit)
+            self._calibration = CalibrationHint(page, session)
             self._progress = gui.add_progress_bar(0.0, visible=False)
             self._listed = gui.add_html("", visible=False)
-            self._take = gui.add_button("Take it as solved", color="gray", visible=False)
-            self._take_all = gui.add_button("Take all", color="gray", visible=False)
+            self._take = page.button("Take it as solved", lambda _: intents.TakeSolved(self._index), visible=False)
+            self._take_all = page.button("Take all", intents.TakeSolved(), visible=False)
             page.row(self._take, self._take_all, weights=(3, 2))
-            self._drop = gui.add_button("Leave them, close the list", icon=viser.Icon.X, color="gray", visible=False)
-            self._stop = gui.add_button("Stop and keep", icon=viser.Icon.PLAYER_STOP, color="gray", visible=False)
-        on_input(self._held, lambda on: intents.HoldKeyframe(bool(on)), emit)
-        on_click(self._between, lambda _: intents.Solve(), emit)
-        on_click(self._all, lambda _: intents.Solve(whole=True), emit)
-        on_click(self._take, lambda _: self._take_shown(), emit)
-        on_click(self._take_all, lambda _: intents.TakeSolved(), emit)
-        on_click(self._drop, lambda _: intents.DropSolved(), emit)
-        on_click(self._stop, lambda _: intents.StopSolving(), emit)
-        on_input(self._direction, lambda label: intents.SetDirection(_DIRECTIONS[label]), emit)
+            self._drop = page.button(
+                "Leave them, close the list", intents.DropSolved(), icon=viser.Icon.X, visible=False
+            )
+            self._stop = page.button("Stop and keep", intents.StopSolving(), icon=viser.Icon.PLAYER_STOP, visible=False)
+        page.on_input(self._held, lambda on: intents.HoldKeyframe(bool(on)))
+        page.on_input(self._direction, lambda label: intents.SetDirection(_DIRECTIONS[label]))
 
     def show(self, state: ViewState) -> None:
         """Update the widgets."""
@@ -152,9 +148,6 @@ class KeyframesPanel:
         self._show_listed(state)
         self._text.content = "".join(f'<p class="carts-caption">{line}</p>' for line in lines)
         self._calibration.show(None if state.solve is None else state.solve.suspicion(state.project), state)
-
-    def _take_shown(self) -> intents.Intent:
-        return intents.TakeSolved(self._index)
 
     def _show_listed(self, state: ViewState) -> None:
         """The frames that became worse or are doubtful, each a link to it."""

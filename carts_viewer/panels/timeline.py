@@ -16,7 +16,7 @@ from websockets.http11 import Response
 from carts_core.errors import CartsError
 from carts_core.model.scene import Scene
 from carts_core.optimization import undetermined_joints
-from carts_core.project import FitVerdict, ProjectState, ReviewState, Source
+from carts_core.project import ProjectState, ReviewState, Source
 from carts_core.project.state import Record
 from carts_core.project.values import VERDICTS, WHOLE_PROJECT
 from carts_core.recording import Sequence
@@ -293,10 +293,10 @@ def code(project: ProjectState, frame: int, scene: Scene) -> int:
     badness = 1.0 - dice if dice is not None else None if verdict is None else verdict.failure
     return (
         review
-        + 8 * _fit(verdict)
+        + 8 * (0 if verdict is None else 1 + VERDICTS.index(verdict.verdict))
         + 32 * source
         + 128 * int(record.is_kept)
-        + 256 * _height(badness)
+        + 256 * (0 if badness is None else min(max(round(255 * badness / _FULL), 1), 255))
         + 65536 * _open(project, frame, scene)
     )
 
@@ -305,11 +305,3 @@ def _open(project: ProjectState, frame: int, scene: Scene) -> int:
     known = {name: found.standard_deviations or () for name, found in project.joints(frame).items()}
     joints = undetermined_joints(scene, known)
     return 0 if joints is None else min(1 + len(joints), _MOST_OPEN)
-
-
-def _fit(verdict: FitVerdict | None) -> int:
-    return 0 if verdict is None else 1 + VERDICTS.index(verdict.verdict)
-
-
-def _height(badness: float | None) -> int:
-    return 0 if badness is None else min(max(round(255 * badness / _FULL), 1), 255)

@@ -22,8 +22,7 @@ from carts_core.resources import sample_sequence
 from carts_viewer.app import ViewerApp
 from carts_viewer.jobs.companions import damage
 from carts_viewer.picture.layers import small_jpeg
-from carts_viewer.start.host import FileBrowser, Host
-from carts_viewer.start.roots import Entry
+from carts_viewer.start.host import FileBrowser, Host, Wanted
 from carts_viewer.transport.document import render
 from carts_viewer.wizard.draft import delete_draft, drafts
 
@@ -208,18 +207,18 @@ class StartPage:
             case "forget":
                 forget(value)
             case "open":
-                purpose = "Choose a sequence file (.toml)."
-                new = FileBrowser(self._site.roots, wanted=_is_toml, folders=False, purpose=purpose)
-                self._browser = None if browser is not None else new
+                self._toggle("Choose a sequence file (.toml).", lambda entry: entry.path.suffix.lower() == ".toml")
             case "open-batch":
-                purpose = "Choose the folder that carts batch has written to."
-                new = FileBrowser(self._site.roots, wanted=lambda _: False, folders=True, purpose=purpose)
-                self._browser = None if browser is not None else new
+                self._toggle("Choose the folder that carts batch has written to.", lambda _: False, folders=True)
             case "browse" if browser is not None:
                 browser.browse(value)
             case "pick" if browser is not None and (path := browser.picked(value)) is not None:
                 return self._site.show_batch(path) if path.is_dir() else self._site.open_sequence(path)
         self.show()
+
+    def _toggle(self, purpose: str, wanted: Wanted, *, folders: bool = False) -> None:
+        new = FileBrowser(self._site.roots, wanted=wanted, folders=folders, purpose=purpose)
+        self._browser = None if self._browser is not None else new
 
     def click(self, u: float, v: float) -> None:
         """There is no image here."""
@@ -251,10 +250,6 @@ def _first_image(path: Path) -> bytes:
     sequence = Sequence.open(path)
     frame = sequence.frame(0, cameras=[sequence.scene.cameras[0].name])
     return small_jpeg(next(iter(frame.images.values())), width=_WIDTH)
-
-
-def _is_toml(entry: Entry) -> bool:
-    return entry.path.suffix.lower() == ".toml"
 
 
 def _ago(seconds: float) -> str:

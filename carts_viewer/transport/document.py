@@ -25,7 +25,8 @@ class Document:
     def __init__(self, page: Page) -> None:
         self.page = page
         self._shown = ("", "")
-        page.server.on_client_connect(self._greet)
+        # A tab that joins later.
+        page.server.on_client_connect(lambda client: self._send(client) if self._shown[0] else None)
 
     def show(self, content: str, place: str = "page") -> None:
         """Show HTML in all tabs and in those that join later.
@@ -42,10 +43,6 @@ class Document:
     def content(self) -> str:
         """The HTML that is shown; empty if none is."""
         return self._shown[0]
-
-    def _greet(self, client: viser.ClientHandle) -> None:
-        if self._shown[0]:
-            self._send(client)
 
     def _send(self, client: viser.ClientHandle) -> None:
         call(client, "showDocument", *self._shown)

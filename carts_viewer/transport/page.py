@@ -138,7 +138,10 @@ class Page:
         self._files = {path.name: path for path in static_dir().iterdir() if path.is_file()}
         queue_safely()
         list_icons_once()
-        with gated(self._respond, self._refuse), contextlib.redirect_stdout(io.StringIO()):
+        with (
+            gated(self._respond, lambda data: refusal(data, self._value_of)),
+            contextlib.redirect_stdout(io.StringIO()),
+        ):
             self.server = viser.ViserServer(host=host, port=port, verbose=False)
         self.url = self._guard.url(self.server.get_port())
         self._add_channel()
@@ -244,10 +247,6 @@ class Page:
         cookie = self._guard.cookie(request.path, request.headers)
         more = {"Content_Security_Policy": policy} | ({} if cookie is None else {"Set_Cookie": cookie})
         return response(http.HTTPStatus.OK, "text/html; charset=utf-8", self._index(nonce), **more)
-
-    def _refuse(self, data: object) -> str | None:
-        """Why a tab's message must not reach viser; None when it may."""
-        return refusal(data, self._value_of)
 
     def _value_of(self, element: str) -> Any:
         # A tab may be there before the server's constructor has returned.

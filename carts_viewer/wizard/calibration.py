@@ -197,7 +197,9 @@ def report_of(result: CalibrationResult, clicking: Clicking, points: Rows[ImageP
     measured = clicking.sequence.measured
     compared = agreement_with_points(result.scene, measured, points, found)
     assessment = result.assessment
-    before, after = (tuple(_number(each) for each in row) for row in (compared.before, compared.after))
+    before, after = (
+        tuple(float(each) if np.isfinite(each) else None for each in row) for row in (compared.before, compared.after)
+    )
     return CalibrationReport(
         loss_before=float(np.mean(result.frame_losses_before)),
         loss_after=float(np.mean(result.frame_losses_after)),
@@ -252,10 +254,6 @@ def _poses(result: CalibrationResult, clicking: Clicking, points: Rows[ImagePoin
 
 def _named(clicking: Clicking, point: ImagePoint) -> str:
     return f"{point.landmark} in frame {clicking.sequence.frame_ids[point.frame]} ({point.camera})"
-
-
-def _number(value: float) -> float | None:
-    return float(value) if np.isfinite(value) else None
 
 
 def calibrated_scene(scene: Scene, calibration: Mapping[str, Any]) -> Scene:

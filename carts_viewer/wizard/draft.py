@@ -86,8 +86,8 @@ class Draft:
         return replace(self, **{"calibration": None, "offered": None, "report": None, **changes})
 
     def with_options(self, **changes: Any) -> "Draft":
-        """The draft with other options; what was clicked or calibrated before stays."""
-        return replace(self, options=replace(self.options, **changes))
+        """The draft with other options, and without its calibration; clicked points stay."""
+        return self.uncalibrated(options=replace(self.options, **changes))
 
 
 @dataclass(frozen=True)
@@ -226,7 +226,7 @@ def changed(draft: Draft, name: str, value: str, guessed: Mapping[str, str]) -> 
         options["columns"] = _columns(draft, which, value, guessed)
     elif name == "remove-camera":
         options["images"] = {camera: place for camera, place in draft.options.images.items() if camera != value}
-    return _new_import(draft.with_options(**options)) if options else None
+    return draft.with_options(**options) if options else None
 
 
 def picked(draft: Draft, part: str, path: Path, found: Mapping[str, Path]) -> Draft:
@@ -245,19 +245,14 @@ def picked(draft: Draft, part: str, path: Path, found: Mapping[str, Path]) -> Dr
             return replace(Draft(), source=str(path), name=recording_name(path), step=Step.CHECK)
         case "images":
             images = options.images or {name: str(place) for name, place in found.items()}
-            return _new_import(draft.with_options(images={**images, which or _new_name(images, path): str(path)}))
+            return draft.with_options(images={**images, which or _new_name(images, path): str(path)})
         case "calibration":
-            return _new_import(draft.with_options(calibration={**options.calibration, which: path}))
+            return draft.with_options(calibration={**options.calibration, which: path})
         case "kinematics":
-            return _new_import(draft.with_options(kinematics=path, columns={}, flip=(), units={}))
+            return draft.with_options(kinematics=path, columns={}, flip=(), units={})
         case "robot":
-            return _new_import(draft.with_options(robot={**options.robot, which: str(path)}))
+            return draft.with_options(robot={**options.robot, which: str(path)})
     return draft
-
-
-def _new_import(draft: Draft) -> Draft:
-    """The draft without its calibration, which other files make void; clicked points stay."""
-    return draft.uncalibrated()
 
 
 def _columns(draft: Draft, which: str, value: str, guessed: Mapping[str, str]) -> dict[str, str]:

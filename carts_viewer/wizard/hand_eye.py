@@ -238,7 +238,8 @@ class HandEyeStep:
         if self._running():
             return draft
         if name == "skip" and prompt is not None:
-            self._skip({prompt})
+            self._skipped |= {prompt}
+            self._wanted = None
         elif name == "skip-frame" and prompt is not None:
             self._skip_frame(draft, prompt)
         elif kind == "look":
@@ -295,10 +296,6 @@ class HandEyeStep:
     def prompt(self, draft: Draft) -> ClickPrompt | None:
         """The next prompt; None without one."""
         return self._wanted or self._clicking.next_prompt(draft.points, self._skipped)
-
-    def _skip(self, prompts: set[ClickPrompt]) -> None:
-        self._skipped |= prompts
-        self._wanted = None
 
     def _skip_frame(self, draft: Draft, prompt: ClickPrompt) -> None:
         """Ask for the same in a frame that nothing is asked about yet, next to this one."""

@@ -82,34 +82,51 @@ class RecordingWizard:
     def choose(self, name: str, value: str) -> None:
         """Carry out a choice."""
         self._problem = ""
-        actions: dict[str, Callable[[], None]] = {
-            "leave": self._host.show_start,
-            "undo": self._take_back,
-            "change": lambda: self._browse(value),
-            "close-browser": lambda: self._set_browser(None),
-            "continue": lambda: self._set(replace(self._draft, step=Step.HAND_EYE)),
-            "back": lambda: self._set(replace(self._draft, step=Step.CHECK)),
-            "delete": self._delete,
-            "estimate-delay": self._estimate_delay,
-            "accept-delay": self._accept_delay,
-        }
-        if name in ("leave", "delete"):
-            return actions[name]()
-        browser = self._browser
-        if name in actions:
-            actions[name]()
-        elif name == "browse" and browser is not None:
-            browser.browse(value)
-        elif name == "pick" and browser is not None:
-            self._pick(browser.picked(value))
-        elif self._step is not None and self._draft.step is Step.HAND_EYE:
-            return self._in_hand_eye(name, value)
-        elif name == "trial":
-            if (trial := next((each for each in self._guessed().trials if str(each) == value), None)) is not None:
-                self._set(picked(self._draft, "source", self._host.roots.checked(trial), {}))
-        elif (draft := changed(self._draft, name, value, self._guess.columns if self._guess else {})) is not None:
-            self._set(draft)
+        steps = {"continue": Step.HAND_EYE, "back": Step.CHECK}
+        if name == "leave":
+            return self._host.show_start()
+        if name == "delete":
+            return self._delete()
+        if name in steps:
+            self._set(replace(self._draft, step=steps[name]))
+        elif name == "undo":
+            self._take_back()
+        elif not self._browsed(name, value):
+            if self._step is not None and self._draft.step is Step.HAND_EYE:
+                return self._in_hand_eye(name, value)
+            self._check(name, value)
         self.show()
+
+    def _browsed(self, name: str, value: str) -> bool:
+        """Carry out a choice about the file browser; whether it was one."""
+        browser = self._browser
+        match name:
+            case "change":
+                self._browse(value)
+            case "close-browser":
+                self._browser = None
+            case "browse" if browser is not None:
+                browser.browse(value)
+            case "pick" if browser is not None:
+                self._pick(browser.picked(value))
+            case _:
+                return False
+        return True
+
+    def _check(self, name: str, value: str) -> None:
+        """Carry out a choice of the step Check."""
+        delay = self._delay
+        match name:
+            case "estimate-delay":
+                self._estimate_delay()
+            case "accept-delay" if delay is not None and delay.proposed is not None:
+                self._set(changed(self._draft, "time_offset", str(delay.proposed), {}) or self._draft)
+            case "trial":
+                if (trial := next((each for each in self._guessed().trials if str(each) == value), None)) is not None:
+                    self._set(picked(self._draft, "source", self._host.roots.checked(trial), {}))
+            case _:
+                columns = self._guess.columns if self._guess else {}
+                self._set(changed(self._draft, name, value, columns) or self._draft)
 
     def click(self, u: float, v: float) -> None:
         """A point of the arm, where one is asked for."""
@@ -157,9 +174,6 @@ class RecordingWizard:
         self._file.delete()
         self._draft = Draft()
         self._host.show_start()
-
-    def _set_browser(self, browser: FileBrowser | None) -> None:
-        self._browser = browser
 
     def _browse(self, part: str) -> None:
         """Look for a file or folder for a part of the recording."""
@@ -214,10 +228,6 @@ class RecordingWizard:
         if recording is not None:
             self._tell("Time", "Comparing the motion in the images with the table …")
             self._delay = estimated_delay(recording)
-
-    def _accept_delay(self) -> None:
-        if self._delay is not None and self._delay.proposed is not None:
-            self._set(changed(self._draft, "time_offset", str(self._delay.proposed), {}) or self._draft)
 
     def _add_pictures(self, found: Guess) -> None:
         assert found.recording is not None
