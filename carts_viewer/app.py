@@ -256,10 +256,7 @@ class ViewerApp:
             stack.callback(self.tabs.close)
 
     def wait_until_shown(self, timeout: float = 30.0) -> ViewState:
-        """Wait until everything asked for so far has been done and sent to the page.
-
-        Args:
-            timeout: [s]
+        """Wait until everything asked for so far has been done and sent to the page, for so long [s].
 
         Raises:
             TimeoutError: it has not, in that time.

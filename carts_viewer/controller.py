@@ -36,14 +36,6 @@ class Background:
         optimizers: OptimizerFactory,
         deliver: Deliver,
     ) -> None:
-        """
-        Args:
-            state: with what jobs of an earlier viewer are done.
-            session: recording and project of the background alone.
-            renderer: renders poses.
-            optimizers: makes optimizers.
-            deliver: sends a file to a tab.
-        """
         self._context = context = Context(state, session, renderer)
         self._propagating = PropagatingHandler(context, optimizers)
         self._exporting = ExportingHandler(context, deliver)
@@ -59,12 +51,7 @@ class Background:
         return any(handler.takes(intent) for handler in (self._jobs, self._propagating, self._exporting))
 
     def handle(self, intent: intents.Intent, person: Person, state: ViewState) -> None:
-        """Carry out an intent of a user.
-
-        Args:
-            intent: the request.
-            person: its user.
-            state: state of their tab.
+        """Carry out an intent of a user, with the state of their tab.
 
         Raises:
             CartsError: the intent cannot be carried out.
@@ -143,15 +130,6 @@ class Controller(Handler):
         background: Background,
         deliver: Deliver,
     ) -> None:
-        """
-        Args:
-            state: what the page shows first.
-            session: the recording and its project.
-            renderer: renders poses.
-            optimizers: makes optimizers.
-            background: takes what takes long.
-            deliver: sends a file to a tab.
-        """
         context = Context(state, session, renderer)
         self._optimizing = OptimizingHandler(context, optimizers)
         super().__init__(context)
@@ -279,12 +257,7 @@ class Controller(Handler):
             self._context.change(error=self._incident)
 
     def fail(self, error: Exception, *, stop: bool) -> None:
-        """Show an error to the user.
-
-        Args:
-            error: What happened.
-            stop: Stop whatever is going on; for errors of what is going on itself.
-        """
+        """Show an error to the user; `stop` also what is going on, after an error of its own."""
         text = str(error) if isinstance(error, CartsError) else f"{type(error).__name__}: {error}"
         self._context.change(error=text, busy=None)
         if stop:

@@ -72,14 +72,7 @@ class People:
     def apply(
         self, person: Person, name: str, edits: Edits, figures: Mapping[int, Figures] | None = None
     ) -> Change | None:
-        """Save a step of a user, with their name if chosen or if there are several users; errors as `Project.apply`.
-
-        Args:
-            person: the user.
-            name: of the step.
-            edits: the changes.
-            figures: of frames with these edits.
-        """
+        """Save a step of a user, with their name if chosen or if there are several users; errors as `Project.apply`."""
         person.undone.clear()
         return self._apply(person, name, edits, figures)
 

@@ -50,13 +50,7 @@ class Session:
     def __init__(
         self, sequence: Sequence, people: People, person: Person | None = None, folders: Iterable[Path] = ()
     ) -> None:
-        """
-        Args:
-            sequence: the recording.
-            people: users of its project.
-            person: the user of this session; None: a new one.
-            folders: what files may be brought in from, besides the sequence's own.
-        """
+        """`folders`, besides the sequence's own, are what files may be brought in from."""
         self._sequence = sequence
         self._own_offset = None if sequence.matching is None else sequence.matching.time_offset
         self.scene: Scene = sequence.scene

@@ -111,7 +111,6 @@ class View:
         emit: Callable[[Intent], None],
         waits: Callable[[Hashable], bool],
     ) -> None:
-        """Build widgets and scene in a tab that shows nothing yet."""
         self.page = PanelPage(client, emit, waits)
         with self.page.atomic():
             self.layout = Layout(self.page, session, storage, state)
@@ -194,11 +193,7 @@ class Tab:
         return self.view.display.ready_in()
 
     def publish(self, attempt: Callable[[Callable[[], None]], None]) -> None:
-        """Show the state, as far as it is not shown.
-
-        Args:
-            attempt: does something and shows its errors.
-        """
+        """Show the state, as far as it is not shown; `attempt` does something and shows its errors."""
         controller, display = self.controller, None if self.view is None else self.view.display
         if self._pictured is not controller.state and (display is None or display.ready_in() <= 0.0):
             attempt(controller.map)
@@ -252,16 +247,6 @@ class Tabs:
         queue: IntentQueue[Tab],
         folders: Iterable[Path] = (),
     ) -> None:
-        """
-        Args:
-            sequence: The recording.
-            storage: Its project.
-            renderer: Renders poses.
-            optimizers: Makes optimizers.
-            deliver: Sends a file to a page.
-            queue: Where intents wait for the worker.
-            folders: What files may be brought in from, besides the sequence's own.
-        """
         self._folders = tuple(folders)
         self._sequence, self._storage, self._renderer = sequence, storage, renderer
         self._optimizers, self._deliver, self._queue = optimizers, deliver, queue

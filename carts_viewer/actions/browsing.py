@@ -39,13 +39,7 @@ class BrowsingHandler(Handler):
     def show(
         self, *, index: int | None = None, domain: str | None = None, camera: str | None = None, again: bool = False
     ) -> None:
-        """Go to another frame, domain or camera; out of range is clamped, an unknown name is refused.
-
-        Args:
-            index: of the frame.
-            domain: its name.
-            camera: its name.
-            again: also if nothing of these changes.
+        """Go to another frame, domain or camera, or show the same again; out of range is clamped.
 
         Raises:
             CartsError: a name is unknown, the image is not usable, or an unfinished edit could not be saved.

@@ -56,10 +56,7 @@ class Context:
         self.state = replace(self.state, **changes)
 
     def end_run(self, reason: str | None) -> None:
-        """End the run on the shown frame, if there is one, and save where it is.
-
-        Args:
-            reason: text for the user; None without one.
+        """End the run on the shown frame, if there is one, and save where it is; `reason` is text for the user.
 
         Raises:
             ProjectError: it could not be saved.
@@ -95,15 +92,7 @@ class Context:
         loss: float | None = None,
         maps: Maps | None = None,
     ) -> None:
-        """Change the project; arguments and errors as `set_pose`, for any edits.
-
-        Args:
-            name: of the step in the history.
-            edits: what changes.
-            gesture: see `set_pose`.
-            loss: the optimizer's, at the new pose.
-            maps: what the optimizer saw there.
-        """
+        """Change the project; arguments and errors as `set_pose`. `loss` and `maps` are the optimizer's at its pose."""
         if self._editor.gesture != gesture:
             self.save()
         self._loss = loss

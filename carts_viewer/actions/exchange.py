@@ -220,13 +220,7 @@ _NAMED = 6
 
 
 def export_warnings(project: ProjectState, frames: Sequence[int], cameras: Collection[str]) -> list[str]:
-    """Warnings about the frames of an export.
-
-    Args:
-        project: as it is exported.
-        frames: indices of those that are exported.
-        cameras: whose images and masks are exported.
-    """
+    """Warnings about the frames of an export, by their indices, and the cameras that are exported."""
     found: list[str] = []
     # An hour has 100,000 frames, of which few have a record.
     recorded = [index for index in frames if index in project.records]

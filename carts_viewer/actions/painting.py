@@ -165,10 +165,6 @@ class Prompting:
     """
 
     def __init__(self, segmenter: Callable[[], Segmenter]) -> None:
-        """
-        Args:
-            segmenter: loads what segments, once.
-        """
         self._segmenter = segmenter
         self._begun: _Begun | None = None
 

@@ -32,11 +32,6 @@ class AnnotatingHandler(Handler):
     """Handler of history, review, copied corrections and keypoints."""
 
     def __init__(self, context: Context, show: Callable[..., None]) -> None:
-        """
-        Args:
-            context: the state, and the way into the project.
-            show: `BrowsingHandler.show`.
-        """
         super().__init__(context)
         self._show = show
         self._keypoints = labelled_keypoints(context.session.scene)

@@ -101,11 +101,6 @@ _KINDS: dict[str, type[Options]] = {
 def read_options(kind: str, values: Mapping[str, Any], frames: int) -> Options:
     """Options of a job with checked types, clamped to the ranges of the page, wherever they come from.
 
-    Args:
-        kind: of the job.
-        values: name -> value.
-        frames: number of frames of the sequence.
-
     Raises:
         ValueError: there is no such kind of job, or a value is missing or of another type.
     """
@@ -232,14 +227,7 @@ class JobList:
     def __init__(
         self, project: Path, *, kept: bool, frame_ids: Sequence[str], recording: str = "", decisions: Decisions
     ) -> None:
-        """
-        Args:
-            project: The project's file, beside which the list lies.
-            kept: Whether the list may be written.
-            frame_ids: Of the sequence.
-            recording: Digest of the recording; jobs of this user in the list of another recording are not theirs.
-            decisions: Of this user.
-        """
+        """`recording` is its digest: jobs of this user in the list of another recording are not theirs."""
         self._path = output_path(project.parent, f"{project.stem}_jobs.json") if kept else None
         self._frame_ids, self._recording, self._decisions = frame_ids, recording, decisions
         self.problem = ""

@@ -41,13 +41,7 @@ class Networks:
     """
 
     def __init__(self, project: Path, *, kept: bool, optimizers: OptimizerFactory, decisions: Decisions) -> None:
-        """
-        Args:
-            project: The project's file, beside which networks lie that were adapted.
-            kept: Whether anything may be written there.
-            optimizers: Run the network.
-            decisions: Of this user.
-        """
+        """`kept` says whether anything may be written beside the project."""
         self._project, self._kept, self._optimizers, self._decisions = project, kept, optimizers, decisions
         self._file = output_path(project.parent, f"{project.stem}_network.json")
         self.names: tuple[str, ...] = ()

@@ -172,11 +172,6 @@ class OptimizerFactory:
     """Makes optimizers; loads the networks once, when they are first needed."""
 
     def __init__(self, *, report: Callable[[str], None], **options: Unpack[NetworkOptions]) -> None:
-        """
-        Args:
-            report: Called with a line for the user about long operations.
-            options: Of the networks.
-        """
         self._segmenter = options.get("segmenter")
         self._own_segmenter: tuple[FeatureExtractor, Segmenter] | None = None
         self._weights = options.get("weights", ())

@@ -179,10 +179,7 @@ _LONGEST_END = 30.0
 def adapt(sequence: Path, folder: Path, minutes: float) -> Generator[Progress]:
     """Train in a process of its own and report progress; closing the iterator stops the training.
 
-    Args:
-        sequence: the sequence file.
-        folder: of the run; one that was stopped goes on.
-        minutes: time for training [min].
+    A training that was stopped goes on in its folder, for so many minutes.
 
     Raises:
         CartsError: training failed.

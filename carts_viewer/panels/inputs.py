@@ -37,13 +37,9 @@ class PanelPage(TabPage):
     def button(
         self, label: str, intent: Intent | Callable[[int], Intent], *, color: Any = "gray", **options: Any
     ) -> viser.GuiButtonHandle:
-        """Add a button to the current container.
+        """Add a button of `viser.GuiApi.add_button` to the current container.
 
-        Args:
-            label: of the button.
-            intent: emitted when a person presses it, or what makes it of the number of their tab.
-            color: of viser's.
-            options: of `viser.GuiApi.add_button`.
+        Pressed, it emits the intent, or what `intent` makes of the number of the tab.
         """
         handle = self.gui.add_button(label, color=color, **options)
 

@@ -22,12 +22,6 @@ class JointsPanel:
     """One tab per arm with its joints, and the buttons that concern all arms."""
 
     def __init__(self, page: PanelPage, session: Session, state: ViewState) -> None:
-        """
-        Args:
-            page: Where to build the widgets, in the current container.
-            session: The open sequence.
-            state: The state to begin with.
-        """
         gui = page.gui
         self._session = session
         self._waits = page.waits

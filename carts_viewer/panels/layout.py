@@ -38,14 +38,6 @@ class Layout:
     """
 
     def __init__(self, page: PanelPage, session: Session, storage: Storage, state: ViewState) -> None:
-        """Build the panels.
-
-        Args:
-            page: where.
-            session: the open sequence.
-            storage: its project.
-            state: what is shown first.
-        """
         gui = page.gui
         gui.set_panel_label("CaRTS")
         gui.main_panel.dock_left()

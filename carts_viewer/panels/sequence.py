@@ -29,12 +29,7 @@ class CalibrationHint:
         self._watched: int | None = None
 
     def show(self, gain: float | None, state: ViewState) -> None:
-        """Bring it up to date.
-
-        Args:
-            gain: what free base frames would explain of the residual that is left [1]; None where it is not known.
-            state: with the jobs.
-        """
+        """Update the widgets; `gain` is what free base frames would explain of the residual [1]."""
         job = newest_calibration(state.jobs)
         if job is not None and not job.over:
             self._watched, line = job.number, ""
@@ -69,11 +64,7 @@ def newest_calibration(jobs: tuple[Job, ...]) -> Job | None:
 
 
 def calibration_line(gain: float | None) -> str:
-    """Warning of wrong base frames with its remedy, as HTML; empty for a small gain.
-
-    Args:
-        gain: what free base frames would explain of that residual [1]; None where it is not known.
-    """
+    """Warning of wrong base frames with its remedy, as HTML; empty for a small or unknown gain."""
     if gain is None or gain < BASE_FRAME_GAIN:
         return ""
     return (

@@ -142,15 +142,7 @@ def label_color(number: int) -> tuple[int, int, int]:
 
 
 def heat(values: Float[np.ndarray, "h w"], low: float, high: float, size: tuple[int, int], opacity: float) -> Rgba:
-    """A map at any resolution in the colours of viridis, from `low` (dark) to `high` (bright).
-
-    Args:
-        values: The map.
-        low: The value of the darkest colour.
-        high: The value of the brightest colour.
-        size: Height and width of the picture [px].
-        opacity: Opacity, 0..1.
-    """
+    """A map at any resolution in the colours of viridis, from `low` (dark) to `high`; `size` is height, width [px]."""
     height, width = size
     share = np.clip((np.nan_to_num(values.astype(np.float32)) - low) / (high - low), 0, 1)
     share = cv2.resize(share, (width, height), interpolation=cv2.INTER_LINEAR)

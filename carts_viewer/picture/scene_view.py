@@ -5,7 +5,7 @@ along z, whatever camera is shown; the recording's own world is a node that move
 """
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import viser
@@ -49,20 +49,13 @@ class SceneView:
     """What a tab sees; it chooses for itself from where."""
 
     def __init__(self, shown: viser.SceneApi, scene: Scene, state: SceneState, camera: str) -> None:
-        """
-        Args:
-            shown: Where nodes are added, of all tabs or of one.
-            scene: The recording's arms and cameras.
-            state: A pose of it, which decides how far from the lens the frame is put.
-            camera: The camera to begin with.
-        """
+        """`state` decides how far from the lens the frame is put."""
         self._shown = shown
         self._scene = scene
         self._depth = max(_DEPTH_SHARE * _distance_of_arms(scene, state, camera), _LEAST_DEPTH)
         self._links: list[list[viser.FrameHandle]] = []
         self._outlines: dict[str, viser.LineSegmentsHandle] = {}
-        self._planes: dict[str, tuple[Camera, viser.ImageHandle]] = {}
-        self._others: dict[str, tuple[tuple[Camera, Camera], viser.ImageHandle]] = {}
+        self._planes: dict[str, tuple[tuple[Camera, ...], viser.ImageHandle]] = {}
         self._world = shown.add_frame(WORLD, show_axes=False)
         self._measured: list[list[viser.FrameHandle]] = []
         self._places: dict[str, bytes] = {}
@@ -87,31 +80,16 @@ class SceneView:
         place, width, height = self._beside(names.index(camera.name), names.index(active.name), camera, active)
         root = f"{OTHERS}/{names.index(camera.name)}"
         for node, picture, share, kind in (("frame", image, 1.0, "jpeg"), ("overlay", overlay, _OVERLAY_SHARE, "png")):
-            name = f"{root}/{node}"
-            if picture is None:
-                continue
-            key = (camera, active)
-            if name in self._others and self._others[name][0] == key:
-                self._others[name][1].image = picture
-                continue
-            handle = self._shown.add_image(
-                name,
-                picture,
-                width * share,
-                height * share,
-                format="jpeg" if kind == "jpeg" else "png",
-                jpeg_quality=_JPEG_QUALITY,
-                position=(share * place[0], share * place[1], share * place[2]),
-                cast_shadow=False,
-                receive_shadow=False,
-            )
-            self._others[name] = (key, handle)
+            if picture is not None:
+                position = (share * place[0], share * place[1], share * place[2])
+                size = (width * share, height * share)
+                self._plane(f"{root}/{node}", picture, (camera, active), size, position, kind)
 
     def hide_beside(self, camera: Camera) -> None:
         """Take away what lies beside the active camera's image of this camera."""
         number = [own.name for own in self._scene.cameras].index(camera.name)
         for node in ("frame", "overlay"):
-            known = self._others.pop(f"{OTHERS}/{number}/{node}", None)
+            known = self._planes.pop(f"{OTHERS}/{number}/{node}", None)
             if known is not None:
                 known[1].remove()
 
@@ -163,26 +141,39 @@ class SceneView:
         before, self._places[name] = self._places.get(name), place
         return before == place
 
-    def _put(self, name: str, image: np.ndarray, camera: Camera, z: float, kind: str) -> None:
+    def _put(self, name: str, image: np.ndarray, camera: Camera, z: float, kind: Literal["jpeg", "png"]) -> None:
         """Show an image as a plane at depth z that K projects exactly onto the image's own pixels."""
-        if name in self._planes and self._planes[name][0] is camera:
-            self._planes[name][1].image = image
-            return
         fx, fy, cx, cy = camera.intrinsics
+        size = (camera.width / fx * z, camera.height / fy * z)
+        position = ((camera.width / 2 - cx) / fx * z, (camera.height / 2 - cy) / fy * z, z)
+        if self._plane(name, image, (camera,), size, position, kind) and name == FRAME:
+            self._outline(LENS, camera, _LENS_COLOR)
+
+    def _plane(
+        self,
+        name: str,
+        image: np.ndarray,
+        cameras: tuple[Camera, ...],
+        size: tuple[float, float],
+        position: tuple[float, float, float],
+        kind: Literal["jpeg", "png"],
+    ) -> bool:
+        """Show an image as a plane [m]; whether it is a new one, as with other cameras than before."""
+        if name in self._planes and self._planes[name][0] == cameras:
+            self._planes[name][1].image = image
+            return False
         handle = self._shown.add_image(
             name,
             image,
-            camera.width / fx * z,
-            camera.height / fy * z,
-            format="jpeg" if kind == "jpeg" else "png",
+            *size,
+            format=kind,
             jpeg_quality=_JPEG_QUALITY,
-            position=((camera.width / 2 - cx) / fx * z, (camera.height / 2 - cy) / fy * z, z),
+            position=position,
             cast_shadow=False,
             receive_shadow=False,
         )
-        self._planes[name] = (camera, handle)
-        if name == FRAME:
-            self._outline(LENS, camera, _LENS_COLOR)
+        self._planes[name] = (cameras, handle)
+        return True
 
     def _outline(self, name: str, camera: Camera, color: tuple[int, int, int]) -> viser.LineSegmentsHandle:
         """Lines from a lens to the corners of its image at the frame's depth, and around the image."""

@@ -109,13 +109,7 @@ class Painted(Event):
 
 
 def read_stroke(painted: Painted, frames: int, cameras: Mapping[str, Camera], classes: int = 0) -> Stroke:
-    """A stroke over a frame of a recording.
-
-    Args:
-        painted: what a tab reports.
-        frames: how many frames there are.
-        cameras: by name.
-        classes: the highest number of a class.
+    """A stroke over a frame of a recording, which has these cameras, by name, and classes.
 
     Raises:
         SettingsError: it is no stroke over one of these frames and cameras. Points beyond the image and a brush that

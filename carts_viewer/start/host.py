@@ -58,13 +58,7 @@ class Host(Protocol):
         """Go to a batch; if it cannot be read, to the start page with the reason."""
 
     def open_sequence(self, path: Path, *, project: Path | None = None, frame: int | None = None) -> None:
-        """Go to the viewer of a sequence; if it cannot be opened, to the start page with the reason.
-
-        Args:
-            path: the sequence file.
-            project: its project; None for the default one.
-            frame: index of the frame to begin with; None for the first.
-        """
+        """Go to the viewer of a sequence and one of its frames; if it cannot be opened, to the start page."""
 
     def open_sample(self) -> None:
         """Open the shipped sequence."""

@@ -80,10 +80,7 @@ class Site:
         self._jobs.put(job)
 
     def wait(self, timeout: float = 60.0) -> None:
-        """Wait until everything asked for so far is done.
-
-        Args:
-            timeout: [s]
+        """Wait until everything asked for so far is done, for so long [s].
 
         Raises:
             TimeoutError: it is not, in that time.

@@ -51,10 +51,6 @@ class Guard:
     """
 
     def __init__(self, host: str) -> None:
-        """
-        Args:
-            host: The address that the server listens on.
-        """
         self._host = host
         self.token = None if _is_loopback(host) else secrets.token_urlsafe(32)
         # Not the token itself, which may stay behind in a browser's history or a terminal.
@@ -300,14 +296,7 @@ def gated(
 
 
 def response(status: http.HTTPStatus, kind: str, body: bytes, **more: str) -> Response:
-    """An answer that no browser guesses about, keeps, or shows inside another site.
-
-    Args:
-        status: HTTP status.
-        kind: Content type.
-        body: Content.
-        more: Further headers, with `_` for `-`.
-    """
+    """An answer that no browser guesses about, keeps, or shows inside another site; `more` are headers, `_` for `-`."""
     headers = Headers()
     headers["Content-Type"] = kind
     headers["Content-Length"] = str(len(body))

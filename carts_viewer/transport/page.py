@@ -36,11 +36,7 @@ _TITLE, _LOADER, _CLIENT = "<title>Viser</title>", "<script data-p=", 'e.type="m
 
 
 def index_of_viser(head: str, nonce: str) -> str:
-    """HTML of viser's page.
-
-    Args:
-        head: HTML in place of its title.
-        nonce: Of the `Content-Security-Policy`, for its inline scripts.
+    """HTML of viser's page with `head` in place of its title, and a nonce for its inline scripts.
 
     Raises:
         CartsError: another version of viser is installed.
@@ -164,11 +160,7 @@ class Page:
         self._channel = self.server.gui.add_text("channel", "", visible=False)
 
     def clear(self, title: str) -> None:
-        """Take away all widgets, commands, nodes and callbacks; tabs must be reloaded when others are there.
-
-        Args:
-            title: The browser tab's new title.
-        """
+        """Take away all widgets, commands, nodes and callbacks; tabs must be reloaded when others are there."""
         self._title = title
         self._farewells.clear()
         self.key_groups = []

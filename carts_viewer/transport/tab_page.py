@@ -55,12 +55,7 @@ class TabPage:
         return next(handle for handle in widgets(self.gui) if getattr(handle, "label", None) == label)
 
     def row(self, *handles: viser.GuiButtonHandle, weights: Sequence[float] | None = None) -> None:
-        """Lay out consecutive buttons of the current container side by side.
-
-        Args:
-            handles: The buttons, in order.
-            weights: Relative widths; equal when left out.
-        """
+        """Lay out consecutive buttons of the current container side by side, with relative widths."""
         shares = [1.0] * len(handles) if weights is None else list(weights)
         self._side_by_side([element_id(handle) for handle in handles], shares, "div:has(> [id='{}'])")
 

@@ -68,15 +68,7 @@ class CalibrationJob:
         load_networks: Callable[[], FeatureExtractor],
         report: Callable[[CalibrationProgress], None],
     ) -> None:
-        """Begin.
-
-        Args:
-            sequence: the recording.
-            scene: its arms and cameras, with the calibration to begin with.
-            known: what that calibration leaves open.
-            load_networks: called on the job's thread.
-            report: called on the job's thread with every progress, the last one `ended`.
-        """
+        """Begin; `report` is called on the job's thread with every progress, the last one `ended`."""
         self._sequence, self._scene, self._known = sequence, scene, known
         self._load_networks = load_networks
         self._report = report
@@ -94,11 +86,7 @@ class CalibrationJob:
         return self._cancelled.is_set()
 
     def join(self, timeout: float | None = None) -> None:
-        """Wait until it has ended.
-
-        Args:
-            timeout: [s]
-        """
+        """Wait until it has ended, for so long [s]."""
         self._thread.join(timeout)
 
     def _run(self) -> None:
@@ -182,12 +170,7 @@ class CalibrationReport:
 
 
 def report_of(result: CalibrationResult, clicking: Clicking, points: Rows[ImagePoint]) -> CalibrationReport:
-    """The figures of a calibration.
-
-    Args:
-        result: of the calibration that began with that of the points.
-        clicking: with the calibration from the points.
-        points: that were clicked.
+    """The figures of a calibration that began with that of the clicked points.
 
     Raises:
         CartsError: the points are of other arms, cameras or frames.

@@ -230,14 +230,7 @@ def estimated_delay(recording: FoundRecording) -> TimeOffsetEstimate:
 def check_form(
     draft: Draft, guess: Guess, pictures: dict[str, list[tuple[str, str]]], delay: TimeOffsetEstimate | None = None
 ) -> str:
-    """All that was found, part by part, with its problems and with what can be changed.
-
-    Args:
-        draft: choices of the user.
-        guess: what follows from it.
-        pictures: camera -> name and address of its previews.
-        delay: between images and table, where it was estimated.
-    """
+    """HTML of all that was found, part by part, with its problems and with what can be changed."""
     table = {} if guess.table is None else guess.table.columns
     return render(
         "check.html",

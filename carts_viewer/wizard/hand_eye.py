@@ -106,17 +106,7 @@ def hand_eye_panel(
     folder: str,
     undoable: bool,
 ) -> str:
-    """The panel.
-
-    Args:
-        draft: with its points and its calibration.
-        clicking: what is asked for, and what follows from the points.
-        prompt: what is to be clicked now.
-        progress: of a calibration that runs or has just ended.
-        problem: what went wrong last; empty if nothing did.
-        folder: where the sequence would be saved.
-        undoable: whether there is something to undo.
-    """
+    """HTML of the panel; `progress` is of a calibration that runs or has ended, `folder` where it would be saved."""
     report, result = draft.report, clicking.result
     deviations = {} if result is None else result.deviations
     if report is not None:
