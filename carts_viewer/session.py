@@ -29,7 +29,7 @@ from carts_core.project import (
 )
 from carts_core.project.calibrated import calibrated, corrected_state, source_of
 from carts_core.recording import Frame, FrameReader, Sequence
-from carts_viewer.choices import NETWORK, JointRange, Observed, Target, joint_range
+from carts_viewer.choices import NETWORK, Observed, Target, joint_range
 from carts_viewer.editing import Editor, People, Person
 from carts_viewer.start.roots import Roots
 from carts_viewer.state import Pose
@@ -43,7 +43,7 @@ class Session:
     Attributes:
         scene: its arms and cameras.
         editor: its project, and what is on the way there.
-        ranges: what each joint may be set to, arm by arm.
+        ranges: what each joint may be set to, by arm.
         roots: folders that files may be brought in from: that of the sequence, and others that were allowed.
     """
 
@@ -55,9 +55,10 @@ class Session:
         self._own_offset = None if sequence.matching is None else sequence.matching.time_offset
         self.scene: Scene = sequence.scene
         self.editor = Editor(people, person or people.join())
-        self.ranges = tuple(
-            joint_range(arm, joint) for arm in self.scene.arms for joint in range(len(arm.robot.joint_names))
-        )
+        self.ranges = {
+            arm.name: tuple(joint_range(arm, joint) for joint in range(len(arm.robot.joint_names)))
+            for arm in self.scene.arms
+        }
         self._reader = FrameReader(sequence)
         self.roots = Roots([sequence.path.parent, *folders])
 
@@ -198,19 +199,9 @@ class Session:
             values[name] = np.clip(moved, np.minimum(low, here), np.maximum(high, here))
         return self.with_joints(self.measured(frame), values)
 
-    def joint_range(self, arm: str, joint: int) -> JointRange:
-        """Range of a joint of an arm, by its index.
-
-        Raises:
-            RobotError: no such arm.
-            IndexError: no such joint.
-        """
-        names = self.scene.arm(arm).robot.joint_names
-        return next(r for r in self.ranges if (r.arm, r.joint) == (arm, names[joint]))
-
     def with_joint(self, state: SceneState, arm: str, joint: int, value: float) -> SceneState:
         """The state with one joint [rad or m] set, clamped to its limits."""
-        limits = self.joint_range(arm, joint)
+        limits = self.ranges[self.scene.arm(arm).name][joint]
         values = {name: joints.copy() for name, joints in self.joints(state).items()}
         values[arm][joint] = min(max(value, limits.lower), limits.upper)
         return self.with_joints(state, values)

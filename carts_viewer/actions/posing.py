@@ -37,7 +37,7 @@ class PosingHandler(Handler):
         arm, joint = self._joint()
         pose = self._context.state.pose.scene
         by = clamped(intent.by, -LARGEST_PERTURBATION, LARGEST_PERTURBATION)
-        step = math.radians(by) if self._session.joint_range(arm, joint).revolute else by / 1e3
+        step = math.radians(by) if self._session.ranges[arm][joint].revolute else by / 1e3
         now = self._session.joints(pose)[arm][joint]
         self._set_pose(f"Nudge {self._joint_name()}", self._session.with_joint(pose, arm, joint, now + step))
 
@@ -62,7 +62,7 @@ class PosingHandler(Handler):
 
     def _joint_name(self) -> str:
         arm, joint = self._joint()
-        name = self._session.joint_range(arm, joint).joint
+        name = self._session.ranges[arm][joint].joint
         return f"{arm} {name.removesuffix('_joint').replace('_', ' ')}"
 
 

@@ -51,7 +51,7 @@ class JointsPanel:
         self._names = {
             f"{limits.arm} {humanized(limits.joint)}": (limits.arm, number)
             for arm in session.scene.arms
-            for number, limits in enumerate(limits for limits in session.ranges if limits.arm == arm.name)
+            for number, limits in enumerate(session.ranges[arm.name])
         }
         self._nudged = gui.add_dropdown("Nudge (I, O)", list(self._names), hint="The joint that the keys I and O move")
         page.on_input(self._reach, lambda name: intents.SetReach(Reach(name)))
@@ -82,7 +82,7 @@ class JointsPanel:
     def _add_arm(self, page: PanelPage, arm: str, state: ViewState) -> None:
         gui = page.gui
         joints = self._session.joints(state.pose.scene)[arm]
-        for joint, limits in enumerate(limits for limits in self._session.ranges if limits.arm == arm):
+        for joint, limits in enumerate(self._session.ranges[arm]):
             low, high = limits.to_shown(limits.lower), limits.to_shown(limits.upper)
             value = limits.to_shown(float(joints[joint]))
             unit = limits.unit
@@ -161,8 +161,7 @@ class ValuesPanel:
         rows = ["".join(f"<th>{name}</th>" for name in columns)]
         for arm in self._session.scene.arms:
             rows.append(f'<th colspan="{len(columns)}">{escaped(arm.name)}</th>')
-            ranges = [limits for limits in self._session.ranges if limits.arm == arm.name]
-            for joint, limits in enumerate(ranges):
+            for joint, limits in enumerate(self._session.ranges[arm.name]):
                 measured = limits.to_shown(float(state.frame.measured[arm.name][joint]))
                 now = limits.to_shown(float(shown[arm.name][joint]))
                 cells = [

@@ -140,7 +140,7 @@ def undetermined_lines(state: ViewState, session: Session) -> str:
 def _moved(unknown: str, state: ViewState, session: Session) -> str:
     """By how much a run has moved a joint, in brackets; nothing for other unknowns."""
     arm, _, joint = unknown.partition("/")
-    found = [limits for limits in session.ranges if limits.arm == arm]
+    found = session.ranges.get(arm, ())
     places = [number for number, limits in enumerate(found) if limits.joint == joint]
     if not places or state.run.start is None:
         return ""

@@ -45,7 +45,7 @@ class Traces:
         self._joints = {
             f"{limits.arm} {humanized(limits.joint)} [{limits.unit}]": (limits, number)
             for arm in session.scene.arms
-            for number, limits in enumerate(limits for limits in session.ranges if limits.arm == arm.name)
+            for number, limits in enumerate(session.ranges[arm.name])
         }
         self._corrected: dict[str, Float[np.ndarray, "frames dofs"]] = {
             arm.name: np.full((frames, len(arm.robot.joint_names)), np.nan, np.float32) for arm in session.scene.arms

@@ -142,7 +142,7 @@ def test_masks_are_those_that_somebody_corrected_and_only_where_they_did(desk: D
 
 def test_kinematics_say_where_each_row_comes_from_and_how_sure_it_is(desk: Desk) -> None:
     desk.do(intents.SetJoint("PSM1", 0, 0.2), intents.Released())
-    joints = len(desk.session.ranges)
+    joints = sum(map(len, desk.session.ranges.values()))
     known = JointCorrection((0.1,) * joints, Provenance(Source.PROPAGATED), (0.01,) * (joints - 1) + (None,))
     desk.session.editor.project.apply("Solve", {Key.joints(1, "PSM1"): known})
     rows = read_kinematics_csv(exported(desk, intents.Export("csv", "All")), desk.session.scene)
