@@ -7,14 +7,15 @@ from typing import Any
 import numpy as np
 
 from carts_core.errors import CartsError, ProjectError
-from carts_core.optimization import FrameEstimate
-from carts_core.project import Figures, Key, Keyframe, ProjectState, between_kept
+from carts_core.optimization import Backgrounds, FrameEstimate, SequenceOptimizer, SequenceSettings
+from carts_core.project import Figures, Key, Keyframe, ProjectState, Source, between_kept
 from carts_core.project.values import WHOLE_PROJECT
+from carts_core.settings.serialization import to_plain
 from carts_core.wording import counted
 from carts_viewer.actions import intents
 from carts_viewer.actions.context import Context, Handler
 from carts_viewer.jobs.comparison import Comparison, Outcome, unchecked
-from carts_viewer.jobs.optimizers import OptimizerFactory, SequenceRun
+from carts_viewer.jobs.optimizers import OptimizerFactory, SequenceRun, scene_at
 from carts_viewer.state import ListedFrame, SolveState
 
 
@@ -108,23 +109,29 @@ class PropagatingHandler(Handler):
     # ---- The run ---------------------------------------------------------------------------------------------------
 
     def _make(self, frames: range, kept: list[int]) -> SequenceRun:
-        state, sequence, cameras = self._context.state, self._session.sequence, self._context.cameras
-        target = self._session.target(state.observed, self._before)
-        poses = {index: self._session.pose(sequence.frame(index, cameras=[]), self._before) for index in kept}
-        return self._optimizers.make_sequence(
-            sequence,
-            state.pose.scene,
-            frames,
-            state.domain,
-            cameras,
-            state.settings,
-            state.direction,
-            state.free,
-            keyframes={index: self._session.joints(pose.scene) for index, pose in poses.items()},
+        """A run on frames together; joints are free as in a run on one frame, calibration is not."""
+        state, session, cameras = self._context.state, self._session, list(self._context.cameras)
+        sequence, target = session.sequence, session.target(state.observed, self._before)
+        poses = {index: session.pose(sequence.frame(index, cameras=[]), self._before) for index in kept}
+        free = replace(state.free, base_frames=False, extrinsics=False, intrinsics=False)
+        model, stamps = SequenceSettings(direction=state.direction), sequence.timestamps
+        optimizer = SequenceOptimizer(
+            scene_at(sequence.scene, state.pose.scene),
+            lambda index: sequence.frame(index, state.domain, cameras),
+            {index: None if stamps is None else float(stamps[index]) for index in frames},
+            self._optimizers.predictor(target),
+            settings=state.settings,
+            model=model,
+            free=free,
+            keyframes={index: session.joints(pose.scene) for index, pose in poses.items()},
             keyframe_std={index: _deviations(self._before, index) for index in kept},
-            target=target,
-            ignore=lambda index: self._session.ignored(index, cameras, target),
+            ignore=lambda index: session.ignored(index, cameras, target),
+            backgrounds=Backgrounds.of(sequence, cameras, state.domain),
+            cameras=cameras,
         )
+        more = {"model": to_plain(model), "frames": [frames[0], frames[-1]], "keyframes": sorted(kept)}
+        provenance = self._optimizers.provenance(cameras, state.settings, free, target, Source.PROPAGATED, **more)
+        return SequenceRun(optimizer, provenance)
 
     def _bits(self, run: SequenceRun) -> Iterator[None]:
         outcomes: dict[int, Outcome] = {}

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Protocol, TypedDict, Unpack
+from typing import Any, Protocol, TypedDict, Unpack
 
 import numpy as np
 import torch
@@ -24,17 +24,14 @@ from carts_core.optimization import (
     NetworkPredictor,
     Progress,
     SequenceOptimizer,
-    SequenceSettings,
     SolverSettings,
     StopReason,
     SurfaceSolver,
     check_domain,
 )
-from carts_core.optimization.measurement import Ignore
 from carts_core.project import FitVerdict, Provenance, Source
 from carts_core.recording import Sequence as Recording
 from carts_core.segmentation import NetworkSegmenter, Segmenter
-from carts_core.settings import Direction
 from carts_core.settings.optimization import Inference
 from carts_core.settings.serialization import to_plain
 from carts_core.settings.stages import NONE
@@ -258,23 +255,25 @@ class OptimizerFactory:
         return MaskPredictor(network, masks, name)
 
     def provenance(
-        self, cameras: Sequence[str], settings: SolverSettings, free: FreeParameters, target: Target = NETWORK
+        self,
+        cameras: Sequence[str],
+        settings: SolverSettings,
+        free: FreeParameters,
+        target: Target = NETWORK,
+        source: Source = Source.OPTIMIZER,
+        **more: Any,
     ) -> Provenance:
-        """Provenance of a run with these settings.
+        """Provenance of a run with these settings, and `more` of them.
 
         Raises:
             WeightsError: the networks cannot be loaded.
         """
-        used = {**to_plain(settings), "free": asdict(free), "cameras": list(cameras), **self._observed(target)}
-        return Provenance.made_by_optimizer(used, self._weights_hash(target))
-
-    def _weights_hash(self, target: Target) -> str | None:
-        return None if target.observed.what == "masks" else self.prepare().sha256
-
-    @staticmethod
-    def _observed(target: Target) -> dict[str, str]:
+        used = {**to_plain(settings), "free": asdict(free), "cameras": list(cameras), **more}
         observed = target.observed
-        return {} if observed.what == "network" else {"observe": observed.what, "masks": observed.masks}
+        if observed.what != "network":
+            used |= {"observe": observed.what, "masks": observed.masks}
+        weights = None if observed.what == "masks" else self.prepare().sha256
+        return Provenance.made_by_optimizer(used, weights, source)
 
     def make(self, task: FrameTask) -> Optimizer:
         """An optimizer of a frame.
@@ -316,66 +315,6 @@ class OptimizerFactory:
             free=task.free,
             cameras=cameras,
         )
-
-    def make_sequence(
-        self,
-        sequence: Recording,
-        calibration: SceneState,
-        frames: range,
-        domain: str,
-        cameras: Sequence[str],
-        settings: SolverSettings,
-        direction: Direction,
-        free: FreeParameters,
-        keyframes: Mapping[int, Mapping[str, np.ndarray]],
-        keyframe_std: Mapping[int, Mapping[str, np.ndarray]],
-        target: Target,
-        ignore: Ignore,
-    ) -> SequenceRun:
-        """A run on frames together; joints are free as in a run on one frame, calibration is not.
-
-        Args:
-            sequence: Where joint positions are measured.
-            calibration: Base frames and cameras; its joint positions do not matter.
-            frames: Which ones; of a `domain`, seen by `cameras`.
-            settings: Of the optimizer.
-            direction: Where to begin.
-            free: Which joints may move.
-            keyframes: Frame -> arm -> joint positions [rad, m] that stay; `keyframe_std`: their standard deviations.
-            target: What is fitted.
-            ignore: Frame -> camera -> pixels that show something else.
-
-        Raises:
-            CartsError: weights, an image, a mask or a setting is not usable.
-        """
-        model = SequenceSettings(direction=direction)
-        free = replace(free, base_frames=False, extrinsics=False, intrinsics=False)
-        stamps = sequence.timestamps
-        optimizer = SequenceOptimizer(
-            scene_at(sequence.scene, calibration),
-            lambda index: sequence.frame(index, domain, list(cameras)),
-            {index: None if stamps is None else float(stamps[index]) for index in frames},
-            self.predictor(target),
-            settings=settings,
-            model=model,
-            free=free,
-            keyframes=keyframes,
-            keyframe_std=keyframe_std,
-            ignore=ignore,
-            backgrounds=Backgrounds.of(sequence, cameras, domain),
-            cameras=list(cameras),
-        )
-        used = {
-            **to_plain(settings),
-            "model": to_plain(model),
-            "free": asdict(free),
-            "cameras": list(cameras),
-            "frames": [frames[0], frames[-1]],
-            "keyframes": sorted(keyframes),
-            **self._observed(target),
-        }
-        made = Provenance.made_by_optimizer(used, self._weights_hash(target), Source.PROPAGATED)
-        return SequenceRun(optimizer, made)
 
 
 def scene_at(scene: Scene, state: SceneState) -> Scene:
