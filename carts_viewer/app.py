@@ -44,7 +44,7 @@ _EVENTS = (
     | intents.ShowCamera
     | intents.ShowFrame
 )
-"""What the page's scripts report; handlers clamp the values of intents, or refuse them."""
+"""Events of the page's scripts; handlers check the values of intents."""
 
 
 class Listening:
@@ -218,7 +218,7 @@ class ViewerApp:
 
     @property
     def view(self) -> View:
-        """What the first tab's page is made of (for tests and scripts).
+        """View of the first tab (for tests and scripts).
 
         Raises:
             RuntimeError: no page shows the first tab.
@@ -234,7 +234,7 @@ class ViewerApp:
 
     @property
     def incident(self) -> str | None:
-        """Where corrections are kept instead, or why they are not; None where all is well."""
+        """Why corrections are not in the project's file, and where they are; None if they are."""
         return self.project.incident
 
     def close(self) -> None:
@@ -266,7 +266,7 @@ class ViewerApp:
         return self.state
 
     def _prepare(self) -> None:
-        """Load on the worker, with the first picture already out, what the first run will need."""
+        """Load the networks on the worker, after the first picture."""
         try:
             self._optimizers.prepare()
         finally:

@@ -116,7 +116,7 @@ Masks = Literal["recording", "imported", "painted"]
 
 @dataclass(frozen=True)
 class Observed:
-    """Choice of what a run fits.
+    """Choice of the target of a run.
 
     Raises:
         SettingsError: a value is none of those that there are.
@@ -135,7 +135,7 @@ class Observed:
 
 @dataclass(frozen=True, eq=False)
 class Target:
-    """What a run fits: network predictions or masks, with the project's masks at its start."""
+    """Target of a run: network predictions or masks, with the project's masks at its start."""
 
     observed: Observed = Observed()
     given: GivenMasks | None = None
@@ -149,7 +149,7 @@ class Target:
         return Target(observed, project_masks(observed.masks, project, recording))
 
     def seen(self, recording: Recording, index: int, domain: str, cameras: Sequence[str]) -> list[str]:
-        """Those of the cameras whose images of a frame can be compared: with masks alone, those that have one."""
+        """Cameras whose images of a frame can be compared; with masks alone, those with a mask."""
         if self.observed.what != "masks":
             return list(cameras)
         if self.given is not None:

@@ -1,4 +1,4 @@
-"""Dispatches intents to handlers and advances what takes long: one controller a tab, one background for all tabs.
+"""Dispatches intents to handlers and advances long work: a controller per tab, one background for all tabs.
 
 Runs on the worker's thread alone; independent of threads and widgets.
 """
@@ -84,7 +84,7 @@ class Background:
         self._jobs.advance()
 
     def fail(self, text: str) -> None:
-        """Stop the work under way after its error."""
+        """Stop the running work after its error."""
         # What is solved is not lost to an error of something else; its own errors have saved it already.
         with suppress(CartsError):
             self._propagating.finish()
@@ -92,7 +92,7 @@ class Background:
         self._jobs.fail(text)
 
     def close(self) -> None:
-        """Save what is under way; exports are abandoned.
+        """Finish and save the running work; exports are cancelled.
 
         Raises:
             CartsError: it could not be saved.
@@ -157,7 +157,7 @@ class Controller(Handler):
 
     @property
     def state(self) -> ViewState:
-        """What the page shows."""
+        """State of the tab."""
         return self._context.state
 
     def handle(self, intent: intents.Intent) -> None:
@@ -212,7 +212,7 @@ class Controller(Handler):
         self._context.change()
 
     def _on_Drawn(self, intent: intents.Drawn) -> None:
-        """Nothing to do: it has woken the worker, which now may send the next overlay."""
+        """No change: the intent wakes the worker, which may send the next overlay."""
 
     def _on_DismissError(self, intent: intents.DismissError) -> None:
         self._context.change(error=None)
@@ -270,7 +270,7 @@ class Controller(Handler):
             self._optimizing.end("Stopped: its tab was closed; Run starts anew from here")
 
     def close(self) -> None:
-        """Save what is under way.
+        """End the stream and save the unfinished gesture.
 
         Raises:
             CartsError: it could not be saved.
@@ -279,7 +279,7 @@ class Controller(Handler):
         self._context.save()
 
     def say(self, text: str | None) -> None:
-        """Show the user what is being prepared, and what the background has begun; None when nothing is."""
+        """Show what is being prepared; None for nothing."""
         self._share()
         self._context.change(busy=text)
 

@@ -38,7 +38,7 @@ class Person:
 
 
 class People:
-    """Users of a project, and their access to its history. Used on the worker's thread alone.
+    """Users of a project and their access to its history; used on the worker's thread only.
 
     Attributes:
         project: the project.
@@ -81,15 +81,15 @@ class People:
         self._makers[self.project.state.position] = person
 
     def can_undo(self, person: Person) -> bool:
-        """Whether there may be something that this person can take back."""
+        """Whether this user may have a step to undo."""
         return self.project.state.position > 0 and (not self.several or self._last(person, free=True) is not None)
 
     def can_redo(self, person: Person) -> bool:
-        """Whether there is something that this person can do again."""
+        """Whether this user has a step to redo."""
         return bool(person.undone) or self._next_is_free(person)
 
     def undo(self, person: Person) -> Change | None:
-        """Take back a person's last step, or one that has no owner; None if there is neither.
+        """Undo a user's last step, or one without an owner; None without either.
 
         Raises:
             CartsError: a later step has changed the same.
@@ -143,13 +143,13 @@ class People:
         return project.go_to(position)
 
     def _last(self, person: Person, *, free: bool) -> int | None:
-        """The last step that is done, was not taken back and is this person's or, where `free`, of no known person."""
+        """Last step in effect of this user or, if `free`, without an owner."""
         owners = (person, None) if free else (person,)
         done = range(self.project.state.position, 0, -1)
         return next((n for n in done if n not in self._reverted and self._maker(n) in owners), None)
 
     def _maker(self, number: int) -> Person | None:
-        """Who made a step; for one from before the viewer started, the person whose name it begins with."""
+        """Owner of a step; for steps from before the viewer started, the user whose name it begins with."""
         if number in self._makers:
             return self._makers[number]
         name = self.project.state.steps[number - 1].name
@@ -232,12 +232,12 @@ class Editor:
 
     @property
     def can_undo(self) -> bool:
-        """Whether there may be something to take back."""
+        """Whether there may be a step to undo."""
         return self.unsaved or self.people.can_undo(self.person)
 
     @property
     def can_redo(self) -> bool:
-        """Whether there is something to do again."""
+        """Whether there is a step to redo."""
         return not self.unsaved and self.people.can_redo(self.person)
 
     def draft(self, name: str, edits: Edits, gesture: object) -> None:
@@ -285,7 +285,7 @@ class Editor:
         return max(0.0, self._changed_at + LONGEST_DRAFT - time.monotonic())
 
     def undo(self) -> Change | None:
-        """Take back this person's last step. A draft that cannot be saved is dropped, as undo would.
+        """Undo this user's last step, or drop a draft that cannot be saved.
 
         Raises:
             ProjectError: it could not be saved, the project is read-only, or another user has changed the same since.
@@ -293,7 +293,7 @@ class Editor:
         return None if self._dropped() else self.people.undo(self.person)
 
     def redo(self) -> Change | None:
-        """Do again what this person took back last; drafts and errors as `undo`."""
+        """Redo this user's last undone step; drafts and errors as `undo`."""
         return None if self._dropped() else self.people.redo(self.person)
 
     def go_to(self, position: int) -> Change | None:

@@ -1,4 +1,4 @@
-"""The immutable state of a tab: what is shown and what is under way. The worker replaces it, panels read it."""
+"""The immutable state of a tab; replaced by the worker, read by panels."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -296,7 +296,7 @@ class ViewState:
 
     @property
     def streaming(self) -> bool:
-        """Whether frame and pose are those of a live stream, which the project knows nothing of."""
+        """Whether frame and pose are those of a live stream, which are not in the project."""
         return self.live is not None and self.live.on
 
     @property

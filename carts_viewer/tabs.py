@@ -142,7 +142,7 @@ class Tab:
         """When the page left [s, monotonic]; None while there is one, and once its run is ended."""
 
     def put(self, intent: Intent) -> None:
-        """Have the worker do something here. Any thread may ask."""
+        """Queue an intent for the worker. Thread-safe."""
         self._queue.put(self, intent)
 
     def waits(self, key: Hashable) -> bool:
@@ -162,7 +162,7 @@ class Tab:
         self._shown = self._pictured = self._left_at = None
 
     def detach(self) -> None:
-        """The page is gone; what is under way goes on for as long as it may come back."""
+        """Detach the closed page; its run continues for `AWAY` seconds."""
         self.view = None
         self.person.present = False
         self._left_at = time.monotonic()
@@ -172,7 +172,7 @@ class Tab:
         return None if self._left_at is None else max(0.0, self._left_at + AWAY - time.monotonic())
 
     def leave(self) -> None:
-        """End what only the page could show, once it has been gone for long.
+        """End the run once the page has been closed for `AWAY` seconds.
 
         Raises:
             CartsError: it could not be saved.
@@ -193,7 +193,7 @@ class Tab:
         return self.view.display.ready_in()
 
     def publish(self, attempt: Callable[[Callable[[], None]], None]) -> None:
-        """Show the state, as far as it is not shown; `attempt` does something and shows its errors."""
+        """Show a changed state; `attempt` calls a function and shows its errors."""
         controller, display = self.controller, None if self.view is None else self.view.display
         if self._pictured is not controller.state and (display is None or display.ready_in() <= 0.0):
             attempt(controller.map)
@@ -282,7 +282,7 @@ class Tabs:
         self._forget_oldest()
 
     def detach(self, client_id: int) -> None:
-        """A page is gone."""
+        """Detach a closed page."""
         tab = self.of_client(client_id)
         if tab is not None:
             tab.detach()
@@ -291,13 +291,13 @@ class Tabs:
             self._tabs = (*(other for other in self._tabs if other is not tab), tab)
 
     def forget_images(self) -> None:
-        """Drop the images of the recording that are kept for the next time, and what was computed from them."""
+        """Drop cached images of the recording and values computed from them."""
         self._sequence.forget_images()
         for session in (self._session, *(tab.session for tab in self._tabs)):
             Backgrounds.forget(session.sequence)
 
     def close(self) -> None:
-        """Save everything that is under way.
+        """Save all unfinished work.
 
         Raises:
             CartsError: something could not be saved; the rest is.
@@ -312,7 +312,7 @@ class Tabs:
             raise problems[0]
 
     def _go(self, tab: Tab, hello: Hello) -> None:
-        """Go where the page wants to be, as far as there is such a place."""
+        """Show the frame, camera and domain of the page's address, if they exist."""
         if tab.controller.state.streaming:
             return
         sequence = self._sequence

@@ -59,7 +59,7 @@ class Worker:
         self._queue.wake()
 
     def settled(self, timeout: float) -> bool:
-        """Wait until nothing is left to do or to show; False when that took longer than `timeout` [s]."""
+        """Wait until all work is done and shown; False after `timeout` [s]."""
         end = time.monotonic() + timeout
         with self._rest:
             while not (self._resting and self._queue.empty() and self._calls.empty()):
@@ -68,7 +68,7 @@ class Worker:
         return True
 
     def report(self, text: str | None) -> None:
-        """Show in all tabs what is being prepared, at once; called on the worker's thread from within the work."""
+        """Show at once in all tabs what is being prepared; called on the worker's thread."""
         for tab in self._tabs:
             tab.controller.say(text)
             tab.show_panels()
@@ -166,7 +166,7 @@ class Worker:
             tab.publish(lambda work, tab=tab: self._attempt(work, tab))
 
     def _attempt(self, work: Callable[[], None], *tabs: Tab, stop: bool = False) -> None:
-        """Do something; an error is shown in these tabs and the worker goes on."""
+        """Call a function; errors are shown in these tabs."""
         try:
             work()
         except Exception as error:

@@ -18,7 +18,7 @@ SPEEDS = (0.5, 60.0)
 
 
 class BrowsingHandler(Handler):
-    """The handler that chooses what is shown."""
+    """Handler of the shown frame, camera, domain and layer, and of playback."""
 
     def __init__(self, context: Context) -> None:
         super().__init__(context)

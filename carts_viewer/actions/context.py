@@ -104,7 +104,7 @@ class Context:
             self.save()
 
     def save(self) -> None:
-        """Save the gesture under way as one step, as far as there is one.
+        """Save the unfinished gesture, if any, as one step.
 
         Raises:
             ProjectError: it could not be saved.

@@ -62,11 +62,11 @@ class ExportingHandler(Handler):
         self._intent: intents.Export | None = None
 
     def wait_time(self) -> float | None:
-        """0 while there is something to write; None when there is not."""
+        """0 during an export, otherwise None."""
         return None if self._job is None else 0.0
 
     def advance(self) -> None:
-        """Write on for a moment, if there is something to write.
+        """Continue the export for `_BIT` seconds.
 
         Raises:
             CartsError: it cannot be written; nothing of it is left.
@@ -91,7 +91,7 @@ class ExportingHandler(Handler):
             self._log(intent, path)
 
     def cancel(self) -> None:
-        """Stop the export that is going on, if there is one; nothing of it is left."""
+        """Cancel the running export and remove its files."""
         if self._job is not None:
             job, self._job = self._job, None
             job.cancel()
@@ -124,7 +124,7 @@ class ExportingHandler(Handler):
     # ---- The export ------------------------------------------------------------------------------------------------
 
     def _dataset(self, intent: intents.Export) -> tuple[Callable[[Monitor], Dataset], int]:
-        """What makes the dataset as the project is now, frame by frame, and how many frames it will have."""
+        """A function that builds the dataset from the present project, and its number of frames."""
         state, session = self._context.state, self._session
         view = session.editor.view
         chosen = frames_within(view, intent.frames, intent.range)
@@ -236,14 +236,14 @@ def export_warnings(project: ProjectState, frames: Sequence[int], cameras: Colle
 
 
 def _seen_by_all(project: ProjectState, frame: int, cameras: Collection[str]) -> bool:
-    """Whether all exported cameras took part in fitting a frame; assumed where it is not recorded."""
+    """Whether all exported cameras were used to fit a frame; True where unknown."""
     used = [_cameras(correction.provenance.settings) for correction in project.joints(frame).values()]
     return all(names is None or set(cameras) <= names for names in used)
 
 
 @lru_cache(maxsize=256)
 def _cameras(settings: str | None) -> frozenset[str] | None:
-    """The cameras that an optimizer has used, as its settings say; None where they do not."""
+    """Cameras in the settings of an optimizer; None where they are not recorded."""
     names = json.loads(settings).get("cameras") if settings else None
     return None if names is None else frozenset(map(str, names))
 
@@ -281,7 +281,7 @@ class CooperativeThread(Generic[T]):
         self._thread = threading.Thread(target=self._work, name="carts-export", daemon=True)
 
     def advance(self, seconds: float) -> T | None:
-        """Go on for about so long [s]; the function's result once there is one.
+        """Continue for about so long [s]; returns the function's result once it has ended.
 
         Raises:
             Exception: what the function raised.

@@ -45,18 +45,18 @@ def review_name(project: ProjectState, index: int) -> str:
 
 
 def copied(project: ProjectState, index: int) -> bool:
-    """Whether joint positions of a frame are another frame's correction; what was solved has settings."""
+    """Whether joint positions of a frame were copied from another frame (solved ones have settings)."""
     made = [correction.provenance for correction in project.joints(index).values()]
     return any(one.source is Source.PROPAGATED and one.settings is None for one in made)
 
 
 def found(project: ProjectState, wanted: FrameFilter) -> list[int]:
-    """Indices of the frames that are looked for, in order."""
+    """Indices of the frames that meet all conditions, in order."""
     return [index for index in range(len(project.identity.frame_ids)) if matches(project, index, wanted)]
 
 
 def matches(project: ProjectState, index: int, wanted: FrameFilter) -> bool:
-    """Whether a frame is one of those that are looked for."""
+    """Whether a frame meets all conditions."""
     review = project.review(index)
     names = (ANY, review_name(project, index), *((UNJUDGED,) if review.state in UNREVIEWED else ()))
     if wanted.review not in names or wanted.note.casefold() not in review.note.casefold():

@@ -1,4 +1,4 @@
-"""Intents: what a user, or the page, asks for.
+"""Intents: requests of a user or of the page.
 
 A control that streams values, such as a slider that is being dragged, gives its intents a key: a newer intent
 replaces a waiting one of the same key, so that work never piles up and the last value counts.
@@ -49,7 +49,7 @@ class Released(Latest):
 
 
 class SetName(Latest):
-    """Choose the name that stands in the history; empty for none."""
+    """Set the user's name in the history; empty for none."""
 
     name: str
 
@@ -71,7 +71,7 @@ class MoveFrame(Intent):
 
 
 class Play(Intent):
-    """Start or stop playing; None changes over."""
+    """Start or stop playback; None toggles it."""
 
     on: bool | None = None
 
@@ -101,7 +101,7 @@ class ShowCamera(Latest):
 
 
 class ShowBeside(Intent):
-    """Show the other cameras' images beside the active one's, or not; None changes over."""
+    """Show or hide the images of the other cameras; None toggles them."""
 
     on: bool | None = None
 
@@ -125,7 +125,7 @@ class MarkRange(Intent):
 
 
 class CompareWith(Latest):
-    """Compare the pose with another one; None: with none."""
+    """Choose the pose to compare with; None for no comparison."""
 
     against: Against | None
 
@@ -208,15 +208,15 @@ class Optimizing(Intent):
 
 
 class Run(Optimizing):
-    """Optimize until it stops, or go on where it was paused."""
+    """Start or resume the optimizer."""
 
 
 class Pause(Optimizing):
-    """Hold the optimizer after the current iteration."""
+    """Pause the optimizer after the current iteration."""
 
 
 class RunOrPause(Optimizing):
-    """Run when not running, else pause."""
+    """Run or pause the optimizer."""
 
 
 class Step(Optimizing):
@@ -224,7 +224,7 @@ class Step(Optimizing):
 
 
 class Reset(Optimizing):
-    """Go back to where the run started."""
+    """Reset the frame to the start of the run."""
 
 
 class Assess(Optimizing):
@@ -279,19 +279,19 @@ class SetObserved(Optimizing, Latest):
 
 
 class SetTool(Latest):
-    """Take a tool."""
+    """Select a tool."""
 
     tool: Tool
 
 
 class ToggleTool(Intent):
-    """Take a tool or, if it is in hand, put it away."""
+    """Select a tool; deselect it if it is selected."""
 
     tool: Tool
 
 
 class SetTarget(Latest):
-    """Paint on this layer; None changes over."""
+    """Choose the painted layer; None toggles it."""
 
     target: Target | None = None
 
@@ -326,7 +326,7 @@ class NextObject(Intent):
 
 
 class ClearLayer(Intent):
-    """Remove what was painted on a layer of the shown frame and camera; None: the layer that is painted on."""
+    """Clear a painted layer of the shown frame and camera; None for the chosen one."""
 
     target: Target | None = None
 
@@ -358,7 +358,7 @@ class SetNote(Latest):
 
 
 class AcceptAndNext(Intent):
-    """Accept the shown frame, then show the next one without a review; within the range, where it lies there."""
+    """Accept the shown frame, then show the next unreviewed one (within the range, if the frame lies there)."""
 
 
 class ShowUnreviewed(Intent):
@@ -382,7 +382,7 @@ class CopyCorrection(Intent):
 
 
 class ShowKeypoints(Intent):
-    """Mark the keypoints in the picture, or not; None changes over."""
+    """Show or hide the keypoints; None toggles them."""
 
     on: bool | None = None
 
@@ -391,7 +391,7 @@ class ChooseKeypoint(Intent):
     """Choose the keypoint that `PointAt` moves."""
 
     label: str | None
-    """None: whichever is nearest to where the picture is pressed."""
+    """None: the keypoint nearest to the pointer."""
 
 
 class PointAt(Latest):
@@ -402,7 +402,7 @@ class PointAt(Latest):
     v: float
     """Row [px]."""
     camera: str | None = None
-    """In whose image; None: the shown one's."""
+    """Camera of the image; None for the shown one."""
 
 
 class ForgetPins(Intent):
@@ -410,20 +410,20 @@ class ForgetPins(Intent):
 
 
 class Propagating(Intent):
-    """An intent about keyframes and what follows from them."""
+    """An intent about sequence mode."""
 
 
 class HoldKeyframe(Intent):
-    """Make the shown frame a keyframe, or none; None changes over."""
+    """Mark or unmark the shown frame as a keyframe; None toggles it."""
 
     on: bool | None = None
 
 
 class Solve(Propagating):
-    """Solve many frames together; those that are kept (keyframes, accepted frames) stay as they are."""
+    """Solve many frames together; kept frames (keyframes, accepted frames) do not change."""
 
     whole: bool = False
-    """All frames of the sequence, not only those between the kept frames around the shown one."""
+    """All frames, instead of those between the kept frames around the shown one."""
 
 
 class StopSolving(Propagating):
@@ -431,19 +431,19 @@ class StopSolving(Propagating):
 
 
 class SetDirection(Intent):
-    """Choose where solving begins: at the first frame, or at the last one."""
+    """Set the direction in which frames are solved."""
 
     direction: Direction
 
 
 class TakeSolved(Propagating):
-    """Take what was solved of a frame that was kept as it was, because it fits worse; None: of all of them."""
+    """Apply the solved pose of a frame although it fits worse; None for all listed frames."""
 
     index: int | None = None
 
 
 class DropSolved(Propagating):
-    """Leave the listed frames as they are, and forget the list."""
+    """Discard the solved poses of all listed frames."""
 
 
 Frames = Literal["found", "unreviewed", "range", "all"]
@@ -454,7 +454,7 @@ class Jobs(Intent):
 
 
 class OptimizeFrames(Jobs):
-    """Run the optimizer on many frames, each alone, from where it is."""
+    """Run the optimizer on many frames, each alone, from its present pose."""
 
     frames: Frames = "unreviewed"
     """Those that the filter finds, those without a review, those in the chosen range, or all."""
@@ -500,17 +500,17 @@ class CancelJob(Jobs):
 
 
 class RepeatJob(Jobs):
-    """Queue a job once more; one on many frames goes on where it was stopped."""
+    """Queue a job again; one on many frames resumes where it stopped."""
 
     number: int
 
 
 class ForgetJobs(Jobs):
-    """Take all jobs that have ended off the list."""
+    """Remove ended jobs from the list."""
 
 
 class Exporting(Intent):
-    """An intent about files to take away."""
+    """An intent about exports and downloads."""
 
 
 class ExportMask(Intent):
@@ -536,11 +536,11 @@ class Export(Exporting):
 
 
 class CancelExport(Exporting):
-    """Stop the export that is going on; nothing of it is left."""
+    """Cancel the running export; its files are removed."""
 
 
 class Download(Exporting):
-    """Send what was exported last to the tab that asked."""
+    """Send the last export to the requesting tab."""
 
     client_id: int
 
@@ -551,7 +551,7 @@ class ImportMasks(Intent):
     place: str
     """Path of the file or folder; relative to the sequence's folder, or absolute in an allowed one."""
     camera: str | None = None
-    """Whose images they are; None: as the names of files say."""
+    """Camera of the masks; None: by the names of the files."""
     replace: bool = False
     """Whether layers that were imported before may be replaced."""
 
@@ -586,13 +586,13 @@ class StartLive(Intent):
     source: str
     """As `carts live --source`: `replay`, `socket:PORT` or `camera:NUMBER`."""
     joints_port: int | None = None
-    """With a camera: port of 127.0.0.1 where joints come from."""
+    """With a camera: port of 127.0.0.1 that receives joint positions."""
     repeat: bool = False
     """Whether a replay begins again when it ends."""
     rate: float | None = None
     """Frames per second of a replay; those of the recording's times if None."""
     record: bool = False
-    """Whether what is seen is kept as a recording with its corrections."""
+    """Whether frames and corrections are recorded."""
 
 
 class StopLive(Intent):

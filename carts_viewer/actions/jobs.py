@@ -77,7 +77,7 @@ class JobsHandler(Handler):
             decisions=decisions,
         )
         self._requester: JobRequester | None = None
-        """Who asks for what is queued now."""
+        """The user of the request that is carried out."""
         self._asked: dict[int, JobRequester] = {}
         """By number of job; a job of an earlier viewer has none."""
         self._work: Generator[Progress] | None = None
@@ -92,7 +92,7 @@ class JobsHandler(Handler):
         self.handle(intent)
 
     def wait_time(self) -> float | None:
-        """0 while there is something to do; None when there is not."""
+        """Time until the next step is due [s]; None without jobs."""
         active = any(job.state in (JobState.WAITING, JobState.RUNNING) for job in self._list.jobs)
         return self._wait if active else None
 
@@ -178,13 +178,13 @@ class JobsHandler(Handler):
             self._follow(job)
 
     def fail(self, text: str) -> None:
-        """Say of the job that runs, if there is one, that it has failed."""
+        """Mark the running job, if any, as failed."""
         job = self._running()
         if job is not None:
             self._end(job, JobState.FAILED, text)
 
     def close(self) -> None:
-        """Write down how far everything is; the viewer ends, and so does what runs in another process."""
+        """Save the progress of all jobs and end the training process."""
         if self._work is not None:
             self._work.close()
         self._list.save()
@@ -199,7 +199,7 @@ class JobsHandler(Handler):
         self._publish()
 
     def _safe_options(self, job: Job) -> Options:
-        """Options to run a job again: a training goes on only in a folder of this user's own that is not finished."""
+        """Options to repeat a job; a training is resumed only in an unfinished folder of this user."""
         own = self._list.is_own(job) and job.state is not JobState.DONE
         if isinstance(job.options, AdaptOptions) and not own:
             return replace(job.options, folder=self._networks.next_number())

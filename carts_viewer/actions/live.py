@@ -59,7 +59,7 @@ class LiveRun:
         return newest
 
     def close(self) -> None:
-        """End it, and wait for its thread; what was recorded is not finished by this."""
+        """End the stream and its thread; the recorder stays open."""
         self._stream.close()
         self._thread.join(10.0)
 
@@ -151,7 +151,7 @@ class LiveHandler(Handler):
         return _LOOK_EVERY if self.active else None
 
     def advance(self) -> None:
-        """Show the newest result, if there is one; end where the stream has ended.
+        """Show the newest result, or stop after the end of the stream.
 
         Raises:
             CartsError: what ended it.
@@ -170,7 +170,7 @@ class LiveHandler(Handler):
                 raise error
 
     def stop(self, why: str) -> None:
-        """Show the recording again, and finish what was recorded.
+        """Stop the stream, show the recording again, and close the recorder.
 
         Raises:
             CartsError: it could not be written.

@@ -47,7 +47,7 @@ class OptimizingHandler(Handler):
         return self._run is not None
 
     def wait_time(self) -> float | None:
-        """0 while iterations are due; None when there are none."""
+        """0 during a run, otherwise None."""
         return 0.0 if self._context.state.run.phase is Phase.RUNNING else None
 
     def advance(self) -> None:
@@ -56,7 +56,7 @@ class OptimizingHandler(Handler):
             self._iterate()
 
     def end(self, reason: str | None, *, save: bool = True) -> None:
-        """Drop the optimizer and save where it is; its curves stay until the next run.
+        """End the run and save its pose; its curves stay until the next run.
 
         Raises:
             ProjectError: it could not be saved.
@@ -74,7 +74,7 @@ class OptimizingHandler(Handler):
         self._before = None
 
     def map(self) -> None:
-        """Compute what the chosen layer shows beyond the pose, if that is not there yet.
+        """Compute the maps of the chosen layer, if they are missing.
 
         Raises:
             CartsError: it cannot be computed.
@@ -237,7 +237,7 @@ class OptimizingHandler(Handler):
         )
 
     def _verdict(self, run: ActiveRun, end: Iterate) -> FitVerdict | None:
-        """On the end of a run: what its own cameras say, and where there are several, what each of all says alone."""
+        """Verdict on the end of a run; of a scene with several cameras, from each of them alone."""
         own = run.verdict()
         if own is not None and (len(self._session.scene.cameras) == 1 or own.verdict == "failed"):
             return own

@@ -114,7 +114,7 @@ class PaintingHandler(Handler):
         return _STEPS[stroke.target, stroke.erase]
 
     def _change(self, name: str, edits: Edits) -> None:
-        """Save layers as one step of undo, those that are others than before."""
+        """Save the layers that have changed as one step of undo."""
         view = self._session.editor.view
         changed = {key: layer for key, layer in edits.items() if view.get(key) != layer}
         if changed:
@@ -122,7 +122,7 @@ class PaintingHandler(Handler):
             self._context.edit(name, changed, loss=self._loss(next(iter(changed))))
 
     def _loss(self, key: Key[Any]) -> float | None:
-        """The optimizer's loss that still holds after this layer changes: a corrected mask changes nothing for it."""
+        """Loss that stays valid after a change of this layer: corrected masks do not affect it."""
         figures = self._session.editor.view.figures(key.frame)
         shown = key.frame == self._context.state.index
         return figures.loss if figures and shown and key.kind is not Kind.IGNORE_REGION else None

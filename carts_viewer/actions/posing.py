@@ -15,7 +15,7 @@ LARGEST_PERTURBATION = 30.0
 
 
 class PosingHandler(Handler):
-    """The handler that moves joints by hand."""
+    """Handler of joints moved by hand."""
 
     def _on_SetJoint(self, intent: intents.SetJoint) -> None:
         value = finite(intent.value)
@@ -73,7 +73,7 @@ _LEAST = 0.5
 
 
 class DraggingHandler(Handler):
-    """The handler that moves a link to where the pointer drags it.
+    """Handler of links that are dragged in the picture.
 
     Every place of a gesture starts from the pose in which the link was taken, so that the way there does not matter and
     dragging it back undoes it.
@@ -110,7 +110,7 @@ class DraggingHandler(Handler):
         context.set_pose(f"Drag {point.arm} {link}", fit.state, gesture=gesture)
 
     def _take(self, intent: intents.DragLink) -> None:
-        """Take hold of what is under the pointer."""
+        """Pick the link under the pointer."""
         state = self._context.state
         self._gesture, self._frame, self._start, self._point = intent.gesture, state.index, state.pose.scene, None
         self._point = self._context.renderer.pick(state.pose.scene, intent.camera, intent.start, _REACH)

@@ -42,7 +42,7 @@ class AnnotatingHandler(Handler):
         self._fitted: SceneState | None = None
         """The pose that the present pins have led to."""
         self._worst: int | None = None
-        """The frame that `ShowWorse` went to last; None after anything else has shown another one."""
+        """Frame last shown by `ShowWorse`; None after other navigation."""
 
     def released(self) -> None:
         """The pointer was let go of."""

@@ -34,11 +34,11 @@ class PropagatingHandler(Handler):
         """The project at the start of the run."""
 
     def wait_time(self) -> float | None:
-        """0 while frames are being solved; None when they are not."""
+        """0 while frames are being solved, otherwise None."""
         return None if self._run is None else 0.0
 
     def advance(self) -> None:
-        """Solve the next frame, if there is one.
+        """Solve the next frame, if any.
 
         Raises:
             CartsError: a frame is not usable, or the frames could not be saved. What was solved is saved if it can be.
@@ -47,7 +47,7 @@ class PropagatingHandler(Handler):
             next(self._work, None)
 
     def drop(self, reason: str) -> None:
-        """Forget what is being solved, if anything is."""
+        """Abort the run without saving."""
         if self._run is not None:
             self._run = None
             self._report(running=False, text=reason)
@@ -177,7 +177,7 @@ class PropagatingHandler(Handler):
             )
 
     def _save(self, run: SequenceRun, outcomes: Mapping[int, Outcome]) -> str:
-        """Save the frames that fit no worse than before as one step, list the others, and say so."""
+        """Save the frames that fit no worse than before as one step; returns a summary that counts the others."""
         self._context.save()
         edits: dict[Key[Any], Any] = {}
         figures: dict[int, Figures] = {}
@@ -240,7 +240,7 @@ def _deviations(project: ProjectState, index: int) -> dict[str, np.ndarray]:
 
 
 class MarkingHandler(Handler):
-    """The handler that marks keyframes."""
+    """Handler of keyframes and of the direction of solving."""
 
     def _on_HoldKeyframe(self, intent: intents.HoldKeyframe) -> None:
         state = self._context.state

@@ -106,7 +106,7 @@ class Comparison:
         self._check = FitCheck(session, optimizers)
 
     def outcome(self, estimate: FrameEstimate, run: SequenceRun, before: ProjectState, state: ViewState) -> Outcome:
-        """The better one of what was solved and a run on the frame alone, or how it was if both are worse.
+        """The best of the solved pose, a run on the frame alone, and the earlier pose.
 
         The run alone is only made where what was solved is worse than before, or not good.
 
@@ -144,7 +144,7 @@ class Comparison:
         return replace(fit, dice=min(known, default=None))
 
     def own_run(self, index: int, state: ViewState) -> Iterator[tuple[Fit, Edits, str | None] | None]:
-        """A run on one frame alone, from how it is: None after every step, at last its fit, edits and what is worse.
+        """Run on one frame alone: yields None after each step, then its fit, edits and how it is worse.
 
         Raises:
             CartsError: an image, the weights or a setting is not usable.

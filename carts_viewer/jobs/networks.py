@@ -1,4 +1,4 @@
-"""The networks that there are for a recording: those that the viewer was started with, and those adapted to it."""
+"""Networks of a recording: those that the viewer was started with, and adapted ones."""
 
 import json
 import re

@@ -99,7 +99,7 @@ class BrowsePanel:
         return _SOURCES[state.pose.source]
 
     def _describe(self, state: ViewState) -> str:
-        """The frame in words: its name, where its joints come from, and how well they fit the truth."""
+        """Text on the frame: name, source of its joint positions, and scores."""
         shown = f"Frame <b>{escaped(state.frame.frame_id)}</b> ({state.index + 1} of {self._count})"
         parts = [
             f"Live frame <b>{escaped(state.frame.frame_id)}</b>" if state.streaming else shown,

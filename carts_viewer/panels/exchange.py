@@ -23,7 +23,7 @@ _NOT_KEPT = "This project ends with the viewer, and its exports with it: downloa
 
 
 class ExportPanel:
-    """The mask of this frame, or frames in any format, with progress, a way to stop it and where it is."""
+    """Exports of frames in any format with progress, and of the shown frame's mask."""
 
     def __init__(self, page: PanelPage, session: Session, storage: Storage) -> None:
         gui = page.gui
@@ -114,7 +114,7 @@ _HINT = "Path in the recording's folder: a COCO (.json) or CVAT (.xml) file, key
 
 
 class ImportPanel:
-    """A path, a camera, a button, and what was imported last."""
+    """Import of masks: path, camera, and the last result."""
 
     def __init__(self, page: PanelPage, session: Session) -> None:
         gui = page.gui

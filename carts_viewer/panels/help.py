@@ -33,7 +33,7 @@ Special = Literal["perturb", "view"]
 
 @dataclass(frozen=True)
 class Shortcut:
-    """A key and what it does."""
+    """A keyboard shortcut."""
 
     hotkey: str
     label: str
@@ -118,7 +118,7 @@ _POINTER = (
 
 
 def key_groups() -> list[tuple[str, list[tuple[str, str]]]]:
-    """The shortcuts for the sheet of keys: group by group, each key with what it does."""
+    """Shortcuts for the sheet of keys: name of each group, with pairs of key and meaning."""
     groups: dict[str, list[tuple[str, str]]] = {name: [] for name in _GROUPS}
     groups["On the picture"] = list(_POINTER)
     order = ["Review", "Optimize", "Paint", "Frames", "View"]
@@ -269,7 +269,7 @@ HINTS = {
 
 
 def explain(page: PanelPage) -> list[str]:
-    """Give all controls of a tab their hints; gives the labels of those that have none, now or before.
+    """Set the hints of all controls of a tab; returns the labels of those without one.
 
     viser shows hints over fields alone, so the page's script shows those of buttons and over labels.
     """

@@ -1,4 +1,4 @@
-"""The traffic between widgets and intents: what a browser sends is checked, what we write is not taken for input."""
+"""Widgets that emit intents; values from a browser are checked, own writes emit nothing."""
 
 import math
 from collections.abc import Callable, Hashable
@@ -61,7 +61,7 @@ class PanelPage(TabPage):
 
 
 def valid(handle: Any, value: Any) -> bool:
-    """Whether a widget's own rules allow a value, as far as they are not numbers to be clamped."""
+    """Whether a value is finite and one of the widget's options."""
     if isinstance(value, float) and not math.isfinite(value):
         return False
     options = getattr(handle, "options", None) if isinstance(handle, viser.GuiDropdownHandle) else None

@@ -105,7 +105,7 @@ class JointsPanel:
     def _place(
         slider: viser.GuiSliderHandle[float], limits: JointRange, state: ViewState, measured: float, shown: float
     ) -> None:
-        """Put a slider's ends around the measured value, within the joint's limits, and the slider where it is.
+        """Set a slider's ends around the measured value, within the joint's limits, and its value.
 
         The ends reach as far as the shown value, and come back when it does; not during a drag, or what is under
         the pointer would be another value.
@@ -180,7 +180,7 @@ class ValuesPanel:
 
 
 def _signed(difference: float) -> str:
-    """With its sign, unless it is nothing to speak of."""
+    """Difference as signed text; without a sign where it rounds to zero."""
     return f"{difference:+.2f}" if abs(difference) >= 0.005 else "0.00"
 
 

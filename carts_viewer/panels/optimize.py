@@ -124,7 +124,7 @@ def status_line(state: ViewState) -> str:
 
 
 def undetermined_lines(state: ViewState, session: Session) -> str:
-    """Which unknowns the images of a run left open, and what it did to them, as HTML; empty while running."""
+    """Unknowns that the images of a run do not determine, with their changes, as HTML; empty while running."""
     known = None if state.maps is None or not state.maps.of_run else state.maps.iterate.uncertainty
     if known is None or state.run.phase is Phase.RUNNING:
         return ""
@@ -138,7 +138,7 @@ def undetermined_lines(state: ViewState, session: Session) -> str:
 
 
 def _moved(unknown: str, state: ViewState, session: Session) -> str:
-    """By how much a run has moved a joint, in brackets; nothing for other unknowns."""
+    """Change of a joint by a run, in brackets; empty for other unknowns."""
     arm, _, joint = unknown.partition("/")
     found = session.ranges.get(arm, ())
     places = [number for number, limits in enumerate(found) if limits.joint == joint]
@@ -217,7 +217,7 @@ class SettingsPanel:
             page.on_input(widget, lambda value, name=name: intents.SetSetting(name, value))
 
     def _show_error(self, state: ViewState) -> None:
-        """Say what is wrong right below the field that it is about."""
+        """Show the error below its field."""
         if self._error is not None:
             self._error.remove()
             self._error = None

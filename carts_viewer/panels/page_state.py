@@ -16,7 +16,7 @@ from carts_viewer.transport.tab_page import TabPage
 
 
 class PageState:
-    """Sends a tab what it needs to know, when it has changed."""
+    """Sends state to the page's scripts when it has changed."""
 
     def __init__(self, page: TabPage, session: Session) -> None:
         self._page = page

@@ -1,4 +1,4 @@
-"""Brush, eraser and polygon: which one is in hand, what it paints on, and what was painted on this frame."""
+"""Panel of the painting tools, their layer, and the pixels painted on this frame."""
 
 import viser
 

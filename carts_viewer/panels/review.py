@@ -35,7 +35,7 @@ _COLORS = {
 
 
 class ReviewPanel:
-    """Review state and note of the shown frame, where to go next, and how many frames are in which state."""
+    """Review state and note of the shown frame, navigation, and counts of frames by state."""
 
     def __init__(self, page: PanelPage) -> None:
         gui = page.gui
@@ -99,7 +99,7 @@ _BULK = {"Accept all": ReviewState.ACCEPTED, "Reject all": ReviewState.REJECTED,
 
 
 class FindPanel:
-    """Conditions, the frames that meet them as links, and buttons for all of those."""
+    """Conditions, links to the frames that meet them, and reviews of all of these."""
 
     def __init__(self, page: PanelPage, session: Session) -> None:
         gui = page.gui
@@ -137,7 +137,7 @@ class FindPanel:
             page.on_input(widget, lambda value, name=name: intents.SetFilter(name, value))
 
     def show(self, state: ViewState) -> None:
-        """Bring conditions and frames up to date; a gesture that is not finished changes nothing."""
+        """Update conditions and frames; unchanged during an unfinished gesture."""
         for name, widget in self._widgets.items():
             if not self._waits((intents.SetFilter, name)):
                 write(widget, getattr(state.filter, name))

@@ -15,7 +15,7 @@ from carts_viewer.transport.document import escaped
 
 
 class CalibrationHint:
-    """Stands below what found the suspicion, and is not there without one."""
+    """Warning of a wrong calibration with a *Calibrate* button and progress."""
 
     def __init__(self, page: PanelPage, session: Session) -> None:
         frames = min(intents.Calibrate().frames, len(session.sequence))

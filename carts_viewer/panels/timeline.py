@@ -64,7 +64,7 @@ class Traces:
         return other
 
     def follow(self, project: ProjectState, frames: Iterable[int]) -> None:
-        """Take what a project says of these frames."""
+        """Update the values of these frames from a project."""
         for frame in frames:
             figures, verdict = project.figures(frame), project.verdict(frame)
             values = (
@@ -111,7 +111,7 @@ def _extremes(values: np.ndarray, edges: np.ndarray) -> list[list[float | None]]
 
 
 HEIGHT = 64
-"""[px]; shown smaller, so that they stay sharp where a CSS pixel is more than one of the screen."""
+"""[px]; shown smaller, for screens with more than one pixel per CSS pixel."""
 _MOST = 4000
 """Number of cached thumbnails of some 3 kB; the least recently used go first."""
 _QUALITY = 70
@@ -131,7 +131,7 @@ class Thumbnails:
         self._thread = ThreadPoolExecutor(1, "carts-thumbnails")
 
     async def answer(self, path: str) -> Response:
-        """The picture at `CAMERA/DOMAIN/FRAME.jpg`, all of them numbers from 0, or that there is none."""
+        """The picture at `CAMERA/DOMAIN/FRAME.jpg`, all numbers from 0, or status 404."""
         content = self._find(path)
         if content is None:
             try:
@@ -197,7 +197,7 @@ _MOST_IDS = 5000
 
 
 class TimelineData:
-    """Sends a tab what is known of the frames, whole at first, and then what has changed."""
+    """Sends the codes of all frames to a tab, then changes."""
 
     def __init__(self, page: TabPage, session: Session) -> None:
         self._page = page
@@ -215,7 +215,7 @@ class TimelineData:
         page.call("setTimeline", self._whole())
 
     def show(self, state: ViewState) -> None:
-        """Send what has changed; a gesture that is not finished changes its own frame alone."""
+        """Send changes; an unfinished gesture changes its own frame only."""
         solving = None
         if state.solve is not None and state.solving:
             solving = [state.solve.frames[0], len(state.solve.frames), state.solve.done]

@@ -1,1 +1,1 @@
-"""What the picture shows: layers, overlays, the 3D scene, and strokes."""
+"""Layers, overlays, strokes, and the 3D scene."""

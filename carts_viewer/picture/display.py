@@ -49,7 +49,7 @@ class PageDisplay:
         return self._rate_limit.ready_in()
 
     def show_picture(self, state: ViewState) -> None:
-        """Send frame, overlay and 3D scene, as far as they changed."""
+        """Send changes of frame, overlay and 3D scene."""
         old = self._shown
         camera = self._scene.camera(state.camera)
         new_frame = old is None or state.frame is not old.frame
@@ -116,7 +116,7 @@ class PageDisplay:
         return imported(labels, () if points is None else points.points, (own.height, own.width), state.opacity)
 
     def _show_others(self, state: ViewState, old: ViewState | None, overlays: Mapping[str, Rgba]) -> None:
-        """The images of the other cameras, as far as they are to be seen."""
+        """Show or hide the images of the other cameras."""
         active = self._scene.camera(state.camera)
         again = old is None or old.frame is not state.frame or old.camera != state.camera or not old.beside
         for camera in self._scene.cameras:

@@ -59,7 +59,7 @@ def small_jpeg(
 
 
 def nothing(height: int, width: int) -> Rgba:
-    """A picture that hides nothing."""
+    """A fully transparent picture."""
     return np.zeros((height, width, 4), np.uint8)
 
 

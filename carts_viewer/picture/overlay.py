@@ -106,7 +106,7 @@ class OverlayRenderer:
         return pick_point(self._scene, self._renderer(camera), state.to("cpu"), pixel, radius)
 
     def scores(self, state: SceneState, frame: Frame, camera: str, correction: MaskCorrection | None = None) -> Scores:
-        """How close the pose and its corrected mask are to the frame's truth, as far as there is one."""
+        """Scores of the pose and its corrected mask against the frame's truth."""
         mask = None if frame.masks is None else frame.masks.get(camera)
         overlap = None if mask is None else dice(self.mask(state, camera, correction), mask)
         others = {

@@ -46,7 +46,7 @@ _SPACING = 1.01
 
 
 class SceneView:
-    """What a tab sees; it chooses for itself from where."""
+    """3D scene of a tab."""
 
     def __init__(self, shown: viser.SceneApi, scene: Scene, state: SceneState, camera: str) -> None:
         """`state` decides how far from the lens the frame is put."""
@@ -86,7 +86,7 @@ class SceneView:
                 self._plane(f"{root}/{node}", picture, (camera, active), size, position, kind)
 
     def hide_beside(self, camera: Camera) -> None:
-        """Take away what lies beside the active camera's image of this camera."""
+        """Remove the image and overlay of this camera."""
         number = [own.name for own in self._scene.cameras].index(camera.name)
         for node in ("frame", "overlay"):
             known = self._planes.pop(f"{OTHERS}/{number}/{node}", None)
@@ -137,7 +137,7 @@ class SceneView:
                 _place(node, T_world_base @ T_base_link)
 
     def _stays(self, name: str, place: bytes) -> bool:
-        """Whether what has this name is at this very place already."""
+        """Whether the node of this name has not moved since the last call."""
         before, self._places[name] = self._places.get(name), place
         return before == place
 

@@ -27,7 +27,7 @@ _Count = Annotated[int, msgspec.Meta(ge=0, lt=2**53)]
 
 
 class Tool(StrEnum):
-    """What the pointer does to the picture; the value is the label in the page."""
+    """Tool of the pointer; the value is its label."""
 
     OFF = "Off"
     BRUSH = "Brush"
@@ -76,7 +76,7 @@ class Stroke:
     label: int = 0
     """Number of the class that it paints; 0: any arm."""
     prompt: bool = False
-    """Whether its one point, or the box between its two, says where something is that is to be segmented."""
+    """Whether its point, or the box between its two points, is a prompt to the segmenter."""
 
     def covers(self, camera: Camera) -> Mask:
         """The pixels of the camera's image that it covers."""

@@ -22,7 +22,7 @@ _WORST = 12
 _SHOWN = 500
 """Jobs that are listed."""
 _SEPARATOR = "\n"
-"""Between a job and a frame in what a button says; neither has one in its name."""
+"""Separates job and frame in the value of a button; no name contains it."""
 
 
 class BatchPage:
@@ -69,10 +69,10 @@ class BatchPage:
         self.show()
 
     def click(self, u: float, v: float) -> None:
-        """There is no image here."""
+        """No image is shown."""
 
     def fail(self, error: Exception) -> None:
-        """Show what went wrong."""
+        """Show an error."""
         self._problem = str(error) or type(error).__name__
         self.show()
 

@@ -24,10 +24,10 @@ class SitePage(Protocol):
         """Handle a click in the image, at shares of its width and height."""
 
     def fail(self, error: Exception) -> None:
-        """Show what went wrong."""
+        """Show an error."""
 
     def close(self) -> None:
-        """Keep what is to be kept."""
+        """Close the page, keeping its draft."""
 
 
 class Host(Protocol):
@@ -123,7 +123,7 @@ class FileBrowser:
 
     @property
     def at_top(self) -> bool:
-        """Whether there is no way up."""
+        """Whether the folder has no parent to list."""
         return self.parent is None and len(self.roots.folders) == 1
 
     def entries(self) -> list[Entry]:

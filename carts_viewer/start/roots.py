@@ -1,4 +1,4 @@
-"""The folders that a person has allowed the page to look into, and nothing outside of them."""
+"""Folders that the user has allowed the page to read."""
 
 import os
 import stat
@@ -38,7 +38,7 @@ class Entry:
 
 
 class Roots:
-    """Allowed folders. Links are not followed, wherever they lead, so that nothing outside can be reached."""
+    """Allowed folders; links are not followed, so nothing outside can be reached."""
 
     def __init__(self, folders: Sequence[Path]) -> None:
         """
@@ -55,7 +55,7 @@ class Roots:
         self.folders = tuple(dict.fromkeys(folder.resolve() for folder in folders))
 
     def checked(self, text: str | Path) -> Path:
-        """An absolute path below one of the folders, on the way to which there is no link and nothing hidden.
+        """An absolute path below one of the folders, without links and hidden folders on its way.
 
         Raises:
             SettingsError: it is outside, is not there, or has a link or a hidden folder on its way.

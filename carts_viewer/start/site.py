@@ -91,7 +91,7 @@ class Site:
             raise TimeoutError(f"The page was still busy after {timeout} s.")
 
     def close(self) -> None:
-        """Save what is under way, and stop the server.
+        """Save and stop the server.
 
         Raises:
             ProjectError: corrections could not be saved.
@@ -150,7 +150,7 @@ class Site:
         self.page.reload()
 
     def _go(self, make: Callable[[], SitePage]) -> None:
-        """Leave what is shown for another page."""
+        """Close the shown page and show another one."""
         self._leave()
         again = not self._listening
         if again:

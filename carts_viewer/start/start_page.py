@@ -57,7 +57,7 @@ class RecentProject:
 
 
 def recent_projects() -> list[RecentProject]:
-    """Those whose sequence files are still there, the newest first; none where the list cannot be read."""
+    """Projects with existing sequence files, the newest first; empty if the list cannot be read."""
     try:
         return [each for each in _read() if is_regular(Path(each.sequence))]
     except (OSError, ValueError):
@@ -221,10 +221,10 @@ class StartPage:
         self._browser = None if self._browser is not None else new
 
     def click(self, u: float, v: float) -> None:
-        """There is no image here."""
+        """No image is shown."""
 
     def fail(self, error: Exception) -> None:
-        """Show what went wrong."""
+        """Show an error."""
         self._problem = str(error) or type(error).__name__
         self.show()
 

@@ -83,7 +83,7 @@ class Media:
         return MEDIA + name
 
     def answer(self, name: str) -> Response:
-        """The picture of a name, or that there is none."""
+        """The picture of a name, or status 404."""
         with self._lock:
             content = self._contents.get(name)
         if content is None:
@@ -178,7 +178,7 @@ class Page:
         initial.up, initial.position, initial.look_at = (0.0, -1.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.1)
 
     def reload(self) -> None:
-        """Have every tab load the page anew, at no place of the recording that was shown.
+        """Reload the page in every tab, without the frame in its address.
 
         A tab that has loaded the page and is not connected yet does so when it is.
         """

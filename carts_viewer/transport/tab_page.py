@@ -43,7 +43,7 @@ class TabPage:
         return self.client.atomic()
 
     def flush(self) -> None:
-        """Send what waits."""
+        """Send queued messages."""
         self.client.flush()
 
     def widgets(self) -> list[Any]:

@@ -103,14 +103,14 @@ class LoopEvent(asyncio.Event):
 
 @dataclasses.dataclass
 class MessageBuffer(AsyncMessageBuffer):
-    """The toolkit's queue with such an event."""
+    """viser's queue with a `LoopEvent`."""
 
     def __post_init__(self) -> None:
         self.message_event = LoopEvent(self.event_loop)
 
 
 def queue_safely() -> None:
-    """Have every server that starts from now on, and every tab that joins it, use such queues."""
+    """Use `MessageBuffer` in all servers that start later."""
     # A tab that has just gone is normal, and what was on its way to it is no loss.
     warnings.filterwarnings("ignore", message="Queued a .* on a closed connection", category=UserWarning)
     _infra.AsyncMessageBuffer = MessageBuffer  # pyright: ignore[reportAttributeAccessIssue, reportPrivateImportUsage]

@@ -166,7 +166,7 @@ class CalibrationReport:
     disagreeing: tuple[int, ...]
     """Points whose residual has grown beyond what noise explains."""
     objection: str
-    """Why the points speak against the calibration; empty where they agree."""
+    """Why the points contradict the calibration; empty where they agree."""
 
 
 def report_of(result: CalibrationResult, clicking: Clicking, points: Rows[ImagePoint]) -> CalibrationReport:
@@ -199,7 +199,7 @@ def report_of(result: CalibrationResult, clicking: Clicking, points: Rows[ImageP
 def _objection(
     result: CalibrationResult, compared: PointAgreement, clicking: Clicking, points: Rows[ImagePoint]
 ) -> str:
-    """Why the points speak against the calibration; empty where they agree."""
+    """Why the points contradict the calibration; empty where they agree."""
     before, after, limits = compared.before, compared.after, compared.limits
     if compared.disagreeing and not compared.agrees:
         worst = max(compared.disagreeing, key=lambda row: after[row] / limits[row])

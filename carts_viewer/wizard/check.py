@@ -136,7 +136,7 @@ class Guess:
 
 
 def guess(draft: Draft) -> Guess:
-    """Read what a draft names; never raises for what is wrong with the files."""
+    """Read the files of a draft; problems are in the result."""
     source = Path(draft.source)
     try:
         kind = detect(source, draft.options.source).name
@@ -230,7 +230,7 @@ def estimated_delay(recording: FoundRecording) -> TimeOffsetEstimate:
 def check_form(
     draft: Draft, guess: Guess, pictures: dict[str, list[tuple[str, str]]], delay: TimeOffsetEstimate | None = None
 ) -> str:
-    """HTML of all that was found, part by part, with its problems and with what can be changed."""
+    """HTML of the form: contents of the files by part, problems, and controls."""
     table = {} if guess.table is None else guess.table.columns
     return render(
         "check.html",

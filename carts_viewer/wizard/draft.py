@@ -1,4 +1,4 @@
-"""Drafts of New recording: what a user has chosen, kept in a file after each change."""
+"""Drafts of New recording: choices of the user, saved after each change."""
 
 import json
 import math
@@ -160,7 +160,7 @@ def delete_draft(key: str) -> None:
 
 
 def _texts(value: Any) -> Iterator[str]:
-    """All texts in what JSON gave."""
+    """All strings in a JSON value."""
     if isinstance(value, str):
         yield value
     for part in value.values() if isinstance(value, dict) else value if isinstance(value, list) else ():

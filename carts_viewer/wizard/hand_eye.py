@@ -147,7 +147,7 @@ Calibrated = Callable[[Callable[[Draft], Draft]], None]
 
 
 class HandEyeStep:
-    """The recording opened, with what was clicked in it.
+    """Clicks in the images of a recording, and their calibration.
 
     Attributes:
         problem: what went wrong last; empty without one.
@@ -198,7 +198,7 @@ class HandEyeStep:
         self._host.document.show(content, "side")
 
     def clicked(self, draft: Draft, u: float, v: float) -> Draft:
-        """The draft with what was asked for at this place; a click where nothing is asked for changes nothing."""
+        """The draft with the prompted point at this place; unchanged without a prompt."""
         prompt, self.problem = self.prompt(draft), ""
         if prompt is None or self._running() or not (0.0 <= u <= 1.0 and 0.0 <= v <= 1.0):
             return draft
@@ -288,7 +288,7 @@ class HandEyeStep:
         return self._wanted or self._clicking.next_prompt(draft.points, self._skipped)
 
     def _skip_frame(self, draft: Draft, prompt: ClickPrompt) -> None:
-        """Ask for the same in a frame that nothing is asked about yet, next to this one."""
+        """Move the prompts to the nearest unused frame."""
         used = {(entry.camera, entry.frame) for entry in self._clicking.plan}
         used |= {(point.camera, point.frame) for point in draft.points}
         frames = range(len(self._sequence))
@@ -300,7 +300,7 @@ class HandEyeStep:
         self._wanted = None
 
     def _look(self, at: ClickPrompt, which: str, value: str) -> None:
-        """Ask for what a person has chosen."""
+        """Prompt for the chosen point."""
         names = {
             "camera": [camera.name for camera in self._sequence.scene.cameras],
             "frame": [str(index) for index in range(len(self._sequence))],

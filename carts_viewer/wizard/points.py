@@ -46,7 +46,7 @@ class Clicking:
 
     @property
     def scene(self) -> Scene:
-        """With what is known of the calibration."""
+        """The scene with the calibration so far."""
         return self.sequence.scene if self.result is None else self.result.scene
 
     def free_focal_length(self, free: bool) -> None:
@@ -83,7 +83,7 @@ class Clicking:
 
 
 def unknown_cameras(scene: Scene) -> tuple[str, ...]:
-    """Cameras but the first whose pose relative to it nothing says: it is the very same."""
+    """Cameras with unknown pose: the same as that of the first camera."""
     first = scene.cameras[0]
     return tuple(
         camera.name for camera in scene.cameras[1:] if np.array_equal(camera.T_camera_world, first.T_camera_world)

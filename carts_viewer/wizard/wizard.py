@@ -129,14 +129,14 @@ class RecordingWizard:
                 self._set(changed(self._draft, name, value, columns) or self._draft)
 
     def click(self, u: float, v: float) -> None:
-        """A point of the arm, where one is asked for."""
+        """Place the prompted point."""
         if self._step is not None and self._draft.step is Step.HAND_EYE:
             self._problem = ""
             self._set(self._step.clicked(self._draft, u, v))
             self.show()
 
     def fail(self, error: Exception) -> None:
-        """Show what went wrong."""
+        """Show an error."""
         self._problem = str(error) or type(error).__name__
         if self._step is not None:
             self._step.problem = self._problem
@@ -147,7 +147,7 @@ class RecordingWizard:
         self._leave_hand_eye()
 
     def _set(self, draft: Draft) -> None:
-        """Go on with another draft; the present one can be gone back to."""
+        """Replace the draft; undo restores the present one."""
         if draft == self._draft:
             return
         self._undo = [*self._undo, self._draft][-_MOST_UNDO:]
@@ -269,7 +269,7 @@ class RecordingWizard:
         self.show()
 
     def _calibrated(self, draft_change: Callable[[Draft], Draft]) -> None:
-        """The calibration has something to say; called on the site's thread."""
+        """Apply a calibration's progress or result; called on the site's thread."""
         if self._step is not None and self._draft.step is Step.HAND_EYE:
             self._set(draft_change(self._draft))
             self.show()
