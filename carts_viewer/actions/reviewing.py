@@ -195,13 +195,6 @@ class AnnotatingHandler(Handler):
 
 _LONGEST = 200
 """Of a text that is looked for, in characters."""
-_STEPS = {
-    ReviewState.ACCEPTED: "Accept",
-    ReviewState.REJECTED: "Reject",
-    ReviewState.NEEDS_WORK: "Mark as needing work",
-    ReviewState.UNTOUCHED: "Clear the review of",
-    ReviewState.OPTIMIZED: "Mark as optimized",
-}
 
 
 class FindingHandler(Handler):
@@ -239,7 +232,8 @@ class FindingHandler(Handler):
             edits[Key.review(index)] = None if review == Review() else review
         # All frames in a name would be a long one.
         self._context.save()
-        self._context.session.editor.apply(f"{_STEPS[intent.state]} {len(frames)} frames", edits)
+        of = " of" if intent.state is ReviewState.UNTOUCHED else ""
+        self._context.session.editor.apply(f"{_REVIEW_STEPS[intent.state]}{of} {len(frames)} frames", edits)
         self._context.refresh()
 
     def _found(self) -> list[int]:

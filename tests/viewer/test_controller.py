@@ -52,7 +52,7 @@ def test_numbers_out_of_range_are_clamped(desk: Desk) -> None:
     assert desk.do(intents.SetOpacity(7.0)).opacity == 1.0
     assert desk.do(intents.SetSpeed(1e9)).fps <= 60.0
     desk.do(intents.SetJoint("PSM1", 0, 1e9))
-    assert desk.joint() == pytest.approx(desk.session.joint_range("PSM1", 0).upper, abs=1e-6)
+    assert desk.joint() == pytest.approx(desk.session.ranges["PSM1"][0].upper, abs=1e-6)
 
 
 def test_a_correction_survives_a_visit_to_other_frames_cameras_and_domains(desk: Desk) -> None:

@@ -94,7 +94,7 @@ def test_a_copied_correction_moves_the_measured_joints_by_as_much(session: Sessi
 
 @pytest.mark.parametrize("value", [1e6, -1e6])
 def test_a_joint_cannot_leave_its_limits(session: Session, value: float) -> None:
-    limits = session.joint_range("PSM1", 0)
+    limits = session.ranges["PSM1"][0]
     moved = session.joints(session.with_joint(_pose(session, 0).scene, "PSM1", 0, value))["PSM1"][0]
     assert moved == pytest.approx(limits.upper if value > 0 else limits.lower, abs=1e-6)
 
