@@ -1,8 +1,14 @@
-"""The queue between people and the worker."""
+"""The queue of intents, and their handlers."""
 
+import inspect
+import pkgutil
 import threading
 import time
+from importlib import import_module
 
+from carts_viewer import actions, controller
+from carts_viewer.actions import intents
+from carts_viewer.actions.context import Handler
 from carts_viewer.actions.intents import Intent, MoveFrame, SetJoint, SetOpacity, ShowFrame
 from carts_viewer.tabs import IntentQueue
 
@@ -61,3 +67,16 @@ def test_a_wait_can_be_ended_with_nothing() -> None:
     queue = IntentQueue[str]()
     threading.Thread(target=lambda: (time.sleep(0.05), queue.wake())).start()
     assert _taken(queue, 20) == []
+
+
+def test_every_intent_has_a_handler() -> None:
+    modules = [
+        controller,
+        *(import_module(f"carts_viewer.actions.{each.name}") for each in pkgutil.iter_modules(actions.__path__)),
+    ]
+    handlers = {
+        one for module in modules for one in vars(module).values() if inspect.isclass(one) and issubclass(one, Handler)
+    }
+    handled = {name.removeprefix("_on_") for handler in handlers for name in vars(handler) if name.startswith("_on_")}
+    kinds = {kind for kind in vars(intents).values() if inspect.isclass(kind) and issubclass(kind, Intent)}
+    assert handled == {kind.__name__ for kind in kinds if not any(base in kind.__subclasses__() for base in kinds)}
