@@ -17,6 +17,7 @@ from carts_core.cli.batch_job import BatchWork
 from carts_core.errors import CartsError
 from carts_core.files import output_path
 from carts_viewer.start.site import Site
+from carts_viewer.transport.events import Chosen
 
 NOTE_NOTES = """
 new MutationObserver((changes) => {
@@ -123,7 +124,7 @@ def test_a_recording_outside_of_the_allowed_folders_is_not_opened(batch: Path, t
         site.wait()
         place = site.shown
         assert place is not None
-        site.post(lambda: site._chosen("review", content["jobs"][0]["name"]))
+        site.post(lambda: site._dispatch(Chosen("review", content["jobs"][0]["name"])))
         site.wait()
         assert site.app is None and "outside of the allowed folders" in site.document.content
 

@@ -27,6 +27,7 @@ from carts_viewer.jobs.job_list import JobState
 from carts_viewer.jobs.networks import STARTED
 from carts_viewer.start.site import Site
 from carts_viewer.start.start_page import RecentProject
+from carts_viewer.transport.events import Chosen
 from carts_viewer.wizard.draft import Draft, Step
 from tools.raw_tab import RawTab
 
@@ -287,7 +288,7 @@ class World:
             self.do(lambda: self.site.show_recording("0123"))
             if problem := self.serves():
                 return problem
-            self.do(lambda: self.site._chosen("continue", ""))
+            self.do(lambda: self.site._dispatch(Chosen("continue", "")))
         return self.serves()
 
     def open_decision(self, case: Case, place: Path) -> str:
@@ -343,7 +344,7 @@ class World:
             return "nothing is said"
         if name in ("job.json", "findings.json") and case.wrong in NEVER and not said:
             return "nothing is said"
-        self.do(lambda: self.site._chosen("review", job.name))
+        self.do(lambda: self.site._dispatch(Chosen("review", job.name)))
         app = self.site.app
         if app is not None and any(not one.over for one in app.state.jobs):
             return "a job starts"

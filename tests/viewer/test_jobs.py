@@ -21,6 +21,7 @@ from carts_viewer.jobs.companions import Decisions
 from carts_viewer.jobs.job_list import (
     AdaptOptions,
     CalibrateOptions,
+    ExportOptions,
     Job,
     JobList,
     JobState,
@@ -123,7 +124,7 @@ def test_after_the_viewer_was_killed_waiting_jobs_wait_and_the_one_that_ran_is_s
         (("calibrate", {"frames": -3}), CalibrateOptions(1)),
         (("adapt", {"minutes": 10**9, "folder": 0}), AdaptOptions(240, 1)),
         (("solve", {"at": 99, "range": [5, -5]}), SolveOptions(False, 2, (0, 2))),
-        (("export", {**EXPORT, "range": [9, 1]}), intents.Export("csv", "All", range=(1, 2))),
+        (("export", {**EXPORT, "range": [9, 1]}), ExportOptions("csv", "All", range=(1, 2))),
     ],
 )
 def test_options_of_a_job_are_clamped_as_in_the_page(options: tuple[str, dict], read: object) -> None:
