@@ -17,7 +17,12 @@ _NONE = "None"
 _LISTED = 5
 """Jobs that a question names."""
 _UNREVIEWED, _RANGE = "Unreviewed", "Range in the timeline"
-_FRAMES = {_UNREVIEWED: "unreviewed", "Found (Review, Find)": "found", _RANGE: "range", "All": "all"}
+_FRAMES: dict[str, intents.Frames] = {
+    _UNREVIEWED: "unreviewed",
+    "Found (Review, Find)": "found",
+    _RANGE: "range",
+    "All": "all",
+}
 
 
 class JobsPanel:

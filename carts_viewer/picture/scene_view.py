@@ -5,7 +5,7 @@ along z, whatever camera is shown; the recording's own world is a node that move
 """
 
 from collections.abc import Callable
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import viser
@@ -141,7 +141,7 @@ class SceneView:
         before, self._places[name] = self._places.get(name), place
         return before == place
 
-    def _put(self, name: str, image: np.ndarray, camera: Camera, z: float, kind: Literal["jpeg", "png"]) -> None:
+    def _put(self, name: str, image: np.ndarray, camera: Camera, z: float, kind: str) -> None:
         """Show an image as a plane at depth z that K projects exactly onto the image's own pixels."""
         fx, fy, cx, cy = camera.intrinsics
         size = (camera.width / fx * z, camera.height / fy * z)
@@ -156,7 +156,7 @@ class SceneView:
         cameras: tuple[Camera, ...],
         size: tuple[float, float],
         position: tuple[float, float, float],
-        kind: Literal["jpeg", "png"],
+        kind: str,
     ) -> bool:
         """Show an image as a plane [m]; whether it is a new one, as with other cameras than before."""
         if name in self._planes and self._planes[name][0] == cameras:
@@ -166,7 +166,7 @@ class SceneView:
             name,
             image,
             *size,
-            format=kind,
+            format="jpeg" if kind == "jpeg" else "png",
             jpeg_quality=_JPEG_QUALITY,
             position=position,
             cast_shadow=False,
