@@ -109,19 +109,13 @@ def _pixel(at: tuple[float, float], camera: Camera) -> tuple[float, float]:
     return at[0] * camera.width, at[1] * camera.height
 
 
-class ViewerOptions(NetworkOptions, total=False):
-    """Options of a viewer."""
+class ServerOptions(NetworkOptions, total=False):
+    """Options of the networks and of the server."""
 
     host: str
     """Address to listen on, 127.0.0.1 by default; one that other computers can reach makes the url carry a token."""
     port: int
     """Port to listen on, 8080 by default; 0 picks a free port, a busy one moves up to the next free one."""
-    report: Callable[[str], None]
-    """Called with a line for the user about long operations."""
-    page: Page | None
-    """An empty page that is served already, and stays when the viewer is closed; None to serve a new one."""
-    folders: tuple[Path, ...]
-    """Folders that masks may be imported from, besides the sequence's own folder."""
 
 
 class ViewerApp:
@@ -148,7 +142,7 @@ class ViewerApp:
         folders: tuple[Path, ...] = (),
         **networks: Unpack[NetworkOptions],
     ) -> None:
-        """Start serving an open sequence with its project, which is closed with the viewer; see `ViewerOptions`."""
+        """Start serving an open sequence with its project, which is closed with the viewer; see `open`."""
         self._report = report
         self._own_page = page is None
         self._closed = False
@@ -174,18 +168,29 @@ class ViewerApp:
         self._worker.start(self._prepare)
 
     @classmethod
-    def open(cls, path: Path, *, project: Path | None = None, **options: Unpack[ViewerOptions]) -> "ViewerApp":
+    def open(
+        cls,
+        path: Path,
+        *,
+        project: Path | None = None,
+        report: Callable[[str], None] = lambda line: None,
+        page: Page | None = None,
+        folders: tuple[Path, ...] = (),
+        **options: Unpack[ServerOptions],
+    ) -> "ViewerApp":
         """Open a sequence file and serve its viewer.
 
         Args:
             path: The sequence file.
             project: The project file, begun if it is not there; None for the default place.
-            options: See `ViewerOptions`.
+            report: Called with a line for the user about long operations.
+            page: An empty page that is served already, and stays when the viewer is closed; None to serve a new one.
+            folders: Folders that masks may be imported from, besides the sequence's own folder.
+            options: See `ServerOptions`.
 
         Raises:
             CartsError: the sequence, its robot, its project or an option is not usable.
         """
-        report = options.get("report", lambda line: None)
         check_address(options.get("host", "127.0.0.1"), options.get("port", 8080))
         report(f"Opening {path}")
         sequence = Sequence.open(path, progress=report)
@@ -195,7 +200,7 @@ class ViewerApp:
         if storage.notice is not None:
             report(storage.notice)
         try:
-            return cls(sequence, storage, **options)
+            return cls(sequence, storage, report=report, page=page, folders=folders, **options)
         except BaseException:
             storage.close()
             raise

@@ -17,22 +17,28 @@ from typing import TYPE_CHECKING, Any, TextIO, Unpack
 from carts_core.console import log_to_stderr, visible
 from carts_core.errors import CartsError
 from carts_core.files import write_text
-from carts_viewer.app import ViewerApp, ViewerOptions
+from carts_viewer.app import ServerOptions, ViewerApp
 
 if TYPE_CHECKING:
     from carts_viewer.start.site import Site
 
 
 def serve(
-    sequence: Path, *, project: Path | None = None, open_browser: bool = False, **options: Unpack[ViewerOptions]
+    sequence: Path,
+    *,
+    project: Path | None = None,
+    folders: tuple[Path, ...] = (),
+    open_browser: bool = False,
+    **options: Unpack[ServerOptions],
 ) -> None:
     """Serve the viewer of a sequence until Ctrl-C, SIGTERM or SIGHUP, then save; prints where it is.
 
     Args:
         sequence: The sequence file.
         project: The project file, begun if it is not there; None for the default place.
+        folders: From where masks may be imported, besides the sequence's own folder.
         open_browser: Open the page in the default browser.
-        options: See `ViewerOptions`.
+        options: See `ServerOptions`.
 
     Raises:
         SystemExit: after a message on stderr, with code 2 when the sequence or an option is not usable, and with code 1
@@ -40,14 +46,14 @@ def serve(
     """
     began = time.monotonic()
     _serve(
-        lambda: ViewerApp.open(sequence, project=project, report=_say_doing, **options),
+        lambda: ViewerApp.open(sequence, project=project, folders=folders, report=_say_doing, **options),
         lambda: f"Ready after {time.monotonic() - began:.1f} s.",
         open_browser=open_browser,
     )
 
 
 def serve_site(
-    folders: Sequence[Path], *, batch: Path | None = None, open_browser: bool = False, **options: Unpack[ViewerOptions]
+    folders: Sequence[Path], *, batch: Path | None = None, open_browser: bool = False, **options: Unpack[ServerOptions]
 ) -> None:
     """Serve the start page, or a batch, until Ctrl-C, SIGTERM or SIGHUP, then save; prints where it is.
 
@@ -55,7 +61,7 @@ def serve_site(
         folders: What the page may look into, and nothing outside.
         batch: Folder of the batch that is shown first; None for the start page.
         open_browser: Open the page in the default browser.
-        options: See `ViewerOptions`.
+        options: See `ServerOptions`.
 
     Raises:
         SystemExit: as `serve`.

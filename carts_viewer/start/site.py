@@ -16,7 +16,7 @@ from carts_core.networks import FeatureExtractor
 from carts_core.process import return_memory
 from carts_core.resources import sample_sequence
 from carts_viewer.actions import intents
-from carts_viewer.app import ViewerApp, ViewerOptions
+from carts_viewer.app import ServerOptions, ViewerApp
 from carts_viewer.jobs.optimizers import NetworkOptions, OptimizerFactory
 from carts_viewer.start.batch_page import BatchPage
 from carts_viewer.start.host import SitePage
@@ -43,13 +43,21 @@ class Site:
         incident: where corrections of a sequence that was left are kept instead, if they are not in its project.
     """
 
-    def __init__(self, folders: Sequence[Path], *, batch: Path | None = None, **options: Unpack[ViewerOptions]) -> None:
+    def __init__(
+        self,
+        folders: Sequence[Path],
+        *,
+        batch: Path | None = None,
+        report: Callable[[str], None] = lambda line: None,
+        **options: Unpack[ServerOptions],
+    ) -> None:
         """Start serving the start page, or a batch.
 
         Args:
             folders: the allowed folders.
             batch: folder of the batch that is shown first.
-            options: see `ViewerOptions`; without `page` and `folders`.
+            report: called with a line for the user about long operations.
+            options: see `ServerOptions`.
 
         Raises:
             SettingsError: a folder is not there, or the address is not usable.
@@ -57,8 +65,7 @@ class Site:
         self.roots = Roots(folders)
         self.page = Page(host=options.get("host", "127.0.0.1"), port=options.get("port", 8080), title="CaRTS")
         self.document = Document(self.page)
-        self._report = options.get("report", lambda line: None)
-        self._options: ViewerOptions = {**options, "page": self.page, "folders": self.roots.folders}
+        self._report, self._options = report, options
         self.url = self.page.url
         self.app: ViewerApp | None = None
         self.incident: str | None = None
@@ -134,7 +141,14 @@ class Site:
             self._leave()
             self._listening = False
             self.page.clear(f"{path.stem} · CaRTS")
-            app = ViewerApp.open(path, project=project, **self._options)
+            app = ViewerApp.open(
+                path,
+                project=project,
+                report=self._report,
+                page=self.page,
+                folders=self.roots.folders,
+                **self._options,
+            )
         except CartsError as error:
             self._report(str(error))
             self.show_start(str(error))
