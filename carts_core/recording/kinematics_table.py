@@ -4,8 +4,8 @@ import csv
 import io
 import math
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from functools import lru_cache
 from itertools import combinations
 from operator import itemgetter
@@ -40,23 +40,11 @@ class Table:
         return len(self.rows)
 
     def text(self, column: str, asked_by: str) -> list[str]:
-        """The cells of a column.
-
-        Args:
-            column: its name in the header.
-            asked_by: the key that names the column, for errors.
-
-        Raises:
-            SequenceError: there is no such column.
-        """
+        """The cells of a column."""
         return [cell.strip() for cell in self._cells(column, asked_by)]
 
     def numbers(self, column: str, asked_by: str) -> Float[np.ndarray, " rows"]:
-        """The values of a column.
-
-        Raises:
-            SequenceError: there is no such column, or a cell is not a finite number.
-        """
+        """The values of a column."""
         try:
             values = np.fromiter(map(float, self._cells(column, asked_by)), np.float64, len(self))
         except ValueError:
@@ -81,11 +69,7 @@ class Table:
 
 
 def read_table(path: Path, delimiter: str = ",", what: str = "kinematics table") -> Table:
-    """Read a CSV file, named `what` in errors; blank lines are skipped.
-
-    Raises:
-        SequenceError: missing, empty, not text, columns with the same name, or a row of another length.
-    """
+    """Read a CSV file, named `what` in errors; blank lines are skipped."""
     try:
         with io.TextIOWrapper(open_regular(path, TABLE), encoding="utf-8-sig", newline="") as handle:
             reader = csv.reader(handle, delimiter=delimiter, skipinitialspace=True)
@@ -160,9 +144,19 @@ class Joint:
     upper: float
 
     @property
+    def kind(self) -> str:
+        """Type of the joint, as `Robot.joint_types` has it."""
+        return "revolute" if self.revolute else "prismatic"
+
+    @property
     def unit(self) -> str:
         """SI unit of the joint."""
         return "rad" if self.revolute else "m"
+
+    @property
+    def units(self) -> Mapping[str, float]:
+        """Unit -> [rad], [m]; without percent."""
+        return ANGLE_UNITS if self.revolute else LENGTH_UNITS
 
     def beyond(self, values: Float[np.ndarray, " rows"], share: float = _BEYOND) -> np.ndarray:
         """Positions [rad], [m] that exceed the limits by more than a share of their range."""
@@ -181,11 +175,7 @@ class Joint:
 
 
 def joints_of(robot: str | Path) -> tuple[Joint, ...]:
-    """The independent joints of a robot, in the order of its URDF.
-
-    Raises:
-        RobotError: it is missing or no URDF.
-    """
+    """The independent joints of a robot, in the order of its URDF."""
     return _joints_of(robot_file(robot).absolute())
 
 
@@ -206,6 +196,20 @@ def _joints_of(urdf: Path) -> tuple[Joint, ...]:
     return tuple(found)
 
 
+OTHER_COLUMNS = "--columns yaw COLUMN pitch COLUMN ..."
+"""Option for another order of the columns."""
+
+
+@dataclass(frozen=True)
+class Remedy:
+    """An interpretation of positions that is within the limits."""
+
+    text: str
+    """The other sign, a unit, or an order of the columns, as a noun."""
+    option: str
+    """Its option of `carts import`."""
+
+
 @dataclass(frozen=True)
 class Misfit:
     """A joint whose positions exceed its limits, with possible remedies."""
@@ -214,8 +218,7 @@ class Misfit:
     lowest: float
     """[rad], [m]"""
     highest: float
-    remedies: tuple[str, ...] = field(default=())
-    """Possible remedies: "the other sign", a unit, or another joint's column."""
+    remedies: tuple[Remedy, ...] = ()
 
     def sentence(self) -> str:
         """Description of the misfit as a sentence."""
@@ -223,7 +226,7 @@ class Misfit:
             f"{self.joint.name} is from {self.lowest:.4g} to {self.highest:.4g} {self.joint.unit}, and the robot's "
             f"limits are {self.joint.lower:.4g} to {self.joint.upper:.4g} {self.joint.unit}"
         )
-        return f"{text}; {' or '.join(self.remedies)} would fit" if self.remedies else text
+        return f"{text}; {' or '.join(remedy.text for remedy in self.remedies)} would fit" if self.remedies else text
 
 
 def misfits(
@@ -243,21 +246,20 @@ def misfits(
     )
 
 
-def _remedies(joint: Joint, values: np.ndarray) -> tuple[str, ...]:
+def _remedies(joint: Joint, values: np.ndarray) -> list[Remedy]:
     """Units and signs that bring positions read as SI units within the limits."""
-    found = []
-    if joint.fits(-values):
-        found.append("the other sign")
-    for unit, factor in (ANGLE_UNITS if joint.revolute else LENGTH_UNITS).items():
+    found = [Remedy("the other sign", f"--flip {joint.name}")] if joint.fits(-values) else []
+    for unit, factor in joint.units.items():
         if factor != 1.0 and joint.fits(values * factor) and not (found and unit != "deg"):
-            found.append(f"{unit} (read as {values.min() * factor:.3g} to {values.max() * factor:.3g} {joint.unit})")
-    return tuple(found)
+            text = f"{unit} (read as {values.min() * factor:.3g} to {values.max() * factor:.3g} {joint.unit})"
+            found.append(Remedy(text, f"--units {joint.name} {unit}"))
+    return found
 
 
-def _other_order(joints: Sequence[Joint], values: np.ndarray, wrong: list[int]) -> tuple[str, ...]:
+def _other_order(joints: Sequence[Joint], values: np.ndarray, wrong: list[int]) -> list[Remedy]:
     """Column orders that bring all positions within the limits, unless changed signs do."""
     if not wrong or all(joints[index].fits(-values[:, index]) for index in wrong):
-        return ()
+        return []
     names = [joint.name for joint in joints]
 
     def fit(order: Sequence[int]) -> bool:
@@ -265,26 +267,15 @@ def _other_order(joints: Sequence[Joint], values: np.ndarray, wrong: list[int]) 
 
     alphabetical = [sorted(names).index(name) for name in names]
     if alphabetical != list(range(len(names))) and fit(alphabetical):
-        return ("the alphabetical order of the joints' names",)
+        return [Remedy("the alphabetical order of the joints' names", OTHER_COLUMNS)]
     found = []
     for a, b in combinations(range(len(joints)), 2):
         order = list(range(len(joints)))
         order[a], order[b] = b, a
         if (a in wrong or b in wrong) and fit(order):
-            found.append(f"the columns of {names[a]} and {names[b]} the other way round")
-    return tuple(found)
+            found.append(Remedy(f"the columns of {names[a]} and {names[b]} the other way round", OTHER_COLUMNS))
+    return found
 
-
-def fits_roughly(joints: Sequence[Joint], columns: Sequence[np.ndarray], convert: Callable[..., np.ndarray]) -> bool:
-    """Whether converted columns are, up to their sign, never far beyond the limits."""
-    for joint, values in zip(joints, columns, strict=True):
-        converted = convert(joint, values)
-        if not (joint.fits(converted, FAR) or joint.fits(-converted, FAR)):
-            return False
-    return True
-
-
-_UNITS = {"revolute": (*ANGLE_UNITS, PERCENT), "prismatic": (*LENGTH_UNITS, PERCENT)}
 
 PLAUSIBLE = {"revolute": 4 * np.pi, "prismatic": 2.0}
 """Largest plausible joint position [rad], [m]; larger values indicate a wrong unit."""
@@ -294,7 +285,7 @@ PLAUSIBLE = {"revolute": 4 * np.pi, "prismatic": 2.0}
 class JointColumn:
     """Linear map from a column to a joint: position = column * scale + offset."""
 
-    joint: str
+    joint: Joint
     column: str
     scale: float
     """[rad or m per unit of the column]"""
@@ -303,6 +294,33 @@ class JointColumn:
     unit: str
     given: bool = False
     """Whether the file states the unit, so that positions beyond the limits are intended."""
+
+    def read(self, table: Table, key: str) -> Float[np.ndarray, " rows"]:
+        """Joint positions of every row [rad], [m]."""
+        joint, where = self.joint, f"column {self.column!r}"
+        with np.errstate(over="ignore", invalid="ignore"):
+            values = table.numbers(self.column, f"{key} {joint.name}") * self.scale + self.offset
+        allowed, other = PLAUSIBLE[joint.kind], "deg" if joint.revolute else "mm"
+        if not (worst := np.abs(values).max()) <= allowed:
+            raise SequenceError(
+                f"{table.path}, line {table.lines[int(np.abs(values).argmax())]}, {where}: read as {self.unit}, joint "
+                f"{joint.name!r} is at {worst:.4g} {joint.unit}, which no instrument reaches ({allowed:.3g} "
+                f"{joint.unit} is allowed). If the column is in {other}, say so: "
+                f'{joint.name} = {{ column = "{self.column}", unit = "{other}" }}.'
+            )
+        if self.given or joint.fits(values, FAR):
+            return values
+        # The unit is not stated, and another one may fit the limits of the robot.
+        fitting = [unit for unit, factor in joint.units.items() if factor != 1.0 and joint.fits(values * factor)]
+        if fitting:
+            option = "angle_unit" if joint.revolute else "length_unit"
+            raise SequenceError(
+                f"{table.path}, {where}: read as {joint.unit}, joint {joint.name!r} is from {values.min():.4g} to "
+                f"{values.max():.4g} {joint.unit}, and its limits are {joint.lower:.4g} to {joint.upper:.4g}. "
+                f'Say the unit in [[arms]]: {option} = "{fitting[0]}" or "{PERCENT}" (-100 to 100 of the range), or '
+                f'"{joint.unit}" if it is that.'
+            )
+        return values
 
 
 @dataclass(frozen=True)
@@ -319,123 +337,77 @@ class JointColumns:
     @property
     def measured(self) -> tuple[str, ...]:
         """Joints that have a column, in the robot's order."""
-        mapped = {column.joint for column in self.columns}
+        mapped = {column.joint.name for column in self.columns}
         return tuple(name for name in self.robot.joint_names if name in mapped)
 
     def read(self, table: Table) -> Float[np.ndarray, "rows dofs"]:
-        """Joint positions of every row [rad], [m], in the order of `Robot.joint_names`.
-
-        Raises:
-            SequenceError: a column is missing, a cell is not a finite number, or values cannot be in the given unit.
-        """
+        """Joint positions of every row [rad], [m], in the robot's order; errors of `JointColumn.read`."""
         names = self.robot.joint_names
         positions = np.tile([self.defaults.get(name, 0.0) for name in names], (len(table), 1))
         for column in self.columns:
-            index = names.index(column.joint)
-            with np.errstate(over="ignore", invalid="ignore"):
-                values = table.numbers(column.column, f"{self.key} {column.joint}") * column.scale + column.offset
-            kind = self.robot.joint_types[index]
-            if not (worst := np.abs(values).max()) <= PLAUSIBLE[kind]:
-                symbol, other = ("rad", "deg") if kind == "revolute" else ("m", "mm")
-                raise SequenceError(
-                    f"{table.path}, line {table.lines[int(np.abs(values).argmax())]}, column {column.column!r}: read "
-                    f"as {column.unit}, joint {column.joint!r} is at {worst:.4g} {symbol}, which no instrument reaches "
-                    f"({PLAUSIBLE[kind]:.3g} {symbol} is allowed). If the column is in {other}, say so: "
-                    f'{column.joint} = {{ column = "{column.column}", unit = "{other}" }}.'
-                )
-            self._check_limits(table, column, index, values)
-            positions[:, index] = values
+            positions[:, names.index(column.joint.name)] = column.read(table, self.key)
         return positions
-
-    def _check_limits(self, table: Table, column: JointColumn, index: int, values: np.ndarray) -> None:
-        """Check that positions of unstated unit are not far beyond the limits of the robot.
-
-        Raises:
-            SequenceError: they are, and another unit would fit.
-        """
-        low, high = self.robot.joint_limits[index].tolist()
-        joint = Joint(column.joint, self.robot.joint_types[index] == "revolute", low, high)
-        if column.given or joint.fits(values, FAR):
-            return
-        units = ANGLE_UNITS if joint.revolute else LENGTH_UNITS
-        fitting = [unit for unit, factor in units.items() if factor != 1.0 and joint.fits(values * factor)]
-        if fitting:
-            key, name = ("angle_unit", "rad") if joint.revolute else ("length_unit", "m")
-            raise SequenceError(
-                f"{table.path}, column {column.column!r}: read as {joint.unit}, joint {joint.name!r} is from "
-                f"{values.min():.4g} to {values.max():.4g} {joint.unit}, and its limits are {low:.4g} to {high:.4g}. "
-                f'Say the unit in [[arms]]: {key} = "{fitting[0]}" or "{PERCENT}" (-100 to 100 of the range), or '
-                f'"{name}" if it is that.'
-            )
 
 
 def take_joints(table: TomlTable, robot: Robot) -> JointColumns:
-    """The keys `joints`, `defaults`, `angle_unit` and `length_unit` of an `[[arms]]` table.
-
-    Raises:
-        SequenceError: a joint is not in the robot, has no value, or a unit does not fit it.
-    """
-    given = {"revolute": "angle_unit" in table, "prismatic": "length_unit" in table}
+    """The keys `joints`, `defaults`, `angle_unit` and `length_unit` of an `[[arms]]` table."""
     units = {
-        "revolute": table.take_choice("angle_unit", _UNITS["revolute"], "rad"),
-        "prismatic": table.take_choice("length_unit", _UNITS["prismatic"], "m"),
+        "revolute": (table.take_choice("angle_unit", (*ANGLE_UNITS, PERCENT), "rad"), "angle_unit" in table),
+        "prismatic": (table.take_choice("length_unit", (*LENGTH_UNITS, PERCENT), "m"), "length_unit" in table),
     }
     mapping, defaults = table.take_table("joints"), table.take_table("defaults")
-    columns = tuple(_take_column(mapping, joint, robot, units, given) for joint in mapping.items())
+    columns = tuple(_take_column(mapping, name, robot, units) for name in mapping.items())
     values: dict[str, float] = {}
-    for joint in defaults.items():
-        _joint_type(defaults, joint, robot)
-        values[joint] = float(defaults.take(joint, float))
-        if abs(values[joint]) > (largest := PLAUSIBLE[_joint_type(defaults, joint, robot)]):
-            raise defaults.error(joint, f"is {values[joint]:g}; allowed is up to {largest:.3g} [rad or m].")
-        if joint in mapping:
-            raise defaults.error(
-                joint, "is given, but the joint has a column in [arms.joints] too. Remove one of them."
-            )
-    for joint in robot.joint_names:
-        if joint not in mapping and joint not in values:
-            unit = "[rad]" if _joint_type(mapping, joint, robot) == "revolute" else "[m]"
+    for name in defaults.items():
+        largest = PLAUSIBLE[_joint(defaults, name, robot).kind]
+        values[name] = float(defaults.take(name, float))
+        if abs(values[name]) > largest:
+            raise defaults.error(name, f"is {values[name]:g}; allowed is up to {largest:.3g} [rad or m].")
+        if name in mapping:
+            raise defaults.error(name, "is given, but the joint has a column in [arms.joints] too. Remove one of them.")
+    for name in robot.joint_names:
+        if name not in mapping and name not in values:
             raise mapping.error(
-                joint,
-                f"is missing: robot {robot.name!r} has this joint. Name its column here, "
-                f"or give the position {unit} that it keeps under [arms.defaults], say {joint} = 0.0.",
+                name,
+                f"is missing: robot {robot.name!r} has this joint. Name its column here, or give its constant position "
+                f"[{_joint(mapping, name, robot).unit}] under [arms.defaults], say {name} = 0.0.",
             )
     return JointColumns(robot, columns, values, mapping.where)
 
 
-def _joint_type(table: TomlTable, joint: str, robot: Robot) -> str:
-    if joint not in robot.joint_names:
+def _joint(table: TomlTable, name: str, robot: Robot) -> Joint:
+    if name not in robot.joint_names:
         raise table.error(
-            joint,
-            f"is not a joint of robot {robot.name!r} ({robot.urdf}).{closest(joint, robot.joint_names)} "
+            name,
+            f"is not a joint of robot {robot.name!r} ({robot.urdf}).{closest(name, robot.joint_names)} "
             f"Its joints are: {', '.join(robot.joint_names)}.",
         )
-    return robot.joint_types[robot.joint_names.index(joint)]
+    index = robot.joint_names.index(name)
+    return Joint(name, robot.joint_types[index] == "revolute", *robot.joint_limits[index].tolist())
 
 
-def _take_column(
-    mapping: TomlTable, joint: str, robot: Robot, units: Mapping[str, str], given: Mapping[str, bool]
-) -> JointColumn:
-    kind = _joint_type(mapping, joint, robot)
-    if isinstance(mapping.take(joint, (str, dict)), str):
-        scale, offset = _conversion(joint, units[kind], robot)
-        return JointColumn(joint, mapping.take(joint, str), scale, offset, units[kind], given[kind])
-    entry = TomlTable(mapping.take(joint, dict), mapping.file, f"{mapping.where}: {joint}")
-    said = given[kind] or any(key in entry for key in ("unit", "scale"))
-    unit = entry.take_choice("unit", _UNITS[kind], units[kind])
+def _take_column(mapping: TomlTable, name: str, robot: Robot, units: Mapping[str, tuple[str, bool]]) -> JointColumn:
+    joint = _joint(mapping, name, robot)
+    unit, given = units[joint.kind]
+    value = mapping.take(name, (str, dict))
+    if isinstance(value, str):
+        return JointColumn(joint, value, *_conversion(joint, unit, robot), unit, given)
+    entry = TomlTable(value, mapping.file, f"{mapping.where}: {name}")
+    given = given or "unit" in entry or "scale" in entry
+    unit = entry.take_choice("unit", (*joint.units, PERCENT), unit)
     scale, offset = _conversion(joint, unit, robot)
     scale, offset = scale * float(entry.take("scale", float, 1.0)), offset + float(entry.take("offset", float, 0.0))
-    result = JointColumn(joint, entry.take("column", str), scale, offset, unit, said)
+    column = entry.take("column", str)
     entry.finish()
-    return result
+    return JointColumn(joint, column, scale, offset, unit, given)
 
 
-def _conversion(joint: str, unit: str, robot: Robot) -> tuple[float, float]:
+def _conversion(joint: Joint, unit: str, robot: Robot) -> tuple[float, float]:
     """Scale and offset to [rad] or [m]; percent refers to the limits of the joint."""
-    index = robot.joint_names.index(joint)
     if unit != PERCENT:
-        return {**ANGLE_UNITS, **LENGTH_UNITS}[unit], 0.0
-    low, high = robot.joint_limits[index].tolist()
-    if not np.isfinite([low, high]).all():
-        raise SequenceError(f"joint {joint!r} of {robot.urdf} has no limits, so {PERCENT} of its range is not known.")
-    return (high - low) / 200, (high + low) / 2
+        return joint.units[unit], 0.0
+    if not np.isfinite([joint.lower, joint.upper]).all():
+        raise SequenceError(
+            f"joint {joint.name!r} of {robot.urdf} has no limits, so {PERCENT} of its range is not known."
+        )
+    return (joint.upper - joint.lower) / 200, (joint.upper + joint.lower) / 2

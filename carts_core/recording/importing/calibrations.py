@@ -5,7 +5,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
-from xml.etree import ElementTree
 
 import numpy as np
 from jaxtyping import Float
@@ -14,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from ...decoders.tables import read_matlab
 from ...errors import SequenceError, SettingsError
 from ...files.decoding import decoded
-from ...files.reading import CALIBRATION, VALUES, is_regular, parse_ini, parse_json, parse_yaml, read_text
+from ...files.reading import CALIBRATION, VALUES, is_regular, parse_ini, parse_json, parse_xml, parse_yaml, read_text
 from ...model.camera import DISTORTION_LENGTHS, T_DVRK_OPENCV, rigid_transform
 from ...settings.interchange import Axes
 
@@ -58,9 +57,6 @@ def read_calibration(path: Path, side: str) -> Calibration:
     Args:
         path: of the file.
         side: "left" or "right", which counts for files of a pair.
-
-    Raises:
-        SequenceError: the file is missing, damaged, of another camera model or of an unknown kind.
     """
     if not is_regular(path):
         raise SequenceError(f"calibration {path} is missing. Correct the path.")
@@ -74,11 +70,12 @@ def read_calibration(path: Path, side: str) -> Calibration:
         if not isinstance(content, dict):
             raise ValueError("it holds no named values")
         return _from_names(content, side)
-    except (OSError, UnicodeDecodeError, ValueError) as error:
-        raise SequenceError(f"calibration {path} cannot be used: {error}. Known are: {_KINDS}.") from error
-    except (KeyError, TypeError, IndexError, AttributeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, IndexError, AttributeError) as error:
+        known = isinstance(error, OSError | ValueError)
         what = f"{error} is missing" if isinstance(error, KeyError) else f"a value has another form ({error})"
-        raise SequenceError(f"calibration {path} cannot be used: {what}. Known are: {_KINDS}.") from error
+        raise SequenceError(
+            f"calibration {path} cannot be used: {error if known else what}. Known are: {_KINDS}."
+        ) from error
 
 
 def calibration_from_info(info: Any) -> Calibration | None:
@@ -106,9 +103,9 @@ def check_model(model: str, camera_model: str = "") -> None:
     Raises:
         ValueError: it is another one.
     """
-    if camera_model.lower() not in _PINHOLES or model.lower() not in _MODELS:
-        wrong = camera_model.lower() not in _PINHOLES
-        given = f"camera model {camera_model!r}" if wrong else f"distortion model {model!r}"
+    pinhole = camera_model.lower() in _PINHOLES
+    if not pinhole or model.lower() not in _MODELS:
+        given = f"distortion model {model!r}" if pinhole else f"camera model {camera_model!r}"
         raise ValueError(
             f"it has the {given}; allowed are pinholes with plumb_bob or rational_polynomial (radtan in Kalibr). "
             "Rectify the images, or calibrate them with such a model"
@@ -128,22 +125,15 @@ def _content(path: Path) -> Any:
 
 def _opencv_xml(text: str) -> dict[str, Any]:
     """Values of an XML file of OpenCV's FileStorage."""
-    if "<!DOCTYPE" in text or "<!ENTITY" in text:
-        raise ValueError("it declares a document type or entities")
-    try:
-        root = ElementTree.fromstring(text)
-    except ElementTree.ParseError as error:
-        raise ValueError(f"it is no XML ({error})") from error
     values: dict[str, Any] = {}
-    for entry in root:
+    for entry in parse_xml(text):
         data = entry.find("data")
-        content = entry.text if data is None else data.text
-        words = (content or "").split()
+        words = (entry if data is None else data).text or ""
         try:
-            numbers = [float(word) for word in words]
+            numbers = [float(word) for word in words.split()]
             values[entry.tag] = numbers[0] if data is None and len(numbers) == 1 else numbers
         except ValueError:
-            values[entry.tag] = " ".join(words)
+            values[entry.tag] = " ".join(words.split())
     return values
 
 
@@ -170,30 +160,22 @@ def _from_names(content: Mapping[str, Any], side: str) -> Calibration:
         raise ValueError(f"none of camera_matrix, K, M1, cam0 is in it; it has {', '.join(map(str, content))}")
     found = _calibration(K, D, _size(content))
     if side == "right":
-        found = _with_extrinsics(found, content)
+        R, T = _first(content, ("R", "R_stereo")), _first(content, ("T", "t", "T_stereo"))
+        if R is None and (om := _first(content, ("om",))) is not None and om.size == 3:
+            R = Rotation.from_rotvec(om.reshape(3)).as_matrix()
+        if R is not None and T is not None and R.size == 9 and T.size == 3:
+            in_mm = float(np.linalg.norm(T)) > _METRES_TO
+            remark = f"its translation of {np.linalg.norm(T):.4g} is taken as millimetres."
+            found = _placed(found, R, T * 1e-3 if in_mm else T, *([remark] if in_mm else []))
     R, P = (_first(content, (name,), suffixes) for name in ("rectification_matrix", "projection_matrix"))
     return replace(found, R=_rotation(R), P=_projection(P))
 
 
-def _with_extrinsics(found: Calibration, content: Mapping[str, Any]) -> Calibration:
-    R, T = _first(content, ("R", "R_stereo"), ("",)), _first(content, ("T", "t", "T_stereo"), ("",))
-    if R is None and (om := _first(content, ("om",), ("",))) is not None and om.size == 3:
-        R = Rotation.from_rotvec(om.reshape(3)).as_matrix()
-    if R is None or T is None or R.size != 9 or T.size != 3:
-        return found
-    return _placed(found, R, T)
-
-
-def _placed(found: Calibration, R: np.ndarray, T: np.ndarray) -> Calibration:
-    """The calibration with an extrinsic rotation and translation; translations above a metre are millimetres."""
+def _placed(found: Calibration, R: np.ndarray, T: np.ndarray, *remarks: str) -> Calibration:
+    """The calibration with an extrinsic rotation and translation [m]."""
     pose = np.eye(4)
-    translation = np.asarray(T, np.float64).reshape(3)
-    distance = float(np.linalg.norm(translation))
-    in_mm = distance > _METRES_TO
-    pose[:3, :3] = np.asarray(R, np.float64).reshape(3, 3)
-    pose[:3, 3] = translation * (1e-3 if in_mm else 1.0)
-    remark = f"its translation of {distance:.4g} is taken as millimetres." if in_mm else ""
-    return replace(found, T_right_left=pose, remarks=(*found.remarks, *filter(None, [remark])))
+    pose[:3, :3], pose[:3, 3] = np.asarray(R, np.float64).reshape(3, 3), np.asarray(T, np.float64).reshape(3)
+    return replace(found, T_right_left=pose, remarks=(*found.remarks, *remarks))
 
 
 def _from_kalibr(content: Mapping[str, Any]) -> Calibration:
@@ -257,7 +239,7 @@ def _size(content: Mapping[str, Any]) -> tuple[int, int] | None:
     return None
 
 
-def _first(content: Mapping[str, Any], names: tuple[str, ...], suffixes: tuple[str, ...]) -> np.ndarray | None:
+def _first(content: Mapping[str, Any], names: tuple[str, ...], suffixes: tuple[str, ...] = ("",)) -> np.ndarray | None:
     for name in names:
         for suffix in suffixes:
             value = content.get(name + suffix)
@@ -270,13 +252,11 @@ def _first(content: Mapping[str, Any], names: tuple[str, ...], suffixes: tuple[s
 
 def _rotation(values: np.ndarray | None) -> np.ndarray | None:
     """Rectification; None for a zero matrix, which means none."""
-    if values is None or values.size != 9 or not np.abs(values).max() > 0:
-        return None
-    return values.reshape(3, 3)
+    return values.reshape(3, 3) if values is not None and values.size == 9 and np.abs(values).max() > 0 else None
 
 
 def _projection(values: np.ndarray | None) -> np.ndarray | None:
-    return None if values is None or values.size != 12 or not values.reshape(3, 4)[0, 0] > 0 else values.reshape(3, 4)
+    return values.reshape(3, 4) if values is not None and values.size == 12 and values.flat[0] > 0 else None
 
 
 def _from_ini(path: Path, side: str) -> Calibration:
@@ -291,8 +271,7 @@ def _from_ini(path: Path, side: str) -> Calibration:
     found = _from_one(_calibration(K, np.array(numbers("kc", range(5))), _size(section)))
     if side != "right":
         return found
-    T = np.array(numbers("T", range(3))) * 1e-3
-    return replace(_placed(found, np.array(numbers("R", range(9))), T), remarks=found.remarks)
+    return _placed(found, np.array(numbers("R", range(9))), np.array(numbers("T", range(3))) * 1e-3)
 
 
 def _from_matlab(content: Any, side: str) -> Calibration:
@@ -305,7 +284,8 @@ def _from_matlab(content: Any, side: str) -> Calibration:
         check_model("fisheye")
     toolbox = {"IntrinsicMatrix", "RadialDistortion", "ImageSize", "TangentialDistortion"} & set(own)
     if not toolbox:
-        return _from_names({name: _plain(value) for name, value in own.items()}, side)
+        plain = {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in own.items()}
+        return _from_names(plain, side)
     K = np.asarray(own["K"], np.float64) if "K" in own else np.asarray(own["IntrinsicMatrix"], np.float64).T
     radial = np.atleast_1d(np.asarray(own.get("RadialDistortion", [0, 0]), np.float64)).tolist() + [0.0] * 3
     tangential = np.atleast_1d(np.asarray(own.get("TangentialDistortion", [0, 0]), np.float64)).tolist()
@@ -315,15 +295,10 @@ def _from_matlab(content: Any, side: str) -> Calibration:
     found = _from_one(_calibration(K, D, size))
     if right and "RotationOfCamera2" in content:
         T = np.asarray(content["TranslationOfCamera2"], np.float64) * 1e-3
-        return replace(_placed(found, np.asarray(content["RotationOfCamera2"]).T, T), remarks=found.remarks)
+        return _placed(found, np.asarray(content["RotationOfCamera2"]).T, T)
     if right and isinstance(pose := content.get("PoseCamera2"), dict):
-        T = np.asarray(pose["Translation"], np.float64) * 1e-3
-        return replace(_placed(found, np.asarray(pose["R"]), T), remarks=found.remarks)
+        return _placed(found, np.asarray(pose["R"]), np.asarray(pose["Translation"], np.float64) * 1e-3)
     return found
-
-
-def _plain(value: Any) -> Any:
-    return value.tolist() if isinstance(value, np.ndarray) else value
 
 
 def _from_one(found: Calibration) -> Calibration:
@@ -355,10 +330,10 @@ def read_base_frames(path: Path, axes: Axes | None = None) -> tuple[DvrkBaseFram
 
     Args:
         path: a JSON file of one of the kinds above.
-        axes: of the camera in the file; None takes them from the kind of file and the names it is given by the dVRK.
+        axes: of the camera in the file; by default those of its kind and name.
 
     Raises:
-        SequenceError: it is missing, of another kind, or does not say which axes it has.
+        SequenceError: it is missing, of another kind, or of unknown axes.
     """
     try:
         content = parse_json(read_text(path, VALUES))
@@ -371,10 +346,13 @@ def read_base_frames(path: Path, axes: Axes | None = None) -> tuple[DvrkBaseFram
         raise SequenceError(f"{path} has no base frame. Expected is {_BASE_FRAME_KINDS}.")
     axes = axes or _axes_of(content, path)
     T = T_DVRK_OPENCV if axes == "dvrk" else np.eye(4)
-    return tuple(
-        DvrkBaseFrame(arm, reference, T @ _transform(value, f"{path}: {where}"))
-        for arm, reference, value, where in found
-    )
+    try:
+        return tuple(
+            DvrkBaseFrame(arm, reference, T @ rigid_transform(value, f"{path}: {where}"))
+            for arm, reference, value, where in found
+        )
+    except SettingsError as error:
+        raise SequenceError(str(error)) from error
 
 
 def _entries(content: Any, path: Path) -> list[tuple[str, str, Any, str]]:
@@ -382,7 +360,8 @@ def _entries(content: Any, path: Path) -> list[tuple[str, str, Any, str]]:
     if not isinstance(content, dict):
         return []
     if (frame := _either(content, "base_frame")) is not None:
-        return [(_arm_in_name(path), *_base_frame(frame))]
+        arm = re.match(r"(?:.*[^A-Za-z])?((?:PSM|ECM|MTM)[0-9RL]?)(?![A-Za-z0-9])", path.name)
+        return [(arm[1] if arm else "", *_base_frame(frame))]
     arms = content.get("arms")
     entries = []
     for entry in arms if isinstance(arms, list) else []:
@@ -406,13 +385,6 @@ def _either(table: dict[str, Any], key: str) -> Any:
     return table.get(key, table.get(key.replace("_", "-")))
 
 
-def _transform(value: Any, what: str) -> np.ndarray:
-    try:
-        return rigid_transform(value, what)
-    except SettingsError as error:
-        raise SequenceError(str(error)) from error
-
-
 def _axes_of(content: dict[str, Any], path: Path) -> Axes:
     if "arms" in content:
         return "dvrk"
@@ -422,11 +394,6 @@ def _axes_of(content: dict[str, Any], path: Path) -> Axes:
     if "dvrk" in name:
         return "dvrk"
     raise SequenceError(
-        f"{path}: neither its content nor its name says which axes the camera has (names end in -open-cv.json or "
+        f"{path}: neither its content nor its name states the axes of the camera (names end in -open-cv.json or "
         "-dVRK.json). Say opencv (x right, y down) or dvrk (x left, y up)."
     )
-
-
-def _arm_in_name(path: Path) -> str:
-    match = re.match(r"(?:.*[^A-Za-z])?((?:PSM|ECM|MTM)[0-9RL]?)(?![A-Za-z0-9])", path.name)
-    return match.group(1) if match else ""

@@ -1,7 +1,7 @@
 """Cameras of foreign recordings: folders of images and videos, and the calibrations that belong to them."""
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -11,18 +11,17 @@ from jaxtyping import Float
 
 from ...errors import SequenceError
 from ...model.camera import implausible_intrinsics
-from ...settings.interchange import ImportOptions
 from ..images import ImageFiles, bits_remark, image_remarks, is_deep
 from ..video import SUFFIXES, Video, index_video
 from .calibrations import Calibration, calibration_from_info, read_calibration
-from .found import FoundCamera, Note, Notes
+from .found import FoundCamera, Import
 
 _SAME_SHAPE = 0.01
 """Largest difference of aspect ratios due to rounding of image sizes [1]."""
 
 
 def side_of(name: str) -> str | None:
-    """`left` or `right`, if part of a topic's or folder's name; else empty."""
+    """`left` or `right`, if part of the name of a topic or folder; else None."""
     words = re.split(r"[^a-z0-9]+", re.sub(r"([a-z])([A-Z])", r"\1_\2", name).lower())
     for side in ("left", "right"):
         short = (side, f"{side}s", f"{side}img", f"img{side}", f"camera{side[0]}", f"cam{side[0]}", f"l{side}")
@@ -33,74 +32,51 @@ def side_of(name: str) -> str | None:
     return found[-1] if found else None
 
 
-def camera_from_info(
-    camera: FoundCamera, info: Any, options: ImportOptions, notes: Notes, *, rectified: bool
-) -> FoundCamera:
-    """The camera with the calibration of a `sensor_msgs/CameraInfo`; unchanged if that is uncalibrated.
-
-    Args:
-        camera: with its images.
-        info: message, or None.
-        options: may name the size of the images that were calibrated.
-        notes: of the import; some are added.
-        rectified: the images are rectified, so that P holds, and no distortion.
-
-    Raises:
-        SequenceError: a distortion model that is not OpenCV's pinhole, or another shape of image.
-    """
+def camera_from_info(camera: FoundCamera, info: Any, job: Import, *, rectified: bool) -> FoundCamera:
+    """The camera with the calibration of a `sensor_msgs/CameraInfo`; unchanged if that is None or uncalibrated."""
     what = f"camera_info of {camera.name}"
     try:
         found = None if info is None else calibration_from_info(info)
     except ValueError as error:
         raise SequenceError(f"{what} cannot be used: {error}. Or give --calibration {camera.name} FILE.") from error
-    if found is None:
-        return camera
-    return _calibrated(camera, found, what, options, notes, rectified=rectified)
+    return camera if found is None else _calibrated(camera, found, what, job, rectified=rectified)
 
 
-def calibration_of(camera: FoundCamera, options: ImportOptions, notes: Notes, **changes: Any) -> FoundCamera:
-    """The camera with the calibration given in the options, and further changes.
-
-    Raises:
-        SequenceError: the file is missing or of an unknown kind.
-    """
-    camera = replace(camera, **changes)
-    path = options.calibration.get(camera.name)
+def calibration_of(camera: FoundCamera, job: Import) -> FoundCamera:
+    """The camera with the calibration given in the options."""
+    path = job.options.calibration.get(camera.name)
     if path is None:
         if camera.intrinsics is not None:
-            notes.found(f"calibration of {camera.name}: from the recording.")
+            job.found(f"calibration of {camera.name}: from the recording.")
         return camera
-    notes.found(f"calibration of {camera.name}: from {path}.")
+    job.found(f"calibration of {camera.name}: from {path}.")
     side = side_of(camera.name) or "left"
     if side_of(path.stem) not in (None, side):
-        text = f"{camera.name}: {path.name} is named for the other camera. Check --calibration"
-        notes.warning(f"{text} {camera.name} FILE.")
-    rectified = any("rect" in re.split(r"[^a-z]+", part.lower()) or "rectified" in part.lower()
-                    for part in camera.images.parts[-2:])  # fmt: skip
+        name = camera.name
+        job.warning(f"{name}: {path.name} has the other camera's name. Check --calibration {name} FILE.")
+    parts = [part.lower() for part in camera.images.parts[-2:]]
+    rectified = any("rect" in re.split(r"[^a-z]+", part) or "rectified" in part for part in parts)
     try:
         found = read_calibration(path, side)
     except SequenceError as error:
         raise SequenceError(f"camera {camera.name}: {error}") from error
-    return _calibrated(camera, found, str(path), options, notes, rectified=rectified)
+    return _calibrated(camera, found, str(path), job, rectified=rectified)
 
 
-def _calibrated(
-    camera: FoundCamera,
-    found: Calibration,
-    what: str,
-    options: ImportOptions,
-    notes: Notes,
-    *,
-    rectified: bool,
-) -> FoundCamera:
+def _calibrated(camera: FoundCamera, found: Calibration, what: str, job: Import, *, rectified: bool) -> FoundCamera:
     """A camera with a calibration, scaled to the size of its images."""
-    notes += [Note("guessed", f"{camera.name}: {what}: {text}") for text in found.remarks]
+    for text in found.remarks:
+        job.guessed(f"{camera.name}: {what}: {text}")
     intrinsics, distortion, R = found.intrinsics, found.distortion, found.R
     if rectified and found.P is not None:
-        fx, _, cx, _, _, fy, cy, *_ = found.P.reshape(-1)
-        intrinsics, distortion, R = (float(fx), float(fy), float(cx), float(cy)), (), np.eye(3)
-        notes.guessed(f"{camera.name}: images are rectified, as their name says; P of {what} is used.")
-    size = _given_size(camera, options) or found.size
+        fx, _, cx, _, _, fy, cy, *_ = map(float, found.P.reshape(-1))
+        intrinsics, distortion, R = (fx, fy, cx, cy), (), np.eye(3)
+        job.guessed(f"{camera.name}: images are rectified, by their name; P of {what} is used.")
+    given = job.options.calibration_size.get(camera.name)
+    size = found.size
+    if given is not None:
+        width, height = map(int, given.lower().split("x"))
+        size = width, height
     calibrated = replace(
         camera,
         intrinsics=intrinsics,
@@ -110,23 +86,11 @@ def _calibrated(
         rectification=R,
         projection=found.P,
     )
-    return calibrated if size is None else _scaled(calibrated, size, what, notes)
+    return calibrated if size is None else _scaled(calibrated, size, what, job)
 
 
-def _given_size(camera: FoundCamera, options: ImportOptions) -> tuple[int, int] | None:
-    text = options.calibration_size.get(camera.name)
-    if text is None:
-        return None
-    width, height = text.lower().split("x")
-    return int(width), int(height)
-
-
-def _scaled(camera: FoundCamera, size: tuple[int, int], what: str, notes: Notes) -> FoundCamera:
-    """The camera with intrinsics for images of `size` scaled to its own images.
-
-    Raises:
-        SequenceError: the images have another shape.
-    """
+def _scaled(camera: FoundCamera, size: tuple[int, int], what: str, job: Import) -> FoundCamera:
+    """The camera with intrinsics for images of `size` scaled to its own images."""
     if size == camera.size or min(size) < 1 or camera.intrinsics is None:
         return camera
     x, y = camera.size[0] / size[0], camera.size[1] / size[1]
@@ -140,16 +104,12 @@ def _scaled(camera: FoundCamera, size: tuple[int, int], what: str, notes: Notes)
     shift = 0.5 - camera.pixel_center
     intrinsics = (fx * x, fy * y, (cx + shift) * x - shift, (cy + shift) * y - shift)
     text = f"{what} is for images of {size[0]} x {size[1]}; it is scaled to {camera.size[0]} x {camera.size[1]}"
-    notes.guessed(f"{camera.name}: {text}, as if they were resized and not cropped.")
+    job.guessed(f"{camera.name}: {text}, as if they were resized and not cropped.")
     return replace(camera, intrinsics=intrinsics)
 
 
-def check_intrinsics(camera: FoundCamera, options: ImportOptions, notes: Notes) -> None:
-    """Check that a calibration is plausible for the size of the images.
-
-    Raises:
-        SequenceError: it is implausible, and the size of the calibrated images was not given.
-    """
+def check_intrinsics(camera: FoundCamera, job: Import) -> None:
+    """Check that a calibration is plausible for the size of the images."""
     assert camera.intrinsics is not None
     fx, fy, cx, cy = camera.intrinsics
     shift = 0.5 - camera.pixel_center
@@ -157,8 +117,8 @@ def check_intrinsics(camera: FoundCamera, options: ImportOptions, notes: Notes) 
     if problem is None:
         return
     text = f"the calibration of {camera.name} has {problem}."
-    if camera.name in options.calibration_size and min(fx, fy) > 0:
-        notes.warning(f"{camera.name}: {text}")
+    if camera.name in job.options.calibration_size and min(fx, fy) > 0:
+        job.warning(f"{camera.name}: {text}")
         return
     raise SequenceError(
         f"{text} Give another one (--calibration {camera.name} FILE), or the size of the images that were calibrated "
@@ -167,18 +127,18 @@ def check_intrinsics(camera: FoundCamera, options: ImportOptions, notes: Notes) 
     )
 
 
-def placed_cameras(cameras: tuple[FoundCamera, ...], notes: Notes) -> tuple[FoundCamera, ...]:
+def placed_cameras(cameras: tuple[FoundCamera, ...], job: Import) -> tuple[FoundCamera, ...]:
     """Cameras with their poses; the world is the frame of the first camera, or of the left one of a pair.
 
     Where the pose of another one is not stated, it follows from the rectification of both:
-    T_right_left = R_right^T [I | t] R_left, with t from the last column of P. A camera whose pose stays unknown stands
-    where the first one stands, which leaves it free in hand-eye calibration.
+    T_right_left = R_right^T [I | t] R_left, with t from the last column of P. A camera of unknown pose gets
+    the pose of the first one, which leaves it free in hand-eye calibration.
     """
     first = next((camera for camera in cameras if camera.name == "left"), cameras[0])
-    return tuple(camera if camera is first else _placed(camera, first, notes) for camera in cameras)
+    return tuple(camera if camera is first else _placed(camera, first, job) for camera in cameras)
 
 
-def _placed(camera: FoundCamera, first: FoundCamera, notes: Notes) -> FoundCamera:
+def _placed(camera: FoundCamera, first: FoundCamera, job: Import) -> FoundCamera:
     if camera.T_camera_world is not None:
         return camera
     lacking = [each.name for each in (first, camera) if each.rectification is None or each.projection is None]
@@ -186,10 +146,10 @@ def _placed(camera: FoundCamera, first: FoundCamera, notes: Notes) -> FoundCamer
         T = _from_rectification(first, camera)
         angle = np.degrees(np.arccos(np.clip((np.trace(T[:3, :3]) - 1) / 2, -1, 1)))
         text = f"{1e3 * np.linalg.norm(T[:3, 3]):.2f} mm from {first.name} and turned by {angle:.2f} deg"
-        notes.found(f"{camera.name}: {text}, from the rectification of both.")
+        job.found(f"{camera.name}: {text}, from the rectification of both.")
         return replace(camera, T_camera_world=T)
     why = "" if camera.intrinsics is None else f" ({' and '.join(lacking)}: no rectification and projection)"
-    notes.missing(
+    job.missing(
         f"{camera.name}: its pose relative to {first.name} is not known{why}; it stands where {first.name} stands. "
         f"Give a stereo calibration (--calibration {camera.name} FILE), or click points (New recording, "
         "carts hand-eye)."
@@ -250,9 +210,6 @@ def find_images(path: Path, only: str = "") -> Images:
     Args:
         path: folder or video file.
         only: keep files whose name ends with this, where a folder holds several kinds.
-
-    Raises:
-        SequenceError: nothing is there, names do not number the frames, or the first image cannot be read.
     """
     if path.is_file() and path.suffix.lower() in SUFFIXES:
         return _video(path)
@@ -298,26 +255,27 @@ def _video(path: Path) -> Images:
     return Images(path, "", ids, (first.shape[1], first.shape[0]), index.timestamps, remarks=video.remarks())
 
 
-def common_ids(kinds: Sequence[Images]) -> tuple[str, ...]:
+def common_ids(images: Mapping[str, Images], path: Path) -> tuple[str, ...]:
     """Ids of the frames that all cameras have, in the first one's order."""
-    shared = set.intersection(*(set(each.ids) for each in kinds))
-    return tuple(frame for frame in kinds[0].ids if frame in shared)
+    first, *others = images.values()
+    shared = set(first.ids).intersection(*(each.ids for each in others))
+    if not shared and first.ids:
+        raise SequenceError(
+            f"{path}: no frame has an image of every camera and domain. Number them alike, or import one camera."
+        )
+    return tuple(frame for frame in first.ids if frame in shared)
 
 
 def cameras_of(
-    images: dict[str, Images], options: ImportOptions, notes: Notes, calibrations: dict[str, Path] | None = None
+    images: Mapping[str, Images], job: Import, calibrations: Mapping[str, Path] | None = None
 ) -> tuple[FoundCamera, ...]:
-    """Cameras with their images and their given or found calibrations.
-
-    Raises:
-        SequenceError: a calibration file is not usable.
-    """
-    known = {**(calibrations or {}), **options.calibration}
-    chosen = replace(options, calibration=known)
+    """Cameras with their images and their given or found calibrations."""
+    job = job.with_options(calibration={**(calibrations or {}), **job.options.calibration})
     cameras = []
     for name, each in images.items():
-        notes.found(f"camera {name}: {each.path}, {len(each.ids)} images, {each.size[0]} x {each.size[1]}.")
-        notes += [Note("guessed", f"{name}: {text}") for text in each.remarks]
+        job.found(f"camera {name}: {each.path}, {len(each.ids)} images, {each.size[0]} x {each.size[1]}.")
+        for text in each.remarks:
+            job.guessed(f"{name}: {text}")
         camera = FoundCamera(name, each.size, each.path, each.pattern, bits=each.bits)
-        cameras.append(calibration_of(camera, chosen, notes))
+        cameras.append(calibration_of(camera, job))
     return tuple(cameras)

@@ -5,7 +5,6 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
-from jaxtyping import Float
 
 from ...errors import SequenceError
 from ...model.instruments import robot_file
@@ -14,8 +13,8 @@ from ...settings.interchange import ImportOptions
 from ..kinematics_table import LENGTH_UNITS, Joint, joints_of
 from .cameras import IMAGE_SUFFIXES
 from .foreign_tables import ForeignTable
-from .found import Note, Notes
-from .joint_units import in_si, joints_of_arm, length_unit
+from .found import Import, Track
+from .joint_units import in_si, length_unit, named_length_unit, psm_joints
 from .logs import ArmLog, track
 from .row_matching import LogRows
 
@@ -25,20 +24,11 @@ _FILLER = set(
     "degrees degree mm m meter meters column header outer action observation".split()
 )
 _JOINTS = {
-    "yaw": "yaw",
-    "pitch": "pitch",
-    "insertion": "insertion",
-    "ins": "insertion",
-    "depth": "insertion",
-    "roll": "roll",
-    "wrist pitch": "wrist_pitch",
-    "wristpitch": "wrist_pitch",
-    "wrist yaw": "wrist_yaw",
-    "wristyaw": "wrist_yaw",
-    "jaw": "jaw",
-    "gripper": "jaw",
-    "grip": "jaw",
-    "grasp": "jaw",
+    **{name: name for name in ("yaw", "pitch", "insertion", "roll", "jaw")},
+    **dict.fromkeys(("ins", "depth"), "insertion"),
+    **dict.fromkeys(("wrist pitch", "wristpitch"), "wrist_pitch"),
+    **dict.fromkeys(("wrist yaw", "wristyaw"), "wrist_yaw"),
+    **dict.fromkeys(("gripper", "grip", "grasp"), "jaw"),
 }
 _POSE = {
     **{name: "x" for name in ("x", "tx", "ee x", "tip x", "translation x")},
@@ -47,33 +37,11 @@ _POSE = {
     **{name: f"q{axis}" for axis in "xyzw" for name in (f"q{axis}", f"orientation {axis}", f"quat {axis}")},
     **{f"rotation {axis}": f"q{axis}" for axis in "xyzw"},
 }
-_STATE = {
-    "pos",
-    "position",
-    "q",
-    "state",
-    "observation",
-    "measured",
-    "actual",
-    "rad",
-    "deg",
-    "angle",
-    "value",
-    "action",
-}
+_STATE = set("pos position q state observation measured actual rad deg angle value action".split())
 """Words beside the name of a joint that name the kind of value."""
 _POSE_ORDER = ("x", "y", "z", "qx", "qy", "qz", "qw")
 _TIMES = (
-    "timestamp",
-    "timestamp ns",
-    "timestamp s",
-    "timestamp ms",
-    "time",
-    "stamp",
-    "t",
-    "time s",
-    "time ms",
-    "time ns",
+    *("timestamp", "timestamp ns", "timestamp s", "timestamp ms", "time", "stamp", "t", "time s", "time ms", "time ns"),
 )
 _FRAMES = (
     *("frame", "frame id", "frame index", "frame number", "frame no", "image", "image id", "image number", "img"),
@@ -98,17 +66,15 @@ class ColumnMeanings:
 
 
 def guess_columns(table: ForeignTable, options: ImportOptions) -> ColumnMeanings:
-    """Meanings of the columns of a table: user's choices first, then names, then positions.
-
-    Raises:
-        SequenceError: a chosen column is not there, or columns are joints of a robot of which some are missing.
-    """
+    """Meanings of the columns of a table: user's choices first, then names, then positions."""
     others = other_robots(options)
     _check_chosen(table, options, others)
     spoken = {column: _words(column) for column in table.columns}
     words = {column: text for column, text in spoken.items() if column not in _name_columns(table)}
     words |= {column: _words(name) for column, name in _named_places(table).items()}
-    time = options.columns.get("time") or _first(words, _TIMES) or _dated(table)
+    time = options.columns.get("time") or _first(words, _TIMES)
+    if time is None and len(table.dates) == 1:
+        (time,) = table.dates
     frame = options.columns.get("frame") or _file_names(table) or _first(words, _FRAMES)
     chosen = {joint: column for joint, column in options.columns.items() if joint not in ("time", "frame")}
     stated = set(options.columns.values()) | {column for column in (time, frame) if column}
@@ -121,25 +87,22 @@ def guess_columns(table: ForeignTable, options: ImportOptions) -> ColumnMeanings
         if column in (time, frame):
             continue
         arm = arm_in(column)
-        meaning = _meaning(re.sub(r"\bpsm ?\d?\b", "", text).strip(), _mentions_pose(column))
+        pose = re.search(r"(?i)pose|orientation|quat|(^|[^a-z])cp([^a-z]|$)", column) is not None
+        meaning = _meaning(re.sub(r"\bpsm ?\d?\b", "", text).strip(), pose)
         if meaning is not None:
             arms.setdefault(arm, {}).setdefault(meaning, column)
     stated |= {column for found in arms.values() for meaning, column in found.items() if not meaning.startswith("#")}
     arms = {arm: _numbers_to_joints(found) for arm, found in arms.items()}
     if chosen:
         arms = {next(iter(options.arms), next(iter(arms), "")): chosen}
-    usable = {arm: found for arm, found in arms.items() if _has_joints(found) or _has_pose(found)}
+    usable = {arm: found for arm, found in arms.items() if _has_joints(found) or set(_POSE_ORDER) <= set(found)}
     if not usable and not chosen:
         usable = _numbered_family(words, (time, frame))
     return ColumnMeanings(time, frame, usable, frozenset(stated))
 
 
 def other_robots(options: ImportOptions) -> dict[str, tuple[Joint, ...]]:
-    """Arm -> joints, of the given robots that are no PSM.
-
-    Raises:
-        RobotError: a robot is missing or no URDF.
-    """
+    """Arm -> joints, of the given robots that are no PSM."""
     given = {arm: joints_of(robot) for arm, robot in options.robot.items() if robot_file(robot).is_file()}
     return {arm: joints for arm, joints in given.items() if not {joint.name for joint in joints} >= set(JOINT_NAMES)}
 
@@ -160,9 +123,6 @@ def order_of_names(names: tuple[str, ...], joints: tuple[str, ...] = JOINT_NAMES
     Args:
         names: beside the positions, in their order; `outer_yaw` is yaw.
         joints: that are wanted.
-
-    Raises:
-        SequenceError: names of joints are mixed with others, so the order is not known.
     """
     meanings = [_meaning(_words(name), pose=False) for name in names]
     if set(joints) <= set(meanings):
@@ -177,18 +137,15 @@ def order_of_names(names: tuple[str, ...], joints: tuple[str, ...] = JOINT_NAMES
     return None
 
 
-def rows_of(
+def track_of(
     groups: list[tuple[list[str], np.ndarray]], role: str, joints: tuple[str, ...] = JOINT_NAMES
-) -> Float[np.ndarray, "rows 1+values"] | None:
-    """Logged times [s] and values of a topic, joint positions in the order of `joints`; None if empty.
+) -> Track | None:
+    """Logged values of a topic, joint positions in the order of `joints`; None if empty.
 
     Args:
         groups: of `decoders.bags.rows`: names in the messages, times and values.
         role: "joints", "jaw" or a pose.
         joints: that are wanted.
-
-    Raises:
-        SequenceError: as `order_of_names`.
     """
     chosen = []
     for names, rows in groups:
@@ -197,7 +154,8 @@ def rows_of(
             order = order_of_names(tuple(names), joints) or range(len(joints))
         if max(order) < rows.shape[1] - 1:
             chosen.append(rows[:, [0, *(1 + index for index in order)]])
-    return np.concatenate(chosen) if chosen else None
+    rows = np.concatenate(chosen) if chosen else np.empty((0, 2))
+    return track(rows[:, 0], rows[:, 1:])
 
 
 def strange_names(names: tuple[str, ...], joints: tuple[str, ...] = JOINT_NAMES) -> bool:
@@ -212,7 +170,8 @@ def arm_in(text: str) -> str:
 
 
 def _words(column: str) -> str:
-    return " ".join(re.findall(r"[a-z]+|\d+", _spaced(column)))
+    """Words and numbers of a name in lower case, `camelCase` being two words."""
+    return " ".join(re.findall(r"[a-z]+|\d+", re.sub(r"([a-z])([A-Z])", r"\1 \2", column).lower()))
 
 
 def _joints_by_name(
@@ -248,11 +207,7 @@ def _name_columns(table: ForeignTable) -> dict[str, re.Match[str]]:
 
 
 def _named_places(table: ForeignTable) -> dict[str, str]:
-    """Column of a position -> joint name from the column of names.
-
-    Raises:
-        SequenceError: a name changes from row to row.
-    """
+    """Column of a position -> joint name from the column of names."""
     named = {}
     for column, match in _name_columns(table).items():
         names = {str(cell).strip() for cell in table.columns[column]}
@@ -279,18 +234,8 @@ def _file_names(table: ForeignTable) -> str | None:
     return None
 
 
-def _dated(table: ForeignTable) -> str | None:
-    """The only column of dates (nanoseconds since 1970)."""
-    found = [column for column in table.dates]
-    return found[0] if len(found) == 1 else None
-
-
 def log_rows(table: ForeignTable, meanings: ColumnMeanings) -> LogRows:
-    """References from the rows of a table to images.
-
-    Raises:
-        SequenceError: a cell of the times is no number.
-    """
+    """References from the rows of a table to images."""
     return LogRows(
         table.path.name,
         len(table),
@@ -325,20 +270,8 @@ def _numbered_family(words: dict[str, str], others: tuple[str | None, ...]) -> d
     return {"": found} if _has_joints(found) else {}
 
 
-def _spaced(column: str) -> str:
-    return re.sub(r"([a-z])([A-Z])", r"\1 \2", column).lower()
-
-
 def _first(words: dict[str, str], wanted: tuple[str, ...]) -> str | None:
-    for name in wanted:
-        for column, text in words.items():
-            if text == name:
-                return column
-    return None
-
-
-def _mentions_pose(column: str) -> bool:
-    return re.search(r"(?i)pose|orientation|quat|(^|[^a-z])cp([^a-z]|$)", column) is not None
+    return next((column for name in wanted for column, text in words.items() if text == name), None)
 
 
 def _meaning(text: str, pose: bool) -> str | None:
@@ -376,17 +309,12 @@ def _has_joints(found: dict[str, str]) -> bool:
     return set(JOINT_NAMES) <= set(found)
 
 
-def _has_pose(found: dict[str, str]) -> bool:
-    return set(_POSE_ORDER) <= set(found)
-
-
 def arm_log(
     table: ForeignTable,
     arm: str,
     found: dict[str, str],
     times: np.ndarray,
-    options: ImportOptions,
-    notes: Notes,
+    job: Import,
     stated: frozenset[str] = frozenset(),
 ) -> ArmLog:
     """The log of one arm, in radians and metres.
@@ -396,65 +324,50 @@ def arm_log(
         arm: its name.
         found: joint or part of a pose -> column.
         times: of the rows, or positions of their images; NaN for rows of no image.
-        options: with units and signs.
-        notes: of the import; some are added.
+        job: the import, with units and signs.
         stated: columns whose meaning is no guess.
-
-    Raises:
-        SequenceError: a cell is no number, a unit is not clear, or a joint to be flipped does not exist.
     """
-    other = other_robots(options).get(arm)
+    other = other_robots(job.options).get(arm)
     if other is None and not _has_joints(found):
-        return _pose_log(table, arm, found, times, options, notes, stated)
-    joints = {joint.name: joint for joint in other or joints_of_arm(arm, options)}
-    order = [*joints] if other is not None else [*JOINT_NAMES, "jaw"]
-    free = {name: Joint(name, name != "insertion", -np.inf, np.inf) for name in order}
-    chosen = [joints.get(name, free[name]) for name in order if name in found]
-    columns = [found[joint.name] for joint in chosen]
+        return _pose_log(table, arm, found, times, job, stated)
+    order = [joint.name for joint in other] if other is not None else [*JOINT_NAMES, "jaw"]
+    known = dict(zip(order, other or psm_joints(arm, order, job), strict=True))
+    joints = [known[name] for name in order if name in found]
+    columns = [found[joint.name] for joint in joints]
     raw = np.stack([table.numbers(column).astype(np.float64) for column in columns], 1)
-    spoken = [f"{column} {table.units.get(column, '')}".strip() for column in columns]
-    values = in_si(raw, chosen, options, notes, arm=arm, columns=spoken, instrument=other is None)
-    kind = "found" if stated.issuperset(columns) else "guessed"
-    notes.append(Note(kind, f"{arm}: joints are {', '.join(columns)} (change: --columns {order[0]} COLUMN ...)."))
-    logged = track([(time, *row) for time, row in zip(times, values, strict=True)])
+    named = [f"{column} {table.units.get(column, '')}".strip() for column in columns]
+    values = in_si(raw, joints, job, arm=arm, columns=named, instrument=other is None)
+    text = f"{arm}: joints are {', '.join(columns)} (change: --columns {order[0]} COLUMN ...)."
+    job.found(text, given=stated.issuperset(columns))
+    logged = track(times, values)
     if other is not None:
-        return ArmLog(arm, joints=logged, names=tuple(joint.name for joint in chosen), si=True)
-    jaw = None if "jaw" not in found else track(list(zip(times, values[:, order.index("jaw")], strict=True)))
+        return ArmLog(arm, joints=logged, names=tuple(joint.name for joint in joints), si=True)
+    jaw = None if "jaw" not in found else track(times, values[:, order.index("jaw")])
     if logged is not None:
         logged = replace(logged, values=logged.values[:, : len(JOINT_NAMES)])
     return ArmLog(arm, joints=logged, jaw=jaw, si=True)
 
 
 def _pose_log(
-    table: ForeignTable,
-    arm: str,
-    found: dict[str, str],
-    times: np.ndarray,
-    options: ImportOptions,
-    notes: Notes,
-    stated: frozenset[str],
+    table: ForeignTable, arm: str, found: dict[str, str], times: np.ndarray, job: Import, stated: frozenset[str]
 ) -> ArmLog:
     """The log of an arm from poses of its tip."""
-    columns = [found[name] for name in _POSE_ORDER]
+    columns, options = [found[name] for name in _POSE_ORDER], job.options
     values = np.stack([table.numbers(column).astype(np.float64) for column in columns], 1)
-    given = options.length_unit or _unit_in_names([f"{column} {table.units.get(column, '')}" for column in columns[:3]])
-    unit = given or length_unit(float(np.nanmax(np.abs(values[:, :3]))), _REACH, arm, "the tip's place")
+    named = " ".join(f"{column} {table.units.get(column, '')}" for column in columns[:3])
+    given = options.length_unit or named_length_unit(named)
+    unit = given or length_unit(float(np.nanmax(np.abs(values[:, :3]))), _REACH, arm, "the tip's position")
     values[:, :3] *= LENGTH_UNITS[unit]
-    notes.append(Note("found" if given else "guessed", f"{arm}: lengths are in {unit} (change: --length-unit)."))
-    poses = track([(time, *row) for time, row in zip(times, values, strict=True)])
+    job.found(f"{arm}: lengths are in {unit} (change: --length-unit).", given=given is not None)
+    poses = track(times, values)
     seen = arm in options.base
     frame = "camera, since --base is given" if seen else "arm's base (if it is the camera: --base)"
-    kind = "found" if seen and stated.issuperset(columns) else "guessed"
-    notes.append(Note(kind, f"{arm}: the tip's pose is {', '.join(columns)}, in the frame of the {frame}."))
+    text = f"{arm}: the tip's pose is {', '.join(columns)}, in the frame of the {frame}."
+    job.found(text, given=seen and stated.issuperset(columns))
     log = ArmLog(arm, poses=poses if seen else None, local_poses=None if seen else poses, si=True)
     if "jaw" not in found:
         return log
     opening = table.numbers(found["jaw"]).astype(np.float64)
     degrees = options.units.get("jaw", options.angle_unit) == "deg" or re.search(r"(?i)deg|°", found["jaw"]) is not None
     opening = opening * (np.pi / 180 if degrees else 1.0) * (-1.0 if "jaw" in options.flip else 1.0)
-    return replace(log, jaw=track(list(zip(times, opening, strict=True))))
-
-
-def _unit_in_names(columns: list[str]) -> str | None:
-    text = " ".join(columns)
-    return next((unit for unit in ("mm", "cm", "dm") if re.search(rf"(?i)(^|[^a-z]){unit}([^a-z]|$)", text)), None)
+    return replace(log, jaw=track(times, opening))

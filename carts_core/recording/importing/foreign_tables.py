@@ -43,11 +43,7 @@ class ForeignTable:
         return len(next(iter(self.columns.values()))) if self.columns else 0
 
     def numbers(self, column: str) -> np.ndarray:
-        """A column as numbers [rows]; whole numbers stay exact.
-
-        Raises:
-            SequenceError: there is no such column, or a cell is no number.
-        """
+        """A column as numbers [rows]; whole numbers stay exact."""
         if column not in self.columns:
             raise SequenceError(f"{self.path} has no column {column!r}. It has: {', '.join(self.columns)}.")
         values = self.columns[column]
@@ -66,11 +62,7 @@ class ForeignTable:
 
 
 def read_foreign_table(path: Path) -> ForeignTable:
-    """A table of any known kind.
-
-    Raises:
-        SequenceError: it is missing, damaged, has no rows, or is of another kind.
-    """
+    """A table of any known kind."""
     readers: dict[str, Callable[[Path], ForeignTable | dict[str, np.ndarray]]] = {
         ".parquet": _parquet,
         ".npy": _numpy,
@@ -90,11 +82,7 @@ def read_foreign_table(path: Path) -> ForeignTable:
 
 
 def read_array(path: Path) -> np.ndarray:
-    """The array of a .npy file.
-
-    Raises:
-        SequenceError: it is missing, damaged, or holds objects.
-    """
+    """The array of a .npy file."""
     try:
         return decoded(tables.read_arrays, path)[""]
     except (OSError, ValueError, KeyError) as error:
@@ -108,7 +96,7 @@ def _csv(path: Path) -> ForeignTable:
     lines = [lines[number - 1] for number in numbers]
     # Extracted dVRK topics begin with their name and type behind a mark.
     begin = 0
-    while begin + 1 < len(lines) and lines[begin].lstrip().startswith("#") and not _begins_with_digit(lines[begin + 1]):
+    while begin + 1 < len(lines) and re.match(r"\s*#", lines[begin]) and not re.match(r"\s*\d", lines[begin + 1]):
         begin += 1
     numbers, lines = numbers[begin:], lines[begin:]
     if not lines:
@@ -140,10 +128,6 @@ def _csv(path: Path) -> ForeignTable:
     if empty := sum(not cell for row in body for cell in row):
         remarks.append(f"{empty} empty cells; rows without a joint are left out")
     return ForeignTable(path, columns, units, dates, tuple(remarks), tuple(numbers))
-
-
-def _begins_with_digit(line: str) -> bool:
-    return line.lstrip()[0:1].isdigit()
 
 
 def _delimiter(lines: list[str]) -> str | None:

@@ -1,13 +1,15 @@
 """Contents of a foreign recording before a sequence file is written, and the interface of their readers."""
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float, Int
 
+from ...errors import SequenceError
+from ...files.reading import VALUES, parse_json, read_text
 from ...settings.interchange import ImportOptions
 
 NoteKind = Literal["found", "guessed", "missing", "warning"]
@@ -19,6 +21,14 @@ def recording_name(path: Path) -> str:
     return path.name if path.is_dir() else path.stem
 
 
+def read_json(path: Path) -> Any:
+    """Content of a JSON file of a recording."""
+    try:
+        return parse_json(read_text(path, VALUES))
+    except (OSError, ValueError) as error:
+        raise SequenceError(f"{path} is not readable JSON ({error}). Copy the recording again.") from error
+
+
 @dataclass(frozen=True)
 class Note:
     """A line of the report."""
@@ -28,24 +38,64 @@ class Note:
     """A sentence; notes on guesses and missing values name the option that changes them."""
 
 
-class Notes(list[Note]):
-    """Notes of an import, in the order in which they were made."""
+@dataclass(frozen=True)
+class Import:
+    """An import in progress: its options, and the notes of its report in the order in which they were made."""
 
-    def found(self, text: str) -> None:
-        """Add a note on a value of the recording."""
-        self.append(Note("found", text))
+    options: ImportOptions
+    notes: list[Note] = field(default_factory=list)
+
+    def note(self, kind: NoteKind, text: str) -> None:
+        """Add a note to the report."""
+        self.notes.append(Note(kind, text))
+
+    def found(self, text: str, *, given: bool = True) -> None:
+        """Add a note on a value of the recording, or on a guess of a value that is not `given`."""
+        self.note("found" if given else "guessed", text)
 
     def guessed(self, text: str) -> None:
         """Add a note on a guess."""
-        self.append(Note("guessed", text))
+        self.note("guessed", text)
 
     def missing(self, text: str) -> None:
         """Add a note on a missing value."""
-        self.append(Note("missing", text))
+        self.note("missing", text)
 
     def warning(self, text: str) -> None:
         """Add a warning."""
-        self.append(Note("warning", text))
+        self.note("warning", text)
+
+    def with_options(self, **changes: Any) -> "Import":
+        """The same import with other options."""
+        return replace(self, options=replace(self.options, **changes))
+
+    def arm_name(self, recorded: str) -> str | None:
+        """Name of a recorded arm in the sequence; None for one that is left out."""
+        names = {given: name for name, given in self.options.arms.items()}
+        return names.get(recorded) if names else recorded
+
+    def recording(
+        self,
+        kind: str,
+        name: str,
+        cameras: "Iterable[FoundCamera]",
+        arms: "Iterable[FoundArm]",
+        ids: tuple[str, ...],
+        times: Float[np.ndarray, " frames"] | None,
+        **further: Any,
+    ) -> "FoundRecording":
+        """The recording with the notes and the given time offset; `further` are other fields of `FoundRecording`."""
+        further = {"time_offset": self.options.time_offset or 0.0, **further}
+        return FoundRecording(kind, name, tuple(cameras), tuple(arms), ids, times, tuple(self.notes), **further)
+
+
+@dataclass(frozen=True, eq=False)
+class Track:
+    """Time series: joint positions [rad], [m], poses x y z [m] with a quaternion x y z w, or transforms."""
+
+    times: Float[np.ndarray, " rows"]
+    """Times in the recording's clock, increasing [s]."""
+    values: Float[np.ndarray, "rows ..."]
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,20 +150,8 @@ class FoundArm:
     """[m]; None if not known."""
     base_from: str = ""
     """Source of the base frame, for the report."""
-    fixed: tuple[str, ...] = ()
-    """Further joints of the robot, constant at 0."""
     beyond_limits: bool = False
     """Whether positions exceed the robot's limits, so that the sequence file has to name their units."""
-
-
-@dataclass(frozen=True, eq=False)
-class FoundMotion:
-    """Time series of the camera mount's pose."""
-
-    times: Float[np.ndarray, " rows"]
-    """Times in the recording's clock, increasing [s]."""
-    Ts_world_mount: Float[np.ndarray, "rows 4 4"]
-    """[m]"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,8 +169,8 @@ class FoundRecording:
     notes: tuple[Note, ...] = ()
     time_offset: float = 0.0
     """Time in the kinematics minus time of the image [s]."""
-    motion: FoundMotion | None = None
-    """Motion of the mount that carries all cameras; None for static cameras."""
+    motion: Track | None = None
+    """T_world_mount [m] of the mount that carries all cameras; None for static cameras."""
     domains: Mapping[str, str] = field(default_factory=dict)
     """Domain -> value of {domain} in patterns; empty for one domain."""
 
@@ -151,5 +189,5 @@ class Source:
     """Whether a path is of this format; quick, never raises."""
     uses: tuple[str, ...]
     """Names of the `ImportOptions` that it uses, besides those of arms, robots and calibrations, which all use."""
-    read: Callable[[Path, ImportOptions], FoundRecording]
+    read: Callable[[Path, Import], FoundRecording]
     """Reads the recording; raises a `CartsError` for damaged or contradictory content."""

@@ -8,9 +8,8 @@ from ...errors import SequenceError
 from ...settings.interchange import ImportOptions
 from ...wording import closest, shown
 from ..sources import SOURCES, Source
-from .found import FoundRecording
-from .placing import completed
-from .writing import write_sequence
+from .found import FoundRecording, Import
+from .writing import completed, write_sequence
 
 _UNFINISHED = {
     ".bag.active": "the recorder did not close it. Run `rosbag reindex` on a copy that is called .bag, and give that.",
@@ -26,15 +25,7 @@ def known_kinds() -> str:
 
 
 def detect(path: Path, name: str | None = None) -> Source:
-    """Format of a recording.
-
-    Args:
-        path: file or folder.
-        name: of the kind, to skip the detection.
-
-    Raises:
-        SequenceError: nothing is there, or it is of no known kind.
-    """
+    """Format of a recording."""
     kinds = known_kinds()
     if not path.exists():
         raise SequenceError(f"{path} is missing. Give the file or folder of a recording.")
@@ -64,11 +55,11 @@ def find(path: Path, options: ImportOptions | None = None) -> FoundRecording:
     for name in ("images", "kinematics", "columns", "clock", "time_offset", "frame_rate"):
         if name not in source.uses and _is_given(options, name):
             raise SequenceError(
-                f"--{name.replace('_', '-')} is not used for {source.label}: it is known there. Leave it out, or "
+                f"--{name.replace('_', '-')} is not used for {source.label}: the recording has it. Leave it out, or "
                 "choose another kind: --source."
             )
     try:
-        recording = source.read(path.absolute(), options)
+        recording = source.read(path.absolute(), Import(options))
         _check_names(recording, options)
         return completed(recording, options)
     except OSError as error:
@@ -82,26 +73,22 @@ def _with_places(path: Path, options: ImportOptions) -> ImportOptions:
     """Options with relative paths resolved against the working directory, else the recording."""
     folder = path if path.is_dir() else path.parent
 
-    def placed(given: Path | str) -> str | None:
-        return next((str(place.absolute()) for place in (Path(given), folder / given) if os.path.exists(place)), None)
+    def placed(given: Path | str) -> str:
+        found = [place for place in (Path(given), folder / given) if os.path.exists(place)]
+        return str(found[0].absolute() if found else given)
 
-    table = options.kinematics
     return replace(
         options,
-        images={name: placed(given) or given for name, given in options.images.items()},
-        calibration={name: Path(placed(given) or given) for name, given in options.calibration.items()},
-        kinematics=None if table is None else Path(placed(table) or table),
-        robot={name: placed(given) or given for name, given in options.robot.items()},
-        base={name: Path(placed(given) or given) for name, given in options.base.items()},
+        images={name: placed(given) for name, given in options.images.items()},
+        calibration={name: Path(placed(given)) for name, given in options.calibration.items()},
+        kinematics=None if options.kinematics is None else Path(placed(options.kinematics)),
+        robot={name: placed(given) for name, given in options.robot.items()},
+        base={name: Path(placed(given)) for name, given in options.base.items()},
     )
 
 
 def _check_names(recording: FoundRecording, options: ImportOptions) -> None:
-    """Check that all given names are those of found arms and cameras.
-
-    Raises:
-        SequenceError: one is not; it lists those that are.
-    """
+    """Check that all given names are those of found arms and cameras."""
     arms = [arm.name for arm in recording.arms]
     cameras = [camera.name for camera in recording.cameras]
     for what, given, known in (

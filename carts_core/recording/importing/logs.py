@@ -12,12 +12,10 @@ from ...errors import CartsError, SequenceError
 from ...model import ecm_kinematics
 from ...model.camera import T_DVRK_OPENCV
 from ...model.psm_kinematics import CLASSIC, JOINT_NAMES, PsmGeometry, forward, inverse
-from ...settings.interchange import ImportOptions
 from ...wording import counted
-from ..kinematics_table import Joint
 from .calibrations import read_base_frames
-from .found import FoundArm, FoundMotion, Notes
-from .joint_units import in_si, joints_of_arm
+from .found import FoundArm, Import, Track
+from .joint_units import in_si, psm_joints
 
 SAME_CYCLE = 2e-3
 """Largest time between rows of two topics of the same controller cycle [s]."""
@@ -93,7 +91,11 @@ def fit_base_frame(
             "no row has both joint positions and a tip pose, so the base frame is not known from them. "
             "Check that both topics were recorded at the same time."
         )
-    Ts = Ts_reference_tip[known] @ np.linalg.inv(forward(joints[known], geometry))
+    return _mean_base(Ts_reference_tip[known] @ np.linalg.inv(forward(joints[known], geometry)))
+
+
+def _mean_base(Ts: Float[np.ndarray, "rows 4 4"]) -> BaseFrame:
+    """Mean rotation and median position of the base frames of all rows."""
     T = np.eye(4)
     T[:3, :3] = Rotation.from_matrix(Ts[:, :3, :3]).mean().as_matrix()
     T[:3, 3] = np.median(Ts[:, :3, 3], axis=0)
@@ -109,9 +111,6 @@ def fit_tool_point(
 
     With T_reference_base = (R, p) and T_base_tip = (R_i, t_i), the places of the point at d from the tip are
     p_i = R (R_i d + t_i) + p: R is the mean of the rotations, and d and p solve a linear least squares problem.
-
-    Raises:
-        CartsError: there are no rows with both.
     """
     known = np.isfinite(joints).all(1) & np.isfinite(Ts_reference_point).all((1, 2))
     R = fit_base_frame(Ts_reference_point, joints, geometry).T_reference_base[:3, :3]
@@ -151,13 +150,13 @@ class InstrumentCheck:
         if self.accepts(name):
             return None
         text = (
-            f"the recording does not fit {name}: measured_cp and measured_js place the arm's base "
-            f"{1e3 * fit.deviation:.3f} mm apart from row to row (allowed is {1e3 * ACCEPTED:g} mm)."
+            f"the recording does not fit {name}: with its lengths the base computed from measured_cp and measured_js "
+            f"moves by {1e3 * fit.deviation:.3f} mm (allowed is {1e3 * ACCEPTED:g} mm)."
         )
         if self.accepts(self.best):
             return f"{text} It fits {self.best} ({1e3 * self.fits[self.best].deviation:.4f} mm): choose that one."
         return (
-            f"{text} No known instrument does: check that joints and poses are of the same arm, in metres and radians."
+            f"{text} No known instrument fits: check that joints and poses are of the same arm, in metres and radians."
         )
 
 
@@ -192,15 +191,6 @@ _SAME_POINT = 1e-4
 
 
 @dataclass(frozen=True, eq=False)
-class Track:
-    """Time series of numbers."""
-
-    times: Float[np.ndarray, " rows"]
-    """Times in the recording's clock, increasing [s]."""
-    values: Float[np.ndarray, "rows columns"]
-
-
-@dataclass(frozen=True, eq=False)
 class ArmLog:
     """Logged values of one arm."""
 
@@ -224,12 +214,18 @@ class ArmLog:
     si: bool = False
     """Whether given units and signs are already applied."""
 
+    @property
+    def T_axes(self) -> Float[np.ndarray, "4 4"]:
+        """From the axes of `poses` and `setup` to those of OpenCV."""
+        return np.eye(4) if self.opencv_axes else T_DVRK_OPENCV
 
-def track(rows: ArrayLike | None) -> Track | None:
-    """Rows of (time, values ...) sorted by time; rows that are not finite or repeat a time are dropped."""
-    table = np.array(rows, np.float64)
-    if table.ndim != 2 or not len(table):
+
+def track(times: ArrayLike, values: ArrayLike) -> Track | None:
+    """Rows sorted by time; rows that are not finite or repeat a time are dropped. None without rows."""
+    times, values = np.asarray(times, np.float64), np.asarray(values, np.float64)
+    if not len(times) or values.ndim > 2:
         return None
+    table = np.column_stack([times, values])
     table = table[np.isfinite(table).all(1)]
     table = table[np.argsort(table[:, 0], kind="stable")]
     table = table[np.concatenate([[True], np.diff(table[:, 0]) > 0])[: len(table)]]
@@ -247,53 +243,36 @@ def transforms(values: Float[np.ndarray, "rows 7"]) -> Float[np.ndarray, "rows 4
     return Ts
 
 
-def arm_from_log(log: ArmLog, options: ImportOptions, notes: Notes) -> FoundArm:
-    """Joint positions and base frame of an arm; notes name their sources.
-
-    Raises:
-        SequenceError: the log has neither joints nor poses, or no joints reach most of its poses.
-    """
+def arm_from_log(log: ArmLog, job: Import) -> FoundArm:
+    """Joint positions and base frame of an arm; notes name their sources."""
+    robot = job.options.robot.get(log.name, FoundArm.robot)
     if log.names:
         assert log.joints is not None
-        T_base, base_from = _base_frame(log, options, CLASSIC, notes)
-        robot = options.robot[log.name]
+        T_base, base_from = _base_frame(log, CLASSIC, job)
         return FoundArm(log.name, log.names, log.joints.values, log.joints.times, robot, T_base, base_from)
-    log = log if log.si else _in_si(log, options, notes)
-    log = _at_the_tip(log, options, notes)
-    geometry = _geometry(log, options, notes)
-    T_camera_base, base_from = _base_frame(log, options, geometry, notes)
-    joints = log.joints if log.joints is not None else _solved(log, T_camera_base, geometry, notes)
-    columns, values = list(JOINT_NAMES), joints.values
-    fixed: tuple[str, ...] = ("jaw",)
+    log = _at_the_tip(log if log.si else _in_si(log, job), job)
+    geometry = _geometry(log, job)
+    T_camera_base, base_from = _base_frame(log, geometry, job)
+    joints = log.joints if log.joints is not None else _solved(log, T_camera_base, geometry, job)
+    columns, values = JOINT_NAMES, joints.values
     if log.jaw is not None:
         jaw = np.interp(joints.times, log.jaw.times, log.jaw.values[:, 0])
-        columns, values, fixed = [*columns, "jaw"], np.column_stack([values, jaw]), ()
+        columns, values = (*JOINT_NAMES, "jaw"), np.column_stack([values, jaw])
         if jaw.min() < -0.1:
-            notes.found(f"{log.name}: the jaw is below 0 while grasping (down to {jaw.min():.2f} rad); drawn shut.")
+            job.found(f"{log.name}: the jaw is below 0 while grasping (down to {jaw.min():.2f} rad); drawn shut.")
             values[:, -1] = np.maximum(values[:, -1], 0.0)
     else:
-        notes.missing(f"{log.name}: no jaw angle; the jaw is drawn shut.")
-    return FoundArm(
-        log.name,
-        tuple(columns),
-        values,
-        joints.times,
-        options.robot.get(log.name, "builtin:psm_lnd"),
-        T_camera_base,
-        base_from,
-        fixed,
-    )
+        job.missing(f"{log.name}: no jaw angle; the jaw is drawn shut.")
+    return FoundArm(log.name, columns, values, joints.times, robot, T_camera_base, base_from)
 
 
-def _in_si(log: ArmLog, options: ImportOptions, notes: Notes) -> ArmLog:
+def _in_si(log: ArmLog, job: Import) -> ArmLog:
     """The log in SI units, by the given units and signs."""
-    robot = {joint.name: joint for joint in joints_of_arm(log.name, options)}
 
     def applied(logged: Track | None, names: tuple[str, ...]) -> Track | None:
         if logged is None:
             return None
-        joints = [robot.get(name, Joint(name, name != "insertion", -np.inf, np.inf)) for name in names]
-        return replace(logged, values=in_si(logged.values, joints, options, notes, arm=log.name))
+        return replace(logged, values=in_si(logged.values, psm_joints(log.name, names, job), job, arm=log.name))
 
     return replace(log, joints=applied(log.joints, JOINT_NAMES), jaw=applied(log.jaw, ("jaw",)))
 
@@ -303,22 +282,27 @@ def _checked_rows(log: ArmLog) -> tuple[np.ndarray, np.ndarray] | None:
     poses = log.poses or log.local_poses
     if log.joints is None or poses is None:
         return None
-    offset = clock_offset(poses.times, log.joints.times)
-    measured = at_times(poses.times - offset, log.joints.times, log.joints.values)
+    measured = _joints_at(poses, log.joints)
     rows = np.flatnonzero(np.isfinite(measured).all(1))
     rows = rows[np.linspace(0, len(rows) - 1, min(len(rows), _CHECKED_ROWS)).astype(int)] if len(rows) else rows
     return None if len(rows) < _FEWEST_ROWS else (transforms(poses.values[rows]), measured[rows])
 
 
-def _at_the_tip(log: ArmLog, options: ImportOptions, notes: Notes) -> ArmLog:
+def _joints_at(poses: Track, joints: Track) -> Float[np.ndarray, "rows 6"]:
+    """Joint positions in the controller cycles of the poses; NaN outside their range."""
+    return at_times(poses.times - clock_offset(poses.times, joints.times), joints.times, joints.values)
+
+
+def _at_the_tip(log: ArmLog, job: Import) -> ArmLog:
     """The log with poses of the tip, where they are those of another point of the tool."""
-    if options.tool_point is not None:
-        point = np.array([0.0, 0.0, options.tool_point])
+    if job.options.tool_point is not None:
+        point = np.array([0.0, 0.0, job.options.tool_point])
     elif (both := _checked_rows(log)) is not None and not _stands_still(*both):
         inverted = np.linalg.inv(both[0])
         if _stands_still(inverted, both[1]):
-            text = "measured_cp holds inverse transforms (the reference in the tip's frame); they are turned round"
-            notes.warning(f"{log.name}: {text}.")
+            job.warning(
+                f"{log.name}: measured_cp holds inverse transforms (the reference in the tip's frame); inverted."
+            )
             return replace(log, poses=_inverse_of(log.poses), local_poses=_inverse_of(log.local_poses))
         fits = [fit_tool_point(*both, geometry) for geometry in CANDIDATES.values()]
         point, moves = min(fits, key=lambda fit: fit[1])
@@ -326,7 +310,7 @@ def _at_the_tip(log: ArmLog, options: ImportOptions, notes: Notes) -> ArmLog:
             return log
         x, y, z = 1e3 * point
         text = f"poses are of a point at {x:.1f}, {y:.1f}, {z:.1f} mm from the tip, along the tool's axes x, y, z"
-        notes.found(f"{log.name}: {text}; they are brought to the tip (change: --tool-point).")
+        job.found(f"{log.name}: {text}; they are converted to the tip (change: --tool-point).")
     else:
         return log
     return replace(log, poses=_moved(log.poses, -point), local_poses=_moved(log.local_poses, -point))
@@ -349,32 +333,30 @@ def _inverse_of(poses: Track | None) -> Track | None:
     if poses is None:
         return None
     Ts = transforms(poses.values)
-    there = np.isfinite(Ts).all((1, 2))
-    Ts = np.linalg.inv(Ts[there])
-    return Track(poses.times[there], np.column_stack([Ts[:, :3, 3], Rotation.from_matrix(Ts[:, :3, :3]).as_quat()]))
+    known = np.isfinite(Ts).all((1, 2))
+    Ts = np.linalg.inv(Ts[known])
+    return Track(poses.times[known], np.column_stack([Ts[:, :3, 3], Rotation.from_matrix(Ts[:, :3, :3]).as_quat()]))
 
 
-def _geometry(log: ArmLog, options: ImportOptions, notes: Notes) -> PsmGeometry:
+def _geometry(log: ArmLog, job: Import) -> PsmGeometry:
     """Lengths of the instrument: as given, as estimated from the recording, or those of a Large Needle Driver."""
     if log.tool:
-        notes.found(f"{log.name}: tool_type is {log.tool}.")
-    chosen = replace(CLASSIC, wrist_length=options.wrist_length) if options.wrist_length is not None else CLASSIC
+        job.found(f"{log.name}: tool_type is {log.tool}.")
+    given = job.options.wrist_length
+    chosen = replace(CLASSIC, wrist_length=given) if given is not None else CLASSIC
     if (both := _checked_rows(log)) is None:
         return chosen
-    Ts, measured = both
     name = f"{1e3 * chosen.wrist_length:.1f} mm wrist"
-    check = check_instrument(Ts, measured, {**CANDIDATES, name: chosen})
-    best = check.fits[check.best]
+    candidates = {**CANDIDATES, name: chosen}
+    check = check_instrument(*both, candidates)
     if check.decides:
-        notes.found(
-            f"{log.name}: joints and tip poses agree with a {check.best} (the base stands still to "
-            f"{1e3 * best.deviation:.4f} mm)."
-        )
-        chosen = {**CANDIDATES, name: chosen}[check.best]
+        deviation = 1e3 * check.fits[check.best].deviation
+        job.found(f"{log.name}: joints and tip poses agree with a {check.best} (base constant to {deviation:.4f} mm).")
+        chosen = candidates[check.best]
     elif (warning := check.warning(name)) is not None:
-        notes.warning(f"{log.name}: {warning}")
-    if chosen.wrist_length != CLASSIC.wrist_length and log.name not in options.robot:
-        notes.warning(
+        job.warning(f"{log.name}: {warning}")
+    if chosen.wrist_length != CLASSIC.wrist_length and log.name not in job.options.robot:
+        job.warning(
             f"{log.name}: the shipped robot has a wrist of 9.1 mm and this instrument one of "
             f"{1e3 * chosen.wrist_length:.1f} mm. Make its robot with carts robot, and give it with --robot "
             f"{log.name} FILE.urdf."
@@ -382,36 +364,32 @@ def _geometry(log: ArmLog, options: ImportOptions, notes: Notes) -> PsmGeometry:
     return chosen
 
 
-def _base_frame(
-    log: ArmLog, options: ImportOptions, geometry: PsmGeometry, notes: Notes
-) -> tuple[np.ndarray | None, str]:
+def _base_frame(log: ArmLog, geometry: PsmGeometry, job: Import) -> tuple[np.ndarray | None, str]:
     """Base frame of the arm in the camera with OpenCV's axes, and its source; None if not known."""
-    if (path := options.base.get(log.name)) is not None:
-        frames = read_base_frames(path, options.axes)
+    if (path := job.options.base.get(log.name)) is not None:
+        frames = read_base_frames(path, job.options.axes)
         chosen = [frame for frame in frames if frame.arm == log.name] or ([frames[0]] if len(frames) == 1 else [])
         if not chosen:
             known = ", ".join(frame.arm for frame in frames)
             raise SequenceError(f"{path} has no base frame of {log.name}. It has: {known}. Name another file.")
-        notes.found(f"{log.name}: base frame from {path}.")
+        job.found(f"{log.name}: base frame from {path}.")
         return chosen[0].T_camera_base, str(path)
-    T_axes = np.eye(4) if log.opencv_axes else T_DVRK_OPENCV
     if log.poses is not None and (log.joints is not None or log.local_poses is not None):
         T, what = _own_base_frame(log, geometry)
         if T is not None and np.abs(T - np.eye(4)).max() > _SAME_BASE:
-            notes.found(f"{log.name}: base frame from {what}; set-up joints are off by some 5 cm unless registered.")
-            return T_axes @ T, what
+            job.found(f"{log.name}: base frame from {what}; set-up joints are off by some 5 cm unless registered.")
+            return log.T_axes @ T, what
     if log.setup is not None:
         T = transforms(log.setup.values[len(log.setup.values) // 2][None])[0]
-        notes.found(f"{log.name}: base frame from set-up joints, which are off by some 5 cm unless registered.")
-        return T_axes @ T, "set-up joints (SUJ)"
+        job.found(f"{log.name}: base frame from set-up joints, which are off by some 5 cm unless registered.")
+        return log.T_axes @ T, "set-up joints (SUJ)"
     return None, ""
 
 
 def _own_base_frame(log: ArmLog, geometry: PsmGeometry) -> tuple[np.ndarray | None, str]:
     assert log.poses is not None
     if log.joints is not None:
-        offset = clock_offset(log.poses.times, log.joints.times)
-        joints = at_times(log.poses.times - offset, log.joints.times, log.joints.values)
+        joints = _joints_at(log.poses, log.joints)
         if not np.isfinite(joints).all(1).any():
             return None, ""
         fit = fit_base_frame(transforms(log.poses.values), joints, geometry)
@@ -420,15 +398,10 @@ def _own_base_frame(log: ArmLog, geometry: PsmGeometry) -> tuple[np.ndarray | No
     rows = nearest(log.poses.times, log.local_poses.times)
     Ts = transforms(log.poses.values) @ np.linalg.inv(transforms(log.local_poses.values)[rows])
     Ts = Ts[np.isfinite(Ts).all((1, 2))]
-    if not len(Ts):
-        return None, ""
-    T = np.eye(4)
-    T[:3, :3] = Rotation.from_matrix(Ts[:, :3, :3]).mean().as_matrix()
-    T[:3, 3] = np.median(Ts[:, :3, 3], axis=0)
-    return T, "measured_cp and local/measured_cp"
+    return (_mean_base(Ts).T_reference_base, "measured_cp and local/measured_cp") if len(Ts) else (None, "")
 
 
-def _solved(log: ArmLog, T_camera_base: np.ndarray | None, geometry: PsmGeometry, notes: Notes) -> Track:
+def _solved(log: ArmLog, T_camera_base: np.ndarray | None, geometry: PsmGeometry, job: Import) -> Track:
     """Joint positions from poses by inverse kinematics."""
     source = log.local_poses or log.poses
     if source is None:
@@ -439,19 +412,18 @@ def _solved(log: ArmLog, T_camera_base: np.ndarray | None, geometry: PsmGeometry
     Ts = transforms(source.values)
     if log.local_poses is None and T_camera_base is not None:
         # measured_cp is in the camera's frame then, with the axes of the dVRK.
-        T_axes = np.eye(4) if log.opencv_axes else T_DVRK_OPENCV
-        Ts = np.linalg.inv(T_camera_base) @ T_axes @ Ts
+        Ts = np.linalg.inv(T_camera_base) @ log.T_axes @ Ts
     found = inverse(Ts, geometry)
     reached = found.reachable
     for entry in found.unreachable:
-        notes.warning(f"{log.name}: poses that no joints reach, left out: {entry}.")
+        job.warning(f"{log.name}: poses that no joints reach, left out: {entry}.")
     if reached.mean() < _FEWEST_REACHABLE:
         raise SequenceError(
             f"{log.name}: no joint positions reach {int((~reached).sum())} of {counted(len(Ts), 'pose')} "
             f"({found.unreachable[0].reason}). The poses are probably not in the frame of the arm's base, or of "
             f"another unit: name the base frame's file with --base {log.name} FILE, or record local/measured_cp."
         )
-    notes.found(f"{log.name}: joint positions by inverse kinematics of {int(reached.sum())} poses.")
+    job.found(f"{log.name}: joint positions by inverse kinematics of {int(reached.sum())} poses.")
     return Track(source.times[reached], found.joints[reached])
 
 
@@ -459,43 +431,34 @@ _MOVES = 5e-4, 0.1
 """Motion [m], [deg] below which an endoscope counts as static."""
 
 
-def endoscope_motion(poses: Track | None, joints: Track | None, start: float, notes: Notes) -> FoundMotion | None:
+def endoscope_motion(poses: Track | None, joints: Track | None, start: float, job: Import) -> Track | None:
     """Pose of the camera over time, in a world with its origin at the first image; None if it is static.
 
-    The tip of the ECM counts as the camera, with the dVRK's axes; what the camera's place on the tip differs from that,
-    `carts calibrate` finds.
+    The tip of the ECM counts as the camera, with the dVRK's axes; `carts calibrate` estimates the camera's pose there.
 
     Args:
         poses: of the ECM's tip in some fixed frame.
         joints: of the ECM, in place of poses.
         start: time of the first image [s].
-        notes: of the import; some are added.
     """
     chosen = poses if poses is not None else joints
     if chosen is None or len(chosen.times) < 2:
         return None
     Ts = transforms(chosen.values) if poses is not None else ecm_kinematics.forward(chosen.values)
-    there = np.asarray(np.isfinite(Ts).all((1, 2)))
-    if there.sum() < 2:
+    known = np.asarray(np.isfinite(Ts).all((1, 2)))
+    if known.sum() < 2:
         return None
-    times, Ts = chosen.times[there], Ts[there]
+    times, Ts = chosen.times[known], Ts[known]
     first = int(np.abs(times - start).argmin())
     relative = T_DVRK_OPENCV @ np.linalg.inv(Ts[first]) @ Ts @ T_DVRK_OPENCV
-    way, turn = _extent(relative)
-    if way <= _MOVES[0] and turn <= _MOVES[1]:
-        notes.found("the endoscope (ECM) stands still.")
+    distance = float(np.linalg.norm(relative[:, :3, 3], axis=1).max())
+    turn = float(np.degrees(Rotation.from_matrix(relative[:, :3, :3]).magnitude().max()))
+    if distance <= _MOVES[0] and turn <= _MOVES[1]:
+        job.found("the endoscope (ECM) stands still.")
         return None
-    notes.found(
-        f"the endoscope (ECM) moves by up to {1e3 * way:.1f} mm and {turn:.1f} deg; a table has where the cameras "
-        "are. Base frames hold for where it is at the first image."
+    job.found(
+        f"the endoscope (ECM) moves by up to {1e3 * distance:.1f} mm and {turn:.1f} deg; a table has the cameras' "
+        "poses. Base frames hold for its pose at the first image."
     )
-    notes.guessed(
-        "the camera is taken for the ECM's tip; let carts calibrate find its place there and the base frames."
-    )
-    return FoundMotion(times, relative)
-
-
-def _extent(Ts: Float[np.ndarray, "rows 4 4"]) -> tuple[float, float]:
-    """Largest distance of poses from the first image's [m], [deg]."""
-    turns = Rotation.from_matrix(Ts[:, :3, :3]).magnitude()
-    return float(np.linalg.norm(Ts[:, :3, 3], axis=1).max()), float(np.degrees(turns.max()))
+    job.guessed("the camera is taken for the ECM's tip; carts calibrate estimates its pose there and the base frames.")
+    return Track(times, relative)

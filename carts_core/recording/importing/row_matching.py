@@ -1,8 +1,8 @@
 """Matching of log rows with images: by times, frame rate, file names, numbers or order.
 
-Times win, then a frame rate that was given, then a column with the images' file names or numbers, then the order of
-rows that are as many as the images. A video's own times are only its nominal rate: one row for each image comes before
-them. Every way is said by a note, and so is what was left out.
+Times win, then a given frame rate, then a column with the images' file names or numbers, then the order of rows that
+are as many as the images. A video's own times are only its nominal rate: one row for each image comes before them. A
+note names the way, and what was left out.
 """
 
 import re
@@ -14,21 +14,16 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from ...errors import SequenceError
-from ...settings.interchange import SECONDS, Clock, ImportOptions
+from ...settings.interchange import SECONDS, Clock
 from ...wording import counted
 from .cameras import Images
-from .found import FoundArm, Note, Notes
+from .found import FoundArm, Import
 
 _STAMPED_DIGITS = 13
 """Digits from which numbers in image names are times."""
 _LONGEST = 1e6
 """Longest recording [s]."""
-_LEAST: Mapping[Clock, tuple[float, float]] = {
-    "ns": (1e17, 9e5),
-    "us": (1e14, 9e2),
-    "ms": (1e11, 0.9),
-    "s": (1e8, 0.0),
-}
+_LEAST: Mapping[Clock, tuple[float, float]] = {"ns": (1e17, 9e5), "us": (1e14, 9e2), "ms": (1e11, 0.9), "s": (1e8, 0.0)}
 """Unit -> smallest time since 1970, and smallest spacing of rows, in that unit."""
 _FEW = 0.1
 """Share of rows without an image up to which a column of numbers counts as image numbers."""
@@ -83,15 +78,9 @@ class RowMatch:
     """Time in the log minus time of the image [s]."""
 
 
-def frame_times(images: Images, ids: tuple[str, ...], options: ImportOptions, notes: Notes) -> FrameTimes:
-    """Times of images: from their names, from the given frame rate, or from a video.
-
-    Args:
-        images: of the leading camera.
-        ids: of the frames that count, in order.
-        options: with `frame_rate`.
-        notes: of the import; some are added.
-    """
+def frame_times(images: Images, ids: tuple[str, ...], job: Import) -> FrameTimes:
+    """Times of the frames `ids` of a camera: from image names, from the given frame rate, or from a video."""
+    rate = job.options.frame_rate
     stems = tuple(
         PureWindowsPath(images.pattern.format(frame=frame, domain="")).stem if images.pattern else frame
         for frame in ids
@@ -100,41 +89,37 @@ def frame_times(images: Images, ids: tuple[str, ...], options: ImportOptions, no
     if images.pattern and all(len(frame) >= _STAMPED_DIGITS for frame in ids):
         numbers = np.array([int(frame) for frame in ids], np.float64)
         clock = guess_clock(numbers)
-        notes.guessed(f"names of the images are times in {clock}.")
-        return _without_rate(replace(found, times=numbers * SECONDS[clock], source="the images' names"), options, notes)
-    video = None
+        job.guessed(f"names of the images are times in {clock}.")
+        return _without_rate(replace(found, times=numbers * SECONDS[clock], source="the images' names"), job)
+    name, video = images.path.name, None
     if images.times is not None:
         position = {frame: index for index, frame in enumerate(images.ids)}
         video = images.times[[position[frame] for frame in ids]]
         spacing = np.diff(video)
         if len(spacing) and np.ptp(spacing) > 0.1 * np.median(spacing):
-            notes.found(f"times of the images are those of {images.path.name}.")
-            return _without_rate(replace(found, times=video, source=images.path.name), options, notes)
-    if options.frame_rate is not None:
-        times = _numbered(ids, notes) / options.frame_rate
+            job.found(f"times of the images are those of {name}.")
+            return _without_rate(replace(found, times=video, source=name), job)
+    if rate is not None:
+        times = _numbered(ids, job) / rate
         if video is not None and len(video) > 1:
-            rate = (len(video) - 1) / (video[-1] - video[0])
-            if abs(rate / options.frame_rate - 1) > 0.01:
-                text = (
-                    f"{images.path.name} has {rate:.4g} images/s; --frame-rate {options.frame_rate:g} is used instead."
-                )
-                notes.warning(text)
-        notes.found(f"times of the images are those of {options.frame_rate:g} images/s.")
+            own = (len(video) - 1) / (video[-1] - video[0])
+            if abs(own / rate - 1) > 0.01:
+                job.warning(f"{name} has {own:.4g} images/s; --frame-rate {rate:g} is used instead.")
+        job.found(f"times of the images are those of {rate:g} images/s.")
         return replace(found, times=times, source="--frame-rate", given=True)
     if video is not None:
-        notes.found(f"times of the images are those of {images.path.name}.")
-        return replace(found, times=video, source=images.path.name, nominal=True)
+        job.found(f"times of the images are those of {name}.")
+        return replace(found, times=video, source=name, nominal=True)
     return found
 
 
-def _without_rate(found: FrameTimes, options: ImportOptions, notes: Notes) -> FrameTimes:
-    if options.frame_rate is not None:
-        text = f"--frame-rate {options.frame_rate:g} is not used: the images have times of their own ({found.source})."
-        notes.warning(text)
+def _without_rate(found: FrameTimes, job: Import) -> FrameTimes:
+    if (rate := job.options.frame_rate) is not None:
+        job.warning(f"--frame-rate {rate:g} is not used: the images have times of their own ({found.source}).")
     return found
 
 
-def _numbered(ids: tuple[str, ...], notes: Notes) -> np.ndarray:
+def _numbered(ids: tuple[str, ...], job: Import) -> np.ndarray:
     """Images counted from 0, with gaps where single numbers are missing in their names."""
     numbers = np.array([int(frame) for frame in ids], np.float64)
     steps = np.diff(numbers)
@@ -144,7 +129,7 @@ def _numbered(ids: tuple[str, ...], notes: Notes) -> np.ndarray:
         return np.arange(len(ids), dtype=float)
     if places[-1] != len(ids) - 1:
         missing = int(places[-1]) + 1 - len(ids)
-        notes.guessed(f"{counted(missing, 'image')} missing in the numbering; they keep their place in time.")
+        job.guessed(f"{counted(missing, 'image')} missing in the numbering; the others keep their times.")
     return places
 
 
@@ -153,7 +138,7 @@ def guess_clock(values: np.ndarray, span: float | None = None) -> Clock:
 
     Args:
         values: of one column.
-        span: how long the images last, where that is known [s].
+        span: duration of the images, where that is known [s].
     """
     values = np.asarray(values, np.float64)
     values = values[np.isfinite(values)]
@@ -177,19 +162,15 @@ def guess_clock(values: np.ndarray, span: float | None = None) -> Clock:
 
 
 def row_seconds(
-    rows: LogRows, clock: Clock | None, notes: Notes, span: float | None = None
+    rows: LogRows, clock: Clock | None, job: Import, span: float | None = None
 ) -> Float[np.ndarray, " rows"] | None:
-    """Times of rows [s]; their unit is guessed if it is not given.
-
-    Raises:
-        SequenceError: times go back.
-    """
+    """Times of rows [s]; their unit is guessed if it is not given."""
     if rows.times is None:
         return None
     values = rows.times
     if clock is None:
         clock = guess_clock(values, span)
-        notes.guessed(f"{rows.name}: times of column {rows.time_column!r} are in {clock} (change: --clock).")
+        job.guessed(f"{rows.name}: times of column {rows.time_column!r} are in {clock} (change: --clock).")
     steps = np.diff(values.astype(np.float64))
     if (steps < 0).any():
         row = int(np.flatnonzero(steps < 0)[0]) + 1
@@ -198,52 +179,44 @@ def row_seconds(
             f"{row + 1}. Sort the rows, or name another column: --columns time COLUMN."
         )
     if repeated := int((steps == 0).sum()):
-        text = f"{rows.name}: {counted(repeated, 'row')} with the time of the row before; the first of each is used."
-        notes.warning(text)
+        job.warning(
+            f"{rows.name}: {counted(repeated, 'row')} with the time of the row before; the first of each is used."
+        )
     return np.asarray(values, np.float64) * SECONDS[clock]
 
 
-def match_rows(frames: FrameTimes, rows: LogRows, options: ImportOptions, notes: Notes) -> RowMatch:
-    """Match rows with images.
-
-    Args:
-        frames: with their times, where known.
-        rows: with their times and images, where known.
-        options: of the import.
-        notes: of the import; some are added.
-
-    Raises:
-        SequenceError: neither times, names, numbers nor order decide; it names the option that does.
-    """
+def match_rows(frames: FrameTimes, rows: LogRows, job: Import) -> RowMatch:
+    """Match rows with images."""
+    options = job.options
     explicit = "frame" in options.columns
-    named = _named(frames, rows, notes)
+    named = _named(frames, rows, job)
     if explicit and named is None:
         raise SequenceError(
             f"{rows.name}: column {rows.image_column!r} names no images (theirs are {frames.stems[0]} to "
             f"{frames.stems[-1]}). Name another one: --columns frame COLUMN."
         )
     span = None if frames.times is None or len(frames.times) < 2 else float(frames.times[-1] - frames.times[0])
-    times = row_seconds(rows, options.clock, notes, span)
+    times = row_seconds(rows, options.clock, job, span)
     one_each = named if named is not None and _is_one_each(named, frames) else None
     in_order = one_each is None and named is None and rows.count == len(frames.ids)
     if in_order:
         one_each = np.arange(rows.count)
     if times is not None and frames.times is not None and not explicit:
-        apart = frames.times[0] > times[-1] or frames.times[-1] < times[0]
+        apart = bool(frames.times[0] > times[-1] or frames.times[-1] < times[0])
         own_clock = options.time_offset is None and not frames.given and (apart or frames.nominal)
         if not (own_clock and one_each is not None):
-            return _by_time(frames, rows, times, apart, named, options, notes)
+            return _by_time(frames, rows, times, apart, named is not None, job)
     if explicit or named is not None:
         assert named is not None
-        if not explicit and one_each is None and _counts_rows(named, rows, times):
+        if not explicit and one_each is None and _counts_rows(named, rows):
             raise SequenceError(
                 f"{rows.name}: column {rows.image_column!r} counts {rows.count} rows and there are "
-                f"{counted(len(frames.ids), 'image')}, so it does not say which row is of which image. Give the "
-                f"images' rate (--frame-rate), or say that it does: --columns frame {rows.image_column!r}."
+                f"{counted(len(frames.ids), 'image')}, so it does not match rows with images. Give the images' rate "
+                f"(--frame-rate), or confirm the column: --columns frame {rows.image_column!r}."
             )
-        return _by_image(frames, rows, named, times, f"column {rows.image_column!r}", notes, stated=explicit)
+        return _by_image(frames, rows, named, times, f"column {rows.image_column!r}", job, stated=explicit)
     if in_order:
-        return _by_image(frames, rows, np.arange(rows.count), times, "their order", notes, stated=False)
+        return _by_image(frames, rows, np.arange(rows.count), times, "their order", job, stated=False)
     lacking = "the images have no times" if times is not None else "the table has no times"
     raise SequenceError(
         f"the recording has {counted(len(frames.ids), 'image')} and {rows.name} has {counted(rows.count, 'row')}, and "
@@ -252,26 +225,16 @@ def match_rows(frames: FrameTimes, rows: LogRows, options: ImportOptions, notes:
     )
 
 
-def _by_time(
-    frames: FrameTimes,
-    rows: LogRows,
-    times: np.ndarray,
-    apart: bool,
-    named: np.ndarray | None,
-    options: ImportOptions,
-    notes: Notes,
-) -> RowMatch:
+def _by_time(frames: FrameTimes, rows: LogRows, times: np.ndarray, apart: bool, named: bool, job: Import) -> RowMatch:
     assert frames.times is not None
-    dropped = (
-        f"; column {rows.image_column!r} is not used (change: --columns frame COLUMN)" if named is not None else ""
-    )
-    text = f"rows meet images by time: column {rows.time_column!r} and {frames.source}{dropped}."
-    notes.append(Note("found" if "time" in options.columns else "guessed", text))
-    offset = options.time_offset
+    dropped = f"; column {rows.image_column!r} is not used (change: --columns frame COLUMN)" if named else ""
+    text = f"rows are matched with images by time: column {rows.time_column!r} and {frames.source}{dropped}."
+    job.found(text, given="time" in job.options.columns)
+    offset = job.options.time_offset
     if offset is None:
         offset = float(times[0] - frames.times[0]) if apart else 0.0
         text = "the clocks do not overlap: the first row is taken for the time of the first image" if apart else "0 s"
-        notes.guessed(f"time offset: {text} (change: --time-offset).")
+        job.guessed(f"time offset: {text} (change: --time-offset).")
     return RowMatch(times, False, frames.times, float(offset))
 
 
@@ -281,31 +244,29 @@ def _by_image(
     positions: np.ndarray,
     times: np.ndarray | None,
     how: str,
-    notes: Notes,
+    job: Import,
     *,
     stated: bool,
 ) -> RowMatch:
-    kind = "found" if stated else "guessed"
-    notes.append(Note(kind, f"each row belongs to one image, by {how} (change: --columns frame COLUMN, --frame-rate)."))
+    job.found(f"each row belongs to one image, by {how} (change: --columns frame COLUMN, --frame-rate).", given=stated)
     if unnamed := int((positions < 0).sum()):
-        notes.warning(f"{rows.name}: {unnamed} of {counted(len(positions), 'row')} belong to no image.")
+        job.warning(f"{rows.name}: {unnamed} of {counted(len(positions), 'row')} belong to no image.")
     known = positions[positions >= 0]
     if repeated := len(known) - len(np.unique(known)):
-        text = f"{rows.name}: {counted(repeated, 'row')} of an image that has a row already; the first one is used."
-        notes.warning(text)
+        job.warning(f"{rows.name}: {counted(repeated, 'row')} of an image that has a row already; the first is used.")
     taken = frames.times
     if times is not None and not frames.given:
         own = np.full(len(frames.ids), np.nan)
         own[known[::-1]] = times[positions >= 0][::-1]
-        there = own[np.isfinite(own)]
-        if len(there) and (np.diff(there) > 0).all():
+        finite = own[np.isfinite(own)]
+        if len(finite) and (np.diff(finite) > 0).all():
             taken = own
             if frames.times is not None:
-                notes.found(f"times of the images are those of their rows instead of those of {frames.source}.")
+                job.found(f"times of the images are those of their rows instead of those of {frames.source}.")
     return RowMatch(np.where(positions >= 0, positions.astype(float), np.nan), True, taken)
 
 
-def _counts_rows(named: np.ndarray, rows: LogRows, times: np.ndarray | None) -> bool:
+def _counts_rows(named: np.ndarray, rows: LogRows) -> bool:
     """Whether a column may count rows: it has a generic name, and many rows have no image."""
     assert rows.images is not None
     general = rows.image_column.strip().lower().replace("_", " ").replace(":", "") in _INDEX
@@ -317,14 +278,14 @@ def _is_one_each(named: np.ndarray, frames: FrameTimes) -> bool:
     return len(np.unique(known)) == len(known) and (named < 0).mean() <= _FEW and len(known) >= 0.5 * len(frames.ids)
 
 
-def _named(frames: FrameTimes, rows: LogRows, notes: Notes) -> Int[np.ndarray, " rows"] | None:
+def _named(frames: FrameTimes, rows: LogRows, job: Import) -> Int[np.ndarray, " rows"] | None:
     """Index of each row's image, -1 for none; None if fewer than half of the rows or images are matched."""
     if rows.images is None:
         return None
     by_stem = {stem: index for index, stem in enumerate(frames.stems)}
     numbers = [_number(cell) for cell in rows.images.tolist()]
     exact = [by_stem.get(_stem(cell), -1) if isinstance(cell, str) else -1 for cell in rows.images.tolist()]
-    named = np.array(exact if max(exact, default=-1) >= 0 else _numbers_to_positions(numbers, frames, rows, notes))
+    named = np.array(exact if max(exact, default=-1) >= 0 else _numbers_to_positions(numbers, frames, rows, job))
     enough = 2 * (named >= 0).sum() >= min(len(frames.ids), len(named))
     return named if enough else None
 
@@ -341,7 +302,7 @@ def _number(cell: object) -> int | None:
     return int(cell) if isinstance(cell, int | float) and np.isfinite(cell) and cell == int(cell) else None
 
 
-def _numbers_to_positions(numbers: list[int | None], frames: FrameTimes, rows: LogRows, notes: Notes) -> list[int]:
+def _numbers_to_positions(numbers: list[int | None], frames: FrameTimes, rows: LogRows, job: Import) -> list[int]:
     ids = [int(frame) for frame in frames.ids]
     position = {number: index for index, number in enumerate(ids)}
     known = [number for number in numbers if number is not None]
@@ -351,48 +312,36 @@ def _numbers_to_positions(numbers: list[int | None], frames: FrameTimes, rows: L
         # Counted from the other end of the first step: every row has an image then, and not all have one without.
         if hits > best and hits == len(known) and min(known) + other == ids[0]:
             best, shift = hits, other
-    if shift:
-        begin = "1" if shift < 0 else "0"
-        kind = "found" if frames.counted else "warning"
-        text = (
-            f"{rows.name}: column {rows.image_column!r} counts from {min(known)} and the images from {ids[0]}; its "
-            f"first row is taken for the first image (rename the images to begin with {min(known)} if it is not)."
+    column = f"{rows.name}: column {rows.image_column!r} counts from"
+    if shift and frames.counted:
+        job.found(f"{column} {1 if shift < 0 else 0}.")
+    elif shift:
+        job.warning(
+            f"{column} {min(known)} and the images from {ids[0]}; its first row is taken for the first image (rename "
+            f"the images to begin with {min(known)} if it is not)."
         )
-        text = f"{rows.name}: column {rows.image_column!r} counts from {begin}." if frames.counted else text
-        notes.append(Note(kind, text))
     return [-1 if number is None else position.get(number + shift, -1) for number in numbers]
 
 
 def by_rows(
-    arms: Sequence[FoundArm],
-    ids: Sequence[str],
-    notes: Notes,
-    times: Float[np.ndarray, " frames"] | None = None,
+    arms: Sequence[FoundArm], ids: Sequence[str], job: Import, times: Float[np.ndarray, " frames"] | None = None
 ) -> tuple[tuple[FoundArm, ...], tuple[str, ...], np.ndarray]:
     """Arms whose times are frame numbers, restricted to the frames that all of them have.
 
     Args:
         arms: `times` are positions in `ids`.
         ids: of all frames.
-        notes: of the import; some are added.
-        times: of the frames [s]; rows get them, so that their delay can be estimated and changed.
+        times: of the frames [s], which become those of the rows, so that a delay can be estimated.
 
     Returns:
         The arms, the ids that remain, and their positions in `ids`.
-
-    Raises:
-        SequenceError: no frame remains.
     """
-    keep = np.ones(len(ids), bool)
     positions = {arm.name: np.asarray(arm.times, int) for arm in arms if arm.times is not None}
-    for rows in positions.values():
-        present = np.zeros(len(ids), bool)
-        present[rows[(rows >= 0) & (rows < len(ids))]] = True
-        keep &= present
+    keep = np.all([np.isin(np.arange(len(ids)), rows) for rows in positions.values()], axis=0) & np.ones(len(ids), bool)
     if not keep.any():
         raise SequenceError("no frame has joint positions of all arms. Leave an arm out: --arms.")
     if not keep.all():
-        notes.warning(f"{int((~keep).sum())} of {len(keep)} frames left out: no joint positions.")
+        job.warning(f"{int((~keep).sum())} of {len(keep)} frames left out: no joint positions.")
     kept = np.flatnonzero(keep)
     timed = times is not None and bool(np.isfinite(times[kept]).all() and (np.diff(times[kept]) > 0).all())
     result = []

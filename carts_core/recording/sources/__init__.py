@@ -1,4 +1,4 @@
-"""Foreign recording formats, one module each; the first that detects a path reads it."""
+"""Foreign recording formats; the first that detects a path reads it. Unusable content is a `SequenceError`."""
 
 from ..importing.found import Source as Source
 from .bag import SOURCE as _BAG
@@ -8,10 +8,10 @@ from .carts_layouts import SEGSTRONG_C as _SEGSTRONG_C
 from .datasets import ENDOVIS as _ENDOVIS
 from .datasets import JIGSAWS as _JIGSAWS
 from .datasets import SURGPOSE as _SURGPOSE
+from .datasets import SURGSYNC as _SURGSYNC
 from .dvrk_recorder import SOURCE as _DVRK
 from .folder import SOURCE as _FOLDER
 from .lerobot import SOURCE as _LEROBOT
-from .surgsync import SOURCE as _SURGSYNC
 
 SOURCES: tuple[Source, ...] = (
     _DVRK,

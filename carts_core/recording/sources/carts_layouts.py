@@ -13,14 +13,12 @@ import numpy as np
 
 from ...errors import SequenceError
 from ...model.psm_kinematics import JOINT_NAMES
-from ...settings.interchange import ImportOptions
 from ..images import mask_remarks, read_mask, spread_files
 from ..importing.cameras import Images, cameras_of, common_ids, find_images, image_files
 from ..importing.foreign_tables import read_array, read_foreign_table
-from ..importing.found import FoundArm, FoundCamera, FoundRecording, Note, Notes, Source
-from ..importing.joint_units import in_si, joints_of_arm
+from ..importing.found import FoundArm, FoundCamera, FoundRecording, Import, Source
+from ..importing.joint_units import in_si, psm_joints
 from ..importing.row_matching import by_rows, frame_times
-from ..kinematics_table import Joint
 
 _TRUTH = "green_screen"
 _FIRST = ("regular",)
@@ -43,40 +41,46 @@ def _ordered(names: Iterable[str]) -> list[str]:
     return sorted(names, key=lambda name: (name not in _FIRST, name))
 
 
-def _domain_images(path: Path, domains: list[str], folder: str, notes: Notes) -> tuple[Images, tuple[str, ...]] | None:
-    """Images of one camera in all domains under one pattern, and the frames that all domains have."""
-    places = [path / domain / folder for domain in domains]
-    if not all(image_files(place) for place in places):
-        return None
-    found = [find_images(place) for place in places]
-    if any(each.pattern != found[0].pattern or each.size != found[0].size for each in found):
-        raise SequenceError(f"{path}: images of {folder} have other names or sizes in some domains. Name them alike.")
-    ids = common_ids(found)
-    if any(len(each.ids) != len(ids) for each in found):
-        notes.warning(f"{folder}: {len(ids)} frames are in all of {', '.join(domains)}; others are left out.")
-    pattern = (
-        f"{{domain}}/{folder}/{found[0].pattern}" if len(domains) > 1 else f"{domains[0]}/{folder}/{found[0].pattern}"
-    )
-    return Images(path, pattern, ids, found[0].size), ids
+def _domain_images(path: Path, domains: list[str], folders: dict[str, str], job: Import) -> dict[str, Images]:
+    """Images of each camera in all domains under one pattern, with the frames that all domains have."""
+    images = {}
+    for camera, folder in folders.items():
+        if not all(image_files(path / domain / folder) for domain in domains):
+            continue
+        found = {domain: find_images(path / domain / folder) for domain in domains}
+        first = found[domains[0]]
+        if any(each.pattern != first.pattern or each.size != first.size for each in found.values()):
+            raise SequenceError(
+                f"{path}: images of {folder} have other names or sizes in some domains. Name them alike."
+            )
+        ids = common_ids(found, path)
+        if any(len(each.ids) != len(ids) for each in found.values()):
+            job.warning(f"{folder}: {len(ids)} frames are in all of {', '.join(domains)}; others are left out.")
+        place = "{domain}" if len(domains) > 1 else domains[0]
+        images[camera] = Images(path, f"{place}/{folder}/{first.pattern}", ids, first.size)
+    if not images:
+        raise SequenceError(f"{path}: no camera has images in all of {', '.join(domains)}. Remove the incomplete ones.")
+    return images
 
 
-def _with_masks(camera: FoundCamera, folder: Path, ids: tuple[str, ...], notes: Notes) -> FoundCamera:
+def _with_masks(camera: FoundCamera, folder: Path, ids: tuple[str, ...], job: Import) -> FoundCamera:
     """The camera with the masks of a folder, if they are white on black."""
     if not image_files(folder):
         return camera
     masks = find_images(folder)
     shared = [frame for frame in ids if frame in set(masks.ids)]
     if not shared:
-        notes.warning(f"{folder}: no mask is of a frame; they are left out.")
+        job.warning(f"{folder}: no mask is of a frame; they are left out.")
         return camera
     files = [folder / masks.pattern.format(frame=frame) for frame in shared]
     try:
         for file in spread_files(files):
             read_mask(file)
     except SequenceError as error:
-        notes.missing(f"{camera.name}: masks in {folder} are left out: {error}")
+        job.missing(f"{camera.name}: masks in {folder} are left out: {error}")
         return camera
-    notes += [Note("found", f"{camera.name}: {text}") for text in mask_remarks(files)]
+    for text in mask_remarks(files):
+        job.found(f"{camera.name}: {text}")
     return replace(camera, masks=str(folder / masks.pattern), sparse_masks=len(shared) < len(ids))
 
 
@@ -84,45 +88,25 @@ def _detect_cts(path: Path) -> bool:
     return any(image_files(each / "images_l") for each in _subfolders(path)) and (path / _TRUTH).is_dir()
 
 
-def _read_cts(path: Path, options: ImportOptions) -> FoundRecording:
-    notes = Notes()
+def _read_cts(path: Path, job: Import) -> FoundRecording:
     domains = _ordered(each.name for each in _subfolders(path) if image_files(each / "images_l"))
-    images: dict[str, Images] = {}
-    ids: tuple[str, ...] = ()
-    for name, folder in (("left", "images_l"), ("right", "images_r")):
-        found = _domain_images(path, domains, folder, notes)
-        if found is not None:
-            images[name] = found[0]
-            ids = tuple(frame for frame in ids if frame in set(found[1])) if ids else found[1]
-    if not ids:
-        raise SequenceError(
-            f"{path}: no frame is in all of the domains {', '.join(domains)}. Remove the incomplete ones."
-        )
-    cameras = tuple(
-        _with_masks(camera, path / _TRUTH / f"ground_truth_{camera.name[0]}", ids, notes)
-        for camera in cameras_of(images, options, notes)
-    )
+    images = _domain_images(path, domains, {"left": "images_l", "right": "images_r"}, job)
+    ids = common_ids(images, path)
+    cameras = [
+        _with_masks(camera, path / _TRUTH / f"ground_truth_{camera.name[0]}", ids, job)
+        for camera in cameras_of(images, job)
+    ]
     arms = []
     for name in ("PSM1", "PSM2", "PSM3"):
         file = path / _TRUTH / f"{name.lower()}_js.npy"
         if file.is_file():
             table = read_foreign_table(file)
             values = np.stack(list(table.columns.values())[:6], 1).astype(np.float64)
-            arms.append(_arm(name, values, ids, file, options, notes))
+            arms.append(_arm(name, values, ids, file, job))
     if not arms:
         raise SequenceError(f"{path / _TRUTH} has no psm1_js.npy or psm2_js.npy. Copy the set again, whole.")
-    found, times = _timed(arms, ids, next(iter(images.values())), options, notes)
-    return FoundRecording(
-        "a set of CTS",
-        path.name,
-        cameras,
-        found,
-        ids,
-        times,
-        tuple(notes),
-        options.time_offset or 0.0,
-        domains=_domains(domains),
-    )
+    found, times = _timed(arms, ids, next(iter(images.values())), job)
+    return job.recording("a set of CTS", path.name, cameras, found, ids, times, domains=_domains(domains))
 
 
 def _domains(names: list[str]) -> dict[str, str]:
@@ -130,18 +114,16 @@ def _domains(names: list[str]) -> dict[str, str]:
 
 
 def _timed(
-    arms: list[FoundArm], ids: tuple[str, ...], images: Images, options: ImportOptions, notes: Notes
+    arms: list[FoundArm], ids: tuple[str, ...], images: Images, job: Import
 ) -> tuple[tuple[FoundArm, ...], np.ndarray | None]:
     """Arms with rows at the times of their images if a frame rate is given, and these times [s]."""
-    times = frame_times(images, ids, options, notes).times
+    times = frame_times(images, ids, job).times
     rows = np.arange(len(ids), dtype=float)
-    found, _, _ = by_rows([replace(arm, times=rows) for arm in arms], ids, notes, times)
+    found, _, _ = by_rows([replace(arm, times=rows) for arm in arms], ids, job, times)
     return found, times
 
 
-def _arm(
-    name: str, values: np.ndarray, ids: tuple[str, ...], file: Path, options: ImportOptions, notes: Notes
-) -> FoundArm:
+def _arm(name: str, values: np.ndarray, ids: tuple[str, ...], file: Path, job: Import) -> FoundArm:
     """Joint positions of the frames: row n is frame n if no row is missing, else rows are matched in order."""
     if values.shape[1] < 6 or not np.isfinite(values).all():
         raise SequenceError(f"{file} does not hold six finite joint positions a row. Copy it again.")
@@ -156,27 +138,23 @@ def _arm(
             "Remove images without kinematics."
         )
     columns = (*JOINT_NAMES, "jaw")[: values.shape[1]]
-    robot = options.robot.get(name, "builtin:psm_lnd")
-    known = {joint.name: joint for joint in joints_of_arm(name, options)}
-    joints = [known.get(column, Joint(column, column != "insertion", -np.inf, np.inf)) for column in columns]
-    values = in_si(values, joints, options, notes, arm=name)
-    return FoundArm(name, columns, values[rows], None, robot)
+    values = in_si(values, psm_joints(name, columns, job), job, arm=name)
+    return FoundArm(name, columns, values[rows], None, job.options.robot.get(name, FoundArm.robot))
 
 
 def _detect_ambf(path: Path) -> bool:
     return (path / "kinematics.npy").is_file() and bool(image_files(path / "images"))
 
 
-def _read_ambf(path: Path, options: ImportOptions) -> FoundRecording:
-    notes = Notes()
+def _read_ambf(path: Path, job: Import) -> FoundRecording:
     images = find_images(path / "images")
-    (camera,) = cameras_of({"camera": images}, options, notes)
+    (camera,) = cameras_of({"camera": images}, job)
     if camera.intrinsics is None:
         width, height = images.size
         focal = height / 2 / np.tan(_AMBF_FIELD_OF_VIEW / 2)
         camera = replace(camera, intrinsics=(focal, focal, width / 2, height / 2), pixel_center=0.5)
-        notes.guessed("the camera sees 1.2 rad from top to bottom (change: --calibration camera FILE).")
-    camera = _with_masks(camera, path / "segmentations", images.ids, notes)
+        job.guessed("the camera sees 1.2 rad from top to bottom (change: --calibration camera FILE).")
+    camera = _with_masks(camera, path / "segmentations", images.ids, job)
     file = path / "kinematics.npy"
     values = read_array(file)
     if values.ndim != 2 or values.shape[1] % _AMBF_COLUMNS or values.dtype.kind not in "fiu":
@@ -185,22 +163,13 @@ def _read_ambf(path: Path, options: ImportOptions) -> FoundRecording:
     for number in range(values.shape[1] // _AMBF_COLUMNS):
         own = values[:, _AMBF_COLUMNS * number : _AMBF_COLUMNS * (number + 1)].astype(np.float64)
         joints = np.column_stack([own[:, :6], own[:, 6] + own[:, 7]])
-        chosen = options
-        if np.abs(joints[:, 2]).max() > _DECIMETRES_FROM and options.length_unit is None:
-            chosen = replace(options, length_unit="dm")
-            notes.guessed(f"PSM{number + 1}: insertion is in decimetres (change: --length-unit m).")
-        arms.append(_arm(f"PSM{number + 1}", joints, images.ids, file, chosen, notes))
-    found, times = _timed(arms, images.ids, images, options, notes)
-    return FoundRecording(
-        "a simulated video (AMBF)",
-        path.name,
-        (camera,),
-        found,
-        images.ids,
-        times,
-        tuple(notes),
-        options.time_offset or 0.0,
-    )
+        chosen = job
+        if np.abs(joints[:, 2]).max() > _DECIMETRES_FROM and job.options.length_unit is None:
+            chosen = job.with_options(length_unit="dm")
+            job.guessed(f"PSM{number + 1}: insertion is in decimetres (change: --length-unit m).")
+        arms.append(_arm(f"PSM{number + 1}", joints, images.ids, file, chosen))
+    found, times = _timed(arms, images.ids, images, job)
+    return job.recording("a simulated video (AMBF)", path.name, (camera,), found, images.ids, times)
 
 
 def _is_subset(path: Path) -> bool:
@@ -221,28 +190,16 @@ def _detect_segstrong(path: Path) -> bool:
     return path.is_dir() and (_is_subset(path) or any(_is_subset(each) for each in _subsets(path)))
 
 
-def _read_segstrong(path: Path, options: ImportOptions) -> FoundRecording:
+def _read_segstrong(path: Path, job: Import) -> FoundRecording:
     if not _is_subset(path):
         subsets = ", ".join(str(each.relative_to(path)) for each in _subsets(path))
         raise SequenceError(f"{path} holds several recordings. Import one of them: {subsets}.")
-    notes = Notes()
-    domains = _ordered(
-        each.name for each in _subfolders(path) if each.name != "ground_truth" and image_files(each / "left")
-    )
-    images: dict[str, Images] = {}
-    for name in ("left", "right"):
-        if (found := _domain_images(path, domains, name, notes)) is not None:
-            images[name] = found[0]
-    ids = common_ids(list(images.values()))
-    if not ids:
-        raise SequenceError(f"{path}: no frame is in all domains and cameras. Remove the incomplete ones.")
-    cameras = tuple(
-        _with_masks(camera, path / "ground_truth" / camera.name, ids, notes)
-        for camera in cameras_of(images, options, notes)
-    )
-    return FoundRecording(
-        "a subset of SegSTRONG-C", path.name, cameras, (), ids, None, tuple(notes), domains=_domains(domains)
-    )
+    folders = [each for each in _subfolders(path) if each.name != "ground_truth"]
+    domains = _ordered(each.name for each in folders if image_files(each / "left"))
+    images = _domain_images(path, domains, {"left": "left", "right": "right"}, job)
+    ids = common_ids(images, path)
+    cameras = [_with_masks(camera, path / "ground_truth" / camera.name, ids, job) for camera in cameras_of(images, job)]
+    return job.recording("a subset of SegSTRONG-C", path.name, cameras, (), ids, None, domains=_domains(domains))
 
 
 CTS = Source(

@@ -1,24 +1,29 @@
-"""Public data sets with layouts of their own: SurgPose, EndoVis 2017 and 2018, JIGSAWS.
+"""Public data sets with layouts of their own: SurgPose, EndoVis 2017 and 2018, JIGSAWS, SurgSync.
 
 SurgPose   NNNNNN/{regular,green}/{left,right}_video.mp4, api_jp_data.yaml, StereoCalibrationDVRK.ini
 EndoVis    {instrument_dataset_N,seq_N}/{left_frames,right_frames}/frame000.png, camera_calibration.txt
 JIGSAWS    TASK/kinematics/AllGestures/TRIAL.txt (76 columns), TASK/video/TRIAL_capture{1,2}.avi
+SurgSync   clips: image/{left,right}/I.png, kinematic/PSM1/I.json, camera_calibration/left.yaml, hand_eye_calibration/
+           episodes: video_raw/stereo_{left,right}.mkv, PSM1.parquet, calibration/left.yaml, calibration/hand_eye/
 """
 
 import re
 import shlex
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ...errors import SequenceError
 from ...files.reading import TABLE, VALUES, parse_yaml, read_text
-from ...settings.interchange import ImportOptions
+from ...model.psm_kinematics import JOINT_NAMES
 from ...wording import listed
 from ..importing.cameras import cameras_of, common_ids, find_images, image_files
-from ..importing.found import FoundArm, FoundCamera, FoundRecording, Notes, Source
+from ..importing.columns import order_of_names
+from ..importing.foreign_tables import read_foreign_table
+from ..importing.found import FoundArm, FoundCamera, FoundRecording, Import, Source, read_json
 from ..importing.logs import ArmLog, arm_from_log, track
 from ..importing.row_matching import by_rows, frame_times
 
@@ -44,56 +49,44 @@ def _detect_surgpose(path: Path) -> bool:
     return _surgpose_folder(path) is not None and any(path.rglob("api_jp_data.yaml"))
 
 
-def _read_surgpose(path: Path, options: ImportOptions) -> FoundRecording:
-    notes = Notes()
+def _read_surgpose(path: Path, job: Import) -> FoundRecording:
     folder = _surgpose_folder(path)
     assert folder is not None
     images = {side: find_images(folder / f"{side}_video.mp4") for side in ("left", "right")}
     calibration = next(iter(sorted(path.rglob("StereoCalibrationDVRK.ini"))), None)
-    cameras = cameras_of(images, options, notes, dict.fromkeys(images, calibration) if calibration else {})
-    ids = common_ids(list(images.values()))
-    file = next(iter(sorted(path.rglob("api_jp_data.yaml"))))
+    cameras = cameras_of(images, job, dict.fromkeys(images, calibration) if calibration else {})
+    ids = common_ids(images, path)
+    file = min(path.rglob("api_jp_data.yaml"))
     rows = _yaml_rows(file)
-    rename = {recorded: name for name, recorded in options.arms.items()}
-    names = sorted({str(arm) for row in rows.values() for arm in row} & (set(rename) or {"PSM1", "PSM2", "PSM3"}))
+    wanted = set(job.options.arms.values()) or {"PSM1", "PSM2", "PSM3"}
+    names = sorted({str(arm) for row in rows.values() for arm in row} & wanted)
     if not names:
         raise SequenceError(
             f"{file} has no joint positions of PSM1, PSM2 or PSM3. Copy it again, or name arms: --arms."
         )
     arms = []
     for recorded in names:
+        own = {frame: row[recorded] for frame, row in rows.items() if recorded in row}
         try:
-            log = track(
-                [(float(frame), *map(float, row[recorded][:6])) for frame, row in rows.items() if recorded in row]
-            )
+            log = track([*own], [[*map(float, values[:6])] for values in own.values()])
         except (TypeError, ValueError) as error:
             raise SequenceError(
                 f"{file}: joint positions of {recorded} are no numbers ({error}). Copy it again."
             ) from error
         if log is None or log.values.shape[1] != 6:
             raise SequenceError(f"{file}: {recorded} needs six joint positions in every frame. Copy it again.")
-        arms.append(arm_from_log(ArmLog(str(rename.get(recorded, recorded)), joints=log), options, notes))
-    times = frame_times(images["left"], ids, options, notes).times
+        arms.append(arm_from_log(ArmLog(job.arm_name(recorded) or recorded, joints=log), job))
+    times = frame_times(images["left"], ids, job).times
     if len(rows) != len(ids):
         text = f"{file.name} has {len(rows)} rows and there are {len(ids)} images."
-        notes.warning(f"{text} Each row is taken for the image of its number; look at the delay.")
-    found, kept_ids, kept = by_rows(arms, ids, notes, times)
-    numbered = tuple(replace(camera, numbers=kept) for camera in cameras)
-    text = (
+        job.warning(f"{text} Each row is taken for the image of its number; look at the delay.")
+    found, kept_ids, kept = by_rows(arms, ids, job, times)
+    job.warning(
         "the kinematics of SurgPose need compensation, its base frames differ from trajectory to trajectory, and "
         "rows of many are up to 71 frames late: estimate the delay with carts time-offset."
     )
-    notes.warning(text)
-    return FoundRecording(
-        "a trajectory of SurgPose",
-        path.name,
-        numbered,
-        found,
-        kept_ids,
-        found[0].times,
-        tuple(notes),
-        options.time_offset or 0.0,
-    )
+    numbered = [replace(camera, numbers=kept) for camera in cameras]
+    return job.recording("a trajectory of SurgPose", path.name, numbered, found, kept_ids, found[0].times)
 
 
 def _yaml_rows(file: Path) -> dict[int, dict]:
@@ -109,24 +102,20 @@ def _detect_endovis(path: Path) -> bool:
     return bool(image_files(path / "left_frames"))
 
 
-def _read_endovis(path: Path, options: ImportOptions) -> FoundRecording:
-    notes = Notes()
-    images = {
-        side: find_images(path / f"{side}_frames") for side in ("left", "right") if image_files(path / f"{side}_frames")
-    }
-    ids = common_ids(list(images.values()))
-    if not ids:
-        raise SequenceError(f"{path}: no frame is in both left_frames and right_frames. Copy the sequence again.")
+def _read_endovis(path: Path, job: Import) -> FoundRecording:
+    folders = {side: path / f"{side}_frames" for side in ("left", "right")}
+    images = {side: find_images(folder) for side, folder in folders.items() if image_files(folder)}
+    ids = common_ids(images, path)
     cameras = []
-    for camera in cameras_of(images, options, notes):
+    for camera in cameras_of(images, job):
         framed = camera.size == (1920, 1080)
         shown = replace(camera, crop=_ENDOVIS_PART, size=_ENDOVIS_PART[2:]) if framed else camera
-        cameras.append(_endovis_calibration(shown, path / "camera_calibration.txt", notes))
-    notes.missing("labels of EndoVis are of classes, not 0 and 255, and are left out.")
-    return FoundRecording("a sequence of EndoVis", path.name, tuple(cameras), (), ids, None, tuple(notes))
+        cameras.append(_endovis_calibration(shown, path / "camera_calibration.txt", job))
+    job.missing("labels of EndoVis are of classes, not 0 and 255, and are left out.")
+    return job.recording("a sequence of EndoVis", path.name, cameras, (), ids, None)
 
 
-def _endovis_calibration(camera: FoundCamera, file: Path, notes: Notes) -> FoundCamera:
+def _endovis_calibration(camera: FoundCamera, file: Path, job: Import) -> FoundCamera:
     if camera.intrinsics is not None or not file.is_file():
         return camera
     number = 1 if camera.name == "right" else 0
@@ -146,7 +135,7 @@ def _endovis_calibration(camera: FoundCamera, file: Path, notes: Notes) -> Found
             T[:3, 3] = np.array(values["Extrinsic-T"][:3]) * 1e-3
     except (OSError, ValueError, KeyError) as error:
         raise SequenceError(f"{file} lacks a readable {error}. Copy it again, or give --calibration.") from error
-    notes.found(f"calibration of {camera.name}: from {file.name}.")
+    job.found(f"calibration of {camera.name}: from {file.name}.")
     return replace(camera, intrinsics=(fx, fy, cx, cy), distortion=distortion, T_camera_world=T)
 
 
@@ -161,11 +150,8 @@ def jigsaws_trials(folder: Path) -> tuple[Path, ...]:
         found = {file for level in levels for file in folder.glob(f"{level}/*.txt" if level else "*.txt")}
     except OSError:
         return ()
-    return tuple(sorted(file for file in found if not file.name.startswith(".") and _is_trial(file)))
-
-
-def _is_trial(file: Path) -> bool:
-    return file.parts[-3:-1] == ("kinematics", "AllGestures") and file.is_file()
+    wanted = (file for file in found if file.parts[-3:-1] == ("kinematics", "AllGestures") and file.is_file())
+    return tuple(sorted(file for file in wanted if not file.name.startswith(".")))
 
 
 def _detect_jigsaws(path: Path) -> bool:
@@ -174,7 +160,7 @@ def _detect_jigsaws(path: Path) -> bool:
     return path.suffix == ".txt" and path.is_file() and path.parent.parent.name == "kinematics"
 
 
-def _read_jigsaws(path: Path, options: ImportOptions) -> FoundRecording:
+def _read_jigsaws(path: Path, job: Import) -> FoundRecording:
     trials = jigsaws_trials(path) if path.is_dir() else (path,)
     if len(trials) > 1:
         names = listed([trial.stem for trial in trials], _LISTED)
@@ -185,7 +171,6 @@ def _read_jigsaws(path: Path, options: ImportOptions) -> FoundRecording:
     if not trials:
         raise SequenceError(f"{path} has no kinematics/AllGestures/TRIAL.txt. Give the root of JIGSAWS, or a trial.")
     path = trials[0]
-    notes = Notes()
     try:
         rows = np.array([line.split() for line in read_text(path, TABLE).splitlines() if line.strip()], np.float64)
     except (OSError, ValueError) as error:
@@ -197,28 +182,23 @@ def _read_jigsaws(path: Path, options: ImportOptions) -> FoundRecording:
     images = {side: find_images(video) for side, video in found.items() if video.is_file()}
     if not images:
         raise SequenceError(f"{videos} has no {path.stem}_capture1.avi. Copy the videos of the task too.")
-    cameras = cameras_of(images, options, notes)
-    ids = common_ids(list(images.values()))
-    rate = options.frame_rate or _JIGSAWS_RATE
+    cameras = cameras_of(images, job)
+    ids = common_ids(images, videos)
+    rate = job.options.frame_rate or _JIGSAWS_RATE
     times = np.arange(len(rows), dtype=float) / rate
     if len(rows) != len(ids):
-        notes.warning(f"{path.name} has {len(rows)} rows and there are {len(ids)} images.")
+        job.warning(f"{path.name} has {len(rows)} rows and there are {len(ids)} images.")
     arms: list[FoundArm] = []
     for arm, first in _JIGSAWS_ARMS.items():
         R = rows[:, first + 3 : first + 12].reshape(-1, 3, 3)
         if np.abs(np.linalg.det(R) - 1).max() > 0.05:
             raise SequenceError(f"{path}: columns {first + 4} to {first + 12} are no rotations. Copy it again.")
-        poses = np.column_stack([rows[:, first : first + 3], Rotation.from_matrix(R).as_quat()])
-        seen = arm in options.base
-        logged = track([(time, *pose) for time, pose in zip(times, poses, strict=True)])
-        jaw = track(list(zip(times, rows[:, first + 18], strict=True)))
-        log = ArmLog(
-            arm, jaw=jaw, poses=logged if seen else None, local_poses=None if seen else logged, opencv_axes=True
-        )
-        arms.append(arm_from_log(log, options, notes))
-    taken = frame_times(next(iter(images.values())), ids, replace(options, frame_rate=rate), notes).times
-    offset = options.time_offset or 0.0
-    return FoundRecording("a trial of JIGSAWS", path.stem, cameras, tuple(arms), ids, taken, tuple(notes), offset)
+        poses = track(times, np.column_stack([rows[:, first : first + 3], Rotation.from_matrix(R).as_quat()]))
+        seen, jaw = arm in job.options.base, track(times, rows[:, first + 18])
+        log = ArmLog(arm, None, jaw, poses if seen else None, None if seen else poses, opencv_axes=True)
+        arms.append(arm_from_log(log, job))
+    taken = frame_times(next(iter(images.values())), ids, job.with_options(frame_rate=rate)).times
+    return job.recording("a trial of JIGSAWS", path.stem, cameras, arms, ids, taken)
 
 
 SURGPOSE = Source(
@@ -239,4 +219,142 @@ JIGSAWS = Source(
     _detect_jigsaws,
     ("time_offset", "frame_rate"),
     _read_jigsaws,
+)
+
+
+_ARMS, _SIDES = ("PSM1", "PSM2", "PSM3"), ("left", "right")
+_TRACKS = ("joints", "poses", "local_poses", "jaw")
+_LENGTHS = {"joints": 6, "poses": 7, "local_poses": 7, "jaw": 1}
+
+
+def _detect_surgsync(path: Path) -> bool:
+    packed = (path / "video_raw").is_dir() and any((path / f"{arm}.parquet").is_file() for arm in _ARMS)
+    return packed or (bool(image_files(path / "image/left")) and (path / "kinematic").is_dir())
+
+
+def _read_surgsync(path: Path, job: Import) -> FoundRecording:
+    packed = (path / "video_raw").is_dir()
+    places = {side: path / f"video_raw/stereo_{side}.mkv" if packed else path / "image" / side for side in _SIDES}
+    images = {side: find_images(place) for side, place in places.items() if place.exists()}
+    if not images:
+        raise SequenceError(f"{path} has neither video_raw/stereo_left.mkv nor image/left. Copy it again, whole.")
+    cameras = cameras_of(images, job, _side_calibrations(path, tuple(images)))
+    if (extrinsics := next(iter(sorted(path.rglob("stereo_calib_params.json"))), None)) is not None:
+        cameras = tuple(_with_extrinsics(camera, extrinsics, job) for camera in cameras)
+    ids = common_ids(images, path)
+    job = job.with_options(base={**_registrations(path), **job.options.base})
+    arms: list[FoundArm] = []
+    for recorded in _ARMS:
+        if (name := job.arm_name(recorded)) is None:
+            continue
+        tracks = _packed(path, recorded) if packed else _raw(path, recorded, ids)
+        if any(found is not None for found in tracks.values()):
+            arms.append(arm_from_log(ArmLog(name, **tracks), job))
+    if not arms:
+        raise SequenceError(f"{path} has no kinematics of {', '.join(_ARMS)}. Copy it again, whole.")
+    times = frame_times(next(iter(images.values())), ids, job).times
+    found, kept_ids, kept = by_rows(arms, ids, job, times)
+    if packed:
+        cameras = tuple(replace(camera, numbers=kept) for camera in cameras)
+    kind = "an episode of SurgSync" if packed else "a clip of SurgSync"
+    return job.recording(kind, path.name, cameras, found, kept_ids, found[0].times)
+
+
+def _side_calibrations(path: Path, sides: tuple[str, ...]) -> dict[str, Path]:
+    places = {side: (path / "calibration" / f"{side}.yaml", path / f"camera_calibration/{side}.yaml") for side in sides}
+    return {side: file for side, files in places.items() for file in files if file.is_file()}
+
+
+def _registrations(path: Path) -> dict[str, Path]:
+    files = sorted(path.rglob("*-registration-open-cv.json")) or sorted(path.rglob("*-registration-dVRK.json"))
+    return {file.name.partition("-")[0]: file for file in files}
+
+
+def _with_extrinsics(camera: FoundCamera, file: Path, job: Import) -> FoundCamera:
+    """The right camera at its pose of the stereo calibration, if the file has R and T."""
+    if camera.name != "right":
+        return camera
+    content = read_json(file)
+    try:
+        R = np.array(content["R"], np.float64).reshape(3, 3)
+        T = np.array(content["T"], np.float64).reshape(3)
+    except (KeyError, TypeError, ValueError):
+        job.warning(f"{file} has no R and T; the right camera is placed by right.yaml alone.")
+        return camera
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = R, T * (1e-3 if np.linalg.norm(T) > 1.0 else 1.0)
+    return replace(camera, T_camera_world=pose)
+
+
+def _packed(path: Path, arm: str) -> dict[str, Any]:
+    """Time series of an arm by rows of its table; times are row numbers."""
+    file = path / f"{arm}.parquet"
+    if not file.is_file():
+        return dict.fromkeys(_TRACKS)
+    table = read_foreign_table(file)
+    given = [table.columns.get(f"measured_js.name.{index}") for index in range(len(JOINT_NAMES))]
+    order = order_of_names(tuple(str(cells[0]) for cells in given if cells is not None))
+    pose = [*(f"position.{index}" for index in range(3)), *(f"orientation.{index}" for index in range(4))]
+    columns = {
+        "joints": [f"measured_js.position.{index}" for index in order or range(len(JOINT_NAMES))],
+        "poses": [f"measured_cp.{part}" for part in pose],
+        "local_poses": [f"local_measured_cp.{part}" for part in pose],
+        "jaw": ["jaw.measured_position"],
+    }
+    return {
+        role: track(np.arange(len(table)), np.column_stack([table.numbers(name) for name in names]))
+        for role, names in columns.items()
+        if set(names) <= set(table.columns)
+    }
+
+
+def _raw(path: Path, arm: str, ids: tuple[str, ...]) -> dict[str, Any]:
+    """Time series of an arm from a JSON file per frame; times are positions in `ids`."""
+    folder = path / "kinematic" / arm
+    rows: dict[str, list[tuple[float, ...]]] = {role: [] for role in _TRACKS}
+    for position, frame in enumerate(ids):
+        file = folder / f"{frame}.json"
+        if not file.is_file():
+            continue
+        content = read_json(file)
+        try:
+            top = content[0] if isinstance(content, list) else content
+            body = top["arm"]
+            measured = body["measured_data"]
+            # Offline recordings keep the jaw inside the arm.
+            jaw = top.get("jaw") or body.get("jaw") or {}
+            values = {
+                "joints": _named_positions(measured.get("measured_js") or {}),
+                "poses": _pose(measured.get("measured_cp")),
+                "local_poses": _pose(measured.get("local_measured_cp")),
+                "jaw": (jaw.get("measured_data") or {}).get("position"),
+            }
+            for role, numbers in values.items():
+                if numbers is not None and len(numbers) >= _LENGTHS[role]:
+                    rows[role].append((float(position), *map(float, numbers[: _LENGTHS[role]])))
+        except (AttributeError, IndexError, KeyError, TypeError, ValueError) as error:
+            raise SequenceError(f"{file} is no kinematics of one frame ({error!r}). Copy it again.") from error
+    return {role: track([row[0] for row in found], [row[1:] for row in found]) for role, found in rows.items()}
+
+
+def _named_positions(state: dict[str, Any]) -> list[float] | None:
+    """Joint positions in the order of the PSM, by their names if present."""
+    positions = state.get("position")
+    order = order_of_names(tuple(map(str, state.get("name") or ())))
+    return positions if positions is None or order is None else [positions[index] for index in order]
+
+
+def _pose(block: Any) -> list[float] | None:
+    if not block or block.get("position") is None or block.get("orientation") is None:
+        return None
+    return [*block["position"][:3], *block["orientation"][:4]]
+
+
+SURGSYNC = Source(
+    "surgsync",
+    "a raw clip or packed episode of SurgSync",
+    "a folder with video_raw/ and PSM1.parquet, or with image/left and kinematic/",
+    _detect_surgsync,
+    ("time_offset", "frame_rate"),
+    _read_surgsync,
 )

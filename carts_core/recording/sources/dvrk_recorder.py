@@ -12,14 +12,12 @@ from typing import Any
 import numpy as np
 
 from ...errors import SequenceError
-from ...files.reading import VALUES, parse_json, read_text
-from ...settings.interchange import ImportOptions
 from ..image_sources import Bag
 from ..importing.cameras import calibration_of, find_images, side_of
 from ..importing.columns import order_of_names
-from ..importing.foreign_tables import ForeignTable, read_foreign_table
-from ..importing.found import FoundCamera, FoundMotion, FoundRecording, Notes, Source
-from ..importing.logs import ArmLog, Track, arm_from_log, nearest, track
+from ..importing.foreign_tables import read_foreign_table
+from ..importing.found import FoundCamera, FoundRecording, Import, Source, Track, read_json
+from ..importing.logs import ArmLog, arm_from_log, nearest, track
 from ..video import SUFFIXES
 from .bag import read_arm_logs, read_endoscope
 
@@ -28,10 +26,7 @@ _OLD_UNITS = {"timestamps_ns": 1e-9, "timestamps_ms": 1e-3, "timestamps": 1.0}
 _FAR = 0.02
 """Time between images of two cameras above which a warning is given [s]."""
 _JOINT_COLUMNS = tuple(f"position.{index}" for index in range(6))
-_POSE_COLUMNS = (
-    *(f"pose.position.{axis}" for axis in "xyz"),
-    *(f"pose.orientation.{axis}" for axis in "xyzw"),
-)
+_POSE_COLUMNS = (*(f"pose.position.{axis}" for axis in "xyz"), *(f"pose.orientation.{axis}" for axis in "xyzw"))
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,13 +44,6 @@ class _Stream:
     """Estimated latency of the images [s]."""
 
 
-def _json(path: Path, what: str) -> Any:
-    try:
-        return parse_json(read_text(path, VALUES))
-    except (OSError, ValueError) as error:
-        raise SequenceError(f"{what} {path} is not readable JSON ({error}). Copy the session again.") from error
-
-
 def _detect(path: Path) -> bool:
     if not path.is_dir():
         return False
@@ -71,10 +59,10 @@ def _videos(path: Path) -> list[Path]:
         return []
 
 
-def _streams(path: Path, notes: Notes) -> list[_Stream]:
+def _streams(path: Path, job: Import) -> list[_Stream]:
     videos = _videos(path)
     if (path / "index.json").is_file():
-        index = _json(path / "index.json", "index")
+        index = read_json(path / "index.json")
         listed = index.get("videos") if isinstance(index, dict) else None
         if not isinstance(listed, list) or not all(isinstance(entry, dict) and "file" in entry for entry in listed):
             raise SequenceError(f'{path / "index.json"} has no list "videos" of entries with "file". Copy it again.')
@@ -82,23 +70,26 @@ def _streams(path: Path, notes: Notes) -> list[_Stream]:
     streams = []
     for video in videos:
         if not video.is_file():
-            raise SequenceError(f"video {video} is missing, which the session names. Copy the session again, whole.")
+            raise SequenceError(f"video {video} is missing. Copy the session again, whole.")
         sidecar = video.with_suffix(".json")
         if not sidecar.is_file():
             raise SequenceError(f"{video} has no {sidecar.name} with the times of its frames. Copy it too.")
-        streams.append(_stream(video, sidecar, notes))
+        streams.append(_stream(video, sidecar, job))
     return streams
 
 
-def _stream(video: Path, sidecar: Path, notes: Notes) -> _Stream:
-    content = _json(sidecar, "sidecar")
+def _stream(video: Path, sidecar: Path, job: Import) -> _Stream:
+    content = read_json(sidecar)
     if not isinstance(content, dict):
         raise SequenceError(f"sidecar {sidecar} holds no named values. Copy it again.")
     name = str(content.get("stream_name") or video.stem)
     for key, unit in _OLD_UNITS.items():
         if isinstance(stamps := content.get(key), list) and stamps:
-            times = _numbers(stamps, sidecar) * unit
-            return _checked(_Stream(video, name, np.arange(len(times)), times, "undefined", 0.0), sidecar, notes)
+            try:
+                times = np.array(stamps, np.float64) * unit
+            except (TypeError, ValueError) as error:
+                raise SequenceError(f"sidecar {sidecar}: its times are no numbers ({error}). Copy it again.") from error
+            return _checked(_Stream(video, name, np.arange(len(times)), times, "undefined", 0.0), sidecar, job)
     frames = content.get("frames")
     if not isinstance(frames, list) or not frames:
         raise SequenceError(f'sidecar {sidecar} has neither "frames" nor "timestamps_ns". Copy it again.')
@@ -115,15 +106,8 @@ def _stream(video: Path, sidecar: Path, notes: Notes) -> _Stream:
     latency = content.get("estimated_latency_ms")
     latency = float(latency) * 1e-3 if isinstance(latency, int | float) else 0.0
     if (dropped := content.get("frames_dropped")) not in (0, None):
-        notes.warning(f"{video.name}: the recorder dropped {dropped} frames.")
-    return _checked(_Stream(video, name, numbers, times, layout, latency), sidecar, notes)
-
-
-def _numbers(values: list[Any], path: Path) -> np.ndarray:
-    try:
-        return np.array(values, np.float64)
-    except (TypeError, ValueError) as error:
-        raise SequenceError(f"sidecar {path}: its times are no numbers ({error}). Copy it again.") from error
+        job.warning(f"{video.name}: the recorder dropped {dropped} frames.")
+    return _checked(_Stream(video, name, numbers, times, layout, latency), sidecar, job)
 
 
 def _frame_time(frame: dict[str, Any]) -> float:
@@ -134,25 +118,21 @@ def _frame_time(frame: dict[str, Any]) -> float:
         value = real.get(f"{key}_ns")
         return int(value) if isinstance(value, int | float) and value > 0 else None
 
-    if (mono := known("mono_source")) is not None:
-        return mono * 1e-9
     left, right = known("left_source"), known("right_source")
-    if left is not None and right is not None:
-        return (left + right) / 2 * 1e-9
-    for value in (left, right, known("recorder_reception")):
+    both = None if left is None or right is None else (left + right) / 2
+    for value in (known("mono_source"), both, left, right, known("recorder_reception")):
         if value is not None:
             return value * 1e-9
     raise KeyError("any time in cpu.realtime")
 
 
-def _checked(stream: _Stream, sidecar: Path, notes: Notes) -> _Stream:
+def _checked(stream: _Stream, sidecar: Path, job: Import) -> _Stream:
     """The stream without frames that are missing in the video, sorted by time."""
     count = len(find_images(stream.video).ids)
     if stream.numbers.max() >= count or len(stream.numbers) < count:
-        text = (
+        job.warning(
             f"{stream.video.name} has {count} frames and its sidecar {len(stream.numbers)}; the common ones are used."
         )
-        notes.warning(text)
     good = (stream.numbers >= 0) & (stream.numbers < count) & np.isfinite(stream.times)
     if not good.any():
         raise SequenceError(
@@ -164,9 +144,7 @@ def _checked(stream: _Stream, sidecar: Path, notes: Notes) -> _Stream:
     return replace(stream, numbers=numbers[order][increasing], times=times[order][increasing])
 
 
-def _cameras(
-    streams: list[_Stream], options: ImportOptions, notes: Notes
-) -> tuple[tuple[FoundCamera, ...], np.ndarray]:
+def _cameras(streams: list[_Stream], job: Import) -> tuple[tuple[FoundCamera, ...], np.ndarray]:
     parts: dict[str, tuple[_Stream, tuple[int, int, int, int] | None, tuple[int, int]]] = {}
     for stream in streams:
         width, height = find_images(stream.video).size
@@ -174,7 +152,7 @@ def _cameras(
         if layout == "undefined" and width >= 3 * height:
             layout = "LR"
             text = f"{stream.video.name} is {width} x {height}: side-by-side stereo, the left camera at the left"
-            notes.guessed(f"{text} (its sidecar does not say).")
+            job.guessed(f"{text} (not in its sidecar).")
         if layout in _SIDES:
             half = width // 2
             for position, side in enumerate(_SIDES[layout]):
@@ -188,25 +166,25 @@ def _cameras(
         stream, crop, size = parts[name]
         rows = nearest(leader.times, stream.times)
         if (late := np.abs(stream.times[rows] - leader.times).max()) > _FAR:
-            notes.warning(f"images of {name} are up to {late:.3f} s from those of {order[0]}.")
+            job.warning(f"images of {name} are up to {late:.3f} s from those of {order[0]}.")
         camera = FoundCamera(name, size, stream.video, crop=crop, numbers=stream.numbers[rows])
-        cameras.append(calibration_of(camera, options, notes))
+        cameras.append(calibration_of(camera, job))
         where = "" if crop is None else f", its part from column {crop[0]}"
-        notes.found(f"camera {name}: {stream.video.name}{where}, {len(stream.times)} frames.")
+        job.found(f"camera {name}: {stream.video.name}{where}, {len(stream.times)} frames.")
     return tuple(cameras), leader.times
 
 
-def _logs(path: Path, options: ImportOptions, start: float, notes: Notes) -> tuple[list[ArmLog], FoundMotion | None]:
+def _logs(path: Path, start: float, job: Import) -> tuple[list[ArmLog], Track | None]:
     bags = [each for each in sorted(path.iterdir()) if (each / "metadata.yaml").is_file()]
     bags += sorted(path.glob("*.mcap"))
     if bags:
         with Bag(bags[0]) as bag:
-            motion = read_endoscope(bag, start, notes)
-            return read_arm_logs(bag, options, notes), motion
-    return _extracted(path, options), None
+            motion = read_endoscope(bag, start, job)
+            return read_arm_logs(bag, job), motion
+    return _extracted(path, job), None
 
 
-def _extracted(path: Path, options: ImportOptions) -> list[ArmLog]:
+def _extracted(path: Path, job: Import) -> list[ArmLog]:
     """Logs from CSV files named by topic, `_PSM1_measured_js.csv`."""
     roles = {
         "jaw_measured_js": "jaw",
@@ -214,52 +192,45 @@ def _extracted(path: Path, options: ImportOptions) -> list[ArmLog]:
         "measured_js": "joints",
         "measured_cp": "poses",
     }
-    rename = {recorded: name for name, recorded in options.arms.items()}
-    found: dict[str, dict[str, Track | None]] = {}
+    found: dict[str, dict[str, Any]] = {}
     for file in sorted(path.glob("*.csv")):
-        arm, _, topic = file.stem.strip("_").partition("_")
-        if not arm.startswith("PSM") or topic not in roles or (rename and arm not in rename):
-            continue
-        found.setdefault(rename.get(arm, arm), {})[roles[topic]] = _extracted_track(file, roles[topic])
-    return [
-        ArmLog(arm, tracks.get("joints"), tracks.get("jaw"), tracks.get("poses"), tracks.get("local_poses"))
-        for arm, tracks in found.items()
-    ]
+        recorded, _, topic = file.stem.strip("_").partition("_")
+        if recorded.startswith("PSM") and topic in roles and (arm := job.arm_name(recorded)) is not None:
+            found.setdefault(arm, {})[roles[topic]] = _extracted_track(file, roles[topic])
+    return [ArmLog(arm, **tracks) for arm, tracks in found.items()]
 
 
 def _extracted_track(file: Path, role: str) -> Track | None:
-    table: ForeignTable = read_foreign_table(file)
+    table = read_foreign_table(file)
     columns = {"joints": _JOINT_COLUMNS, "jaw": _JOINT_COLUMNS[:1]}.get(role, _POSE_COLUMNS)
     if role == "joints":
         names = tuple(str(table.columns[f"name.{n}"][0]) for n in range(6) if f"name.{n}" in table.columns)
         order = order_of_names(names) if len(names) == len(columns) else None
         columns = columns if order is None else tuple(columns[index] for index in order)
-    values = [table.numbers(column).astype(np.float64) for column in columns]
-    times = table.numbers("timestamp").astype(np.float64) * 1e-9
-    return track(list(zip(times, *values, strict=True)))
+    values = np.column_stack([table.numbers(column).astype(np.float64) for column in columns])
+    return track(table.numbers("timestamp").astype(np.float64) * 1e-9, values)
 
 
-def _read(path: Path, options: ImportOptions) -> FoundRecording:
-    notes = Notes()
-    streams = _streams(path, notes)
+def _read(path: Path, job: Import) -> FoundRecording:
+    streams = _streams(path, job)
     if not streams:
         raise SequenceError(f"{path} has no videos with sidecars. Record a stream, or copy the session again, whole.")
-    cameras, times = _cameras(streams, options, notes)
-    logs, motion = _logs(path, options, float(times[0]), notes)
+    cameras, times = _cameras(streams, job)
+    logs, motion = _logs(path, float(times[0]), job)
     if not logs:
         raise SequenceError(
             f"{path} has no kinematics: neither a bag with /PSM1/measured_cp or measured_js nor CSV files extracted "
             "from one (_PSM1_measured_js.csv). Copy the bag's folder too."
         )
-    arms = tuple(arm_from_log(log, options, notes) for log in logs)
-    latency = max(stream.latency for stream in streams)
-    offset = -latency if options.time_offset is None else options.time_offset
-    if latency and options.time_offset is None:
-        notes.guessed(f"time offset {-latency:.4f} s: the recorder's estimated latency (change: --time-offset).")
+    arms = [arm_from_log(log, job) for log in logs]
+    latency, offset = max(stream.latency for stream in streams), job.options.time_offset
+    if offset is None:
+        offset = -latency
+        if latency:
+            job.guessed(f"time offset {offset:.4f} s: the recorder's estimated latency (change: --time-offset).")
     ids = tuple(f"{number:06d}" for number in range(len(times)))
-    return FoundRecording(
-        "a session of the dVRK's recorder", path.name, cameras, arms, ids, times, tuple(notes), offset, motion
-    )
+    kind = "a session of the dVRK's recorder"
+    return job.recording(kind, path.name, cameras, arms, ids, times, time_offset=offset, motion=motion)
 
 
 SOURCE = Source(

@@ -12,7 +12,7 @@ from ...settings.interchange import NO_TABLE, ImportOptions
 from ..importing.cameras import Images, cameras_of, common_ids, find_images, image_files, side_of
 from ..importing.columns import ColumnMeanings, arm_in, arm_log, guess_columns, log_rows, samples
 from ..importing.foreign_tables import TABLE_SUFFIXES, ForeignTable, read_foreign_table
-from ..importing.found import FoundArm, FoundRecording, Note, Notes, Source
+from ..importing.found import FoundArm, FoundRecording, Import, Source
 from ..importing.logs import arm_from_log
 from ..importing.row_matching import FrameTimes, RowMatch, by_rows, frame_times, match_rows, row_seconds
 from ..video import SUFFIXES
@@ -47,14 +47,11 @@ def _files(path: Path, suffixes: tuple[str, ...]) -> list[Path]:
     found = []
     for folder in _folders(path):
         try:
-            found += sorted(each for each in folder.iterdir() if _is_wanted(each, suffixes))
+            wanted = [each for each in folder.iterdir() if each.suffix.lower() in suffixes and each.is_file()]
         except OSError:
             continue
+        found += sorted(each for each in wanted if not each.name.startswith("."))
     return found
-
-
-def _is_wanted(file: Path, suffixes: tuple[str, ...]) -> bool:
-    return file.suffix.lower() in suffixes and not file.name.startswith(".") and file.is_file()
 
 
 def _tables(path: Path) -> list[Path]:
@@ -89,7 +86,7 @@ def _images(path: Path, options: ImportOptions) -> dict[str, Images]:
     return {side: find_images(found[0]) for side, found in sorted(named.items())}
 
 
-def _calibrations(path: Path, cameras: list[str], options: ImportOptions, notes: Notes) -> dict[str, Path]:
+def _calibrations(path: Path, cameras: list[str], job: Import) -> dict[str, Path]:
     """Calibration files of the cameras without a given one: of the same side, or the only one."""
     files = [file for file in _files(path, _CALIBRATION_SUFFIXES) if _looks_like_calibration(file)]
     found: dict[str, Path] = {}
@@ -100,9 +97,9 @@ def _calibrations(path: Path, cameras: list[str], options: ImportOptions, notes:
             found[camera] = own[0]
         elif len(shared) == 1 or (len(files) == 1 and len(cameras) == 1):
             found[camera] = (shared or files)[0]
-    found = {camera: file for camera, file in found.items() if camera not in options.calibration}
+    found = {camera: file for camera, file in found.items() if camera not in job.options.calibration}
     for camera, file in found.items():
-        notes.guessed(f"{file.name} is the calibration of {camera} (change: --calibration {camera} FILE).")
+        job.guessed(f"{file.name} is the calibration of {camera} (change: --calibration {camera} FILE).")
     return found
 
 
@@ -118,11 +115,7 @@ def _looks_like_calibration(file: Path) -> bool:
 
 
 def kinematics_table(path: Path, options: ImportOptions) -> ForeignTable | None:
-    """The table of kinematics: as named, with an arm, or else with many numbers.
-
-    Raises:
-        SequenceError: the table that was named is missing or damaged, or a chosen column is not there.
-    """
+    """The table of kinematics: as named, with an arm, or else with many numbers."""
     if options.kinematics == NO_TABLE:
         return None
     if options.kinematics is not None:
@@ -144,12 +137,9 @@ def _is_wide(table: ForeignTable) -> bool:
     return len(table) > 1 and sum(values.dtype.kind in "iuf" for values in table.columns.values()) >= len(JOINT_NAMES)
 
 
-def _kinematics(path: Path, options: ImportOptions, notes: Notes) -> list[tuple[ForeignTable, ColumnMeanings]]:
-    """Tables that contain an arm, each another one, with the meanings of their columns.
-
-    Raises:
-        SequenceError: a table was named or may have joints, but its columns are not recognized; or it is damaged.
-    """
+def _kinematics(path: Path, job: Import) -> list[tuple[ForeignTable, ColumnMeanings]]:
+    """Tables that contain an arm, each another one, with the meanings of their columns."""
+    options = job.options
     if options.kinematics == NO_TABLE:
         return []
     if options.kinematics is not None or options.columns:
@@ -172,9 +162,10 @@ def _kinematics(path: Path, options: ImportOptions, notes: Notes) -> list[tuple[
             continue
         named = _of_file(table, meanings)
         if taken := [arm for arm in named.arms if arm in known]:
-            text = f"{table.path} has joints or poses of {taken[0] or 'an arm'} too, and is not used"
-            remedy = "(change: --kinematics). Call files of other arms by their names, say psm2.csv."
-            notes.warning(f"{text} {remedy}")
+            job.warning(
+                f"{table.path} has joints or poses of {taken[0] or 'an arm'} too, and is not used (change: "
+                "--kinematics). Name files of other arms by the arms, as psm2.csv."
+            )
             continue
         known |= dict.fromkeys(named.arms, table)
         chosen.append((table, named))
@@ -198,94 +189,86 @@ def _of_file(table: ForeignTable, meanings: ColumnMeanings) -> ColumnMeanings:
     return replace(meanings, arms={arm or name: found for arm, found in meanings.arms.items()})
 
 
-def _frames(
-    path: Path, images: Images, ids: tuple[str, ...], kinematics: list[Path], options: ImportOptions, notes: Notes
-) -> FrameTimes:
+def _frames(path: Path, images: Images, ids: tuple[str, ...], kinematics: list[Path], job: Import) -> FrameTimes:
     """Images with their times: from a table with as many rows as images, else from a video's rate."""
+    rate = job.options.frame_rate
     for file in _tables(path):
         table = None if file in kinematics else _readable(file)
         if table is None:
             continue
-        meanings = guess_columns(table, replace(options, columns={}, kinematics=None))
+        meanings = guess_columns(table, replace(job.options, columns={}, kinematics=None))
         if meanings.time is not None and not meanings.arms and len(table) == len(ids):
-            notes.guessed(f"times of the images are in {file.name}.")
-            times = row_seconds(log_rows(table, meanings), None, notes)
-            found = frame_times(images, ids, replace(options, frame_rate=None), Notes())
-            if options.frame_rate is not None:
-                text = f"--frame-rate {options.frame_rate:g} is not used: the images have times in {file.name}."
-                notes.warning(text)
+            job.guessed(f"times of the images are in {file.name}.")
+            times = row_seconds(log_rows(table, meanings), None, job)
+            found = frame_times(images, ids, Import(replace(job.options, frame_rate=None)))
+            if rate is not None:
+                job.warning(f"--frame-rate {rate:g} is not used: the images have times in {file.name}.")
             return replace(found, times=times, source=file.name, nominal=False)
-    return frame_times(images, ids, options, notes)
+    return frame_times(images, ids, job)
 
 
-def _read(path: Path, options: ImportOptions) -> FoundRecording:
-    notes = Notes()
-    images = _images(path, options)
-    cameras = cameras_of(images, options, notes, _calibrations(path, list(images), options, notes))
-    ids = common_ids(list(images.values()))
+def _read(path: Path, job: Import) -> FoundRecording:
+    images = _images(path, job.options)
+    cameras = cameras_of(images, job, _calibrations(path, list(images), job))
+    ids = common_ids(images, path)
+    shared = set(ids)
     for name, each in images.items():
-        if lacking := [frame for frame in each.ids if frame not in set(ids)]:
+        if lacking := [frame for frame in each.ids if frame not in shared]:
             shown = ", ".join(lacking[:5]) + (" ..." if len(lacking) > 5 else "")
-            text = (
+            job.warning(
                 f"{name}: {len(lacking)} of {len(each.ids)} images left out, since another camera has none of that "
                 f"frame: {shown}. To keep them, import {name} alone: --images {name} {each.path.name}."
             )
-            notes.warning(text)
-    if not ids:
-        raise SequenceError(f"{path}: no frame has an image of every camera. Number them alike, or import one camera.")
-    found = _kinematics(path, options, notes)
+    found = _kinematics(path, job)
     if not found:
-        notes.append(_without_kinematics(path, options))
-        return FoundRecording("images without kinematics", path.name, cameras, (), ids, None, tuple(notes))
-    frames = _frames(path, next(iter(images.values())), ids, [table.path for table, _ in found], options, notes)
-    arms, match = _matched(found, frames, options, notes)
+        _note_missing_kinematics(path, job)
+        return job.recording("images without kinematics", path.name, cameras, (), ids, None)
+    frames = _frames(path, next(iter(images.values())), ids, [table.path for table, _ in found], job)
+    arms, match = _matched(found, frames, job)
     times = match.frame_times
     if match.by_image:
-        arms, ids, kept = by_rows(arms, ids, notes, times)
+        arms, ids, kept = by_rows(arms, ids, job, times)
         cameras = tuple(camera if camera.pattern else replace(camera, numbers=kept) for camera in cameras)
         times = arms[0].times
-    offset = match.time_offset if options.time_offset is None else options.time_offset
-    return FoundRecording(
-        "a folder with images and a table", path.name, cameras, arms, ids, times, tuple(notes), float(offset)
-    )
+    offset = match.time_offset if job.options.time_offset is None else job.options.time_offset
+    kind = "a folder with images and a table"
+    return job.recording(kind, path.name, cameras, arms, ids, times, time_offset=float(offset))
 
 
-def _without_kinematics(path: Path, options: ImportOptions) -> Note:
-    """Why no kinematics were found, with the columns of the tables that were considered."""
-    if options.kinematics == NO_TABLE:
-        return Note("found", "kinematics are left out, as given.")
+def _note_missing_kinematics(path: Path, job: Import) -> None:
+    """Say why no kinematics were found, with the columns of the tables that were considered."""
+    if job.options.kinematics == NO_TABLE:
+        job.found("kinematics are left out, as given.")
+        return
     tables = [table for table in map(_readable, _tables(path)) if table is not None and len(table.columns) > 1]
     if not tables:
-        return Note("missing", f"no table of joints or poses in {path}. Name one: --kinematics FILE.")
+        job.missing(f"no table of joints or poses in {path}. Name one: --kinematics FILE.")
+        return
     seen = "; ".join(f"{table.path.name} has {', '.join([*table.columns][:12])}" for table in tables[:3])
-    return Note(
-        "missing",
+    job.missing(
         f"no table in {path} has six joints or a tip's pose (x, y, z, qx, qy, qz, qw): {seen}. Name another: "
-        "--kinematics FILE.",
+        "--kinematics FILE."
     )
 
 
 def _matched(
-    found: list[tuple[ForeignTable, ColumnMeanings]], frames: FrameTimes, options: ImportOptions, notes: Notes
+    found: list[tuple[ForeignTable, ColumnMeanings]], frames: FrameTimes, job: Import
 ) -> tuple[tuple[FoundArm, ...], RowMatch]:
-    """Arms of all tables, and the common matching of their rows with images.
-
-    Raises:
-        SequenceError: it is not, or does not say.
-    """
+    """Arms of all tables, and the common matching of their rows with images."""
     arms: list[FoundArm] = []
     matches: list[RowMatch] = []
     for table, meanings in found:
-        kind = "guessed" if options.kinematics is None else "found"
-        notes.append(Note(kind, f"kinematics: {table.path}, {len(table)} rows (change: --kinematics)."))
-        notes += [Note("found", f"{table.path.name}: {remark}.") for remark in table.remarks]
+        text = f"kinematics: {table.path}, {len(table)} rows (change: --kinematics)."
+        job.found(text, given=job.options.kinematics is not None)
+        for remark in table.remarks:
+            job.found(f"{table.path.name}: {remark}.")
         try:
-            match = match_rows(frames, log_rows(table, meanings), options, notes)
+            match = match_rows(frames, log_rows(table, meanings), job)
         except SequenceError as error:
             others = [f"{other.path.name}, {len(other)} rows" for other, _ in found if other is not table]
             also = f" Beside it lies {'; '.join(others)}." if others else ""
             raise SequenceError(f"{error}{also}") from error
-        arms += _arms(table, meanings, match.rows, options, notes)
+        arms += _arms(table, meanings, match.rows, job)
         matches.append(match)
     first = matches[0]
     if any((each.by_image, each.time_offset) != (first.by_image, first.time_offset) for each in matches):
@@ -297,18 +280,15 @@ def _matched(
     return tuple(arms), first
 
 
-def _arms(
-    table: ForeignTable, meanings: ColumnMeanings, rows: np.ndarray, options: ImportOptions, notes: Notes
-) -> tuple[FoundArm, ...]:
+def _arms(table: ForeignTable, meanings: ColumnMeanings, rows: np.ndarray, job: Import) -> tuple[FoundArm, ...]:
     """Arms with a time for each row; rows without an image are dropped."""
-    rename = {recorded: name for name, recorded in options.arms.items()}
     arms = []
     for recorded, found in meanings.arms.items():
-        if options.arms and recorded not in rename and len(meanings.arms) > 1:
+        known = job.arm_name(recorded)
+        if known is None and len(meanings.arms) > 1:
             continue
-        name = rename.get(recorded) or recorded or next(iter(options.arms), "PSM1")
-        log = arm_log(table, name, found, rows, options, notes, meanings.stated)
-        arms.append(arm_from_log(log, options, notes))
+        name = known or recorded or next(iter(job.options.arms), "PSM1")
+        arms.append(arm_from_log(arm_log(table, name, found, rows, job, meanings.stated), job))
     return tuple(arms)
 
 

@@ -10,11 +10,10 @@ import numpy as np
 from ...errors import SequenceError
 from ...files.reading import VALUES, parse_json, read_text
 from ...imports import needs_extra
-from ...settings.interchange import ImportOptions
 from ..importing.cameras import calibration_of, find_images, side_of
 from ..importing.columns import arm_log, guess_columns, samples
 from ..importing.foreign_tables import ForeignTable, read_parquet
-from ..importing.found import FoundArm, FoundCamera, FoundRecording, Notes, Source
+from ..importing.found import FoundArm, FoundCamera, FoundRecording, Import, Source
 from ..importing.logs import arm_from_log, nearest
 from ..importing.row_matching import by_rows
 
@@ -44,7 +43,7 @@ def _root(path: Path) -> Path:
     return path
 
 
-def _read(path: Path, options: ImportOptions) -> FoundRecording:
+def _read(path: Path, job: Import) -> FoundRecording:
     needs_extra("pyarrow", "import")
     root = _root(path)
     try:
@@ -55,33 +54,24 @@ def _read(path: Path, options: ImportOptions) -> FoundRecording:
         raise SequenceError(
             f"{root / 'meta/info.json'} is no LeRobot description with features and fps ({error!r}). Copy it again."
         ) from error
-    notes = Notes()
     wanted = _EPISODE.search(path.name)
     cameras = [key for key, value in features.items() if isinstance(value, dict) and value.get("dtype") == "video"]
-    episode = _episode(root, info, cameras, int(wanted.group(1)) if wanted else 0, notes)
+    episode = _episode(root, info, cameras, int(wanted.group(1)) if wanted else 0, job)
     rows = len(episode.table)
     if not rows:
         raise SequenceError(f"{root}: episode {episode.index} has no rows. Name another one.")
     if (total := info.get("total_episodes", 1)) != 1:
-        notes.found(f"episode {episode.index} of {total}; give an episode's .parquet file for another one.")
+        job.found(f"episode {episode.index} of {total}; give an episode's .parquet file for another one.")
     ids = tuple(f"{number:06d}" for number in range(rows))
-    arms = _arms(root, features, episode, options, notes)
-    times = _times(root, episode, rate, notes)
-    arms, kept_ids, kept = by_rows(arms, ids, notes, times)
-    found = _cameras(root, episode, kept, times, options, notes)
-    return FoundRecording(
-        f"a LeRobot data set ({info.get('codebase_version', 'unknown version')})",
-        f"{root.name}-{episode.index:06d}",
-        found,
-        arms,
-        kept_ids,
-        times[kept],
-        tuple(notes),
-        options.time_offset or 0.0,
-    )
+    arms = _arms(root, features, episode, job)
+    times = _times(root, episode, rate, job)
+    arms, kept_ids, kept = by_rows(arms, ids, job, times)
+    found = _cameras(root, episode, kept, times, job)
+    kind = f"a LeRobot data set ({info.get('codebase_version', 'unknown version')})"
+    return job.recording(kind, f"{root.name}-{episode.index:06d}", found, arms, kept_ids, times[kept])
 
 
-def _times(root: Path, episode: _Episode, rate: float, notes: Notes) -> np.ndarray:
+def _times(root: Path, episode: _Episode, rate: float, job: Import) -> np.ndarray:
     """Times of an episode's rows, which are its images [s]: from their column, else from the rate."""
     even = np.arange(len(episode.table)) / rate
     if "timestamp" not in episode.table.columns:
@@ -89,27 +79,26 @@ def _times(root: Path, episode: _Episode, rate: float, notes: Notes) -> np.ndarr
     times = episode.table.numbers("timestamp").astype(np.float64)
     if times.shape != even.shape or not np.isfinite(times).all() or (np.diff(times) <= 0).any():
         text = "the column timestamp does not increase and is not used; times are those of the rate"
-        notes.warning(f"{text}, {rate:g} images/s.")
+        job.warning(f"{text}, {rate:g} images/s.")
         return even
     times = times - times[0]
     if (late := np.abs(times - even).max()) > 0.5 / rate:
-        text = (
+        job.warning(
             f"times of the column timestamp are up to {late:.3f} s from those of {rate:g} images/s. They are used; "
             "row n is taken for image n of the episode."
         )
-        notes.warning(text)
         return times
     # Numbers of single precision are no better than the rate.
     return even
 
 
-def _episode(root: Path, info: dict[str, Any], cameras: list[str], index: int, notes: Notes) -> _Episode:
+def _episode(root: Path, info: dict[str, Any], cameras: list[str], index: int, job: Import) -> _Episode:
     chunk = index // max(int(info.get("chunks_size", 1000)), 1)
     old = root / f"data/chunk-{chunk:03d}/episode_{index:06d}.parquet"
     if old.is_file():
         videos = {key: (root / f"videos/chunk-{chunk:03d}/{key}/episode_{index:06d}.mp4", 0) for key in cameras}
         return _Episode(index, _parquet(old), videos)
-    # v3.0: many episodes in one file; meta/episodes says where each begins.
+    # v3.0: many episodes in one file; meta/episodes has their positions.
     listed = sorted((root / "meta/episodes").rglob("*.parquet"))
     for file in listed:
         columns = _parquet(file).columns
@@ -158,9 +147,7 @@ def _names(value: Any) -> list[str]:
     return [name for entry in value or () for name in _names(entry)]
 
 
-def _arms(
-    root: Path, features: dict[str, Any], episode: _Episode, options: ImportOptions, notes: Notes
-) -> tuple[FoundArm, ...]:
+def _arms(root: Path, features: dict[str, Any], episode: _Episode, job: Import) -> tuple[FoundArm, ...]:
     if _STATE not in features or _STATE not in episode.table.columns:
         raise SequenceError(f"{root} has no feature {_STATE}. Its features are: {', '.join(features)}.")
     names = _names(features[_STATE].get("names"))
@@ -173,33 +160,28 @@ def _arms(
             f"{root}: {_STATE} has {values.shape[-1]} columns and {len(names)} names in meta/info.json. Correct them."
         )
     table = ForeignTable(root / "meta/info.json", {name: values[:, index] for index, name in enumerate(names)})
-    meanings = guess_columns(table, options)
+    meanings = guess_columns(table, job.options)
     if not meanings.arms:
         raise SequenceError(
             f"{root}: {_STATE} has the columns {samples(table)}, among which six joints of a PSM or a tip's pose "
             "are not recognized. Name them: --columns yaw COLUMN ..., or give the robot: --robot NAME FILE.urdf."
         )
-    rename = {recorded: name for name, recorded in options.arms.items()}
     times = np.arange(len(values), dtype=float)
     arms = []
     for recorded, columns in meanings.arms.items():
-        if rename and recorded not in rename:
-            continue
-        name = rename.get(recorded, recorded or "PSM1")
-        log = arm_log(table, name, columns, times, options, notes, meanings.stated)
-        arms.append(arm_from_log(log, options, notes))
+        if (name := job.arm_name(recorded)) is not None:
+            log = arm_log(table, name or "PSM1", columns, times, job, meanings.stated)
+            arms.append(arm_from_log(log, job))
     return tuple(arms)
 
 
 def _cameras(
-    root: Path, episode: _Episode, kept: np.ndarray, times: np.ndarray, options: ImportOptions, notes: Notes
+    root: Path, episode: _Episode, kept: np.ndarray, times: np.ndarray, job: Import
 ) -> tuple[FoundCamera, ...]:
     rows = len(times)
-    chosen = {name: key for name, key in options.images.items()} or {
-        side_of(key) or key.rsplit(".", 1)[-1]: key for key in episode.videos
-    }
+    own = {side_of(key) or key.rsplit(".", 1)[-1]: key for key in episode.videos}
     cameras = []
-    for name, key in sorted(chosen.items()):
+    for name, key in sorted((job.options.images or own).items()):
         if key not in episode.videos:
             raise SequenceError(f"{root} has no video {key!r}. It has: {', '.join(episode.videos) or 'none'}.")
         video, start = episode.videos[key]
@@ -211,15 +193,14 @@ def _cameras(
                 f"video {video} has {len(images.ids)} frames, but episode {episode.index} is frames {start} to "
                 f"{start + rows - 1}. Copy it again."
             )
-        notes.found(f"camera {name}: {key}, {images.size[0]} x {images.size[1]}.")
+        job.found(f"camera {name}: {key}, {images.size[0]} x {images.size[1]}.")
         numbers = start + kept
         if start == 0 and len(images.ids) > rows and images.times is not None:
             # A video of this episode alone, with images that have no row.
             numbers = nearest(times, images.times - images.times[0])[kept]
-            text = f"{video.name} has {len(images.ids)} images for {rows} rows; rows meet images by time."
-            notes.warning(text)
+            job.warning(f"{video.name} has {len(images.ids)} images for {rows} rows, which are matched by time.")
         camera = FoundCamera(name, images.size, video, numbers=numbers)
-        cameras.append(calibration_of(camera, options, notes))
+        cameras.append(calibration_of(camera, job))
     return tuple(cameras)
 
 

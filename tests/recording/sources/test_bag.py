@@ -136,7 +136,7 @@ def test_a_bag_without_images_gets_those_of_a_video_beside_it(tmp_path: Path, ca
 def test_images_beside_a_bag_without_times_are_asked_for_their_rate(tmp_path: Path) -> None:
     path = write_bag(tmp_path / "bag", BagKind(cameras=("right",)))
     write_images(tmp_path / "pictures", 5)
-    with pytest.raises(CartsError, match=r"have no times\. Say how many there are a second: --frame-rate"):
+    with pytest.raises(CartsError, match=r"have no times\. Give their number per second: --frame-rate"):
         import_recording(path, tmp_path / "out", ImportOptions(images={"left": "pictures"}))
     file, _ = import_recording(path, tmp_path / "out", ImportOptions(images={"left": "pictures"}, frame_rate=20))
     assert np.array_equal(Sequence.open(file).frame(3).images["left"], image(3))
@@ -186,7 +186,7 @@ def test_a_truncated_bag_is_an_error_in_words_and_leaves_nothing(tmp_path, capsy
         (BagKind(cameras=()), {}, "no images were found.*--images"),
         (BagKind(), {"arms": {"PSM3": "PSM3"}}, "has no arm 'PSM3'. It has: PSM1"),
         (BagKind(), {"images": {"left": "/nothing"}}, "has no image topic '/nothing'. It has: /stereo/left"),
-        (BagKind(cameras=("one", "two")), {}, "names do not say which camera.*--images left TOPIC right TOPIC"),
+        (BagKind(cameras=("one", "two")), {}, "names are of no known camera.*--images left TOPIC right TOPIC"),
         (BagKind(), {"time_offset": 100.0}, "no frame has joint positions.*clocks|Clocks"),
         (
             BagKind(info=lambda values: values.update(distortion_model="equidistant")),

@@ -130,7 +130,7 @@ MUTATIONS = {
     "no common frame": (
         cts,
         lambda p: [f.rename(f.with_name(f"{int(f.stem) + 10}.png")) for f in (p / "smoke/images_l").iterdir()],
-        "no frame is in all",
+        "no frame has an image of every camera and domain",
     ),
     "other names": (
         cts,

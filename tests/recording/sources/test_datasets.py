@@ -147,7 +147,7 @@ MUTATIONS: dict[str, tuple[Callable[[Path], Path], Callable[[Path], object], str
     "EndoVis, no common frame": (
         endovis,
         lambda p: [f.rename(f.with_name(f"frame9{f.name[5:]}")) for f in (p / "right_frames").iterdir()],
-        "no frame is in both",
+        "no frame has an image of every camera",
     ),
     "EndoVis, cut image": (endovis, lambda p: (p / "left_frames/frame000.png").write_bytes(b""), "damaged"),
     "JIGSAWS, other columns": (jigsaws, lambda p: p.write_text("1 2 3\n"), "has 76 columns"),

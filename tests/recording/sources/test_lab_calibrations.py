@@ -338,7 +338,7 @@ def test_a_pair_in_millimetres_or_the_wrong_way_round_is_said(
 
 def test_the_calibration_of_the_other_camera_is_said(tmp_path: Path) -> None:
     (tmp_path / "right.yaml").write_text(ros())
-    assert "right.yaml is named for the other camera" in said(imported(tmp_path, {"left": tmp_path / "right.yaml"}))
+    assert "right.yaml has the other camera's name" in said(imported(tmp_path, {"left": tmp_path / "right.yaml"}))
 
 
 def test_new_recording_asks_for_the_size_of_the_calibrated_images(tmp_path: Path) -> None:

@@ -533,7 +533,7 @@ def test_joint_states_are_read_by_their_names_in_bags_and_clips(tmp_path: Path) 
     assert np.abs(measured(found)[:, :6] - joints_at(found.frame_times - START * 1e-9)).max() < 1e-4
     says(found, "PSM1: joint positions are in the order outer_insertion, outer_pitch")
     strange = find(write_bag(tmp_path / "other", BagKind(names=tuple("abcdef"), cameras=("left",))))
-    says(strange, "warning: PSM1: joints are called a, b, c, d, e, f, which says nothing of a PSM")
+    says(strange, "warning: PSM1: a, b, c, d, e, f are not joints of a PSM")
     mixed = ("pitch", "yaw", "insertion", "roll", "wrist_pitch", "q")
     with pytest.raises(CartsError, match=r"names pitch, yaw, .*not in their order"):
         find(write_bag(tmp_path / "mixed", BagKind(names=mixed, cameras=("left",))))

@@ -148,7 +148,7 @@ MUTATIONS: dict[str, tuple[Callable[[Path], object], str]] = {
     "cut video": (lambda p: (p / VIDEO).write_bytes((p / VIDEO).read_bytes()[:300]), r"episode_000000\.mp4"),
     "poses elsewhere": (
         lambda p: write_parquet(p / FIRST, {"observation.state": [[1.0, 2, 3, 0, 0, 0, 1, 0]] * 4}),
-        "the unit of the tip.s place is not clear",
+        "the unit of the tip.s position is not clear",
     ),
     "no orientation": (
         lambda p: write_parquet(p / FIRST, {"observation.state": [[0.0] * 8] * 4}),
