@@ -154,11 +154,33 @@ def _annotations(
         yield {**mask_annotation(view, category.id, mask), "keypoints": values, "num_keypoints": labelled}
 
 
+def _element(tag: str, content: object) -> ElementTree.Element:
+    """An XML element with a text, or with a child for each entry of a mapping; a list stands for several children."""
+    element = ElementTree.Element(tag)
+    if isinstance(content, Mapping):
+        for name, value in content.items():
+            element.extend(_element(name, one) for one in (value if isinstance(value, list) else [value]))
+    else:
+        element.text = str(content)
+    return element
+
+
+def _xml(root: ElementTree.Element) -> bytes:
+    """Indented XML."""
+    ElementTree.indent(root, " ")
+    return ElementTree.tostring(root, encoding="utf-8")
+
+
 def write_cvat(dataset: Dataset, folder: OutputPath, monitor: Monitor) -> None:
     """Write the dataset in CVAT's format, with lossless masks."""
-    root = ElementTree.Element("annotations")
-    _texts(root, {"version": "1.1"})
-    _add_meta(root, dataset)
+    labels = [{"name": category.name, "type": "mask", "attributes": ""} for category in dataset.categories]
+    task = {
+        "name": dataset.sequence.name,
+        "size": len(dataset.steps),
+        "mode": "annotation",
+        "labels": {"label": labels},
+    }
+    root = _element("annotations", {"version": "1.1", "meta": {"task": task}})
     for view in dataset.views(monitor):
         size = {"width": str(view.camera.width), "height": str(view.camera.height)}
         name = dataset.write_image(view, folder / "images")
@@ -166,31 +188,10 @@ def write_cvat(dataset: Dataset, folder: OutputPath, monitor: Monitor) -> None:
         for category, mask in dataset.instances(view):
             left, top, width, height = bounding_box(mask)
             runs = row_runs(mask[top : top + height, left : left + width])
-            attributes = {
-                "label": category.name,
-                "source": "auto",
-                "occluded": "0",
-                "rle": ", ".join(map(str, runs)),
-                "left": str(left),
-                "top": str(top),
-                "width": str(width),
-                "height": str(height),
-                "z_order": "0",
-            }
-            ElementTree.SubElement(image, "mask", attributes)
-    ElementTree.indent(root, " ")
-    content = ElementTree.tostring(root, encoding="utf-8", xml_declaration=True)
-    write_bytes(folder / "annotations.xml", content)
-
-
-def _add_meta(root: ElementTree.Element, dataset: Dataset) -> None:
-    task = ElementTree.SubElement(ElementTree.SubElement(root, "meta"), "task")
-    _texts(task, {"name": dataset.sequence.name, "size": len(dataset.steps), "mode": "annotation"})
-    labels = ElementTree.SubElement(task, "labels")
-    for category in dataset.categories:
-        label = ElementTree.SubElement(labels, "label")
-        _texts(label, {"name": category.name, "type": "mask"})
-        ElementTree.SubElement(label, "attributes")
+            attributes = {"label": category.name, "source": "auto", "occluded": "0", "rle": ", ".join(map(str, runs))}
+            box = {"left": str(left), "top": str(top), "width": str(width), "height": str(height), "z_order": "0"}
+            ElementTree.SubElement(image, "mask", {**attributes, **box})
+    write_bytes(folder / "annotations.xml", b"<?xml version='1.0' encoding='utf-8'?>\n" + _xml(root))
 
 
 _IMAGE = 2
@@ -204,24 +205,15 @@ def write_datumaro(dataset: Dataset, folder: OutputPath, monitor: Monitor) -> No
         file = dataset.write_image(view, folder / "images" / "default")
         annotations = [
             {
-                "id": number,
-                "type": "mask",
-                "attributes": {},
-                "group": 0,
-                "label_id": category.id - 1,
-                "rle": coco_rle(mask),
-                "z_order": 0,
+                **{"id": number, "type": "mask", "attributes": {}, "group": 0},
+                **{"label_id": category.id - 1, "rle": coco_rle(mask), "z_order": 0},
             }
             for number, (category, mask) in enumerate(dataset.instances(view))
         ]
-        items.append(
-            {
-                "id": str(PurePosixPath(file).with_suffix("")),
-                "annotations": annotations,
-                "attr": {"frame": view.frame.frame_id, "camera": view.camera.name, "source": view.frame.source},
-                "image": {"path": file, "size": [view.camera.height, view.camera.width]},
-            }
-        )
+        item = {"id": str(PurePosixPath(file).with_suffix("")), "annotations": annotations}
+        item["attr"] = {"frame": view.frame.frame_id, "camera": view.camera.name, "source": view.frame.source}
+        item["image"] = {"path": file, "size": [view.camera.height, view.camera.width]}
+        items.append(item)
     labels = [{"name": category.name, "parent": "", "attributes": []} for category in dataset.categories]
     content = {
         "dm_format_version": "1.0",
@@ -250,45 +242,38 @@ def write_voc(dataset: Dataset, folder: OutputPath, monitor: Monitor) -> None:
     for view in dataset.views(monitor):
         stem = dataset.stems[view.id - 1]
         file = dataset.write_image_as(view, folder / "JPEGImages", stem)
-        labels, objects = dataset.label_image(view), np.zeros(view.link_ids.shape, np.uint8)
-        root = _annotation(view, file)
+        objects = np.zeros(view.link_ids.shape, np.uint8)
+        entries = []
         for number, (category, mask) in enumerate(dataset.instances(view), start=1):
             objects[mask] = number
-            _add_object(root, category, mask)
-        _write_palette(folder / "SegmentationClass" / f"{stem}.png", labels)
+            entries.append(_object(category, mask))
+        size = {"width": view.camera.width, "height": view.camera.height, "depth": 3}
+        content = {"folder": "JPEGImages", "filename": file, "size": size, "segmented": 1, "object": entries}
+        _write_palette(folder / "SegmentationClass" / f"{stem}.png", dataset.label_image(view))
         _write_palette(folder / "SegmentationObject" / f"{stem}.png", objects)
-        ElementTree.indent(root, " ")
-        write_bytes(folder / "Annotations" / f"{stem}.xml", ElementTree.tostring(root, encoding="utf-8"))
+        write_bytes(folder / "Annotations" / f"{stem}.xml", _xml(_element("annotation", content)))
     names = "".join(f"{stem}\n" for stem in dataset.stems)
     for name in _LISTS:
         write_text(folder / "ImageSets" / name / "trainval.txt", names)
-    _write_label_map(folder / "labelmap.txt", dataset)
+    colors = [",".join(map(str, color)) for color in _palette().tolist()]
+    names = ["background", *(_name(category) for category in dataset.categories)]
+    lines = ["# label:color_rgb:parts:actions\n", *(f"{name}:{colors[n]}::\n" for n, name in enumerate(names))]
+    write_text(folder / "labelmap.txt", "".join(lines))
 
 
-def _annotation(view: View, file: str) -> ElementTree.Element:
-    root = ElementTree.Element("annotation")
-    _texts(root, {"folder": "JPEGImages", "filename": file})
-    size = {"width": view.camera.width, "height": view.camera.height, "depth": 3}
-    _texts(ElementTree.SubElement(root, "size"), size)
-    _texts(root, {"segmented": 1})
-    return root
-
-
-def _add_object(root: ElementTree.Element, category: Category, mask: np.ndarray) -> None:
+def _object(category: Category, mask: np.ndarray) -> dict[str, Any]:
     """An object; VOC counts pixels from 1."""
     left, top, width, height = bounding_box(mask)
-    object_ = ElementTree.SubElement(root, "object")
-    _texts(object_, {"name": _name(category), "pose": "Unspecified", "truncated": 0, "difficult": 0, "occluded": 0})
-    box = {"xmin": left + 1, "ymin": top + 1, "xmax": left + width, "ymax": top + height}
-    _texts(ElementTree.SubElement(object_, "bndbox"), box)
-    for polygon in polygons(mask):
-        points = {f"{'xy'[axis]}{number + 1}": value + 1 for (number, axis), value in np.ndenumerate(polygon)}
-        _texts(ElementTree.SubElement(object_, "polygon"), points)
-
-
-def _texts(parent: ElementTree.Element, values: Mapping[str, object]) -> None:
-    for tag, value in values.items():
-        ElementTree.SubElement(parent, tag).text = str(value)
+    outlines = [
+        {f"{'xy'[axis]}{number + 1}": value + 1 for (number, axis), value in np.ndenumerate(polygon)}
+        for polygon in polygons(mask)
+    ]
+    return {
+        "name": _name(category),
+        **{"pose": "Unspecified", "truncated": 0, "difficult": 0, "occluded": 0},
+        "bndbox": {"xmin": left + 1, "ymin": top + 1, "xmax": left + width, "ymax": top + height},
+        "polygon": outlines,
+    }
 
 
 def _name(category: Category) -> str:
@@ -309,13 +294,6 @@ def _write_palette(path: OutputPath, labels: UInt8[np.ndarray, "height width"]) 
     image.putpalette(_palette().tobytes())  # turns grey values into numbers of colours
     with output_stream(path) as stream:
         image.save(stream, format="PNG")
-
-
-def _write_label_map(path: OutputPath, dataset: Dataset) -> None:
-    colors = [",".join(map(str, color)) for color in _palette().tolist()]
-    names = ["background", *(_name(category) for category in dataset.categories)]
-    lines = ["# label:color_rgb:parts:actions\n", *(f"{name}:{colors[n]}::\n" for n, name in enumerate(names))]
-    write_text(path, "".join(lines))
 
 
 _INTO_PIXEL = 0.25

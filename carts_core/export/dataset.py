@@ -45,7 +45,7 @@ class Monitor:
         """The steps one by one, with progress and cancellation.
 
         Raises:
-            ExportCancelled: `cancelled` said so.
+            ExportCancelled: `cancelled` is true.
         """
         for done, step in enumerate(steps):
             self._check()
@@ -142,10 +142,8 @@ class Dataset:
 
     def categories_of(self, parts: Parts) -> tuple[Category, ...]:
         """A category for each arm, for each part of one, or for each link."""
-        if parts == "arms":
-            return self.arms
-        if parts == "links":
-            return self.links
+        if parts != "parts":
+            return self.arms if parts == "arms" else self.links
         classes = part_classes(self.scene.arms)
         return tuple(Category(id, f"{one.arm}.{one.part}", one.arm) for id, one in enumerate(classes, start=1))
 

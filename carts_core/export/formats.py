@@ -83,7 +83,7 @@ def export(
         The path that was written.
 
     Raises:
-        ExportCancelled: the monitor said so.
+        ExportCancelled: the monitor cancels it.
         CartsError: the output exists, cannot be written, or what it needs is missing.
     """
     chosen = FORMATS[name]

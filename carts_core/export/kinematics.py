@@ -20,7 +20,7 @@ from ..model.scene import Scene
 from ..optimization.observability import undetermined_joints
 from ..wording import shortened
 
-_SAID = ["verdict", "not_determined"]
+_TEXT_COLUMNS = ["verdict", "not_determined"]
 """Text columns after the numbers."""
 JOINED = "; "
 """Separator of joint names in a text."""
@@ -76,8 +76,8 @@ def kinematics_csv(scene: Scene, rows: Iterable[KinematicsRow]) -> str:
     table.writerow(_header(scene, with_std, with_verdict))
     for row in rows:
         values = [position_values(scene, row), *([std_values(scene, row)] if with_std else [])]
-        said = [row.verdict or "", JOINED.join(row.undetermined(scene) or ())]
-        numbers, verdict = np.concatenate(values), list(map(csv_cell, said)) if with_verdict else []
+        texts = [row.verdict or "", JOINED.join(row.undetermined(scene) or ())]
+        numbers, verdict = np.concatenate(values), list(map(csv_cell, texts)) if with_verdict else []
         table.writerow([csv_cell(row.frame_id), csv_cell(row.source), *(f"{value:.9g}" for value in numbers), *verdict])
     return text.getvalue()
 
@@ -97,7 +97,7 @@ def read_kinematics_csv(path: Path, scene: Scene) -> list[KinematicsRow]:
 def _header(scene: Scene, with_std: bool, with_verdict: bool = False) -> list[str]:
     columns = joint_columns(scene)
     further = [f"{column}.std" for column in columns] if with_std else []
-    return ["frame", "source", *map(csv_cell, [*columns, *further]), *(_SAID if with_verdict else [])]
+    return ["frame", "source", *map(csv_cell, [*columns, *further]), *(_TEXT_COLUMNS if with_verdict else [])]
 
 
 def _read(path: Path, scene: Scene) -> list[KinematicsRow]:
@@ -105,8 +105,8 @@ def _read(path: Path, scene: Scene) -> list[KinematicsRow]:
         table = csv.reader(file)
         header = next(table, [])
         # Tables of earlier versions end with the verdict.
-        said = [name for name in header[-len(_SAID) :] if name in _SAID]
-        numbers = header[: len(header) - len(said)]
+        texts = [name for name in header[-len(_TEXT_COLUMNS) :] if name in _TEXT_COLUMNS]
+        numbers = header[: len(header) - len(texts)]
         with_std = numbers == _header(scene, True)
         if not with_std and numbers != _header(scene, False):
             found, wanted = ", ".join(header), ", ".join(_header(scene, False))
@@ -128,7 +128,7 @@ def _read(path: Path, scene: Scene) -> list[KinematicsRow]:
                     text_of_cell(cells[1]),
                     _by_arm(scene, positions),
                     _by_arm(scene, std) if with_std else None,
-                    (text_of_cell(cells[len(numbers)]) or None) if said else None,
+                    (text_of_cell(cells[len(numbers)]) or None) if texts else None,
                 )
             )
     return rows

@@ -3,6 +3,7 @@
 import json
 import math
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -10,8 +11,7 @@ from jaxtyping import Float
 
 from ..errors import CartsError
 from ..files import OutputPath, output_stream, write_text
-from ..model.camera import T_DVRK_OPENCV, Camera
-from ..model.scene import Arm
+from ..model.camera import T_DVRK_OPENCV
 from .dataset import Dataset, Monitor
 from .frames import ExportFrame
 from .kinematics import JOINED, joint_columns, joint_units, kinematics_csv, position_values, std_values
@@ -38,8 +38,8 @@ def write_kinematics_npz(dataset: Dataset, path: OutputPath, monitor: Monitor) -
     Arrays: `frame_id`, `source`, `verdict` (of the mask, empty where it was not assessed), `not_determined` (joints
     that the images leave open, with `; ` between them) and `index` [frames]; `column` (`ARM.JOINT`)
     and `unit` [columns]; `joint_positions` and `joint_std` [frames, columns] in [rad] or [m], as `unit` says; a
-    `joint_std` that is not known is NaN. Where cameras move, `T_camera_world` [frames, cameras, 4, 4] [m] and `camera`
-    (text) say where they were.
+    `joint_std` that is not known is NaN. Where cameras move, `T_camera_world` [frames, cameras, 4, 4] [m] has their
+    poses, and `camera` their names.
     """
     frames = list(monitor.track(dataset.frames))
     moving, poses = _camera_poses(dataset, frames), {}
@@ -89,30 +89,10 @@ def write_kinematics_json(dataset: Dataset, path: OutputPath, monitor: Monitor) 
     write_text(path, json.dumps(content, indent=1, ensure_ascii=False, allow_nan=False))
 
 
-def base_frame_transform(arm: Arm, camera: Camera) -> Float[np.ndarray, "4 4"]:
-    """T_camera_base [m] with the dVRK's axes of the camera."""
-    return T_DVRK_OPENCV @ camera.T_camera_world @ arm.T_world_base
-
-
-def write_dvrk(dataset: Dataset, path: OutputPath, monitor: Monitor) -> None:
-    """Write base frames of all arms in the frame of the first exported camera, to be merged into a system's file
-    (2.4)."""
-    _write(dataset, path, monitor, lambda name, T: {"base_frame": {"reference_frame": name, "transform": T}})
-
-
-def write_dvrk_2_3(dataset: Dataset, path: OutputPath, monitor: Monitor) -> None:
-    """Write base frames for a console's file of 2.3 and earlier."""
-    _write(dataset, path, monitor, lambda name, T: {"base-frame": {"reference-frame": name, "transform": T}})
-
-
-def write_dvrk_suj(dataset: Dataset, path: OutputPath, monitor: Monitor) -> None:
-    """Write base frames as a file of fixed set-up joints."""
-    _write(dataset, path, monitor, lambda _, T: {"measured_cp": T})
-
-
-def _write(
-    dataset: Dataset, path: OutputPath, monitor: Monitor, entry: Callable[[str, list[list[float]]], dict[str, Any]]
+def _write_base_frames(
+    entry: Callable[[str, list[list[float]]], dict[str, Any]], dataset: Dataset, path: OutputPath, monitor: Monitor
 ) -> None:
+    """Write base frames of all arms in the frame of the first exported camera, with the dVRK's axes."""
     camera = dataset.scene.cameras[0]
     if camera.name in dataset.sequence.moving_cameras:
         raise CartsError(
@@ -120,7 +100,15 @@ def _write(
             "frames of a recording in which the endoscope stands still."
         )
     arms = [
-        {"name": arm.name, **entry(camera.name, base_frame_transform(arm, camera).tolist())}
+        {"name": arm.name, **entry(camera.name, (T_DVRK_OPENCV @ camera.T_camera_world @ arm.T_world_base).tolist())}
         for arm in monitor.track(dataset.scene.arms)
     ]
     write_text(path, json.dumps({"arms": arms}, indent=1, ensure_ascii=False))
+
+
+write_dvrk = partial(_write_base_frames, lambda name, T: {"base_frame": {"reference_frame": name, "transform": T}})
+"""Writes base frames to be merged into a system's file (2.4)."""
+write_dvrk_2_3 = partial(_write_base_frames, lambda name, T: {"base-frame": {"reference-frame": name, "transform": T}})
+"""Writes base frames for a console's file of 2.3 and earlier."""
+write_dvrk_suj = partial(_write_base_frames, lambda name, T: {"measured_cp": T})
+"""Writes base frames as a file of fixed set-up joints."""

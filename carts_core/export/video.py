@@ -10,7 +10,6 @@ import torch
 from jaxtyping import Bool, UInt8
 
 from ..files import OutputPath, output_stream, unique_file_names
-from ..model.camera import Camera
 from ..model.scene import SceneState
 from ..rendering import Renderer
 from .dataset import Dataset, Monitor, View
@@ -62,7 +61,9 @@ def write_video(dataset: Dataset, folder: OutputPath, monitor: Monitor) -> None:
             file = stack.enter_context(output_stream(folder / f"{name}.mp4"))
             container = stack.enter_context(av.open(file, "w", format="mp4"))
             stream = container.add_stream("libx264", rate=rate, options=_QUALITY)
-            stream.width, stream.height, stream.pix_fmt = *_even(camera), "yuv420p"
+            # H.264 requires even sides.
+            stream.width, stream.height = camera.width + camera.width % 2, camera.height + camera.height % 2
+            stream.pix_fmt = "yuv420p"
             streams[camera.name] = container, stream
         for view in dataset.views(monitor):
             container, stream = streams[view.camera.name]
@@ -88,11 +89,6 @@ def _picture(dataset: Dataset, view: View) -> UInt8[np.ndarray, "height width 3"
     image, rendered = image_and_mask(dataset.renderers[view.camera.name], state)
     mask = view.link_ids >= 0
     return outlined(overlay(dataset.image(view), image, rendered & mask, _OPACITY), mask)
-
-
-def _even(camera: Camera) -> tuple[int, int]:
-    """Even width and height [px], as H.264 requires."""
-    return camera.width + camera.width % 2, camera.height + camera.height % 2
 
 
 def _padded(image: UInt8[np.ndarray, "height width 3"]) -> UInt8[np.ndarray, "height width 3"]:

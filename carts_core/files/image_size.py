@@ -41,11 +41,7 @@ class ImageTraits:
 
 
 def image_traits(content: bytes) -> ImageTraits:
-    """Traits of a PNG, JPEG or TIFF image; defaults for other kinds and damaged headers.
-
-    Args:
-        content: of the file, at least its beginning.
-    """
+    """Traits of a PNG, JPEG or TIFF image; defaults for other kinds and damaged headers."""
     if content.startswith(PNG):
         return _png_traits(content)
     if content.startswith(JPEG):
@@ -97,11 +93,7 @@ def _tiff_orientation(content: bytes) -> int:
 
 
 def size_problem(content: bytes) -> str | None:
-    """Reason to refuse an image, as a clause after the file's name; None if it can be decoded.
-
-    Args:
-        content: of the file: PNG, JPEG, TIFF, BMP, WebP or PPM.
-    """
+    """Reason to refuse an image, as a clause after the file's name; None if it can be decoded."""
     size = _size(content)
     if size is None:
         return "cannot be decoded; it must be a JPEG, PNG, TIFF, BMP, WebP or PPM image"

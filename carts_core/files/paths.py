@@ -60,11 +60,6 @@ def allowed_names(most_bytes: int = NAME_BYTES) -> str:
 def check_name(text: str, what: str, most_bytes: int = NAME_BYTES) -> str:
     """The name itself, seen to be one component of a path that leads nowhere else.
 
-    Args:
-        text: the name.
-        what: owner of the name for the error, such as "camera".
-        most_bytes: its largest length in UTF-8.
-
     Raises:
         OutputError: it cannot be the name of a file.
     """
@@ -144,7 +139,8 @@ def as_output(path: OutputPath | Path) -> OutputPath:
 
 def file_name(text: str) -> str:
     """A foreign text as the name of a file, whatever it is; letters of any script stay."""
-    return _cut(re.sub(r"[^\w.-]+", "_", text).lstrip("."), NAME_BYTES) or "_"
+    name = re.sub(r"[^\w.-]+", "_", text).lstrip(".")
+    return name.encode(errors="ignore")[:NAME_BYTES].decode(errors="ignore") or "_"
 
 
 def unique_file_names(texts: list[str]) -> list[str]:
@@ -160,10 +156,6 @@ def unique_file_names(texts: list[str]) -> list[str]:
         taken.add(name.casefold())
         names.append(name)
     return names
-
-
-def _cut(text: str, most_bytes: int) -> str:
-    return text.encode(errors="ignore")[:most_bytes].decode(errors="ignore")
 
 
 _FOLDER = os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC

@@ -194,10 +194,6 @@ def published(target: OutputPath | Path, *, overwrite: bool = False, key: str | 
 def published_file(target: OutputPath | Path, *, overwrite: bool = False) -> Iterator[OutputPath]:
     """Path for a single file, to be written by `write_bytes` or `output_stream`, which are atomic.
 
-    Args:
-        target: the file; no link itself.
-        overwrite: replace a file that is there.
-
     Raises:
         OutputError: the target exists and may not be replaced, or the disk refuses.
     """
@@ -233,7 +229,9 @@ def _check_free(folder: int, output: OutputPath, overwrite: bool) -> None:
     if stat.S_ISDIR(found.st_mode):
         if not _entries(folder, output.name):
             return
-        if not _is_export(folder, output.name):
+        with _below(folder, output.name) as inside:
+            marker = status(inside, MARKER)
+        if marker is None or not stat.S_ISREG(marker.st_mode):
             raise OutputError(
                 f"{output} is a folder with other files ({MARKER} is not among them), and these are never replaced. "
                 "Name a new folder."
@@ -245,18 +243,15 @@ def _check_free(folder: int, output: OutputPath, overwrite: bool) -> None:
 
 
 def _entries(folder: int, name: str) -> list[str]:
-    descriptor = open_below(folder, name)
-    try:
+    with _below(folder, name) as descriptor:
         return os.listdir(descriptor)
-    finally:
-        os.close(descriptor)
 
 
-def _is_export(folder: int, name: str) -> bool:
+@contextmanager
+def _below(folder: int, name: str) -> Iterator[int]:
     descriptor = open_below(folder, name)
     try:
-        found = status(descriptor, MARKER)
-        return found is not None and stat.S_ISREG(found.st_mode)
+        yield descriptor
     finally:
         os.close(descriptor)
 

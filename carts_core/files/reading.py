@@ -16,6 +16,7 @@ from functools import cache
 from io import BufferedReader
 from pathlib import Path
 from typing import Any, TypeVar
+from xml.etree import ElementTree
 
 import msgspec
 
@@ -90,7 +91,7 @@ def open_regular(path: Path, kind: Kind) -> BufferedReader:
     """Open a regular file for reading; pipes and devices neither block nor take effect.
 
     Raises:
-        FileNotFoundError, IsADirectoryError, OSError: as the system says.
+        FileNotFoundError, IsADirectoryError, OSError: as raised by the system.
         RefusedFileError: it is no regular file, is too large, or has a name that no file can have.
     """
     try:
@@ -238,6 +239,20 @@ def _plain_yaml(parser: Any) -> Any:
     PlainLoader.add_constructor("tag:yaml.org,2002:float", real)
     PlainLoader.add_constructor("tag:yaml.org,2002:timestamp", parser.construct_yaml_str)
     return PlainLoader
+
+
+def parse_xml(text: str) -> ElementTree.Element:
+    """Root of an XML document without document type and entities, which parsers expand without limit.
+
+    Raises:
+        ValueError: it is not XML, or declares a document type or entities.
+    """
+    if "<!DOCTYPE" in text or "<!ENTITY" in text:
+        raise ValueError("it declares a document type or entities")
+    try:
+        return ElementTree.fromstring(text)
+    except ElementTree.ParseError as error:
+        raise ValueError(f"it is no XML ({error})") from error
 
 
 def parse_ini(text: str) -> configparser.ConfigParser:

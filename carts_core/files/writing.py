@@ -81,9 +81,10 @@ def write_new(path: OutputPath | Path, content: bytes) -> bool:
                 stream.write(content)
                 stream.flush()
                 os.fsync(stream.fileno())
-                source = _OWN_DESCRIPTORS / str(stream.fileno()) if temporary is None else temporary
-                there = {} if temporary is None else {"src_dir_fd": folder}
-                os.link(source, output.name, dst_dir_fd=folder, follow_symlinks=temporary is None, **there)
+                if temporary is None:
+                    _link(stream.fileno(), folder, output.name)
+                else:
+                    os.link(temporary, output.name, src_dir_fd=folder, dst_dir_fd=folder, follow_symlinks=False)
         except FileExistsError:
             return False
         finally:
@@ -106,7 +107,10 @@ def output_stream(path: OutputPath | Path) -> Iterator[BinaryIO]:
             with os.fdopen(os.open(output.name, _NEW, _MODE, dir_fd=folder), "w+b") as stream:
                 yield stream
             return
-        _check_replaceable(folder, output)
+        found = status(folder, output.name)
+        if found is not None and not (stat.S_ISREG(found.st_mode) or stat.S_ISLNK(found.st_mode)):
+            text = f"{output} is {kind_of(found)}, where a file is to be. Remove it, or name another output."
+            raise OutputError(text)
         descriptor, temporary = _new_file(folder)
         try:
             with os.fdopen(descriptor, "w+b") as stream:
@@ -114,7 +118,8 @@ def output_stream(path: OutputPath | Path) -> Iterator[BinaryIO]:
                 stream.flush()
                 os.fsync(stream.fileno())
                 if temporary is None:
-                    temporary = _named(stream.fileno(), folder)
+                    temporary = _random_name()
+                    _link(stream.fileno(), folder, temporary)
             os.replace(temporary, output.name, src_dir_fd=folder, dst_dir_fd=folder)
         except BaseException:
             if temporary is not None:
@@ -206,12 +211,6 @@ def check_own(folder: int, output: OutputPath) -> None:
     raise OutputError(f"{output} is {what}, which is not written into. Remove it, or name another output.")
 
 
-def _check_replaceable(folder: int, output: OutputPath) -> None:
-    found = status(folder, output.name)
-    if found is not None and not (stat.S_ISREG(found.st_mode) or stat.S_ISLNK(found.st_mode)):
-        raise OutputError(f"{output} is {kind_of(found)}, where a file is to be. Remove it, or name another output.")
-
-
 def _new_file(folder: int) -> tuple[int, str | None]:
     """A new empty file in an open folder, and its name; None if it can do without."""
     if _NAMELESS:
@@ -222,11 +221,9 @@ def _new_file(folder: int) -> tuple[int, str | None]:
     return os.open(name, _NEW, _MODE, dir_fd=folder), name
 
 
-def _named(descriptor: int, folder: int) -> str:
-    """Give a file without name a random one."""
-    name = _random_name()
+def _link(descriptor: int, folder: int, name: str) -> None:
+    """Give a file without name one in an open folder."""
     os.link(_OWN_DESCRIPTORS / str(descriptor), name, dst_dir_fd=folder, follow_symlinks=True)
-    return name
 
 
 def _random_name() -> str:
@@ -253,7 +250,7 @@ def locked_folder(path: OutputPath | Path, *, wait: bool = False) -> Iterator[No
 
     Raises:
         BusyError: another process holds it.
-        OutputError: the folder cannot be made, or its file system knows no locks.
+        OutputError: the folder cannot be made, or its file system has no locks.
     """
     output = path if isinstance(path, OutputPath) else OutputPath(path)
     with explained(output), opened_folder(output, make=True) as folder:
@@ -269,7 +266,7 @@ def try_lock(descriptor: int) -> bool:
     """Lock an open file or folder until it is closed; False if it is locked already.
 
     Raises:
-        OSError: the file system knows no locks.
+        OSError: the file system has no locks.
     """
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)

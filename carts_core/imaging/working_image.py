@@ -91,13 +91,14 @@ def stacked_images(
         if camera.name not in images:
             raise SettingsError(f"no {what} of camera {camera.name!r} was given; given are: {', '.join(images)}.")
         image = images[camera.name]
-        if image.shape != (camera.height, camera.width, 3):
-            raise SettingsError(
-                f"the {what} of camera {camera.name!r} has shape {image.shape}, but its camera says "
-                f"({camera.height}, {camera.width}, 3)."
-            )
+        _check_shape(image, (camera.height, camera.width, 3), f"{what} of camera {camera.name!r}")
         resized.append(cv2.resize(image, size, interpolation=cv2.INTER_AREA))
     return torch.from_numpy(np.stack(resized)).permute(0, 3, 1, 2).float() / 255.0
+
+
+def _check_shape(image: np.ndarray, shape: tuple[int, ...], what: str) -> None:
+    if image.shape != shape:
+        raise SettingsError(f"the {what} has shape {image.shape}, but its camera's images have {shape}.")
 
 
 def pixel_weights(
@@ -113,11 +114,7 @@ def pixel_weights(
         mask = ignore.get(camera.name)
         if mask is None:
             continue
-        if mask.shape != (camera.height, camera.width):
-            raise SettingsError(
-                f"the ignore mask of camera {camera.name!r} has shape {mask.shape}, but its camera says "
-                f"({camera.height}, {camera.width})."
-            )
+        _check_shape(mask, (camera.height, camera.width), f"ignore mask of camera {camera.name!r}")
         weight[index, 0] = 1.0 - cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA)
     return torch.from_numpy(weight)
 

@@ -136,7 +136,7 @@ class Results:
                 camera.name: (T_camera_world[number] @ T_world_base[index]).tolist()
                 for number, camera in enumerate(self._scene.cameras)
             }
-        found = {name: self._mask(name, estimate) for name in self._renderers}
+        found = {name: one.segment(estimate.state.to("cpu"))[0] >= 0 for name, one in self._renderers.items()}
         return ResultMessage(
             id=estimate.frame_id,
             time=estimate.time,
@@ -148,6 +148,3 @@ class Results:
             base_frames=frames,
             masks=encoded_masks(found),
         )
-
-    def _mask(self, name: str, estimate: LiveEstimate) -> np.ndarray:
-        return self._renderers[name].segment(estimate.state.to("cpu"))[0] >= 0

@@ -14,7 +14,8 @@ import msgspec
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from ..errors import CartsError, SequenceError
+from ..errors import CartsError, SequenceError, SettingsError
+from ..model.camera import rigid_transform
 from ..model.scene import Scene
 from ..recording import Frame, Sequence
 from ..recording.kinematics_table import PLAUSIBLE
@@ -178,13 +179,7 @@ class Source(Protocol):
 def mounts_of(
     scene: Scene, frame: Frame, camera_poses: Mapping[str, Float[np.ndarray, "4 4"]]
 ) -> dict[str, Float[np.ndarray, "4 4"]]:
-    """Camera -> T_mount_world [m] of the cameras that move; poses that were sent override the frame's.
-
-    Args:
-        scene: with the cameras' poses on their mounts.
-        frame: of a recording or a stream.
-        camera_poses: camera -> T_camera_world [m].
-    """
+    """Camera -> T_mount_world [m] of the cameras that move; poses that were sent override the frame's."""
     sent = {
         camera.name: np.linalg.inv(camera.T_camera_world) @ camera_poses[camera.name]
         for camera in scene.cameras
@@ -254,11 +249,12 @@ class Assembler:
     def _take_poses(self, message: FrameMessage) -> None:
         known = [camera.name for camera in self._sequence.scene.cameras]
         for name, rows in message.camera_poses.items():
-            square = len(rows) == 4 and {len(row) for row in rows} == {4}
-            pose = np.array(rows, np.float64) if square else np.zeros((4, 4))
-            if name not in known or not _is_rigid(pose):
-                raise StreamError(f"camera_poses of {name!r}: give a rigid 4 x 4 matrix for one of {', '.join(known)}.")
-            self._poses[name] = pose
+            if name not in known:
+                raise StreamError(f"camera_poses of {name!r}: the cameras are {', '.join(known)}.")
+            try:
+                self._poses[name] = rigid_transform(rows, f"camera_poses of {name!r}")
+            except SettingsError as error:
+                raise StreamError(str(error)) from error
 
     def _image(self, name: str, message: FrameMessage) -> np.ndarray:
         if name not in message.images:
@@ -278,14 +274,6 @@ class Assembler:
                 f"image of {name} is {width} x {height} px; the camera has {camera.width} x {camera.height}."
             )
         return camera.undistort(image)
-
-
-def _is_rigid(pose: np.ndarray) -> bool:
-    """Whether a 4 x 4 matrix is a rigid transform."""
-    if not np.isfinite(pose).all() or not np.array_equal(pose[3], [0.0, 0.0, 0.0, 1.0]):
-        return False
-    rotation = pose[:3, :3]
-    return bool(np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-4) and np.linalg.det(rotation) > 0)
 
 
 class LatestFrame:

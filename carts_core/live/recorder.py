@@ -1,6 +1,5 @@
 """Recorder of a stream as a sequence, with the corrections as its project."""
 
-import json
 import queue
 import threading
 from collections.abc import Collection
@@ -9,16 +8,20 @@ from typing import Any
 
 import cv2
 import numpy as np
+import tomlkit
 from scipy.spatial.transform import Rotation
 
 from ..errors import OutputError
 from ..export.kinematics import KinematicsRow, joint_columns, kinematics_csv, position_values
 from ..files import append_line, file_name, output_path, remove_file, write_bytes, write_text
 from ..files.reading import SEQUENCE, parse_toml, read_text
+from ..model.camera import HALF_PIXEL
+from ..model.instruments import SCHEME
 from ..model.scene import Scene
 from ..project import Edits, FitVerdict, JointCorrection, Key, Project, Provenance
 from ..recording import Sequence
 from ..recording.matching import ORIENTATION, POSITION
+from ..recording.sequence_file import FORMAT
 from .loop import Tracked
 from .messages import mounts_of
 from .tracker import LiveVerdict
@@ -167,46 +170,34 @@ def _motion_file(camera: str) -> str:
 
 def _sequence_file(sequence: Sequence, scene: Scene, moving: Collection[str]) -> str:
     """Sequence file of the recording; its images are undistorted."""
-    lines = [
-        "# Recorded by carts live.",
-        'format = "carts-sequence/1"',
-        f"name = {json.dumps(f'{sequence.name} live')}",
-        "",
-        "[kinematics]",
-        'table = "kinematics.csv"',
-        'frame_id = "{frame}"',
-        'timestamp = "time"',
-    ]
+    folder = sequence.path.parent.resolve()
     described = parse_toml(read_text(sequence.path, SEQUENCE))["arms"]
-    robots = {table["name"]: table["robot"] for table in described}
-    for arm in scene.arms:
-        robot = robots[arm.name]
-        if not robot.startswith("builtin:"):
-            robot = str(sequence.path.parent.resolve() / robot)
-        lines += [
-            "",
-            "[[arms]]",
-            f"name = {json.dumps(arm.name)}",
-            f"robot = {json.dumps(robot)}",
-            f"base_link = {json.dumps(arm.robot.base_link)}",
-            f"T_world_base = {np.asarray(arm.T_world_base).tolist()}",
-            "",
-            "[arms.joints]",
-            *(f"{json.dumps(name)} = {json.dumps(f'{arm.name}.{name}')}" for name in arm.robot.joint_names),
-        ]
+    robots = {
+        table["name"]: robot if (robot := table["robot"]).startswith(SCHEME) else str(folder / robot)
+        for table in described
+    }
+    arms = [
+        {
+            "name": arm.name,
+            "robot": robots[arm.name],
+            "base_link": arm.robot.base_link,
+            "T_world_base": np.asarray(arm.T_world_base).tolist(),
+            "joints": {name: f"{arm.name}.{name}" for name in arm.robot.joint_names},
+        }
+        for arm in scene.arms
+    ]
+    cameras = []
     for camera in scene.cameras:
-        fx, fy, cx, cy = camera.intrinsics
-        lines += [
-            "",
-            "[[cameras]]",
-            f"name = {json.dumps(camera.name)}",
-            f"size = [{camera.width}, {camera.height}]",
-            f"K = {{ fx = {fx!r}, fy = {fy!r}, cx = {cx!r}, cy = {cy!r} }}",
-            "pixel_center = 0.5",
-            f"T_camera_world = {np.asarray(camera.T_camera_world).tolist()}",
-            f"images = {json.dumps(f'images/{file_name(camera.name)}/' + '{frame}.png')}",
-        ]
-        if camera.name in moving:
-            motion = json.dumps(_motion_file(camera.name))
-            lines.append(f'motion = {{ table = {motion}, pose = "T_mount_world" }}')
-    return "\n".join(lines) + "\n"
+        entry = {
+            "name": camera.name,
+            "size": [camera.width, camera.height],
+            "pixel_center": HALF_PIXEL,
+            "T_camera_world": np.asarray(camera.T_camera_world).tolist(),
+            "images": f"images/{file_name(camera.name)}/{{frame}}.png",
+            "K": dict(zip(("fx", "fy", "cx", "cy"), map(float, camera.intrinsics), strict=True)),
+        }
+        motion = {"table": _motion_file(camera.name), "pose": "T_mount_world"}
+        cameras.append({**entry, **({"motion": motion} if camera.name in moving else {})})
+    table = {"table": "kinematics.csv", "frame_id": "{frame}", "timestamp": "time"}
+    content = {"format": FORMAT, "name": f"{sequence.name} live", "kinematics": table, "arms": arms, "cameras": cameras}
+    return f"# Recorded by carts live.\n{tomlkit.dumps(content)}"

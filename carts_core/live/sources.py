@@ -6,7 +6,7 @@ import socket
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, suppress
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -112,7 +112,9 @@ class StreamServer:
                 if not full:
                     self._clients[connection] = client
             if full:
-                _refuse(connection)
+                text = f"{_CLIENTS} clients are connected. Close one, or try again."
+                with connection, suppress(OSError):
+                    connection.sendall(packed(ErrorMessage(text)))
                 continue
             connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             threading.Thread(target=self._read, args=(connection, client), daemon=True).start()
@@ -157,12 +159,6 @@ class StreamServer:
         connection.close()
 
 
-def _refuse(connection: socket.socket) -> None:
-    """Refuse a connection with an error message."""
-    with connection, suppress(OSError):
-        connection.sendall(packed(ErrorMessage(f"{_CLIENTS} clients are connected. Close one, or try again.")))
-
-
 def _put_newest(waiting: queue.Queue, item: object) -> None:
     """Put an item into a queue; drops the oldest one if it is full."""
     while True:
@@ -183,7 +179,18 @@ _POLL = 0.01
 _SUFFIXES = (".png", ".jpg", ".jpeg")
 
 
-class Replay:
+class _Closable:
+    """Source that ends when `close` is called."""
+
+    def __init__(self) -> None:
+        self._closed = threading.Event()
+
+    def close(self) -> None:
+        """See `Source`."""
+        self._closed.set()
+
+
+class Replay(_Closable):
     """Real-time replay of a recording; late frames are skipped.
 
     Args:
@@ -200,6 +207,7 @@ class Replay:
     def __init__(
         self, sequence: Sequence, cameras: tuple[str, ...], domain: str, *, rate: float | None = None, loops: int = 1
     ) -> None:
+        super().__init__()
         self._sequence, self._cameras, self._domain, self._loops = sequence, cameras, domain, loops
         count = len(sequence)
         if rate is not None:
@@ -210,7 +218,6 @@ class Replay:
             self._times = sequence.timestamps - sequence.timestamps[0]
         last_gap = self._times[-1] - self._times[-2] if count > 1 else 1.0
         self._length = float(self._times[-1] + last_gap)
-        self._closed = threading.Event()
 
     def __iter__(self) -> Iterator[Moment]:
         """See `Source`."""
@@ -226,12 +233,8 @@ class Replay:
                     return
                 yield Moment(replace(frame, timestamp=due))
 
-    def close(self) -> None:
-        """See `Source`."""
-        self._closed.set()
 
-
-class Camera:
+class Camera(_Closable):
     """Camera device or video file, by OpenCV; joints come from another source.
 
     Args:
@@ -244,6 +247,7 @@ class Camera:
     """
 
     def __init__(self, assembler: Assembler, camera: str, device: int | str) -> None:
+        super().__init__()
         self._assembler, self._camera = assembler, camera
         self._capture = cv2.VideoCapture(device)
         if not self._capture.isOpened():
@@ -253,7 +257,6 @@ class Camera:
         # A device sets its own rate; a file is throttled to its frame rate.
         rate = self._capture.get(cv2.CAP_PROP_FPS) if isinstance(device, str) else 0.0
         self._gap = 1.0 / rate if rate > 0 else 0.0
-        self._closed = threading.Event()
 
     def __iter__(self) -> Iterator[Moment]:
         """See `Source`."""
@@ -272,12 +275,8 @@ class Camera:
         finally:
             self._capture.release()
 
-    def close(self) -> None:
-        """See `Source`."""
-        self._closed.set()
 
-
-class Folder:
+class Folder(_Closable):
     """Watched folder with `NAME.json` and `NAME.png`, or `NAME.CAMERA.png` for each of several cameras.
 
     The JSON file is a frame message without images, and is written last. Of several new names only the last is read.
@@ -293,11 +292,11 @@ class Folder:
     """
 
     def __init__(self, assembler: Assembler, cameras: tuple[str, ...], folder: Path) -> None:
+        super().__init__()
         if not folder.is_dir():
             raise SettingsError(f"{folder} is no folder. Name the one that images are written to.")
         self._assembler, self._cameras, self._folder = assembler, cameras, folder
         self._left_out = 0
-        self._closed = threading.Event()
 
     def __iter__(self) -> Iterator[Moment]:
         """See `Source`."""
@@ -314,10 +313,6 @@ class Folder:
                 continue
             if moment is not None:
                 yield moment
-
-    def close(self) -> None:
-        """See `Source`."""
-        self._closed.set()
 
     def _leave_out(self, error: StreamError) -> None:
         self._left_out += 1
@@ -392,19 +387,15 @@ def open_stream(
         return OpenStream(Replay(sequence, cameras, domain, rate=rate, loops=loops))
     assembler = Assembler(sequence, cameras)
     port = int(address.place) if address.kind is StreamKind.SOCKET else address.joints_port
-    with ExitStack() as held:
-        server = None if port is None else StreamServer(assembler, port)
+    server = None if port is None else StreamServer(assembler, port)
+    try:
+        if server is not None and address.kind is StreamKind.SOCKET:
+            return OpenStream(server, server)
+        if address.kind is StreamKind.FOLDER:
+            return OpenStream(Folder(assembler, cameras, Path(address.place)), server)
+        device = int(address.place) if address.kind is StreamKind.CAMERA else address.place
+        return OpenStream(Camera(assembler, cameras[0], device), server)
+    except BaseException:
         if server is not None:
-            held.callback(server.close)
-        match address.kind:
-            case StreamKind.SOCKET:
-                assert server is not None
-                source: Source = server
-            case StreamKind.FOLDER:
-                source = Folder(assembler, cameras, Path(address.place))
-            case StreamKind.CAMERA:
-                source = Camera(assembler, cameras[0], int(address.place))
-            case _:
-                source = Camera(assembler, cameras[0], address.place)
-        held.pop_all()
-    return OpenStream(source, server)
+            server.close()
+        raise

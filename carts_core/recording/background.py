@@ -57,10 +57,7 @@ def widen(silhouette: Bool[np.ndarray, "height width"], margins: int = 1) -> Boo
 
 
 def background_of_recording(
-    scene: Scene,
-    camera: str,
-    states: Items[SceneState],
-    image: Callable[[int], UInt8[np.ndarray, "height width 3"]],
+    scene: Scene, camera: str, states: Items[SceneState], image: Callable[[int], UInt8[np.ndarray, "height width 3"]]
 ) -> MeanBackground:
     """The mean background of a recording: see `estimate_background`.
 
@@ -104,9 +101,6 @@ def estimate_background(
     """Median of every pixel over the views in which it is not covered.
 
     A pixel that is covered in every view is filled in from its surroundings.
-
-    Args:
-        views: images with what covers the background in each.
 
     Raises:
         SequenceError: the whole image is covered in every view.

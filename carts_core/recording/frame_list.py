@@ -32,16 +32,7 @@ class FrameId(str):
 
 
 def expand(pattern: str, key: str, **values: object) -> str:
-    """`pattern` with its {placeholders} filled in.
-
-    Args:
-        pattern: as written in the sequence file.
-        key: its name in errors.
-        values: of the placeholders.
-
-    Raises:
-        SequenceError: an unknown placeholder, or a number format for an id that is no number.
-    """
+    """`pattern` with its {placeholders} filled in."""
     try:
         _check_format(pattern)
         filled = pattern.format(**values)
@@ -125,11 +116,7 @@ class FrameNames:
     """Key that names the column, for errors."""
 
     def of(self, table: Table) -> tuple[str, ...]:
-        """The id of every row.
-
-        Raises:
-            SequenceError: no such column, or an id is missing, repeated, or not a number where the pattern wants one.
-        """
+        """The id of every row."""
         key = f"{table.path}, column {self.column!r}"
         cells = table.text(self.column, self.asked_by)
         if self.pattern == _FRAME_ALONE:
@@ -156,20 +143,12 @@ class FrameNames:
 
 
 def take_frame_names(section: TomlTable) -> FrameNames:
-    """The keys `frame` and `frame_id`.
-
-    Raises:
-        SequenceError: the pattern does not tell frames apart.
-    """
+    """The keys `frame` and `frame_id`."""
     return FrameNames(section.take("frame", str, "frame"), _take_pattern(section), f"`frame` in {section.where}")
 
 
 def take_frame_list(section: TomlTable) -> FrameList:
-    """Frames that the `[frames]` table describes: the rows of a table, or all frames of a video.
-
-    Raises:
-        SequenceError: the table or video is missing, wrong, or has no times.
-    """
+    """Frames that the `[frames]` table describes: the rows of a table, or all frames of a video."""
     if "video" in section:
         return _frames_of_video(section)
     if "table" not in section:
@@ -194,9 +173,6 @@ def list_of_rows(table: Table, names: FrameNames, timestamp: str, section: TomlT
         timestamp: its column with the time [s]; empty for frames without times.
         section: table of the sequence file that describes it.
         counted: number of frames, as a clause for errors.
-
-    Raises:
-        SequenceError: ids, times or video frame numbers are wrong.
     """
     frame_ids = names.of(table)
     times = table.numbers(timestamp, section.name("timestamp")) if timestamp else None
@@ -206,11 +182,7 @@ def list_of_rows(table: Table, names: FrameNames, timestamp: str, section: TomlT
 
 
 def take_delimiter(section: TomlTable) -> str:
-    """The key `delimiter`.
-
-    Raises:
-        SequenceError: it is not one character.
-    """
+    """The key `delimiter`."""
     delimiter = section.take("delimiter", str, ",")
     if len(delimiter) != 1:
         raise section.error("delimiter", f"is {delimiter!r}, but must be one character.")
@@ -226,8 +198,7 @@ def _frames_of_video(section: TomlTable) -> FrameList:
     index = index_video(path)
     if index.timestamps is None:
         raise section.error(
-            "video",
-            f"is {path}, which gives its frames no times. Name a `table` with the time of every frame instead.",
+            "video", f"is {path}, which gives its frames no times. Name a `table` with the time of every frame instead."
         )
     numbers = tuple(range(index.count))
     ids = tuple(expand(pattern, section.name("frame_id"), frame=FrameId(number)) for number in numbers)
@@ -244,11 +215,7 @@ def _take_pattern(section: TomlTable) -> str:
 
 
 def numbers_of_frames(table: Table, column: str, asked_by: str) -> tuple[int, ...]:
-    """Video frame numbers of the rows, from a column of a table.
-
-    Raises:
-        SequenceError: there is no such column, or a cell is no whole number from 0.
-    """
+    """Video frame numbers of the rows, from a column of a table."""
     numbers = table.numbers(column, asked_by)
     if (wrong := np.flatnonzero((numbers < 0) | (numbers != np.round(numbers)))).size:
         raise SequenceError(
@@ -265,11 +232,7 @@ _MOST_WILD_PARTS = 2
 def frame_files(
     folder: Path, pattern: str, key: str, frames: FrameList, *, domain: str, camera: str
 ) -> tuple[Path, ...]:
-    """One path per frame, in the frames' order; the files need not exist.
-
-    Raises:
-        SequenceError: a wrong pattern, or a glob that matches another number of files than there are frames.
-    """
+    """One path per frame, in the frames' order; the files need not exist."""
     if is_per_frame(pattern):
         return tuple(
             folder / expand(pattern, key, frame=FrameId(frame_id), index=row, domain=domain, camera=camera)
@@ -302,11 +265,7 @@ def _matching(base: Path, key: str) -> tuple[Path, list[Path]]:
 
 
 def check_present(key: str, files: tuple[Path, ...], frames: FrameList, hint: str = "") -> None:
-    """Check that every frame's file is there.
-
-    Raises:
-        SequenceError: some are not.
-    """
+    """Check that every frame's file is there."""
     missing = [(file, frame_id) for file, frame_id in zip(files, frames.frame_ids, strict=True) if not is_regular(file)]
     if missing:
         shown = ", ".join(f"{file} (frame {frame_id})" for file, frame_id in missing[:_SHOWN_MISSING])

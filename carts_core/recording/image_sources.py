@@ -22,15 +22,19 @@ from .images import ImageSource, decode_image
 BAG_SUFFIXES = (".bag", ".mcap", ".db3")
 """Suffixes of ROS bags; a folder with `metadata.yaml` is a bag, too."""
 
-_CHANNELS = {"rgb8": None, "bgr8": cv2.COLOR_BGR2RGB, "rgba8": cv2.COLOR_RGBA2RGB, "bgra8": cv2.COLOR_BGRA2RGB}
-_BAYER = {
+_ENCODINGS: dict[str, tuple[int, int | None]] = {
+    "rgb8": (3, None),
+    "bgr8": (3, cv2.COLOR_BGR2RGB),
+    "rgba8": (4, cv2.COLOR_RGBA2RGB),
+    "bgra8": (4, cv2.COLOR_BGRA2RGB),
+    "mono8": (1, cv2.COLOR_GRAY2RGB),
     # ROS names the first two pixels of the first row, OpenCV those of the second.
-    "bayer_rggb8": cv2.COLOR_BayerBG2RGB,
-    "bayer_bggr8": cv2.COLOR_BayerRG2RGB,
-    "bayer_gbrg8": cv2.COLOR_BayerGR2RGB,
-    "bayer_grbg8": cv2.COLOR_BayerGB2RGB,
+    "bayer_rggb8": (1, cv2.COLOR_BayerBG2RGB),
+    "bayer_bggr8": (1, cv2.COLOR_BayerRG2RGB),
+    "bayer_gbrg8": (1, cv2.COLOR_BayerGR2RGB),
+    "bayer_grbg8": (1, cv2.COLOR_BayerGB2RGB),
 }
-_ONE_CHANNEL = {"mono8": cv2.COLOR_GRAY2RGB, **_BAYER}
+"""Encoding -> channels, and OpenCV's conversion to RGB."""
 
 
 @dataclass(frozen=True)
@@ -71,9 +75,6 @@ class Cropped:
 
 class Bag:
     """An opened ROS bag, read in a child process, one call at a time; use as a context.
-
-    Args:
-        path: ROS 1 bag, MCAP file or ROS 2 bag folder.
 
     Attributes:
         topics: name and message type of each topic.
@@ -194,25 +195,20 @@ class BagImages:
 def decode_message(message: Any, what: str) -> UInt8[np.ndarray, "height width 3"]:
     """Pixels of a `sensor_msgs` image message, RGB.
 
-    Args:
-        message: an `Image` or `CompressedImage`.
-        what: its name in errors.
-
     Raises:
         SequenceError: it is damaged or of an encoding that is not known.
     """
     if not hasattr(message, "encoding"):
         return decode_image(np.asarray(message.data, np.uint8).tobytes(), what)
     encoding = message.encoding.lower()
-    channels = 1 if encoding in _ONE_CHANNEL else 4 if encoding in ("rgba8", "bgra8") else 3
-    if encoding not in _ONE_CHANNEL and encoding not in _CHANNELS:
-        known = ", ".join([*_CHANNELS, *_ONE_CHANNEL])
+    if encoding not in _ENCODINGS:
+        known = ", ".join(_ENCODINGS)
         raise SequenceError(f"{what} has the encoding {message.encoding!r}. Known are: {known}. Convert the bag.")
+    channels, conversion = _ENCODINGS[encoding]
     height, width, step = int(message.height), int(message.width), int(message.step)
     data = np.asarray(message.data, np.uint8)
     if step < width * channels or len(data) < step * height or not height or not width:
         raise SequenceError(f"{what} has {len(data)} bytes, too few for {width} x {height} pixels of {encoding}.")
     pixels = data[: step * height].reshape(height, step)[:, : width * channels]
     pixels = np.ascontiguousarray(pixels.reshape(height, width, *([channels] if channels > 1 else [])))
-    conversion = _ONE_CHANNEL.get(encoding, _CHANNELS.get(encoding))
     return pixels if conversion is None else cv2.cvtColor(pixels, conversion)

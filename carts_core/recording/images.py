@@ -1,6 +1,6 @@
 """Image files and masks: strict decoding, upright orientation, 8 bits, and remarks on every change to stored pixels.
 
-A truncated file is an error, not a half grey image.
+Unusable files are a `SequenceError`; a truncated one gives no half grey image.
 """
 
 import hashlib
@@ -72,19 +72,11 @@ class ImageFiles:
         return str(self.files[index])
 
     def read(self, index: int) -> UInt8[np.ndarray, "height width 3"]:
-        """The decoded file, RGB.
-
-        Raises:
-            SequenceError: it is missing, truncated, not an image, or has more bits than the others.
-        """
+        """The decoded file, RGB."""
         return read_image(self.files[index], self.bits)
 
     def fingerprint(self, index: int) -> str:
-        """SHA-256 of the file and, for images of more than 8 bits, of the bit depth.
-
-        Raises:
-            SequenceError: it is missing or cannot be read.
-        """
+        """SHA-256 of the file and, for images of more than 8 bits, of the bit depth."""
         content = read_file(self.files[index])
         eight_bits = content.startswith(JPEG) or (content.startswith(PNG) and content[24:25] != b"\x10")
         return hashlib.sha256(content + (b"" if eight_bits else bytes([self.bits()]))).hexdigest()
@@ -97,11 +89,8 @@ class ImageFiles:
 
     def upright(self, index: int) -> bool:
         """Whether the stored pixels are used without an EXIF rotation; also True for a missing file."""
-        try:
-            with open_regular(self.files[index], IMAGE) as stream:
-                return image_traits(stream.read(_HEADER)).orientation == 1
-        except OSError:
-            return True
+        traits = _header(self.files[index])
+        return traits is None or traits.orientation == 1
 
     def remarks(self) -> tuple[str, ...]:
         """Remarks on some of the images."""
@@ -124,10 +113,6 @@ def read_image(path: Path, bits: Callable[[], int] | None = None) -> UInt8[np.nd
 
 def decode_image(content: bytes, what: str) -> UInt8[np.ndarray, "height width 3"]:
     """As `read_image`, for an encoded image in memory.
-
-    Args:
-        content: PNG, JPEG, TIFF, BMP, WebP or PPM.
-        what: its name in errors.
 
     Raises:
         SequenceError: it is damaged, too large or not an image.
@@ -179,11 +164,7 @@ class LabelImage:
 
 
 def read_labels(path: Path) -> LabelImage:
-    """A label image or mask, in full depth.
-
-    Raises:
-        SequenceError: it is missing, damaged, or its transparency contradicts its colours.
-    """
+    """A label image or mask, in full depth."""
     raster = _decode(path, colour=False)
     grey, remarks = raster.grey, _orientation_remarks([raster.traits])
     mask = _white_part(raster, f"mask {path}")
@@ -216,17 +197,20 @@ def mask_remarks(files: Iterable[Path]) -> tuple[str, ...]:
 
 def image_remarks(files: Sequence[Path]) -> tuple[str, ...]:
     """Remarks on images, from their headers; missing files are ignored."""
-    traits = []
-    for file in files:
-        try:
-            with open_regular(file, IMAGE) as stream:
-                traits.append(image_traits(stream.read(_HEADER)))
-        except OSError:
-            continue
+    traits = [each for each in map(_header, files) if each is not None]
     found = [f"images: {text} ({len(traits)} looked at)." for text in _orientation_remarks(traits)]
     if any(each.alpha for each in traits):
         found.append("images: transparency (alpha) is not used.")
     return tuple(found)
+
+
+def _header(file: Path) -> ImageTraits | None:
+    """Traits of an image file, from its beginning; None if it cannot be read."""
+    try:
+        with open_regular(file, IMAGE) as stream:
+            return image_traits(stream.read(_HEADER))
+    except OSError:
+        return None
 
 
 def bits_remark(files: Sequence[Path]) -> tuple[str, ...]:
@@ -304,11 +288,7 @@ def _decode(path: Path, *, colour: bool) -> _Raster:
 
 
 def read_file(path: Path) -> bytes:
-    """Content of an image file.
-
-    Raises:
-        SequenceError: it is missing or cannot be read.
-    """
+    """Content of an image file."""
     try:
         return read_bytes(path, IMAGE)
     except (FileNotFoundError, IsADirectoryError) as error:
@@ -320,13 +300,7 @@ def read_file(path: Path) -> bytes:
 
 
 def _raster(content: bytes, what: str, *, colour: bool) -> _Raster:
-    """Pixels of an encoded image.
-
-    Args:
-        content: of the file.
-        what: its name in errors.
-        colour: RGB in any case, without transparency.
-    """
+    """Pixels of an encoded image."""
     if (damage := find_damage(content)) is not None:
         raise SequenceError(f"{what} is damaged: {damage}. {_REMEDY}")
     if (problem := size_problem(content)) is not None:
@@ -444,7 +418,7 @@ def _orientation_remarks(traits: Sequence[ImageTraits]) -> list[str]:
 def find_damage(content: bytes) -> str | None:
     """Description of the damage of a JPEG or PNG file; None for a whole one and for other kinds.
 
-    OpenCV decodes a truncated JPEG without an error and leaves the rest grey, so this looks at the file itself.
+    OpenCV decodes a truncated JPEG without an error and leaves the rest grey, so the file itself is checked.
     """
     if not content:
         return "the file is empty"

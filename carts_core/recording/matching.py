@@ -4,14 +4,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from scipy.spatial.transform import Rotation, Slerp
 
 from ..errors import SequenceError
 from ..model.ecm_kinematics import JOINT_NAMES, forward
 from ..wording import counted
 from .frame_list import FrameList, FrameNames, list_of_rows, take_delimiter, take_frame_list, take_frame_names
-from .kinematics_table import PLAUSIBLE, JointColumns, Table, read_table
+from .kinematics_table import LENGTH_UNITS, PLAUSIBLE, JointColumns, Table, read_table
 from .toml_table import TomlTable
 
 INTERPOLATIONS = ("linear", "nearest")
@@ -32,14 +32,8 @@ class TimeMatching:
 
 
 def take_matching(section: TomlTable) -> TimeMatching:
-    """The keys `time_offset`, `interpolation` and `max_gap` of `[frames]`.
-
-    Raises:
-        SequenceError: a value is not finite, or unknown.
-    """
+    """The keys `time_offset`, `interpolation` and `max_gap` of `[frames]`."""
     time_offset = float(section.take("time_offset", float, 0.0))
-    if not np.isfinite(time_offset):
-        raise section.error("time_offset", f"is {time_offset}, but must be a finite number [s].")
     interpolation = section.take_choice("interpolation", INTERPOLATIONS, "linear")
     max_gap = float(section.take("max_gap", float, TimeMatching.max_gap))
     if not 0.0 < max_gap < np.inf:
@@ -48,19 +42,10 @@ def take_matching(section: TomlTable) -> TimeMatching:
 
 
 @dataclass(frozen=True)
-class Neighbours:
-    """Rows of a table on both sides of each frame in time."""
+class Samples:
+    """Logged rows of a table: joint positions [rows, dofs] [rad], [m], or poses T_world_mount [rows, 4, 4] [m]."""
 
-    before: Int[np.ndarray, " frames"]
-    after: Int[np.ndarray, " frames"]
-    share: Float[np.ndarray, " frames"]
-    """Interpolation weight of the row after, in [0, 1]."""
-
-
-@dataclass(frozen=True)
-class RowTimes:
-    """Origin and times of the rows of a table."""
-
+    values: Float[np.ndarray, "rows ..."]
     path: Path
     """Path of the table, for errors."""
     lines: tuple[int, ...]
@@ -68,17 +53,10 @@ class RowTimes:
     times: Float[np.ndarray, " rows"] | None
     """Time of each row in the table's clock, increasing [s]; None where row n belongs to frame n."""
 
-    def neighbours(self, frames: FrameList, matching: TimeMatching, what: str) -> Neighbours:
-        """The rows on both sides of each frame in time.
-
-        Args:
-            frames: with their times.
-            matching: time offset and interpolation.
-            what: content of the rows, for errors.
-
-        Raises:
-            SequenceError: a frame has no row near enough in time.
-        """
+    def at_frames(self, frames: FrameList, matching: TimeMatching | None) -> Float[np.ndarray, "frames ..."]:
+        """The value of every frame; joints and positions are interpolated linearly, rotations spherically."""
+        if matching is None:
+            return self.values
         assert self.times is not None and frames.timestamps is not None
         wanted = frames.timestamps + matching.time_offset
         last = len(self.times) - 1
@@ -94,12 +72,35 @@ class RowTimes:
             distance = np.maximum(to_before, to_after)
             share = np.where(before == after, 0.0, to_before / np.maximum(to_before + to_after, _ROUNDING))
         if (far := np.flatnonzero(distance > matching.max_gap + _ROUNDING)).size:
-            raise self._too_far(frames, matching, far, what)
-        return Neighbours(before, after, share)
+            raise self._too_far(frames, matching, far)
+        if self.values.ndim == 3:
+            return self._poses_at(before + share * (after - before))
+        return (1.0 - share[:, None]) * self.values[before] + share[:, None] * self.values[after]
 
-    def _too_far(self, frames: FrameList, matching: TimeMatching, far: np.ndarray, what: str) -> SequenceError:
+    def logged_at(self, times: Float[np.ndarray, " times"]) -> Float[np.ndarray, "times ..."]:
+        """Values at times of the table's clock; NaN outside its range."""
+        assert self.times is not None
+        if self.values.ndim == 2:
+            columns = [np.interp(times, self.times, one, left=np.nan, right=np.nan) for one in self.values.T]
+            return np.stack(columns, 1)
+        places = np.interp(times, self.times, np.arange(len(self.times), dtype=float), left=np.nan, right=np.nan)
+        Ts = self._poses_at(np.nan_to_num(places))
+        Ts[np.isnan(places)] = np.nan
+        return Ts
+
+    def _poses_at(self, places: Float[np.ndarray, " places"]) -> Float[np.ndarray, "places 4 4"]:
+        """Poses at fractional row numbers, from 0."""
+        if len(self.values) == 1:
+            return np.tile(self.values, (len(places), 1, 1))
+        rows = np.arange(len(self.values))
+        Ts = np.tile(np.eye(4), (len(places), 1, 1))
+        Ts[:, :3, :3] = Slerp(rows, Rotation.from_matrix(self.values[:, :3, :3]))(places).as_matrix()
+        Ts[:, :3, 3] = np.stack([np.interp(places, rows, one) for one in self.values[:, :3, 3].T], 1)
+        return Ts
+
+    def _too_far(self, frames: FrameList, matching: TimeMatching, far: np.ndarray) -> SequenceError:
         assert self.times is not None and frames.timestamps is not None
-        row = far[0]
+        row, what = far[0], "joint positions" if self.values.ndim == 2 else "camera poses"
         wanted = frames.timestamps + matching.time_offset
         after = int(np.searchsorted(self.times, wanted[row]))
         near = " and ".join(
@@ -115,85 +116,6 @@ class RowTimes:
             f"{self.times[-1]:.6g} s. Correct `time_offset` in [frames] (both clocks are in seconds), leave the frames "
             "out by a table of the others, or allow a larger `max_gap`."
         )
-
-
-@dataclass(frozen=True)
-class JointSamples:
-    """Joint positions of the rows of a table."""
-
-    positions: Float[np.ndarray, "rows dofs"]
-    """[rad, m]"""
-    rows: RowTimes
-
-    def at_times(self, frames: FrameList, matching: TimeMatching) -> Float[np.ndarray, "frames dofs"]:
-        """The joint positions of every frame [rad, m].
-
-        Raises:
-            SequenceError: a frame has no row near enough in time.
-        """
-        found = self.rows.neighbours(frames, matching, "joint positions")
-        share = found.share[:, None]
-        return (1.0 - share) * self.positions[found.before] + share * self.positions[found.after]
-
-    def logged_at(self, times: Float[np.ndarray, " times"]) -> Float[np.ndarray, "times dofs"]:
-        """Joint positions at times of the table's clock [rad, m]; NaN outside its range."""
-        assert self.rows.times is not None
-        known = self.rows.times
-        return np.stack([np.interp(times, known, one, left=np.nan, right=np.nan) for one in self.positions.T], 1)
-
-
-@dataclass(frozen=True)
-class PoseSamples:
-    """Poses of a camera's mount of the rows of a table."""
-
-    Ts_world_mount: Float[np.ndarray, "rows 4 4"]
-    """[m]"""
-    rows: RowTimes
-
-    def at_times(self, frames: FrameList, matching: TimeMatching) -> Float[np.ndarray, "frames 4 4"]:
-        """T_world_mount of every frame [m]; positions are interpolated linearly, rotations spherically.
-
-        Raises:
-            SequenceError: a frame has no row near enough in time.
-        """
-        found = self.rows.neighbours(frames, matching, "camera poses")
-        # Fractional row numbers.
-        return self._between(found.before + found.share * (found.after - found.before))
-
-    def logged_at(self, times: Float[np.ndarray, " times"]) -> Float[np.ndarray, "times 4 4"]:
-        """T_world_mount at times of the table's clock [m]; NaN outside its range."""
-        assert self.rows.times is not None
-        numbers = np.arange(len(self.rows.times), dtype=np.float64)
-        places = np.interp(times, self.rows.times, numbers, left=np.nan, right=np.nan)
-        Ts = self._between(np.nan_to_num(places))
-        Ts[np.isnan(places)] = np.nan
-        return Ts
-
-    def _between(self, places: Float[np.ndarray, " places"]) -> Float[np.ndarray, "places 4 4"]:
-        """Poses at fractional row numbers, from 0."""
-        if len(self.Ts_world_mount) == 1:
-            return np.tile(self.Ts_world_mount, (len(places), 1, 1))
-        rows, points = np.arange(len(self.Ts_world_mount)), self.Ts_world_mount[:, :3, 3]
-        Ts = np.tile(np.eye(4), (len(places), 1, 1))
-        Ts[:, :3, :3] = Slerp(rows, Rotation.from_matrix(self.Ts_world_mount[:, :3, :3]))(places).as_matrix()
-        Ts[:, :3, 3] = np.stack([np.interp(places, rows, one) for one in points.T], 1)
-        return Ts
-
-
-def row_times(table: Table, column: str, asked_by: str) -> Float[np.ndarray, " rows"]:
-    """The time of every row [s].
-
-    Raises:
-        SequenceError: no such column, not numbers, or not increasing.
-    """
-    times = table.numbers(column, asked_by)
-    if (wrong := np.flatnonzero(np.diff(times) <= 0.0)).size:
-        row = wrong[0] + 1
-        raise SequenceError(
-            f"{table.path}, line {table.lines[row]}, column {column!r}: {times[row]:.9g} s does not come after "
-            f"{times[row - 1]:.9g} s in line {table.lines[row - 1]}. Sort the rows by time, and keep one of each time."
-        )
-    return times
 
 
 @dataclass(frozen=True)
@@ -213,47 +135,41 @@ class Rows:
     timestamp: str
     """Column with the time of a row; empty without one."""
 
-    def measured_of(self, arm: TomlTable, columns: JointColumns) -> JointSamples:
-        """The measured joint positions of an arm, from its own `table` or that of the sequence.
-
-        Raises:
-            SequenceError: the table is missing, wrong, or has other frames.
-        """
+    def measured_of(self, arm: TomlTable, columns: JointColumns) -> Samples:
+        """The measured joint positions of an arm, from its own `table` or that of the sequence; errors as `read`."""
         own = arm.take("table", str, "")
-        return self._samples(self.read(arm.path(own)) if own else self.table, columns)
+        table = self.read(arm.path(own)) if own else self.table
+        return self.samples(table, columns.read(table))
 
-    def truth_of(self, arm: TomlTable, columns: JointColumns) -> JointSamples | None:
-        """The true joint positions of an arm, from its own `truth` or that of the sequence; None without either.
-
-        Raises:
-            SequenceError: the table is missing, wrong, or has other frames.
-        """
+    def truth_of(self, arm: TomlTable, columns: JointColumns) -> Samples | None:
+        """The true joint positions of an arm, from its own `truth` or that of the sequence; errors as `read`."""
         own = arm.take("truth", str, "")
-        path = arm.path(own) if own else self.truth
-        return None if path is None else self._samples(self.read(path), columns)
+        if (path := arm.path(own) if own else self.truth) is None:
+            return None
+        table = self.read(path)
+        return self.samples(table, columns.read(table))
 
     def read(self, path: Path) -> Table:
-        """Another table with the same frames, or of the same clock.
-
-        Raises:
-            SequenceError: the table is missing, wrong, or has other frames.
-        """
+        """Another table with the same frames, or of the same clock."""
         table = read_table(path, self.delimiter)
         if self.names is not None:
             _check_same_frames(table, self.names.of(table), self.frames.frame_ids)
         return table
 
-    def times_of(self, table: Table) -> RowTimes:
-        """Times of the rows of a table.
-
-        Raises:
-            SequenceError: there is no such column, or the times do not increase.
-        """
-        times = None if self.matching is None else row_times(table, self.timestamp, "`timestamp` in [kinematics]")
-        return RowTimes(table.path, table.lines, times)
-
-    def _samples(self, table: Table, columns: JointColumns) -> JointSamples:
-        return JointSamples(columns.read(table), self.times_of(table))
+    def samples(self, table: Table, values: np.ndarray) -> Samples:
+        """Values of the rows of a table with their times."""
+        if self.matching is None:
+            return Samples(values, table.path, table.lines, None)
+        column = self.timestamp
+        times = table.numbers(column, "`timestamp` in [kinematics]")
+        if (wrong := np.flatnonzero(np.diff(times) <= 0.0)).size:
+            row = wrong[0] + 1
+            raise SequenceError(
+                f"{table.path}, line {table.lines[row]}, column {column!r}: {times[row]:.9g} s does not come after "
+                f"{times[row - 1]:.9g} s in line {table.lines[row - 1]}. Sort the rows by time, and keep one of each "
+                "time."
+            )
+        return Samples(values, table.path, table.lines, times)
 
 
 def take_rows(section: TomlTable, frames_section: TomlTable | None) -> Rows:
@@ -262,9 +178,6 @@ def take_rows(section: TomlTable, frames_section: TomlTable | None) -> Rows:
     Args:
         section: `[kinematics]`.
         frames_section: `[frames]`, whose times the rows are matched with; None where every row is a frame.
-
-    Raises:
-        SequenceError: a table is missing, or its frames, times or numbers are wrong.
     """
     delimiter = take_delimiter(section)
     table = read_table(section.path(section.take("table", str)), delimiter)
@@ -307,19 +220,14 @@ POSES = ("T_world_mount", "T_mount_world")
 POSITION, ORIENTATION = ("x", "y", "z"), ("qx", "qy", "qz", "qw")
 """Columns of a pose by default [m], unit quaternion."""
 
-_UNITS = {"m": 1.0, "mm": 1e-3}
 _NORM_TOLERANCE = 0.01
 """Largest deviation of a quaternion's norm from 1."""
 _FARTHEST = 100.0
 """Largest distance of the mount from the origin [m]."""
 
 
-def take_camera_motion(table: TomlTable, rows: Rows) -> PoseSamples | None:
-    """The key `motion` of a `[[cameras]]` table; None without one.
-
-    Raises:
-        SequenceError: the table is missing, has other frames, or a pose is impossible.
-    """
+def take_camera_motion(table: TomlTable, rows: Rows) -> Samples | None:
+    """The key `motion` of a `[[cameras]]` table; None without one."""
     given = table.take("motion", (str, dict), {})
     if not given:
         return None
@@ -328,17 +236,21 @@ def take_camera_motion(table: TomlTable, rows: Rows) -> PoseSamples | None:
     poses = rows.read(section.path(section.take("table", str)))
     joints = section.take("ecm_joints", list, [])
     if joints:
-        Ts = forward(_numbers(section, "ecm_joints", poses, joints, len(JOINT_NAMES)))
-        _check_joints(section, poses, joints)
+        positions = _numbers(section, "ecm_joints", poses, joints, len(JOINT_NAMES))
+        for joint, largest in zip(JOINT_NAMES, np.abs(positions).max(0), strict=True):
+            if largest > (allowed := PLAUSIBLE["prismatic" if joint == "insertion" else "revolute"]):
+                text = f"has {joint} at {largest:.4g}; {allowed:.3g} is allowed. Give [rad] and [m]."
+                raise section.error("ecm_joints", text)
+        Ts = forward(positions)
     else:
         Ts = _poses(section, poses)
     section.finish()
-    return PoseSamples(Ts, rows.times_of(poses))
+    return rows.samples(poses, Ts)
 
 
 def _poses(section: TomlTable, table: Table) -> Float[np.ndarray, "rows 4 4"]:
     kind = section.take_choice("pose", POSES, POSES[0])
-    unit = _UNITS[section.take_choice("length_unit", tuple(_UNITS), "m")]
+    unit = LENGTH_UNITS[section.take_choice("length_unit", ("m", "mm"), "m")]
     positions = unit * _numbers(section, "position", table, section.take("position", list, list(POSITION)), 3)
     turns = _numbers(section, "orientation", table, section.take("orientation", list, list(ORIENTATION)), 4)
     with np.errstate(over="ignore"):
@@ -362,14 +274,3 @@ def _numbers(section: TomlTable, key: str, table: Table, columns: list, count: i
     if len(columns) != count or not all(isinstance(column, str) for column in columns):
         raise section.error(key, f"is {columns!r}. Give the names of {count} columns.")
     return np.column_stack([table.numbers(column, section.name(key)) for column in columns])
-
-
-def _check_joints(section: TomlTable, table: Table, columns: list[str]) -> None:
-    """Check that joints of the ECM are plausible in rad and m."""
-    for column, joint in zip(columns, JOINT_NAMES, strict=True):
-        kind = "prismatic" if joint == "insertion" else "revolute"
-        largest = np.abs(table.numbers(column, section.name("ecm_joints"))).max()
-        if largest > PLAUSIBLE[kind]:
-            raise section.error(
-                "ecm_joints", f"has {joint} at {largest:.4g}; {PLAUSIBLE[kind]:.3g} is allowed. Give [rad] and [m]."
-            )

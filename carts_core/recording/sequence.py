@@ -2,8 +2,8 @@
 
 import hashlib
 import threading
-from collections import OrderedDict, deque
-from collections.abc import Callable, Collection, Hashable, Iterable, Mapping
+from collections import deque
+from collections.abc import Callable, Collection, Iterable, Mapping
 from copy import copy
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -16,63 +16,10 @@ from ..model.camera import Camera
 from ..model.scene import Scene
 from ..wording import closest, counted
 from .background import MeanBackground, background_of_recording, spread
+from .cache import ByteCache
 from .images import ImageFiles, ImageSource, read_file, read_image, read_mask
 from .matching import TimeMatching
 from .sequence_file import CameraInput, Description, read_description
-
-
-class ByteCache:
-    """Least-recently-used cache of arrays with a limit in bytes; thread-safe, and each array is computed only once.
-
-    Args:
-        limit: memory [bytes]; a single array may be larger.
-    """
-
-    def __init__(self, limit: int) -> None:
-        self._limit = limit
-        self._used = 0
-        self._arrays: OrderedDict[Hashable, np.ndarray] = OrderedDict()
-        self._making: set[Hashable] = set()
-        self._changed = threading.Condition()
-
-    def get(self, key: Hashable, make: Callable[[], np.ndarray]) -> np.ndarray:
-        """The array of `key`, computed by `make` if it is not cached.
-
-        Raises:
-            Exception: what `make` raises. Nothing is cached then, and waiting threads call their own `make`.
-        """
-        with self._changed:
-            self._changed.wait_for(lambda: key not in self._making)
-            if key in self._arrays:
-                self._arrays.move_to_end(key)
-                return self._arrays[key]
-            self._making.add(key)
-        try:
-            array = make()
-            with self._changed:
-                self._keep(key, array)
-        finally:
-            with self._changed:
-                self._making.discard(key)
-                self._changed.notify_all()
-        return array
-
-    def clear(self) -> None:
-        """Remove all arrays."""
-        with self._changed:
-            self._arrays.clear()
-            self._used = 0
-
-    def __contains__(self, key: Hashable) -> bool:
-        with self._changed:
-            return key in self._arrays
-
-    def _keep(self, key: Hashable, array: np.ndarray) -> None:
-        self._arrays[key] = array
-        self._used += array.nbytes
-        while self._used > self._limit and len(self._arrays) > 1:
-            self._used -= self._arrays.popitem(last=False)[1].nbytes
-
 
 CACHE_BYTES = 192 * 2**20
 """Memory for decoded images and masks of one sequence."""
@@ -138,15 +85,16 @@ class Sequence:
         self.timestamps = description.frames.timestamps
         self.matching = description.matching
         self.measured_joints = {name: arm.measured_joints for name, arm in description.arms.items()}
-        self.measured = {name: description.at_frames(arm.measured) for name, arm in description.arms.items()}
-        self.truth = {
-            name: description.at_frames(arm.truth) for name, arm in description.arms.items() if arm.truth is not None
-        } or None
+        times = description.frames, description.matching
+        self.measured = {name: arm.measured.at_frames(*times) for name, arm in description.arms.items()}
+        truth = {name: arm.truth for name, arm in description.arms.items() if arm.truth is not None}
+        self.truth = {name: samples.at_frames(*times) for name, samples in truth.items()} or None
         self.remarks = description.remarks
-        self._mounts = description.mounts()
+        moving = {name: camera.motion for name, camera in description.cameras.items() if camera.motion is not None}
+        self._mounts = {name: np.linalg.inv(samples.at_frames(*times)) for name, samples in moving.items()}
         self._description = description
         self._cameras = description.cameras
-        self._cache = ByteCache(CACHE_BYTES)
+        self._cache: ByteCache[np.ndarray] = ByteCache(CACHE_BYTES)
         self._backgrounds: dict[tuple[str, str], MeanBackground] = {}
         self._background_lock = threading.Lock()
 
@@ -380,22 +328,18 @@ class Sequence:
             )
 
     def _domain(self, domain: str | None) -> str:
-        if domain is None:
-            return self.domains[0]
-        if domain not in self.domains:
-            raise SequenceError(
-                f"{self.path} has no domain {domain!r}.{closest(domain, self.domains)} "
-                f"Its domains are: {', '.join(self.domains)}."
-            )
-        return domain
+        return self.domains[0] if domain is None else self._known(domain, "domain", self.domains)
 
     def _camera(self, camera: str) -> CameraInput:
-        if camera not in self._cameras:
+        return self._cameras[self._known(camera, "camera", self._cameras)]
+
+    def _known(self, name: str, what: str, known: Collection[str]) -> str:
+        if name not in known:
+            listing = ", ".join(known)
             raise SequenceError(
-                f"{self.path} has no camera {camera!r}.{closest(camera, self._cameras)} "
-                f"Its cameras are: {', '.join(self._cameras)}."
+                f"{self.path} has no {what} {name!r}.{closest(name, known)} Its {what}s are: {listing}."
             )
-        return self._cameras[camera]
+        return name
 
 
 AHEAD = 8

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import tomlkit
-from jaxtyping import Float
 
 from ..errors import RobotError, SequenceError, SettingsError
 from ..files.reading import SEQUENCE, VALUES, is_regular, parse_json, read_text
@@ -21,17 +20,13 @@ from .frame_list import FrameList, check_present, expand, frame_files, is_glob, 
 from .image_sources import BagImages, Cropped
 from .images import DEPTHS, ImageFiles, ImageSource, mask_remarks
 from .kinematics_table import take_joints
-from .matching import JointSamples, PoseSamples, Rows, TimeMatching, take_camera_motion, take_rows
+from .matching import Rows, Samples, TimeMatching, take_camera_motion, take_rows
 from .toml_table import TomlTable, check_file_name, read_toml
 from .video import SUFFIXES, Video
 
 
 def take_value(table: TomlTable, key: str, default: Any) -> Any:
-    """The value of `key`; text `file.json#a/b` stands for the value under `a`, `b` in that JSON file.
-
-    Raises:
-        SequenceError: the JSON file or the name in it does not exist.
-    """
+    """The value of `key`; text `file.json#a/b` stands for the value under `a`, `b` in that JSON file."""
     value = table.take(key, object, default)
     if not isinstance(value, str):
         return value
@@ -63,11 +58,7 @@ def take_value(table: TomlTable, key: str, default: Any) -> Any:
 
 
 def take_transform(table: TomlTable, key: str, default: Any) -> np.ndarray:
-    """A rigid transform [4, 4], translation in [m].
-
-    Raises:
-        SequenceError: it is not rigid.
-    """
+    """A rigid transform [4, 4], translation in [m]."""
     value = take_value(table, key, default)
     try:
         return rigid_transform(value, table.name(key))
@@ -76,11 +67,7 @@ def take_transform(table: TomlTable, key: str, default: Any) -> np.ndarray:
 
 
 def take_camera(table: TomlTable) -> Camera:
-    """The camera that a `[[cameras]]` table describes.
-
-    Raises:
-        SequenceError: a value is missing or impossible.
-    """
+    """The camera that a `[[cameras]]` table describes."""
     name = table.take("name", str)
     width, height = _take_size(table)
     intrinsics = _take_intrinsics(table)
@@ -136,11 +123,7 @@ def _is_number(value: object) -> bool:
 
 
 def resolve_robot(table: TomlTable) -> Path:
-    """URDF that the key `robot` names: a path, or `builtin:NAME`.
-
-    Raises:
-        SequenceError: no robot of that name is built in.
-    """
+    """URDF that the key `robot` names: a path, or `builtin:NAME`."""
     value = table.take("robot", str)
     if value.startswith(SCHEME):
         try:
@@ -159,7 +142,7 @@ class CameraInput:
     masks: Mapping[str, tuple[Path | None, ...]]
     """Mask file of every frame, None for a frame without one; empty for a sequence without masks."""
     background: Mapping[str, Path]
-    motion: PoseSamples | None
+    motion: Samples | None
     """Poses of the camera's mount; None for a static camera."""
 
     def remarks(self) -> tuple[str, ...]:
@@ -174,25 +157,16 @@ class CameraInput:
 
 
 def take_camera_input(table: TomlTable, rows: Rows, domains: tuple[str, ...]) -> CameraInput:
-    """The camera that a `[[cameras]]` table describes; all its files are checked to exist.
-
-    Raises:
-        SequenceError: a value is missing or wrong, or a file is missing.
-    """
+    """The camera that a `[[cameras]]` table describes; all its files are checked to exist."""
     camera, frames = take_camera(table), rows.frames
     motion = take_camera_motion(table, rows)
-    images = {
-        domain: _images(table, pattern, frames, domain, camera.name)
-        for domain, pattern in _by_domain(table, "images", domains, required=True).items()
-    }
-    sparse = table.take("sparse_masks", bool, False)
-    masks = {
-        domain: _masks(table, pattern, frames, domain=domain, camera=camera.name, sparse=sparse)
-        for domain, pattern in _by_domain(table, "masks", domains).items()
-    }
+    patterns = _by_domain(table, "images", domains, required=True)
+    images = {domain: _images(table, pattern, frames, domain, camera.name) for domain, pattern in patterns.items()}
+    patterns, sparse = _by_domain(table, "masks", domains), table.take("sparse_masks", bool, False)
+    masks = {name: _masks(table, pattern, frames, name, camera.name, sparse) for name, pattern in patterns.items()}
     background: dict[str, Path] = {}
     for domain, pattern in _by_domain(table, "background", domains).items():
-        path = table.path(expand(pattern, table.name("background"), domain=domain, camera=camera.name))
+        path = _path(table, "background", pattern, domain, camera.name)
         if not is_regular(path):
             raise table.error("background", f"points at {path}, which is missing. Correct the path or remove the key.")
         background[domain] = path
@@ -200,6 +174,11 @@ def take_camera_input(table: TomlTable, rows: Rows, domains: tuple[str, ...]) ->
         raise table.error("background", "does not go with `motion`: it would be another one in every frame. Remove it.")
     table.finish()
     return CameraInput(camera, images, masks, background, motion)
+
+
+def _path(table: TomlTable, key: str, pattern: str, domain: str, camera: str) -> Path:
+    """Path of a pattern that is the same for every frame."""
+    return table.path(expand(pattern, table.name(key), domain=domain, camera=camera))
 
 
 def _remarks_of(source: ImageSource) -> tuple[str, ...]:
@@ -253,14 +232,14 @@ def _whole_images(table: TomlTable, pattern: str, frames: FrameList, domain: str
         raise table.error("bits", f"is {bits}. Give the bits of the images' values: {', '.join(map(str, DEPTHS))}.")
     deinterlace = table.take("deinterlace", bool, True)
     if topic:
-        path = table.path(expand(pattern, key, domain=domain, camera=camera))
+        path = _path(table, "images", pattern, domain, camera)
         return BagImages(path, topic, _message_times(table, message_time, frames))
     if video_frame:
         if frames.table is None:
             raise table.error("video_frame", "names a column, but [frames] has no table. Name the frames in a table.")
         numbers = numbers_of_frames(frames.table, video_frame, table.name("video_frame"))
     if not is_per_frame(pattern) and not is_glob(pattern):
-        path = table.path(expand(pattern, key, domain=domain, camera=camera))
+        path = _path(table, "images", pattern, domain, camera)
         if path.suffix.lower() not in SUFFIXES:
             raise table.error(
                 "images",
@@ -284,7 +263,7 @@ def _message_times(table: TomlTable, column: str, frames: FrameList) -> tuple[in
 
 
 def _masks(
-    table: TomlTable, pattern: str, frames: FrameList, *, domain: str, camera: str, sparse: bool
+    table: TomlTable, pattern: str, frames: FrameList, domain: str, camera: str, sparse: bool
 ) -> tuple[Path | None, ...]:
     key = table.name("masks")
     if not is_per_frame(pattern) and not is_glob(pattern):
@@ -309,8 +288,8 @@ class ArmInput:
 
     arm: Arm
     measured_joints: tuple[str, ...]
-    measured: JointSamples
-    truth: JointSamples | None
+    measured: Samples
+    truth: Samples | None
 
 
 @dataclass(frozen=True)
@@ -329,39 +308,9 @@ class Description:
     remarks: tuple[str, ...] = ()
     """Remarks on changes to images and masks before they are used, and on unusual calibrations."""
 
-    def at_frames(self, samples: JointSamples) -> Float[np.ndarray, "frames dofs"]:
-        """The joint positions of every frame [rad, m].
-
-        Raises:
-            SequenceError: a frame has no row near enough in time.
-        """
-        return samples.positions if self.matching is None else samples.at_times(self.frames, self.matching)
-
-    def mounts(self) -> dict[str, Float[np.ndarray, "frames 4 4"]]:
-        """Camera -> T_mount_world of every frame [m], of the cameras that move.
-
-        Raises:
-            SequenceError: a frame has no row near enough in time.
-        """
-        moving = {name: camera.motion for name, camera in self.cameras.items() if camera.motion is not None}
-        poses = {
-            name: motion.Ts_world_mount if self.matching is None else motion.at_times(self.frames, self.matching)
-            for name, motion in moving.items()
-        }
-        return {name: np.linalg.inv(Ts) for name, Ts in poses.items()}
-
 
 def read_description(path: Path, progress: Callable[[str], None] | None = None) -> Description:
-    """Read a sequence file and all files that it names, except images.
-
-    Args:
-        path: the TOML file.
-        progress: called with a line of progress.
-
-    Raises:
-        SequenceError: the file or something it points at is missing or wrong.
-        RobotError: a robot or one of its meshes is missing or wrong.
-    """
+    """Read a sequence file and all files that it names, except images."""
     root = read_toml(path)
     root.take_choice("format", (FORMAT,), "(none)")
     name = root.take("name", str, path.stem)
@@ -381,17 +330,8 @@ def read_description(path: Path, progress: Callable[[str], None] | None = None) 
     if progress is not None:
         for remark in remarks:
             progress(f"note: {remark}")
-    return Description(
-        path=path,
-        name=name,
-        scene=scene,
-        domains=domains,
-        frames=rows.frames,
-        matching=rows.matching,
-        cameras={entry.camera.name: entry for entry in cameras},
-        arms={entry.arm.name: entry for entry in arms},
-        remarks=remarks,
-    )
+    by_name = {entry.camera.name: entry for entry in cameras}, {entry.arm.name: entry for entry in arms}
+    return Description(path, name, scene, domains, rows.frames, rows.matching, *by_name, remarks)
 
 
 def _take_domains(root: TomlTable) -> tuple[str, ...]:
@@ -408,11 +348,10 @@ def _take_domains(root: TomlTable) -> tuple[str, ...]:
 def _take_light(table: TomlTable) -> Light:
     values: dict[str, Any] = {}
     for setting in fields(Light):
-        if setting.name in table:
-            value = table.take(setting.name, list if setting.name == "position" else float)
-            values[setting.name] = tuple(value) if isinstance(value, list) else float(value)
-        else:
-            table.take(setting.name, object, None)
+        kind = list if setting.name == "position" else float
+        value = table.take(setting.name, kind, None)
+        if value is not None:
+            values[setting.name] = tuple(value) if kind is list else float(value)
     table.finish()
     position = values.get("position", (0.0, 0.0, 0.0))
     if len(position) != 3 or not all(isinstance(value, int | float) and abs(value) <= FARTHEST for value in position):
@@ -424,10 +363,7 @@ def _take_light(table: TomlTable) -> Light:
 
 
 def _take_arm(
-    table: TomlTable,
-    rows: Rows,
-    robots: dict[tuple[Path, str | None], Robot],
-    progress: Callable[[str], None] | None,
+    table: TomlTable, rows: Rows, robots: dict[tuple[Path, str | None], Robot], progress: Callable[[str], None] | None
 ) -> ArmInput:
     name = table.take("name", str)
     urdf = resolve_robot(table)

@@ -1,9 +1,9 @@
 """Estimation of the delay between images and kinematics from their common motion.
 
-Optical flow says how each part of the image moved from one frame to the next, and the kinematics how points of the arms
-moved between the same two times. One is nearly a linear function of the other, whatever the hand-eye calibration is. So
-neither camera poses nor a network is needed: flow is regressed on motion at many delays, and the delay that explains
-most of it is the one. How far it can be relied on is the jackknife's answer over parts of the recording.
+Optical flow between two frames is nearly a linear function of the motion of points of the arms between the same times,
+for any hand-eye calibration. Flow is regressed on motion at many delays, without camera poses or a network; the
+estimate is the delay with the largest explained share, and its standard deviation is that of the jackknife over parts
+of the recording.
 """
 
 from collections.abc import Callable
@@ -115,10 +115,10 @@ def estimate_time_offset(
 
     Args:
         sequence: rows of its tables are matched with frames by time.
-        camera: whose images count; the first one by default.
+        camera: of the images; the first one by default.
         domain: of the images; the first one by default.
-        largest: how far from the present offset it is looked for [s]; up to 3 s where the best one is at the end.
-        progress: called with how many frames are read, and how many there are.
+        largest: search range around the present offset [s]; widened to 3 s where the best one is at its end.
+        progress: called with the numbers of frames that are read, and of all.
 
     Raises:
         SequenceError: rows are not matched by time, or an image is not usable.
@@ -181,14 +181,7 @@ def _flows(
 
 
 class _Delays:
-    """Regression of flow on motion at a given delay.
-
-    Args:
-        sequence: whose arms move.
-        times: of its frames [s].
-        steps: pairs of frames.
-        flows: what the images show of each step.
-    """
+    """Regression of flow on motion at a given delay."""
 
     def __init__(self, sequence: Sequence, times: np.ndarray, steps: np.ndarray, flows: np.ndarray) -> None:
         self._sequence, self._begin, self._end = sequence, times[steps[:, 0]], times[steps[:, 1]]

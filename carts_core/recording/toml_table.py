@@ -1,7 +1,6 @@
 """TOML tables with typed access to their keys and errors for wrong, missing and unknown ones."""
 
 import difflib
-from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -11,17 +10,13 @@ from ..files.reading import SEQUENCE, all_finite, check_path, parse_toml, read_t
 from ..wording import closest, listed, shown
 
 _MOST_COMPARED = 200
-"""Number of keys among which a misspelling is looked for."""
+"""Number of keys that are compared for misspellings."""
 _REQUIRED: Any = object()
 _KINDS = {str: "text", bool: "true or false", dict: "a table", list: "a list", float: "a number", int: "a whole number"}
 
 
 def read_toml(path: Path) -> "TomlTable":
-    """The root table of a TOML file.
-
-    Raises:
-        SequenceError: the file is missing or not TOML.
-    """
+    """The root table of a TOML file."""
     try:
         values = parse_toml(read_text(path, SEQUENCE))
     except FileNotFoundError as error:
@@ -63,9 +58,6 @@ class TomlTable:
             key: its name.
             kind: type it must have (or a tuple of them); `float` takes whole numbers too, `object` takes anything.
             default: value when the key is absent; without one the key is required.
-
-        Raises:
-            SequenceError: the key is absent and required, or of another type.
         """
         self._known.append(key)
         if key not in self._values:
@@ -86,11 +78,7 @@ class TomlTable:
         return value
 
     def take_choice(self, key: str, choices: tuple[str, ...], default: str) -> str:
-        """The text of `key`, one of `choices`.
-
-        Raises:
-            SequenceError: it is another one.
-        """
+        """The text of `key`, one of `choices`."""
         value = self.take(key, str, default)
         if value not in choices:
             raise self.error(
@@ -104,11 +92,7 @@ class TomlTable:
         return TomlTable(self.take(key, dict, {}), self.file, f"{place}[{self._prefix}{key}]")
 
     def take_tables(self, key: str) -> list["TomlTable"]:
-        """The array of tables `[[key]]`: at least one, each with a `name` of its own.
-
-        Raises:
-            SequenceError: there is none, or names repeat.
-        """
+        """The array of tables `[[key]]`: at least one, each with a `name` of its own."""
         values = self.take(key, list, [])
         if not values or not all(isinstance(value, dict) for value in values):
             raise self.error(f"[[{key}]]", f"is missing. Describe at least one, under a line [[{key}]].")
@@ -131,11 +115,7 @@ class TomlTable:
         return dict(self._values)
 
     def path(self, value: str) -> Path:
-        """Absolute form of a path that is relative to the file's folder.
-
-        Raises:
-            SequenceError: no file can be called so.
-        """
+        """Absolute form of a path that is relative to the file's folder."""
         try:
             check_path(value)
             if "\0" in value:
@@ -145,23 +125,16 @@ class TomlTable:
         return self.file.parent / value
 
     def finish(self) -> None:
-        """Check that all keys are known to the format.
-
-        Raises:
-            SequenceError: one was not.
-        """
+        """Check that all keys are known to the format."""
         for key in self._values:
             if key not in self._known:
                 known = list(dict.fromkeys(self._known))
-                raise self.error(key, f"is not a key of the format.{closest(key, known)} Known here: {_list(known)}.")
+                listing = listed(known) or "none"
+                raise self.error(key, f"is not a key of the format.{closest(key, known)} Known here: {listing}.")
 
 
 def check_file_name(table: TomlTable, key: str, verb: str, name: str) -> None:
-    """Check that a name can be part of file names.
-
-    Raises:
-        SequenceError: it cannot.
-    """
+    """Check that a name can be part of file names."""
     if fault := name_fault(name):
         raise table.error(key, f"{verb} {name!r}, {fault}. {allowed_names()}.")
 
@@ -169,7 +142,3 @@ def check_file_name(table: TomlTable, key: str, verb: str, name: str) -> None:
 def _typo(key: str, given: list[str]) -> str:
     matches = difflib.get_close_matches(key, given[:_MOST_COMPARED], n=1, cutoff=0.5)
     return f" Is {matches[0]!r} a misspelling of it?" if matches else ""
-
-
-def _list(names: Iterable[str]) -> str:
-    return listed(names) or "none"

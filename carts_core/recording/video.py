@@ -1,10 +1,12 @@
-"""Video files as images of a camera. Frames are found by presentation time, never by counting while seeking."""
+"""Video files as images of a camera. Frames are found by presentation time, never by counting while seeking.
+
+Videos that cannot be decoded are a `SequenceError`.
+"""
 
 import copy
 import hashlib
 import threading
 from bisect import bisect_right
-from collections import OrderedDict
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -29,11 +31,12 @@ from ..errors import SequenceError
 from ..files.image_size import LARGEST_IMAGE, pixels_problem
 from ..files.reading import MIB, VIDEO, check_regular, is_regular, open_regular
 from ..wording import counted
+from .cache import ByteCache
 
 _EXACT = ("mp4", "matroska")
 """Containers with exact presentation times and seeking."""
 _COMPLETE = ("mp4",)
-"""Those of them whose packets have complete times and key frame flags."""
+"""Exact containers whose packets have complete times and key frame flags."""
 _COMPARED = 16
 """Number of places, and of packets at each of them, at which the container's index is compared with the packets."""
 _REMEMBERED = 32
@@ -68,11 +71,7 @@ class VideoIndex:
 
 
 def index_video(path: Path) -> VideoIndex:
-    """Index of a video file; cached until the file changes.
-
-    Raises:
-        SequenceError: the file is missing or cannot be decoded.
-    """
+    """Index of a video file; cached until the file changes."""
     try:
         status = path.stat()
     except (OSError, ValueError) as error:
@@ -95,9 +94,6 @@ def opened(path: Path, *, parsed: bool = True) -> Iterator[tuple[InputContainer,
     Args:
         path: the file.
         parsed: parse packets for data missing in the container, which takes as long as reading them.
-
-    Raises:
-        SequenceError: it cannot be decoded.
     """
     container, stream = open_video(path, parsed=parsed)
     with container:
@@ -272,7 +268,7 @@ class Video:
         self._number_of = {time: number for number, time in enumerate(self._index.pts or ())}
         self._key_frames = self._index.key_frames
         self._lock = threading.Lock()
-        self._kept = _Kept(_KEPT_BYTES)
+        self._kept = ByteCache(_KEPT_BYTES, _frame_bytes)
         self._open: tuple[InputContainer, VideoStream] | None = None
         self._frames: Iterator[tuple[int, VideoFrame]] = iter(())
         self._last: int | None = None
@@ -341,7 +337,7 @@ class Video:
         return tuple(found)
 
     def _frame(self, number: int) -> VideoFrame:
-        frame = self._kept.get(number) or self._decode(number)
+        frame = self._kept.find(number) or self._decode(number)
         if frame is None or frame.is_corrupt:
             raise SequenceError(
                 f"video {self.path} ends, or is damaged, at frame number {number} (counted from 0). "
@@ -352,7 +348,7 @@ class Video:
     def another(self) -> "Video":
         """An independent reader of the same file, with its own position and cache."""
         other = copy.copy(self)
-        other._lock, other._kept = threading.Lock(), _Kept(_KEPT_BYTES // 4)
+        other._lock, other._kept = threading.Lock(), ByteCache(_KEPT_BYTES // 4, _frame_bytes)
         other._open, other._frames, other._last = None, iter(()), None
         return other
 
@@ -461,25 +457,5 @@ def _turned(image: np.ndarray, matrix: Float[np.ndarray, "2 2"]) -> np.ndarray:
     return image[:: int(down), :: int(across)]
 
 
-class _Kept:
-    """Least-recently-used cache of decoded frames (YUV, half of RGB) with a limit in bytes."""
-
-    def __init__(self, limit: int) -> None:
-        self._limit = limit
-        self._used = 0
-        self._frames: OrderedDict[int, VideoFrame] = OrderedDict()
-
-    def get(self, number: int) -> VideoFrame | None:
-        return self._frames.get(number)
-
-    def add(self, number: int, frame: VideoFrame) -> None:
-        if (old := self._frames.pop(number, None)) is not None:
-            self._used -= _size(old)
-        self._frames[number] = frame
-        self._used += _size(frame)
-        while self._used > self._limit and len(self._frames) > 1:
-            self._used -= _size(self._frames.popitem(last=False)[1])
-
-
-def _size(frame: VideoFrame) -> int:
-    return sum(plane.buffer_size for plane in frame.planes)
+def _frame_bytes(frame: VideoFrame) -> int:
+    return sum(plane.buffer_size for plane in frame.planes)  # YUV, half of RGB

@@ -7,14 +7,13 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
-from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from ...errors import SequenceError
-from ...files.reading import VALUES, is_regular, parse_json, parse_yaml, read_text
+from ...files.reading import VALUES, is_regular, parse_json, parse_xml, parse_yaml, read_text
 from ...model.camera import HALF_PIXEL
 from ...wording import shown
 from ..images import read_labels
@@ -64,11 +63,7 @@ class Labels:
         self.names: list[str] = []
 
     def number(self, name: str) -> int:
-        """Number of a label, from 1.
-
-        Raises:
-            SequenceError: there are too many.
-        """
+        """Number of a label, from 1."""
         if name not in self.names:
             if len(self.names) == MOST_LABELS:
                 raise SequenceError(f"there are more than {MOST_LABELS} labels, say {name!r}. Join some of them.")
@@ -153,36 +148,46 @@ _LARGEST_SIDE = 16384
 _FEWEST_CORNERS = 3
 
 
+_Part = tuple[str, Bool[np.ndarray, "height width"]]
+_MALFORMED = (ValueError, TypeError, KeyError, AttributeError, IndexError)
+"""Errors of values of a wrong form."""
+
+
 def read_coco(path: Path, remarks: Counter[str]) -> Iterator[ForeignImage]:
-    """The images of a COCO file.
-
-    Args:
-        path: of the file.
-        remarks: reasons for omitted annotations are added.
-
-    Raises:
-        SequenceError: it is not COCO.
-    """
+    """The images of a COCO file; reasons for omitted annotations are added to `remarks`."""
     try:
         content = parse_json(read_text(path, VALUES))
         names = {int(entry["id"]): entry for entry in content["categories"]}
         marked: dict[int, list[dict[str, Any]]] = defaultdict(list)
         for annotation in content["annotations"]:
             marked[int(annotation["image_id"])].append(annotation)
-        images = list(content["images"])
-        if len(images) > MOST_IMAGES:
-            raise ValueError(f"it has {len(images)} images; {MOST_IMAGES} are allowed")
+        images = _few_enough(content["images"])
         for absent in sorted(marked.keys() - {int(image["id"]) for image in images}):
             why = f"image {absent} is not in the file"
-            remarks.update(_left_out(annotation, why) for annotation in marked[absent])
-    except (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
+            remarks.update(f"{_annotation(annotation)} left out: {why}" for annotation in marked[absent])
+    except (OSError, RecursionError, *_MALFORMED) as error:
         raise SequenceError(f"{path} is not a COCO file ({_why(error)}). Export it again.") from error
     for image in images:
         yield _coco_image(path, image, marked[int(image["id"])], names, remarks)
 
 
-def _left_out(annotation: dict[str, Any], why: str) -> str:
-    return f"annotation {annotation.get('id', '(without id)')} left out: {why}"
+def _few_enough(images: Iterable[Any]) -> list[Any]:
+    images = list(images)
+    if len(images) > MOST_IMAGES:
+        raise ValueError(f"it has {len(images)} images; {MOST_IMAGES} are allowed")
+    return images
+
+
+def _size(image: Any) -> tuple[int, int]:
+    """Height and width of an image [px]."""
+    size = int(image["height"]), int(image["width"])
+    if not all(0 < side <= _LARGEST_SIDE for side in size):
+        raise ValueError(f"its size is {size[1]} x {size[0]}")
+    return size
+
+
+def _annotation(annotation: dict[str, Any]) -> str:
+    return f"annotation {annotation.get('id', '(without id)')}"
 
 
 def _coco_image(
@@ -190,11 +195,8 @@ def _coco_image(
 ) -> ForeignImage:
     where = f"{path}: image {image.get('file_name')!r}"
     try:
-        size = int(image["height"]), int(image["width"])
-        if not all(0 < side <= _LARGEST_SIDE for side in size):
-            raise ValueError(f"its size is {size[1]} x {size[0]}")
-        name = str(image["file_name"])
-    except (ValueError, TypeError, KeyError, AttributeError) as error:
+        size, name = _size(image), str(image["file_name"])
+    except _MALFORMED as error:
         raise SequenceError(f"{where} cannot be read ({_why(error)}). Export it again.") from error
     points: dict[str, tuple[float, float]] = {}
     usable = []
@@ -202,18 +204,18 @@ def _coco_image(
         try:
             points |= _coco_keypoints(annotation, _category(annotation, names))
             usable.append(annotation)
-        except (ValueError, TypeError, KeyError, AttributeError) as error:
-            remarks[_left_out(annotation, f"{name}: {_why(error)}")] += 1
+        except _MALFORMED as error:
+            remarks[f"{_annotation(annotation)} left out: {name}: {_why(error)}"] += 1
     if len(points) > MOST_KEYPOINTS:
         raise SequenceError(f"{where} has {len(points)} keypoints; {MOST_KEYPOINTS} are allowed. Export fewer.")
 
-    def parts() -> Iterator[tuple[str, Bool[np.ndarray, "height width"]]]:
+    def parts() -> Iterator[_Part]:
         for annotation in usable:
             try:
                 mask = _coco_mask(annotation.get("segmentation"), *size)
                 label = str(_category(annotation, names)["name"])
-            except (ValueError, TypeError, KeyError, AttributeError, IndexError) as error:
-                remarks[_left_out(annotation, f"{name}: {_why(error)}")] += 1
+            except _MALFORMED as error:
+                remarks[f"{_annotation(annotation)} left out: {name}: {_why(error)}"] += 1
                 continue
             if mask is not None:
                 yield label, mask
@@ -269,29 +271,16 @@ def _why(error: Exception) -> str:
 
 
 def read_cvat(path: Path, remarks: Counter[str]) -> Iterator[ForeignImage]:
-    """The images of a CVAT file.
-
-    Args:
-        path: of the file.
-        remarks: reasons for omitted shapes are added.
-
-    Raises:
-        SequenceError: it is not CVAT's.
-    """
+    """The images of a CVAT file; reasons for omitted shapes are added to `remarks`."""
     try:
-        text = read_text(path, VALUES)
-        if "<!DOCTYPE" in text or "<!ENTITY" in text:
-            raise ValueError("it declares a document type or entities")
-        root = ElementTree.fromstring(text)
+        root = parse_xml(read_text(path, VALUES))
         if root.tag != "annotations" or root.find("image") is None:
             raise ValueError("there is no <image> in <annotations>; export as 'CVAT for images 1.1'")
-        images = root.findall("image")
-        if len(images) > MOST_IMAGES:
-            raise ValueError(f"it has {len(images)} images; {MOST_IMAGES} are allowed")
+        images = _few_enough(root.findall("image"))
         name, times = Counter(image.get("name") for image in images).most_common(1)[0]
         if times > 1:
             raise ValueError(f"it has image {shown(str(name))} {times} times")
-    except (OSError, ValueError, RecursionError, ElementTree.ParseError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise SequenceError(f"{path} is not a CVAT file ({error}). Export it again.") from error
     for image in images:
         yield _cvat_image(path, image, remarks)
@@ -299,24 +288,21 @@ def read_cvat(path: Path, remarks: Counter[str]) -> Iterator[ForeignImage]:
 
 def _cvat_image(path: Path, image: Element, remarks: Counter[str]) -> ForeignImage:
     name = image.get("name", "")
-    where = f"{path}: image {name!r}"
     try:
-        height, width = int(image.get("height", "")), int(image.get("width", ""))
-        if not (0 < height <= _LARGEST_SIDE and 0 < width <= _LARGEST_SIDE):
-            raise ValueError(f"its size is {width} x {height}")
-        points = dict(_cvat_keypoints(image))
+        size, points = _size(image.attrib), dict(_cvat_keypoints(image))
         if len(points) > MOST_KEYPOINTS:
             raise ValueError(f"it has {len(points)} keypoints; {MOST_KEYPOINTS} are allowed")
-    except (ValueError, TypeError) as error:
-        raise SequenceError(f"{where} cannot be read ({error}). Export it again.") from error
+    except _MALFORMED as error:
+        raise SequenceError(f"{path}: image {name!r} cannot be read ({_why(error)}). Export it again.") from error
 
-    def parts() -> Iterator[tuple[str, Bool[np.ndarray, "height width"]]]:
+    def parts() -> Iterator[_Part]:
         shapes = [shape for shape in image if shape.tag in ("mask", "polygon")]
         for shape in sorted(shapes, key=lambda shape: int(shape.get("z_order", "0"))):
             try:
-                mask = _cvat_mask(shape, height, width)
-            except (ValueError, TypeError) as error:
-                remarks[f"a {shape.tag} ({shape.get('label', 'no label')}) of {name} left out: {error}"] += 1
+                mask = _cvat_mask(shape, *size)
+            except _MALFORMED as error:
+                label = shape.get("label", "no label")
+                remarks[f"a {shape.tag} ({label}) of {name} left out: {_why(error)}"] += 1
                 continue
             yield shape.get("label", "instrument"), mask
 
@@ -354,11 +340,7 @@ def _cvat_keypoints(image: Element) -> Iterator[tuple[str, tuple[float, float]]]
 
 
 def read_surgpose(path: Path, remarks: Counter[str]) -> Iterator[ForeignImage]:
-    """The frames of a file of keypoints; without remarks.
-
-    Raises:
-        SequenceError: it is none.
-    """
+    """The frames of a file of keypoints; without remarks."""
     del remarks
     try:
         content = parse_yaml(read_text(path, VALUES))
@@ -401,22 +383,19 @@ _BACKGROUND = ("background", "background-tissue")
 _SCENE_PARTS = ("instrument", "clasper", "wrist", "shaft")
 """Prefixes of EndoVis 2018 labels that belong to an instrument; all others are anatomy or thread."""
 
-_Colours = Mapping[tuple[int, int, int], str]
-
 
 def read_mask_folder(path: Path, remarks: Counter[str], *, confined: bool = False) -> Iterator[ForeignImage]:
     """The images below a folder; files of the same name in sibling folders belong to the same frame.
 
     Args:
         path: of the folder.
-        remarks: what was changed or decided about how many files is added while they are decoded.
-        confined: whether links are left out, and what values mean is not looked for above the folder.
-
-    Raises:
-        SequenceError: there are none, or it is not known what their values mean.
+        remarks: numbers of files with a change or decision are added while they are decoded.
+        confined: whether links are left out, and names of values are not looked for above the folder.
     """
-    there = [file for file in _files(_finest(path)) if not (confined and file.is_symlink())]
-    files = [file for file in there if file.suffix.lower() in _SUFFIXES] or there
+    # An export of carts has a folder with links, which are the finest labels.
+    finest = path / "links" if (path / "labels.json").is_file() and (path / "links").is_dir() else path
+    usable = [file for file in _files(finest) if not (confined and file.is_symlink())]
+    files = [file for file in usable if file.suffix.lower() in _SUFFIXES] or usable
     if not files:
         known = ", ".join((*_SUFFIXES, *_OTHER_SUFFIXES))
         raise SequenceError(f"{path} has no masks ({known}). Name the folder that holds them.")
@@ -429,11 +408,6 @@ def read_mask_folder(path: Path, remarks: Counter[str], *, confined: bool = Fals
         yield ForeignImage(
             file.relative_to(path.parent).as_posix(), lambda file=file, meaning=meaning: _parts(file, meaning, remarks)
         )
-
-
-def _finest(path: Path) -> Path:
-    """The folder with links, for an export of carts; else the folder itself."""
-    return path / "links" if (path / "labels.json").is_file() and (path / "links").is_dir() else path
 
 
 def _files(folder: Path) -> list[Path]:
@@ -468,13 +442,13 @@ def _meaning(path: Path) -> Any:
         raise SequenceError(f"{path} cannot be read ({error}). Correct it or remove it.") from error
 
 
-def _parts(file: Path, meaning: Any, remarks: Counter[str]) -> Iterator[tuple[str, Bool[np.ndarray, "height width"]]]:
+def _parts(file: Path, meaning: Any, remarks: Counter[str]) -> Iterator[_Part]:
     image = read_labels(file)
     tool = next((part.removesuffix(_TOOL) for part in file.parts[::-1] if part.endswith(_TOOL)), "")
     yield "", np.zeros(image.colours.shape[:2], bool)
     try:
         if isinstance(meaning, list):
-            yield from _by_colour(image.colours, _colours(meaning), file)
+            yield from _by_colour(image.colours, meaning, file)
             return
         names = _names(meaning, file.parent.name)
         remarks.update(image.remarks)
@@ -483,7 +457,7 @@ def _parts(file: Path, meaning: Any, remarks: Counter[str]) -> Iterator[tuple[st
                 yield tool or _INSTRUMENT, image.mask
         elif image.values is None:
             raise SequenceError(
-                f"{file} has colours, and no labels.json in its folder or above says what they mean. Add one as "
+                f"{file} has colours, and no labels.json in its folder or above names them. Add one as "
                 'EndoVis 2018 has it: [{"name": ..., "color": [r, g, b]}, ...].'
             )
         else:
@@ -492,27 +466,20 @@ def _parts(file: Path, meaning: Any, remarks: Counter[str]) -> Iterator[tuple[st
         raise SequenceError(f"what the values of {file} mean cannot be read ({error}).") from error
 
 
-def _colours(meaning: list[Any]) -> _Colours:
-    rows = [(tuple(int(value) for value in entry["color"]), str(entry["name"])) for entry in meaning]
-    return {colour: name for colour, name in rows if len(colour) == 3}  # type: ignore[misc]
-
-
-def _by_colour(
-    image: np.ndarray, colours: _Colours, file: Path
-) -> Iterator[tuple[str, Bool[np.ndarray, "height width"]]]:
+def _by_colour(image: np.ndarray, meaning: list[Any], file: Path) -> Iterator[_Part]:
+    """Labels of instruments, given entries with `name` and `color`."""
+    rows = [(tuple(map(int, entry["color"])), str(entry["name"])) for entry in meaning]
+    known = {r * 65536 + g * 256 + b: name for (r, g, b), name in (row for row in rows if len(row[0]) == 3)}
     code = image.astype(np.int64) @ (65536, 256, 1)
-    there = {int(value) for value in np.unique(code)}
-    known = {colour[0] * 65536 + colour[1] * 256 + colour[2]: name for colour, name in colours.items()}
-    if unknown := there - known.keys():
+    values = [int(value) for value in np.unique(code)]
+    if unknown := set(values) - known.keys():
         raise SequenceError(f"{file} has the colour #{min(unknown):06x}, which labels.json does not know. Add it.")
-    for value in sorted(there):
+    for value in values:
         if known[value].lower().startswith(_SCENE_PARTS):
             yield known[value], code == value
 
 
-def _by_value(
-    image: np.ndarray, names: Mapping[int, str], tool: str, file: Path
-) -> Iterator[tuple[str, Bool[np.ndarray, "height width"]]]:
+def _by_value(image: np.ndarray, names: Mapping[int, str], tool: str, file: Path) -> Iterator[_Part]:
     values = [int(value) for value in np.unique(image) if value]
     unknown = [value for value in values if value not in names]
     if len(unknown) > _MOST_UNNAMED:

@@ -52,7 +52,7 @@ def read_annotations(
         confined: whether files beside the source and links in it are ignored.
 
     Raises:
-        SequenceError: it is none of these, or cannot be read; also later, while frames are gone through.
+        SequenceError: it is of another kind or cannot be read; also raised while frames are iterated.
     """
     if camera is not None:
         sequence.recorded_camera(camera)
@@ -77,15 +77,7 @@ def read_annotations(
 
 
 class _FrameReader:
-    """Converts images of a source into frames of a sequence.
-
-    Args:
-        sequence, camera: see `read_annotations`.
-        source: name of the source, which may contain the camera.
-        labels: numbered while iterating.
-        unknown: names of images without a frame are added.
-        undistorted: whether the annotated images are undistorted.
-    """
+    """Converts images of a source into frames of a sequence."""
 
     def __init__(
         self,
