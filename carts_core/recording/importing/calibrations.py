@@ -394,6 +394,6 @@ def _axes_of(content: dict[str, Any], path: Path) -> Axes:
     if "dvrk" in name:
         return "dvrk"
     raise SequenceError(
-        f"{path}: neither its content nor its name states the axes of the camera (names end in -open-cv.json or "
+        f"{path}: neither its content nor its name states which axes the camera has (names end in -open-cv.json or "
         "-dVRK.json). Say opencv (x right, y down) or dvrk (x left, y up)."
     )

@@ -60,8 +60,11 @@ class SeparateImages:
 
 def separate_images(path: Path, topics: list[str], job: Import) -> SeparateImages | None:
     """Images given as files or folders; None if none are given or they are topics of the bag."""
-    given = job.options.images
-    files = {name: Path(image) for name, image in given.items() if image not in topics and os.path.exists(image)}
+    given, files = job.options.images, {}
+    for name, image in given.items():
+        beside = [place for place in (Path(image), path.parent / image) if os.path.exists(place)]
+        if image not in topics and beside:
+            files[name] = beside[0]
     if not files:
         return None
     if len(files) < len(given):
