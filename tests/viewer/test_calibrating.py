@@ -202,7 +202,7 @@ def test_a_calibration_that_moves_off_the_points_is_offered_and_not_kept(
     site.post(lambda: place.choose(*CALIBRATE))
     offer = ended(site, "Calibration not kept")
     assert offer.calibration is None and offer.offered is not None
-    assert offer.report is not None and offer.report.disagreeing
+    assert offer.report is not None and offer.report.objection
     assert "px allowed" in site.document.content and "<td>2.00°</td>" in site.document.content
     for choice, text, kept in (
         ("keep", "Kept by choice", True),
