@@ -16,13 +16,13 @@ Axes = Literal["opencv", "dvrk"]
 """Axes of the camera: x right, y down (OpenCV), or x left, y up (dVRK); z looks away from the viewer in both."""
 
 NO_TABLE = Path("none")
-"""What `kinematics` calls images without a table."""
+"""Value of `kinematics` for images without a table."""
 SECONDS: Mapping[Clock, float] = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 
 
 @dataclass(frozen=True)
 class ImportOptions:
-    """Answers to what a recording does not say."""
+    """Information that a recording lacks."""
 
     source: str | None = None
     """Kind of source (`carts import` alone lists them); by default it is detected."""
@@ -41,7 +41,7 @@ class ImportOptions:
     length_unit: LengthUnit | None = None
     """Of the lengths."""
     units: Mapping[str, str] = field(default_factory=dict)
-    """Joint -> its own unit, where it is another one than that of the rest."""
+    """Joint -> its unit, if it differs from the others."""
     flip: tuple[str, ...] = ()
     """Joints whose sign is the other way round."""
     clock: Clock | None = None
@@ -51,17 +51,17 @@ class ImportOptions:
     frame_rate: float | None = None
     """Of images without times, or in place of a video's constant rate [1/s]."""
     arms: Mapping[str, str] = field(default_factory=dict)
-    """Arm -> what the recording calls it; only these are imported."""
+    """Arm -> its name in the recording; only these are imported."""
     robot: Mapping[str, str] = field(default_factory=dict)
     """Arm -> its robot: a URDF, or `builtin:psm_lnd`, which is the default."""
     wrist_length: float | None = None
     """From wrist pitch to wrist yaw [m], for inverse kinematics; by default that of the instrument, else 0.0091."""
     tool_point: float | None = None
-    """How far along the tool the point of tip poses is from the dVRK's tip [m]; by default as joints and poses show."""
+    """Distance of the point of tip poses from the dVRK's tip along the tool [m]; by default estimated."""
     base: Mapping[str, Path] = field(default_factory=dict)
     """Arm -> registration, configuration or set-up joint file of the dVRK with its base frame."""
     axes: Axes | None = None
-    """Axes of the camera in these files, where the file does not say."""
+    """Axes of the camera in these files, if not stated there."""
 
     def __post_init__(self) -> None:
         for camera, size in self.calibration_size.items():
@@ -98,7 +98,7 @@ FormatName = Literal[
 """Names of the export formats."""
 
 Parts = Literal["arms", "parts", "links"]
-"""What gets a category of its own: every arm, every part of it (shaft, wrist, jaws), or every link."""
+"""Categories: one per arm, per part (shaft, wrist, jaws), or per link."""
 
 Images = Literal["named", "copied", "none"]
 """Images of an export: labels name the recording's own files, or copies of them, byte for byte, or none are written."""

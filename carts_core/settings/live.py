@@ -2,13 +2,15 @@
 
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import Annotated
 
 from ..errors import SettingsError
-from .stages import LIVE_SEARCH, WARM, WARM_WIDE, Stage, require
+from .ranges import Range, Ranged
+from .stages import LIVE_SEARCH, WARM, WARM_WIDE, Stage
 
 
 class StreamKind(StrEnum):
-    """Where frames come from."""
+    """Source of frames."""
 
     REPLAY = "replay"
     """The recording itself, at the speed of the clock."""
@@ -23,16 +25,19 @@ class StreamKind(StrEnum):
 KNOWN = "replay, camera:NUMBER, video:FILE, folder:PATH or socket:PORT"
 _PORTS = 2**16
 
+Seconds = Annotated[float, Range(0, 3600, "s")]
+"""A duration [s]."""
+
 
 @dataclass(frozen=True)
 class StreamAddress:
-    """Where frames come from, and joints where images have none."""
+    """Source of frames, and of joints if images have none."""
 
     kind: StreamKind
     place: str = ""
     """Number of a device, a file, a folder or a port."""
     joints_port: int | None = None
-    """With a camera or video: port of 127.0.0.1 where joints come from, and where results go."""
+    """With a camera or video: port of 127.0.0.1 for joints and results."""
 
     @classmethod
     def parse(cls, text: str, joints_port: int | None = None) -> "StreamAddress":
@@ -63,28 +68,22 @@ class StreamAddress:
 
 
 @dataclass(frozen=True)
-class LiveSettings:
-    """What a tracker does with each frame, and when it takes the arms for lost."""
+class LiveSettings(Ranged):
+    """Stages of a tracker, and thresholds for lost arms."""
 
     small: tuple[Stage, ...] = WARM
-    """Stages of a frame that is where it is expected."""
+    """Stages of a frame near its prediction."""
     full: tuple[Stage, ...] = WARM_WIDE
-    """Stages where the small ones end in a bad fit."""
+    """Stages after a bad fit of the small ones."""
     search: tuple[Stage, ...] = LIVE_SEARCH
-    """Stages where the arms are lost; `small` follows."""
-    bad_loss: float = 0.06
+    """Stages for lost arms; `small` follows."""
+    bad_loss: Annotated[float, Range(1e-3, 10)] = 0.06
     """Loss from which a fit is bad [1]."""
-    bad_factor: float = 2.5
+    bad_factor: Annotated[float, Range(1, 100)] = 2.5
     """A fit of that many times the usual loss is bad, too [1]."""
-    lost_seconds: float = 0.25
+    lost_seconds: Seconds = 0.25
     """After bad fits for so long, the arms are lost [s]."""
-    search_seconds: float = 0.4
-    """Lost arms are searched for this often; frames between are compared with where they were last seen [s]."""
-    oldest_seconds: float = 0.1
+    search_seconds: Seconds = 0.4
+    """Interval of searches for lost arms; frames between are compared with the last known pose [s]."""
+    oldest_seconds: Seconds = 0.1
     """A frame whose result would be older, at the usual time for a frame, is dropped for the next one [s]."""
-
-    def __post_init__(self) -> None:
-        require(1e-3 <= self.bad_loss <= 10, "bad_loss", self.bad_loss, "0.001 to 10")
-        require(1 <= self.bad_factor <= 100, "bad_factor", self.bad_factor, "1 to 100")
-        for name in ("lost_seconds", "search_seconds", "oldest_seconds"):
-            require(0 <= getattr(self, name) <= 3600, name, getattr(self, name), "0 to 3600 s")

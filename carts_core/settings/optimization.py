@@ -2,9 +2,10 @@
 
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Literal, get_args
+from typing import Annotated, Literal, get_args
 
 from ..errors import SettingsError
+from .ranges import Range, Ranged, Share, require
 from .stages import (
     CALIBRATION_STAGES,
     COLD,
@@ -17,13 +18,12 @@ from .stages import (
     WARM_WIDE,
     FirstOrder,
     Stage,
-    require,
 )
 
 Inference = Literal["auto", "torch", "onnx"]
 """`torch`, `onnx` (ONNX Runtime, on a CPU), or whichever is faster here and gives the same."""
 Engine = Literal["torch", "onnx"]
-"""What it came to."""
+"""Selected inference engine."""
 
 
 Direction = Literal["forward", "backward"]
@@ -31,34 +31,34 @@ Direction = Literal["forward", "backward"]
 
 
 @dataclass(frozen=True)
-class SequenceSettings:
+class SequenceSettings(Ranged):
     """Model of the measurement error, and how frames inform each other (docs: explanation/sequences)."""
 
-    constant_deg: float = 2.0
+    constant_deg: Annotated[float, Range(1e-3, 360, "deg")] = 2.0
     """Deviation of the constant part of the error [deg]; `length_scale` turns it into metres."""
-    drift_deg: float = 0.2
+    drift_deg: Annotated[float, Range(1e-3, 360, "deg")] = 0.2
     """Deviation of the slow drift about it [deg]."""
-    drift_seconds: float = 4.0
+    drift_seconds: Annotated[float, Range(1e-3, 1e6, "s")] = 4.0
     """Time constant of the drift's autocorrelation [s]."""
-    jitter_deg: float = 0.05
+    jitter_deg: Annotated[float, Range(1e-3, 360, "deg")] = 0.05
     """Deviation of the error that is independent in every frame [deg]."""
-    measurement_noise: float = 4.0
+    measurement_noise: Annotated[float, Range(1e-3, 100)] = 4.0
     """As `SurfaceSolver.noise`, for a frame's measurement in the smoother; larger, since the errors of neighbouring
     pixels are correlated [1]."""
-    correlation_seconds: float = 0.5
+    correlation_seconds: Annotated[float, Range(1e-6, 1e6, "s")] = 0.5
     """Time constant of the autocorrelation of image errors; frames that follow each other faster count less for the
     others [s]."""
-    shared_seconds: float = 5.0
+    shared_seconds: Annotated[float, Range(1e-6, 1e6, "s")] = 5.0
     """The same for the reported deviations: a network errs alike for as long as an instrument is seen from one side,
     and deviations are not to count on more than that [s]."""
-    initial_frames: int = 5
+    initial_frames: Annotated[int, Range(1, 20)] = 5
     """How many frames, evenly spread, are solved alone to find where the first one starts; 1 takes the first frame
     only [1]."""
-    cold_factor: float = 2.0
+    cold_factor: Annotated[float, Range(1, 100)] = 2.0
     """A loss of that many times the median has a frame start cold [1]."""
     direction: Direction = "forward"
-    """Where the first pass begins: at the first frame, or at the last one."""
-    frame_seconds: float = 0.25
+    """Direction of the first pass: from the first frame, or from the last one."""
+    frame_seconds: Annotated[float, Range(1e-6, 1e6, "s")] = 0.25
     """Time between frames, where the sequence has no times [s]."""
     cold: tuple[Stage, ...] = COLD
     """Stages from measured kinematics; `warm` follows."""
@@ -68,23 +68,8 @@ class SequenceSettings:
     """Stages where `warm` ends with an unusual loss, before a cold start."""
 
     def __post_init__(self) -> None:
-        for name, (low, high) in _RANGES.items():
-            require(low <= getattr(self, name) <= high, name, getattr(self, name), f"{low:g} to {high:g}")
+        super().__post_init__()
         require(self.direction in get_args(Direction), "direction", self.direction, " or ".join(get_args(Direction)))
-
-
-_RANGES = {
-    "constant_deg": (1e-3, 360.0),
-    "drift_deg": (1e-3, 360.0),
-    "drift_seconds": (1e-3, 1e6),
-    "jitter_deg": (1e-3, 360.0),
-    "measurement_noise": (1e-3, 100.0),
-    "correlation_seconds": (1e-6, 1e6),
-    "shared_seconds": (1e-6, 1e6),
-    "initial_frames": (1, 20),
-    "cold_factor": (1.0, 100.0),
-    "frame_seconds": (1e-6, 1e6),
-}
 
 
 class Loss(StrEnum):
@@ -119,9 +104,9 @@ class FreeParameters:
     arms: tuple[str, ...] = ()
     """Names of the free arms; none named means all."""
     locked_joints: tuple[str, ...] = ()
-    """Joints that stay where they are, as `joint` for every arm or `arm/joint` for one."""
+    """Joints that are held, as `joint` for every arm or `arm/joint` for one."""
     locked_cameras: tuple[str, ...] = ()
-    """Cameras whose extrinsics stay where they are."""
+    """Cameras whose extrinsics are held."""
 
     @property
     def joints_only(self) -> bool:
@@ -130,57 +115,45 @@ class FreeParameters:
 
 
 @dataclass(frozen=True)
-class SurfaceSolver:
+class SurfaceSolver(Ranged):
     """Compares predicted surface maps with rendered ones, by Levenberg-Marquardt: the default."""
 
     stages: tuple[Stage, ...] = FRAME
     """What runs, in this order."""
-    iterations: int = 60
+    iterations: Annotated[int, Range(1, 10_000)] = 60
     """Largest number of evaluations [1]; where stages run again from the start, they have as many again."""
-    working_width: int = 320
+    working_width: Annotated[int, Range(64, 4096, "px")] = 320
     """Width of the working image [px]; stages say how many times larger their images are."""
-    noise: float = 1.33
+    noise: Annotated[float, Range(1e-3, 100)] = 1.33
     """Deviation of the predicted surface map, per pixel [1]; a small value relies on the image."""
-    mask_noise: float = 0.5
+    mask_noise: Annotated[float, Range(1e-3, 100)] = 0.5
     """The same of given masks [1]."""
-    parts_weight: float = 0.1
+    parts_weight: Annotated[float, Range(0, 100)] = 0.1
     """Weight of the coverage of single parts beside that of the whole arm [1]."""
-    normals_weight: float = 0.05
+    normals_weight: Annotated[float, Range(0, 100)] = 0.05
     """Weight of normals beside that [1]."""
-    dehaze: float = 0.8
-    """Share of smoke and haze that is taken off images [1]; 0 leaves images as they are."""
-    outline_error: float = 0.3
+    dehaze: Share = 0.8
+    """Share of smoke and haze that is removed from images [1]."""
+    outline_error: Annotated[float, Range(0, 100, "px")] = 0.3
     """Expected error that all outlines in an image have in common, outwards or inwards [px of the working image].
     It widens the reported deviations of what moves an arm along the line of sight."""
-    start_share: float = 0.1
+    start_share: Share = 0.1
     """Share of an error of the start that is left in what the network predicts, which is given a rendering of the start
     [1]. It widens the reported deviations and changes no estimate; given masks have no such share."""
-    prior_deg: float = 2.5
+    prior_deg: Annotated[float, Range(1e-3, 360, "deg")] = 2.5
     """Expected error of a joint position at the start [deg]; `length_scale` turns it into metres."""
-    frame_prior_deg: float = 0.5
+    frame_prior_deg: Annotated[float, Range(1e-3, 360, "deg")] = 0.5
     """The same of base frames and camera extrinsics [deg]."""
-    intrinsics_prior: float = 0.01
+    intrinsics_prior: Annotated[float, Range(1e-6, 1)] = 0.01
     """The same of focal lengths and principal points, as a share of the focal length [1]."""
-    length_scale: float = 0.15
+    length_scale: Annotated[float, Range(1e-3, 10, "m")] = 0.15
     """Metres of translation that count as one radian [m]: about the distance from the remote centre to the tip."""
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         require(len(self.stages) > 0, "stages", self.stages, "one or more")
         of_kind = not any(isinstance(stage, FirstOrder) for stage in self.stages)
         require(of_kind, "stages", self.stages, "stages of the surface solver (no FirstOrder)")
-        require(1 <= self.iterations <= 10_000, "iterations", self.iterations, "1 to 10000")
-        require(64 <= self.working_width <= 4096, "working_width", self.working_width, "64 to 4096 px")
-        require(1e-3 <= self.noise <= 100, "noise", self.noise, "0.001 to 100")
-        require(1e-3 <= self.mask_noise <= 100, "mask_noise", self.mask_noise, "0.001 to 100")
-        require(0 <= self.parts_weight <= 100, "parts_weight", self.parts_weight, "0 to 100")
-        require(0 <= self.normals_weight <= 100, "normals_weight", self.normals_weight, "0 to 100")
-        require(0 <= self.dehaze <= 1, "dehaze", self.dehaze, "0 to 1")
-        require(0 <= self.outline_error <= 100, "outline_error", self.outline_error, "0 to 100 px")
-        require(0 <= self.start_share <= 1, "start_share", self.start_share, "0 to 1")
-        require(1e-3 <= self.prior_deg <= 360, "prior_deg", self.prior_deg, "0.001 to 360 deg")
-        require(1e-3 <= self.frame_prior_deg <= 360, "frame_prior_deg", self.frame_prior_deg, "0.001 to 360 deg")
-        require(1e-6 <= self.intrinsics_prior <= 1, "intrinsics_prior", self.intrinsics_prior, "0.000001 to 1")
-        require(1e-3 <= self.length_scale <= 10, "length_scale", self.length_scale, "0.001 to 10 m")
 
     @property
     def needs_background(self) -> bool:
@@ -189,7 +162,7 @@ class SurfaceSolver:
 
 
 @dataclass(frozen=True)
-class DescentSolver:
+class DescentSolver(Ranged):
     """Compares features of the image with those of the hybrid image (rendered arms over the mean background)."""
 
     loss: Loss = Loss.ACS
@@ -198,40 +171,32 @@ class DescentSolver:
     """Optimizer that descends it."""
     stages: tuple[Stage, ...] = FEATURES
     """What runs, in this order."""
-    iterations: int = 60
+    iterations: Annotated[int, Range(1, 10_000)] = 60
     """Planned number of steps [1]."""
-    learning_rate: float = 6e-3
+    learning_rate: Annotated[float, Range(0, 1, "rad", above=True)] = 6e-3
     """First step size [rad]; a prismatic joint or a translation moves `length_scale` times as many metres."""
-    decay: float = 0.82
+    decay: Annotated[float, Range(0, 1, above=True)] = 0.82
     """Factor on the step size every `decay_every` steps [1]."""
-    decay_every: int = 5
+    decay_every: Annotated[int, Range(1, 10_000)] = 5
     """Steps between two decays [1]."""
-    length_scale: float = 0.15
+    length_scale: Annotated[float, Range(1e-3, 10, "m")] = 0.15
     """Metres of translation that count as one radian [m]."""
-    prior_weight: float = 0.02
-    """Weight of the prior that holds unknowns at their start [1/rad^2]; what the image leaves open stays measured."""
-    working_width: int = 320
+    prior_weight: Annotated[float, Range(0, 1e6)] = 0.02
+    """Weight of the prior that holds unknowns at their start [1/rad^2]."""
+    working_width: Annotated[int, Range(64, 4096, "px")] = 320
     """Width of the images that are compared [px]."""
-    tolerance: float = 0.0
+    tolerance: Annotated[float, Range(0, 1, below=True)] = 0.0
     """It stops when the best loss has improved by less than this in `patience` steps; 0 never stops early."""
-    patience: int = 10
+    patience: Annotated[int, Range(1, 10_000)] = 10
     """See `tolerance` [1]."""
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         object.__setattr__(self, "loss", _loss(self.loss))
         methods = ("adam", "gradient_descent")
         require(self.method in methods, "method", self.method, " or ".join(methods))
         of_kind = len(self.stages) > 0 and all(isinstance(stage, FirstOrder) for stage in self.stages)
         require(of_kind, "stages", self.stages, "one or more FirstOrder stages")
-        require(1 <= self.iterations <= 10_000, "iterations", self.iterations, "1 to 10000")
-        require(0 < self.learning_rate <= 1, "learning_rate", self.learning_rate, "above 0, at most 1 rad")
-        require(0 < self.decay <= 1, "decay", self.decay, "above 0, at most 1")
-        require(1 <= self.decay_every <= 10_000, "decay_every", self.decay_every, "1 to 10000")
-        require(1e-3 <= self.length_scale <= 10, "length_scale", self.length_scale, "0.001 to 10 m")
-        require(0 <= self.prior_weight <= 1e6, "prior_weight", self.prior_weight, "0 to 1e6")
-        require(64 <= self.working_width <= 4096, "working_width", self.working_width, "64 to 4096 px")
-        require(0 <= self.tolerance < 1, "tolerance", self.tolerance, "0 to 1")
-        require(1 <= self.patience <= 10_000, "patience", self.patience, "1 to 10000")
 
     @property
     def needs_background(self) -> bool:
@@ -256,15 +221,11 @@ class DescentSolver:
 
 
 SolverSettings = SurfaceSolver | DescentSolver
-"""How one frame is optimized."""
+"""Settings of a solver of single frames."""
 
 
 def surface_solver(settings: SolverSettings | None, what: str) -> SurfaceSolver:
     """The settings, or the default ones.
-
-    Args:
-        settings: of any solver.
-        what: needs the surface solver, as messages name it.
 
     Raises:
         SettingsError: they are those of another solver.
@@ -322,7 +283,7 @@ def _loss(value: Loss | str) -> Loss:
 
 
 CALIBRATION = FreeParameters(joints=False, base_frames=True, extrinsics=True)
-"""What a calibration frees by default."""
+"""Free parameters of a calibration by default."""
 
 CALIBRATION_SETTINGS = SurfaceSolver(
     stages=CALIBRATION_STAGES,

@@ -27,7 +27,7 @@ def field_docstrings(kind: type) -> dict[str, str]:
 
 
 def described(kind: type) -> str:
-    """A settings dataclass as text: what it is, and each field with its default and meaning."""
+    """A settings dataclass as text: its summary, and each field with default and meaning."""
     lines = [f"{kind.__name__}: {inspect.getdoc(kind) or ''}"]
     texts = field_docstrings(kind)
     for field in fields(kind):
@@ -63,11 +63,6 @@ def to_plain(value: Any) -> Any:
 def changed(base: _Settings, table: Mapping[str, Any], where: str) -> _Settings:
     """Settings with some fields replaced by those of a table.
 
-    Args:
-        base: a settings dataclass.
-        table: field -> value, as `to_plain` writes them.
-        where: the table's name, for messages.
-
     Raises:
         SettingsError: a name is unknown, or a value has another type or is out of range.
     """
@@ -79,7 +74,9 @@ def changed(base: _Settings, table: Mapping[str, Any], where: str) -> _Settings:
                 f"{where} has no setting {name!r}.{closest(name, types)} Its settings are: {', '.join(types)}."
             )
         present = getattr(base, name)
-        of_stages = name == "stages" or (isinstance(present, tuple) and present and type(present[0]) in get_args(Stage))
+        of_stages = name in ("stages", "then") or (
+            isinstance(present, tuple) and any(type(one) in get_args(Stage) for one in present)
+        )
         values[name] = _stages(value, f"{where}.{name}") if of_stages else _like(value, present, f"{where}.{name}")
     return replace(base, **values)  # pyright: ignore[reportArgumentType, reportCallIssue]
 
@@ -111,25 +108,9 @@ def _stage(table: Mapping[str, Any], where: str) -> Stage:
     name = rest.pop("stage", None)
     if name not in _STAGES:
         raise SettingsError(f"{where} has the stage {name!r}; allowed is {', '.join(_STAGES)}.")
-    kind = _STAGES[name]
-    known = {field.name for field in fields(kind)}
-    unknown = [key for key in rest if key not in known]
-    if unknown:
-        raise SettingsError(f"{where} ({name}) has no {unknown[0]!r}; it has {', '.join(sorted(known)) or 'nothing'}.")
-    if "then" in known:
-        rest["then"] = _stages(rest.get("then", []), f"{where}.then")
     if name == "Descend" and "blur" not in rest:
         raise SettingsError(f"{where} (Descend) needs a blur [px], for instance 1.6.")
-    example = _EXAMPLES.get(name) or kind()
-    values = {
-        key: _like(value, getattr(example, key), f"{where}.{key}") for key, value in rest.items() if key != "then"
-    }
-    return kind(**values, **({"then": rest["then"]} if "then" in rest else {}))
-
-
-_EXAMPLES: dict[str, Any] = {
-    "Descend": _STAGES["Descend"](blur=1.0),
-    "RandomRestart": _STAGES["RandomRestart"](then=()),
-    "OtherBackground": _STAGES["OtherBackground"](then=()),
-    "IgnoreOccluders": _STAGES["IgnoreOccluders"](then=()),
-}
+    kind = _STAGES[name]
+    required: dict[str, Any] = {"blur": 1.0, "then": ()}
+    base = kind(**{field.name: required[field.name] for field in fields(kind) if field.default is MISSING})
+    return changed(base, rest, f"{where} ({name})")

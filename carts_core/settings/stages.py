@@ -2,18 +2,9 @@
 
 from dataclasses import dataclass, replace
 from enum import StrEnum
+from typing import Annotated
 
-from ..errors import SettingsError
-
-
-def require(condition: bool, name: str, value: object, allowed: str) -> None:
-    """Check the range of a setting.
-
-    Raises:
-        SettingsError: it is out of range.
-    """
-    if not condition:
-        raise SettingsError(f"{name} is {value!r}; allowed is {allowed}. Change it, or leave it at its default.")
+from .ranges import Range, Ranged, Share
 
 
 class Given(StrEnum):
@@ -26,47 +17,36 @@ class Given(StrEnum):
 
 
 @dataclass(frozen=True)
-class Observe:
+class Observe(Ranged):
     """Predict the surface map of the images: per pixel the coverage of each part of the arms, and the
     normal (`carts_core.model.parts`). `Descend` and `AlignEdges` never call the network; a `RandomRestart` and a
     `PreferStart` observe once more, and verdicts (`OtherBackground`, `RejectFailed`) need it for their evidence.
     """
 
-    scale: float = 1.5
-    """How many times larger than the working image the images are, up to the camera's own size [1]."""
+    scale: Annotated[float, Range(0.1, 8)] = 1.5
+    """Size of the images relative to the working image, up to the camera's own size [1]."""
     given: Given = Given.ESTIMATE
     """The state that the network is conditioned on."""
-    margin: int = 16
-    """How far the network's input reaches beyond the arms of that state [px]."""
-    attention: int = 8
+    margin: Annotated[int, Range(0, 1000, "px")] = 16
+    """Margin of the network's input around the arms of that state [px]."""
+    attention: Annotated[int, Range(1, 1000, "px")] = 8
     """Distance from the arms of that state beyond which nothing counts, the paper's attention [px]."""
     haze: bool = True
     """Whether pixels under haze or smoke count less, by its transmission. A search does better with all pixels."""
 
-    def __post_init__(self) -> None:
-        require(0.1 <= self.scale <= 8, "Observe.scale", self.scale, "0.1 to 8")
-        require(0 <= self.margin <= 1000, "Observe.margin", self.margin, "0 to 1000 px")
-        require(1 <= self.attention <= 1000, "Observe.attention", self.attention, "1 to 1000 px")
-
 
 @dataclass(frozen=True)
-class Descend:
+class Descend(Ranged):
     """Levenberg-Marquardt on the surface factor (rendered minus observed surface map) and the prior, under one blur."""
 
-    blur: float
+    blur: Annotated[float, Range(0, 40, "px")]
     """Deviation of the blur under which surface maps are compared [px]."""
-    robust: float = 0.5
+    robust: Annotated[float, Range(1e-3, 100)] = 0.5
     """Difference of surface maps beyond which a pixel loses its weight (Geman-McClure's scale) [1]."""
-    steps: int = 6
+    steps: Annotated[int, Range(1, 1000)] = 6
     """Largest number of steps [1]."""
-    tolerance: float = 1e-2
+    tolerance: Annotated[float, Range(0, 1, below=True)] = 1e-2
     """The stage ends when no more than this share of the objective is to be gained [1]."""
-
-    def __post_init__(self) -> None:
-        require(0 <= self.blur <= 40, "Descend.blur", self.blur, "0 to 40 px")
-        require(1e-3 <= self.robust <= 100, "Descend.robust", self.robust, "0.001 to 100")
-        require(1 <= self.steps <= 1000, "Descend.steps", self.steps, "1 to 1000")
-        require(0 <= self.tolerance < 1, "Descend.tolerance", self.tolerance, "0 to 1")
 
 
 FINEST = Descend(blur=0.8)
@@ -74,97 +54,71 @@ FINEST = Descend(blur=0.8)
 
 
 @dataclass(frozen=True)
-class RandomRestart:
+class RandomRestart(Ranged):
     """Where the fit is bad or an arm was lost (it has left the image, or is where none was observed): draw random
     states, compare them with the whole image, and descend again from the best."""
 
     then: tuple["Stage", ...]
-    """What runs from there. States are compared as the first `Descend` of these compares them."""
-    if_loss: float = 0.045
+    """Stages from there. States are compared as in the first `Descend` of these."""
+    if_loss: Annotated[float, Range(0, 10)] = 0.045
     """Cost per pixel of the arms, without the prior, from which a fit is bad [1]."""
-    candidates: int = 64
+    candidates: Annotated[int, Range(1, 10_000)] = 64
     """Random states per arm [1]."""
-    deviation: float = 1.8
+    deviation: Annotated[float, Range(0, 10, above=True)] = 1.8
     """Their deviation, in deviations of the prior (`SurfaceSolver.prior_deg` and its like) [1]."""
-    scale: float = 0.75
+    scale: Annotated[float, Range(0.1, 8)] = 0.75
     """Of the whole image that they are compared with, as `Observe.scale` [1]."""
-
-    def __post_init__(self) -> None:
-        require(0 <= self.if_loss <= 10, "RandomRestart.if_loss", self.if_loss, "0 to 10")
-        require(1 <= self.candidates <= 10_000, "RandomRestart.candidates", self.candidates, "1 to 10000")
-        require(0 < self.deviation <= 10, "RandomRestart.deviation", self.deviation, "above 0, at most 10")
-        require(0.1 <= self.scale <= 8, "RandomRestart.scale", self.scale, "0.1 to 8")
 
 
 @dataclass(frozen=True)
-class SilhouetteSearch:
+class SilhouetteSearch(Ranged):
     """Where given masks are the target and the start is far from them: draw states, compare their silhouettes with the
     masks by distance, which needs no overlap, and go on from the nearest. Skipped where a network says where arms are.
     """
 
-    if_overlap: float = 0.8
+    if_overlap: Share = 0.8
     """Overlap of silhouettes and masks at the start (Dice) from which nothing is searched [1]."""
-    starts: int = 4
+    starts: Annotated[int, Range(1, 100)] = 4
     """Largest number of searches [1]."""
-    rounds: int = 10
+    rounds: Annotated[int, Range(1, 1000)] = 10
     """Rounds of each; every round draws around the best of the one before [1]."""
-    candidates: int = 48
+    candidates: Annotated[int, Range(20, 10_000)] = 48
     """States per round; the first has more [1]."""
-    joints_deg: float = 6.0
+    joints_deg: Annotated[float, Range(0, 90, "deg", above=True)] = 6.0
     """Deviation of joints in the first round [deg]; `length_scale` turns it into metres."""
-    frames_deg: float = 15.0
+    frames_deg: Annotated[float, Range(0, 90, "deg", above=True)] = 15.0
     """Deviation of base frames and cameras in the first round [deg]; places deviate by what half of this angle is at
     the distance of the arms from the camera."""
-    enough: float = 1.5
+    enough: Annotated[float, Range(0, 1000, "px")] = 1.5
     """Distance of silhouettes and masks at which no further search begins [px of the compared images]."""
-    scale: float = 0.5
+    scale: Annotated[float, Range(0.1, 8)] = 0.5
     """Of the compared images, as `Observe.scale` [1]."""
-
-    def __post_init__(self) -> None:
-        require(0 <= self.if_overlap <= 1, "SilhouetteSearch.if_overlap", self.if_overlap, "0 to 1")
-        require(1 <= self.starts <= 100, "SilhouetteSearch.starts", self.starts, "1 to 100")
-        require(1 <= self.rounds <= 1000, "SilhouetteSearch.rounds", self.rounds, "1 to 1000")
-        require(20 <= self.candidates <= 10_000, "SilhouetteSearch.candidates", self.candidates, "20 to 10000")
-        require(0 < self.joints_deg <= 90, "SilhouetteSearch.joints_deg", self.joints_deg, "above 0, at most 90 deg")
-        require(0 < self.frames_deg <= 90, "SilhouetteSearch.frames_deg", self.frames_deg, "above 0, at most 90 deg")
-        require(0 <= self.enough <= 1000, "SilhouetteSearch.enough", self.enough, "0 to 1000 px")
-        require(0.1 <= self.scale <= 8, "SilhouetteSearch.scale", self.scale, "0.1 to 8")
 
 
 @dataclass(frozen=True)
-class AlignEdges:
+class AlignEdges(Ranged):
     """Move the outlines of the arms to edges of the image, weighed against the surface factor. Skipped where given
     masks are the target: they say where outlines are."""
 
-    steps: int = 24
+    steps: Annotated[int, Range(1, 1000)] = 24
     """Largest number of steps [1]."""
-    weight: float = 0.3
+    weight: Annotated[float, Range(0, 100, above=True)] = 0.3
     """Of a squared distance from an edge, per pixel of the outline [1/px^2]."""
-
-    def __post_init__(self) -> None:
-        require(1 <= self.steps <= 1000, "AlignEdges.steps", self.steps, "1 to 1000")
-        require(0 < self.weight <= 100, "AlignEdges.weight", self.weight, "above 0, at most 100")
 
 
 @dataclass(frozen=True)
-class PreferStart:
-    """Go back to the start where it explains the image as well as the estimate. Not where a calibration is free."""
+class PreferStart(Ranged):
+    """Return to the start if it explains the image as well as the estimate, unless a calibration is free."""
 
-    improvement: float = 5.0
+    improvement: Annotated[float, Range(0, 1e6, above=True)] = 5.0
     """Least improvement of the objective that keeps the estimate [1]."""
-    ratio: float = 1.25
+    ratio: Annotated[float, Range(1, 100)] = 1.25
     """Beyond this many times the estimate's cost, the start never explains the image as well [1]."""
-    edges: float = 1.12
+    edges: Annotated[float, Range(1, 100)] = 1.12
     """Beyond this many times the estimate's distance of outlines to edges, it does not either [1]: what a start that is
     exactly right stays below in 39 of 40 synthetic frames."""
-    overlap: float = 0.9
+    overlap: Share = 0.9
     """Dice of both silhouettes below which the start is not tried [1]."""
-
-    def __post_init__(self) -> None:
-        require(0 < self.improvement <= 1e6, "PreferStart.improvement", self.improvement, "above 0, at most 1e6")
-        require(1 <= self.ratio <= 100, "PreferStart.ratio", self.ratio, "1 to 100")
-        require(1 <= self.edges <= 100, "PreferStart.edges", self.edges, "1 to 100")
-        require(0 <= self.overlap <= 1, "PreferStart.overlap", self.overlap, "0 to 1")
 
 
 @dataclass(frozen=True)
@@ -174,15 +128,15 @@ class OtherBackground:
     its arms overlap more with what differs from the background, which false detections cannot help."""
 
     then: tuple["Stage", ...]
-    """What runs from the start again."""
+    """Stages from the start."""
 
 
 @dataclass(frozen=True)
 class IgnoreOccluders:
-    """Propose an ignore mask of occluders from what contradicts the fit, and run again without those pixels."""
+    """Propose an ignore mask of occluders from contradicting pixels, and run again without these."""
 
     then: tuple["Stage", ...]
-    """What runs from the start again, if anything was proposed."""
+    """Stages from the start, if a mask was proposed."""
 
 
 @dataclass(frozen=True)
@@ -197,20 +151,15 @@ class RejectFailed:
 
 
 @dataclass(frozen=True)
-class FirstOrder:
+class FirstOrder(Ranged):
     """Gradient descent on a loss of image features, as in the paper."""
 
-    share: float = 0.5
+    share: Annotated[float, Range(0, 1, above=True)] = 0.5
     """Of the planned iterations [1]."""
-    attention: int = 10
+    attention: Annotated[int, Range(1, 400, "px")] = 10
     """Dilation of the silhouette [px]."""
-    blur: float = 0.6
+    blur: Annotated[float, Range(0, 20, "px")] = 0.6
     """Deviation of the lens blur of the rendering before it is compared [px]."""
-
-    def __post_init__(self) -> None:
-        require(0 < self.share <= 1, "FirstOrder.share", self.share, "above 0, at most 1")
-        require(1 <= self.attention <= 400, "FirstOrder.attention", self.attention, "1 to 400 px")
-        require(0 <= self.blur <= 20, "FirstOrder.blur", self.blur, "0 to 20 px")
 
 
 Stage = (

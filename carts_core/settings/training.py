@@ -4,47 +4,38 @@ import json
 import re
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 from ..errors import SettingsError
 from ..files.reading import parse_json
 from ..resources import shipped_robot
+from .ranges import Count, NotNegative, Positive, Range, Ranged, Share
 
 
 @dataclass(frozen=True)
-class ObjectiveWeights:
+class ObjectiveWeights(Ranged):
     """Weights of the terms of the training loss; zero leaves a term out."""
 
-    cross_entropy: float = 1.0
+    cross_entropy: NotNegative = 1.0
     """Binary cross-entropy of the instrument's probability, as in the paper."""
-    dice: float = 0.5
+    dice: NotNegative = 0.5
     """One minus soft Dice per image, so that small instruments count as much as large ones."""
-    consistency: float = 1.0
-    """Cosine between the features of an observed and a hybrid image: 1 where they show the same, 0 where not."""
-
-    def __post_init__(self) -> None:
-        for name in self.__dataclass_fields__:
-            if not getattr(self, name) >= 0:
-                raise SettingsError(f"weight {name} is {getattr(self, name)}; give zero or more.")
+    consistency: NotNegative = 1.0
+    """Cosine of the features of an observed and a hybrid image: 1 for equal classes, 0 for different ones."""
 
 
 @dataclass(frozen=True)
-class SurfaceWeights:
+class SurfaceWeights(Ranged):
     """Weights of the terms of the surface network's loss; zero leaves a term out."""
 
-    everywhere: float = 1.0
+    everywhere: NotNegative = 1.0
     """Cross-entropy of coverage, all pixels."""
-    near: float = 1.0
+    near: NotNegative = 1.0
     """The same near instruments, where the optimizer compares."""
-    dice: float = 0.5
+    dice: NotNegative = 0.5
     """One minus soft Dice per image and part, so that small parts count as much as large ones."""
-    normals: float = 1.0
+    normals: NotNegative = 1.0
     """Smooth L1 of normals near instruments."""
-
-    def __post_init__(self) -> None:
-        for name in self.__dataclass_fields__:
-            if not getattr(self, name) >= 0:
-                raise SettingsError(f"weight {name} is {getattr(self, name)}; give zero or more.")
 
 
 _MOST_LEVELS, _MOST_CHANNELS, _MOST_CONVOLUTIONS = 8, 1024, 16
@@ -52,7 +43,7 @@ _MOST_LEVELS, _MOST_CHANNELS, _MOST_CONVOLUTIONS = 8, 1024, 16
 
 @dataclass(frozen=True)
 class Architecture:
-    """What distinguishes one feature network from another; it travels in the weights file."""
+    """Architecture of a network, stored in the weights file."""
 
     widths: tuple[int, ...] = (12, 24, 48, 64, 96)
     """Channels per level, from full resolution down; each level halves the resolution."""
@@ -108,48 +99,45 @@ class Architecture:
         )
 
 
-Range = tuple[float, float]
+Interval = Annotated[tuple[float, float], Range(0)]
+"""Lower and upper end."""
 
 DARKEST_BRIGHTNESS = 0.65
 """Training images are never darkened below this factor: low light is a domain that is only evaluated."""
 
 
 @dataclass(frozen=True)
-class AppearanceRanges:
+class AppearanceRanges(Ranged):
     """Ranges that the camera of an observed training image is drawn from.
 
     There is deliberately no smoke, no blood and no low light: robustness to those is to be shown, not trained.
     Nothing red is ever drawn over an instrument, nothing hides a part of the image, and `brightness` has a floor.
     """
 
-    brightness: Range = (0.65, 1.35)
+    brightness: Interval = (0.65, 1.35)
     """Factor on the whole image [1]; at least `DARKEST_BRIGHTNESS`."""
-    contrast: Range = (0.6, 1.3)
+    contrast: Interval = (0.6, 1.3)
     """Factor on the distance from the image's mean [1]."""
-    gamma: Range = (0.8, 1.25)
+    gamma: Interval = (0.8, 1.25)
     """Exponent of the tone curve [1]."""
-    white_balance: Range = (0.82, 1.2)
+    white_balance: Interval = (0.82, 1.2)
     """Factor per colour channel [1]."""
-    blur: Range = (0.0, 1.1)
+    blur: Interval = (0.0, 1.1)
     """Standard deviation of the lens blur [px at the working size]."""
-    noise: Range = (0.0, 0.03)
+    noise: Interval = (0.0, 0.03)
     """Standard deviation of the sensor noise [1]."""
-    jpeg_quality: Range = (45.0, 98.0)
+    jpeg_quality: Interval = (45.0, 98.0)
     """Quality of the JPEG artefacts, 100 is best."""
-    vignette: Range = (0.0, 0.45)
+    vignette: Interval = (0.0, 0.45)
     """Darkening in the image corners [1]."""
-    unevenness: float = 0.4
+    unevenness: Share = 0.4
     """Largest deviation of the logarithm of the light over the image [1]; its mean is left as it is."""
 
     def __post_init__(self) -> None:
-        if not 0 <= self.unevenness <= 1:
-            raise SettingsError(f"unevenness is {self.unevenness}; give a value from 0 to 1.")
-        for name in self.__dataclass_fields__:
-            if name == "unevenness":
-                continue
-            low, high = getattr(self, name)
-            if not 0 <= low <= high:
-                raise SettingsError(f"{name} is ({low}, {high}); give two values with 0 <= lower <= upper.")
+        super().__post_init__()
+        for name, value in vars(self).items():
+            if name != "unevenness" and not value[0] <= value[1]:
+                raise SettingsError(f"{name} is {value}; give two values with 0 <= lower <= upper.")
         if self.brightness[0] < DARKEST_BRIGHTNESS:
             raise SettingsError(
                 f"brightness starts at {self.brightness[0]}, below {DARKEST_BRIGHTNESS}. Low light is a domain that is "
@@ -159,12 +147,9 @@ class AppearanceRanges:
             raise SettingsError("gamma must be positive and jpeg_quality at most 100; correct the range.")
 
 
-_SHARES = ("two_arms", "same_kinematics", "same_background", "occluded", "things", "absent", "from_photographs")
-
-
 @dataclass(frozen=True)
-class ImageSettings:
-    """What training images look like."""
+class ImageSettings(Ranged):
+    """Settings of training images."""
 
     width: int = 192
     """Width of a training image [px]."""
@@ -172,21 +157,21 @@ class ImageSettings:
     """Height of a training image [px]."""
     field_width: int = 320
     """Width [px] of the camera image that a training image is a crop of; focal lengths refer to it."""
-    two_arms: float = 0.4
+    two_arms: Share = 0.4
     """Share of pairs with two arms."""
-    same_kinematics: float = 0.5
+    same_kinematics: Share = 0.5
     """Share of pairs whose hybrid image shows exactly the kinematics of the observed one."""
-    same_background: float = 0.7
+    same_background: Share = 0.7
     """Share of pairs whose mean background is that of the observed image."""
-    occluded: float = 0.4
+    occluded: Share = 0.4
     """Share of observed images in which something occludes the arms; the labels are those of the arms below it."""
-    things: float = 0.35
+    things: Share = 0.35
     """Share of observed images with rods, plates, cables and the like behind the arms."""
-    absent: float = 0.1
+    absent: Share = 0.1
     """Share of observed images in which one arm or all are claimed to be in view and are not."""
     photographs: Path | None = None
     """Folder of photographs; `from_photographs` of the backgrounds are parts of them."""
-    from_photographs: float = 0.2
+    from_photographs: Share = 0.2
     """Share of backgrounds that are parts of photographs, if a folder of them is given."""
     recording: Path | None = None
     """Sequence file; arms are then where its cameras see them, about, and not 5 to 25 cm from the camera."""
@@ -196,15 +181,13 @@ class ImageSettings:
     """The camera's ranges."""
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if self.width % 16 or self.height % 16 or min(self.width, self.height) <= 0:
             raise SettingsError(
                 f"training images of {self.width}x{self.height} px; give positive multiples of 16 for both."
             )
         if self.field_width < self.width:
             raise SettingsError(f"field_width is {self.field_width}; give at least the width, {self.width}.")
-        for name in _SHARES:
-            if not 0 <= getattr(self, name) <= 1:
-                raise SettingsError(f"{name} is {getattr(self, name)}; give a share from 0 to 1.")
         if not 0 <= self.coverage[0] < self.coverage[1] <= 1:
             raise SettingsError(f"coverage is {self.coverage}; give two shares, the lower one first.")
 
@@ -214,7 +197,7 @@ NetworkName = Literal["feature", "surface"]
 
 
 @dataclass(frozen=True)
-class TrainingConfig:
+class TrainingConfig(Ranged):
     """Everything that a training run depends on."""
 
     network: NetworkName = "feature"
@@ -224,41 +207,41 @@ class TrainingConfig:
     start: Path | None = None
     """Weights file to start from, for fine-tuning; random weights without it. The network is as large as these,
     unless another architecture is asked for, into which it then grows."""
-    steps: int = 4000
+    steps: Count = 4000
     """Optimizer steps."""
-    minutes: float | None = None
+    minutes: Annotated[float | None, Range(0, unit="min", above=True)] = None
     """Processor time for training, per thread of the training process [min]; a run that would take longer has fewer
     steps. On a busy machine a run takes longer and learns as much."""
-    batch_size: int = 8
+    batch_size: Count = 8
     """Samples per step: a pair of an observed and a hybrid image, or one observed image."""
-    reuse: int = 2
+    reuse: Count = 2
     """How often a sample is used, mirrored by chance after the first time: making one takes as long as learning it."""
-    learning_rate: float = 3e-3
+    learning_rate: Positive = 3e-3
     """Peak learning rate of AdamW; it rises for `warmup` steps and then falls along a cosine to a hundredth."""
-    weight_decay: float = 1e-4
+    weight_decay: NotNegative = 1e-4
     """Weight decay of AdamW."""
-    warmup: int = 100
+    warmup: Annotated[int, Range(0)] = 100
     """Steps until the learning rate is at its peak."""
-    average: float = 0.995
+    average: Annotated[float, Range(0, 1, below=True)] = 0.995
     """Decay per step of the running average of the weights, which is what is saved."""
-    validation_every: int = 250
+    validation_every: Count = 250
     """Steps between validations."""
-    patience: int | None = None
+    patience: Annotated[int | None, Range(1)] = None
     """Validations in a row without a gain after which a run ends, and whose weights are not kept."""
-    validation_samples: int = 32
+    validation_samples: Count = 32
     """Samples of the fixed validation set."""
-    checkpoint_every: int = 100
+    checkpoint_every: Count = 100
     """Steps between checkpoints."""
-    workers: int = 2
+    workers: Annotated[int, Range(0)] = 2
     """Processes that make images."""
-    threads: int = 2
+    threads: Count = 2
     """Threads of the training process itself."""
-    seed: int = 0
+    seed: Annotated[int, Range(0)] = 0
     """Seed of everything random."""
     device: str = "cpu"
-    """Where the network is trained."""
+    """Device of the training."""
     images: ImageSettings = field(default_factory=ImageSettings)
-    """What training images look like."""
+    """Settings of training images."""
     objective: ObjectiveWeights = field(default_factory=ObjectiveWeights)
     """Weights of the feature network's loss terms."""
     surface_objective: SurfaceWeights = field(default_factory=SurfaceWeights)
@@ -267,31 +250,7 @@ class TrainingConfig:
     """The network."""
 
     def __post_init__(self) -> None:
-        for name in (
-            "steps",
-            "batch_size",
-            "reuse",
-            "validation_every",
-            "validation_samples",
-            "checkpoint_every",
-            "threads",
-        ):
-            if getattr(self, name) < 1:
-                raise SettingsError(f"{name} is {getattr(self, name)}; give 1 or more.")
-        for name in ("warmup", "workers", "seed"):
-            if getattr(self, name) < 0:
-                raise SettingsError(f"{name} is {getattr(self, name)}; give 0 or more.")
-        if not self.learning_rate > 0 or not self.weight_decay >= 0:
-            raise SettingsError(
-                f"learning_rate is {self.learning_rate} and weight_decay {self.weight_decay}; give a positive rate and "
-                "a decay of 0 or more."
-            )
-        if self.minutes is not None and not self.minutes > 0:
-            raise SettingsError(f"minutes is {self.minutes}; give a positive time, or leave it out.")
-        if self.patience is not None and self.patience < 1:
-            raise SettingsError(f"patience is {self.patience}; give 1 or more, or leave it out.")
-        if not 0 <= self.average < 1:
-            raise SettingsError(f"average is {self.average}; give a decay from 0 (no average) to below 1.")
+        super().__post_init__()
         if not self.robots:
             raise SettingsError("no robot to train on; give at least one URDF file.")
         stride = self.architecture.stride
@@ -303,7 +262,7 @@ class TrainingConfig:
 
 
 BaselineName = Literal["unet", "hrnet", "swin", "colleoni"]
-"""Which network: three look at the image alone, Colleoni's at what is rendered of the kinematics, too."""
+"""Baseline network. Three use the image alone, Colleoni's also a rendering of the kinematics."""
 Augmentation = Literal["none", "smoke", "autoaugment", "elastic", "projective"]
 """What is done to training images besides mirroring them: simulated smoke (the paper), or what SegSTRONG-C compares."""
 
@@ -318,7 +277,7 @@ _LARGEST = 1024
 
 @dataclass(frozen=True)
 class BaselineNetwork:
-    """What distinguishes one baseline network from another; it travels in the weights file."""
+    """Architecture of a baseline network, stored in the weights file."""
 
     name: BaselineName = "hrnet"
     """Which network."""
@@ -351,56 +310,41 @@ class BaselineNetwork:
 
     @property
     def looks_at_kinematics(self) -> bool:
-        """Whether it is given what is rendered of the measured kinematics."""
+        """Whether a rendering of the measured kinematics is an input."""
         return self.name == "colleoni"
 
 
 @dataclass(frozen=True)
-class BaselineTraining:
+class BaselineTraining(Ranged):
     """Everything that a training run of a baseline depends on."""
 
     augmentation: Augmentation = "smoke"
-    """What is done to training images."""
+    """Augmentation of training images."""
     start: Path | None = None
     """Safetensors file with timm's weights of the encoder, such as pretrained ones; for a U-Net one with a feature
     network. Random weights without it."""
-    frames: int = 3000
+    frames: Annotated[int, Range(101)] = 3000
     """Synthetic training frames; the last 100 validate."""
-    steps: int = 20_000
+    steps: Count = 20_000
     """Optimizer steps."""
-    minutes: float | None = None
+    minutes: Annotated[float | None, Range(0, unit="min", above=True)] = None
     """Processor time for training, per thread [min]; a run that would take longer has fewer steps."""
-    batch_size: int = 4
+    batch_size: Count = 4
     """Frames per step."""
-    learning_rate: float = 1e-3
+    learning_rate: Positive = 1e-3
     """Peak learning rate of AdamW; it rises for `warmup` steps and then falls along a cosine to a hundredth."""
-    weight_decay: float = 1e-4
+    weight_decay: NotNegative = 1e-4
     """Weight decay of AdamW."""
-    warmup: int = 50
+    warmup: Annotated[int, Range(0)] = 50
     """Steps until the learning rate is at its peak."""
     bfloat16: bool | None = None
     """Compute in bfloat16; weights stay float32. Without it, on a GPU alone: a processor that has no instructions for
     bfloat16 takes ten times as long with it."""
-    checkpoint_every: int = 100
+    checkpoint_every: Count = 100
     """Steps between checkpoints."""
-    threads: int = 2
+    threads: Count = 2
     """Threads of torch."""
-    seed: int = 0
+    seed: Annotated[int, Range(0)] = 0
     """Seed of everything random, the frames included."""
     device: str = "cpu"
-    """Where the network is trained."""
-
-    def __post_init__(self) -> None:
-        for name, least in (("frames", 101), ("steps", 1), ("batch_size", 1), ("checkpoint_every", 1), ("threads", 1)):
-            if getattr(self, name) < least:
-                raise SettingsError(f"{name} is {getattr(self, name)}; give {least} or more.")
-        for name in ("warmup", "seed"):
-            if getattr(self, name) < 0:
-                raise SettingsError(f"{name} is {getattr(self, name)}; give 0 or more.")
-        if not self.learning_rate > 0 or not self.weight_decay >= 0:
-            raise SettingsError(
-                f"learning_rate is {self.learning_rate} and weight_decay {self.weight_decay}; give a positive rate and "
-                "a decay of 0 or more."
-            )
-        if self.minutes is not None and not self.minutes > 0:
-            raise SettingsError(f"minutes is {self.minutes}; give a positive time, or leave it out.")
+    """Device of the training."""

@@ -190,7 +190,7 @@ def test_a_program_that_ends_while_it_trains_does_not_hang(tiny_sequence: Callab
 def test_training_that_fails_says_why(at_desk: Desk, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(adapting, "OPTIONS", ("--steps", "0"))
     at_desk.do(intents.Adapt(1))
-    with pytest.raises(CartsError, match="steps is 0; give 1 or more"):
+    with pytest.raises(CartsError, match="steps is 0; allowed is 1 or more"):
         ended(at_desk)
     assert at_desk.state.jobs[0].state is JobState.FAILED and at_desk.state.networks == (STARTED,)
 

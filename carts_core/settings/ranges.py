@@ -1,0 +1,71 @@
+"""Ranges of settings as part of their types, and the check of them."""
+
+from dataclasses import dataclass, fields
+from math import inf
+from typing import Annotated
+
+from ..errors import SettingsError
+
+
+@dataclass(frozen=True)
+class Range:
+    """Allowed values of a field, such as `Annotated[float, Range(0, 1)]`; of each element of a tuple."""
+
+    low: float = -inf
+    high: float = inf
+    unit: str = ""
+    above: bool = False
+    """Whether `low` itself is excluded."""
+    below: bool = False
+    """Whether `high` itself is excluded."""
+
+    def holds(self, value: float) -> bool:
+        """Whether a value lies in the range; NaN does not."""
+        return (self.low < value if self.above else self.low <= value) and (
+            value < self.high if self.below else value <= self.high
+        )
+
+    def __str__(self) -> str:
+        unit = f" {self.unit}" if self.unit else ""
+        if self.above or self.below:
+            low = f"above {self.low:g}" if self.above else f"at least {self.low:g}"
+            high = f", below {self.high:g}" if self.below else f", at most {self.high:g}"
+            return low + (high if self.high < inf else "") + unit
+        return (f"{self.low:g} to {self.high:g}" if self.high < inf else f"{self.low:g} or more") + unit
+
+
+Share = Annotated[float, Range(0, 1)]
+"""A number from 0 to 1."""
+Count = Annotated[int, Range(1)]
+"""A number of things, at least one."""
+Positive = Annotated[float, Range(0, above=True)]
+"""A number above 0."""
+NotNegative = Annotated[float, Range(0)]
+"""A number from 0 on."""
+
+
+def require(condition: bool, name: str, value: object, allowed: object) -> None:
+    """Check a setting.
+
+    Raises:
+        SettingsError: the condition is false.
+    """
+    if not condition:
+        raise SettingsError(f"{name} is {value!r}; allowed is {allowed}. Change it, or leave it at its default.")
+
+
+class Ranged:
+    """Base of dataclasses whose fields have a `Range` in their types; None is allowed where the type has it."""
+
+    def __post_init__(self) -> None:
+        """Check all ranges.
+
+        Raises:
+            SettingsError: a value is out of its range.
+        """
+        for field in fields(self):  # pyright: ignore[reportArgumentType]
+            for allowed in getattr(field.type, "__metadata__", ()):
+                value = getattr(self, field.name)
+                if isinstance(allowed, Range) and value is not None:
+                    inside = all(map(allowed.holds, value if isinstance(value, tuple) else (value,)))
+                    require(inside, f"{type(self).__name__}.{field.name}", value, allowed)
