@@ -69,7 +69,6 @@ def seal(connection: sqlite3.Connection, nonce: bytes) -> None:
     """Compute the digests of all rows, inside a transaction of the caller.
 
     Args:
-        connection: to a project of the present schema.
         nonce: for one that has none yet.
     """
     total = 0

@@ -17,13 +17,11 @@ import struct
 import sys
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import closing, suppress
-from dataclasses import dataclass, replace
-from functools import lru_cache
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from jaxtyping import UInt8, UInt32
 
 from ..errors import ProjectError
 from . import database
@@ -133,171 +131,81 @@ def holder(path: Path) -> str:
         wanted = os.stat(path, follow_symlinks=False)
         for process in sorted(Path("/proc").glob("[0-9]*"), key=lambda folder: folder.name == own):
             with suppress(OSError):
-                if any(_is_open_at(entry, wanted) for entry in (process / "fd").iterdir()):
-                    return f"process {process.name} on {socket.gethostname()}"
+                for entry in (process / "fd").iterdir():
+                    with suppress(OSError):
+                        if os.path.samestat(os.stat(entry), wanted):
+                            return f"process {process.name} on {socket.gethostname()}"
     return "another process"
 
 
-def _is_open_at(entry: Path, wanted: os.stat_result) -> bool:
-    try:
-        return os.path.samestat(os.stat(entry), wanted)
-    except OSError:
-        return False
-
-
-HEADER = 32
-"""Size of the log's header [bytes]."""
-FRAME_HEADER = 24
-"""Size of a frame's header, before its page [bytes]."""
+HEADER, FRAME_HEADER = 32, 24
+"""Sizes of the header of a log, and of a frame's, before its page [bytes]."""
 _ORDERS: dict[int, Literal["<", ">"]] = {0x377F0682: "<", 0x377F0683: ">"}
 """Magic number -> byte order of the words in checksums."""
-_COVERED = 8
-"""Bytes of a frame's header that its checksum covers, besides the page."""
 _WORD = 0xFFFFFFFF
 _FRAMES_AT_ONCE = 256
 _PAGE_SIZES = frozenset(1 << n for n in range(9, 17))
-_Sum = tuple[int, int]
 
 
-@dataclass(frozen=True)
-class _Frame:
-    """A frame of a log: the new content of a page."""
+def _recovered(main: bytes, log: bytes) -> tuple[bytearray, bool]:
+    """The database after all finished transactions of a log, as SQLite recovers it, and whether the log is damaged.
 
-    start: int
-    """Offset in the log [bytes]."""
-    before: _Sum
-    """Checksum of the log up to the frame."""
-    page: int
-    """Number of the page, from 1."""
-    pages: int
-    """Size of the database after a transaction that ends with the frame [pages]; 0 for other frames."""
-
-
-@dataclass(frozen=True)
-class _LogHeader:
-    """Header of a log."""
-
-    order: Literal["<", ">"]
-    page_size: int
-    salts: tuple[int, int]
-    checksum: _Sum
-
-    @staticmethod
-    def of(log: bytes) -> "_LogHeader | None":
-        """The header of a log; None if it is damaged."""
-        if len(log) < HEADER:
-            return None
-        magic, _, page_size, _, *salts, first, second = struct.unpack_from(">8I", log)
-        order = _ORDERS.get(magic)
-        if order is None or page_size not in _PAGE_SIZES or _header_sum(order, log) != (first, second):
-            return None
-        return _LogHeader(order, page_size, (salts[0], salts[1]), (first, second))
-
-    def frames(self, log: bytes, start: int, running: _Sum) -> Iterator[_Frame | None]:
-        """The complete frames of a log in order; None, as the last one, for a damaged frame.
-
-        Args:
-            log: content of the log, or of its end.
-            start: offset of the first frame in `log` [bytes].
-            running: checksum of the log before it.
-        """
-        size = FRAME_HEADER + self.page_size
-        weights, ((a, b), (c, d)) = _weights((_COVERED + self.page_size) // 4)
-        while count := min((len(log) - start) // size, _FRAMES_AT_ONCE):
-            frames = np.frombuffer(log, np.uint8, count * size, start).reshape(count, size)
-            covered = np.concatenate((frames[:, :_COVERED], frames[:, FRAME_HEADER:]), axis=1)
-            for x, y in (_words(self.order, covered) @ weights).tolist():
-                before, (s, t) = running, running
-                running = (x + a * s + b * t) & _WORD, (y + c * s + d * t) & _WORD
-                page, pages, *rest = struct.unpack_from(">6I", log, start)
-                if rest != [*self.salts, *running] or page == 0:
-                    yield None
-                    return
-                yield _Frame(start, before, page, pages)
-                start += size
-
-
-@dataclass(frozen=True)
-class Playback:
-    """A database with its log applied."""
-
-    database: bytearray
-    damaged: bool
-    """Whether the log has more than finished transactions and the beginning of one. Valid for logs that began empty, as
-    those of carts do."""
-
-
-def played_back(database: bytes, log: bytes) -> Playback:
-    """The database after all finished transactions, as SQLite recovers it.
-
-    Args:
-        database: content of the database file.
-        log: content of the log, which may be empty.
+    Logs of carts begin empty, so behind the finished transactions there is at most the beginning of one.
     """
-    result = bytearray(database)
+    result, unfinished = bytearray(main), []
+    for frame in _frames(log):
+        if frame is None:
+            return result, True
+        page, pages, content = frame
+        unfinished.append((page, content))
+        if pages:
+            for number, content in unfinished:
+                end = number * len(content)
+                result.extend(bytes(max(end - len(result), 0)))
+                result[end - len(content) : end] = content
+            unfinished.clear()
+            del result[pages * len(content) :]
+    return result, False
+
+
+def _frames(log: bytes) -> Iterator[tuple[int, int, bytes] | None]:
+    """Page number, size of the database [pages] if the frame ends a transaction, and page of each complete frame.
+
+    The last one is None if that frame, or the header, is damaged.
+    """
     if len(log) < HEADER:
         # The header is written first and at once; an incomplete one means a kill at that moment.
-        return Playback(result, damaged=False)
-    header = _LogHeader.of(log)
-    if header is None:
-        return Playback(result, damaged=True)
-    unfinished: list[_Frame] = []
-    for frame in header.frames(log, HEADER, header.checksum):
-        if frame is None:
-            return Playback(result, damaged=True)
-        unfinished.append(frame)
-        if frame.pages:
-            for one in unfinished:
-                begin, end = one.start + FRAME_HEADER, one.page * header.page_size
-                result.extend(bytes(max(end - len(result), 0)))
-                result[end - header.page_size : end] = log[begin : begin + header.page_size]
-            unfinished.clear()
-            del result[frame.pages * header.page_size :]
-    return Playback(result, damaged=False)
+        return
+    magic, _, page_size, _, *salts, s, t = struct.unpack_from(">8I", log)
+    order = _ORDERS.get(magic)
+    if order is None or page_size not in _PAGE_SIZES or _checksums(order, log[: HEADER - 8])[0] != [s, t]:
+        yield None
+        return
+    size = FRAME_HEADER + page_size
+    for start in range(HEADER, len(log) - size + 1, size * _FRAMES_AT_ONCE):
+        frames = [
+            log[at : at + size] for at in range(start, min(start + size * _FRAMES_AT_ONCE, len(log) - size + 1), size)
+        ]
+        *sums, (a, c), (b, d) = _checksums(order, *(frame[:8] + frame[FRAME_HEADER:] for frame in frames))
+        for frame, (x, y) in zip(frames, sums, strict=True):
+            # A checksum is linear in the data and in the checksum before it.
+            s, t = (x + a * s + b * t) & _WORD, (y + c * s + d * t) & _WORD
+            page, pages, *rest = struct.unpack_from(">6I", frame)
+            if rest != [*salts, s, t] or page == 0:
+                yield None
+                return
+            yield page, pages, frame[FRAME_HEADER:]
 
 
-def _next_commit(log: bytes, header: bytes, last: _Frame | None) -> _Frame | None:
-    """Last frame of the next transaction, if the frame `last` and all after it are intact; else None.
-
-    Args:
-        log: content of the log from `last` on, or without its header.
-        header: the log's header.
-        last: last frame of the transaction before; None in an empty log.
-    """
-    found = _LogHeader.of(header)
-    if found is None:
-        return None
-    frames = found.frames(log, 0, found.checksum if last is None else last.before)
-    if last is not None and next(frames, None) is None:
-        return None
-    end = next((frame for frame in frames if frame is None or frame.pages), None)
-    return None if end is None else replace(end, start=end.start + (HEADER if last is None else last.start))
-
-
-def _header_sum(order: Literal["<", ">"], log: bytes) -> _Sum:
-    words = _words(order, np.frombuffer(log, np.uint8, HEADER - 8))
-    first, second = (words @ _weights(len(words))[0]).tolist()
-    return first, second
-
-
-def _words(order: Literal["<", ">"], data: UInt8[np.ndarray, "*rows bytes"]) -> UInt32[np.ndarray, "*rows words"]:
-    return data.view(np.dtype(np.uint32).newbyteorder(order)).astype(np.uint32, copy=False)
-
-
-@lru_cache(maxsize=8)
-def _weights(words: int) -> tuple[UInt32[np.ndarray, "words 2"], tuple[_Sum, _Sum]]:
-    """Contribution of each word to the two sums of a checksum, and the matrix that propagates earlier sums.
-
-    Each pair of words (x, y) takes the sums (s, t) to s' = s + x + t and t' = t + y + s', modulo 2^32. This is linear,
-    so that any number of words are two sums of products.
-    """
-    columns, (a, b, c, d) = [], (1, 0, 0, 1)
-    for _ in range(words // 2):
-        # The last pair comes first: nothing follows it.
-        columns.append((((a + b) & _WORD, (c + d) & _WORD), (b, d)))
-        a, b, c, d = (value & _WORD for value in (a + b, a + 2 * b, c + d, c + 2 * d))
-    weights = [word for pair in reversed(columns) for word in pair]
-    return np.array(weights, np.uint32).reshape(-1, 2), ((a, b), (c, d))
+def _checksums(order: Literal["<", ">"], *parts: bytes) -> list[list[int]]:
+    """Checksums of parts of equal length, followed by those of zeros after the checksums (1, 0) and (0, 1)."""
+    words = np.frombuffer(b"".join([*parts, bytes(2 * len(parts[0]))]), np.dtype(np.uint32).newbyteorder(order))
+    s, t = np.zeros((2, len(parts) + 2), np.uint32)
+    s[-2] = t[-1] = 1
+    for x, y in words.reshape(len(s), -1, 2).transpose(1, 2, 0).astype(np.uint32):
+        s = s + x + t
+        t = t + y + s
+    return np.stack([s, t], 1).tolist()
 
 
 LARGEST = 768 * 2**20
@@ -371,10 +279,9 @@ def open_copy(content: Content, path: Path) -> Copy:
     main = content.database
     if not main.startswith(_MAGIC) or len(main) < 512:
         raise database.not_a_project(path)
-    played = played_back(main, content.log)
+    patched, damaged = _recovered(main, content.log)
     memory = sqlite3.connect(":memory:", isolation_level=None, check_same_thread=False)
     try:
-        patched = played.database
         patched[_WRITE_VERSION] = b"\1\1"
         # SQLite opens no truncated file; filled with zeros, the rest can be read.
         missing = min(_promised(patched), LARGEST) - len(patched)
@@ -386,7 +293,7 @@ def open_copy(content: Content, path: Path) -> Copy:
         memory.close()
         raise
     # Logs of older versions were used again without being emptied, so that old frames lie at their end.
-    drops = played.damaged and database.version(memory) >= database.SEALED
+    drops = damaged and database.version(memory) >= database.SEALED
     fault = "the last edits in its log (-wal) cannot be read" if drops else None
     return Copy(memory, f"{missing} bytes at its end are missing" if missing > 0 else fault)
 
@@ -406,19 +313,6 @@ def check_copy(copy: Copy) -> None:
         found = memory.execute("PRAGMA integrity_check(3)").fetchall()
     if found != [("ok",)]:
         raise database.DamagedProject("; ".join(str(row[0]) for row in found)[:300])
-
-
-def verified_seal(path: Path) -> tuple[bytes, bytes, bytes] | None:
-    """The `seal` row of the file on disk, if all of its content is intact; else None."""
-    try:
-        with database.errors_explained(path):
-            copy = open_copy(read_files(path), path)
-            with closing(copy.connection):
-                check_copy(copy)
-                verify(copy.connection)
-                return copy.connection.execute("SELECT nonce, total, digest FROM seal").fetchone()
-    except ProjectError:
-        return None
 
 
 def _promised(main: bytearray) -> int:
@@ -467,9 +361,8 @@ class ProjectFile:
         self._seal: SealRow = (b"", b"", b"")
         self._left: tuple[object, ...] = ()
         """Identity, size and time of file and log after the last write of this process."""
-        self._last: _Frame | None = None
-        """Frame of the log that ends the last transaction."""
-        self._header = b""
+        self._end, self._written = 0, (b"", b"")
+        """End of the last transaction in the log, and headers of the log and of its last frame."""
 
     @classmethod
     def locked(cls, path: Path) -> "ProjectFile | None":
@@ -509,7 +402,7 @@ class ProjectFile:
                 raise ProjectError(f"project {self.path} cannot be opened for writing. Open it read-only.")
             connection.execute("PRAGMA synchronous = FULL")
             connection.execute("PRAGMA wal_autocheckpoint = 0")
-            # Logs of carts begin empty; see `Playback.damaged`.
+            # Logs of carts begin empty; see `_recovered`.
             connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
             database.migrate(connection, nonce)
             self._log = open_regular(self._log_path)
@@ -520,10 +413,6 @@ class ProjectFile:
 
     def commit(self, statements: Statements, seal: SealRow) -> None:
         """Run statements as one transaction, which is on disk when this returns.
-
-        Args:
-            statements: SQL to run.
-            seal: seal after the transaction; one of the statements writes it.
 
         Raises:
             LostFile: the file is not the same any more; whether the edit is in it is not known.
@@ -557,7 +446,7 @@ class ProjectFile:
         with suppress(sqlite3.Error):
             self._usable().execute("PRAGMA wal_checkpoint(TRUNCATE)")
         if os.fstat(self._open_log()).st_size == 0:
-            self._last, self._header = None, b""
+            self._end, self._written = 0, (b"", b"")
         self._check_names()
         self._check_content()
         self._remember()
@@ -640,9 +529,13 @@ class ProjectFile:
 
     def _check_content(self) -> None:
         """Verify the content on disk."""
-        with suppress(OSError):
-            if verified_seal(self.path) == self._seal:
-                return
+        with suppress(OSError, ProjectError), database.errors_explained(self.path):
+            copy = open_copy(read_files(self.path), self.path)
+            with closing(copy.connection):
+                check_copy(copy)
+                verify(copy.connection)
+                if copy.connection.execute("SELECT nonce, total, digest FROM seal").fetchone() == self._seal:
+                    return
         raise LostFile("was changed by something else, and does not hold what was saved in it")
 
     def _check_since(self, *, committed: bool) -> None:
@@ -652,14 +545,20 @@ class ProjectFile:
             raise LostFile("was changed by something else while an edit was being saved")
         if not committed:
             return
+        written = self._headers(self._end)
+        end = os.fstat(self._open_log()).st_size
+        headers = self._headers(end)
+        salts, pages = headers[0][16:24], headers[1][4:8]
+        if (self._end and written != self._written) or end <= self._end or headers[1][8:16] != salts or not any(pages):
+            raise LostFile("lost an edit, or what was before it in its log (-wal), while that was being saved")
+        self._end, self._written = end, headers
+
+    def _headers(self, end: int) -> tuple[bytes, bytes]:
+        """Headers of the log and of its frame that ends at an offset [bytes]."""
         log = self._open_log()
         header = os.pread(log, HEADER, 0)
-        start = HEADER if self._last is None else self._last.start
-        frames = os.pread(log, max(os.fstat(log).st_size - start, 0), start)
-        last = _next_commit(frames, header, self._last)
-        if last is None or (self._last is not None and header != self._header):
-            raise LostFile("lost an edit, or what was before it in its log (-wal), while that was being saved")
-        self._last, self._header = last, header
+        size = FRAME_HEADER + int.from_bytes(header[8:12], "big")
+        return header, os.pread(log, FRAME_HEADER, max(end - size, 0))
 
 
 def _look(descriptor: int) -> tuple[int, ...]:

@@ -1,4 +1,4 @@
-"""The journal: every step and what it set. The state is the journal read up to a position, so undo moves that.
+"""The journal: all steps with their changes. The state is the journal up to a position; undo moves that position.
 
 Changes are returned as a `Script`, which is run on the file and on its copy in memory.
 """
@@ -91,9 +91,6 @@ def append(memory: sqlite3.Connection, step: Step, edits: Edits, last: int) -> S
     """Append a step at the present position and remove undone ones.
 
     Args:
-        memory: the journal as it is.
-        step: the step.
-        edits: what it sets.
         last: number of the last step, done or undone.
     """
     script = Script(position=step.number)

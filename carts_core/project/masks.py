@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -10,9 +10,7 @@ import numpy as np
 from jaxtyping import Bool
 
 from ..errors import ProjectError
-from ..model.scene import Scene
 from ..optimization import GivenMasks
-from ..recording import Frame
 from ..recording import Sequence as Recording
 from ..recording.annotations import read_annotations
 from ..rendering import Renderer
@@ -41,8 +39,6 @@ def project_masks(layer: MaskLayer, state: ProjectState, recording: Recording) -
 
     Args:
         layer: imported masks, or rendered masks corrected with a brush.
-        state: of the project.
-        recording: of the project.
     """
     cameras = [camera.name for camera in recording.scene.cameras]
     if layer == "imported":
@@ -52,8 +48,25 @@ def project_masks(layer: MaskLayer, state: ProjectState, recording: Recording) -
     offset = state.get(Key.time_offset())
     if offset is not None and recording.matching is not None:
         recording = recording.with_time_offset(offset.seconds)
-    painted = _Painted(state, recording.scene, lambda index: recording.frame(index, cameras=[]))
-    return GivenMasks("painted mask", painted.masks, painted.there, partial(_ignored, state, cameras))
+    scene, sequence = recording.scene, recording
+
+    @cache
+    def renderer(name: str) -> Renderer:
+        own = scene.camera(name)
+        return Renderer(scene, width=own.width, height=own.height, cameras=[name])
+
+    def masks(index: int) -> Masks:
+        corrections = {name: state.get(Key.mask_correction(index, name)) for name in cameras}
+        known = {name: correction for name, correction in corrections.items() if correction is not None}
+        if not known:
+            return {}
+        pose = corrected_state(scene, sequence.frame(index, cameras=[]), state)
+        return {name: known[name].applied_to(renderer(name).segment(pose)[0] >= 0) for name in known}
+
+    def there(index: int, camera: str) -> bool:
+        return state.get(Key.mask_correction(index, camera)) is not None
+
+    return GivenMasks("painted mask", masks, there, partial(_ignored, state, cameras))
 
 
 def file_masks(source: Path, recording: Recording) -> GivenMasks:
@@ -115,34 +128,6 @@ def _ignored(state: ProjectState, cameras: Iterable[str], index: int) -> Masks:
     return {name: region.region() for name, region in regions.items() if region is not None}
 
 
-class _Painted:
-    """Masks rendered at the poses of a project, with the user's corrections."""
-
-    def __init__(self, state: ProjectState, scene: Scene, load: Callable[[int], Frame]) -> None:
-        self._state, self._scene, self._load = state, scene, load
-        self._renderers: dict[str, Renderer] = {}
-
-    def there(self, index: int, camera: str) -> bool:
-        """Whether the mask of a frame was corrected."""
-        return self._state.get(Key.mask_correction(index, camera)) is not None
-
-    def masks(self, index: int) -> Masks:
-        """Camera -> mask of a frame, for cameras with a correction."""
-        found: Masks = {}
-        for camera in self._scene.cameras:
-            correction = self._state.get(Key.mask_correction(index, camera.name))
-            if correction is not None:
-                pose = corrected_state(self._scene, self._load(index), self._state)
-                found[camera.name] = correction.applied_to(self._renderer(camera.name).segment(pose)[0] >= 0)
-        return found
-
-    def _renderer(self, name: str) -> Renderer:
-        if name not in self._renderers:
-            own = self._scene.camera(name)
-            self._renderers[name] = Renderer(self._scene, width=own.width, height=own.height, cameras=[name])
-        return self._renderers[name]
-
-
 _SHOWN = 5
 """Largest number of remarks in a sentence."""
 
@@ -188,8 +173,6 @@ def import_annotations(
     """Import annotations into a project. Painted layers and the recording's own masks are kept.
 
     Args:
-        project: open for writing.
-        annotations: of the same sequence.
         source: name of the file or folder, for the history.
         replace: whether layers that were imported before may be replaced by others.
 

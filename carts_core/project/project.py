@@ -15,7 +15,7 @@ from ..wording import counted
 from . import database, journal
 from .identity import SequenceIdentity, default_path
 from .state import ExportRecord, ProjectState, Step, by_revision, step_at
-from .store import Store, Writable, open_or_begin, read_project
+from .store import Store, open_or_begin, read_project
 from .values import WHOLE_PROJECT, Edits, Figures, FitVerdict, Key, check_edit
 
 if TYPE_CHECKING:
@@ -53,8 +53,6 @@ class Project:
         read_only_reason: why nothing can be saved, as a sentence; None if it can.
 
     Args:
-        identity: of the sequence.
-        path: the file, created if it is missing.
         read_only: do not write; later edits of other processes are not seen.
 
     Raises:
@@ -190,9 +188,6 @@ class Project:
 
         Nothing is changed. A frame that is restored to its state before the step regains its verdict and figures.
 
-        Args:
-            number: of a step that is done.
-
         Raises:
             ProjectError: there is no such step, or a later one has changed the same.
         """
@@ -247,12 +242,6 @@ class Project:
     def log_export(self, format: str, path: Path, frames: int, settings: Mapping[str, Any]) -> None:
         """Log a finished export. Not an undo step.
 
-        Args:
-            format: its name.
-            path: the file or folder that was written.
-            frames: how many frames it holds.
-            settings: values for JSON.
-
         Raises:
             ProjectError: it could not be saved.
         """
@@ -296,12 +285,12 @@ class Project:
         with database.errors_explained(self._path):
             if self.read_only_reason is not None:
                 return read_project(self._path, identity)
-            opened = open_or_begin(self._path, identity)
-        if isinstance(opened, Writable):
-            self._store = opened.store
+            state, store = open_or_begin(self._path, identity)
+        if isinstance(store, Store):
+            self._store = store
         else:
-            self.read_only_reason = opened.reason
-        return opened.state
+            self.read_only_reason = store
+        return state
 
     def _writer(self) -> Store:
         if self._store is None:

@@ -133,10 +133,9 @@ class ProjectState:
         return None if entry is None else entry.value
 
     def changed(self, edits: Edits) -> dict[Key[Any], Any]:
-        """Edits that change something; a verdict on another pose always does.
+        """Edits that change something, among them all verdicts on a changed pose.
 
-        An accepted frame that becomes another one is not accepted any more, unless an edit says what its review is.
-        That belongs to the same step, so undo accepts it again.
+        A change of an accepted frame withdraws its acceptance in the same step, unless an edit sets its review.
         """
         changed = {key: value for key, value in edits.items() if self.get(key) != value}
         moved = {key.frame for key in changed if key.kind not in _MARKS}
@@ -306,7 +305,6 @@ def next_unreviewed(state: ProjectState, after: int, step: int = 1, within: rang
     """The next frame without review, cyclically; None if there is none.
 
     Args:
-        state: of the project.
         after: index of the present frame, which comes last.
         step: 1 forwards, -1 backwards.
         within: frames to stay in, of which the present one is one; None: all of them.
@@ -338,7 +336,6 @@ def worst_first(
     """Frames sorted by decreasing badness of fit; those without figures come last, in order.
 
     Args:
-        state: of the project.
         frames: indices to order, by default all.
         badness: larger is worse, None unknown. By default 1 - Dice if any of the frames has Dice, else the probability
             of a failure if any has a verdict, else the loss.

@@ -27,6 +27,13 @@ from .values import Figures, Key, Kind, check_edit, decode
 
 UNREADABLE = (ValueError, TypeError, KeyError, AttributeError, OverflowError, RecursionError, MemoryError)
 """Errors of decoding untrusted values, besides `ProjectError`."""
+_TYPES: dict[str, tuple[Any, ...]] = {
+    "steps": (int, str, float),
+    "changes": (str, int, str, int, str | bytes | None),
+    "figures": (int, int, float | None, float | None),
+    "exports": (float, str, str, int, str),
+}
+"""Types of a row's values."""
 _LISTED = 5
 _LOST_STEP = "A step whose name was lost to damage"
 
@@ -52,8 +59,8 @@ def rescue(copy: Copy, identity: SequenceIdentity) -> Rescued | None:
     old = copy.connection
     rescued = Rescued(database.empty(identity))
     tables = {table: list(_rows(copy, table, rescued)) for table in TABLES}
-    tables["changes"] = [row for row in tables["changes"] if _fits(identity, row, rescued)]
-    tables["figures"] = [row for row in tables["figures"] if _is_figure(identity, row, rescued)]
+    for table in ("changes", "figures"):
+        tables[table] = [row for row in tables[table] if _fits(identity, table, row, rescued)]
     names = {number: (name, time) for number, name, time in tables["steps"]}
     numbers = sorted(names.keys() | {row[3] for row in tables["changes"]})
     renumbered = {old_number: number for number, old_number in enumerate(numbers, start=1)} | {0: 0}
@@ -94,7 +101,8 @@ def _rows(copy: Copy, table: str, rescued: Rescued) -> Iterator[tuple]:
                     if number in seen:
                         continue
                     seen.add(number)
-                    if (sealed and row_digest(table, row) != written) or not _has_types(table, row):
+                    typed = all(isinstance(value, kind) for value, kind in zip(row, _TYPES[table], strict=True))
+                    if (sealed and row_digest(table, row) != written) or not typed:
                         rescued.lost.append(f"a row of {table}")
                     else:
                         yield tuple(row)
@@ -103,33 +111,18 @@ def _rows(copy: Copy, table: str, rescued: Rescued) -> Iterator[tuple]:
             rescued.lost.append(f"a part of {table}")
 
 
-def _has_types(table: str, row: list[Any]) -> bool:
-    types: dict[str, tuple[type | tuple[type, ...], ...]] = {
-        "steps": (int, str, float),
-        "changes": (str, int, str, int, (str, bytes, type(None))),
-        "figures": (int, int, (float, type(None)), (float, type(None))),
-        "exports": (float, str, str, int, str),
-    }
-    return all(isinstance(value, kind) for value, kind in zip(row, types[table], strict=True))
-
-
-def _fits(identity: SequenceIdentity, row: tuple, rescued: Rescued) -> bool:
-    kind, frame, name, _, value = row
+def _fits(identity: SequenceIdentity, table: str, row: tuple, rescued: Rescued) -> bool:
+    """Whether a row of changes or figures belongs to a sequence."""
+    what, frame = row[:2] if table == "changes" else (table, row[0])
     try:
-        key: Key[Any] = Key(Kind(kind), frame, name)
-        check_edit(identity, key, decode(key.kind, value))
-    except (database.ProjectError, *UNREADABLE):
-        rescued.lost.append(f"{kind} of frame number {frame}")
-        return False
-    return True
-
-
-def _is_figure(identity: SequenceIdentity, row: tuple, rescued: Rescued) -> bool:
-    try:
-        check_edit(identity, Key.review(row[0]), None)
-        Figures(*row[2:])
-    except (database.ProjectError, *UNREADABLE):
-        rescued.lost.append(f"figures of frame number {row[0]}")
+        if table == "changes":
+            key: Key[Any] = Key(Kind(what), frame, row[2])
+            check_edit(identity, key, decode(key.kind, row[4]))
+        else:
+            check_edit(identity, Key.review(frame), None)
+            Figures(*row[2:])
+    except (ProjectError, *UNREADABLE):
+        rescued.lost.append(f"{what} of frame number {frame}")
         return False
     return True
 
@@ -296,24 +289,11 @@ class Store:
         return file
 
 
-@dataclass(frozen=True)
-class Writable:
-    """A project open for writing."""
+def open_or_begin(path: Path, identity: SequenceIdentity) -> tuple[ProjectState, Store | str]:
+    """Open the project of a sequence; a missing one is created.
 
-    state: ProjectState
-    store: Store
-
-
-@dataclass(frozen=True)
-class ReadOnly:
-    """A project that another process has open for writing."""
-
-    state: ProjectState
-    reason: str
-
-
-def open_or_begin(path: Path, identity: SequenceIdentity) -> Writable | ReadOnly:
-    """Open the project of a sequence, for reading if another process writes to it; a missing one is created.
+    Returns:
+        Its state, and its store or, if another process writes to it, the reason why there is none.
 
     Raises:
         DamagedProject: it is damaged; what can be read of it is in a new file by now.
@@ -324,10 +304,10 @@ def open_or_begin(path: Path, identity: SequenceIdentity) -> Writable | ReadOnly
     file = ProjectFile.locked(path)
     if file is None:
         reason = f"It is open for writing elsewhere ({holder(path)}). Close it there, then open it again."
-        return ReadOnly(read_project(path, identity), reason)
+        return read_project(path, identity), reason
     try:
         memory, state, seal = _load(path, identity, keep_what_is_left=True)
-        return Writable(state, Store(memory, seal, state.position, file))
+        return state, Store(memory, seal, state.position, file)
     except LostFile as lost:
         file.abandon()
         raise ProjectError(f"project {path} {lost} while it was being opened. Open it again.") from lost
