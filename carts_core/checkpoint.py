@@ -25,7 +25,6 @@ class Checkpoint:
     """File of intermediate results.
 
     Args:
-        path: the file, created with the first entry.
         made_with: fingerprint of the common inputs; a file with another one is replaced.
         classes: the frozen dataclasses that values consist of, beside numbers, lists and float64 arrays.
 

@@ -65,7 +65,6 @@ def calibration_fingerprint(scene: Scene, cameras: Iterable[Camera]) -> str:
     """Fingerprint of the poses of arms and cameras, and of the cameras' intrinsics.
 
     Args:
-        scene: for its arms.
         cameras: as their images were recorded, with distortion.
     """
     arms = [(arm.name, arm.robot.base_link, np.asarray(arm.T_world_base)) for arm in scene.arms]

@@ -70,12 +70,7 @@ def table_html(table: Table) -> str:
 
 
 def figure_html(caption: str, path: PurePath) -> str:
-    """A picture with a caption.
-
-    Args:
-        caption: below it.
-        path: of the picture, relative to the page.
-    """
+    """A picture with a caption."""
     return (
         f'<figure><img src="{escape(path.as_posix())}" alt="{escape(caption)}">'
         f"<figcaption>{escape(caption)}</figcaption></figure>"

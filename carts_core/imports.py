@@ -14,10 +14,6 @@ from .errors import CartsError
 def needs_extra(module: str, extra: str) -> None:
     """Check that a module of an optional dependency is installed.
 
-    Args:
-        module: what will be imported.
-        extra: of this project, which brings it.
-
     Raises:
         CartsError: it is not installed.
     """

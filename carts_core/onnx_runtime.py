@@ -16,7 +16,6 @@ def inference_session(graph: bytes, threads: int | None = None, *, fold: bool = 
     """A session of an ONNX graph on the CPU.
 
     Args:
-        graph: content of an ONNX file.
         threads: for one operator; None lets ONNX Runtime choose.
         fold: compute constants when the graph is loaded; those of a foreign graph may take any amount of memory.
 

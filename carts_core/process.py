@@ -46,8 +46,8 @@ def tune_process() -> None:
 def _leave_a_core_free() -> None:
     """Limit torch to all cores but one, four at most, unless `OMP_NUM_THREADS` is set.
 
-    Every parallel step of torch waits for its slowest thread. When all cores are asked for and another process (or
-    our own web server) holds one of them, each step waits for the scheduler: an iteration of 0.1 s then takes 2.6 s.
+    Each parallel step waits for its slowest thread: with another process on one of the cores, an iteration of 0.1 s
+    took 2.6 s.
     """
     if "OMP_NUM_THREADS" not in os.environ:
         import torch  # noqa: PLC0415  child processes that need no torch import this module, too
@@ -59,8 +59,8 @@ def _leave_a_core_free() -> None:
 def inference_threads() -> int:
     """Number of threads for ONNX Runtime: torch's, or one per core, four at most, where a core was left free.
 
-    Its threads hand out work in small pieces, so that one that has to wait for a core holds up no other: with another
-    process on one or on both of two cores, two threads took .73 and .53 of the time of one.
+    Its threads share work in small pieces: with another process on one or both of two cores, two threads took .73 and
+    .53 of the time of one.
     """
     if _TUNED.core_left_free:
         return min(os.cpu_count() or 1, MOST_THREADS)
@@ -72,9 +72,8 @@ def inference_threads() -> int:
 def _keep_memory() -> None:
     """Make glibc keep the memory of images instead of returning it to the system.
 
-    The system hands out memory a page at a time, as it is first written to, and clears every page: a rendering of
-    640x480 px took 29 ms with that and 16 ms without, in one run beside other programs. `MALLOC_...` variables of the
-    environment count for more.
+    The system clears each page when it is first written to: a rendering of 640x480 px took 29 ms instead of 16 ms.
+    `MALLOC_...` variables of the environment take precedence.
     """
     mallopt = _of_malloc("mallopt")
     if mallopt is None:

@@ -54,10 +54,6 @@ def end_with_parent(parent: int, number: int = signal.SIGTERM) -> None:
 
     Linux sends the signal (`prctl(PR_SET_PDEATHSIG)`) when the thread that started this process ends. Elsewhere, a
     thread checks once a second.
-
-    Args:
-        parent: process id of the parent.
-        number: the signal.
     """
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, number)

@@ -1,9 +1,7 @@
 """Results that do not depend on torch's number of threads.
 
-Most operations give the same bits however many threads share them: each value is the work of one thread. Sums over a
-whole image are not among them (every thread adds up a part), nor are some kernels that torch, oneDNN and MKL choose by
-the number of threads. Their last bits would decide whether an optimization begins again elsewhere, so these few run in
-one thread, which costs little: the convolutions, which take the time, keep all of theirs.
+Sums over whole images, and kernels that torch, oneDNN and MKL select by the number of threads, differ in their last
+bits, which could trigger a restart of an optimization. These few operations run in one thread; convolutions use all.
 """
 
 from collections.abc import Iterator

@@ -38,7 +38,7 @@ AS_IS = SurfaceSolver()
 """What variants are compared with."""
 
 _PARTS = {
-    "images": ("imaging.haze.", "optimization.observation.", "optimization.counterfactual."),
+    "images": ("imaging.haze.", "optimization.observation.", "optimization.backgrounds."),
     "surface": ("optimization.factors.surface.",),
     "edges": ("imaging.haze.", "optimization.factors.edges."),
 }

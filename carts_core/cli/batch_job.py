@@ -145,18 +145,14 @@ def _steps(job: Job, folder: OutputPath, state: RunningJob, work: BatchWork) -> 
             done += 1
         if step in ("import", "calibrate"):
             sequence = (folder / _FOLDERS[step] / "sequence.toml").path
-    if not _has_findings(folder):
-        write_findings(job, folder, sequence)
-    return done
-
-
-def _has_findings(folder: OutputPath) -> bool:
-    """Whether findings exist; damaged ones are renamed."""
     try:
-        return read_findings(folder) is not None
+        there = read_findings(folder) is not None
     except (OSError, ValueError):
         set_aside(folder / FINDINGS_FILE)
-        return False
+        there = False
+    if not there:
+        write_findings(job, folder, sequence)
+    return done
 
 
 def _inference(step: Step, job: Job, inference: Inference) -> tuple[str, ...]:
@@ -176,22 +172,22 @@ _FOLDERS: dict[Step, str] = {"import": "recording", "calibrate": "calibration"}
 def _arguments(job: Job, step: Step, sequence: Path, folder: OutputPath) -> list[str]:
     """Arguments of a step's command before its options."""
     chosen = ["--camera", job.camera, *(["--domain", job.domain] if job.domain else [])]
+    output = str(folder / _FOLDERS.get(step, step))
     match step:
         case "import":
-            return [str(sequence), "--output", str(folder / "recording"), "--overwrite"]
+            arguments = ["--output", output, "--overwrite"]
         case "calibrate":
-            return [str(sequence), "--output", str(folder / "calibration"), "--overwrite", *chosen]
+            arguments = ["--output", output, "--overwrite", *chosen]
         case "optimize":
-            return [str(sequence), "--output", str(folder / "optimize"), *chosen]
+            arguments = ["--output", output, *chosen]
         case "sequence":
-            further = ["--mode", "sequence"]
-            return [str(sequence), "--output", str(folder / "sequence"), *further, *chosen]
+            arguments = ["--output", output, "--mode", "sequence", *chosen]
         case "evaluate":
-            return [str(sequence), "--json", str(folder / "evaluation.json"), *chosen]
+            arguments = ["--json", str(folder / "evaluation.json"), *chosen]
         case "export":
             table = _table(job, folder)
-            corrected = ["--kinematics", str(table)] if table else []
-            return [str(sequence), str(folder / "export"), "--overwrite", *corrected, *chosen]
+            arguments = [output, "--overwrite", *(["--kinematics", str(table)] if table else []), *chosen]
+    return [str(sequence), *arguments]
 
 
 def _table(job: Job, folder: OutputPath) -> Path | None:

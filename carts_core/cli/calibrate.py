@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence as Points
 
     from ..optimization import CalibrationOptimizer, CalibrationResult
-    from ..optimization.hand_eye import HandEyePrior, HandEyeResult, ImagePoint
+    from ..optimization.hand_eye import HandEyeResult, ImagePoint
     from ..recording import Sequence
 
 
@@ -183,6 +183,7 @@ class Calibrate:
     def run(self) -> None:
         """Calibrate; Ctrl-C or an error leaves no files."""
         from ..evaluation import frame_residuals, mean_dice, remark, write_calibration
+        from ..evaluation.calibration import beyond_prior
         from ..files import MARKER, published, write_text
         from ..optimization import Backgrounds, CalibrationOptimizer
         from ..optimization.hand_eye import read_prior
@@ -196,7 +197,9 @@ class Calibrate:
         output = output_folder(self.output, sequence.name, "calibration")
         observer = self.network.observer(self.solving.chosen, sequence)
         prior = read_prior(sequence)
-        free = self.free if prior is None else _with_locked_cameras(self.free, cameras, prior)
+        # Cameras whose pose was known before the hand-eye calibration are locked.
+        known_cameras = [name for name in cameras if prior is not None and name not in prior.free_cameras]
+        free = replace(self.free, locked_cameras=tuple(dict.fromkeys((*self.free.locked_cameras, *known_cameras))))
         observer.check(sequence, indices, cameras, [self.domain])
         with when_stopped(f"nothing was written to {output}"), published(output, overwrite=self.overwrite) as folder:
             frames = [observer.completed(sequence.frame(index, self.domain, cameras)) for index in indices]
@@ -218,8 +221,12 @@ class Calibrate:
                 known_base_frames=prior and prior.base_covariances,
             )
             result = _optimized(optimizer, console)
-            if prior and not self.beyond_hand_eye:
-                _check_moves(sequence, result, prior)
+            text = beyond_prior(sequence.scene, result, prior.base_covariances) if prior else None
+            if text is not None and not self.beyond_hand_eye:
+                raise SettingsError(
+                    f"{text[0].upper()}{text[1:]} Nothing was written. Check the clicked points, the joints and the "
+                    "masks, or write it all the same with --beyond-hand-eye."
+                )
             residuals = frame_residuals(sequence, frames, result)
             named = [sequence.frame_ids[index] for index in indices]
             write_calibration(folder, output.path, sequence, result, residuals)
@@ -264,27 +271,6 @@ def frame_indices(frames: str | None, positions: str | None, sequence: "Sequence
     from ..recording import spread
 
     return spread(len(sequence), int(count))
-
-
-def _with_locked_cameras(free: FreeParameters, cameras: list[str], prior: "HandEyePrior") -> FreeParameters:
-    """`free`, with the cameras locked whose pose was known before the hand-eye calibration."""
-    known = [camera for camera in cameras if camera not in prior.free_cameras]
-    return replace(free, locked_cameras=tuple(dict.fromkeys((*free.locked_cameras, *known))))
-
-
-def _check_moves(sequence: "Sequence", result: "CalibrationResult", prior: "HandEyePrior") -> None:
-    """Check that no base frame has moved beyond its prior.
-
-    Raises:
-        SettingsError: a base frame has.
-    """
-    from ..evaluation.calibration import beyond_prior
-
-    if (text := beyond_prior(sequence.scene, result, prior.base_covariances)) is not None:
-        raise SettingsError(
-            f"{text[0].upper()}{text[1:]} Nothing was written. Check the clicked points, the joints and the masks, or "
-            "write it all the same with --beyond-hand-eye."
-        )
 
 
 def _optimized(optimizer: "CalibrationOptimizer", console: Console) -> "CalibrationResult":

@@ -95,12 +95,18 @@ def main(arguments: list[str] | None = None) -> None:
                 return
             print_settings = "--print-settings" in arguments
             if "--help-all" in arguments:
-                print_all_help(arguments)
+                shown = [argument if argument != "--help-all" else "--help" for argument in arguments]
+                with contextlib.suppress(SystemExit):
+                    tyro.cli(Command, prog="carts", description=_DESCRIPTION, args=shown)  # pyright: ignore
+                print(settings_reference())
                 return
             arguments = [argument for argument in arguments if argument != "--print-settings"]
             command = _parsed(arguments)
             if print_settings:
-                print(_settings_of(command))
+                if not hasattr(command, "solving"):
+                    named = "`carts optimize`, `carts evaluate` and `carts calibrate`"
+                    raise SettingsError(f"--print-settings is for {named}.")
+                print(command.solving.printed())
                 return
         if not isinstance(command, _AT_ONCE):
             # Imports take seconds on a busy machine.
@@ -142,28 +148,6 @@ def _parsed(arguments: list[str]) -> Any:
         if found := _INVALID_CHOICE.search(" ".join(said.getvalue().replace("│", " ").split())):
             print(closest(found["given"], re.findall("'([^']*)'", found["known"])).strip(), file=sys.stderr)
         raise
-
-
-def print_all_help(arguments: list[str]) -> None:
-    """Print a command's options and then all settings that a settings file can hold."""
-
-    try:
-        shown = [argument if argument != "--help-all" else "--help" for argument in arguments]
-        tyro.cli(Command, prog="carts", description=_DESCRIPTION, args=shown)  # pyright: ignore
-    except SystemExit:
-        print(settings_reference())
-
-
-def _settings_of(command: object) -> str:
-    """Settings of a command as a settings file.
-
-    Raises:
-        SettingsError: the command has no settings.
-    """
-    solving = getattr(command, "solving", None)
-    if solving is None:
-        raise SettingsError("--print-settings is for `carts optimize`, `carts evaluate` and `carts calibrate`.")
-    return solving.printed()
 
 
 @contextmanager

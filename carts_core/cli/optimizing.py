@@ -50,11 +50,7 @@ class _Part:
 
 
 class Optimizing:
-    """Corrects the chosen frames and writes the results.
-
-    Args:
-        asked: options of the command.
-    """
+    """Corrects the chosen frames and writes the results."""
 
     def __init__(self, asked: OptimizeOptions) -> None:
         self._asked, self._console, self._solver = asked, Terminal(), asked.solving.chosen

@@ -372,7 +372,7 @@ class SolverOptions:
 
     def printed(self) -> str:
         """All settings as a settings file."""
-        return printed({"solver": to_plain(self.chosen), "sequence": to_plain(self.sequence)})
+        return tomlkit.dumps({"solver": to_plain(self.chosen), "sequence": to_plain(self.sequence)})
 
 
 @dataclass(frozen=True)
@@ -393,12 +393,7 @@ class CalibrationOptions:
 
     def printed(self) -> str:
         """All settings as a settings file."""
-        return printed({"solver": to_plain(self.chosen)})
-
-
-def printed(tables: dict[str, Any]) -> str:
-    """Tables as TOML."""
-    return tomlkit.dumps(tables)
+        return tomlkit.dumps({"solver": to_plain(self.chosen)})
 
 
 def _table(given: tuple[str, ...], name: str) -> dict[str, Any]:
@@ -409,8 +404,14 @@ def _table(given: tuple[str, ...], name: str) -> dict[str, Any]:
     """
     found: dict[str, Any] = {}
     for text in given:
-        single = "=" in text and not Path(text).exists()
-        content = _parsed(text, _of_solver(text) if single else _read(Path(text)))
+        remedy = "Give a file as --print-settings writes, or `NAME=VALUE`."
+        try:
+            single = "=" in text and not Path(text).exists()
+            content = parse_toml(_of_solver(text) if single else read_text(Path(text), SETTINGS))
+        except (OSError, UnicodeDecodeError) as error:
+            raise SettingsError(f"--settings {text} cannot be read: {error}. {remedy}") from error
+        except ValueError as error:
+            raise SettingsError(f"--settings {text} is not TOML: {error}. {remedy}") from error
         strangers = set(content) - {"solver", "sequence", "free"}
         if strangers or not all(isinstance(table, dict) for table in content.values()):
             wrong = ", ".join(sorted(strangers)) or "values outside tables"
@@ -430,24 +431,6 @@ def _of_solver(text: str) -> str:
     except ValueError:
         value = json.dumps(value)
     return f"{key} = {value}"
-
-
-def _read(path: Path) -> str:
-    try:
-        return read_text(path, SETTINGS)
-    except (OSError, UnicodeDecodeError) as error:
-        raise SettingsError(
-            f"--settings {path} cannot be read: {error}. Name a file as --print-settings writes, or `NAME=VALUE`."
-        ) from error
-
-
-def _parsed(given: str, text: str) -> dict[str, Any]:
-    try:
-        return parse_toml(text)
-    except ValueError as error:
-        raise SettingsError(
-            f"--settings {given} is not TOML: {error}. Give a file as --print-settings writes, or `NAME=VALUE`."
-        ) from error
 
 
 RECORDING = "recording"
@@ -523,7 +506,6 @@ class Observer:
         """Warnings from one frame: the network is not suited to these arms or images, or masks of cameras are missing.
 
         Args:
-            sequence, index, domain, cameras: which frame.
             background: whether the solver knows the empty background.
         """
         if self.masked:

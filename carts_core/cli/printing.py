@@ -25,12 +25,7 @@ def print_hints(console: Console, *hints: str | None) -> None:
 
 
 def kept_start_hint(where: str, stopped: Sequence[str]) -> str | None:
-    """Hint where estimates are equal to their start; None if there are none.
-
-    Args:
-        where: camera, or another description of the frames.
-        stopped: reason why each optimization ended.
-    """
+    """Hint where estimates are equal to their start; None if there are none."""
     kept = sum(reason == "start kept" for reason in stopped)
     if not kept:
         return None
@@ -46,7 +41,6 @@ def verdict_line(
     """Verdicts on masks, and numbers of undetermined joints; None where nothing was assessed.
 
     Args:
-        where: camera, or another description of the frames.
         verdicts: of each run, None where it was not assessed.
         undetermined: `ARM.JOINT` of the undetermined joints of each run, None where that is not known.
     """
@@ -59,12 +53,7 @@ def verdict_line(
 
 
 def verdict_hints(where: str, assessed: Mapping[str, Assessment | None]) -> list[str]:
-    """A line for each reason why results are doubtful or failed.
-
-    Args:
-        where: camera, or another description of the frames.
-        assessed: id of each frame -> its assessment.
-    """
+    """A line for each reason why results are doubtful or failed."""
     frames: dict[tuple[str, str, str], list[str]] = {}
     for frame_id, found in assessed.items():
         if found is not None and found.verdict is not Verdict.GOOD:
@@ -96,7 +85,6 @@ def base_frame_hint(where: str, gains: Sequence[float | None]) -> str | None:
     """Hint where base frames are probably wrong, on average over frames; None elsewhere.
 
     Args:
-        where: camera, or another description of the frames.
         gains: share of each frame's residual that free base frames would explain, None where that is not known.
     """
     known = [gain for gain in gains if gain is not None]
@@ -121,8 +109,6 @@ def constant_correction_hint(where: str, sequence: recording.Sequence, rows: Seq
     Joints compensate for a wrong focal length or base frame: the image fits, and the joints are wrong.
 
     Args:
-        where: description of the frames.
-        sequence: with the measured joint positions.
         rows: results; only optimized ones count.
     """
     scene, position = sequence.scene, {frame_id: index for index, frame_id in enumerate(sequence.frame_ids)}

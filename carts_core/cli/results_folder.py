@@ -60,11 +60,8 @@ class FrameInputs:
     """Fingerprints of the inputs of frames, for some cameras in a domain. No image is decoded.
 
     Args:
-        sequence, cameras, domain: the frames.
-        observer: source of the observations.
         start: position of a frame -> arm -> joint positions where the optimization starts [dofs] [rad, m].
         backgrounds: camera name -> mean background that frames are compared with, where there is one.
-        settings: the requested settings, as JSON.
     """
 
     def __init__(
@@ -179,12 +176,6 @@ def row_fingerprint(scene: Scene, row: KinematicsRow) -> str:
     return fingerprint(row.frame_id, row.source, [f"{value:.9g}" for value in values], *verdict)
 
 
-def records_text(records: Mapping[str, Record]) -> str:
-    """Contents of results.json, one frame a line."""
-    lines = [f"{json.dumps(frame_id)}: {json.dumps(asdict(record))}" for frame_id, record in records.items()]
-    return f'{{"format": "{_FORMAT}", "frames": {{\n' + ",\n".join(lines) + "\n}}\n"
-
-
 def read_records(path: OutputPath) -> dict[str, Record]:
     """Records by frame; empty where the file is missing or damaged, so that all results are redone.
 
@@ -224,10 +215,7 @@ class FrameFolder:
     frame counts only if all its files were written. Nothing is created or changed before the first frame is written.
 
     Args:
-        sequence, cameras: whose frames these are.
-        folder: where to write.
         settings: of the run; a folder with results of another `sequence` is not written to.
-        overwrite: discard earlier results.
 
     Attributes:
         rows: of the kinematics table.
@@ -282,19 +270,20 @@ class FrameFolder:
         """Reason why the result of a frame is not up to date; None if it is.
 
         Args:
-            frame_id: of a frame in `rows`.
             origin: fingerprints of its present inputs; kinds that are missing here are not compared.
         """
         record = self._records.get(frame_id)
-        row = self._row(frame_id)
+        row = self.rows[bisect_left(self.rows, self._order[frame_id], key=lambda row: self._order[row.frame_id])]
         if record is None:
             return "what they were made from is not known"
         if record.row != row_fingerprint(self._scene, row):
             return "their rows in the table were changed"
         if changed := changes(record.origin, origin):
             return changed
-        if any(self._mask_fingerprint(frame_id, camera) != record.masks.get(camera) for camera in self._masks):
-            return "their masks are missing or damaged"
+        for camera, folder in self._masks.items():
+            path = folder / f"{frame_id}.png"
+            if not holds_file(path) or fingerprint(path.path.read_bytes()) != record.masks.get(camera):
+                return "their masks are missing or damaged"
         return None
 
     def others_dropped(self, chosen: Several[str]) -> int:
@@ -309,7 +298,10 @@ class FrameFolder:
             return
         with finished_first():
             if not self._goes_on:
-                self._start_over()
+                names = [masks / f"{name}.png" for name in self._written_before() for masks in self._masks.values()]
+                for path in (*names, self._table, self._records_file):
+                    remove_file(path)
+                self._goes_on = True
             if self._settings_written() != self._settings:
                 write_text(self._settings_file, json.dumps(self._settings, indent=1))
             for result in found:
@@ -333,15 +325,10 @@ class FrameFolder:
             # A frame counts if all three files list it, so that a kill between them has it redone.
             write_text(self._table, kinematics_csv(self._scene, self.rows))
             known = {row.frame_id: self._records[row.frame_id] for row in self.rows if row.frame_id in self._records}
-            write_text(self._records_file, records_text(known))
-
-    def _start_over(self) -> None:
-        for frame_id in self._written_before():
-            for masks in self._masks.values():
-                remove_file(masks / f"{frame_id}.png")
-        remove_file(self._table)
-        remove_file(self._records_file)
-        self._goes_on = True
+            # One frame a line.
+            lines = [f"{json.dumps(frame_id)}: {json.dumps(asdict(record))}" for frame_id, record in known.items()]
+            content = f'{{"format": "{_FORMAT}", "frames": {{\n' + ",\n".join(lines) + "\n}}\n"
+            write_text(self._records_file, content)
 
     def _written_before(self) -> list[str]:
         """Frames of this sequence with results in the folder, under any settings."""
@@ -350,14 +337,6 @@ class FrameFolder:
         lines = self._table.path.read_text(encoding="utf-8", errors="replace").splitlines()
         ids = {line.partition(",")[0] for line in lines} | set(read_records(self._records_file))
         return [frame_id for frame_id in self._order if frame_id in ids]
-
-    def _mask_fingerprint(self, frame_id: str, camera: str) -> str | None:
-        path = self._masks[camera] / f"{frame_id}.png"
-        return fingerprint(path.path.read_bytes()) if holds_file(path) else None
-
-    def _row(self, frame_id: str) -> KinematicsRow:
-        place = bisect_left(self.rows, self._order[frame_id], key=lambda row: self._order[row.frame_id])
-        return self.rows[place]
 
     @cached_property
     def _renderers(self) -> dict[str, Renderer]:

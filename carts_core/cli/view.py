@@ -3,7 +3,7 @@
 import gc
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
@@ -45,33 +45,23 @@ class View:
         # Otherwise each garbage collection would search all modules and stop the page for 0.2 s.
         gc.freeze()
         segmenter = self._segmenter()
-        if self.sequence is None or is_batch(self.sequence):
-            if self.project is not None:
-                raise SettingsError("--project is of a sequence, and none is named. Name its sequence file, too.")
-            serve_site(
-                self.root or (Path(), *([self.sequence] if self.sequence is not None else [])),
-                host=self.host,
-                port=self.port,
-                device=self.network.processor,
-                inference=self.network.inference,
-                weights=self.network.weights,
-                segmenter=segmenter,
-                open_browser=self.open_browser,
-                batch=None if self.sequence is None else self.sequence.resolve(),
-            )
+        options: dict[str, Any] = {
+            "host": self.host,
+            "port": self.port,
+            "device": self.network.processor,
+            "inference": self.network.inference,
+            "weights": self.network.weights,
+            "segmenter": segmenter,
+            "open_browser": self.open_browser,
+        }
+        if self.sequence is not None and not is_batch(self.sequence):
+            serve(self.sequence, project=self.project, folders=self.root, **options)
             return
-        serve(
-            self.sequence,
-            project=self.project,
-            folders=self.root,
-            host=self.host,
-            port=self.port,
-            device=self.network.processor,
-            inference=self.network.inference,
-            weights=self.network.weights,
-            segmenter=segmenter,
-            open_browser=self.open_browser,
-        )
+        if self.project is not None:
+            raise SettingsError("--project is of a sequence, and none is named. Name its sequence file, too.")
+        batch = None if self.sequence is None else self.sequence.resolve()
+        roots = self.root or (Path(), *([self.sequence] if self.sequence is not None else []))
+        serve_site(roots, batch=batch, **options)
 
     def _segmenter(self) -> "Segmenter | None":
         if self.segmenter is None:

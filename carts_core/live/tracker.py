@@ -16,7 +16,7 @@ from jaxtyping import Float
 
 from ..model.scene import Scene, SceneState
 from ..networks.extractor import FeatureExtractor
-from ..optimization.counterfactual import Backgrounds
+from ..optimization.backgrounds import Backgrounds
 from ..optimization.error_model import ErrorModel, Gaussian, combined
 from ..optimization.measurement import FrameSolver, Measurement
 from ..optimization.predictor import SurfacePredictor, predictor_of

@@ -15,14 +15,14 @@ HALF_PIXEL = 0.5
 """Offset of pixel centres: +0.5 here and 0 in OpenCV, so OpenCV's principal point is smaller by this [px]."""
 
 DISTORTION_LENGTHS = (0, 4, 5, 8, 12, 14)
-"""How many coefficients OpenCV's distortion models have."""
+"""Numbers of coefficients of OpenCV's distortion models."""
 
 RIGID_TOLERANCE = 1e-3
-"""How far R^T R may be from the identity, in any element."""
+"""Largest deviation of R^T R from the identity, per element [1]."""
 EXACT = 1e-9
 """Rotations that deviate less than this from rigid ones are not changed; others are projected onto SO(3)."""
 LAST_ROW_TOLERANCE = 1e-6
-"""How far the last row may be from 0, 0, 0, 1, as matrices in single precision are."""
+"""Largest deviation of the last row from 0, 0, 0, 1, for matrices in single precision [1]."""
 
 T_DVRK_OPENCV = np.diag([-1.0, -1.0, 1.0, 1.0])
 """From OpenCV's camera frame (x right, y down) to the dVRK's (x left, y up); its own inverse."""
@@ -43,7 +43,6 @@ def rigid_transform(value: ArrayLike, what: str) -> Float[np.ndarray, "4 4"]:
 
     Args:
         value: 4x4 numbers, translation in [m].
-        what: how errors call it, say "T_camera_world".
 
     Raises:
         SettingsError: not 4x4, not finite, or not a rotation with a translation.
@@ -87,7 +86,6 @@ def implausible_intrinsics(
     Args:
         width, height: of the images [px].
         intrinsics: fx, fy, cx, cy [px].
-        distortion: OpenCV's coefficients.
     """
     fx, fy, cx, cy = intrinsics
     size = f"images of {width} x {height} px"
@@ -113,7 +111,7 @@ def implausible_intrinsics(
 def _folds(
     width: int, height: int, intrinsics: tuple[float, float, float, float], distortion: tuple[float, ...]
 ) -> bool:
-    """Whether radial distortion is not monotonic over the image; its corners are where it begins."""
+    """Whether radial distortion is not monotonic within the image's corners."""
     fx, fy, cx, cy = intrinsics
     k = [*distortion, *[0.0] * 8]
     reach = np.hypot(max(cx, width - cx) / fx, max(cy, height - cy) / fy)
@@ -176,7 +174,6 @@ class Camera:
 
         Args:
             image: an image as recorded, `uint8` or floating point, or a `bool` mask (nearest neighbour then).
-            interpolation: one of OpenCV's flags.
 
         Raises:
             SettingsError: the image has another size than the camera.

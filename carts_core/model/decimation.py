@@ -15,7 +15,7 @@ LIBRARIES = {"fewest": ("fast_simplification", "scipy.spatial")}
 _SECONDS = 12.0
 """Of computing, not of waiting for a processor."""
 _SECONDS_PER_FACE = 1e-4
-"""Some five times what meshes of instruments need."""
+"""About five times the need of instrument meshes."""
 _MEMORY = 2 * GIB
 _FEWER = 0.6
 """Triangles of a trial, relative to those of the one before."""
@@ -41,7 +41,6 @@ def decimated(
 
     Args:
         vertices: of the mesh [m].
-        faces: its triangles.
         tolerance: how far points of either surface may be from the other one [m].
 
     Raises:

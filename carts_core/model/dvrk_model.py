@@ -47,9 +47,6 @@ class Instrument:
 def list_instruments(model: Path) -> dict[str, Instrument]:
     """The instruments of a model tree, by number.
 
-    Args:
-        model: folder of the checkout, with `package.xml` and `urdf/`.
-
     Raises:
         RobotError: it is no such folder.
     """
@@ -103,8 +100,6 @@ def dvrk_urdf(model: Path, number: str, folder: Path) -> str:
     Its root is the DH base of the arm, in the remote centre; joints are called as in the sequence format.
 
     Args:
-        model: folder of the checkout.
-        number: of the instrument.
         folder: where the URDF will lie; meshes are named from there, and stay where they are.
 
     Raises:

@@ -54,7 +54,7 @@ def keypoints(arm: Arm) -> tuple[Keypoint, ...]:
 def project_keypoints(
     scene: Scene, state: SceneState, points: Sequence[Keypoint], camera: str
 ) -> Float[Tensor, "points 2"]:
-    """Where the points are in a camera's image [px], differentiable; NaN behind the camera.
+    """Projections of points into a camera's image [px], differentiable; NaN behind the camera.
 
     Raises:
         RobotError: there is no such camera or arm.
@@ -104,9 +104,13 @@ def _joints(robot: Robot, depth: np.ndarray) -> list[tuple[int, str]]:
     return named
 
 
+def _vertices(robot: Robot, link: int) -> Float[np.ndarray, "V 3"]:
+    return np.concatenate([mesh.vertices for mesh in robot.meshes if mesh.link == link]).astype(np.float64)
+
+
 def _tip(robot: Robot, link: int) -> tuple[float, float, float]:
     """The point of a link's meshes that is furthest from its joint."""
-    vertices = np.concatenate([mesh.vertices for mesh in robot.meshes if mesh.link == link]).astype(np.float64)
+    vertices = _vertices(robot, link)
     x, y, z = vertices[np.linalg.norm(vertices, axis=-1).argmax()]
     return float(x), float(y), float(z)
 
@@ -149,7 +153,7 @@ class Landmark:
     """Of the cylinder [m]."""
 
     def positions(self, Ts_base_link: Float[np.ndarray, "links 4 4"]) -> Float[np.ndarray, "points 3"]:
-        """Where its points are in the arm's base frame [m]: one for a point, two for a line."""
+        """Positions in the arm's base frame [m]: one for a point, two for a line."""
         found = np.stack([(Ts_base_link[link] @ (*position, 1.0))[:3] for link, position in self.points])
         return found.mean(0, keepdims=True) if self.kind is LandmarkKind.POINT else found
 
@@ -187,7 +191,7 @@ def landmarks(arm: Arm) -> Mapping[str, Landmark]:
 def link_transforms(
     arm: Arm, joint_positions: Float[np.ndarray, "frames dofs"]
 ) -> Float[np.ndarray, "frames links 4 4"]:
-    """Where the links are in the arm's base frame, in double precision."""
+    """Ts_base_link [m] in double precision."""
     return arm.robot.forward_kinematics(torch.as_tensor(np.asarray(joint_positions, np.float64))).numpy()
 
 
@@ -195,7 +199,7 @@ def _shaft(arm: Arm) -> tuple[int, tuple[float, float, float], tuple[float, floa
     """Link, two ends of the axis in the link's frame and radius [m] of the longest slender link; None without one."""
     best, longest = None, 0.0
     for link in range(len(arm.robot.link_names)):
-        vertices = np.concatenate([mesh.vertices for mesh in arm.robot.meshes if mesh.link == link]).astype(np.float64)
+        vertices = _vertices(arm.robot, link)
         centre = vertices.mean(0)
         _, _, directions = np.linalg.svd(vertices - centre, full_matrices=False)
         # A tube's vertices are at its ends mainly, so that the first direction is the tube's own.

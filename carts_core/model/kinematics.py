@@ -41,7 +41,7 @@ def exact_right_angles(root: Element) -> None:
 
 
 def _skeleton(urdf_text: str) -> str:
-    """The URDF's links and joints alone: what the kinematics parser needs, and nothing that it warns about."""
+    """Links and joints of the URDF, without elements that the kinematics parser warns about."""
     root = ElementTree.fromstring(urdf_text)
     for child in list(root):
         if child.tag not in ("link", "joint"):
@@ -62,10 +62,8 @@ class Kinematics:
     """Transforms of a robot's links from its independent joint positions.
 
     Args:
-        model: the parsed URDF.
         urdf_text: its text, with exact right angles.
         base_link: the frame that transforms are given in; it must not move with any joint.
-        source: file named in errors.
     """
 
     def __init__(self, model: yourdfpy.URDF, urdf_text: str, base_link: str | None, source: Path) -> None:

@@ -36,14 +36,13 @@ def fingerprint(files: Iterable[Path], *settings: object) -> str:
 
 
 Made = tuple[tuple[LinkMesh, ...], Decimation]
-"""Meshes of links, and what became of those of the files."""
+"""Meshes of links, and a summary of their decimation."""
 
 
 def kept(key: str, make: Callable[[], Made]) -> Made:
-    """What is stored under `key`, made and stored if nothing is.
+    """The entry of `key`; a missing one is computed and stored.
 
-    Of many processes that open a robot at once, as in a batch, one makes it, and the others wait for that and have it;
-    where the cache cannot be written to or locked, none waits.
+    Concurrent processes wait for the one that computes it, unless the cache cannot be locked.
     """
     if (stored := read(key)) is not None:
         return stored
@@ -58,24 +57,18 @@ def kept(key: str, make: Callable[[], Made]) -> Made:
 
 
 def read(key: str) -> Made | None:
-    """Meshes stored under `key` and what became of them, or None when there are none (or the file is damaged)."""
+    """The entry of `key`; None if it is missing or damaged."""
     try:
         with (
             open_regular(cache_dir() / f"{key}.npz", CACHED) as file,
             np.load(file, allow_pickle=False) as stored,
         ):
-            meshes = tuple(
-                LinkMesh(
-                    int(stored[f"{i}_link"]),
-                    stored[f"{i}_vertices"],
-                    stored[f"{i}_normals"],
-                    stored[f"{i}_faces"],
-                    stored[f"{i}_color"],
-                    bool(stored[f"{i}_closed"]),
-                )
-                for i in range(int(stored["count"]))
-            )
-            return meshes, Decimation(int(stored["before"]), int(stored["after"]), float(stored["deviation"]))
+            meshes = []
+            for i in range(int(stored["count"])):
+                arrays = {name: stored[f"{i}_{name}"] for name in ("vertices", "normals", "faces", "color")}
+                link, closed = int(stored[f"{i}_link"]), bool(stored[f"{i}_closed"])
+                meshes.append(LinkMesh(link=link, closed=closed, **arrays))
+            return tuple(meshes), Decimation(int(stored["before"]), int(stored["after"]), float(stored["deviation"]))
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error):
         return None
 
@@ -91,8 +84,5 @@ def write(key: str, meshes: tuple[LinkMesh, ...], decimation: Decimation) -> Non
     for i, mesh in enumerate(meshes):
         for field in ("link", "vertices", "normals", "faces", "color", "closed"):
             arrays[f"{i}_{field}"] = np.asarray(getattr(mesh, field))
-    try:
-        with output_stream(output_path(cache_dir(), f"{key}.npz")) as stream:
-            np.savez(stream, allow_pickle=False, **arrays)
-    except OutputError:
-        return
+    with suppress(OutputError), output_stream(output_path(cache_dir(), f"{key}.npz")) as stream:
+        np.savez(stream, allow_pickle=False, **arrays)

@@ -29,7 +29,7 @@ _UNIT = re.compile(rb"<unit\b[^>]*?\bmeter\s*=\s*[\"']\s*([0-9.eE+-]+)\s*[\"']")
 _UP_AXIS = re.compile(rb"<up_axis>\s*([XYZ]_UP)\s*</up_axis>")
 
 _PACKAGE_LEVELS = 6
-"""How many folders above the URDF's own a ROS package is looked for in."""
+"""Number of parent folders of the URDF that are searched for a ROS package."""
 
 
 def mesh_path(urdf_folder: Path, name: str) -> Path:
@@ -38,10 +38,6 @@ def mesh_path(urdf_folder: Path, name: str) -> Path:
     `package://NAME/REST` is looked for as ROS lays packages out: `REST` inside the folder of the URDF or one above it
     (`NAME/urdf` beside `NAME/meshes`), or inside a folder `NAME` in one of these. `file://` and plain paths are taken
     as they are; relative ones belong to the URDF's folder.
-
-    Args:
-        urdf_folder: folder of the URDF, absolute.
-        name: as the URDF has it.
     """
     scheme, mark, rest = name.partition("://")
     if not mark:
@@ -73,11 +69,6 @@ def read_mesh(path: Path, scale: np.ndarray, named: str) -> list[tuple[trimesh.T
     """The triangle meshes of a file with their colours; those of COLLADA files scaled by their unit.
 
     The up axis of COLLADA files is not applied, as in RViz: a URDF's <origin> is for coordinates as they are stored.
-
-    Args:
-        path: the file.
-        scale: factors of x, y and z.
-        named: what names the file, for errors.
 
     Raises:
         RobotError: it is missing, cannot be read, has no or too many triangles, or is not finite or huge.
@@ -113,8 +104,6 @@ def check_mesh(mesh: trimesh.Trimesh, name: str, farthest: float = FARTHEST) -> 
     """Check that a mesh can be worked on.
 
     Args:
-        mesh: of triangles.
-        name: how errors call it.
         farthest: largest coordinate.
 
     Raises:
@@ -287,7 +276,6 @@ def build_link_meshes(
         parts: index of a link, a mesh of it [m], and its colour.
         max_faces: so many triangles in all are left as they are.
         tolerance: how far surfaces may move [m].
-        progress: called with a line for people for every mesh.
 
     Raises:
         RobotError: a mesh is degenerate, or so irregular that it takes too long or keeps too many triangles.
@@ -353,7 +341,6 @@ def clustered(
 
     Args:
         vertices: [m]
-        faces: triangles.
         cell: side of the cells [m].
     """
     places = np.floor(vertices / cell).astype(np.int64)

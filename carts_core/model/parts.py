@@ -55,9 +55,9 @@ def link_classes(arms: Sequence[Arm]) -> Int[np.ndarray, " links"]:
 def link_parts(robot: Robot) -> Int[np.ndarray, " links"]:
     """Index into `PARTS` of each link with a mesh, by how many degrees of freedom move it.
 
-    What all but the last two move is the wrist, what more of them move are the jaws with what they turn on, and
-    everything else belongs to the shaft. An instrument without moving jaws, as a hook, has one degree of freedom less:
-    what moves no more than its shaft does, the longest mesh if that is slender, is no wrist.
+    Links that all but the last two degrees of freedom move are the wrist, those that more of them move are the jaws
+    with their bearing, and all others belong to the shaft. For instruments without moving jaws (a hook), links that
+    move with the shaft, which is the longest mesh if that is slender, are no wrist.
     """
     dofs = len(robot.joint_names)
     probes = torch.cat([torch.zeros(1, dofs), _PROBE * torch.eye(dofs)]).double()
@@ -69,7 +69,7 @@ def link_parts(robot: Robot) -> Int[np.ndarray, " links"]:
 
 
 def _shaft_movers(robot: Robot, movers: Int[np.ndarray, " links"]) -> int:
-    """How many degrees of freedom move the shaft; 0 for a robot that has none."""
+    """Number of degrees of freedom that move the shaft; 0 without a shaft."""
     extents = [np.sort(np.ptp(mesh.vertices, axis=0)) for mesh in robot.meshes]
     longest = int(np.argmax([extent[-1] for extent in extents]))
     slender = extents[longest][-2] < SLENDER * extents[longest][-1]

@@ -20,10 +20,7 @@ def perturb(
     Prismatic joints move by as many millimetres. Joint limits hold.
 
     Args:
-        scene: whose arms these are.
         joint_positions: arm name -> [rad, m].
-        degrees: size of the error.
-        seed: fixes the signs.
         joints: arm name -> joints to move; every joint of every arm by default.
     """
     generator = np.random.default_rng(seed)

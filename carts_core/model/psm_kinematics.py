@@ -153,7 +153,6 @@ def inverse(
 
     Args:
         Ts_base_tip: poses of the tip in the arm's base frame, translation in [m].
-        geometry: of the arm and instrument.
         tip_offset: where the poses' origin lies, seen from the tip described above, in the pose's axes [m].
         continuous: rows follow each other in time, so that the roll, which has more than one turn, may not jump.
         roll_near: where more than one turn fits, the one is taken whose (mean) roll is nearest to this [rad].

@@ -38,10 +38,6 @@ _XACRO = "ros.org/wiki/xacro}"
 def parsed_urdf(text: str, source: Path) -> Element:
     """The root of a URDF's elements, checked.
 
-    Args:
-        text: of the file.
-        source: the file, for errors.
-
     Raises:
         RobotError: it is no URDF, links and joints are not one tree, or a number is not finite or impossible.
     """
@@ -165,14 +161,13 @@ def _check_geometry(geometry: Element, source: Path) -> None:
             if not shape.get("filename"):
                 raise RobotError(f'robot {source}: a <mesh> has no file name. Give one, say filename="link.stl".')
             scale = _floats(shape, "scale", source)
-            if scale and (len(scale) not in (1, 3) or not all(_is_factor(value) for value in scale)):
+            if scale and (
+                len(scale) not in (1, 3)
+                or not 1 / _LARGEST_FACTOR <= min(map(abs, scale)) <= max(map(abs, scale)) <= _LARGEST_FACTOR
+            ):
                 raise _wrong(shape, "scale", source, "one or three factors other than 0, within a million")
         for key, count in (("size", 3), ("radius", 1), ("length", 1)):
             _vector(shape, key, count, source, smallest=1 / _LARGEST_FACTOR)
-
-
-def _is_factor(value: float) -> bool:
-    return 1 / _LARGEST_FACTOR <= abs(value) <= _LARGEST_FACTOR
 
 
 def _floats(element: Element, key: str, source: Path) -> list[float]:
@@ -280,7 +275,6 @@ class Robot:
             max_faces: a robot with so many triangles is left as it is; those of others are decimated.
             tolerance: how far decimation may move surfaces [m]; by default 0.2 mm for an instrument, which has a
                 slender shaft, and a thousandth of the reach for other robots.
-            progress: called with a line for people, now and then.
 
         Raises:
             RobotError: the URDF or one of its meshes is missing or broken, or `base_link` is not in it.

@@ -148,7 +148,6 @@ class Scene:
 
         Args:
             joint_positions: arm name -> values `[*batch, dofs]` in the order of `Robot.joint_names`.
-            device: where the tensors live.
             mounts: camera name -> T_mount_world [m], of cameras that move.
 
         Raises:

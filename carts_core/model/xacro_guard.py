@@ -63,11 +63,6 @@ _MESSAGES = ("message", "warning", "error")
 def expanded(path: Path, packages: dict[str, str], arguments: dict[str, str]) -> str:
     """The URDF of a model; for a child process, since xacro is changed to use the expressions of this module.
 
-    Args:
-        path: of the model.
-        packages: folders of ROS packages by name.
-        arguments: of the model.
-
     Raises:
         Exception: it cannot be expanded; the class is that of xacro, or of an expression.
     """
@@ -98,12 +93,7 @@ def expanded(path: Path, packages: dict[str, str], arguments: dict[str, str]) ->
 
 
 class Expression:
-    """Evaluates expressions.
-
-    Args:
-        symbols: properties by name.
-        path_of: the path of a file that the model names.
-    """
+    """Evaluates expressions."""
 
     def __init__(self, symbols: Mapping[str, Any], path_of: Callable[[str], str]) -> None:
         self._symbols, self._path_of = symbols, path_of

@@ -2,5 +2,3 @@
 
 from .extractor import FeatureExtractor as FeatureExtractor
 from .extractor import hybrid as hybrid
-
-__all__ = ["FeatureExtractor", "hybrid"]

@@ -22,8 +22,7 @@ def hybrid(
 ) -> Float[Tensor, "*batch 3 h w"]:
     """BG_m + Î of the paper: the rendering where the silhouette is, the mean background elsewhere.
 
-    The rendering is black outside the silhouette, so the background only has to make room for it; at a silhouette
-    between 0 and 1 (blurred, or moving in a gradient) the two add up to what a lens would mix.
+    At a silhouette between 0 and 1 (blurred, or in a gradient) both are mixed as by a lens.
 
     Args:
         rendering_image: rendered arms, RGB in [0, 1], black where the silhouette is 0.
@@ -78,8 +77,6 @@ class FeatureExtractor:
         """Read weights files; a network without one has the shipped weights.
 
         Args:
-            weights: files.
-            device: where the networks live.
             inference: who runs the surface network; `auto` measures once on each machine who is faster.
 
         Raises:

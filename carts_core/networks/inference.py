@@ -10,7 +10,7 @@ import platform
 import time
 import warnings
 from collections.abc import Callable
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import AbstractContextManager, nullcontext, suppress
 from importlib.metadata import version
 from importlib.util import find_spec
 from pathlib import Path
@@ -54,10 +54,6 @@ class OnnxSurface:
 
     Its graph is exported once and kept in the cache, under the fingerprint of the weights.
 
-    Args:
-        network: folded, on the CPU.
-        sha256: fingerprint of its weights.
-
     Raises:
         RuntimeError: torch cannot export the network, or ONNX Runtime cannot load it.
     """
@@ -70,7 +66,8 @@ class OnnxSurface:
             # It is not there yet, or was damaged.
             graph = _exported(network)
             self._session = inference_session(graph, inference_threads())
-            _keep(path, graph)
+            with suppress(OutputError):
+                write_bytes(output_path(path.parent, path.name), graph)
 
     def __call__(
         self, images: Float[Tensor, "batch 3 h w"], given: Float[Tensor, "batch 6 h w"]
@@ -110,14 +107,6 @@ def _exported(network: SurfaceNetwork) -> bytes:
     return stream.getvalue()
 
 
-def _keep(path: Path, graph: bytes) -> None:
-    """Write the graph to the cache, ignoring errors."""
-    try:
-        write_bytes(output_path(path.parent, path.name), graph)
-    except OutputError:
-        return
-
-
 TOLERANCE = 1e-4
 """Largest difference between equivalent surface maps [1]."""
 _GAIN = 0.9
@@ -136,18 +125,14 @@ def surface_engine(
 ) -> "tuple[Engine, OnnxSurface | None]":
     """Select the engine of the network.
 
-    Args:
-        network: folded.
-        sha256: fingerprint of its weights.
-        device: where torch runs it.
-        wanted: who is to run it.
-
     Raises:
         SettingsError: `onnx` was asked for and does not do.
     """
     if wanted == "torch":
         return "torch", None
-    if fault := _missing(device):
+    absent = [name for name in ("onnxruntime", "onnx") if find_spec(name) is None]
+    if device.type != "cpu" or absent:
+        fault = f"{' and '.join(absent)} is not installed" if absent else f"it needs a CPU, and the device is {device}"
         return _without(wanted, fault)
     try:
         found = OnnxSurface(network, sha256)
@@ -166,14 +151,6 @@ def full_precision(device: torch.device) -> AbstractContextManager[None]:
     if device.type != "cuda":
         return nullcontext()
     return torch.backends.cudnn.flags(enabled=True, allow_tf32=False)
-
-
-def _missing(device: torch.device) -> str | None:
-    """Reason why ONNX Runtime cannot be used; None if it can."""
-    if device.type != "cpu":
-        return f"it runs on a CPU only, and the device is {device}"
-    absent = [name for name in ("onnxruntime", "onnx") if find_spec(name) is None]
-    return f"{' and '.join(absent)} is not installed" if absent else None
 
 
 def _without(wanted: Inference, fault: str) -> tuple[Engine, None]:

@@ -30,12 +30,7 @@ Network = TypeVar("Network", bound=nn.Module)
 
 
 class UNet(nn.Module):
-    """Convolution, batch norm and ReLU, down and up; skips are added, not concatenated, which costs half as much.
-
-    Args:
-        architecture: channels and convolutions per level.
-        inputs: channels of the input.
-    """
+    """Convolution, batch norm and ReLU, down and up; skips are added, not concatenated, which costs half as much."""
 
     kind: ClassVar[str]
     """Name of the network in weights files."""
@@ -100,9 +95,8 @@ class UNet(nn.Module):
 class FeatureNetwork(UNet):
     """The paper's network: a mask is a linear function of its features, and those are what ACS compares.
 
-    Images are standardised first: their local mean is taken off and what is left gets unit deviation. Exposure, colour
-    casts and anything that is laid smoothly over the image then change little before the first convolution, without the
-    network ever having been shown such a thing.
+    Images are standardised: their local mean is subtracted, and the rest is scaled to unit deviation. The input is thus
+    nearly invariant to exposure, colour casts and smooth haze, without training on such images.
     """
 
     kind = "feature"
@@ -212,8 +206,7 @@ class SurfaceLogits:
 class SurfaceNetwork(UNet):
     """U-Net over a standardised image and the surface map of the measured kinematics.
 
-    The measured kinematics are wrong by a few degrees, but they say which arms are there, roughly where, and which way
-    they point. The network only has to say where they are instead.
+    The measured kinematics are wrong by a few degrees but give a prior pose of each arm, which the network corrects.
     """
 
     kind = "surface"

@@ -29,7 +29,6 @@ def tensor_bytes(tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> 
     """A safetensors file; `safetensors` itself writes metadata in another order every time.
 
     Args:
-        tensors: contiguous, by name.
         metadata: texts for the header, in this order.
     """
     content = save(dict(tensors))
@@ -70,7 +69,6 @@ def save_weights(network: UNet, path: Path, training: dict, working_size: tuple[
     Args:
         network: the network whose state is written (batch norms included, so that training can go on from it).
         path: the file, by convention `*.safetensors`; its folder is made.
-        training: settings and figures that JSON can hold.
         working_size: width and height [px] of the images that the network is meant for.
     """
     metadata = {

@@ -7,11 +7,11 @@ from ..settings import FreeParameters as FreeParameters
 from ..settings import SequenceSettings as SequenceSettings
 from ..settings import SolverSettings as SolverSettings
 from ..settings import SurfaceSolver as SurfaceSolver
+from .backgrounds import Backgrounds as Backgrounds
 from .calibration import CalibrationIterate as CalibrationIterate
 from .calibration import CalibrationOptimizer as CalibrationOptimizer
 from .calibration import CalibrationResult as CalibrationResult
 from .calibration import UnknownChange as UnknownChange
-from .counterfactual import Backgrounds as Backgrounds
 from .evidence import Evidence as Evidence
 from .factors import Factor as Factor
 from .factors import Linearization as Linearization
@@ -38,43 +38,3 @@ from .verdict import DomainCheck as DomainCheck
 from .verdict import SequenceAssessment as SequenceAssessment
 from .verdict import Verdict as Verdict
 from .verdict import check_domain as check_domain
-
-__all__ = [
-    "BASE_FRAME_GAIN",
-    "CALIBRATION",
-    "CALIBRATION_SETTINGS",
-    "Assessment",
-    "Backgrounds",
-    "CalibrationIterate",
-    "CalibrationOptimizer",
-    "CalibrationResult",
-    "DescentSolver",
-    "DomainCheck",
-    "Evidence",
-    "Factor",
-    "FrameEstimate",
-    "FrameOptimizer",
-    "FramePredictor",
-    "FreeParameters",
-    "GivenMasks",
-    "ImagePredictor",
-    "Iterate",
-    "Linearization",
-    "MaskPredictor",
-    "NetworkPredictor",
-    "Origin",
-    "Progress",
-    "SequenceAssessment",
-    "SequenceOptimizer",
-    "SequenceSettings",
-    "SolverSettings",
-    "StopReason",
-    "SurfacePredictor",
-    "SurfaceSolver",
-    "UnknownChange",
-    "Verdict",
-    "check_domain",
-    "fit_words",
-    "propose_ignore",
-    "undetermined_joints",
-]

@@ -26,8 +26,8 @@ from ..settings import (
     surface_solver,
 )
 from ..settings.stages import Descend
+from .backgrounds import Backgrounds
 from .calibration_problem import CalibrationEvaluation, CalibrationProblem, Ignored, with_joint_errors
-from .counterfactual import Backgrounds
 from .frame import Progress
 from .hand_eye.result import PoseDeviation
 from .predictor import SurfacePredictor, predictor_of
@@ -40,7 +40,6 @@ def calibrated_scene(whole: Scene, part: Scene, variables: Variables, offsets: t
     """Scene with the calibration of a part of its cameras; unmoved values stay exact.
 
     Args:
-        whole: the scene.
         part: the same arms with the cameras that take part.
         variables: the unknowns of `part`.
         offsets: of the unknowns from their start.
@@ -50,17 +49,14 @@ def calibrated_scene(whole: Scene, part: Scene, variables: Variables, offsets: t
         replace(arm, T_world_base=_moved(arm.T_world_base, start, state, "T_world_base", index))
         for index, arm in enumerate(whole.arms)
     )
-    indices = {camera.name: index for index, camera in enumerate(part.cameras)}
-    cameras = []
-    for camera in whole.cameras:
-        if (index := indices.get(camera.name)) is not None:
-            T_camera_world = _moved(camera.T_camera_world, start, state, "T_camera_world", index)
-            before, after = start.intrinsics[index], state.intrinsics[index]
-            fx, fy, cx, cy = camera.intrinsics if torch.equal(before, after) else after.tolist()
-            cameras.append(replace(camera, T_camera_world=T_camera_world, intrinsics=(fx, fy, cx, cy)))
-        else:
-            cameras.append(camera)
-    return replace(whole, arms=arms, cameras=tuple(cameras))
+    cameras = {camera.name: camera for camera in whole.cameras}
+    for index, name in enumerate(camera.name for camera in part.cameras):
+        camera = cameras[name]
+        T_camera_world = _moved(camera.T_camera_world, start, state, "T_camera_world", index)
+        before, after = start.intrinsics[index], state.intrinsics[index]
+        fx, fy, cx, cy = camera.intrinsics if torch.equal(before, after) else after.tolist()
+        cameras[name] = replace(camera, T_camera_world=T_camera_world, intrinsics=(fx, fy, cx, cy))
+    return replace(whole, arms=arms, cameras=tuple(cameras.values()))
 
 
 def _moved(given: np.ndarray, start: SceneState, state: SceneState, name: str, index: int) -> np.ndarray:
@@ -158,7 +154,6 @@ class CalibrationOptimizer:
     first camera keeps its extrinsics, and the base frames move.
 
     Args:
-        scene: arms and cameras.
         frames: observed images and measured joint positions.
         networks: the networks, or another predictor of surface maps.
         settings: the solver; `frame_prior_deg` and `intrinsics_prior` are its own.
@@ -199,18 +194,9 @@ class CalibrationOptimizer:
         self._whole_scene, self._scene = scene, scene.with_cameras(cameras)
         self.free = free if _some_camera_moves(frames) else with_fixed_gauge(self._scene, free)
         self._frames, self._predictor = frames, predictor_of(networks)
-        self._problem = CalibrationProblem(
-            self._scene,
-            frames,
-            self._predictor,
-            self.free,
-            settings,
-            joint_prior_deg,
-            ignore,
-            backgrounds,
-            known_base_frames,
-        )
         self._known = known_base_frames or {}
+        problem = self._scene, frames, self._predictor, self.free, settings
+        self._problem = CalibrationProblem(*problem, joint_prior_deg, ignore, backgrounds, self._known)
         self.variables = self._problem.variables
         self._fit = Fit(self._problem, torch.zeros_like(self.variables.lower), settings.iterations)
         self._points = self._judged(run_stages(settings.stages, self._fit))
@@ -224,7 +210,7 @@ class CalibrationOptimizer:
         the start. A doubtful one has failed if the network does not know the robot."""
 
     def cancel(self) -> None:
-        """Stop; what was reached stays in `best` and `history`."""
+        """Stop; `best` and `history` are kept."""
         self.stop_reason = self.stop_reason or StopReason.CANCELLED
 
     def step(self) -> CalibrationIterate | None:
@@ -286,8 +272,7 @@ class CalibrationOptimizer:
 
     def __iter__(self) -> Iterator[CalibrationIterate]:
         """Step until the optimization stops."""
-        while (iterate := self.step()) is not None:
-            yield iterate
+        return iter(self.step, None)
 
     def result(self) -> CalibrationResult:
         """Result of the best iterate, evaluated once more under the finest descent reached.
@@ -408,7 +393,6 @@ def _widened(
     Args:
         frames: variances from a number of frames, with one degree of freedom less than that.
         shared: variances that are known, of errors that all frames share.
-        count: of frames.
     """
     variance = frames + shared
     if count < 2:

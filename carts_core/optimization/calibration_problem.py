@@ -14,7 +14,7 @@ from ..recording import Frame
 from ..recording.background import spread
 from ..settings import FreeParameters, SurfaceSolver
 from ..settings.stages import Descend, Observe, SilhouetteSearch
-from .counterfactual import Backgrounds
+from .backgrounds import Backgrounds
 from .evidence import Evidence
 from .factors import Prior
 from .factors.surface import SurfaceFactor
@@ -45,7 +45,6 @@ def eliminate(gradient: Float[Tensor, " n"], curvature: Float[Tensor, "n n"], ow
 
     Args:
         gradient, curvature: of the model; the block of the own unknowns is positive definite.
-        own: how many unknowns belong to the frame alone.
     """
     gradient, curvature = gradient.double().cpu(), curvature.double().cpu()
     across = curvature[:own, own:]
@@ -122,10 +121,7 @@ class _FramePart:
         columns = torch.tensor([every.names.index(name) for name in known.names])
         offsets = torch.zeros_like(every.lower)
         offsets[columns] = torch.cat([self.own, shared])
-        factor = SurfaceFactor(
-            problem.scene, every, problem.observation, problem.settings, blur=stage.blur, robust=stage.robust
-        )
-        model = factor.linearize(offsets)
+        model = SurfaceFactor(problem.scene, every, problem.observation, problem.settings, stage).linearize(offsets)
         hessian = model.hessian.clone()
         hessian[:own, :own] += problem.prior.precision[:own, :own]
         held = [index for index in range(own, len(every)) if index not in set(columns.tolist())]
@@ -137,13 +133,8 @@ class CalibrationProblem:
     """Sum of the frames' factors as a function of the calibration alone. Implements `Problem`.
 
     Args:
-        scene: with the cameras that take part.
-        frames: observed images and measured joint positions.
-        predictor: predicts surface maps.
         free: unknowns; joints are free in each frame separately.
-        settings: noise, and the prior on the calibration.
         joint_prior_deg: expected error of free joints [deg]; `settings.length_scale` turns it into metres.
-        ignore: per frame, pixels that show an occluder.
         backgrounds: of the cameras, where they are known; see `FrameProblem`.
         known_base_frames: arm -> covariance of its base frame's turn and shift in its own axes [rad, m], where it is
             known better than the prior of `settings`.
@@ -190,7 +181,7 @@ class CalibrationProblem:
                 live=False,
             )
             self._parts.append(_FramePart(problem, own))
-        self.prior = _with_base_frames(self.variables, settings, known_base_frames)
+        self.prior = _with_base_frames(self.variables, settings, known_base_frames or {})
         self._given_prior = bool(known_base_frames)
         self._free = free
         self._weights = torch.ones(len(frames), dtype=torch.float64)
@@ -219,16 +210,12 @@ class CalibrationProblem:
         for part in self._parts:
             part.follow(offsets)
         evaluations = [part.evaluate(offsets, part.own, stage, gradient=gradient) for part in self._parts]
-        models = [
-            eliminate(evaluation.gradient, evaluation.hessian, len(part.own))
-            for evaluation, part in zip(evaluations, self._parts, strict=True)
-            if evaluation.hessian is not None
-        ]
-        outlines = [
-            eliminate(evaluation.common, evaluation.hessian, len(part.own)).gradient
-            for evaluation, part in zip(evaluations, self._parts, strict=True)
-            if evaluation.hessian is not None and evaluation.common is not None
-        ]
+        models, outlines = [], []
+        for evaluation, part in zip(evaluations, self._parts, strict=True):
+            if evaluation.hessian is not None and evaluation.common is not None:
+                own = len(part.own)
+                models.append(eliminate(evaluation.gradient, evaluation.hessian, own))
+                outlines.append(eliminate(evaluation.common, evaluation.hessian, own).gradient)
         combined = self._combined(offsets, evaluations, models, outlines)
         self._losses = combined.frame_losses
         # The solver steps from the lowest point so far, and so do the frames' own unknowns.
@@ -312,21 +299,16 @@ class CalibrationProblem:
             total = curvatures.sum(0)
             slope = prior.gradient + gradients.sum(0).to(offsets)
             hessian = prior.hessian.double() + total.to(offsets.device)
-        maps = vars(evaluations[0])
+        loss = float(weights @ losses / weights.sum())
+        value = float(weights @ values) + prior.cost
+        first = replace(evaluations[0], value=value, loss=loss, stage_loss=loss, gradient=slope, hessian=hessian)
         return CalibrationEvaluation(
-            **maps
-            | {
-                "value": float(weights @ values) + prior.cost,
-                "loss": float(weights @ losses / weights.sum()),
-                "stage_loss": float(weights @ losses / weights.sum()),
-                "gradient": slope,
-                "hessian": hessian,
-                "frame_losses": losses,
-                "frame_weights": weights,
-                "frame_gradients": gradients,
-                "frame_curvatures": curvatures,
-                "outline": outline,
-            }
+            **vars(first),
+            frame_losses=losses,
+            frame_weights=weights,
+            frame_gradients=gradients,
+            frame_curvatures=curvatures,
+            outline=outline,
         )
 
 
@@ -338,12 +320,12 @@ def with_joint_errors(covariance: Float[np.ndarray, "6 6"], length_scale: float)
 
 
 def _with_base_frames(
-    variables: Variables, settings: SurfaceSolver, known: Mapping[str, Float[np.ndarray, "6 6"]] | None
+    variables: Variables, settings: SurfaceSolver, known: Mapping[str, Float[np.ndarray, "6 6"]]
 ) -> Prior:
     """Prior of the settings with known covariances of base frames."""
     prior = variables.prior(settings)
     precision = prior.precision.clone()
-    for arm, covariance in (known or {}).items():
+    for arm, covariance in known.items():
         rows = [index for index, name in enumerate(variables.names) if name.startswith(f"{arm}/base/")]
         if rows:
             here = torch.tensor(rows, device=precision.device)

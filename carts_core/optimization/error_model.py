@@ -52,7 +52,7 @@ class Information:
 
         It is the normalized innovation squared of a filter (Bar-Shalom, Li and Kirubarajan, Estimation with
         Applications to Tracking and Navigation, 2001, 5.4), whose degrees of freedom are the rank of the precision:
-        about 1 if all is well, however many directions the image does not show, and 0 where it shows none.
+        about 1 for a consistent measurement, and 0 if no direction is measured.
         """
         residual = self.vector - self.precision @ expected.mean
         # r (L + L S L)^-1 r, with the pseudoinverse of L, which may be singular, and an S that may be 0.
@@ -150,9 +150,9 @@ def combined(state: Gaussian, information: Information, C: Float[np.ndarray, "m 
 def information_shares(gaps: Sequence[float], memory: float) -> list[float]:
     """Share of each frame's information that counts for the others, since image errors are correlated in time [1].
 
-    They are taken for an autoregressive process of first order. The mean of many of its values, a gap apart, is as
-    certain as that of (1 - r) / (1 + r) times as many independent ones, with r = exp(-gap / memory). A frame gets the
-    mean of that for the gaps on either side.
+    The model is an autoregressive process of first order: n values that are a gap apart have the information of
+    n (1 - r) / (1 + r) independent ones, with r = exp(-gap / memory). The share of a frame is the mean for the gaps on
+    either side.
 
     Args:
         gaps: from the frame before to each frame [s]; that of the first one does not matter.
@@ -176,11 +176,10 @@ def remove_measurement(smoothed: Gaussian, own: Information) -> Gaussian:
 class Smoother:
     """Filters measurements in the order of visits, and smooths them backwards.
 
-    Neighbouring frames share errors of their images, so only a share of what a frame measures counts for the others;
-    all of it counts for the frame itself.
+    Image errors of neighbouring frames are correlated, so that only a share of a frame's information is used for the
+    others; all of it is used for the frame itself.
 
     Args:
-        errors: model of the error of the measured kinematics.
         gaps: position -> seconds from the frame visited before it, in the order of the visits.
         correlation_seconds: time constant of the autocorrelation of image errors [s].
         exact: positions of frames that are known and therefore count whole.

@@ -47,8 +47,6 @@ def log_odds_of_failure(loss: float, arm: ArmEvidence, masked: bool) -> float:
     """Log odds that the mask is wrong (Dice below 0.9).
 
     Args:
-        loss: of the fit; see `Evidence.loss`.
-        arm: evidence on the arm with the worst fit.
         masked: whether given masks are the target.
     """
     if masked:
@@ -108,14 +106,7 @@ class Evidence(ArmEvidence):
 def evidence(
     images: FrameImages, start: SceneState, end: SceneState, predictor: FramePredictor, loss: float
 ) -> Evidence:
-    """Evidence of images for and against a fit; runs the predictor twice.
-
-    Args:
-        images: of the cameras that take part.
-        start, end: states before and after the optimization.
-        predictor: of surface maps.
-        loss: of the fit.
-    """
+    """Evidence of images for and against a fit; runs the predictor twice."""
     before, maps = (images.renderer.surface_maps(state) for state in (start, end))
     covered, was = (part[:, COVERAGE].sum(1, keepdim=True) for part in (maps, before))
     margin = max(images.size) if predictor.masked else round(_MARGIN * images.scale)
@@ -125,7 +116,7 @@ def evidence(
     )
     conditioned, alone = parts.sum(1, keepdim=True), parts_alone.sum(1, keepdim=True)
     rendered, weight = window.of(covered), window.of(images.weight)
-    labels = images.renderer.segment(end)
+    before_labels, labels = images.renderer.segment(start), images.renderer.segment(end)
     change = None
     if images.change is not None:
         change = window.of(images.change.telling), window.of(images.change.surely)
@@ -135,31 +126,27 @@ def evidence(
     ]
     worst = max(found, key=lambda arm: log_odds_of_failure(loss, arm, predictor.masked))
     rendered = rendered * weight
-    parts_predicted = 1.0 if predictor.masked else _parts_predicted(window.of(maps[:, COVERAGE]) * weight, parts)
+    shares = []
+    for part in range(1, parts.shape[1]):  # The first part is the shaft.
+        shown = window.of(maps[:, COVERAGE])[:, [part]] * weight
+        if total(shown) >= _PART_SHOWN:
+            shares.append(_share(parts[:, [part]].clamp(0.0, 1.0), shown))
+    informative = change is not None and _share(change[0], rendered) > _TELLING
+    areas = {arm: int((before_labels == arm).sum()) for arm in range(len(start.joint_positions))}
+    visible = [arm for arm, pixels in areas.items() if pixels >= OUT_OF_VIEW * labels.size]
+    in_view = [images.still_in_view(arm, (before_labels, start), (labels, end)) for arm in visible]
     return Evidence(
         **asdict(worst),
         area=total(covered) / covered.numel(),
         start_area=total(was) / was.numel(),
         loss=loss,
         predicted=_share(alone, rendered),
-        changed=_share_of_telling(rendered, change),
-        still_in_view=_still_in_view(images, (images.renderer.segment(start), start), (labels, end)),
+        changed=_share(change[1], rendered * change[0]) if change is not None and informative else None,
+        still_in_view=min([1.0, *in_view]),
         elsewhere=_elsewhere(images, labels, len(end.joint_positions), predictor),
-        parts_predicted=parts_predicted,
+        parts_predicted=1.0 if predictor.masked else min(shares, default=1.0),
         masked=predictor.masked,
     )
-
-
-def _parts_predicted(
-    rendered: Float[Tensor, "cameras parts h w"], predicted: Float[Tensor, "cameras parts h w"]
-) -> float:
-    """See `Evidence.parts_predicted`; the first part is the shaft."""
-    shares = [
-        _share(predicted[:, [part]].clamp(0.0, 1.0), rendered[:, [part]])
-        for part in range(1, rendered.shape[1])
-        if total(rendered[:, part]) >= _PART_SHOWN
-    ]
-    return min(shares, default=1.0)
 
 
 def _elsewhere(
@@ -207,9 +194,7 @@ def _of_arm(
     """Evidence from maps under pixel weights.
 
     Args:
-        here: weight of each pixel.
         rendered, conditioned, alone: coverage, as rendered and as predicted with and without a condition.
-        change: `Change.telling` and `Change.surely`.
     """
     rendered, conditioned, alone = rendered * here, conditioned * here, alone * here
     overlap = None
@@ -221,22 +206,6 @@ def _of_arm(
         unconditioned=_overlap(rendered, alone),
         overlap_with_change=overlap,
     )
-
-
-def _share_of_telling(rendered: Tensor, change: tuple[Tensor, Tensor] | None) -> float | None:
-    """See `Evidence.changed`."""
-    if change is None or _share(change[0], rendered) <= _TELLING:
-        return None
-    return _share(change[1], rendered * change[0])
-
-
-def _still_in_view(
-    images: FrameImages, before: tuple[np.ndarray, SceneState], after: tuple[np.ndarray, SceneState]
-) -> float:
-    """See `Evidence.still_in_view`."""
-    seen = [int((before[0] == arm).sum()) for arm in range(len(before[1].joint_positions))]
-    shown = [arm for arm, area in enumerate(seen) if area >= OUT_OF_VIEW * before[0].size]
-    return min([1.0, *(images.still_in_view(arm, before, after) for arm in shown)])
 
 
 def _overlap(one: Float[Tensor, "cameras 1 h w"], other: Float[Tensor, "cameras 1 h w"]) -> float:

@@ -42,7 +42,6 @@ def attentional_loss(
     Args:
         similarity: of features, at most 1; for `l1` the negated difference of predictions.
         weight: attention map, in [0, 1].
-        loss: which form.
         pixels: w x h of the whole image, where the maps are a window of it that holds all attention.
     """
     pixels = pixels or similarity.shape[-2] * similarity.shape[-1]
@@ -61,19 +60,14 @@ def smooth_l1(observed: Float[Tensor, "*batch h w"], rendered: Float[Tensor, "*b
 
 
 _SURROUNDINGS = 16
-"""How far the network's input reaches beyond the attention [px of the working image]."""
+"""Margin of the network's input around the attention [px of the working image]."""
 
 
 class FeatureProblem:
     """Compares a frame's observed features with rendered ones (f_L of the paper).
 
     Args:
-        scene: with the cameras that take part.
-        images: camera name -> observed RGB image.
         backgrounds: camera name -> mean background BG_m, of the same size.
-        extractor: the feature network.
-        variables: the unknowns.
-        settings: loss, attention and working size.
 
     Raises:
         SettingsError: an image or a background is missing, or of another size than its camera.

@@ -16,7 +16,7 @@ from ..networks.extractor import FeatureExtractor
 from ..recording import Frame
 from ..settings import FreeParameters, SolverSettings, SurfaceSolver
 from ..settings.stages import FINEST, Descend
-from .counterfactual import Backgrounds
+from .backgrounds import Backgrounds
 from .factors import Factor
 from .factors.surface import SurfaceFactor
 from .feature_problem import FeatureProblem
@@ -32,7 +32,7 @@ BASE_FRAME_GAIN = 0.12
 """Least share of the residual that free base frames explain from which they are suspected to be wrong [1]."""
 
 _BLUR = 3.0
-"""Blur of the linear model, which is valid about as far as it reaches [px of the working image]."""
+"""Blur of the linear model, and about its range of validity [px of the working image]."""
 
 
 @torch.no_grad()
@@ -40,17 +40,12 @@ def base_frame_gain(problem: FrameProblem, offsets: Float[Tensor, " n"], free: F
     """Share of the surface residual at a point that free base frames would explain [1].
 
     What the present unknowns alone would still explain does not count, and a joint at its limit stays there.
-
-    Args:
-        problem: one frame.
-        offsets: the point.
-        free: the present unknowns.
     """
     settings, own = problem.settings, problem.variables
     wider = Variables(problem.scene, own.start, replace(free, base_frames=True), settings.length_scale)
     columns = [wider.names.index(name) for name in own.names]
     point = torch.zeros_like(wider.lower).index_copy(0, torch.tensor(columns, device=offsets.device), offsets)
-    factor = SurfaceFactor(problem.scene, wider, problem.observation, settings, blur=_BLUR, robust=Descend.robust)
+    factor = SurfaceFactor(problem.scene, wider, problem.observation, settings, Descend(_BLUR))
     surface = factor.linearize(point)
     total = wider.prior(settings).linearize(point) + surface
     gradient, hessian = surface.gradient.double(), surface.hessian.double()
@@ -93,7 +88,7 @@ class Iterate:
     """Standard deviations; None for losses without curvature."""
     attention: Float[np.ndarray, "cameras h w"]
     similarity: Float[np.ndarray, "cameras h w"]
-    """Of what is compared: cosine of features, or 1 minus the squared difference of surface maps; at most 1."""
+    """Cosine of features, or 1 minus the squared difference of surface maps; at most 1."""
 
     def joint_positions(self) -> dict[str, np.ndarray]:
         """Arm name -> joint positions [dofs], [rad, m]."""
@@ -121,7 +116,6 @@ class FrameOptimizer:
     """Optimization of one frame (paper, section 3), one iterate at a time.
 
     Args:
-        scene: arms and cameras.
         frame: observed images and measured joint positions.
         backgrounds: camera name -> mean background BG_m. A `DescentSolver` needs them all; a `SurfaceSolver` discards
             false detections in them, and does without where one is missing. `Backgrounds` cache this across frames.
@@ -129,7 +123,6 @@ class FrameOptimizer:
         ignore: camera name -> pixels that show an occluder; a `SurfaceSolver` leaves them out.
         start: arm name -> joint positions to start from, the measured ones by default.
         settings: the solver, `SurfaceSolver()` by default.
-        free: what is unknown.
         factors: makes further factors over the unknowns, which a `SurfaceSolver` adds to its objective.
         cameras: names of the cameras that take part, all by default.
         live: whether iterates are displayed. If not, a `SurfaceSolver` saves a third of its time: iterates of coarse
@@ -169,17 +162,8 @@ class FrameOptimizer:
         self._problem: FrameProblem | FeatureProblem
         if isinstance(settings, SurfaceSolver):
             predictor = predictor_of(networks).for_frame(frame, [camera.name for camera in scene.cameras])
-            self._problem = FrameProblem(
-                scene,
-                frame.images,
-                predictor,
-                self._variables,
-                settings,
-                ignore or {},
-                factors=further,
-                backgrounds=known,
-                live=live,
-            )
+            given = scene, frame.images, predictor, self._variables, settings, ignore
+            self._problem = FrameProblem(*given, factors=further, backgrounds=known, live=live)
         elif further:
             raise SettingsError(f"the loss {settings.loss} takes no further factors. Use the solver `surface`.")
         elif isinstance(networks, FeatureExtractor):
@@ -212,7 +196,7 @@ class FrameOptimizer:
         return self._problem.proposed if isinstance(self._problem, FrameProblem) else {}
 
     def cancel(self) -> None:
-        """Stop; what was reached stays in `best` and `history`."""
+        """Stop; `best` and `history` are kept."""
         self.stop_reason = self.stop_reason or StopReason.CANCELLED
 
     def step(self) -> Iterate | None:
@@ -234,8 +218,7 @@ class FrameOptimizer:
 
     def __iter__(self) -> Iterator[Iterate]:
         """Step until the optimization stops."""
-        while (iterate := self.step()) is not None:
-            yield iterate
+        return iter(self.step, None)
 
     def comparable_losses(self) -> list[float]:
         """Losses of all iterates under the last observation.
@@ -250,8 +233,8 @@ class FrameOptimizer:
     def base_frame_gain(self) -> float | None:
         """Share of the surface residual at the best iterate that free base frames would explain [1].
 
-        By the linear model, so it costs one more comparison and no run. Pixels that are ignored, on a proposal too, do
-        not count. Several cameras count together, so a single one with a wrong pose shows less.
+        It follows from the linear model at the cost of one comparison. Ignored pixels are left out. All cameras are
+        combined, so that the effect of a single one with a wrong pose is smaller.
 
         Returns:
             None before the end, if base frames are free already, or for losses without a surface factor.

@@ -18,7 +18,7 @@ from ..model.scene import Scene, SceneState
 from ..settings import SurfaceSolver
 from ..settings.stages import FINEST, AlignEdges, Descend, Given, Observe, SilhouetteSearch, first_observe
 from ..threads import total
-from .counterfactual import Backgrounds
+from .backgrounds import Backgrounds
 from .evidence import Evidence, evidence
 from .factors import Factor, Linearization, Prior
 from .factors.edges import EdgeFactor, align_edges
@@ -41,35 +41,28 @@ def propose_ignore(
 ) -> dict[str, Bool[np.ndarray, "height width"]]:
     """Probable occluders: areas at the arms where the prediction differs from the rendering.
 
-    An occluder that the network takes for background makes a gap in the arm, one that it takes for an instrument
-    sticks out of the arm. Both count, if they touch the silhouette.
+    Occluders predicted as background are gaps in the arm, occluders predicted as instruments extend it; both count if
+    they touch the silhouette.
 
     Args:
-        scene: with the cameras that took part.
         silhouette: of an estimate, as an `Iterate` carries it.
-        similarity: the same of what was compared.
 
     Returns:
         Camera name -> mask at the camera's size; cameras without a proposal are left out.
     """
     proposals = {}
     for camera, inside, alike in zip(scene.cameras, silhouette > 0.5, similarity, strict=True):
-        mask = _proposal(inside, alike < _CONTRADICTS)
-        if mask.any():
+        scale = inside.shape[1] / 320.0
+        contradicts = (alike < _CONTRADICTS).astype(np.uint8)
+        _, labels = cv2.connectedComponents(cv2.morphologyEx(contradicts, cv2.MORPH_OPEN, _disc(_SMALLEST * scale)))
+        near = cv2.dilate(inside.astype(np.uint8), _disc(_NEAR * scale)) > 0
+        touching = np.unique(labels[near])
+        chosen = np.isin(labels, touching[touching > 0]).astype(np.uint8)
+        mask = cv2.dilate(cv2.morphologyEx(chosen, cv2.MORPH_CLOSE, _disc(_GAP * scale)), _disc(_RIM * scale))
+        if mask.any() and (mask[inside] > 0).sum() <= _MOST * inside.sum():
             size = camera.width, camera.height
             proposals[camera.name] = cv2.resize(mask, size, interpolation=cv2.INTER_NEAREST).astype(bool)
     return proposals
-
-
-def _proposal(inside: Bool[np.ndarray, "h w"], contradicts: Bool[np.ndarray, "h w"]) -> np.ndarray:
-    scale = inside.shape[1] / 320.0
-    objects = cv2.morphologyEx(contradicts.astype(np.uint8), cv2.MORPH_OPEN, _disc(_SMALLEST * scale))
-    _, labels = cv2.connectedComponents(objects)
-    near = cv2.dilate(inside.astype(np.uint8), _disc(_NEAR * scale)) > 0
-    touching = np.unique(labels[near])
-    chosen = np.isin(labels, touching[touching > 0]).astype(np.uint8)
-    mask = cv2.dilate(cv2.morphologyEx(chosen, cv2.MORPH_CLOSE, _disc(_GAP * scale)), _disc(_RIM * scale))
-    return mask if (mask[inside] > 0).sum() <= _MOST * inside.sum() else np.zeros_like(mask)
 
 
 def _disc(radius: float) -> np.ndarray:
@@ -110,13 +103,7 @@ def silhouette_distance(
     masks: Bool[np.ndarray, "cameras h w"],
     weight: Bool[np.ndarray, "cameras h w"],
 ) -> Float[np.ndarray, " batch"]:
-    """Symmetric mean distance of silhouettes and masks [px].
-
-    Args:
-        rendered: silhouettes of a batch of states.
-        masks: the given ones.
-        weight: which pixels count.
-    """
+    """Symmetric mean distance of silhouettes and masks [px]."""
     to_masks = mask_distances(masks)
     rendered, masks = rendered & weight, masks & weight
     outside = (rendered * to_masks).sum((1, 2, 3)) / rendered.sum((1, 2, 3)).clip(min=1)
@@ -127,12 +114,7 @@ def silhouette_distance(
 
 
 class SilhouetteComparison:
-    """Silhouettes of one frame against its given masks, in small images.
-
-    Args:
-        images: in the size that is compared.
-        predictor: of the frame; it knows its masks.
-    """
+    """Silhouettes of one frame against its given masks, in small images."""
 
     def __init__(self, images: FrameImages, predictor: FramePredictor) -> None:
         nothing = images.images.new_zeros(len(images.images), SURFACE_CHANNELS, *images.images.shape[-2:])
@@ -163,9 +145,6 @@ def search_silhouettes(
 
     Args:
         distances: between silhouettes and masks at each of a batch of points [px].
-        deviation: standard deviation of the first round.
-        clamp: clamps points to their bounds.
-        stage: numbers of starts, rounds and candidates.
     """
     best, lowest = torch.zeros_like(deviation), float("inf")
     for start in range(stage.starts):
@@ -202,14 +181,8 @@ class FrameProblem:
     """The sum of the surface factor of the last observation, the prior, and further factors.
 
     Args:
-        scene: with the cameras that take part.
-        images: camera name -> observed RGB image.
-        predictor: predicts surface maps.
-        variables: the unknowns.
-        settings: noise, weights, working size.
         ignore: camera name -> pixels that show an occluder.
         prior: of the unknowns; as the settings expect by default.
-        factors: further ones over the same unknowns.
         backgrounds: of the cameras; predictions in them are false positives.
         live: whether coarse stages are also compared under a fine blur for display, which takes a third more time.
 
@@ -257,7 +230,7 @@ class FrameProblem:
 
     @property
     def start(self) -> Float[Tensor, " n"]:
-        """Where all offsets are 0."""
+        """Offsets of the start: zeros."""
         return torch.zeros_like(self.variables.lower)
 
     @property
@@ -278,10 +251,9 @@ class FrameProblem:
                 self.scene,
                 self._observed,
                 self._ignore,
+                self.settings,
+                self.predictor,
                 scale=scale,
-                working_width=self.settings.working_width,
-                dehaze=self.settings.dehaze,
-                predictor=self.predictor,
                 backgrounds=self._backgrounds,
                 replaced=self._replaced,
             )
@@ -316,11 +288,9 @@ class FrameProblem:
 
     def factor(self, stage: Descend) -> SurfaceFactor:
         """The surface factor of the last observation, as a stage compares it."""
-        key = blur, robust = stage.blur, stage.robust
+        key = stage.blur, stage.robust
         if key not in self._factors:
-            self._factors[key] = SurfaceFactor(
-                self.scene, self.variables, self.observation, self.settings, blur=blur, robust=robust
-            )
+            self._factors[key] = SurfaceFactor(self.scene, self.variables, self.observation, self.settings, stage)
         return self._factors[key]
 
     def objective_key(self, blur: float) -> tuple[int, float]:
@@ -446,13 +416,5 @@ class FrameProblem:
         return self._edges.result()
 
     def _edges_beside(self) -> Future[EdgeFactor]:
-        return _BESIDE.submit(
-            EdgeFactor,
-            self.scene,
-            self._observed,
-            self.variables,
-            self._ignore,
-            working_width=self.settings.working_width,
-            dehaze=self.settings.dehaze,
-            device=self.predictor.device,
-        )
+        problem = self.scene, self._observed, self.variables, self._ignore
+        return _BESIDE.submit(EdgeFactor, *problem, self.settings, self.predictor.device)

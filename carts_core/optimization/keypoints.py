@@ -1,4 +1,4 @@
-"""Joint positions from points that a person has found in the image, by bounded least squares."""
+"""Joint positions from keypoints placed by a person, by bounded least squares."""
 
 import math
 from collections.abc import Sequence
@@ -14,6 +14,7 @@ from ..errors import SettingsError
 from ..model.keypoints import Keypoint, project_keypoints
 from ..model.scene import Scene, SceneState
 from ..settings import FreeParameters, SurfaceSolver
+from ..settings.ranges import Count, Positive, Ranged
 from .variables import Variables
 
 _ROOM = 1e-12
@@ -22,7 +23,7 @@ _ROOM = 1e-12
 
 @dataclass(frozen=True)
 class Pin:
-    """A keypoint, and where a person says that it is."""
+    """A keypoint with its position in an image, set by a person."""
 
     keypoint: Keypoint
     camera: str
@@ -31,27 +32,22 @@ class Pin:
 
 
 @dataclass(frozen=True)
-class KeypointSettings:
-    """How pins are weighed against where the joints were."""
+class KeypointSettings(Ranged):
+    """Weights of pins and of the initial joint positions."""
 
-    prior_deg: float = 10.0
+    prior_deg: Positive = 10.0
     """Expected error of a joint at the start [deg]; a prismatic joint's is `length_scale` times as many metres."""
-    pixel_error: float = 0.5
+    pixel_error: Positive = 0.5
     """Expected error of a pin [px]."""
-    length_scale: float = SurfaceSolver.length_scale
+    length_scale: Positive = SurfaceSolver.length_scale
     """Metres of translation that count as one radian [m]."""
-    iterations: int = 60
+    iterations: Count = 60
     """Largest number of steps [1]."""
-
-    def __post_init__(self) -> None:
-        for name in ("prior_deg", "pixel_error", "length_scale", "iterations"):
-            if not getattr(self, name) > 0:
-                raise SettingsError(f"{name} is {getattr(self, name)!r}; allowed is anything above 0.")
 
 
 @dataclass(frozen=True, eq=False)
 class KeypointFit:
-    """Where the arms are according to the pins."""
+    """State of the arms that fits the pins."""
 
     state: SceneState
     residuals: tuple[float, ...]
@@ -68,10 +64,7 @@ def fit_keypoints(
     (`scipy.optimize.least_squares`). So pins alone decide what they determine, and the rest stays near the start.
 
     Args:
-        scene: arms and cameras.
-        start: where the joints are expected to be.
         pins: one or more, also in several cameras.
-        settings: weights and number of steps.
 
     Raises:
         SettingsError: there is no pin, or a keypoint starts behind its camera.
@@ -103,19 +96,17 @@ def fit_keypoints(
         lambda offsets: residuals(torch.from_numpy(offsets)).numpy(),
         origin.numpy(),
         jac=jacobian,  # pyright: ignore[reportArgumentType]
-        bounds=_open_bounds(variables),
+        # The method needs some room for a start that is at or beyond a joint limit.
+        bounds=(
+            np.minimum(variables.lower.double().numpy(), -_ROOM),
+            np.maximum(variables.upper.double().numpy(), _ROOM),
+        ),
         x_scale="jac",
         max_nfev=settings.iterations,
     )
     offsets = torch.from_numpy(fit.x)
     errors = distances(offsets).norm(dim=-1)
     return KeypointFit(variables.state(offsets).map(torch.Tensor.float), tuple(errors.tolist()), int(fit.nfev))
-
-
-def _open_bounds(variables: Variables) -> tuple[np.ndarray, np.ndarray]:
-    """The joint limits; a start that is at or beyond one gets a hair of room, which the method needs."""
-    lower, upper = variables.lower.double().numpy(), variables.upper.double().numpy()
-    return np.minimum(lower, -_ROOM), np.maximum(upper, _ROOM)
 
 
 def _distances(scene: Scene, state: SceneState, pins: Sequence[Pin]) -> Float[Tensor, "pins 2"]:

@@ -20,10 +20,10 @@ from ..recording import Frame
 from ..rendering import Renderer
 from ..settings import FreeParameters, SequenceSettings, SurfaceSolver
 from ..settings.stages import COMPARE, FINEST, Observe, Stage, first_observe, reduced
-from .counterfactual import Backgrounds
+from .backgrounds import Backgrounds
 from .error_model import Gaussian, Information
 from .evidence import Evidence
-from .factors import Linearization, Prior
+from .factors import Prior
 from .frame import base_frame_gain
 from .frame_problem import FrameProblem
 from .observability import Evaluation, Uncertainty
@@ -75,7 +75,6 @@ def sequence_checkpoint(path: OutputPath, made_with: str) -> Checkpoint:
     """The checkpoint of a `SequenceOptimizer`.
 
     Args:
-        path: the file.
         made_with: fingerprint of scene, weights, settings and code; frames and what is expected of them need not be in.
     """
     return Checkpoint(path, made_with, (Measurement, Information, Evidence))
@@ -108,12 +107,8 @@ class FrameSolver:
     """Solves single frames of a sequence.
 
     Args:
-        scene: with the cameras that take part.
-        predictor: predicts surface maps.
-        settings: noise, weights, working size.
         model: stages of cold and warm starts, and the noise of a measurement.
         ignore: position of a frame -> camera name -> pixels that show an occluder.
-        backgrounds: of the cameras, where they are known.
         checkpoint: made by `sequence_checkpoint`; keeps what was found.
     """
 
@@ -143,7 +138,8 @@ class FrameSolver:
         seen = _information(fit.reached.offsets, fit.reached.evaluation, prior)
         correction = fit.reached.offsets
         if fit.edges is not None:
-            correction, seen = fit.offsets, seen + _of_edges(fit.offsets, fit.edges)
+            correction, precision = fit.offsets, _double(fit.edges.hessian)
+            seen += Information(precision, precision @ _double(correction) - _double(fit.edges.gradient))
         loss = fit.reached.evaluation.stage_loss
         return Measurement(_double(correction), seen.scaled(self._share), loss, fit.used)
 
@@ -192,7 +188,7 @@ class FrameSolver:
         """Losses of corrections [n] in a smaller image, observed conditioned on each."""
         problem, found = self._problem(frame, variables, None), []
         for correction in corrections:
-            offsets = variables.clamp(torch.from_numpy(correction).to(variables.lower))
+            offsets = _offsets(correction, variables)
             problem.observe(first_observe(COMPARE), offsets)
             found.append(problem.evaluate(offsets, FINEST, gradient=False).stage_loss)
         return found
@@ -200,12 +196,12 @@ class FrameSolver:
     @_checkpointed
     def evidence(self, frame: Frame, variables: Variables, correction: np.ndarray, loss: float) -> Evidence:
         """Evidence for and against a correction [n] of known loss."""
-        offsets = variables.clamp(torch.from_numpy(correction).to(variables.lower))
+        offsets = _offsets(correction, variables)
         return self._problem(frame, variables, None).evidence(offsets, loss)
 
     def arms_out_of_view(self, variables: Variables, correction: np.ndarray) -> bool:
         """Whether some arm is out of view at a correction [n]."""
-        offsets = variables.clamp(torch.from_numpy(correction).to(variables.lower))
+        offsets = _offsets(correction, variables)
         width, height = working_size(self._scene, self._settings.working_width, 1)
         labels = Renderer(self._scene, width=width, height=height).segment(variables.state(offsets).to("cpu"))
         return any(not (labels == arm).any() for arm in range(len(self._scene.arms)))
@@ -216,11 +212,9 @@ class FrameSolver:
         """Share of the surface residual at a correction [n] that free base frames would explain [1].
 
         Args:
-            frame, variables: the frame, and its unknowns.
             correction: of the measured values [n].
-            free: the unknowns, by kind.
         """
-        offsets = variables.clamp(torch.from_numpy(correction).to(variables.lower))
+        offsets = _offsets(correction, variables)
         problem = self._problem(frame, variables, None)
         problem.observe(Observe(), offsets)
         return base_frame_gain(problem, offsets, free)
@@ -248,7 +242,7 @@ class FrameSolver:
         cancelled: Callable[[], bool] = lambda: False,
     ) -> Fit:
         problem = self._problem(frame, variables, prior)
-        offsets = variables.clamp(torch.from_numpy(start).to(variables.lower))
+        offsets = _offsets(start, variables)
         fit = Fit(problem, offsets, self._settings.iterations)
         for _ in run_stages(stages, fit):
             if cancelled():
@@ -257,9 +251,13 @@ class FrameSolver:
 
 
 def _prior(expected: Gaussian, variables: Variables) -> Prior:
-    like = variables.lower
-    precision = np.linalg.inv(expected.covariance)
-    return Prior(torch.from_numpy(expected.mean).to(like), torch.from_numpy(precision).to(like))
+    parts = expected.mean, np.linalg.inv(expected.covariance)
+    return Prior(*(torch.from_numpy(part).to(variables.lower) for part in parts))
+
+
+def _offsets(correction: np.ndarray, variables: Variables) -> Tensor:
+    """A correction [n] within the joint limits."""
+    return variables.clamp(torch.from_numpy(correction).to(variables.lower))
 
 
 def _information(offsets: Tensor, evaluation: Evaluation, prior: Prior) -> Information:
@@ -272,11 +270,6 @@ def _information(offsets: Tensor, evaluation: Evaluation, prior: Prior) -> Infor
     precision = vectors @ np.diag(values.clip(min=0.0)) @ vectors.T
     slope = _double(evaluation.gradient - known.gradient)
     return Information(precision, precision @ _double(offsets) - slope)
-
-
-def _of_edges(offsets: Tensor, edges: Linearization) -> Information:
-    precision = _double(edges.hessian)
-    return Information(precision, precision @ _double(offsets) - _double(edges.gradient))
 
 
 def _double(values: Tensor) -> np.ndarray:

@@ -75,7 +75,6 @@ def undetermined_joints(
     """`ARM.JOINT` of each joint whose standard deviation after a fit exceeds a third of the prior's.
 
     Args:
-        scene: whose arms these are.
         joint_std: arm -> standard deviations [rad, m]; None and NaN (joints that were held) do not count.
 
     Returns:
@@ -97,7 +96,6 @@ def fit_words(verdict: str, undetermined: Sequence[str] | None) -> str:
     """Verdict on the mask and number of undetermined joints as text: `mask good, 4 joints not determined`.
 
     Args:
-        verdict: good, doubtful or failed.
         undetermined: as from `undetermined_joints`; None where no deviation is known.
     """
     if undetermined is None:
@@ -112,7 +110,6 @@ def uncertainty(
     """Uncertainty under the prior of the settings, from the curvature of an objective in units of its noise.
 
     Args:
-        variables: the unknowns.
         prior: of their offsets, before the image was used.
         curvature: J^T J / noise^2 and the prior's precision, per offset.
         common: change of the gradient for one standard deviation of an error that all pixels share. It does not average
@@ -137,15 +134,13 @@ def uncertainty_after(
 ) -> Uncertainty:
     """Uncertainty under a prior that is rescaled by the size of the corrections.
 
-    The fit is the optimum under a prior of the expected size, so more is left of larger errors than its curvature says:
-    of an error e of the start, (P + a I) (I + P)^-1 e, where I is the image's information, P the prior's precision and
-    a the share of the start in what the network predicts. Noise comes on top of it.
+    The fit is the optimum under the original prior, so a part of an error e of the start remains:
+    (P + a I) (I + P)^-1 e, where I is the image's information, P the prior's precision and a the share of the start in
+    the network's prediction. Noise is added to it.
 
     Args:
-        variables: the unknowns.
         prior: of their offsets, before the image was used; it informs all of them.
         curvature: J^T J / noise^2 and the prior's precision, per offset.
-        common: as in `uncertainty`.
         moved: offsets at the optimum, less the prior's mean.
         start_share: share of an error of the start that is left in what the image seems to show [1].
     """
@@ -177,16 +172,13 @@ def expected_scale(
 ) -> float:
     """Ratio of the likely size of the start's errors to the prior's, from the corrections of a fit [1].
 
-    Errors of one frame are about as large for joints that it shows as for those that it does not show. The square of
-    the scale is lognormal beforehand, of mean 1 and a deviation of 1 of its logarithm; corrections are Gaussian in each
-    direction, given the scale. This is the root of the square's mean afterwards (a hierarchical prior; Gelman et al.,
-    Bayesian Data Analysis, 2013, chapter 5). An image which determines nothing changes nothing.
+    Hierarchical prior (Gelman et al., Bayesian Data Analysis, 2013, chapter 5): the square of the scale is lognormal
+    with mean 1 and a deviation of 1 of its logarithm, and corrections are Gaussian in each direction, given the scale.
+    The result is the root of the posterior mean of the square; it is 1 if the image determines nothing.
 
     Args:
-        moved: offsets at the optimum, less the prior's mean.
         information: curvature of the image's part of the objective.
         prior: inverse covariance of the offsets before the image was used.
-        start_share: as in `uncertainty_after`.
     """
     root = torch.linalg.cholesky(torch.linalg.inv(prior.double()))
     shown, axes = torch.linalg.eigh(root.T @ information.double() @ root)

@@ -14,9 +14,10 @@ from ..imaging.working_image import Window, attention, pixel_weights, stacked_im
 from ..model.parts import COVERAGE
 from ..model.scene import Scene, SceneState
 from ..rendering import Renderer
+from ..settings import SurfaceSolver
 from ..settings.stages import Observe
 from ..threads import total
-from .counterfactual import Backgrounds, Change, without_background
+from .backgrounds import Backgrounds, Change, without_background
 from .predictor import FramePredictor
 
 HAS_LEFT = 0.3
@@ -45,12 +46,7 @@ class FrameImages:
     """Renderer of the whole image."""
 
     def area_alone(self, state: SceneState, arm: int) -> int:
-        """Number of pixels of an arm in all images, without occlusion by other arms.
-
-        Args:
-            state: of the scene.
-            arm: its position in the scene.
-        """
+        """Number of pixels of an arm in all images, without occlusion by other arms."""
         whole = self.renderer.scene
         scene = whole.with_arms([whole.arms[arm].name])
         renderer = Renderer(scene, width=self.size[0], height=self.size[1], device=self.renderer.device)
@@ -70,7 +66,6 @@ class FrameImages:
         """Area of an arm relative to its area at the start [1]; parts behind another arm count as in view.
 
         Args:
-            arm: its position in the scene.
             before, after: arm of each pixel and state, at the start and now.
         """
         share = int((after[0] == arm).sum()) / max(int((before[0] == arm).sum()), 1)
@@ -88,39 +83,34 @@ class FrameImages:
         scene: Scene,
         images: Mapping[str, UInt8[np.ndarray, "h w 3"]],
         ignore: Mapping[str, Bool[np.ndarray, "h w"]],
-        *,
-        scale: float,
-        working_width: int,
-        dehaze: float,
+        settings: SurfaceSolver,
         predictor: FramePredictor,
+        *,
+        scale: float = 1.0,
         backgrounds: Backgrounds | None = None,
         replaced: bool | None = None,
     ) -> "FrameImages":
         """Images at `scale` times the working size, as far as the predictor's stride allows.
 
         Args:
-            scene: with the cameras that take part.
-            images: camera name -> observed RGB image.
             ignore: camera name -> pixels that show an occluder.
-            scale: times the working size [1].
-            working_width: width of the working image [px].
-            dehaze: share of smoke and haze that is removed [1].
+            settings: working size and dehazing.
             predictor: sizes are multiples of its stride; it also sees the backgrounds, once.
-            backgrounds: of the cameras, where they are known.
+            scale: times the working size [1].
             replaced: whether unchanged background is replaced before prediction; otherwise predictions in the
                 background are subtracted. By default it is replaced where it causes false detections.
 
         Raises:
             SettingsError: an image is missing, or an image or a mask is of another size than its camera.
         """
-        unit, _ = working_size(scene, working_width, predictor.stride)
-        size = working_size(scene, round(working_width * scale), predictor.stride)
+        unit, _ = working_size(scene, settings.working_width, predictor.stride)
+        size = working_size(scene, round(settings.working_width * scale), predictor.stride)
         stacked = stacked_images(scene, images, size, "image").to(predictor.device)
         # Given masks need neither dehazing nor a background.
-        through = transmission(stacked, dehaze if predictor.knows_parts else 0.0)
+        through = transmission(stacked, settings.dehaze if predictor.knows_parts else 0.0)
         explained, change = None, None
         if not predictor.masked and backgrounds is not None and backgrounds.covers(scene):
-            background = backgrounds.at(scene, size, dehaze, predictor)
+            background = backgrounds.at(scene, size, settings.dehaze, predictor)
             change = background.compared(stacked, size[0] / unit)
             if background.deceptive if replaced is None else replaced:
                 stacked, through = without_background(stacked, change.surely, size[0] / unit), torch.ones_like(through)
@@ -179,15 +169,7 @@ class Observation:
 def observe(
     images: FrameImages, predictor: FramePredictor, state: SceneState, stage: Observe, *, whole: bool = False
 ) -> Observation:
-    """Predict surface maps.
-
-    Args:
-        images: of the frame, in the stage's scale.
-        predictor: of surface maps.
-        state: that the prediction is conditioned on.
-        stage: margin and attention around its arms.
-        whole: predict and weight the whole image.
-    """
+    """Predict surface maps."""
     given = images.renderer.surface_maps(state)
     everything = whole or predictor.masked
     margin = max(images.size) if everything else round(stage.margin * images.scale)

@@ -53,7 +53,6 @@ class FramePredictor(Protocol):
         Args:
             images: RGB in [0, 1], whole.
             given: surface maps of the state that the prediction is conditioned on.
-            window: part to predict.
         """
         ...
 
@@ -147,7 +146,6 @@ class MaskPredictor:
     Args:
         network: predicts parts and normals inside the masks, and all of a frame that has no mask; None goes without.
         masks: position of a frame -> camera name -> mask in the camera's size; `Frame.masks` by default.
-        origin: name of a mask in errors.
     """
 
     def __init__(

@@ -18,20 +18,13 @@ from ..networks.extractor import FeatureExtractor
 from ..recording import Frame
 from ..recording.background import spread
 from ..settings import FreeParameters, SequenceSettings, SolverSettings, surface_solver
-from .counterfactual import Backgrounds
+from .backgrounds import Backgrounds
 from .error_model import ErrorModel, Gaussian, Information, Smoother, combined, remove_measurement
 from .measurement import FrameSolver, Ignore, Measurement
 from .predictor import SurfacePredictor, predictor_of
-from .sequence_estimate import (
-    FrameEstimate,
-    Origin,
-    Visit,
-    assessed_estimates,
-    assessed_sequence,
-    sequence_base_frame_gain,
-)
+from .sequence_estimate import FrameEstimate, Origin, Visit
 from .variables import Variables
-from .verdict import SequenceAssessment
+from .verdict import SequenceAssessment, Verdict, assess, assess_sequence
 
 
 def visiting_gaps(times: Mapping[int, float | None], model: SequenceSettings) -> dict[int, float]:
@@ -77,8 +70,6 @@ def initial_correction(
 
     Args:
         corrections: position of each of these frames -> its measured correction [rad].
-        solver: of single frames.
-        open_frame: loads a frame, with its unknowns.
         allowance: largest ratio to the lowest loss in the first frame [1].
     """
     candidates = list(corrections.values())
@@ -86,6 +77,11 @@ def initial_correction(
     suits = losses[0] <= allowance * losses[0].min()
     return candidates[int(np.where(suits, losses.mean(0), np.inf).argmin())]
 
+
+_LOOKED_AT = 3
+"""Number of frames in which base frames are checked."""
+_IN_VAIN = 5
+"""Number of consecutive failures of the single-frame solver after which it is not tried again."""
 
 GivenPositions = Mapping[int, Mapping[str, ArrayLike]]
 """Position of a frame -> arm name -> a value for each joint."""
@@ -95,7 +91,6 @@ class Keyframes:
     """Fixed joint positions of frames, exact or with a standard deviation.
 
     Args:
-        scene: the arms.
         positions: joint positions [rad, m].
         std: standard deviations [rad, m]; those that are missing or NaN are 0.
 
@@ -104,7 +99,7 @@ class Keyframes:
     """
 
     def __init__(self, scene: Scene, positions: GivenPositions | None, std: GivenPositions | None) -> None:
-        self._scene, self._positions, self._std = scene, _arrays(positions or {}), _arrays(std or {})
+        self._scene, self._positions, self._std = scene, _arrays(positions), _arrays(std)
         for given in self._positions.values():
             scene.state(given)
 
@@ -142,10 +137,10 @@ class Keyframes:
         return {arm.name: np.nan_to_num(known.get(arm.name, 0.0 * given[arm.name])) for arm in self._scene.arms}
 
 
-def _arrays(given: GivenPositions) -> dict[int, dict[str, np.ndarray]]:
+def _arrays(given: GivenPositions | None) -> dict[int, dict[str, np.ndarray]]:
     return {
         index: {name: np.asarray(values, np.float64) for name, values in positions.items()}
-        for index, positions in given.items()
+        for index, positions in (given or {}).items()
     }
 
 
@@ -159,13 +154,11 @@ class SequenceOptimizer:
     failed, frames that still fail return to their measured values. Frames in `keyframes` stay as given.
 
     Args:
-        scene: arms and cameras.
         load: returns the frame at a position of the sequence; its `measured` values are corrected.
         times: position of each frame to be corrected -> its time [s], or None where times are not known.
         networks: the networks, or another predictor of surface maps.
         settings: noise, weights and working size; the stages are those of `model`.
         model: of the measurement error, and the direction.
-        free: what is unknown.
         keyframes: position -> arm name -> joint positions [rad, m] set by hand.
         keyframe_std: position -> arm name -> standard deviations [rad, m] of keyframes that are accepted results of an
             optimizer. Other keyframes, and NaN deviations, count as exact.
@@ -254,28 +247,23 @@ class SequenceOptimizer:
         if self._estimates is None:
             corrections = self._smoother.smoothed()
             certain = self._smoother.cautious(self.model.shared_seconds).smoothed()
-            self._estimates = {
-                index: self._estimate(
-                    index, self._visits[index], replace(correction, covariance=certain[index].covariance)
-                )
-                for index, correction in corrections.items()
-            }
+            known = {index: Gaussian(found.mean, certain[index].covariance) for index, found in corrections.items()}
+            self._estimates = {index: self._estimate(index, self._visits[index], known[index]) for index in known}
         return dict(self._estimates)
 
     def cancel(self) -> None:
-        """Stop; what was reached stays in `estimates`."""
+        """Stop; `estimates` are kept."""
         self.stop_reason = self.stop_reason or "cancelled"
 
     def __iter__(self) -> Iterator[FrameEstimate]:
         """Step until all is done."""
-        while (estimate := self.step()) is not None:
-            yield estimate
+        return iter(self.step, None)
 
     def step(self) -> FrameEstimate | None:
         """Visit the next frame; None once all is done.
 
-        The first steps solve a few frames alone, and what they return is not among `estimates`. After them the
-        estimate knows the frames visited before it, with the filter's deviations; those in `estimates` know all others.
+        The first steps solve a few frames alone; their results are not in `estimates`. Later ones return the filtered
+        estimate, given the frames visited before; those in `estimates` are smoothed, given all frames.
         """
         if self.stop_reason is not None:
             return None
@@ -289,14 +277,11 @@ class SequenceOptimizer:
         if self._revisits:
             return self._visit_again(*self._revisits.pop())
         if self._judging is None:
-            found, alone = (self.estimates, self._smoother.smoothed()), not self._keyframes and self._free.joints_only
-            self._judging = assessed_estimates(*found, self._scene, self._solver, self._open, alone=alone)
+            self._judging = self._assessed()
         if (judged := next(self._judging, None)) is not None:
             self._estimates = self.estimates | {judged.index: judged}
             return judged
-        self.assessment, self._estimates = assessed_sequence(
-            self.estimates, self._visits, self._scene, self._prior, bool(self._keyframes)
-        )
+        self._assess_whole()
         self.stop_reason = "finished"
         return None
 
@@ -304,18 +289,63 @@ class SequenceOptimizer:
         """As `FrameOptimizer.base_frame_gain`, of a few frames; None before the end, or where base frames are free."""
         if self.assessment is None or self._free.base_frames:
             return None
-        return sequence_base_frame_gain(self._smoother.smoothed(), self._solver, self._open, self._free)
+        corrections = self._smoother.smoothed()
+        indices = sorted(corrections)
+        chosen = [indices[place] for place in spread(len(indices), min(_LOOKED_AT, len(indices)))]
+        return statistics.median(
+            [self._solver.base_frame_gain(*self._open(i), corrections[i].mean, self._free) for i in chosen]
+        )
+
+    def _assessed(self) -> Iterator[FrameEstimate]:
+        """Assess all estimates, then solve failed frames alone if only joints are free; yields each new estimate."""
+        failed, corrections = [], self._smoother.smoothed()
+        for index, estimate in self.estimates.items():
+            began = time.perf_counter()
+            frame, variables = self._open(index)
+            found = assess(self._solver.evidence(frame, variables, corrections[index].mean, estimate.loss))
+            seconds = estimate.seconds + time.perf_counter() - began
+            judged = replace(estimate.judged(found, self._scene), seconds=seconds)
+            yield judged
+            if found.verdict is Verdict.FAILED and not found.nothing_there:
+                failed.append(judged)
+        in_vain = 0
+        for estimate in failed if not self._keyframes and self._free.joints_only else ():
+            began = time.perf_counter()
+            frame, variables = self._open(estimate.index)
+            alone = self._solver.alone(frame, variables)
+            seconds = time.perf_counter() - began
+            verdict = alone and alone.assessment and alone.assessment.verdict
+            if alone is None or alone.uncertainty is None or verdict in (None, Verdict.FAILED):
+                in_vain += 1
+                yield replace(estimate, seconds=estimate.seconds + seconds)
+            else:
+                in_vain = 0
+                yield estimate.solved_alone(self._scene, variables, alone, seconds)
+            if in_vain == _IN_VAIN:
+                return
+
+    def _assess_whole(self) -> None:
+        """Verdict on the sequence; if it failed without keyframes, failed frames return to their measured values."""
+        kept = self.estimates
+        found = {index: estimate.assessment for index, estimate in kept.items() if estimate.assessment is not None}
+        self.assessment = assess_sequence(list(found.values()))
+        if self.assessment.verdict is Verdict.FAILED and not self._keyframes:
+            for index, assessment in found.items():
+                if assessment.verdict is Verdict.FAILED:
+                    visit = replace(self._visits[index], start=Origin.MEASURED)
+                    measured = visit.estimate(self._scene, index, self._prior, self._prior)
+                    kept[index] = replace(measured, assessment=assessment, seconds=kept[index].seconds)
+        self._estimates = kept
 
     def _solve_alone(self, index: int) -> FrameEstimate | None:
         """Measurement of a frame alone; None if it is not usable, which is reported at its visit."""
         began = time.perf_counter()
-        start = Origin.KEYFRAME if index in self._keyframes else Origin.COLD
         try:
             frame, variables = self._open(index)
-            if start is Origin.KEYFRAME:
-                measurement = self._keyframe(frame, variables, self._prior)
+            if index in self._keyframes:
+                start, measurement = Origin.KEYFRAME, self._keyframe(frame, variables, self._prior)
             else:
-                measurement = self._solver.cold(frame, variables, self._prior, quick=True)
+                start, measurement = Origin.COLD, self._solver.cold(frame, variables, self._prior, quick=True)
         except CartsError:
             return None
         visit = Visit(frame.frame_id, variables, measurement, start, time.perf_counter() - began)
@@ -330,8 +360,7 @@ class SequenceOptimizer:
         frame, variables = self._open(index)
         expected = self._smoother.expected(index)
         if index in self._keyframes:
-            start = Origin.KEYFRAME
-            measurement = self._keyframe(frame, variables, expected)
+            start, measurement = Origin.KEYFRAME, self._keyframe(frame, variables, expected)
         else:
             start, measurement, lost = self._measure(frame, variables, expected)
             if self._visits and measurement.information.contradicts(expected):
@@ -352,7 +381,9 @@ class SequenceOptimizer:
     def _measure(self, frame: Frame, variables: Variables, expected: Gaussian) -> tuple[Origin, Measurement, bool]:
         """Warm start, or a cold one for the first frame or an unusual loss; returns whether recovery failed, too."""
         if not self._visits:
-            return Origin.COLD, self._first_measurement(frame, variables), False
+            if self._initial_correction is None:
+                return Origin.COLD, self._solver.cold(frame, variables, self._prior), False
+            return Origin.COLD, self._solver.warm(frame, variables, self._prior, self._initial_correction), False
         losses = [visit.measurement.loss for visit in self._visits.values() if visit.start is not Origin.CARRIED]
         usual = self.model.cold_factor * statistics.median(losses or [math.inf])
         warm = self._solver.warm(frame, variables, expected, expected.mean)
@@ -366,11 +397,6 @@ class SequenceOptimizer:
         best = replace(best, iterations=warm.iterations + cold.iterations)
         lost = best.loss > usual and best.loss * self.model.cold_factor > warm.loss
         return Origin.WARM if best.loss == warm.loss else Origin.COLD, best, lost
-
-    def _first_measurement(self, frame: Frame, variables: Variables) -> Measurement:
-        if self._initial_correction is None:
-            return self._solver.cold(frame, variables, self._prior)
-        return self._solver.warm(frame, variables, self._prior, self._initial_correction)
 
     def _keyframe(self, frame: Frame, variables: Variables, expected: Gaussian) -> Measurement:
         correction, known = self._keyframes.correction(frame.index, variables)

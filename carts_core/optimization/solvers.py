@@ -70,7 +70,6 @@ def bounded_step(
 
     Args:
         offsets: the present point [rad].
-        gradient, hessian: of the model there.
         lower, upper: bounds; an unknown at a bound that would leave it stays.
     """
     free = ~(((offsets <= lower) & (gradient > 0)) | ((offsets >= upper) & (gradient < 0)))
@@ -88,9 +87,7 @@ class FirstOrderDescent:
     """Adam, or gradient descent whose largest component moves by the present step size.
 
     Args:
-        settings: method and schedule.
         start: initial values [rad].
-        lower, upper: bounds.
     """
 
     def __init__(self, settings: DescentSolver, start: Tensor, lower: Tensor, upper: Tensor) -> None:

@@ -180,8 +180,6 @@ def best_random_start(
     Args:
         problem: one frame; its observation is replaced by that of the whole image.
         offsets: the present estimate; it and the start are among the candidates.
-        stage: how many points, and how far apart.
-        seed: of the random numbers.
     """
     generator = torch.Generator().manual_seed(seed)
     deviation = stage.deviation * problem.prior.marginal_precision.rsqrt().cpu()

@@ -41,9 +41,6 @@ class Variables:
     A prismatic joint or a translation counts `length_scale` metres as one radian, so that one step size suits all.
 
     Args:
-        scene: arms and cameras.
-        start: where all offsets are 0.
-        free: what is unknown.
         length_scale: [m/rad].
 
     Attributes:
@@ -166,7 +163,7 @@ class Variables:
 
     @property
     def scales(self) -> Float[Tensor, " n"]:
-        """What an offset of 1 is in its unit: 1 for angles and intrinsics, `length_scale` metres for lengths."""
+        """Value of an offset of 1 in its unit: 1 for angles and intrinsics, `length_scale` metres for lengths."""
         scales = torch.ones_like(self.lower)
         for block in self._blocks:
             part = scales[block.start : block.start + block.size]
@@ -192,7 +189,7 @@ class Variables:
         return expected
 
     def spread(self, joints_deg: float, frames_deg: float, distance: float) -> Float[Tensor, " n"]:
-        """Deviations to search with [rad]; intrinsics stay where they are.
+        """Standard deviations of a search [rad]; 0 for intrinsics.
 
         Args:
             joints_deg: of joint positions [deg]; `length_scale` makes it metres.

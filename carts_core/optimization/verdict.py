@@ -63,9 +63,6 @@ class Assessment:
         """Uncertainty that allows for a wrong fit.
 
         That of a certain fit stays as it is; that of a failed fit becomes the prior.
-
-        Args:
-            known: from the curvature of the objective.
         """
         if self.certain:
             return known
@@ -78,25 +75,17 @@ docs/explanation/decisions.md."""
 
 
 def assess(found: Evidence) -> Assessment:
-    """Verdict on the fit of a frame.
-
-    Args:
-        found: the evidence.
-    """
-    what = "given mask" if found.masked else "image"
+    """Verdict on the fit of a frame."""
+    what = "The given mask" if found.masked else "The image"
     # The overlap with given masks is the Dice itself, so they need no margin.
-    return _assessed(
-        found, _UNCERTAIN if found.masked else _POSSIBLE, f"The {what} contradicts", f"The {what} supports", "fit"
-    )
+    doubtful_from = _UNCERTAIN if found.masked else _POSSIBLE
+    return _assessed(found, doubtful_from, f"{what} contradicts", f"{what} supports", "fit")
 
 
 def assess_calibration(frames: Sequence[Evidence]) -> Assessment:
     """Verdict on a calibration, from the median evidence of its frames with measured joints.
 
     It is doubtful earlier than a frame: all frames depend on it, and its masks can be right while it is wrong.
-
-    Args:
-        frames: the evidence of each; at least one.
     """
     median = median_evidence(frames)
     what = "given masks" if median.masked else "images"
@@ -110,10 +99,8 @@ def _assessed(found: Evidence, doubtful_from: float, contradicts: str, supports:
     """The verdict on a fit or a calibration.
 
     Args:
-        found: the evidence.
         doubtful_from: probability of failure from which it is doubtful [1].
         contradicts, supports: subject and verb of the reasons.
-        subject: "fit" or "calibration".
     """
     probability = 1.0 / (1.0 + math.exp(-log_odds_of_failure(found.loss, found, found.masked)))
     for applies, reason, remedy in _NOTHING_THERE:
@@ -124,14 +111,13 @@ def _assessed(found: Evidence, doubtful_from: float, contradicts: str, supports:
         return Assessment(Verdict.FAILED, reason, _REMEDY_FAILED, probability, found)
     if arm_is_elsewhere(found):
         reason = "An arm is out of view where it was fitted, and something that looks like an arm is elsewhere."
-        return Assessment(Verdict.DOUBTFUL, reason, _REMEDY, max(probability, _POSSIBLE), found)
-    if probability >= doubtful_from:
+    elif probability >= doubtful_from:
         reason = f"{supports} the {subject} only in part: " + _weakest(found)
-        return Assessment(Verdict.DOUBTFUL, reason, _REMEDY, max(probability, _POSSIBLE), found)
-    if found.parts_predicted < _PART_UNSEEN:
+    elif found.parts_predicted < _PART_UNSEEN:
         reason = "The wrist or the jaws of an arm are not predicted where they were fitted, so only the shaft is."
-        return Assessment(Verdict.DOUBTFUL, reason, _REMEDY, max(probability, _POSSIBLE), found)
-    return Assessment(Verdict.GOOD, f"{supports} the {subject}.", "", probability, found)
+    else:
+        return Assessment(Verdict.GOOD, f"{supports} the {subject}.", "", probability, found)
+    return Assessment(Verdict.DOUBTFUL, reason, _REMEDY, max(probability, _POSSIBLE), found)
 
 
 def arm_is_elsewhere(found: Evidence) -> bool:
@@ -249,7 +235,6 @@ class DomainCheck:
         """Warnings before an optimization; empty where the network fits the recording.
 
         Args:
-            where: name of the images in messages.
             remedy: for a network that does not know arms or images.
             background: whether the empty background is known; then false detections in it do no harm.
         """
@@ -276,26 +261,12 @@ def check_domain(
 ) -> DomainCheck:
     """Check a network on a frame, with two predictions.
 
-    Args:
-        scene: with the cameras that take part.
-        frame: images and measured joint positions.
-        networks: the networks, or another predictor of surface maps.
-        settings: working size and dehazing.
-
     Raises:
         SettingsError: an image is missing, or of another size than its camera.
     """
     settings = settings or SurfaceSolver()
     predictor = predictor_of(networks).for_frame(frame, [camera.name for camera in scene.cameras])
-    images = FrameImages.of(
-        scene,
-        frame.images,
-        {},
-        scale=1.0,
-        working_width=settings.working_width,
-        dehaze=settings.dehaze,
-        predictor=predictor,
-    )
+    images = FrameImages.of(scene, frame.images, {}, settings, predictor)
     rendered = images.renderer(scene.state(frame.measured, predictor.device, frame.mounts))
     nothing = images.images.new_zeros(len(images.images), SURFACE_CHANNELS, *images.images.shape[-2:])
     whole = Window(0, 0, *images.size)
@@ -343,11 +314,7 @@ class SequenceAssessment:
 
 
 def assess_sequence(frames: Sequence[Assessment]) -> SequenceAssessment:
-    """Verdict on a sequence of at least one frame.
-
-    Args:
-        frames: verdicts on its frames.
-    """
+    """Verdict on a sequence of at least one frame."""
     counts = Counter(frame.verdict for frame in frames)
     named = {verdict.value: counts[verdict] for verdict in Verdict}
     probability = float(np.mean([frame.probability for frame in frames]))
@@ -365,12 +332,7 @@ def assess_sequence(frames: Sequence[Assessment]) -> SequenceAssessment:
 
 
 def without_knowledge(found: Assessment, known: Sequence[DomainCheck]) -> Assessment:
-    """Verdict on a calibration that fails a doubtful one where the network does not know the robot.
-
-    Args:
-        found: the verdict from the images.
-        known: domain checks of some of the frames.
-    """
+    """Verdict on a calibration that fails a doubtful one where the network does not know the robot."""
     recognized = [one.recognized for one in known if one.recognized is not None]
     if found.verdict is not Verdict.DOUBTFUL or not recognized or float(np.median(recognized)) >= RECOGNIZED:
         return found

@@ -8,14 +8,3 @@ from .renderer import Renderer as Renderer
 from .renderer import Rendering as Rendering
 from .renderer import SurfaceRendering as SurfaceRendering
 from .renderer import pick_point as pick_point
-
-__all__ = [
-    "JacobianBlock",
-    "Outline",
-    "Renderer",
-    "Rendering",
-    "SurfaceRendering",
-    "Tangents",
-    "pick_point",
-    "visibility",
-]

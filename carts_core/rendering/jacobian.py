@@ -64,7 +64,6 @@ def fill_jacobian(unknowns, runs, pixel, point, position, normal, dTs, dKs, Ks, 
         Ks [views, 4]: intrinsics [px].
         maps [views, channels, height, width], near [views, height, width]: surface maps and inverse depth [1/m].
         left, top: of the block [px].
-        first: channel of the normal.
         out [g, views, channels, rows, columns]: zeros.
     """
     views, _, rows, columns = out.shape[1:]
@@ -101,7 +100,7 @@ def fill_jacobian(unknowns, runs, pixel, point, position, normal, dTs, dKs, Ks, 
 
 @dataclass(frozen=True)
 class Tangents:
-    """Derivatives of what a renderer places and projects with, one per unknown."""
+    """Derivatives of link transforms and intrinsics, one per unknown."""
 
     Ts_camera_link: Float[Tensor, "unknowns cameras links 4 4"]
     intrinsics: Float[Tensor, "unknowns cameras 4"]
@@ -110,13 +109,13 @@ class Tangents:
 
 @dataclass(frozen=True)
 class JacobianBlock:
-    """Derivatives by the unknowns that move the same arms, around what they move; zero elsewhere."""
+    """Derivatives by unknowns that move common links, in a window around these; zero elsewhere."""
 
     unknowns: Int[Tensor, " g"]
     """Which they are."""
     left: int
     top: int
-    """Where the values lie in the maps [px]."""
+    """Upper left corner of the values in the maps [px]."""
     values: Float[Tensor, "g cameras 6 rows columns"]
 
     def dense(self, unknowns: int, like: Float[Tensor, "cameras 6 height width"]) -> Tensor:
@@ -140,13 +139,10 @@ def map_jacobian(
     """The derivative of surface maps by the unknowns.
 
     Args:
-        points: what each pixel sees.
         position: where that is in the camera's frame [m].
         facing: its normal in its link's frame, towards the camera.
-        maps: the surface maps.
         inverse_depth: 1 / depth [1/m], 0 for background.
         intrinsics: of the cameras [px].
-        tangents: of the unknowns.
         margin: what blocks hold around what is moved [px].
     """
     seen = (points, position, facing, maps, inverse_depth, intrinsics, tangents)
@@ -159,7 +155,7 @@ def map_jacobian(
 
 
 _Run = tuple[int, int, slice]
-"""View, link, and where its points are."""
+"""View, link, and the range of its points."""
 
 
 def _families(points: VisiblePoints, tangents: Tangents) -> list[tuple[list[int], list[_Run]]]:
@@ -190,7 +186,7 @@ class _Box:
 
     @staticmethod
     def around(pixels: list[Tensor], inverse_depth: Float[Tensor, "cameras height width"], margin: int) -> "_Box":
-        """What holds these pixels of the flattened maps, with a margin."""
+        """Bounding box of pixels of the flattened maps, with a margin."""
         height, width = inverse_depth.shape[1:]
         pixel = torch.cat(pixels)
         place = torch.stack([pixel % width, pixel // width % height])
@@ -218,21 +214,9 @@ def jacobian_of_box(
 ) -> Float[Tensor, "g cameras 6 rows columns"]:
     """The derivative of a box of surface maps by some unknowns."""
     values = np.zeros((len(unknowns), *maps.shape[:2], box.rows, box.columns), np.float32)
-    fill_jacobian(
-        np.array(unknowns),
-        np.array([(view, link, here.start, here.stop) for view, link, here in runs]),
-        as_array(points.pixel),
-        as_array(points.point_link),
-        as_array(position),
-        as_array(facing),
-        as_array(tangents.Ts_camera_link),
-        as_array(tangents.intrinsics),
-        as_array(intrinsics),
-        as_array(maps),
-        as_array(inverse_depth),
-        box.left,
-        box.top,
-        NORMALS.start,
-        values,
-    )
+    spans = np.array([(view, link, here.start, here.stop) for view, link, here in runs])
+    seen = points.pixel, points.point_link, position, facing
+    moved = tangents.Ts_camera_link, tangents.intrinsics, intrinsics, maps, inverse_depth
+    arrays = map(as_array, (*seen, *moved))
+    fill_jacobian(np.array(unknowns), spans, *arrays, box.left, box.top, NORMALS.start, values)
     return torch.from_numpy(values).to(maps.device)

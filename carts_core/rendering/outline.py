@@ -109,7 +109,7 @@ def move_along_normal(runs, point, normal, Ts, Ks, dTs, dKs, out):
 
 
 BEHIND = 0.01
-"""How much further away what is beside an outline is at least, as a share [1]. With less, folds of a surface count."""
+"""Least relative depth difference at an outline [1]; with less, folds of a surface count."""
 
 _BLUR = 1.5
 """Deviation of the blur that gives outlines their normals [px]."""
@@ -124,7 +124,7 @@ class Outline:
 
     camera: Int[Tensor, " K"]
     position: Float[Tensor, "2 K"]
-    """Where the outline is, x and y; the centre of the first pixel is (0, 0) [px]."""
+    """Position x and y; the centre of the first pixel is (0, 0) [px]."""
     normal: Float[Tensor, "2 K"]
     """Unit vectors, outwards."""
     parts: Int[Tensor, " K"]
@@ -133,11 +133,11 @@ class Outline:
     """Along the normal [px per unit of each unknown]."""
 
     def at(self, step: Float[Tensor, " unknowns"]) -> "Outline":
-        """Where the outlines are after a small step of the unknowns."""
+        """Outlines after a small step of the unknowns."""
         return replace(self, position=self.position + self.normal * (step @ self.motion))
 
     def moved_by(self, step: Float[Tensor, " unknowns"]) -> float:
-        """How far a step of the unknowns moves what moves most along its normal [px]; 0 where there are none."""
+        """Largest motion along the normal for a step of the unknowns [px]; 0 without outlines."""
         motion = step @ self.motion
         return float(motion.abs().max()) if len(motion) else 0.0
 
@@ -150,7 +150,6 @@ def outline_faces(
     Pixels nearer than `BORDER` to the border of the image do not count.
 
     Args:
-        face_ids: index of the visible triangle.
         inverse_depth: 1 / depth [1/m], 0 for background.
     """
     kept = keep_outline(as_array(face_ids), as_array(inverse_depth), 1.0 - BEHIND, BORDER)
@@ -160,7 +159,7 @@ def outline_faces(
 def outline_position(
     inverse_depth: Float[Tensor, "cameras height width"], pixel: Int[Tensor, " K"]
 ) -> tuple[Float[Tensor, "2 K"], Float[Tensor, "2 K"]]:
-    """Where the outline is at its pixels, and its normal, away from what is nearer.
+    """Positions of outline pixels, and their normals away from the nearer surface.
 
     Args:
         inverse_depth: 1 / depth [1/m], 0 for background.
@@ -178,26 +177,15 @@ def normal_motion(
     intrinsics: Float[Tensor, "cameras 4"],
     tangents: Tangents,
 ) -> Float[Tensor, "unknowns K"]:
-    """How fast points move along a direction in the image [px per unit of each unknown].
+    """Speed of points along a direction in the image [px per unit of each unknown].
 
     Args:
-        points: what is seen there.
-        normal: the direction.
         Ts_camera_link, intrinsics: where links are, and the cameras [m, px].
-        tangents: derivatives of both by the unknowns.
     """
     runs = [(view, link, here.start, here.stop) for view, link, here in points.runs()]
     motion = np.empty((len(tangents.intrinsics), normal.shape[1]), np.float32)
-    move_along_normal(
-        np.array(runs, np.int64).reshape(-1, 4),
-        as_array(points.point_link),
-        as_array(normal),
-        as_array(Ts_camera_link),
-        as_array(intrinsics),
-        as_array(tangents.Ts_camera_link),
-        as_array(tangents.intrinsics),
-        motion,
-    )
+    seen = points.point_link, normal, Ts_camera_link, intrinsics, tangents.Ts_camera_link, tangents.intrinsics
+    move_along_normal(np.array(runs, np.int64).reshape(-1, 4), *map(as_array, seen), motion)
     return torch.from_numpy(motion).to(normal.device)
 
 

@@ -120,7 +120,7 @@ def vertices_in_camera(
 
 
 def as_array(values: Tensor) -> np.ndarray:
-    """A tensor as compiled kernels take it: on the CPU, in C order; not copied where it is so already."""
+    """A tensor as a C-ordered array on the CPU, copied only if necessary."""
     return values.contiguous().cpu().numpy()
 
 
@@ -135,10 +135,7 @@ def phong(
     """Phong shading with one point light, two-sided.
 
     Args:
-        color: of the surface, linear RGB.
         points: in the camera's frame [m].
-        normals: unit vectors in the camera's frame.
-        light: its position is in the camera's frame.
 
     Returns:
         Linear RGB in [0, 1].
@@ -222,7 +219,7 @@ def gather_points(
     face_barycentric: Float[np.ndarray, "8 F"],
     face_normals: Float[np.ndarray, "9 F"],
 ) -> tuple[Int[np.ndarray, " K"], Int[np.ndarray, " K"], Float[np.ndarray, "3 K"], Float[np.ndarray, "3 K"], list[int]]:
-    """What the visible pixels see, in the order of views, links and pixels; see `points.VisiblePoints`.
+    """Surface points of visible pixels, in the order of views, links and pixels; see `VisiblePoints`.
 
     Returns:
         `pixel`, `face`, `point_link`, `normal_link`, and the number of points of each link in each view.
@@ -233,25 +230,14 @@ def gather_points(
     starts, total = np.cumsum(counts) - counts, int(counts.sum())
     pixels, faces = np.empty(total, np.int64), np.empty(total, np.int64)
     out = np.empty((6, total), np.float32)
-    _gather(
-        face_ids,
-        inverse_depth,
-        Ts_camera_link,
-        intrinsics,
-        face_links,
-        face_barycentric,
-        face_normals,
-        starts,
-        pixels,
-        faces,
-        out,
-    )
+    seen = face_ids, inverse_depth, Ts_camera_link, intrinsics, face_links, face_barycentric, face_normals
+    _gather(*seen, starts, pixels, faces, out)
     return pixels, faces, out[:3], out[3:], counts.tolist()
 
 
 @dataclass(frozen=True)
 class VisiblePoints:
-    """What the visible pixels see. `K` counts visible pixels through all views. Nothing here carries a gradient."""
+    """Surface points of visible pixels, without gradients. `K` counts visible pixels in all views."""
 
     pixel: Int[Tensor, " K"]
     """Index into the flattened `views x height x width`."""
@@ -264,7 +250,7 @@ class VisiblePoints:
     """Interpolated normal there, in the frame of its link."""
 
     def runs(self) -> list[tuple[int, int, slice]]:
-        """View, link, and where the points are, of each run of points on the same link in the same view."""
+        """View, link and range of each run of points on the same link in the same view."""
         ends = list(accumulate(count for _, _, count in self.groups))
         return [
             (view, link, slice(end - count, end)) for (view, link, count), end in zip(self.groups, ends, strict=True)
@@ -300,15 +286,8 @@ def visible_points(
     intrinsics: Float[Tensor, "views 4"],
 ) -> VisiblePoints:
     """The surface point and the normal that each visible pixel sees."""
-    *found, counts = gather_points(
-        as_array(face_ids),
-        as_array(inverse_depth),
-        as_array(Ts_camera_link),
-        as_array(intrinsics),
-        as_array(geometry.face_links),
-        as_array(geometry.face_barycentric),
-        as_array(geometry.face_normals),
-    )
+    faces = geometry.face_links, geometry.face_barycentric, geometry.face_normals
+    *found, counts = gather_points(*map(as_array, (face_ids, inverse_depth, Ts_camera_link, intrinsics, *faces)))
     links = Ts_camera_link.shape[1]
     groups = tuple((index // links, index % links, count) for index, count in enumerate(counts) if count)
     pixel, face, point, normal = (torch.from_numpy(values).to(face_ids.device) for values in found)

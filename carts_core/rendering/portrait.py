@@ -16,18 +16,17 @@ _FOCAL_LENGTH = 2.4
 _MARGIN = 1.25
 _TILT = np.deg2rad(35.0)
 _OPEN = 0.45
-"""Where joints stand, a part of their range above 0; jaws are then open."""
+"""Joint positions as a share of their range above 0, so that jaws are open [1]."""
 _SUPERSAMPLING = 2
 _GAMMA = 1 / 1.5
 _STEP = 0.1
-"""How far the last joint is moved to see what it moves [rad]."""
+"""Motion of the last joint that identifies the links that it moves [rad]."""
 
 
 def portrait(robot: Robot, width: int = 480, height: int = 320) -> UInt8[np.ndarray, "height width 3"]:
     """A robot before a plain backdrop, RGB: what its shaft carries if it is an instrument, else all of it.
 
     Args:
-        robot: any.
         width, height: of the picture [px].
     """
     joints, opening = _pose(robot)

@@ -15,7 +15,7 @@ NEAR = 1e-3
 
 
 _WIDE = 8
-"""Width of a bounding box [px] from which on it pays to find where each of its rows enters and leaves the triangle."""
+"""Width of a bounding box [px] from which the entry and exit of each row are computed."""
 
 
 @compiled
@@ -151,7 +151,6 @@ def rasterize(
 
     Args:
         vertices_camera: in the camera's frame [m].
-        faces: vertex indices.
         intrinsics: fx, fy, cx, cy [px].
         width, height: size of the image [px].
         surfaces: of each triangle, the index of the closed surface that it is part of, -1 for none (the default). Seen

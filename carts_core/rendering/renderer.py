@@ -125,7 +125,6 @@ class Renderer:
     """Renders the arms of a scene into its cameras.
 
     Args:
-        scene: arms, cameras and light.
         width, height: size of the rendered images [px], by default that of the first camera. The intrinsics of a
             state are those of the camera's own size and are scaled.
         cameras: names of the cameras to render, in this order; all by default. States are of all cameras of the scene,
@@ -203,14 +202,11 @@ class Renderer:
         face_ids, inverse_depth = self._visibility(Ts.flatten(0, -4), intrinsics.flatten(0, -2))
         return face_ids.view(shape), inverse_depth.view(shape)
 
-    @torch.no_grad()
     def _visible(self, state: SceneState, face_labels: Int[Tensor, " F"]) -> np.ndarray:
         """Label of the visible triangle per pixel, -1 for background."""
-        Ts, intrinsics = self._views(state)
-        face_ids, _ = self._visibility(Ts.flatten(0, -4), intrinsics.flatten(0, -2))
+        face_ids, _ = self.visibility(state)
         # Background is face -1, which is the last label.
-        labels = np.append(face_labels.cpu().numpy(), -1)[face_ids.cpu().numpy()]
-        return labels.reshape(*Ts.shape[:-3], self.height, self.width)
+        return np.append(face_labels.cpu().numpy(), -1)[face_ids.cpu().numpy()]
 
     @torch.no_grad()
     def surface_maps(self, state: SceneState) -> Float[Tensor, "*batch cameras 6 height width"]:
@@ -326,9 +322,7 @@ def pick_point(
     """The point of the rendered surface at a pixel, fixed to its link.
 
     Args:
-        scene: arms and cameras.
         renderer: of one camera of the scene alone, at its full size.
-        state: where the scene's arms and cameras are (no batch).
         pixel: column and row, pixel centres at 0.5 [px].
         radius: how far the centre of the nearest pixel with an arm may be [px]; 0 for the pixel that holds the place.
 

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 _MEAN, _DEVIATION = (123.675, 116.28, 103.53), (58.395, 57.12, 57.375)
 """Of the colours of an image, as SAM's encoders take it, RGB in 0..255."""
 _INSIDE, _OUTSIDE, _CORNERS, _PADDING = 1.0, 0.0, (2.0, 3.0), -1.0
-"""What SAM calls a point: on the thing, beside it, upper left and lower right corner of a box, none."""
+"""SAM's labels of points: on the object, beside it, corners of a box, padding."""
 _REMEDY = (
     "Give two ONNX files, the encoder first, as Segment Anything's export_onnx_model.py and samexporter write them."
 )
@@ -86,7 +86,7 @@ class OnnxSegmenter:
         return OnnxSegmenter(first, second, shape[2], decoder.stem)
 
     def segment(self, image: UInt8[np.ndarray, "height width 3"], prompt: Prompt) -> Bool[np.ndarray, "height width"]:
-        """The mask of what is at the points or in the box; see `Segmenter`.
+        """Mask of the object; see `Segmenter`.
 
         Raises:
             WeightsError: the model cannot be run, or makes something else than masks.
@@ -121,7 +121,7 @@ class OnnxSegmenter:
         return _at_size(masks[best], (height, width)) > 0.0
 
     def _features(self, image: np.ndarray, scale: float) -> dict[str, np.ndarray]:
-        """What the encoder makes of an image; remembered, since a person's clicks come on the same image."""
+        """Features of an image, cached for further clicks on the same image."""
         if self._last is None or self._last[0] is not image:
             height, width = image.shape[:2]
             size = round(width * scale), round(height * scale)
@@ -142,7 +142,7 @@ def _run(session: "InferenceSession", inputs: Mapping[str, np.ndarray]) -> dict[
 
 
 def _points(prompt: Prompt, scale: float) -> tuple[Float[np.ndarray, "points 2"], Float[np.ndarray, " points"]]:
-    """Points and what they are, in pixels of the encoder's image."""
+    """Points with their labels, in pixels of the encoder's image."""
     places = [*prompt.inside, *prompt.outside]
     kinds = [_INSIDE] * len(prompt.inside) + [_OUTSIDE] * len(prompt.outside)
     if prompt.box is not None:

@@ -19,7 +19,7 @@ MOST_POINTS = 100
 
 @dataclass(frozen=True)
 class Prompt:
-    """Where something is in an image: points on it, points beside it, a box around it.
+    """Prompt for an object in an image: points on it, points beside it, a box around it.
 
     Raises:
         SettingsError: neither a point on it nor a box, too many points, a place that is not finite, or an empty box.
@@ -45,14 +45,10 @@ class Prompt:
 
 
 class Segmenter(Protocol):
-    """Segments what a prompt points at; a plug-in may be anything that has this method."""
+    """Protocol of segmenters: segments the object of a prompt."""
 
     def segment(self, image: UInt8[np.ndarray, "height width 3"], prompt: Prompt) -> Bool[np.ndarray, "height width"]:
-        """The mask of what is there.
-
-        Args:
-            image: RGB.
-            prompt: places in it.
+        """Mask of the object.
 
         Raises:
             CartsError: it could not be done.
@@ -69,7 +65,7 @@ as shares of the image's longer side."""
 _POINT, _AROUND = 0.006, 0.05
 """Radius of what a point says for certain, and of what one beside the thing puts in question; shares as above."""
 _ALIKE = 25
-"""Largest difference of colour from a point where the network sees nothing, in steps of 8 bits."""
+"""Largest colour difference from a point outside of detections, in steps of 8 bits."""
 _SMALLEST = 0.02
 """A piece in a box counts if it is at least this share of the largest."""
 
@@ -93,7 +89,7 @@ class NetworkSegmenter:
         return NetworkSegmenter(lambda image: instrument_probability(extractor, image))
 
     def segment(self, image: UInt8[np.ndarray, "height width 3"], prompt: Prompt) -> Bool[np.ndarray, "height width"]:
-        """The mask of what is at the points or in the box; see `Segmenter`."""
+        """Mask of the object; see `Segmenter`."""
         height, width = image.shape[:2]
         scale = min(1.0, _LONGEST_SIDE / max(height, width))
         size = round(width * scale), round(height * scale)
@@ -118,7 +114,7 @@ class NetworkSegmenter:
 def instrument_probability(
     extractor: FeatureExtractor, image: UInt8[np.ndarray, "height width 3"]
 ) -> Float[np.ndarray, "height width"]:
-    """How likely each pixel shows an instrument: the surface network's coverage; no arm needs to be known."""
+    """Probability that a pixel shows an instrument: unconditioned coverage of the surface network."""
     height, width = image.shape[:2]
     stride = extractor.stride
     scale = extractor.working_size[0] / width
@@ -181,7 +177,7 @@ class _Places:
 def _seeds(
     small: np.ndarray, likely: Bool[np.ndarray, "h w"], places: _Places
 ) -> tuple[Bool[np.ndarray, "h w"], float]:
-    """What is probably meant, and how far from its outline the image decides."""
+    """Probable object, and width of the band around its outline in which the image decides."""
     seen = likely & places.boxed()
     if places.inside:
         _, labels = cv2.connectedComponents(seen.astype(np.uint8))
@@ -202,7 +198,7 @@ def _seeds(
 
 
 def _alike(small: np.ndarray, places: list[tuple[int, int]]) -> Bool[np.ndarray, "h w"]:
-    """What is connected with these places and has their colour."""
+    """Regions connected with these pixels, of similar colour."""
     smooth = cv2.bilateralFilter(small, 7, 30, 5)
     found = np.zeros((small.shape[0] + 2, small.shape[1] + 2), np.uint8)
     flags = 8 | cv2.FLOODFILL_MASK_ONLY | cv2.FLOODFILL_FIXED_RANGE | (1 << 8)

@@ -16,7 +16,7 @@ from carts_core.model.parts import COVERAGE
 from carts_core.model.scene import Scene
 from carts_core.networks import FeatureExtractor
 from carts_core.optimization import Backgrounds, FrameOptimizer, ImagePredictor, SurfaceSolver, Verdict
-from carts_core.optimization.counterfactual import Background, without_background
+from carts_core.optimization.backgrounds import Background, without_background
 from carts_core.optimization.observation import FrameImages
 from carts_core.recording import Sequence
 from carts_core.rendering import Renderer
@@ -59,16 +59,8 @@ def _with_arm(room: np.ndarray) -> np.ndarray:
 
 def _seen(scene: Scene, image: np.ndarray, backgrounds: Backgrounds | None) -> tuple[FrameImages, np.ndarray]:
     predictor = DarkIsArm()
-    found = FrameImages.of(
-        scene,
-        {"left": image},
-        {},
-        scale=1.0,
-        working_width=320,
-        dehaze=0.0,
-        predictor=predictor,
-        backgrounds=backgrounds,
-    )
+    settings = SurfaceSolver(dehaze=0.0)
+    found = FrameImages.of(scene, {"left": image}, {}, settings, predictor, backgrounds=backgrounds)
     seen = predictor.predict(found.images, torch.zeros(1, 6, 240, 320), Window(0, 0, 320, 240))[0, 0]
     if found.explained is not None:
         seen = seen * (1 - found.explained[0, 0])

@@ -57,9 +57,8 @@ def align(sequence: Sequence, image: np.ndarray | None = None, **given) -> Align
         images,
         variables,
         given.pop("ignore", {}),
-        working_width=320,
-        dehaze=given.pop("dehaze", 0.0),
-        device=seen.device,
+        SurfaceSolver(dehaze=given.pop("dehaze", 0.0)),
+        seen.device,
     )
     prior, origin = variables.prior(SurfaceSolver(prior_deg=3.0)), torch.zeros(len(variables))
     stage = AlignEdges(steps=given.pop("steps", 20))
@@ -211,7 +210,7 @@ def test_the_compiled_kernel_finds_the_same_edges_as_torch(sequence: Sequence) -
     start = sequence.scene.state({ARM: (frame.truth or {})[ARM] + OFF})
     variables = Variables(sequence.scene, start, FreeParameters(), 0.15)
     device = torch.device("cpu")
-    edges = EdgeFactor(sequence.scene, frame.images, variables, {}, working_width=320, dehaze=0.0, device=device)
+    edges = EdgeFactor(sequence.scene, frame.images, variables, {}, SurfaceSolver(dehaze=0.0), device)
     outline = edges.near(torch.zeros(len(variables)), torch.ones(1, 360, 480), 0.3)._outline
     compiled, plain = edges._nearest(outline), nearest_ref(edges, outline)
     assert len(outline.camera) > 500 and 0.2 < float(plain[1].mean()) < 1.0

@@ -198,19 +198,12 @@ def test_many_states_are_compared_at_once_as_each_alone(
     frame, scene = sequence.frame(0), sequence.scene
     settings = SurfaceSolver(dehaze=0.0)
     variables = Variables(scene, scene.state(frame.measured), FreeParameters(), 0.15)
-    images = FrameImages.of(
-        scene,
-        frame.images,
-        {},
-        scale=1.0,
-        working_width=320,
-        dehaze=0.0,
-        predictor=PerfectPredictor(sequence, scene.state(frame.truth or {})),
-    )
+    predictor = PerfectPredictor(sequence, scene.state(frame.truth or {}))
+    images = FrameImages.of(scene, frame.images, {}, settings, predictor)
     maps = Renderer(scene).surface_maps(scene.state(frame.truth or {}))
     ones = torch.ones_like(maps[:, :1])
     observation = Observation(images, Window(0, 0, 320, 240), maps, ones, ones)
-    factor = SurfaceFactor(scene, variables, observation, settings, blur=4.0, robust=0.5)
+    factor = SurfaceFactor(scene, variables, observation, settings, Descend(4.0))
     offsets = torch.linspace(-0.1, 0.1, 5)[:, None] * torch.ones(len(variables))
     costs = factor.costs(offsets)
     alone = [factor.compare(each).pixels / settings.noise**2 for each in offsets]

@@ -225,7 +225,7 @@ def test_an_arm_behind_another_one_is_in_view_and_one_outside_the_image_has_left
     mask = Renderer(scene).segment(beside(0.0, 0.004))[0] >= 0
     frame = replace(Sequence.open(tiny_sequence(frames=1, width=320, height=240)).frame(0), masks={"left": mask})
     predictor = MaskPredictor().for_frame(frame, ["left"])
-    images = FrameImages.of(scene, frame.images, {}, scale=1.0, working_width=320, dehaze=0.0, predictor=predictor)
+    images = FrameImages.of(scene, frame.images, {}, SurfaceSolver(dehaze=0.0), predictor)
     start = beside(0.02, 0.004)
     hidden, gone = (evidence(images, start, end, predictor, 0.01) for end in (beside(0.0, 0.004), beside(0.2, 0.004)))
     assert hidden.still_in_view > 0.7 and "left the image" not in assess(hidden).reason

@@ -34,11 +34,11 @@ _SLIM_WRIST = 9.1
 _JAW_LOWEST = -0.349066
 """Jaws read less than 0 while they grasp [rad]."""
 _TURNED_JAW = 'xyz="0 0 -2.5e-05" rpy="0 3.141592653589793 0"'
-"""Where the shipped robot's second jaw has the mesh of its first."""
+"""Pose of the first jaw's mesh in the second jaw of the shipped robot."""
 
 
 def builtin_names() -> tuple[str, ...]:
-    """What may follow `builtin:`."""
+    """Names after `builtin:`."""
     return (SHIPPED, *(name + suffix for name in BY_NAME for suffix in ("", SI_SUFFIX)))
 
 

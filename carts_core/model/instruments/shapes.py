@@ -147,7 +147,7 @@ CHEEK_INSIDE = 2.95
 _NECK = 1.2
 """Half the thickness of the part between the shaft's fork arms."""
 _END = 4.1
-"""How far the cheeks reach beyond the yaw axis."""
+"""Extent of the cheeks beyond the yaw axis [mm]."""
 
 
 def wide_body(length: float) -> Solid:
@@ -231,17 +231,17 @@ class Jaws:
     root: float = 4.0
     """Where the blades begin [mm]."""
     arch: float = 0.0
-    """How far the middle of the blades bends sideways [mm]."""
+    """Lateral bend of the blades' middle [mm]."""
     turn: float = 0.0
-    """How far their ends bend sideways [mm]."""
+    """Lateral bend of their ends [mm]."""
     windows: tuple[tuple[float, float], ...] = ()
     """Openings in a blade, from and to, places along it."""
     rim: float = 0.75
-    """Width of what is left beside a window [mm]."""
+    """Width of the rim beside a window [mm]."""
     insert: float = 0.0
     """Thickness of an insert of another material in the gripping face [mm]."""
     pivot: float = 0.0
-    """How far beyond the yaw axis the jaws turn [mm]."""
+    """Distance of the jaws' axis beyond the yaw axis [mm]."""
 
     def jaw(self, side: int) -> Solid:
         """The metal part of one jaw."""
@@ -262,7 +262,7 @@ class Jaws:
         return together(parts)
 
     def base(self) -> Solid | None:
-        """What the jaws turn on, beyond the yaw axis."""
+        """Bearing of the jaws beyond the yaw axis."""
         if not self.pivot:
             return None
         reach = self.pivot + 0.55 * self.hub.radius
@@ -306,7 +306,7 @@ class Scissors:
     """Thickness of a blade [mm]."""
     hub: Hub = Hub(2.4, 2.0)
     turn: float = 0.0
-    """How far the ends bend sideways [mm]."""
+    """Lateral bend of the ends [mm]."""
     root: float = 2.0
     """Where the blades begin [mm]."""
     pivot: float = 0.0

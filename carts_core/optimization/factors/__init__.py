@@ -1,4 +1,4 @@
-"""What a problem is a sum of: each factor says how badly a state fits, and how that changes with the unknowns."""
+"""Factors: terms of an objective, with a cost and a quadratic model in the unknowns."""
 
 from .base import Factor as Factor
 from .base import Linearization as Linearization

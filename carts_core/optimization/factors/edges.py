@@ -15,6 +15,7 @@ from ...imaging.working_image import attention, pixel_weights, smoothed, stacked
 from ...model.scene import Scene
 from ...rendering import Outline, Renderer
 from ...rendering.points import as_array
+from ...settings import SurfaceSolver
 from ...settings.stages import AlignEdges
 from ...threads import total
 from ..solvers import bounded_step
@@ -73,9 +74,7 @@ def nearest_edges(
 
     Args:
         gradient: of the images' three colours, to the right and then down [1/px].
-        camera: of each pixel of the outline.
         position: where the outline is [px].
-        normal: unit vectors, outwards.
         samples: distances at which edges are looked for, evenly spaced, at least three [px].
         expected: what each of them counts [1].
     """
@@ -86,16 +85,16 @@ def nearest_edges(
 
 
 _SCALE = 2.0
-"""How many times larger than the working image that is in which edges are looked for, up to the camera's image [1]."""
+"""Size of the image for edge detection relative to the working image, up to the camera's image [1]."""
 
 _REACH, _SAMPLING = 4.0, 0.5
-"""How far from an outline edges are looked for, and how densely [px]."""
+"""Search range along the normal of an outline, and distance of samples [px]."""
 
 _LIKELY = 3.0
 """Deviation of how far from the outline the right edge is expected [px]."""
 
 _NEAR = 8
-"""How near an outline the network has to see an arm [px]."""
+"""Largest distance of an outline from predicted coverage [px]."""
 
 _ROBUST = 1.5
 """Distance at which an edge has lost three quarters of its weight [px]."""
@@ -104,7 +103,7 @@ _BLUR = 1.0
 """Deviation of the blur under which edges are looked for [px]."""
 
 _SHARE = (0.3, 1.0, 1.0)
-"""How much a pixel of the outline counts, per part. Along a straight shaft the errors of many pixels are the same."""
+"""Weight of an outline pixel per part; along a straight shaft the errors of many pixels are correlated [1]."""
 
 _RENDERED_ANEW = 1.0
 """Outlines that have moved by more than this are rendered again; up to there they move by their Jacobian [px]."""
@@ -114,13 +113,7 @@ class EdgeFactor:
     """Half the weighted squared distances of outlines to edges of the images.
 
     Args:
-        scene: with the cameras that take part.
-        images: camera name -> observed RGB image.
-        variables: the unknowns.
         ignore: camera name -> pixels that show an occluder.
-        working_width: of the working image [px].
-        dehaze: share of smoke and haze that is taken off [1].
-        device: where to compute.
 
     Raises:
         SettingsError: an image is missing, or an image or a mask is of another size than its camera.
@@ -132,15 +125,13 @@ class EdgeFactor:
         images: Mapping[str, UInt8[np.ndarray, "h w 3"]],
         variables: Variables,
         ignore: Mapping[str, Bool[np.ndarray, "h w"]],
-        *,
-        working_width: int,
-        dehaze: float,
+        settings: SurfaceSolver,
         device: torch.device,
     ) -> None:
         self.variables = variables
-        size = working_size(scene, round(working_width * _SCALE), 1)
+        size = working_size(scene, round(settings.working_width * _SCALE), 1)
         stacked = stacked_images(scene, images, size, "image").to(device)
-        through = transmission(stacked, dehaze)
+        through = transmission(stacked, settings.dehaze)
         clear = dehazed(stacked, through)
         down, right = torch.gradient(smoothed(clear, _BLUR), dim=(-2, -1))
         # The compiled kernel reads all colours of a pixel at once.
@@ -159,7 +150,6 @@ class EdgeFactor:
         """The factor in the neighbourhood of a point.
 
         Args:
-            offsets: the point.
             coverage: of the arms as they were observed, of the whole image at any size; other edges do not count.
             weight: of a squared distance, per pixel of the outline [1/px^2].
         """
@@ -167,7 +157,7 @@ class EdgeFactor:
         return LocalEdgeFactor(self, offsets, attention(near, _NEAR) * self._shown, weight)
 
     def equations(self, outline: Outline, counts: Float[Tensor, "cameras 1 h w"], edge_weight: float) -> Linearization:
-        """The quadratic model of outlines as they are, where pixels of the images count that much."""
+        """Quadratic model of given outlines, with weights of the image's pixels."""
         distance, weight = self._nearest(outline)
         column, row = outline.position.round().long()
         weight = weight * counts[outline.camera, 0, row, column] * self._share[outline.parts]
@@ -177,7 +167,7 @@ class EdgeFactor:
         return Linearization(cost, -weighted @ distance, weighted @ outline.motion.T)
 
     def cost(self, outline: Outline, counts: Float[Tensor, "cameras 1 h w"]) -> float:
-        """How far outlines are from edges: robust squared distances, summed [px^2].
+        """Distance of outlines from edges: sum of robust squared distances [px^2].
 
         A pixel without an edge costs as much as one far away, so that poses compare.
         """
@@ -217,11 +207,11 @@ class LocalEdgeFactor:
         return self._factor.equations(self._outline.at(offsets - self._rendered_at), self._counts, self._weight)
 
     def cost(self) -> float:
-        """How far the outlines that were rendered last are from edges; see `EdgeFactor.cost`."""
+        """Distance of the last rendered outlines from edges; see `EdgeFactor.cost`."""
         return self._factor.cost(self._outline, self._counts)
 
     def moved_by(self, step: Float[Tensor, " n"]) -> float:
-        """How far outlines move with a step [px]."""
+        """Largest motion of outlines for a step [px]."""
         return self._outline.moved_by(step)
 
 
@@ -240,9 +230,6 @@ def align_edges(
     """Minimize the sum of the edge factor and of a fixed quadratic model.
 
     Args:
-        edges: the edge factor.
-        stage: number of steps, and weight of the edges.
-        offsets: where to begin.
         known: the quadratic model there of all other factors.
         coverage: of the arms as observed, see `EdgeFactor.near`.
 

@@ -19,31 +19,27 @@ from ...model.parts import COVERAGE, NORMALS, SURFACE_CHANNELS
 from ...model.scene import Scene, SceneState
 from ...rendering import JacobianBlock, Renderer, SurfaceRendering
 from ...settings import SurfaceSolver
+from ...settings.stages import Descend
 from ...threads import one_thread, total
 from ..observation import Observation
 from ..variables import APART, Variables
 from .base import Linearization
 
 _REDUCTIONS = (1, 2, 4, 8)
-"""How many times smaller than the observed images those of a factor can be."""
+"""Allowed reductions of the observed images in a factor [1]."""
 
 _PIXELS_AT_ONCE = 1 << 20
 """Most pixels of all states together that are rendered at once."""
 
 _SMALLEST_BLUR = 1.2
-"""Images are reduced as far as the blur stays at least this [px of the reduced image]."""
+"""Smallest blur after reduction of the images [px of the reduced image]."""
 
 
 class SurfaceFactor:
     """Half the sum of robust squared differences of surface maps, in units of the noise. Implements `Factor`.
 
     Args:
-        scene: with the cameras that take part.
-        variables: the unknowns.
-        observation: the predicted surface maps.
-        settings: noise and weights of the channels.
-        blur: deviation of the blur [px of the working image].
-        robust: difference beyond which a pixel loses its weight [1].
+        stage: blur, and difference beyond which a pixel loses its weight.
 
     Attributes:
         noise: deviation of what is observed, per pixel [1].
@@ -59,14 +55,12 @@ class SurfaceFactor:
         variables: Variables,
         observation: Observation,
         settings: SurfaceSolver,
-        *,
-        blur: float,
-        robust: float,
+        stage: Descend,
     ) -> None:
         images = observation.images
-        blur *= images.scale
+        blur = stage.blur * images.scale
         reduction = max(r for r in _REDUCTIONS if r == 1 or blur / r >= _SMALLEST_BLUR)
-        self._variables, self._blur, self._robust = variables, blur / reduction, robust
+        self._variables, self._blur, self._robust = variables, blur / reduction, stage.robust
         self.area = (reduction / images.scale) ** 2
         self.noise = settings.mask_noise if observation.masked else settings.noise
         self._precision = self.area / self.noise**2
@@ -132,14 +126,14 @@ class SurfaceFactor:
         )
 
     def _difference(self, maps: Float[Tensor, "*batch cameras 6 h w"]) -> tuple[Tensor, Tensor, Tensor]:
-        """Maps under the blur, the squared residual of each pixel, and what is left of that for being large [1]."""
+        """Blurred maps, squared residuals of pixels, and robust weights in (0, 1]."""
         model = self._blurred(maps * self._weight)
         squared = ((self._observed - model).square() * self._channels).sum(-3, keepdim=True)
         # Geman-McClure: a residual far beyond the scale costs no more, and no longer pulls.
         return model, squared, 1.0 / (1.0 + squared / self._robust**2)
 
     def _blurred(self, maps: Float[Tensor, "*batch 6 h w"]) -> Float[Tensor, "*batch channels h w"]:
-        """What is compared of surface maps: all their channels, or where no parts are known the coverage alone."""
+        """Compared channels of surface maps: all, or the total coverage if no parts are known."""
         if self._total_only:
             return smoothed(maps[..., COVERAGE, :, :].sum(-3, keepdim=True), self._blur)
         return with_total(smoothed(maps, self._blur))
@@ -174,10 +168,10 @@ class SurfaceFactor:
 
 @dataclass(frozen=True)
 class Comparison:
-    """How a state compares with what is observed."""
+    """Comparison of a state with an observation."""
 
     pixels: float
-    """The cost in pixels of the working image: half the sum of robust squared residuals, each as far as it counts."""
+    """Cost [px of the working image]: half the weighted sum of robust squared residuals."""
     rendering: SurfaceRendering
     similarity: Float[Tensor, "cameras h w"]
     trust: Float[Tensor, "cameras h w"]
@@ -190,16 +184,16 @@ class SurfaceLinearization(Linearization):
 
     comparison: Comparison
     outline: Float[Tensor, " n"]
-    """What the gradient loses when all observed outlines move outwards by a pixel of the working image [1/px]."""
+    """Decrease of the gradient if all observed outlines move outwards by a pixel of the working image [1/px]."""
 
 
 def _growth(coverage: Float[Tensor, "cameras h w"]) -> Float[Tensor, "cameras h w"]:
-    """What coverage gains when outlines move outwards by a pixel."""
+    """Increase of coverage if outlines move outwards by a pixel."""
     down, right = torch.gradient(coverage, dim=(-2, -1))
     return torch.hypot(down, right)
 
 
 def with_total(maps: Float[Tensor, "*batch 6 h w"]) -> Float[Tensor, "*batch 6 h w"]:
-    """Surface maps, in place, with the coverage of all parts in place of the first one's: what a mask is made of."""
+    """Replace the coverage of the first part by that of all parts, in place."""
     maps[..., COVERAGE.start, :, :] = maps[..., COVERAGE, :, :].sum(-3)
     return maps

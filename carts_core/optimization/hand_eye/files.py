@@ -173,7 +173,6 @@ def moved_cameras(scene: Scene, mounts: Mapping[str, Float[np.ndarray, "4 4"]], 
     """Scene with its cameras moved by their mounts, or back.
 
     Args:
-        scene: arms and cameras.
         mounts: camera -> T_mount_world [m], of the cameras that move.
         back: from the world to the mounts.
     """

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Annotated
 
 import cv2
 import numpy as np
@@ -13,23 +14,20 @@ from ...errors import SettingsError
 from ...model.camera import HALF_PIXEL
 from ...model.keypoints import Landmark, LandmarkKind, landmarks, link_transforms
 from ...model.scene import Scene
+from ...settings.ranges import Range, Ranged
 from ...wording import counted
 
 
 @dataclass(frozen=True)
-class HandEyeSettings:
+class HandEyeSettings(Ranged):
     """Free parameters of hand-eye calibration, and the noise of clicked points."""
 
-    pixel_error: float = 2.0
+    pixel_error: Annotated[float, Range(0.05, 100, "px")] = 2.0
     """Expected error of a point [px]."""
     focal_length: bool = False
     """Solve for the focal lengths of all cameras that have points, too."""
     free_cameras: tuple[str, ...] = ()
     """Cameras whose pose relative to the others is not known."""
-
-    def __post_init__(self) -> None:
-        if not 0.05 <= self.pixel_error <= 100:
-            raise SettingsError(f"pixel_error is {self.pixel_error:g}; allowed is 0.05 to 100 px.")
 
 
 NEAREST = 1e-3
@@ -68,11 +66,6 @@ class View:
     pixels: Float[np.ndarray, "points 2"]
 
     @property
-    def has_edges(self) -> bool:
-        """Whether some points are edges of a shaft."""
-        return any(landmark.kind is LandmarkKind.EDGE for landmark in self.landmarks)
-
-    @property
     def is_point(self) -> np.ndarray:
         """Mask of the points that are not lines [points]."""
         return np.array([landmark.kind is LandmarkKind.POINT for landmark in self.landmarks])
@@ -83,7 +76,6 @@ class View:
         """Distances of the landmarks from their clicked points [px]; for lines, the second number is 0.
 
         Args:
-            T_camera_base: pose of the arm.
             intrinsics: fx, fy, cx, cy [px].
             side: of the shaft that all its edges were found on, 1 or -1; 0 takes the nearer side for each.
         """
@@ -104,9 +96,7 @@ def views_of(
     """Points by camera and arm, in the scene's order.
 
     Args:
-        scene: arms and cameras.
         measured: arm -> joint positions of all frames [rad, m].
-        points: clicked points.
 
     Raises:
         SettingsError: a point names a frame or a landmark that does not exist, or lies at no place.
@@ -121,30 +111,21 @@ def views_of(
         if not np.isfinite(point.pixel).all():
             raise SettingsError(f"the {point.landmark} in frame {point.frame} is at {point.pixel}. Give two numbers.")
         grouped.setdefault((camera, arm), []).append(row)
-    return [_view(scene, measured, points, camera, arm, tuple(rows)) for (camera, arm), rows in sorted(grouped.items())]
-
-
-def _view(
-    scene: Scene, measured: Mapping[str, np.ndarray], points: Sequence[ImagePoint], camera: int, arm: int, rows
-) -> View:
-    entry = scene.arms[arm]
-    known = landmarks(entry)
-    chosen = [points[row] for row in rows]
-    for point in chosen:
-        if point.landmark not in known:
-            raise SettingsError(f"{entry.name} has no {point.landmark!r}. Its landmarks are: {', '.join(known)}.")
-    Ts = link_transforms(entry, np.asarray(measured[entry.name])[[point.frame for point in chosen]])
-    ends = [known[point.landmark].positions(T) for point, T in zip(chosen, Ts, strict=True)]
-    return View(
-        camera=camera,
-        arm=arm,
-        rows=rows,
-        frames=tuple(point.frame for point in chosen),
-        landmarks=tuple(known[point.landmark] for point in chosen),
-        starts=np.stack([each[0] for each in ends]),
-        ends=np.stack([each[-1] for each in ends]),
-        pixels=np.array([point.pixel for point in chosen], np.float64),
-    )
+    views = []
+    for (camera, arm), rows in sorted(grouped.items()):
+        entry, chosen = scene.arms[arm], [points[row] for row in rows]
+        known = landmarks(entry)
+        for point in chosen:
+            if point.landmark not in known:
+                raise SettingsError(f"{entry.name} has no {point.landmark!r}. Its landmarks are: {', '.join(known)}.")
+        frames = tuple(point.frame for point in chosen)
+        found = tuple(known[point.landmark] for point in chosen)
+        Ts = link_transforms(entry, np.asarray(measured[entry.name])[list(frames)])
+        ends = [landmark.positions(T) for landmark, T in zip(found, Ts, strict=True)]
+        starts, last = (np.stack([each[place] for each in ends]) for place in (0, -1))
+        pixels = np.array([point.pixel for point in chosen], np.float64)
+        views.append(View(camera, arm, tuple(rows), frames, found, starts, last, pixels))
+    return views
 
 
 def _line_distance(
@@ -265,7 +246,15 @@ class HandEyeProblem:
             view for view in views if view.arm in self._T_world_base and (view.camera, view.arm) not in self.missing
         ]
         if not self.views:
-            raise SettingsError(_too_few(scene, self.missing))
+            parts = [
+                f"{scene.arms[arm].name} needs {counted(more, 'more point')} in {scene.cameras[camera].name}"
+                for (camera, arm), more in self.missing.items()
+            ]
+            raise SettingsError(
+                f"{'; '.join(parts)}. Edges of the shaft do not count; click tip and wrist, in several frames."
+                if parts
+                else "there is no point. Click tip, wrist and shaft of an arm in 3 to 6 frames."
+            )
         self._arms = list(self._T_world_base)
         self._cameras = [view.camera for view in self.views]
         self._free = sorted(free & set(self._cameras) - {self._anchor})
@@ -345,7 +334,6 @@ class HandEyeProblem:
         """Distances of the landmarks of each view from their clicked points [px].
 
         Args:
-            values: of the unknowns.
             sides: side of the shaft with the edges of each view; the nearer one by default.
         """
         bases, cameras, intrinsics = self.poses(values)
@@ -381,13 +369,3 @@ def _anchor(views: list[View], free: set[int]) -> int:
         if (count := int(view.is_point.sum())) >= FEWEST_POINTS:
             points[view.camera] = points.get(view.camera, 0) + count
     return max(points, key=lambda camera: (camera not in free, points[camera], -camera), default=-1)
-
-
-def _too_few(scene: Scene, missing: Mapping[tuple[int, int], int]) -> str:
-    if not missing:
-        return "there is no point. Click tip, wrist and shaft of an arm in 3 to 6 frames."
-    parts = [
-        f"{scene.arms[arm].name} needs {counted(more, 'more point')} in {scene.cameras[camera].name}"
-        for (camera, arm), more in missing.items()
-    ]
-    return f"{'; '.join(parts)}. Edges of the shaft do not count as points; click tip and wrist, in several frames."

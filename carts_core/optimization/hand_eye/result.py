@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from scipy.special import chdtri
 
 from ...errors import SettingsError
+from ...model.keypoints import LandmarkKind
 from ...model.scene import Scene
 from ...settings import SurfaceSolver
 from .problem import HandEyeProblem, HandEyeSettings, ImagePoint, View, place_of, views_of
@@ -172,21 +173,14 @@ def _deviation(problem: HandEyeProblem, view: View, values: np.ndarray, covarian
 def _filled(
     problem: HandEyeProblem, bases: dict[int, np.ndarray], cameras: dict[int, np.ndarray], intrinsics: np.ndarray
 ) -> Scene:
-    scene = problem.scene
-    return replace(
-        scene,
-        arms=tuple(
-            replace(arm, T_world_base=bases[index]) if index in bases else arm for index, arm in enumerate(scene.arms)
-        ),
-        cameras=tuple(
-            replace(
-                camera,
-                T_camera_world=cameras[index],
-                intrinsics=tuple(intrinsics[index].tolist()) if index in problem.focal else camera.intrinsics,
-            )
-            for index, camera in enumerate(scene.cameras)
-        ),
-    )
+    arms, views = list(problem.scene.arms), list(problem.scene.cameras)
+    for index, T_world_base in bases.items():
+        arms[index] = replace(arms[index], T_world_base=T_world_base)
+    for index, T_camera_world in cameras.items():
+        views[index] = replace(views[index], T_camera_world=T_camera_world)
+    for index in problem.focal:
+        views[index] = replace(views[index], intrinsics=tuple(intrinsics[index].tolist()))
+    return replace(problem.scene, arms=tuple(arms), cameras=tuple(views))
 
 
 def _differences(function: Callable[[np.ndarray], np.ndarray], at: np.ndarray, step: float = 1e-6) -> np.ndarray:
@@ -221,7 +215,6 @@ def solve_hand_eye(
         scene: arms and cameras; its base frames are not used, those of arms without points stay.
         measured: arm -> joint positions of all frames [rad, m], as `Sequence.measured`.
         points: 3 to 6 frames with three or more points each are good; an arm needs 4 points in one camera.
-        settings: free parameters.
 
     Raises:
         SettingsError: no arm has enough points, all coincide, or a point names a missing frame or landmark.
@@ -230,14 +223,10 @@ def solve_hand_eye(
     settings = settings or HandEyeSettings()
     free = {scene.cameras.index(scene.camera(name)) for name in settings.free_cameras}
     views = views_of(scene, measured, points)
-    best: tuple[float, HandEyeProblem, OptimizeResult] | None = None
-    for factor in _FOCAL_FACTORS if settings.focal_length else (1.0,):
-        problem = HandEyeProblem(scene, views, free, settings, factor)
-        fit = _minimum(problem, problem.origin)
-        if best is None or fit.cost < best[0]:
-            best = (fit.cost, problem, fit)
-    assert best is not None
-    _, problem, fit = best
+    factors = _FOCAL_FACTORS if settings.focal_length else (1.0,)
+    problems = [HandEyeProblem(scene, views, free, settings, factor) for factor in factors]
+    fits = [(problem, _minimum(problem, problem.origin)) for problem in problems]
+    problem, fit = min(fits, key=lambda found: found[1].cost)
     for sides in _sides(problem):
         other = _minimum(problem, _minimum(problem, fit.x, sides).x)
         fit = min(fit, other, key=lambda found: found.cost)
@@ -263,7 +252,8 @@ def _minimum(problem: HandEyeProblem, start: np.ndarray, sides: Sequence[int] | 
 
 def _sides(problem: HandEyeProblem) -> Iterator[tuple[int, ...]]:
     """Sides of the shafts in all views: each combination of few views, and the same side in all of many."""
-    choices = [(1, -1) if view.has_edges else (0,) for view in problem.views]
+    edges = [any(mark.kind is LandmarkKind.EDGE for mark in view.landmarks) for view in problem.views]
+    choices = [(1, -1) if there else (0,) for there in edges]
     if sum(len(choice) > 1 for choice in choices) <= _COMBINED:
         yield from (sides for sides in product(*choices) if any(sides))
         return
@@ -320,10 +310,7 @@ def agreement_with_points(
     all points at the same level.
 
     Args:
-        scene: with the calibration.
         measured: arm -> joint positions of all frames [rad, m].
-        points: clicked points.
-        found: the calibration from these points.
 
     Raises:
         SettingsError: a point names a frame or a landmark that does not exist.

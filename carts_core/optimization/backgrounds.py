@@ -37,13 +37,13 @@ _FOREIGN = 0.06
 """Median difference from which a background is not that of the image [1]."""
 
 _UNTELLING = 0.15
-"""Where only such a difference counts in full, as in moving smoke, arms need not differ that much [1]."""
+"""Difference above which arms need not be visible as a change, as in moving smoke [1]."""
 
 _DECEPTIVE = 0.08
 """Share of a background with false positives from which the network gets images without that background [1]."""
 
 _SMOOTH = 12.0
-"""Deviation of the blur of what is put in the place of such a background [px of the working image]."""
+"""Deviation of the blur that replaces such a background [px of the working image]."""
 
 _FITS, _SAMPLES = 4, 4
 """Rounds of the robust fit of light, and the step between the pixels that it looks at [px]."""
@@ -55,10 +55,10 @@ _KEPT = 4
 
 @dataclass(frozen=True)
 class Change:
-    """What differs between images and the empty background."""
+    """Difference of images and the empty background."""
 
     surely: Float[Tensor, "cameras 1 h w"]
-    """How surely each pixel differs, in [0, 1]; 1 where the background is not known."""
+    """Confidence that a pixel differs, in [0, 1]; 1 where the background is not known."""
     telling: Float[Tensor, "cameras 1 h w"]
     """How far a pixel that does not differ shows no arm, in [0, 1]: 0 where the background is not known, in images of
     another scene, and where smoke differs as much as an arm would."""
@@ -66,14 +66,14 @@ class Change:
 
 @dataclass(frozen=True)
 class Background:
-    """What cameras see without arms, in the size of the compared images."""
+    """Images of the cameras without arms, in the size of the compared images."""
 
     images: Float[Tensor, "cameras 3 h w"]
     """RGB in [0, 1]."""
     known: Float[Tensor, "cameras 1 h w"]
-    """How far they are known to show no arm [1]."""
+    """Confidence that they show no arm, in [0, 1]."""
     seen: Float[Tensor, "cameras 1 h w"]
-    """Coverage that the network predicts in them, where they are known: false positives."""
+    """Predicted coverage where they are known: false positives."""
 
     @property
     def deceptive(self) -> bool:
@@ -86,7 +86,6 @@ class Background:
         What is not known to be background counts as different.
 
         Args:
-            images: of the same cameras.
             scale: times the working size [1].
         """
         found = [
@@ -132,7 +131,7 @@ def _lit_as(background: Float[Tensor, "3 h w"], image: Float[Tensor, "3 h w"]) -
 def without_background(
     images: Float[Tensor, "cameras 3 h w"], changed: Float[Tensor, "cameras 1 h w"], scale: float
 ) -> Float[Tensor, "cameras 3 h w"]:
-    """What has changed in images, before a blurred background without features.
+    """Changed pixels of images, before a blurred background.
 
     The blurred background goes on smoothly where it is not known, so that what is there has no outline.
 
@@ -147,7 +146,7 @@ def without_background(
 
 
 class Recording(Protocol):
-    """What has frames of cameras, of which a mean background can be made."""
+    """Source of mean backgrounds."""
 
     def mean_background(self, camera: str, domain: str | None = None) -> MeanBackground:
         """Of a camera, in a domain."""
@@ -158,9 +157,7 @@ class Backgrounds:
     """The mean backgrounds of cameras, and the network's false positives in them; one object serves all frames.
 
     Args:
-        images: camera name -> mean background BG_m.
         known: camera name -> where it certainly shows no arm; everywhere by default.
-        problems: why other cameras have none, for people.
     """
 
     def __init__(
@@ -177,9 +174,6 @@ class Backgrounds:
         """Those of a recording's cameras in a domain that say what is there without arms; made once, then kept.
 
         Args:
-            recording: where they are from.
-            cameras: names.
-            domain: its name.
             required: whether a loss needs them all, whatever they can say.
 
         Raises:
@@ -207,7 +201,7 @@ class Backgrounds:
 
     @staticmethod
     def forget(recording: Recording) -> None:
-        """Drop what is kept of a recording; the mean backgrounds themselves are kept by the recording."""
+        """Drop the cached objects of a recording, which itself caches the mean backgrounds."""
         _MADE.pop(recording, None)
 
     def covers(self, scene: Scene) -> bool:
