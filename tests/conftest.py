@@ -4,7 +4,7 @@ import csv
 import signal
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 
 import cv2
@@ -154,32 +154,40 @@ def _sequence_toml(tiny: TinyScene, domains: tuple[str, ...], robot: str, masks:
     return "\n".join(lines) + "\n"
 
 
-@pytest.fixture
-def tiny_sequence(tmp_path: Path, shipped_psm: Robot) -> Callable[..., Path]:
-    """Factory of small valid sequences of the shipped robot in a folder of the test's own.
+def write_tiny_sequence(
+    folder: Path,
+    robot: Robot,
+    *,
+    frames: int = 3,
+    domains: tuple[str, ...] = ("regular",),
+    cameras: tuple[str, ...] = ("left",),
+    width: int = 96,
+    height: int = 72,
+    masks: bool = True,
+    truth: bool = True,
+    edit: Callable[[str], str] = str,
+) -> Path:
+    """Write a small valid sequence of the shipped robot; gives its file.
 
-    Args (all optional): `frames`, `domains` (each darker than the one before), `cameras`, `width`, `height` [px],
-    `masks`, `truth`, and `edit`, which gets the sequence file's text and returns the text that is written.
+    Every domain is darker than the one before. `edit` gets the sequence file's text and returns what is written.
     Files: `sequence.toml`, `kinematics.csv`, `truth.csv`, `DOMAIN/CAMERA/001.png`, `masks/CAMERA/001.png`.
     """
+    tiny = tiny_scene(robot, frames, cameras, width, height)
+    _write_table(folder / "kinematics.csv", robot, tiny.measured)
+    _write_table(folder / "truth.csv", robot, tiny.truth)
+    _write_images(folder, tiny_images(robot, frames, cameras, width, height), domains)
+    path = folder / "sequence.toml"
+    path.write_text(edit(_sequence_toml(tiny, domains, "builtin:psm_lnd", masks, truth)))
+    return path
 
-    def make(
-        *,
-        frames: int = 3,
-        domains: tuple[str, ...] = ("regular",),
-        cameras: tuple[str, ...] = ("left",),
-        width: int = 96,
-        height: int = 72,
-        masks: bool = True,
-        truth: bool = True,
-        edit: Callable[[str], str] = str,
-    ) -> Path:
-        tiny = tiny_scene(shipped_psm, frames, cameras, width, height)
-        _write_table(tmp_path / "kinematics.csv", shipped_psm, tiny.measured)
-        _write_table(tmp_path / "truth.csv", shipped_psm, tiny.truth)
-        _write_images(tmp_path, tiny_images(shipped_psm, frames, cameras, width, height), domains)
-        path = tmp_path / "sequence.toml"
-        path.write_text(edit(_sequence_toml(tiny, domains, "builtin:psm_lnd", masks, truth)))
-        return path
 
-    return make
+@pytest.fixture
+def tiny_sequence(tmp_path: Path, shipped_psm: Robot) -> Callable[..., Path]:
+    """Writes a tiny sequence into the test's own folder, see `write_tiny_sequence`."""
+    return partial(write_tiny_sequence, tmp_path, shipped_psm)
+
+
+@pytest.fixture(scope="module")
+def shared_sequence(tmp_path_factory: pytest.TempPathFactory, shipped_psm: Robot) -> Callable[..., Path]:
+    """Writes a tiny sequence that tests of one module share and do not change, see `write_tiny_sequence`."""
+    return lambda **options: write_tiny_sequence(tmp_path_factory.mktemp("tiny"), shipped_psm, **options)

@@ -1,8 +1,9 @@
-"""Links and special files that an attacker lays where a program writes, and what must be as before afterwards."""
+"""Links and special files where a program writes, processes killed while they write, and comparison of what is left."""
 
 import hashlib
 import os
 import shutil
+import signal
 from collections.abc import Callable
 from pathlib import Path
 
@@ -66,3 +67,18 @@ def plant(kind: str, place: Path, home: Path) -> None:
         place.unlink(missing_ok=True)
     place.parent.mkdir(parents=True, exist_ok=True)
     (PLANTED | PLANTED_INPUTS)[kind](place, home)
+
+
+def killed(work: Callable[[], object]) -> bool:
+    """Do some work in a forked process; whether it was killed, as `die` does, before its end."""
+    if (child := os.fork()) == 0:
+        try:
+            work()
+        finally:
+            os._exit(0)
+    return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == -signal.SIGKILL
+
+
+def die(*_: object, **__: object) -> None:
+    """Kill this process."""
+    os.kill(os.getpid(), signal.SIGKILL)

@@ -19,7 +19,6 @@ from carts_core.batch.manifest import read_manifest
 from carts_core.batch.report import write_batch_report
 from carts_core.cli import main
 from carts_core.cli.batch_job import BatchWork
-from carts_core.errors import CartsError
 from carts_core.files import output_path
 from carts_core.networks import FeatureExtractor
 from carts_core.settings.optimization import Inference
@@ -273,9 +272,3 @@ def test_a_stopped_batch_goes_on_and_comes_to_the_same_end(sequence: Path, tmp_p
     finished = run(path, "--output", tmp_path / "stopped", "--workers", "1")
     assert finished.returncode == 0 and "already there" in finished.stdout
     assert results(tmp_path / "stopped") == results(tmp_path / "whole")
-
-
-def test_options_of_the_batch_are_checked() -> None:
-    for arguments in (["--workers", "-1"], ["--threads", "0"]):
-        with pytest.raises((SystemExit, CartsError)):
-            main(["batch", "archive.toml", *arguments])

@@ -70,22 +70,6 @@ def test_intrinsics_and_joints_are_free_on_request(sequence: Path, tmp_path: Pat
     assert units == ["%", "%", "px", "px"]
 
 
-def test_an_earlier_calibration_is_replaced_only_on_request(
-    sequence: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    command = ["calibrate", str(sequence), "--output", str(tmp_path / "out"), *QUICK, "--frames", "001"]
-    main(command)
-    with pytest.raises(SystemExit) as stop:
-        main(command)
-    assert stop.value.code == BAD_INPUT and "--overwrite" in capsys.readouterr().err
-    main([*command, "--overwrite"])
-    (tmp_path / "mine").mkdir()
-    (tmp_path / "mine" / "notes.txt").write_text("keep")
-    with pytest.raises(SystemExit):
-        main([*command, "--overwrite", "--output", str(tmp_path / "mine")])
-    assert (tmp_path / "mine" / "notes.txt").read_text() == "keep"
-
-
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

@@ -143,24 +143,6 @@ def test_ignored_pixels_of_the_project_and_of_a_label_are_left_out(
     assert scores(sequence, *masked, "imported")["mean"]["dice_after"] > 0.95
 
 
-@pytest.mark.usefixtures("no_network")
-def test_frames_whose_imported_mask_has_changed_are_optimized_again(
-    sequence: Path, theirs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    main(["import-masks", str(sequence), str(theirs)])
-    command = ["optimize", str(sequence), "--observe", "masks", "--masks", "imported", "--settings", "iterations=1"]
-    command += ["--output", str(tmp_path / "out")]
-    main(command)
-    main(command)
-    assert "2 of 2 frames already there" in said(capsys)
-    assert cv2.imwrite(str(theirs / "001.png"), np.zeros((SIZE["height"], SIZE["width"]), np.uint8))
-    main(["import-masks", str(sequence), str(theirs), "--replace"])
-    main(command)
-    text = said(capsys)
-    assert "1 of 2 already there" in text or "1 of 2 frames already there" in text
-    assert "1 of 2 frames redone: the masks changed" in text
-
-
 def test_what_does_not_go_together_or_is_not_there_is_refused(
     sequence: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

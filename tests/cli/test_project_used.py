@@ -9,16 +9,7 @@ import numpy as np
 import pytest
 
 from carts_core.cli.command_line import BAD_INPUT, main
-from carts_core.project import (
-    JointCorrection,
-    Key,
-    MaskCorrection,
-    Project,
-    Provenance,
-    Review,
-    ReviewState,
-    Source,
-)
+from carts_core.project import JointCorrection, Key, MaskCorrection, Project, Provenance, Review, ReviewState, Source
 from carts_core.recording import Sequence
 
 BY_HAND = Provenance(Source.HAND)

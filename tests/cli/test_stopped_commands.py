@@ -84,8 +84,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Run]:
 
 
 @pytest.mark.parametrize(
-    ("mode", "number"),
-    [pytest.param("frame", signal.SIGTERM, marks=pytest.mark.slow), ("sequence", signal.SIGHUP)],
+    ("mode", "number"), [pytest.param("frame", signal.SIGTERM, marks=pytest.mark.slow), ("sequence", signal.SIGHUP)]
 )
 def test_a_stopped_optimization_keeps_what_it_says_and_ends_as_if_it_had_not_been_stopped(
     sequence: Path, tmp_path: Path, mode: str, number: signal.Signals, run: Run

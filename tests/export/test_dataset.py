@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from awkward import ARMS, CAMERA, all_views, expected_masks
+from awkward import ARMS, CAMERA, all_views
 
 from carts_core.errors import CartsError, SequenceError, SettingsError
 from carts_core.export import (
@@ -54,10 +54,6 @@ def test_a_corrected_mask_decides_where_arms_are_and_the_rendering_whose_they_ar
     np.testing.assert_array_equal(view.link_ids[both], rendered.link_ids[both])
 
 
-def test_an_empty_mask_has_no_objects(dataset: Dataset) -> None:
-    assert {name for name, _ in expected_masks(dataset)} == {dataset.stems[0], dataset.stems[2]}
-
-
 def test_added_pixels_get_the_nearest_label() -> None:
     rendered = np.array([[3, -1, -1, -1, -1, 7]])
     np.testing.assert_array_equal(
@@ -97,14 +93,6 @@ def test_masks_of_an_unknown_camera_are_refused(dataset: Dataset) -> None:
 def test_an_impossible_frame_rate_is_refused(sequence: Sequence, rate: float) -> None:
     with pytest.raises(SettingsError, match="frame rate"):
         Dataset(sequence, tuple(measured_frames(sequence, [0])), sequence.scene, "regular", frame_rate=rate)
-
-
-def test_only_frames_with_a_row_are_corrected(sequence: Sequence) -> None:
-    positions = {arm.name: np.full(len(arm.robot.joint_names), 0.1) for arm in sequence.scene.arms}
-    rows = [KinematicsRow(sequence.frame_ids[1], "optimized", positions)]
-    (frame,) = corrected_frames(sequence, range(3), rows)
-    assert (frame.index, frame.frame_id, frame.source) == (1, sequence.frame_ids[1], "optimized")
-    assert corrected_frames(sequence, [0, 2], rows) == []
 
 
 def test_rows_of_unknown_or_repeated_frames_are_refused(sequence: Sequence) -> None:

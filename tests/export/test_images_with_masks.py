@@ -362,15 +362,6 @@ def test_simple_shapes_come_back_exactly(mask: np.ndarray) -> None:
     np.testing.assert_array_equal(_filled(mask), mask)
 
 
-def test_straight_edges_need_corners_only() -> None:
-    (rectangle,) = polygons(np.pad(np.ones((30, 40), bool), 3))
-    assert len(rectangle) == 4
-
-
-def test_an_empty_mask_has_no_polygon() -> None:
-    assert polygons(np.zeros((4, 4), bool)) == []
-
-
 @pytest.mark.parametrize("seed", range(3))
 def test_row_runs_alternate_from_outside(seed: int) -> None:
     mask = _blobs(seed)

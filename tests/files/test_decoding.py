@@ -4,22 +4,17 @@ import io
 import os
 import signal
 import time
-import zipfile
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow
-import pyarrow.parquet
 import pytest
 
 from carts_core.decoders import tables
-from carts_core.errors import SequenceError
 from carts_core.files.decoding import Decoder, Limits, called, decoded
 from carts_core.files.reading import parse_ini, parse_yaml
-from carts_core.recording.importing.foreign_tables import read_foreign_table
 
 SMALL = Limits(seconds=1, memory=100 * 2**20)
 ALIASES = "a0: &a0 [1]\n" + "\n".join(f"a{n + 1}: &a{n + 1} [{','.join([f'*a{n}'] * 9)}]" for n in range(9))
@@ -123,35 +118,3 @@ def test_ini_is_not_interpolated_and_costs_what_its_length_does():
         parse_ini(f"[a]\nb{' ' * 2_000_000}x")
     with pytest.raises(ValueError, match="more than 10,000 lines"):
         parse_ini("[a]\n" * 10_001)
-
-
-def dictionary_of_texts(path: Path) -> None:
-    """1.5 MB that are 5 GB as Python's texts."""
-    texts = pyarrow.array([f"{number}{'x' * 5_000}" for number in range(300)])
-    rows = pyarrow.array(np.arange(1_000_000, dtype=np.int32) % 300)
-    pyarrow.parquet.write_table(pyarrow.table({"yaw": pyarrow.DictionaryArray.from_arrays(rows, texts)}), path)
-
-
-def false_size(path: Path) -> None:
-    """An array of 480 MiB in an archive that says 8 bytes."""
-    with (
-        zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive,
-        archive.open("yaw.npy", "w") as member,
-    ):
-        np.lib.format.write_array_header_1_0(member, {"descr": "|i1", "fortran_order": False, "shape": (480 * 2**20,)})  # pyright: ignore
-        for _ in range(480):
-            member.write(bytes(2**20))
-    content = bytearray(path.read_bytes())
-    place = content.rindex(b"PK\x01\x02") + 24
-    content[place : place + 4] = (8).to_bytes(4, "little")
-    path.write_bytes(content)
-
-
-@pytest.mark.parametrize(("name", "write"), [("a.parquet", dictionary_of_texts), ("a.npz", false_size)])
-def test_a_small_table_that_is_large_in_memory_is_refused(name: str, write: Callable[[Path], None], tmp_path: Path):
-    write(tmp_path / name)
-    assert (tmp_path / name).stat().st_size < 3 * 2**20
-    with pytest.raises(
-        SequenceError, match=rf"{name} cannot be read \(.*(needs more|damaged|decompress|Bad CRC|magic)"
-    ):
-        read_foreign_table(tmp_path / name)

@@ -47,48 +47,31 @@ def _refused_or_done(name: str, work: Path, what: object) -> None:
         signal.alarm(0)
 
 
-def _attack(name: str, recording: Path, folder: Path, sample: int | None) -> int:
-    """Plant each kind at each place that a command writes, and run it; the number of runs."""
+def _attack(name: str, recording: Path, folder: Path, sample: int | None, *, inputs: bool = False) -> int:
+    """Plant each kind at each place that a command writes, or reads, and run it; the number of runs."""
     work, _ = _fresh(recording, folder / "trace")
     with traced() as trace:
         COMMANDS[name](work)
-    found = [place for place in places(trace.written, work) if str(place) not in FOLLOWED.get(name, [])]
-    assert found, "nothing was written"
-    attacks = [(place, kind) for place in found for kind in PLANTED]
+    if inputs:
+        found, kinds = [place for place in read_places(trace, work) if place.parts[0] in INPUTS], SPECIAL
+    else:
+        found = [place for place in places(trace.written, work) if str(place) not in FOLLOWED.get(name, [])]
+        kinds = tuple(PLANTED)
+        assert found, "nothing was written"
+    attacks = [(place, kind) for place in found for kind in kinds]
     if sample is not None:
         attacks = random.Random(name).sample(attacks, min(sample, len(attacks)))
     for number, (place, kind) in enumerate(attacks):
         work, home = _fresh(recording, folder / str(number))
         plant(kind, work / place, home)
-        before, inputs = contents(home), [contents(work / given) for given in INPUTS]
+        before, given = contents(home), [contents(work / one) for one in INPUTS]
         _refused_or_done(name, work, (place, kind))
         assert contents(home) == before, (place, kind)
-        assert [contents(work / given) for given in INPUTS] == inputs, (place, kind)
-        if kind == "folder":
+        assert [contents(work / one) for one in INPUTS] == given, (place, kind)
+        if kind == "folder" and not inputs:
             assert (work / place / "own.txt").read_text() == PRECIOUS, (place, kind)
         shutil.rmtree(folder / str(number))
-    print(f"{name}: written: {len(found)} places, {len(attacks)} runs: {', '.join(map(str, found))}")
-    return len(attacks)
-
-
-def _attack_inputs(name: str, recording: Path, folder: Path, sample: int | None) -> int:
-    """Plant each kind of special file at each place that a command reads, and run it; the number of runs."""
-    work, _ = _fresh(recording, folder / "trace")
-    with traced() as trace:
-        COMMANDS[name](work)
-    found = [place for place in read_places(trace, work) if place.parts[0] in INPUTS]
-    attacks = [(place, kind) for place in found for kind in SPECIAL]
-    if sample is not None:
-        attacks = random.Random(name).sample(attacks, min(sample, len(attacks)))
-    for number, (place, kind) in enumerate(attacks):
-        work, home = _fresh(recording, folder / str(number))
-        plant(kind, work / place, home)
-        before, inputs = contents(home), [contents(work / given) for given in INPUTS]
-        _refused_or_done(name, work, (place, kind))
-        assert contents(home) == before, (place, kind)
-        assert [contents(work / given) for given in INPUTS] == inputs, (place, kind)
-        shutil.rmtree(folder / str(number))
-    print(f"{name}: read: {len(found)} places, {len(attacks)} runs: {', '.join(map(str, found))}")
+    print(f"{name}: {'read' if inputs else 'written'}: {len(found)} places, {len(attacks)} runs")
     return len(attacks)
 
 
@@ -101,7 +84,7 @@ def test_nothing_planted_is_followed(name: str, recording: Path, tmp_path_factor
 def test_special_files_among_the_inputs_are_refused(
     name: str, recording: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
-    assert _attack_inputs(name, recording, tmp_path_factory.mktemp("attacks"), sample=2) == 2
+    assert _attack(name, recording, tmp_path_factory.mktemp("attacks"), sample=2, inputs=True) == 2
 
 
 @pytest.mark.slow
@@ -119,4 +102,4 @@ def test_nothing_planted_anywhere_is_followed(
 def test_special_files_anywhere_among_the_inputs_are_refused(
     name: str, recording: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
-    assert _attack_inputs(name, recording, tmp_path_factory.mktemp("attacks"), sample=None) >= len(SPECIAL)
+    assert _attack(name, recording, tmp_path_factory.mktemp("attacks"), sample=None, inputs=True) >= len(SPECIAL)

@@ -5,10 +5,11 @@ import os
 import shutil
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 
 import pytest
-from planted import contents, treasure
+from planted import contents, die, killed, treasure
 
 from carts_core.errors import CartsError
 from carts_core.files import MARKER, OutputPath, output_path, published, write_text
@@ -68,28 +69,17 @@ def test_a_folder_is_replaced_also_where_two_cannot_change_places(
     assert _names(tmp_path) == ["out"] and (tmp_path / "out" / MARKER).read_text() == "new"
 
 
-_KILLED_BETWEEN_RENAMES = """
-import os, signal, sys
-from pathlib import Path
-from carts_core.files import MARKER, published, write_text
-sys.platform, renames, rename = "darwin", [], os.rename
-def rename_once(*names, **folders):
-    if renames:
-        os.kill(os.getpid(), signal.SIGKILL)
-    renames.append(names)
-    rename(*names, **folders)
-os.rename = rename_once
-with published(Path(sys.argv[1]), overwrite=True) as path:
-    write_text(path / MARKER, "new")
-"""
-
-
-def test_what_a_kill_between_two_renames_took_away_comes_back(tmp_path: Path) -> None:
+def test_what_a_kill_between_two_renames_took_away_comes_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     _make(tmp_path / "out", "old")
-    assert (
-        subprocess.run([sys.executable, "-c", _KILLED_BETWEEN_RENAMES, tmp_path / "out"], check=False).returncode == -9
-    )
-    assert "out" not in _names(tmp_path)
+    rename = os.rename
+
+    def replace_and_die() -> None:
+        monkeypatch.setattr(sys, "platform", "darwin")
+        monkeypatch.setattr(os, "rename", lambda *names, **folders: (rename(*names, **folders), die()))
+        with published(tmp_path / "out", overwrite=True) as path:
+            _make(path, "new")
+
+    assert killed(replace_and_die) and "out" not in _names(tmp_path)
     with pytest.raises(CartsError, match="out exists"), published(tmp_path / "out"):
         pass
     assert _names(tmp_path) == ["out"] and (tmp_path / "out" / MARKER).read_text() == "old"
@@ -136,15 +126,18 @@ def test_two_exports_to_one_place_do_not_meet(tmp_path: Path) -> None:
     assert (tmp_path / "out" / MARKER).read_text() == "first"
 
 
-_KILLED = """
-import sys, time
-from pathlib import Path
-from carts_core.files import MARKER, published, write_text
-with published(Path(sys.argv[1]), overwrite=True) as path:
-    write_text(path / MARKER, "half")
-    print("writing", flush=True)
-    time.sleep(600)
-"""
+def _kill(target: Path, key: str | None = None) -> Path:
+    """What a killed process has left beside a target."""
+    before = set(target.parent.iterdir())
+
+    def write_half() -> None:
+        with published(target, overwrite=key is None, key=key) as path:
+            write_text(path / "half", "half")
+            die()
+
+    assert killed(write_half)
+    (left,) = set(target.parent.iterdir()) - before
+    return left
 
 
 @pytest.mark.parametrize("before", [None, "old"])
@@ -152,32 +145,12 @@ def test_a_kill_in_the_middle_changes_nothing_and_the_next_export_works(tmp_path
     target = tmp_path / "out"
     if before is not None:
         _make(target, before)
-    with subprocess.Popen([sys.executable, "-c", _KILLED, target], stdout=subprocess.PIPE, text=True) as child:
-        assert child.stdout is not None and child.stdout.readline() == "writing\n"
-        child.kill()
+    _kill(target)
     assert target.exists() == (before is not None)
     assert before is None or (target / MARKER).read_text() == before
     with published(target, overwrite=True) as path:
         _make(path, "new")
     assert _names(tmp_path) == ["out"] and (target / MARKER).read_text() == "new"
-
-
-_KILLED_WHILE_WRITING = """
-import os, signal, sys
-from pathlib import Path
-from carts_core.files import published, write_text
-with published(Path(sys.argv[1]), key=sys.argv[2] or None) as path:
-    write_text(path / "half", "half")
-    os.kill(os.getpid(), signal.SIGKILL)
-"""
-
-
-def _kill(target: Path, key: str = "") -> Path:
-    """What a killed process has left beside a target."""
-    before = set(target.parent.iterdir())
-    assert subprocess.run([sys.executable, "-c", _KILLED_WHILE_WRITING, target, key], check=False).returncode == -9
-    (left,) = set(target.parent.iterdir()) - before
-    return left
 
 
 def test_names_are_random_and_hidden(tmp_path: Path) -> None:
@@ -276,43 +249,30 @@ def test_a_draft_is_told_apart(tmp_path: Path) -> None:
         write_text(resumable, "b")
 
 
-_KILLED_AT_REMOVAL = """
-import os, signal, sys
-from pathlib import Path
-from carts_core.files import MARKER, published, write_text
-
-steps = int(sys.argv[2])
-
-def counted(step):
-    def do(*arguments, **named):
-        global steps
-        if steps == 0:
-            os.kill(os.getpid(), signal.SIGKILL)
-        steps -= 1
-        return step(*arguments, **named)
-    return do
-
-with published(Path(sys.argv[1]), overwrite=True) as path:
-    for name in ("a", "z", MARKER):
-        write_text(path / name, name)
-    os.unlink, os.rmdir = counted(os.unlink), counted(os.rmdir)
-"""
-
-
 def test_a_kill_at_any_moment_of_tidying_up_leaves_nothing_for_good(tmp_path: Path) -> None:
-    kills, returned = 0, -9
-    while returned == -9:
+    unlink, rmdir = os.unlink, os.rmdir
+
+    def replaced_until(steps: int) -> None:
+        """Killed at this step of removing the old files."""
+        done = iter(range(steps))
+        with published(tmp_path / "out", overwrite=True) as path:
+            for name in ("a", "z", MARKER):
+                write_text(path / name, name)
+            os.unlink = lambda *given, **named: die() if next(done, None) is None else unlink(*given, **named)
+            os.rmdir = lambda *given, **named: die() if next(done, None) is None else rmdir(*given, **named)
+
+    kills, was_killed = 0, True
+    while was_killed:
         with published(tmp_path / "out", overwrite=True) as path:
             write_text(path / MARKER, "old")
-        command = [sys.executable, "-c", _KILLED_AT_REMOVAL, tmp_path / "out", str(kills)]
-        returned = subprocess.run(command, check=False).returncode
-        kills += returned == -9
+        was_killed = killed(partial(replaced_until, kills))
+        kills += was_killed
         assert (tmp_path / "out" / "z").read_text() == "z"
         with published(tmp_path / "out", overwrite=True) as path:
             write_text(path / MARKER, "new")
         assert os.listdir(tmp_path) == ["out"], kills
     # The old export's file and folder, the mark, and the staging folder.
-    assert returned == 0 and kills >= 4
+    assert kills >= 4
 
 
 def test_what_was_killed_while_it_was_marked_is_tidied_up(tmp_path: Path) -> None:

@@ -2,14 +2,12 @@
 
 import os
 import stat
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from planted import PLANTED, PRECIOUS, contents, plant, treasure
+from planted import PLANTED, PRECIOUS, contents, die, killed, plant, treasure
 
 from carts_core.errors import OutputError
 from carts_core.files import (
@@ -59,20 +57,16 @@ def test_a_failure_keeps_the_old_file_and_leaves_nothing(
     assert (tmp_path / "a").read_text() == "new" and os.listdir(tmp_path) == ["a"]
 
 
-_KILLED = """
-import os, signal, sys
-from pathlib import Path
-from carts_core.files import output_stream
-with output_stream(Path(sys.argv[1])) as stream:
-    stream.write(b"half" * 100_000)
-    stream.flush()
-    os.kill(os.getpid(), signal.SIGKILL)
-"""
-
-
 def test_a_kill_leaves_the_old_file_and_nothing_else(tmp_path: Path) -> None:
     write_text(tmp_path / "a", "old")
-    assert subprocess.run([sys.executable, "-c", _KILLED, tmp_path / "a"], check=False).returncode == -9
+
+    def write_half() -> None:
+        with output_stream(tmp_path / "a") as stream:
+            stream.write(b"half" * 100_000)
+            stream.flush()
+            die()
+
+    assert killed(write_half)
     assert (tmp_path / "a").read_text() == "old" and os.listdir(tmp_path) == ["a"]
 
 

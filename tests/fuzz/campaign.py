@@ -1,19 +1,12 @@
-"""Many wrong inputs, each within a time and an amount of memory, in a worker process that may die.
+"""Many wrong inputs, each within a time and an amount of memory, in a worker process that may die."""
 
-python tests/fuzz/campaign.py --count 5000 --seed 0
-"""
-
-import argparse
-import contextlib
 import multiprocessing
 import os
 import random
 import resource
-import sys
 import tempfile
 import time
 import traceback
-from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
@@ -127,31 +120,3 @@ def _outcome(folder: Path, kind: str, seed: int, right: bytes) -> Outcome:
 def _memory(key: str) -> int:
     status = dict(line.split(":", 1) for line in Path("/proc/self/status").read_text().splitlines())
     return 1024 * int(status[key].split()[0])
-
-
-def main() -> None:
-    """Run a campaign and print how it went; status 1 if anything is wrong."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--count", type=int, default=5000)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--kinds", nargs="*", default=list(KINDS))
-    arguments = parser.parse_args()
-    tally: Counter[tuple[str, str]] = Counter()
-    slowest = 0.0
-    for outcome in run(arguments.count, arguments.seed, tuple(arguments.kinds)):
-        tally[outcome.kind, outcome.result] += 1
-        slowest = max(slowest, outcome.seconds)
-        if outcome.result not in GOOD:
-            print(f"{outcome.result}: {outcome.kind} {outcome.seed} ({outcome.seconds:.1f} s)\n{outcome.detail}")
-            sys.stdout.flush()
-    for kind in arguments.kinds:
-        print(kind, dict(sorted((result, count) for (name, result), count in tally.items() if name == kind)))
-    wrong = sum(count for (_, result), count in tally.items() if result not in GOOD)
-    print(f"{sum(tally.values())} inputs, {wrong} wrong, slowest {slowest:.1f} s")
-    with contextlib.suppress(BrokenPipeError):
-        sys.stdout.flush()
-    sys.exit(wrong > 0)
-
-
-if __name__ == "__main__":
-    main()

@@ -1,6 +1,6 @@
 """Small files that grow when they are read: each is read in a process of its own, whose time and memory are measured.
 
-PYTHONPATH=tests python -m fuzz.growing --kinds yaml dae
+PYTHONPATH=tests python -m fuzz.growing "yaml/aliases" "npz/false small size"
 """
 
 import argparse
@@ -12,14 +12,14 @@ import sys
 import tempfile
 import time
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 import msgspec
 
 from carts_core.errors import CartsError
-from fuzz.growing_files import CASES, READERS, right_file, right_folder
+from fuzz.growing_files import CASES, READERS, RIGHT, right_folder
 
 SECONDS = 5.0
 """Of processor time, of the process and its children [s]."""
@@ -46,6 +46,11 @@ class Cost:
     memory: int
     """[bytes]"""
     detail: str = ""
+
+    @property
+    def wrong(self) -> bool:
+        """Whether the file was neither read nor refused at a small cost."""
+        return self.result not in ("read", "refused")
 
 
 def measured(kind: str, name: str, make: Callable[[Path], Path]) -> Cost:
@@ -106,41 +111,27 @@ def _forked(work: Callable[[], str]) -> dict:
     return json.loads(content)
 
 
-def run(kinds: list[str], only: str = "") -> Iterator[Cost]:
-    """The costs of all files of some kinds, or of those with a part of a name."""
-    right_folder()
-    for kind in kinds:
-        yield measured(kind, "right", right_file(kind))
-        for name, make in CASES[kind].items():
-            if only in name:
-                yield measured(kind, name, make)
-
-
 def main() -> None:
-    """Measure files and print a table; status 1 if any is wrong."""
+    """Measure files and print a line for each; status 1 if any is wrong."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--kinds", nargs="*", default=list(CASES))
-    parser.add_argument("--only", default="")
+    parser.add_argument("cases", nargs="*", help="KIND/NAME; every file of every kind if none is given")
     arguments = parser.parse_args()
-    wrong = 0
-    costs: dict[str, list[Cost]] = {}
-    for cost in run(arguments.kinds, arguments.only):
-        costs.setdefault(cost.kind, []).append(cost)
-        good = cost.result in ("read", "refused")
-        wrong += not good
-        detail = cost.detail.strip() if not good else cost.detail.strip().split("\n")[-1][:160]
-        print(
-            f"{cost.kind:12} {cost.name:24} {cost.result:9} {cost.size / 1e6:8.3f} MB {cost.seconds:6.2f} s "
-            f"{cost.memory / 2**20:7.1f} MiB  {detail}",
-            flush=True,
-        )
-    print("| kind | files | most s | most MiB | wrong |\n|---|---|---|---|---|")
-    for kind, found in costs.items():
-        bad = sum(cost.result not in ("read", "refused") for cost in found)
-        crafted = found[1:] or found
-        most = max(cost.seconds for cost in crafted), max(cost.memory for cost in crafted) / 2**20
-        print(f"| {kind} | {len(found) - 1} | {most[0]:.1f} | {most[1]:.0f} | {bad} |")
-    print(f"{sum(len(found) - 1 for found in costs.values())} files, {wrong} wrong")
+    right_folder()
+    costs = []
+    for kind in CASES:
+        made = {"right": RIGHT[kind], **CASES[kind]}
+        for name, make in made.items():
+            if arguments.cases and f"{kind}/{name}" not in arguments.cases:
+                continue
+            cost = measured(kind, name, make)
+            costs.append(cost)
+            print(
+                f"{kind:12} {name:24} {cost.result:9} {cost.size / 1e6:8.3f} MB {cost.seconds:6.2f} s "
+                f"{cost.memory / 2**20:7.1f} MiB  {cost.detail.strip() if cost.wrong else cost.detail[:160]!r}",
+                flush=True,
+            )
+    wrong = sum(cost.wrong for cost in costs)
+    print(f"{len(costs)} files, {wrong} wrong")
     sys.exit(wrong > 0)
 
 

@@ -1,11 +1,13 @@
 """Small files of every kind that can be read, which are large or slow for a decoder that takes them as they are."""
 
+import atexit
 import io
 import json
 import shutil
 import sqlite3
 import struct
 import sys
+import tempfile
 import zipfile
 import zlib
 from collections.abc import Callable
@@ -51,14 +53,6 @@ _XACRO = '<robot xmlns:xacro="http://www.ros.org/wiki/xacro" name="x">'
 _TRIANGLE = "v 0 0 0\nv 0.1 0 0\nv 0 0.1 0\n"
 
 
-def _calibration(path: Path) -> object:
-    return read_calibration(path, "left")
-
-
-def _mesh(path: Path) -> object:
-    return read_mesh(path, np.ones(3), "a test names it")
-
-
 def _expanded(path: Path) -> object:
     try:
         return decoded(expanded, path, {}, {})
@@ -87,31 +81,19 @@ def _project(path: Path) -> object:
 
 
 READERS: dict[str, Callable[[Path], object]] = {
-    "yaml": _calibration,
-    "ini": _calibration,
-    "mat": _calibration,
-    "json": _calibration,
+    **{kind: lambda path: read_calibration(path, "left") for kind in ("yaml", "ini", "mat", "json")},
     "toml": Sequence.open,
     "settings": lambda path: SolverOptions(settings=(str(path),)).printed(),
     "manifest": read_manifest,
-    "csv": read_foreign_table,
+    **dict.fromkeys(("csv", "parquet", "npy", "npz"), read_foreign_table),
+    **dict.fromkeys(("bag", "mcap"), find),
     "kinematics": lambda path: Sequence.open(path.parent / "sequence.toml"),
-    "parquet": read_foreign_table,
-    "npy": read_foreign_table,
-    "npz": read_foreign_table,
-    "bag": find,
-    "mcap": find,
     "video": _video,
     "image": read_image,
     "urdf": lambda path: parsed_urdf(read_text(path, ROBOT), path),
     "xacro": _expanded,
-    **{
-        kind: lambda path: read_mesh(path, np.ones(3), "a test names it")
-        for kind in ("dae", "obj", "stl", "ply", "glb")
-    },
-    "coco": _annotations,
-    "cvat": _annotations,
-    "surgpose": _annotations,
+    **{kind: lambda path: read_mesh(path, np.ones(3), "a test") for kind in ("dae", "obj", "stl", "ply", "glb")},
+    **dict.fromkeys(("coco", "cvat", "surgpose"), _annotations),
     "safetensors": read_weights,
     "onnx": _onnx,
     "project": _project,
@@ -135,11 +117,10 @@ def _text(name: str, text: str | bytes | Callable[[], str | bytes]) -> Maker:
 @cache
 def right_folder() -> Path:
     """A folder with a right file of each kind."""
-    import tempfile  # noqa: PLC0415
-
-    folder = Path(tempfile.mkdtemp(prefix="carts-right-")) / "files"
-    make_folder(folder)
-    return folder
+    folder = Path(tempfile.mkdtemp(prefix="carts-right-"))
+    atexit.register(shutil.rmtree, folder)
+    make_folder(folder / "files")
+    return folder / "files"
 
 
 def _fill(folder: Path) -> None:
@@ -148,86 +129,46 @@ def _fill(folder: Path) -> None:
 
 # -- text formats --------------------------------------------------------------------------------------------------
 
-_K = '"K": [[60, 0, 32], [0, 60, 24], [0, 0, 1]]'
 JSON = {
     "deep lists": lambda: "[" * 100_000 + "]" * 100_000,
-    "deep tables": lambda: '{"a":' * 100_000 + "1" + "}" * 100_000,
     "empty lists": lambda: "[" + "[]," * 1_300_000 + "[]]",
-    "empty tables": lambda: "[" + "{}," * 1_300_000 + "{}]",
-    "numbers": lambda: "[" + "0.5," * 1_000_000 + "0]",
     "long text": lambda: '"' + "a" * 4_000_000 + '"',
-    "escapes": lambda: '"' + "\\u0041" * 600_000 + '"',
-    "long key": lambda: '{"' + "k" * 4_000_000 + '": 1}',
     "many keys": lambda: "{" + ",".join(f'"{n}":0' for n in range(300_000)) + "}",
-    "equal keys": lambda: "{" + '"a":{"b":[1,2,3]},' * 200_000 + '"a":0}',
     "long whole number": lambda: "1" * 4_000_000,
-    "long fraction": lambda: "0." + "1" * 4_000_000,
-    "large exponent": lambda: "1e" + "9" * 100_000,
     "blanks": lambda: " " * 4_000_000 + "1",
 }
 TOML = {
     "deep lists": lambda: "a = " + "[" * 100_000 + "]" * 100_000,
     "long dotted key": lambda: ".".join(["a"] * 200_000) + " = 1",
     "many dotted keys": lambda: "\n".join(f"{'.'.join(['a'] * 31)}.b{n} = 1" for n in range(14_000)),
-    "many tables": lambda: "\n".join(f"[a{n}]" for n in range(100_000)),
-    "many arrays of tables": lambda: "[[a]]\n" * 150_000,
     "nested table headers": lambda: "\n".join(f"[{'.'.join(f'x{n}' for n in range(30))}.y{m}]" for m in range(7_000)),
     "long text": lambda: 'a = "' + "x" * 1_000_000 + '"',
-    "escapes": lambda: 'a = "' + "\\u0041" * 160_000 + '"',
     "long whole number": lambda: "a = " + "1" * 1_000_000,
-    "long hexadecimal": lambda: "a = 0x" + "f" * 1_000_000,
     "empty lists": lambda: "a = [" + "[]," * 340_000 + "]",
-    "inline tables": lambda: "a = [" + "{b=1}," * 170_000 + "]",
-    "comments": lambda: "#\n" * 500_000,
     "many keys": lambda: "\n".join(f"a{n}=1" for n in range(100_000)),
-    "underscores": lambda: "a = 1" + "_1" * 500_000,
-    "blanks": lambda: "a = " + " " * 1_000_000 + "1",
 }
 _ALIASES = "\n".join(f"a{n + 1}: &a{n + 1} [{','.join([f'*a{n}'] * 9)}]" for n in range(9))
 _MERGES = "\n".join(f"a{n + 1}: &a{n + 1} {{<<: [{','.join([f'*a{n}'] * 9)}]}}" for n in range(9))
 YAML = {
     "aliases": lambda: f"a0: &a0 [1]\n{_ALIASES}",
     "merge keys": lambda: f"a0: &a0 {{k: 1}}\n{_MERGES}",
-    "inline merges": lambda: "a: {" + "<<: {a: 1}, " * 80_000 + "}",
     "sexagesimal": lambda: "a: 1" + ":1" * 1_000_000,
-    "typed sexagesimal": lambda: "a: !!float 1" + ":1" * 1_000_000 + ".5",
-    "typed whole sexagesimal": lambda: "a: !!int 1" + ":1" * 1_000_000,
-    "hexadecimal": lambda: "a: 0x" + "f" * 300,
     "long hexadecimal": lambda: "a: 0x" + "f" * 4_000_000,
-    "long octal": lambda: "a: 0" + "7" * 4_000_000,
-    "long binary": lambda: "a: 0b" + "1" * 4_000_000,
     "long whole number": lambda: "a: " + "9" * 4_000_000,
-    "underscores": lambda: "a: 1" + "_1" * 2_000_000,
     "deep lists": lambda: "[" * 1_000_000,
     "deep blocks": lambda: "\n".join(" " * n + "a:" for n in range(2_500)),
     "many values": lambda: "- 1\n" * 1_000_000,
-    "many tables": lambda: "- {a: 1}\n" * 400_000,
-    "empty lists": lambda: "[" + "[]," * 1_300_000 + "]",
     "long key": lambda: "? " + "k" * 4_000_000 + "\n: 1",
-    "escapes": lambda: 'a: "' + "\\x41" * 1_000_000 + '"',
-    "anchors": lambda: "\n".join(f"- &a{n} 1" for n in range(300_000)),
     "tags": lambda: "%TAG ! tag:a," + "b" * 3_000_000 + ":\n---\n" + "- !c 1\n" * 1000,
     "documents": lambda: "--- 1\n" * 600_000,
-    "binary": lambda: "a: !!binary " + "QUFB" * 1_000_000,
-    "timestamp": lambda: "a: !!timestamp 2001-01-01" + " " * 4_000_000 + "x",
-    "folded": lambda: "a: >\n" + " b\n\n" * 900_000,
 }
 INI = {
     "interpolation": lambda: (
         "[StereoLeft]\nx0 = 1\n" + "".join(f"x{n + 1} = {f'%(x{n})s' * 8}\n" for n in range(30)) + "fc_x = %(x30)s\n"
     ),
     "blanks": lambda: "[StereoLeft]\nfc_x" + " " * 2_000_000 + "x",
-    "blanks before a value": lambda: "[StereoLeft]\nfc_x = " + " " * 2_000_000 + "x",
-    "other blanks": lambda: "[StereoLeft]\nfc_x" + "\u2003\x0b" * 600_000 + "x",
-    "no section": lambda: "x" * 2_000_000,
     "many sections": lambda: "\n".join(f"[a{n}]" for n in range(300_000)),
-    "many keys": lambda: "[a]\n" + "\n".join(f"k{n} = 1" for n in range(300_000)),
     "continuation": lambda: "[a]\nk = 1\n" + " 1\n" * 1_000_000,
-    "comments": lambda: "[a]\nk = " + "; " * 2_000_000,
-    "semicolons": lambda: "[a]\nk = " + ";" * 4_000_000,
-    "equal signs": lambda: "[a]\n" + "=" * 4_000_000,
-    "colons": lambda: "[a]\n" + "a:" * 2_000_000,
-    "brackets": lambda: "[" * 4_000_000,
     "long number": lambda: "[StereoLeft]\nfc_x = " + "1" * 4_000_000 + "\n[StereoRight]\n",
 }
 _URDF_HEAD = '<robot name="a"><link name="base"/>'
@@ -235,7 +176,6 @@ URDF = {
     "entities": lambda: '<!DOCTYPE r [<!ENTITY a "aa">]><robot name="&a;"/>',
     "deep": lambda: '<robot name="a">' + "<link>" * 500_000,
     "many elements": lambda: _URDF_HEAD + "<a/>" * 3_500_000 + "</robot>",
-    "long attribute": lambda: f'<robot name="{"a" * 15_000_000}"/>',
     "many attributes": lambda: "<robot " + " ".join(f'a{n}=""' for n in range(700_000)) + "/>",
     "long text": lambda: "<robot name='a'>" + "x" * 15_000_000 + "</robot>",
     "many joints": lambda: _URDF_HEAD + '<joint name="j"/>' * 700_000 + "</robot>",
@@ -249,10 +189,6 @@ URDF = {
         )
         + "</robot>"
     ),
-    "long number": lambda: f'{_URDF_HEAD}<material><color rgba="{"1" * 15_000_000}"/></material></robot>',
-    "many numbers": lambda: f'{_URDF_HEAD}<material><color rgba="{"1 " * 5_000_000}"/></material></robot>',
-    "comments": lambda: "<robot name='a'>" + "<!---->" * 2_000_000 + "</robot>",
-    "namespaces": lambda: "<robot " + " ".join(f'xmlns:a{n}="b"' for n in range(300_000)) + "/>",
 }
 _DOUBLED = "".join(f'<xacro:macro name="m{n + 1}"><xacro:m{n}/><xacro:m{n}/></xacro:macro>' for n in range(40))
 XACRO = {
@@ -266,30 +202,16 @@ XACRO = {
     "endless property": lambda: '<xacro:property name="p" value="${p}${p}"/><link name="${p}"/>',
     "long expression": lambda: f'<link name="${{{"1+" * 1_000_000}1}}"/>',
     "power": lambda: '<link name="${10 ** 10 ** 10}"/>',
-    "many elements": lambda: "<a/>" * 1_000_000,
-    "deep": lambda: "<a>" * 100_000 + "</a>" * 100_000,
-    "entities": lambda: '<!DOCTYPE r [<!ENTITY a "aa">]>&a;',
-    "many macros": lambda: "".join(f'<xacro:macro name="m{n}"/>' for n in range(100_000)),
-    "many expressions": lambda: '<a b="' + "${1}" * 300_000 + '"/>',
     "yaml": lambda: "<link name=\"${xacro.load_yaml('/dev/zero')}\"/>",
     "conditions": lambda: "<xacro:if value='1'>" * 5_000 + "</xacro:if>" * 5_000,
-    "parameters": lambda: f'<xacro:macro name="m" params="{" ".join(f"a{n}:=^" for n in range(200_000))}"/><xacro:m/>',
 }
 CSV = {
     "long cell": lambda: "yaw\n" + "1\n" * 100_000 + "9" * 1_000_000,
-    "long text": lambda: "yaw,a\n" + "1,x\n" * 100_000 + "1," + "x" * 100_000,
     "many columns": lambda: ",".join(f"c{n}" for n in range(400_000)) + "\n" + ",".join(["1"] * 400_000),
     "many rows": lambda: "yaw\n" + "1\n" * 2_000_000,
-    "commas": lambda: "," * 4_000_000,
     "open quote": lambda: 'yaw,a\n"' + "x,\n" * 1_000_000,
-    "quotes": lambda: "yaw,a\n" + '"' * 4_000_000,
-    "blanks": lambda: "yaw\n" + " " * 4_000_000 + "1",
-    "blank lines": lambda: "yaw\n" + "\n" * 4_000_000 + "1",
     "long name": lambda: "y" * 4_000_000 + ",a\n1,2\n",
-    "comments": lambda: "#\n" * 2_000_000,
-    "tabs": lambda: "yaw\t" * 500_000 + "\n",
     "long number": lambda: "yaw,a\n" + "1" * 2_000_000 + ",1\n",
-    "exponents": lambda: "yaw,a\n" + "1e999999999,1\n" * 100_000,
 }
 
 
@@ -320,22 +242,16 @@ def _nested(depth: int) -> Any:
 
 PARQUET: dict[str, Maker] = {
     "dictionary of texts": _parquet(lambda: _dictionary(300, 5_000, 1_000_000)),
-    "one long text": _parquet(lambda: _dictionary(1, 1_000_000, 100_000)),
-    "short texts": _parquet(lambda: _dictionary(1, 1, 5_000_000)),
     "equal numbers": _parquet(lambda: pyarrow.table({"yaw": np.zeros(9_900_000)}), compression="zstd"),
     "too many numbers": _parquet(lambda: pyarrow.table({"yaw": np.zeros(12_000_000, np.int8)}), compression="zstd"),
     "many columns": _parquet(lambda: pyarrow.table({f"c{n}": [0] for n in range(5_000)})),
-    "row groups": _parquet(lambda: pyarrow.table({"yaw": np.zeros(3_000)}), row_group_size=1),
     "deep lists": _parquet(lambda: _nested(60)),
-    "lists": _parquet(lambda: pyarrow.table({"yaw": pyarrow.array([[0] * 1000] * 9_000)}), compression="zstd"),
     "lists of texts": _parquet(
         lambda: pyarrow.table({"yaw": pyarrow.array([["x" * 1000] * 2 + ["y" * 100_000]] * 2_000)}), compression="zstd"
     ),
     "structs": _parquet(
         lambda: pyarrow.table({"yaw": pyarrow.array([{"a": {"b": {"c": "x" * 100}}}] * 300_000)}), compression="zstd"
     ),
-    "binary": _parquet(lambda: pyarrow.table({"yaw": pyarrow.array([bytes(MIB)] * 900)}), compression="zstd"),
-    "metadata": _parquet(lambda: pyarrow.table({"yaw": [1]}).replace_schema_metadata({"a": "x" * 20_000_000})),
     "nothing": _parquet(lambda: pyarrow.table({"yaw": pyarrow.nulls(5_000_000)})),
 }
 
@@ -352,17 +268,10 @@ def _shaped(shape: tuple[int, ...], descr: Any = "<f8", **options: Any) -> dict[
 NPY = {
     "false length": lambda: _npy(_shaped((10**12,))),
     "false shape": lambda: _npy(_shaped((10**9, 10**9))),
-    "overflow": lambda: _npy(_shaped((2**40, 2**40, 2**40))),
-    "many dimensions": lambda: _npy(_shaped((1,) * 5000)),
     "no size": lambda: _npy(_shaped((10**12,), "|V0")),
-    "empty rows": lambda: _npy(_shaped((10**12, 0))),
     "wide text": lambda: _npy(_shaped((10,), "<U500000000")),
-    "structured": lambda: _npy(_shaped((1,), [(f"f{n}", "<f8") for n in range(3_000)])),
     "deep header": lambda: _npy("(" * 9_000),
-    "long header": lambda: _npy("{" + " " * 4_000_000 + "}", version=2),
     "objects": lambda: _npy(_shaped((10,), "|O")),
-    "sub-arrays": lambda: _npy(_shaped((10,), ("<f8", (10_000, 10_000)))),
-    "negative": lambda: _npy(_shaped((-1, 10**9))),
     "mebibytes": lambda: _npy(_shaped((40 * MIB,), "|i1"), bytes(40 * MIB)),
 }
 
@@ -387,14 +296,7 @@ NPZ = {
     "expands": lambda: _zip({"a.npy": _zeros(1_000)}),
     "false small size": lambda: _zip({"a.npy": _zeros(1_000)}, size=8),
     "false large size": lambda: _zip({"a.npy": _zeros(1)}, size=2**32 - 2),
-    "bzip2": lambda: _zip({"a.npy": _zeros(1_000)}, zipfile.ZIP_BZIP2),
-    "lzma": lambda: _zip({"a.npy": _zeros(600)}, zipfile.ZIP_LZMA),
     "many members": lambda: _zip({f"a{n}.npy": _zeros(0) for n in range(30_000)}),
-    "several": lambda: _zip({f"a{n}.npy": _zeros(100) for n in range(9)}),
-    "false length": lambda: _zip({"a.npy": _npy(_shaped((10**12,)))}),
-    "wide text": lambda: _zip({"a.npy": _npy(_shaped((10,), "<U500000000"))}),
-    "no size": lambda: _zip({"a.npy": _npy(_shaped((10**12,), "|V0"))}),
-    "long name": lambda: _zip({"a" * 60_000: _zeros(0)}),
     "no array": lambda: _zip({"a.txt": bytes(800 * MIB)}),
 }
 
@@ -433,17 +335,10 @@ MAT = {
     "expands": _saved(K=np.zeros(120 * MIB)),
     "bomb": lambda: _mat(_element(15, zlib.compress(_element(14, bytes(900 * MIB)), 1))),
     "false shape": lambda: _mat(_matrix((30_000, 30_000), _element(9, bytes(64)))),
-    "false cells": lambda: _mat(_matrix((30_000, 30_000), b"", 1)),
     "deep cells": lambda: _mat(_cells(3_000)),
     "many cells": _saved(K=np.array([[n] for n in range(200_000)], object)),
     "false length": lambda: _mat(_element(14, bytes(64), 2**31 - 1)),
-    "many variables": lambda: _mat(*[_matrix((1, 1), _element(9, bytes(8))) for _ in range(40_000)]),
     "sparse": _saved(K=scipy.sparse.csc_matrix((1, 50_000_000))),
-    "text": _saved(K="x" * 20_000_000),
-    "false struct": lambda: _mat(
-        _matrix((30_000, 30_000), _element(5, struct.pack("<i", 32)) + _element(1, bytes(32)), 2)
-    ),
-    "many dimensions": lambda: _mat(_matrix((1,) * 5_000, _element(9, bytes(8)))),
 }
 
 # -- bags and MCAP files -------------------------------------------------------------------------------------------
@@ -499,10 +394,7 @@ def _packed_messages(bag: Path) -> None:
 
 
 BAG: dict[str, Maker] = {
-    "aliases": _metadata(lambda text: f"a0: &a0 [1]\n{_ALIASES}\n{text}"),
     "merge keys": _metadata(lambda text: f"a0: &a0 {{k: 1}}\n{_MERGES}\n{text}"),
-    "deep": _metadata(lambda text: f"a: {'[' * 100_000}"),
-    "sexagesimal": _metadata(lambda text: f"a: 1{':1' * 500_000}\n{text}"),
     "long metadata": _metadata(lambda text: "a: [" + "1, " * 700_000 + f"]\n{text}"),
     "file of zeros": _bag(_packed_bag),
     "messages of zeros": _bag(_packed_messages),
@@ -520,10 +412,6 @@ BAG: dict[str, Maker] = {
     "nested definition": _database(
         "UPDATE message_definitions SET encoded_message_definition = 'a/B[1000000000] header\n" + "=" * 80 + "\n"
         "MSG: a/B\na/C[1000000000] c\n" + "=" * 80 + "\nMSG: a/C\nuint8[1000000000] d\n'"
-    ),
-    "long definition": _database(
-        "UPDATE message_definitions SET encoded_message_definition = "
-        "replace(hex(zeroblob(200000)), '00', 'float64 a' || char(10))"
     ),
 }
 
@@ -573,18 +461,10 @@ MCAP: dict[str, Maker] = {
     "zstd": _text("a.mcap", lambda: _mcap(_chunk("zstd", _zstd(900 * MIB), 900 * MIB))),
     "lz4": _text("a.mcap", lambda: _mcap(_chunk("lz4", _lz4(900 * MIB), 900 * MIB))),
     "false size": _text("a.mcap", lambda: _mcap(_chunk("zstd", _zstd(900 * MIB), 8))),
-    "false length": _text("a.mcap", lambda: _mcap(b"\x06" + struct.pack("<Q", 2**62))),
     "false large size": _text("a.mcap", lambda: _mcap(_chunk("", bytes(64), 2**62))),
-    "many schemas": _text(
-        "a.mcap",
-        lambda: _mcap(*[_record(3, struct.pack("<H", 1 + n % 60_000) + _mcap_text("a/B") * 3) for n in range(60_000)]),
-    ),
     "many chunks": _text("a.mcap", lambda: _mcap(*[_chunk("zstd", _zstd(20 * MIB), 20 * MIB) for _ in range(100)])),
-    "long text": _text("a.mcap", lambda: _mcap(_record(1, _mcap_text("x" * 4_000_000)))),
-    "false text": _text("a.mcap", lambda: _mcap(_record(3, struct.pack("<HI", 1, 2**32 - 1)))),
     "end first": _damaged_mcap(lambda data: data[:-8] + struct.pack("<Q", 2**60)),
     "no summary": _damaged_mcap(lambda data: data[:-37] + bytes(20) + data[-17:]),
-    "repeated": _damaged_mcap(lambda data: data[:8] + data[8:-8] * 10 + data[-8:]),
 }
 
 
@@ -622,15 +502,9 @@ VIDEO: dict[str, Maker] = {
     "many samples": _mp4(b"stsz", _put(8, 2**30)),
     "long time table": _mp4(b"stts", _put(4, 1, 2**31 - 1, 1)),
     "many time entries": _mp4(b"stts", _put(4, 2**30)),
-    "many chunks": _mp4(b"stsc", _put(4, 1, 1, 2**31 - 1, 1)),
     "chunk offsets": _mp4(b"stco", _put(4, 2**30)),
-    "edit list": _mp4(b"elst", _put(4, 2**28)),
-    "negative edits": _mp4(b"elst", _put(8, 2**31 - 1, 2**32 - 1)),
     "time scale": _mp4(b"mdhd", _put(12, 1)),
-    "no time scale": _mp4(b"mdhd", _put(12, 0)),
     "wide": _mp4(b"avc1", _put(24, (16_000 << 16) + 16_000)),
-    "composition": _mp4(b"ctts", _put(4, 2**30)),
-    "sync": _mp4(b"stss", _put(4, 2**30)),
     "movie length": _mp4(b"mvhd", _put(12, 1, 2**32 - 1)),
 }
 
@@ -674,26 +548,13 @@ IMAGE: dict[str, Maker] = {
     "zeros": _text("a.png", lambda: _png(6_000, 6_000, bytes(6_001 * 6_000))),
     "too large": _text("a.png", lambda: _png(60_000, 60_000, bytes(1000))),
     "rows of zeros": _text("a.png", lambda: _png(64, 48, bytes(900 * MIB))),
-    "16 bits": _text("a.png", lambda: _png(6_000, 6_000, bytes(48_001 * 6_000), depth=16, color=6)),
-    "interlaced": _text("a.png", lambda: _png(6_000, 6_000, bytes(6_001 * 8_000), lace=1)),
     "text": _text(
         "a.png", lambda: _png(64, 48, bytes(65 * 48), _chunk_png(b"zTXt", b"a\0\0" + zlib.compress(bytes(900 * MIB))))
     ),
-    "profile": _text(
-        "a.png", lambda: _png(64, 48, bytes(65 * 48), _chunk_png(b"iCCP", b"a\0\0" + zlib.compress(bytes(900 * MIB))))
-    ),
     "many chunks": _text("a.png", lambda: _png(64, 48, bytes(65 * 48), _chunk_png(b"tEXt", b"a\0b") * 200_000)),
     "scans": _text("a.jpg", lambda: _scans(6_000, 400)),
-    "many small scans": _text("a.jpg", lambda: _scans(500, 60_000)),
     "large tiff": _text("a.tiff", lambda: _tiff(2**31, 2**31)),
     "tiles": _text("a.tiff", lambda: _tiff(64, 48, t322=2**20, t323=2**20, t324=8, t325=64)),
-    "channels": _text("a.tiff", lambda: _tiff(6_000, 6_000, t277=60_000)),
-    "bitmap": _text(
-        "a.bmp",
-        lambda: (
-            b"BM" + struct.pack("<IIIIiiHHIIIIII", 200, 0, 54, 40, 2**30, 2**30, 1, 24, 0, 64, 0, 0, 0, 0) + bytes(64)
-        ),
-    ),
 }
 
 
@@ -743,8 +604,6 @@ DAE = {
     "many nodes": lambda: _dae(scene=_nodes(60_000)),
     "deep nodes": lambda: _dae(scene='<node id="a">' * 5_000 + "</node>" * 5_000),
     "many numbers": lambda: _dae(numbers="0.5 " * 1_000_000),
-    "long number": lambda: _dae(numbers="1" * 4_000_000),
-    "many places": lambda: _dae(places="0 1 2 " * 900_000),
     "large place": lambda: _dae(places="0 1 2000000000"),
     "entities": lambda: (
         '<!DOCTYPE a [<!ENTITY a0 "aaaaaaaaaa">'
@@ -752,26 +611,13 @@ DAE = {
         + f"]>{_dae(more='<extra>&a9;</extra>')}"
     ),
     "many elements": lambda: _dae(more="<extra/>" * 500_000),
-    "long text": lambda: _dae(more=f"<extra>{'x' * 9_000_000}</extra>"),
-    "many materials": lambda: _dae(
-        more="<library_materials>" + "".join(f'<material id="m{n}"/>' for n in range(60_000)) + "</library_materials>"
-    ),
 }
 OBJ = {
     "large place": lambda: f"{_TRIANGLE}f 1 2 2000000000\n",
-    "far places": lambda: f"{_TRIANGLE}f -1 -2 -2000000000\n",
     "one large face": lambda: _TRIANGLE + "f " + "1 2 3 " * 300_000,
     "many faces": lambda: _TRIANGLE + "f 1 2 3\n" * 400_000,
-    "many vertices": lambda: "v 0 0 0\n" * 500_000,
-    "long line": lambda: "v " + "0 " * 2_000_000,
     "long number": lambda: "v " + "1" * 4_000_000 + " 0 0\nf 1 1 1\n",
     "many objects": lambda: _TRIANGLE + "".join(f"o a{n}\nf 1 2 3\n" for n in range(100_000)),
-    "many materials": lambda: _TRIANGLE + "".join(f"usemtl m{n}\nf 1 2 3\n" for n in range(100_000)),
-    "many groups": lambda: _TRIANGLE + "g a\nf 1 2 3\n" * 200_000,
-    "mixed faces": lambda: _TRIANGLE + "f 1/1 2/2 3/3\nf 1//1 2//2 3//3\nf 1 2 3 1\n" * 60_000,
-    "continued lines": lambda: _TRIANGLE + "f 1 \\\n" * 500_000,
-    "comments": lambda: "#\n" * 1_500_000,
-    "blanks": lambda: _TRIANGLE + "f 1 2 3" + " " * 4_000_000,
 }
 
 
@@ -785,19 +631,6 @@ STL = {
     "many faces": lambda: _stl(1_100_000, bytes(50 * 1_100_000)),
     "text": lambda: "solid a\n" + _ASCII_STL * 40_000 + "endsolid",
     "many solids": lambda: f"solid a\n{_ASCII_STL}endsolid\n" * 20_000,
-    "empty solids": lambda: "solid a\nendsolid a\n" * 200_000,
-    "long line": lambda: "solid " + "a" * 4_000_000,
-    "long number": lambda: "solid a\n" + _ASCII_STL.replace("1 0 0", "1" * 4_000_000 + " 0 0") + "endsolid",
-    "blanks": lambda: "solid a\n" + " " * 4_000_000 + _ASCII_STL,
-    "words": lambda: "solid a\n" + "vertex " * 600_000,
-    "lines": lambda: "solid\n" + "\n" * 4_000_000,
-    "random": lambda: _stl(
-        40_000,
-        b"".join(
-            bytes(12) + row.tobytes() + bytes(2) for row in np.random.default_rng(0).random((40_000, 9), np.float32)
-        ),
-    ),
-    "not finite": lambda: _stl(10_000, b"\xff" * 500_000),
 }
 
 
@@ -809,29 +642,17 @@ def _ply(elements: str, body: bytes | str = b"", form: str = "binary_little_endi
 _XYZ = "property float x\nproperty float y\nproperty float z"
 PLY = {
     "false count": lambda: _ply(f"element vertex 2000000000\n{_XYZ}", bytes(120)),
-    "false faces": lambda: _ply(
-        f"element vertex 3\n{_XYZ}\nelement face 2000000000\nproperty list uchar int vertex_indices", bytes(120)
-    ),
     "long list": lambda: _ply(
         f"element vertex 3\n{_XYZ}\nelement face 1\nproperty list uint int vertex_indices",
         bytes(36) + b"\xff\xff\xff\x7f" + bytes(64),
     ),
     "empty rows": lambda: _ply(f"element vertex 3\n{_XYZ}\nelement a 2000000000", bytes(36)),
     "many properties": lambda: _ply("element vertex 1\n" + "\n".join(f"property float a{n}" for n in range(60_000))),
-    "many elements": lambda: _ply("\n".join(f"element a{n} 1\nproperty uchar b" for n in range(40_000)), bytes(40_000)),
     "text": lambda: _ply(
         f"element vertex 3\n{_XYZ}\nelement face 300000\nproperty list uchar int vertex_indices",
         "0 0 0\n1 0 0\n0 1 0\n" + "3 0 1 2\n" * 300_000,
         "ascii",
     ),
-    "ragged text": lambda: _ply(
-        f"element vertex 3\n{_XYZ}\nelement face 200000\nproperty list uchar int vertex_indices",
-        "0 0 0\n1 0 0\n0 1 0\n" + "3 0 1 2\n4 0 1 2 0\n" * 100_000,
-        "ascii",
-    ),
-    "false text": lambda: _ply(f"element vertex 2000000000\n{_XYZ}", "0 0 0\n", "ascii"),
-    "long text": lambda: _ply(f"element vertex 1\n{_XYZ}", "1" * 4_000_000, "ascii"),
-    "comments": lambda: _ply("comment a\n" * 400_000 + f"element vertex 3\n{_XYZ}"),
     "texture": lambda: _ply(
         f"comment TextureFile zeros.png\nelement vertex 3\n{_XYZ}\nproperty float s\nproperty float t\n"
         "element face 1\nproperty list uchar int vertex_indices",
@@ -881,20 +702,12 @@ GLB = {
         _gltf(nodes=[{"mesh": 0}, *({"children": [n] * 10} for n in range(9))], scenes=[{"nodes": [9]}]), _BIN
     ),
     "many nodes": lambda: _glb(_gltf(nodes=[{"mesh": 0}] * 60_000, scenes=[{"nodes": list(range(60_000))}]), _BIN),
-    "circle": lambda: _glb(_gltf(nodes=[{"mesh": 0, "children": [1]}, {"mesh": 0, "children": [0]}]), _BIN),
     "deep nodes": lambda: _glb(_gltf(nodes=[{"children": [n + 1]} for n in range(20_000)] + [{"mesh": 0}]), _BIN),
     "many primitives": lambda: _glb(
         _gltf(meshes=[{"primitives": [{"attributes": {"POSITION": 0}, "indices": 1}] * 60_000}]), _BIN
     ),
-    "many meshes": lambda: _glb(
-        _gltf(meshes=[{"primitives": [{"attributes": {"POSITION": 0}, "indices": 1}]}] * 60_000), _BIN
-    ),
     "deep tree": lambda: _glb(b"[" * 1_000_000),
-    "many values": lambda: _glb(b'{"a": [' + b"[]," * 1_300_000 + b"[]]}"),
     "false length": lambda: struct.pack("<4sIII4s", b"glTF", 2, 2**32 - 1, 2**32 - 1, b"JSON") + b"{}",
-    "stride": lambda: _glb(
-        _gltf(bufferViews=[{"buffer": 0, "byteLength": 36, "byteStride": 2**30}, {"buffer": 0, "byteLength": 12}]), _BIN
-    ),
 }
 
 
@@ -919,21 +732,10 @@ def _marked(segmentation: Any, times: int = 1, **image: Any) -> str:
 COCO = {
     "huge image": lambda: _marked([[0, 0, 9e8, 0, 9e8, 9e8]], width=10**9, height=10**9),
     "huge runs": lambda: _marked({"counts": [0, 10**18], "size": [10**9, 10**9]}),
-    "many runs": lambda: _marked({"counts": [1] * 1_500_000, "size": [48, 64]}),
     "long runs": lambda: _marked({"counts": "1" * 4_000_000, "size": [48, 64]}),
-    "open runs": lambda: _marked({"counts": "o" * 4_000_000, "size": [48, 64]}),
     "large polygon": lambda: _marked([[1, 2] * 400_000]),
-    "far polygon": lambda: _marked([[-1e300, 0, 1e300, 0, 0, 1e300]]),
     "many polygons": lambda: _marked([[1, 1, 60, 1, 60, 40]] * 60_000),
     "many marks": lambda: _marked([[1, 1, 60, 1, 60, 40]], 20_000),
-    "many images": lambda: _coco(
-        images=[{"id": n, "file_name": f"{n}.png", "width": 64, "height": 48} for n in range(60_000)]
-    ),
-    "many categories": lambda: _coco(categories=[{"id": n, "name": f"c{n}"} for n in range(100_000)]),
-    "deep": lambda: '{"annotations": ' + "[" * 200_000,
-    "keypoints": lambda: _coco(
-        annotations=[{"id": 1, "image_id": 7, "category_id": 3, "keypoints": [1, 1, 2] * 500_000}]
-    ),
     "large images": lambda: _marked(
         {"counts": [0, 40_000_000], "size": [5_000, 8_000]}, 300, width=8_000, height=5_000
     ),
@@ -948,34 +750,17 @@ def _cvat(shapes: str, width: int = 64, height: int = 48) -> str:
 
 CVAT = {
     "entities": lambda: f'<!DOCTYPE a [<!ENTITY a "aa">]>{_cvat("&a;")}',
-    "deep": lambda: _CVAT_HEAD + "<image>" * 500_000,
     "many elements": lambda: _cvat("<a/>" * 1_000_000),
-    "many images": lambda: (
-        _CVAT_HEAD + '<image id="0" name="left_001.png" width="64" height="48"/>' * 80_000 + "</annotations>"
-    ),
-    "large polygon": lambda: _cvat(f'<polygon label="a" points="{"1,2;" * 600_000}3,3"/>'),
     "many polygons": lambda: _cvat('<polygon label="a" points="1,1;60,1;60,40"/>' * 60_000),
-    "long text": lambda: _cvat("x" * 4_000_000),
-    "mask": lambda: _cvat(f'<mask label="a" rle="{"1, " * 1_000_000}1" left="0" top="0" width="64" height="48"/>'),
     "huge mask": lambda: _cvat(
         '<mask label="a" rle="0, 999999999999" left="0" top="0" width="1000000" height="1000000"/>'
     ),
     "huge image": lambda: _cvat('<polygon label="a" points="0,0;1000000000,0;0,1000000000"/>', 10**9, 10**9),
-    "many attributes": lambda: _cvat("<polygon " + " ".join(f'a{n}=""' for n in range(300_000)) + "/>"),
-    "long number": lambda: _cvat(f'<polygon label="a" points="{"1" * 4_000_000},1;2,2;3,3"/>'),
 }
 SURGPOSE = {
     "aliases": lambda: f"a0: &a0 [1]\n{_ALIASES}",
-    "merge keys": lambda: f"0: &a0 {{1: [1, 2]}}\n{_MERGES}",
-    "many frames": lambda: "\n".join(f"{n}: {{1: [1, 2]}}" for n in range(60_000)),
     "too many frames": lambda: "\n".join(f"{n}: {{1: [1, 2]}}" for n in range(300_000)),
     "many keypoints": lambda: "0: {" + ", ".join(f"{n}: [1, 2]" for n in range(100_000)) + "}",
-    "long frame": lambda: "9" * 4_000 + ": {1: [1, 2]}",
-    "sexagesimal": lambda: "0: {1: [1" + ":1" * 2_000 + ", 2]}",
-    "hexadecimal": lambda: "0: {1: [0x" + "f" * 300 + ", 2]}",
-    "large": lambda: "0: {1: [1.0e+300, 2]}",
-    "deep": lambda: "0: " + "[" * 1_000_000,
-    "text": lambda: "0: {1: [" + "x" * 4_000_000 + ", 2]}",
 }
 
 
@@ -991,14 +776,8 @@ SAFETENSORS = {
         {f"t{n}": {"dtype": "F32", "shape": [0], "data_offsets": [0, 0]} for n in range(100_000)}
     ),
     "false shape": lambda: _tensors({"a": {"dtype": "F32", "shape": [10**9, 10**9], "data_offsets": [0, 64]}}),
-    "false place": lambda: _tensors({"a": {"dtype": "F32", "shape": [16], "data_offsets": [2**60, 2**61]}}),
-    "many dimensions": lambda: _tensors({"a": {"dtype": "F32", "shape": [1] * 500_000, "data_offsets": [0, 4]}}),
     "deep": lambda: _tensors("[" * 1_000_000),
-    "numbers": lambda: _tensors('{"a": ' + "9" * 4_000_000 + "}"),
     "metadata": lambda: _tensors({"__metadata__": {f"k{n}": "" for n in range(200_000)}}),
-    "equal places": lambda: _tensors(
-        {f"t{n}": {"dtype": "F32", "shape": [16], "data_offsets": [0, 64]} for n in range(60_000)}
-    ),
 }
 
 
@@ -1013,10 +792,8 @@ def _graph(nodes: Callable[[Any], list[Any]], **more: Any) -> bytes:
 def _filled(count: int) -> Callable[[Any], list[Any]]:
     def nodes(onnx: Any) -> list[Any]:
         shape = onnx.helper.make_tensor("s", onnx.TensorProto.INT64, [1], [count])
-        return [
-            onnx.helper.make_node("Constant", [], ["s"], value=shape),
-            onnx.helper.make_node("ConstantOfShape", ["s"], ["y"]),
-        ]
+        node = onnx.helper.make_node
+        return [node("Constant", [], ["s"], value=shape), node("ConstantOfShape", ["s"], ["y"])]
 
     return nodes
 
@@ -1036,18 +813,6 @@ ONNX = {
             onnx.helper.make_node("Identity", ["x11"], ["y"]),
         ]
     ),
-    "range": lambda: _graph(
-        lambda onnx: [
-            *(
-                onnx.helper.make_node(
-                    "Constant", [], [name], value=onnx.helper.make_tensor(name, onnx.TensorProto.FLOAT, [], [value])
-                )
-                for name, value in (("a", 0.0), ("b", 1e9), ("c", 1.0))
-            ),
-            onnx.helper.make_node("Range", ["a", "b", "c"], ["y"]),
-        ]
-    ),
-    "no graph": lambda: b"\x0a" * 4_000_000,
     "deep": lambda: b"\x3a\x80\x80\x01" * 200_000,
 }
 
@@ -1081,14 +846,10 @@ PROJECT: dict[str, Maker] = {
     "trigger": _changed_project(
         "CREATE TABLE t (a)", "CREATE TRIGGER g AFTER INSERT ON t BEGIN INSERT INTO t SELECT 1; END"
     ),
-    "another table": _changed_project("CREATE TABLE t (a)", "INSERT INTO t VALUES (zeroblob(3000000))"),
-    "only zeros": _text("project.carts", lambda: bytes(4_000_000)),
     "another database": _text(
         "project.carts", _sqlite("CREATE TABLE a (b)", "INSERT INTO a VALUES (zeroblob(2000000))")
     ),
     "many tables": _text("project.carts", _sqlite(*[f"CREATE TABLE a{n} (b)" for n in range(3_000)])),
-    "generated": _text("project.carts", _sqlite("CREATE TABLE a (b, c AS (hex(zeroblob(100000000))))")),
-    "wide table": _text("project.carts", _sqlite(f"CREATE TABLE a ({', '.join(f'c{n}' for n in range(1_900))})")),
     "false pages": _text(
         "project.carts",
         lambda: b"SQLite format 3\0" + struct.pack(">HBBBBBBIII", 4096, 1, 1, 0, 64, 32, 32, 1, 2**31, 0),
@@ -1096,37 +857,39 @@ PROJECT: dict[str, Maker] = {
 }
 
 
-def right_file(kind: str) -> Maker:
-    """Writes a right file of a kind."""
-    names = {
-        "toml": "sequence.toml", "settings": "settings.toml", "manifest": "manifest.toml",
-        "kinematics": "kinematics.csv",
-        "csv": "kinematics.csv", "video": "video.mp4", "image": "images/001.png", "urdf": "two_links.urdf",
-        "stl": "ball.stl", "obj": "ball.obj", "ply": "ball.ply", "safetensors": "weights.safetensors",
-    }  # fmt: skip
-    if kind in names:
-        return lambda folder: (_fill(folder), folder / names[kind])[1]
-    made: dict[str, Maker] = {
-        "yaml": _text("a.yaml", "camera_matrix: {data: [60, 0, 32, 0, 60, 24, 0, 0, 1]}"),
-        "ini": _text("a.ini", "[StereoLeft]\nfc_x=60\nfc_y=60\ncc_x=32\ncc_y=24\nres_x=64\nres_y=48\n[StereoRight]\n"),
-        "mat": _text("a.mat", _saved(K=np.diag([60.0, 60.0, 1.0]))),
-        "json": _text("a.json", "{" + _K + "}"),
-        "parquet": _parquet(lambda: pyarrow.table({"yaw": [0.1, 0.2]})),
-        "npy": _text("a.npy", lambda: _npy(_shaped((2,)), bytes(16))),
-        "npz": _text("a.npz", lambda: _zip({"a.npy": _npy(_shaped((2,)), bytes(16))})),
-        "bag": _bag(lambda bag: None),
-        "mcap": _damaged_mcap(lambda data: data),
-        "xacro": _text("a.xacro", f'{_XACRO}<link name="a"/></robot>'),
-        "dae": _text("a.dae", _dae()),
-        "glb": _text("a.glb", lambda: _glb(_gltf(), _BIN)),
-        "coco": _text("a.json", _coco),
-        "cvat": _text("a.xml", _cvat('<polygon label="a" points="1,1;60,1;60,40"/>')),
-        "surgpose": _text("a.yaml", "0: {1: [1, 2]}"),
-        "onnx": _text("a.onnx", lambda: _graph(_filled(4))),
-        "project": _changed_project(),
-        "batch": _text("job.json", '{"format": "carts-job/1"}'),
-    }
-    return made[kind]
+def _right(name: str) -> Maker:
+    return lambda folder: (_fill(folder), folder / name)[1]
+
+
+RIGHT: dict[str, Maker] = {
+    **{kind: _right(f"{kind}.toml") for kind in ("settings", "manifest")},
+    **{kind: _right(f"ball.{kind}") for kind in ("stl", "obj", "ply")},
+    **{kind: _right("kinematics.csv") for kind in ("csv", "kinematics")},
+    "toml": _right("sequence.toml"),
+    "video": _right("video.mp4"),
+    "image": _right("images/001.png"),
+    "urdf": _right("two_links.urdf"),
+    "safetensors": _right("weights.safetensors"),
+    "yaml": _text("a.yaml", "camera_matrix: {data: [60, 0, 32, 0, 60, 24, 0, 0, 1]}"),
+    "ini": _text("a.ini", "[StereoLeft]\nfc_x=60\nfc_y=60\ncc_x=32\ncc_y=24\nres_x=64\nres_y=48\n[StereoRight]\n"),
+    "mat": _text("a.mat", _saved(K=np.diag([60.0, 60.0, 1.0]))),
+    "json": _text("a.json", '{"K": [[60, 0, 32], [0, 60, 24], [0, 0, 1]]}'),
+    "parquet": _parquet(lambda: pyarrow.table({"yaw": [0.1, 0.2]})),
+    "npy": _text("a.npy", lambda: _npy(_shaped((2,)), bytes(16))),
+    "npz": _text("a.npz", lambda: _zip({"a.npy": _npy(_shaped((2,)), bytes(16))})),
+    "bag": _bag(lambda bag: None),
+    "mcap": _damaged_mcap(lambda data: data),
+    "xacro": _text("a.xacro", f'{_XACRO}<link name="a"/></robot>'),
+    "dae": _text("a.dae", _dae()),
+    "glb": _text("a.glb", lambda: _glb(_gltf(), _BIN)),
+    "coco": _text("a.json", _coco),
+    "cvat": _text("a.xml", _cvat('<polygon label="a" points="1,1;60,1;60,40"/>')),
+    "surgpose": _text("a.yaml", "0: {1: [1, 2]}"),
+    "onnx": _text("a.onnx", lambda: _graph(_filled(4))),
+    "project": _changed_project(),
+    "batch": _text("job.json", '{"format": "carts-job/1"}'),
+}
+"""Right files of each kind."""
 
 
 def _named(name: str, texts: dict[str, Any], around: Callable[[str], str] = str) -> dict[str, Maker]:
@@ -1140,16 +903,30 @@ def _named(name: str, texts: dict[str, Any], around: Callable[[str], str] = str)
     return {key: _text(name, content(text)) for key, text in texts.items()}
 
 
+_REPEATED = {
+    "blanks": " ", "blank lines": "\n", "brackets": "[", "comments": "#\n", "commas": ",", "digits": "1",
+    "letters": "x", "quotes": '"',
+}  # fmt: skip
+
+
+def _repeated(name: str, head: str = "", tail: str = "") -> dict[str, Maker]:
+    """Texts of half a megabyte of one token, within the syntax of a kind."""
+    return {
+        f"repeated {key}": _text(name, lambda token=token: head + token * (500_000 // len(token)) + tail)
+        for key, token in _REPEATED.items()
+    }
+
+
 CASES: dict[str, dict[str, Maker]] = {
-    "yaml": _named("a.yaml", YAML),
-    "ini": _named("a.ini", INI),
+    "yaml": _named("a.yaml", YAML) | _repeated("a.yaml", "a: "),
+    "ini": _named("a.ini", INI) | _repeated("a.ini", "[StereoLeft]\nfc_x = "),
     "mat": _named("a.mat", MAT),
-    "json": _named("a.json", JSON),
-    "toml": _named("sequence.toml", TOML),
+    "json": _named("a.json", JSON) | _repeated("a.json", '{"K": '),
+    "toml": _named("sequence.toml", TOML) | _repeated("sequence.toml", "a = "),
     "settings": _named("settings.toml", TOML),
     "manifest": _named("manifest.toml", TOML),
-    "csv": _named("a.csv", CSV),
-    "kinematics": _named("kinematics.csv", CSV),
+    "csv": _named("a.csv", CSV) | _repeated("a.csv", "yaw,a\n1,"),
+    "kinematics": _named("kinematics.csv", CSV) | _repeated("kinematics.csv", "frame,time,yaw\n1,0.0,"),
     "parquet": PARQUET,
     "npy": _named("a.npy", NPY),
     "npz": _named("a.npz", NPZ),
@@ -1157,16 +934,16 @@ CASES: dict[str, dict[str, Maker]] = {
     "mcap": MCAP,
     "video": VIDEO,
     "image": IMAGE,
-    "urdf": _named("a.urdf", URDF),
-    "xacro": _named("a.xacro", XACRO, lambda text: f"{_XACRO}{text}</robot>"),
-    "dae": _named("a.dae", DAE),
-    "obj": _named("a.obj", OBJ),
-    "stl": _named("a.stl", STL),
-    "ply": _named("a.ply", PLY),
+    "urdf": _named("a.urdf", URDF) | _repeated("a.urdf", '<robot name="', '"/>'),
+    "xacro": _named("a.xacro", XACRO, lambda text: f"{_XACRO}{text}</robot>") | _repeated("a.xacro", f"{_XACRO}${{"),
+    "dae": _named("a.dae", DAE) | _repeated("a.dae", _dae()[:-60]),
+    "obj": _named("a.obj", OBJ) | _repeated("a.obj", f"{_TRIANGLE}f 1 2 "),
+    "stl": _named("a.stl", STL) | _repeated("a.stl", "solid a\nfacet normal 0 0 "),
+    "ply": _named("a.ply", PLY) | _repeated("a.ply", "ply\nformat ascii 1.0\nelement vertex "),
     "glb": _named("a.glb", GLB),
     "coco": _named("a.json", COCO),
-    "cvat": _named("a.xml", CVAT),
-    "surgpose": _named("a.yaml", SURGPOSE),
+    "cvat": _named("a.xml", CVAT) | _repeated("a.xml", _CVAT_HEAD),
+    "surgpose": _named("a.yaml", SURGPOSE) | _repeated("a.yaml", "0: {1: "),
     "safetensors": _named("a.safetensors", SAFETENSORS),
     "onnx": _named("a.onnx", ONNX),
     "project": PROJECT,

@@ -9,7 +9,6 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
-from types import SimpleNamespace
 
 import cv2
 import msgspec
@@ -32,7 +31,6 @@ from carts_core.live import (
     Results,
     StreamError,
     StreamServer,
-    Tracked,
     follow,
     packed,
 )
@@ -397,11 +395,3 @@ def test_a_video_is_shown_at_its_own_rate_with_joints_from_elsewhere(
     assert len(moments) == 6 and time.monotonic() - began > 0.2
     with pytest.raises(SettingsError, match="cannot open"):
         Camera(assembler, "left", str(tmp_path / "missing.avi"))
-
-
-def test_a_result_says_how_old_it_is(sequence: Sequence) -> None:
-    moment = Moment(sequence.frame(0))
-    tracked = Tracked(moment, Repeater(sequence).track(moment.frame), 0.125)
-    message = Results(sequence.scene).message(tracked)
-    assert (message.id, message.age, message.verdict, message.masks) == ("001", 0.125, "good", {})
-    assert SimpleNamespace(**json.loads(msgspec.json.encode(message))).type == "result"

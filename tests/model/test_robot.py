@@ -131,16 +131,6 @@ def test_a_file_that_is_no_urdf_is_named(tmp_path: Path) -> None:
         Robot.load(path)
 
 
-def test_a_missing_urdf_is_named(tmp_path: Path) -> None:
-    with pytest.raises(RobotError, match=r"nowhere\.urdf is missing"):
-        Robot.load(tmp_path / "nowhere.urdf")
-
-
-def test_an_unknown_base_link_lists_the_links() -> None:
-    with pytest.raises(RobotError, match=r"no link is called 'foot'. The links are: base_link"):
-        Robot.load(shipped_robot(), base_link="foot")
-
-
 def test_a_base_link_that_moves_is_refused() -> None:
     with pytest.raises(RobotError, match="moves with a joint"):
         Robot.load(shipped_robot(), base_link="roll_link")
@@ -164,12 +154,6 @@ def test_a_damaged_cache_is_made_again(tmp_path: Path, monkeypatch: pytest.Monke
     (cached,) = tmp_path.glob("*.npz")
     cached.write_bytes(cached.read_bytes()[:100])
     assert len(Robot.load(shipped_robot()).meshes) > 0
-
-
-def test_a_robot_with_few_triangles_is_left_as_it_is() -> None:
-    robot = Robot.load(shipped_robot())
-    assert robot.decimation.before == robot.decimation.after
-    assert robot.decimation.deviation == 0.0
 
 
 def instrument_of(urdf: Path, *meshes: str) -> Path:

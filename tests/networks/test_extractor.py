@@ -145,10 +145,6 @@ def test_a_hybrid_shows_the_rendering_inside_the_silhouette_and_the_background_o
     torch.testing.assert_close(image[:, ~inside], background[:, ~inside])
 
 
-def test_one_background_serves_a_batch_of_hypotheses():
-    assert hybrid(torch.rand(5, 2, 3, 4, 6), torch.rand(5, 2, 4, 6), torch.rand(3, 4, 6)).shape == (5, 2, 3, 4, 6)
-
-
 def test_a_point_that_moves_outwards_takes_the_backgrounds_place():
     """Where the silhouette grows by a share, so does the rendering, and the background gives way by that share."""
     silhouette = torch.zeros(1, 1, requires_grad=True)

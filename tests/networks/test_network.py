@@ -67,15 +67,6 @@ def test_an_empty_image_is_not_amplified_to_noise():
     assert standardize(flat, 4, 1.0).abs().max() < 0.05
 
 
-def test_an_architecture_survives_json():
-    architecture = Architecture(
-        widths=(8, 16), encoder_convolutions=(1, 2), decoder_convolutions=(3,), local_mean=False
-    )
-    assert Architecture.from_json(architecture.to_json()) == architecture
-    architecture = Architecture(local_contrast=0.7)
-    assert Architecture.from_json(architecture.to_json()) == architecture
-
-
 def test_weights_from_before_local_contrast_have_none():
     older = Architecture().to_json().replace(', "local_contrast": 0.0', "")
     assert "local_contrast" not in older

@@ -1,5 +1,8 @@
 """A predictor that sees the truth of a short sequence, and the optimizer of that sequence."""
 
+from copy import copy
+from typing import Self
+
 import torch
 from perfect_predictor import PerfectPredictor
 
@@ -20,6 +23,12 @@ class Truths(PerfectPredictor):
         self.all = [PerfectPredictor(sequence, truth).maps for truth in truths]
         self.blind: set[int] = set()
         self.read: list[int] = []
+
+    def fresh(self) -> Self:
+        """The same, as if nothing had been read or hidden."""
+        other = copy(self)
+        other.all, other.blind, other.read = list(self.all), set(), []
+        return other
 
     def load(self, index: int) -> Frame:
         self.read.append(index)

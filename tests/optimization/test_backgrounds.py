@@ -38,9 +38,9 @@ class DarkIsArm(ImagePredictor):
         return window.of(found)
 
 
-@pytest.fixture
-def scene(tiny_sequence: Callable[..., Path]) -> Scene:
-    return Sequence.open(tiny_sequence(frames=1, **SIZE)).scene.with_cameras(["left"])
+@pytest.fixture(scope="module")
+def scene(shared_sequence: Callable[..., Path]) -> Scene:
+    return Sequence.open(shared_sequence(frames=1, **SIZE)).scene.with_cameras(["left"])
 
 
 def _room(bar: bool = True) -> np.ndarray:

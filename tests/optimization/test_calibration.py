@@ -1,6 +1,7 @@
 """Calibration over many frames, with a predictor that sees exactly what is there."""
 
 from collections.abc import Callable
+from copy import copy
 from dataclasses import replace
 from pathlib import Path
 
@@ -55,12 +56,12 @@ class PerfectPredictor(ImagePredictor):
         return window.of(self.maps[round(255 * float(images[0, 0, 0, 0]))])[: len(images)]
 
 
-@pytest.fixture
-def sequence(tiny_sequence: Callable[..., Path]) -> Sequence:
-    return Sequence.open(tiny_sequence(frames=FRAMES, cameras=("left", "right"), width=SIZE[0], height=SIZE[1]))
+@pytest.fixture(scope="module")
+def sequence(shared_sequence: Callable[..., Path]) -> Sequence:
+    return Sequence.open(shared_sequence(frames=FRAMES, cameras=("left", "right"), width=SIZE[0], height=SIZE[1]))
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def frames(sequence: Sequence) -> list[Frame]:
     """Frames whose joints are measured without an error; their images are as bright as their number."""
     return [
@@ -71,9 +72,14 @@ def frames(sequence: Sequence) -> list[Frame]:
     ]
 
 
-@pytest.fixture
-def predictor(sequence: Sequence, frames: list[Frame]) -> PerfectPredictor:
+@pytest.fixture(scope="module")
+def made_predictor(sequence: Sequence, frames: list[Frame]) -> PerfectPredictor:
     return PerfectPredictor(sequence.scene, frames)
+
+
+@pytest.fixture
+def predictor(made_predictor: PerfectPredictor) -> PerfectPredictor:
+    return copy(made_predictor)
 
 
 def rigid(degrees: list[float], millimetres: list[float]) -> np.ndarray:
@@ -168,6 +174,21 @@ def test_deviations_of_one_frame_and_of_few_are_not_those_of_independent_pixels(
     for unknown in found(2):
         between = unknown.deviation_between_frames
         assert between is not None and unknown.standard_deviation > max(between, unknown.deviation)
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_few_frames_bring_a_base_frame_back_as_near_as_their_deviations_say(
+    sequence: Sequence, frames: list[Frame], predictor: PerfectPredictor, count: int
+) -> None:
+    free = FreeParameters(joints=False, base_frames=True)
+    wrong, truth = (scene.with_cameras(["left"]) for scene in (with_wrong_base(sequence.scene), sequence.scene))
+    optimizer = CalibrationOptimizer(wrong, frames[:count], predictor, settings=SETTINGS, free=free)
+    list(optimizer)
+    result, positions = optimizer.result(), frames[0].measured["PSM1"]
+    angle, distance = worst_error(result.scene, truth, positions)
+    known = result.deviations["PSM1", "left"]
+    assert distance < 0.5 * worst_error(wrong, truth, positions)[1]
+    assert angle < 4 * known.rotation_deg and distance < 4 * np.hypot(known.sideways_mm, known.depth_mm)
 
 
 def test_what_differs_from_the_empty_background_counts_in_a_calibration(

@@ -197,18 +197,22 @@ def test_the_real_stereo_frames_are_calibrated_from_points_alone(shared_dir: Pat
     assert result.error < 4.0
 
 
+def write_points(path: Path, sequence: Sequence, points: list[ImagePoint]) -> None:
+    rows = [
+        f"{sequence.frame_ids[point.frame]},{point.camera},PSM1,{point.landmark},{point.pixel[0]},{point.pixel[1]}"
+        for point in points
+    ]
+    path.write_text("frame,camera,arm,landmark,u,v\n" + "\n".join(rows) + "\n")
+
+
 def test_the_command_reads_a_table_and_writes_a_sequence_file(
     tiny_sequence: Callable[..., Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = tiny_sequence(frames=5, cameras=("left", "right"), width=640, height=480)
     sequence = Sequence.open(path)
     points = clicked(sequence.scene, sequence.measured, range(5), ["left"], noise=0.0)
-    rows = [
-        f"{sequence.frame_ids[point.frame]},left,PSM1,{point.landmark},{point.pixel[0]},{point.pixel[1]}"
-        for point in points
-    ]
     table = tmp_path / "points.csv"
-    table.write_text("frame,camera,arm,landmark,u,v\n" + "\n".join(rows) + "\n")
+    write_points(table, sequence, points)
     main(["hand-eye", str(path), "--points", str(table), "--output", str(tmp_path / "out")])
     said = " ".join(capsys.readouterr().out.split())
     assert "20 points agree to 0.0 px" in said and "PSM1 before left: known to" in said
@@ -259,24 +263,9 @@ def test_a_refinement_keeps_to_what_the_points_left_open_and_to_known_cameras(
     wrong = replace(sequence.scene, arms=(replace(arm, T_world_base=arm.T_world_base @ turn),))
     for name, scene in (("right", sequence.scene), ("wrong", wrong)):
         points = clicked(scene, sequence.measured, range(2), ["left", "right"], noise=0.5)
-        rows = [
-            f"{sequence.frame_ids[point.frame]},{point.camera},PSM1,{point.landmark},{point.pixel[0]},{point.pixel[1]}"
-            for point in points
-        ]
-        (tmp_path / f"{name}.csv").write_text("frame,camera,arm,landmark,u,v\n" + "\n".join(rows) + "\n")
-        found = tmp_path / name
-        main(
-            [
-                "hand-eye",
-                str(path),
-                "--points",
-                str(tmp_path / f"{name}.csv"),
-                "--output",
-                str(found),
-                "--pixel-error",
-                "0.5",
-            ]
-        )
+        write_points(tmp_path / f"{name}.csv", sequence, points)
+        given = ["--points", str(tmp_path / f"{name}.csv"), "--pixel-error", "0.5"]
+        main(["hand-eye", str(path), *given, "--output", str(tmp_path / name)])
     refine = ["--observe", "masks", "--frames", "all"]
     main(["calibrate", str(tmp_path / "right/sequence.toml"), *refine, "--output", str(tmp_path / "refined")])
     refined = Sequence.open(tmp_path / "refined/sequence.toml").scene
@@ -294,19 +283,6 @@ def test_a_refinement_keeps_to_what_the_points_left_open_and_to_known_cameras(
     said = " ".join(capsys.readouterr().err.split())
     assert "he base frame of PSM1 moves by" in said and "its hand-eye calibration is known to" in said
     assert "--beyond-hand-eye" in said and not (tmp_path / "moved").exists()
-
-
-def test_covariances_of_base_frames_are_as_large_as_their_errors(scene: Scene) -> None:
-    one = replace(scene, arms=scene.arms[:1])
-    measured = {"PSM1": joints()}
-    (arm,), squares = one.arms, []
-    for seed in range(12):
-        points = clicked(one, measured, range(4), ["left"], seed=seed)
-        result = solve_hand_eye(unknown(one), measured, points)
-        T = np.linalg.inv(result.scene.arms[0].T_world_base) @ arm.T_world_base
-        error = np.concatenate([Rotation.from_matrix(T[:3, :3]).as_rotvec(), T[:3, 3]])
-        squares.append(error @ np.linalg.solve(result.base_covariances["PSM1"], error))
-    assert 3.0 < np.mean(squares) < 9.0, "six degrees of freedom"
 
 
 @pytest.mark.parametrize(

@@ -15,9 +15,9 @@ from carts_core.settings.stages import OCCLUDED
 WIDTH, HEIGHT = 320, 240
 
 
-@pytest.fixture
-def scene(tiny_sequence: Callable[..., Path]) -> Scene:
-    return Sequence.open(tiny_sequence(frames=1, width=2 * WIDTH, height=2 * HEIGHT)).scene
+@pytest.fixture(scope="module")
+def scene(shared_sequence: Callable[..., Path]) -> Scene:
+    return Sequence.open(shared_sequence(frames=1, width=2 * WIDTH, height=2 * HEIGHT)).scene
 
 
 def _arm() -> tuple[np.ndarray, np.ndarray]:

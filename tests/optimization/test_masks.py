@@ -30,9 +30,9 @@ from carts_core.settings import FreeParameters
 SIZE = {"width": 320, "height": 240}
 
 
-@pytest.fixture
-def sequence(tiny_sequence: Callable[..., Path]) -> Sequence:
-    return Sequence.open(tiny_sequence(frames=3, **SIZE))
+@pytest.fixture(scope="module")
+def sequence(shared_sequence: Callable[..., Path]) -> Sequence:
+    return Sequence.open(shared_sequence(frames=3, **SIZE))
 
 
 def dice_of(sequence: Sequence, frame: Frame, predictor: MaskPredictor, *, degrees: float = 3.0, **options) -> float:
@@ -123,6 +123,19 @@ def test_every_frame_of_a_sequence_is_fitted_to_its_own_mask(sequence: Sequence)
     for index, estimate in optimizer.estimates.items():
         mask = (sequence.frame(index).masks or {})["left"]
         assert dice(renderer.segment(estimate.state)[0] >= 0, mask) > 0.98
+
+
+def test_the_order_in_which_cameras_are_named_changes_no_estimate(tiny_sequence: Callable[..., Path]) -> None:
+    sequence = Sequence.open(tiny_sequence(frames=1, cameras=("left", "right"), width=160, height=120))
+    frame, found = sequence.frame(0), []
+    for cameras in (["left", "right"], ["right", "left"]):
+        optimizer = FrameOptimizer(sequence.scene, frame, {}, MaskPredictor(), cameras=cameras, live=False)
+        list(optimizer)
+        assert optimizer.best is not None
+        found.append(optimizer.best)
+    np.testing.assert_allclose(found[0].joint_positions()["PSM1"], found[1].joint_positions()["PSM1"], atol=1e-4)
+    np.testing.assert_allclose(found[0].joint_std()["PSM1"], found[1].joint_std()["PSM1"], rtol=1e-2)
+    assert found[0].loss == pytest.approx(found[1].loss, rel=1e-3)
 
 
 def test_a_calibration_is_found_from_masks(sequence: Sequence) -> None:

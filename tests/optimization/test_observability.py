@@ -87,12 +87,12 @@ def test_a_joint_that_the_image_determines_stays_determined_where_all_errors_tur
     assert [after.doubted(0.5).observability(name) for name in after.names] == ["weak", "not visible"]
 
 
-@pytest.fixture
-def sequence(tiny_sequence: Callable[..., Path]) -> Sequence:
-    return Sequence.open(tiny_sequence(frames=1, cameras=("left",), width=320, height=240))
+@pytest.fixture(scope="module")
+def sequence(shared_sequence: Callable[..., Path]) -> Sequence:
+    return Sequence.open(shared_sequence(frames=1, cameras=("left",), width=320, height=240))
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def predictor(sequence: Sequence) -> PerfectPredictor:
     return PerfectPredictor(sequence, sequence.scene.state(sequence.frame(0).truth or {}))
 
@@ -117,9 +117,7 @@ def test_what_is_not_in_the_image_stays_and_is_unknown(sequence: Sequence, predi
     assert np.allclose(blind.best.joint_positions()["PSM1"], away["PSM1"], atol=1e-4)
 
 
-def test_outlines_that_are_all_too_far_out_are_allowed_for_in_the_deviations(
-    sequence: Sequence,
-) -> None:
+def test_outlines_that_are_all_too_far_out_are_allowed_for_in_the_deviations(sequence: Sequence) -> None:
     frame = sequence.frame(0)
     assert frame.truth is not None
     predictor = PerfectPredictor(sequence, sequence.scene.state(frame.truth))

@@ -29,9 +29,9 @@ class Off(Truths):
         return replace(frame, measured={ARM: (frame.truth or {})[ARM] + OFF})
 
 
-@pytest.fixture
-def truths(tiny_sequence: Callable[..., Path]) -> Off:
-    return Off(Sequence.open(tiny_sequence(frames=FRAMES, width=320, height=240)))
+@pytest.fixture(scope="module")
+def made_truths(shared_sequence: Callable[..., Path]) -> Off:
+    return Off(Sequence.open(shared_sequence(frames=FRAMES, width=320, height=240)))
 
 
 def finished(truths: Truths, **arguments) -> SequenceOptimizer:

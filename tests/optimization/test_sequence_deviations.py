@@ -1,8 +1,6 @@
 """How certain the estimates of a sequence say they are."""
 
-from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,12 +8,6 @@ from short_sequence import ALONE, ARM, FRAMES, Truths, optimizer
 
 from carts_core.optimization.sequence_estimate import Origin
 from carts_core.optimization.verdict import Verdict
-from carts_core.recording import Sequence
-
-
-@pytest.fixture
-def truths(tiny_sequence: Callable[..., Path]) -> Truths:
-    return Truths(Sequence.open(tiny_sequence(frames=FRAMES, width=320, height=240)))
 
 
 def test_frames_in_quick_succession_inform_others_less(truths: Truths) -> None:

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -23,16 +22,11 @@ from carts_core.optimization.error_model import Gaussian
 from carts_core.optimization.measurement import FrameSolver, Measurement
 from carts_core.optimization.sequence import initial_correction
 from carts_core.optimization.variables import Variables
-from carts_core.recording import Frame, Sequence
+from carts_core.recording import Frame
 from carts_core.rendering import Renderer
 from carts_core.settings.stages import WARM_WIDE, AlignEdges
 
 WRIST_PITCH = 4
-
-
-@pytest.fixture
-def truths(tiny_sequence: Callable[..., Path]) -> Truths:
-    return Truths(Sequence.open(tiny_sequence(frames=FRAMES, width=320, height=240)))
 
 
 def error(truths: Truths, index: int, joint_positions: dict[str, np.ndarray]) -> np.ndarray:
@@ -158,12 +152,6 @@ def test_cancelling_keeps_what_is_there(truths: Truths) -> None:
     assert error(truths, 1, sequence.estimates[1].joint_positions)[:2].max() < np.deg2rad(0.25)
 
 
-def test_nothing_was_visited_yet(truths: Truths) -> None:
-    sequence = optimizer(truths)
-    sequence.cancel()
-    assert sequence.estimates == {} and sequence.frames_per_second == 0
-
-
 def test_a_few_frames_are_solved_alone_before_the_first_one(truths: Truths) -> None:
     sequence = optimizer(truths, model=SequenceSettings(initial_frames=4))
     alone = [step for _ in range(4) if (step := sequence.step()) is not None]
@@ -176,31 +164,6 @@ def test_a_few_frames_are_solved_alone_before_the_first_one(truths: Truths) -> N
     assert 0 < first.iterations - sum(step.iterations for step in alone) <= 2
     list(sequence)
     assert sequence.progress == (FRAMES, FRAMES) and sequence.seconds_left == 0
-
-
-def test_the_first_frame_starts_where_those_solved_alone_agree(truths: Truths, monkeypatch: pytest.MonkeyPatch) -> None:
-    here = np.full(7, 0.011)
-    monkeypatch.setattr("carts_core.optimization.sequence.initial_correction", lambda *_: here)
-    starts: list[np.ndarray] = []
-    warm = FrameSolver.warm
-
-    def watched(solver: FrameSolver, *arguments) -> Measurement:
-        starts.append(arguments[-1])
-        return warm(solver, *arguments)
-
-    sequence = optimizer(truths, model=SequenceSettings(initial_frames=2))
-    assert sequence.step() is not None
-    assert sequence.step() is not None
-    monkeypatch.setattr(FrameSolver, "warm", watched)
-    sequence.step()
-    assert np.array_equal(starts[0], here)
-
-
-def test_cancelling_while_frames_are_solved_alone_leaves_nothing(truths: Truths) -> None:
-    sequence = optimizer(truths)
-    sequence.step()
-    sequence.cancel()
-    assert sequence.step() is None and sequence.estimates == {}
 
 
 def test_a_frame_that_cannot_be_read_is_told_when_its_turn_comes(truths: Truths) -> None:
@@ -234,13 +197,6 @@ def test_where_it_starts_suits_all_frames_that_were_solved_alone(truths: Truths,
     solver = FrameSolver(scene, truths, settings, SequenceSettings(), lambda _: {})
     found = initial_correction({0: wrong, 2: right, 4: right}, solver, open_frame, allowance=2.0)
     assert np.array_equal(found, wrong if jumped else right)
-
-
-def test_a_keyframe_at_the_start_needs_no_other_frames(truths: Truths) -> None:
-    given = {ARM: (truths.sequence.frame(0).truth or {})[ARM]}
-    sequence = optimizer(truths, keyframes={0: given})
-    first = sequence.step()
-    assert first is not None and first.start == "keyframe" and sequence.progress == (1, FRAMES)
 
 
 def test_a_keyframe_counts_for_the_start_wherever_it_is(truths: Truths) -> None:

@@ -45,9 +45,9 @@ class Bowl:
         return Evaluation(value, value, value, slope, torch.eye(len(offsets)), None, *(empty,) * 4)
 
 
-@pytest.fixture
-def variables(tiny_sequence: Callable[..., Path]) -> Variables:
-    sequence = Sequence.open(tiny_sequence(frames=1))
+@pytest.fixture(scope="module")
+def variables(shared_sequence: Callable[..., Path]) -> Variables:
+    sequence = Sequence.open(shared_sequence(frames=1))
     return Variables(sequence.scene, sequence.scene.state(sequence.frame(0).measured), FreeParameters(), 0.15)
 
 
@@ -70,12 +70,6 @@ def test_a_descent_ends_when_no_more_than_its_tolerance_is_to_be_gained(variable
     assert float(fit.offsets[0]) == pytest.approx(0.06**0.5, abs=0.1)
 
 
-def test_after_a_restart_coarse_stages_end_as_late_as_fine_ones(variables: Variables) -> None:
-    fit = Fit(bowl(variables, 0.03), torch.zeros_like(variables.lower), 60)
-    fit.jump_to(torch.zeros_like(variables.lower))
-    assert len(list(run_stage(Descend(1.0, tolerance=0.06), fit))) > 1
-
-
 def test_no_stage_runs_when_all_evaluations_are_used_up(variables: Variables) -> None:
     problem = bowl(variables, 10.0)
     fit, steps = run([Descend(1.0, steps=3), Observe(), Descend(1.0), Observe()], problem, budget=3)
@@ -88,14 +82,6 @@ def test_a_descent_never_passes_a_joint_limit(variables: Variables) -> None:
     fit, _ = run([Descend(1.0, steps=60, tolerance=0.0)], problem)
     assert (fit.offsets <= variables.upper).all()
     torch.testing.assert_close(fit.offsets, variables.upper)
-
-
-def test_the_end_has_the_deviation_of_the_descent_before_it(variables: Variables) -> None:
-    fit = Fit(bowl(variables, 0.03), torch.zeros_like(variables.lower), 60)
-    *_, descended, end = run_stages((Descend(1.0), Evaluate()), fit)
-    assert end.objective_key[-1] == "end"
-    assert fit.reached is not None and end.evaluation.gradient is fit.reached.evaluation.gradient
-    assert descended.objective_key != end.objective_key, "the end replaces the best point, whatever its loss"
 
 
 def test_what_is_no_stage_is_refused(variables: Variables) -> None:

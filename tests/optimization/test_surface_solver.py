@@ -1,19 +1,15 @@
 """The surface factor and the default solver, with a predictor that sees exactly what is there."""
 
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from perfect_predictor import PerfectPredictor, with_stage, without
-from torch.nn import functional
 
 from carts_core.errors import SettingsError
-from carts_core.evaluation import dice
 from carts_core.imaging.working_image import Window
-from carts_core.model.parts import COVERAGE
 from carts_core.networks import FeatureExtractor
 from carts_core.optimization import DescentSolver, FrameOptimizer, FreeParameters, SurfaceSolver
 from carts_core.optimization.factors import Prior
@@ -24,15 +20,15 @@ from carts_core.optimization.variables import Variables
 from carts_core.recording import Sequence
 from carts_core.rendering import Renderer
 from carts_core.resources import sample_sequence
-from carts_core.settings.stages import FRAME, Descend, Observe, PreferStart, RandomRestart
+from carts_core.settings.stages import Descend, Observe, PreferStart, RandomRestart
 
 
-@pytest.fixture
-def sequence(tiny_sequence: Callable[..., Path]) -> Sequence:
-    return Sequence.open(tiny_sequence(frames=1, cameras=("left",), width=320, height=240))
+@pytest.fixture(scope="module")
+def sequence(shared_sequence: Callable[..., Path]) -> Sequence:
+    return Sequence.open(shared_sequence(frames=1, cameras=("left",), width=320, height=240))
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def predictor(sequence: Sequence) -> PerfectPredictor:
     return PerfectPredictor(sequence, sequence.scene.state(sequence.frame(0).truth or {}))
 
@@ -116,62 +112,6 @@ def test_nobody_watching_changes_no_step(sequence: Sequence, predictor: PerfectP
     assert len(ends) == 2
     assert ends[0].index == ends[1].index and ends[0].loss == ends[1].loss
     assert np.array_equal(ends[0].silhouette, ends[1].silhouette)
-
-
-def test_the_default_solver_observes_a_small_image_first_and_conditions_it_on_the_start_twice(
-    sequence: Sequence, predictor: PerfectPredictor, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    frame, seen = sequence.frame(0), []
-    start = {"PSM1": (frame.truth or {})["PSM1"] + np.deg2rad([2.0, -2.0, 0.0, 4.0, 4.0, -4.0, 0.0])}
-
-    def predict(images: torch.Tensor, given: torch.Tensor, window: Window) -> torch.Tensor:
-        seen.append(given[0, COVERAGE].sum(0))
-        return PerfectPredictor.predict(predictor, images, given, window)
-
-    monkeypatch.setattr(predictor, "predict", predict)
-    settings = without(PreferStart, working_width=160)
-    list(FrameOptimizer(sequence.scene, frame, {}, predictor, start=start, settings=settings))
-    *ours, _, _ = seen  # the last two are the verdict's
-    assert [tuple(one.shape) for one in ours] == [(96, 128), *3 * [(176, 240)]]
-    small = functional.interpolate(seen[0][None, None], seen[1].shape, mode="bilinear")[0, 0]
-    moved = float((seen[2] - seen[1]).abs().mean())
-    assert float((small - seen[1]).abs().mean()) < 0.2 * moved
-
-
-def test_stages_that_others_follow_end_earlier(sequence: Sequence, predictor: PerfectPredictor) -> None:
-    frame = sequence.frame(0)
-    start = {"PSM1": (frame.truth or {})["PSM1"] + np.deg2rad([1.5, -1.5, 0.0, 1.5, 1.5, -1.5, 0.0])}
-    steps = []
-    for tolerance in (1e-5, 0.5):
-        stages = tuple(
-            replace(stage, tolerance=tolerance) if isinstance(stage, Descend) and stage.blur > 1 else stage
-            for stage in FRAME
-        )
-        settings = SurfaceSolver(stages=stages)
-        optimizer = FrameOptimizer(sequence.scene, frame, {}, predictor, start=start, settings=settings)
-        steps.append(len(list(optimizer)))
-    assert steps[1] <= steps[0] - 4
-
-
-def test_first_steps_are_longer_where_the_coarsest_stage_has_a_wide_robust_scale(
-    sequence: Sequence, predictor: PerfectPredictor
-) -> None:
-    """Where arm and image overlap little, most pixels differ by all they can, and a robust weight takes these away."""
-    frame, renderer = sequence.frame(0), Renderer(sequence.scene)
-    truth = (frame.truth or {})["PSM1"]
-    start = {"PSM1": truth + np.deg2rad([2.5, -2.5, 0.0, 2.5, 2.5, -2.5, 0.0])}
-    mask = renderer.segment(sequence.scene.state({"PSM1": truth}))[0] >= 0
-    overlaps = []
-    for robust in (0.5, 2.0):
-        stages = list(FRAME)
-        place, coarse = next((i, stage) for i, stage in enumerate(stages) if isinstance(stage, Descend))
-        stages[place] = replace(coarse, robust=robust)
-        settings = SurfaceSolver(stages=tuple(stages))
-        optimizer = FrameOptimizer(sequence.scene, frame, {}, predictor, start=start, settings=settings)
-        second = [optimizer.step() for _ in range(3)][-1]
-        assert second is not None
-        overlaps.append(dice(renderer.segment(second.state)[0] >= 0, mask))
-    assert overlaps[1] > overlaps[0] + 0.1
 
 
 def test_an_arm_that_the_first_observations_miss_is_searched_in_the_whole_image(

@@ -97,12 +97,6 @@ def test_a_step_below_another_edit_of_its_frame_is_taken_back_without_its_verdic
     assert project.state.verdict(0) is None
 
 
-def test_the_same_verdict_on_another_pose_holds_too(project: Project) -> None:
-    for value in (0.1, 0.2):
-        project.apply("Optimize", {Key.joints(0, "PSM1"): _joints(value), Key.verdict(0): FAILED})
-        assert project.state.verdict(0) == FAILED
-
-
 def test_without_truth_the_worst_frame_is_the_one_that_most_probably_failed(project: Project) -> None:
     project.apply("Assess", {Key.verdict(0): GOOD, Key.verdict(1): FAILED})
     assert worst_first(project.state)[:2] == [1, 0]

@@ -9,7 +9,7 @@ import pytest
 
 from carts_core.cli.command_line import main
 from carts_core.errors import ProjectError
-from carts_core.project import ImportedMask, Key, MaskCorrection, Project, import_annotations
+from carts_core.project import Key, MaskCorrection, Project, import_annotations
 from carts_core.recording import Sequence
 from carts_core.recording.annotations import read_annotations
 
@@ -108,11 +108,6 @@ def test_importing_keypoints_leaves_figures_of_a_frame_as_they_are(sequence: Seq
         found = project.state.get(Key.imported_keypoints(0, "left"))
         assert found is not None and found.points == (("1", 10.5, 20.5),)
         assert (report.masks, report.keypoints) == (0, 1) and project.state.revision(0) == revision
-
-
-def test_labels_that_are_no_picture_of_8_bits_are_refused() -> None:
-    with pytest.raises(ProjectError, match="Give 8 bits per pixel"):
-        ImportedMask.of(np.zeros(SIZE, np.int32))
 
 
 def test_the_command_imports_into_the_project_and_says_what(

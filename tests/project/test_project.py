@@ -37,15 +37,6 @@ def test_a_new_project_says_what_the_sequence_says(project: Project) -> None:
     assert project.undo() is None and project.redo() is None and project.history() == ()
 
 
-def test_an_edit_is_there_after_reopening(project: Project, project_path: Path) -> None:
-    project.apply("Drag PSM1", {Key.joints(1, "PSM1"): JOINTS, Key.review(1): ACCEPTED})
-    project.close()
-    with Project(IDENTITY, project_path) as again:
-        assert again.state.joints(1) == {"PSM1": JOINTS}
-        assert again.state.review(1) == ACCEPTED
-        assert [step.name for step in again.history()] == ["Drag PSM1"]
-
-
 def test_values_keep_every_bit_and_who_made_them(project: Project, project_path: Path) -> None:
     positions = np.random.default_rng(0).normal(size=3)
     correction = JointCorrection(positions, OPTIMIZER, np.array([1e-5, np.inf, np.nan]))  # pyright: ignore[reportArgumentType]
@@ -88,23 +79,6 @@ def test_a_gesture_over_many_frames_is_one_step_of_undo_even_after_a_restart(tmp
         assert all(project.state.joints(frame) for frame in range(200))
 
 
-def test_a_new_edit_drops_what_could_be_redone(project: Project) -> None:
-    for note in ("a", "b", "c"):
-        project.apply(f"Note {note}", {Key.review(0): Review(note=note)})
-    project.go_to(1)
-    project.apply("Note d", {Key.review(1): Review(note="d")})
-    assert [step.name for step in project.history()] == ["Note a", "Note d"]
-    assert project.redo() is None
-    project.undo()
-    assert project.state.review(0).note == "a" and project.state.review(1).note == ""
-
-
-def test_an_edit_that_changes_nothing_is_no_step(project: Project) -> None:
-    project.apply("Accept", {Key.review(0): ACCEPTED})
-    assert project.apply("Accept", {Key.review(0): ACCEPTED, Key.review(1): None}) is None
-    assert len(project.history()) == 1
-
-
 def test_hand_made_frames_are_keyframes_unless_somebody_says_otherwise(project: Project) -> None:
     project.apply("Optimize", {Key.joints(0, "PSM1"): replace(JOINTS, provenance=OPTIMIZER)})
     assert not project.state.is_keyframe(0)
@@ -114,33 +88,6 @@ def test_hand_made_frames_are_keyframes_unless_somebody_says_otherwise(project: 
     assert not project.state.is_keyframe(0)
     project.apply("Hold", {Key.keyframe(1): Keyframe(True)})
     assert project.state.is_keyframe(1)
-
-
-def test_figures_hold_for_the_values_they_were_computed_for(project: Project) -> None:
-    first, second = Figures(loss=0.3), Figures(loss=0.1, dice=0.9)
-    project.record_figures({0: first}, project.state)
-    project.apply("Optimize", {Key.joints(0, "PSM1"): JOINTS}, {0: second})
-    assert project.state.figures(0) == second
-    project.apply("Accept", {Key.review(0): ACCEPTED})
-    assert project.state.figures(0) == second
-    project.apply("Move camera", {Key.intrinsics("left"): CorrectedIntrinsics((9, 9, 4, 3), HAND)})
-    assert project.state.figures(0) is None
-    project.go_to(2)
-    assert project.state.figures(0) == second
-    project.go_to(0)
-    assert project.state.figures(0) == first
-
-
-def test_figures_of_a_dropped_step_are_not_taken_for_those_of_the_step_in_its_place(
-    project: Project, project_path: Path
-) -> None:
-    project.apply("Drag", {Key.joints(0, "PSM1"): JOINTS}, {0: Figures(loss=0.3)})
-    project.undo()
-    project.apply("Drag elsewhere", {Key.joints(0, "PSM1"): replace(JOINTS, joint_positions=(0, 0, 0))})
-    assert project.state.figures(0) is None
-    project.close()
-    with Project(IDENTITY, project_path) as again:
-        assert again.state.figures(0) is None
 
 
 def test_figures_that_come_too_late_are_not_given_to_another_state(project: Project) -> None:
@@ -180,16 +127,6 @@ def test_layers_come_back_pixel_for_pixel(project: Project, project_path: Path) 
     assert np.array_equal(mask.added(), added) and np.array_equal(mask.removed(), removed)
     assert np.array_equal(mask.applied_to(rendered), (rendered | added) & ~removed)
     assert np.array_equal(region.region(), ignored)
-
-
-def test_a_snapshot_stays_as_it_was(project: Project) -> None:
-    project.apply("Accept", {Key.review(0): ACCEPTED})
-    before = project.state
-    seen = visible(before)
-    project.apply("Reject", {Key.review(0): Review(ReviewState.REJECTED)}, {0: Figures(loss=1.0)})
-    project.undo()
-    project.undo()
-    assert visible(before) == seen
 
 
 def test_listeners_hear_of_every_save_after_it_is_done_and_cannot_spoil_it(project: Project) -> None:

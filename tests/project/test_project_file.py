@@ -1,7 +1,6 @@
 """The project file: its path, lock, content, and readers beside the writer."""
 
 import os
-import socket
 import sqlite3
 import subprocess
 import sys
@@ -15,7 +14,6 @@ from sql_file import rows
 
 from carts_core.errors import ProjectError
 from carts_core.project import CorrectedTransform, JointCorrection, Key, Project, Review, ReviewState, default_path
-from carts_core.project.file import holder, try_lock
 from carts_core.recording import Sequence
 from carts_core.resources import sample_sequence
 
@@ -84,14 +82,6 @@ def test_a_second_process_opens_read_only_and_says_so_until_the_first_is_killed(
             assert third.writable and third.state.review(0) == ACCEPTED
 
 
-def test_a_second_opening_in_the_same_process_is_read_only_too(project: Project, project_path: Path) -> None:
-    project.apply("Accept", {Key.review(0): ACCEPTED})
-    with Project(IDENTITY, project_path) as second:
-        assert not second.writable and second.state.review(0) == ACCEPTED
-    assert project.writable
-    project.apply("Reject", {Key.review(0): None})
-
-
 def test_a_link_to_the_folder_of_a_project_leads_to_the_same_project(project: Project, project_path: Path) -> None:
     link = project_path.parent / "link"
     link.symlink_to(project_path.parent)
@@ -132,10 +122,6 @@ def test_a_project_survives_moving_its_folder_and_correcting_the_sequence_file(
         Project.open(Sequence.open(file))
 
 
-def test_a_project_is_beside_its_sequence(tmp_path: Path) -> None:
-    assert default_path(tmp_path / "sequence.toml") == tmp_path / "sequence.carts"
-
-
 def test_the_shipped_sequence_has_its_project_among_the_users_data(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -160,18 +146,6 @@ def test_sequences_of_one_name_in_read_only_folders_have_projects_of_their_own(
 NOTE = {Key.review(0): Review(note="a")}
 
 
-def test_one_at_a_time_and_the_next_when_the_first_is_closed(tmp_path: Path) -> None:
-    path = tmp_path / "project"
-    path.touch()
-    first, second = (os.open(path, os.O_RDWR) for _ in range(2))
-    assert try_lock(first) and not try_lock(second)
-    assert holder(path) == f"process {os.getpid()} on {socket.gethostname()}"
-    os.close(first)
-    assert try_lock(second)
-    os.close(second)
-    assert holder(path) == "another process"
-
-
 def test_the_lock_outlives_another_descriptor_of_the_file_that_is_closed(project: Project, project_path: Path) -> None:
     project_path.read_bytes()
     with Project(IDENTITY, project_path) as second:
@@ -184,11 +158,6 @@ def test_the_lock_outlives_another_descriptor_of_the_file_that_is_closed(project
     command = [sys.executable, "-c", program, str(project_path)]
     finished = subprocess.run(command, capture_output=True, text=True, check=True, env=environment, timeout=60)
     assert finished.stdout == "False\n"
-
-
-def test_there_is_no_lock_file_whose_loss_would_let_two_writers_in(project: Project, project_path: Path) -> None:
-    project.apply("Note", NOTE)
-    assert {path.name for path in project_path.parent.iterdir()} == {"small.carts", "small.carts-wal"}
 
 
 def test_other_programs_that_use_sqlite_cannot_write_meanwhile(project: Project, project_path: Path) -> None:

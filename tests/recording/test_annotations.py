@@ -216,12 +216,6 @@ def test_a_wrong_annotation_of_coco_is_left_out_and_named(
     assert remark.startswith("annotation 52 left out: ") and message in remark
 
 
-def test_a_polygon_without_a_list_around_it_is_a_polygon(sequence: Sequence, tmp_path: Path) -> None:
-    marked = [{"id": 1, "image_id": 7, "category_id": 3, "segmentation": [10, 10, 30, 10, 30, 20, 10, 20]}]
-    frames, _, _ = all_of(write_coco(tmp_path / "labels.json", annotations=marked), sequence)
-    assert frames[1, "left"].labels.sum() == 200
-
-
 def write_png(path: Path, values: np.ndarray) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     assert cv2.imwrite(str(path), values[..., ::-1] if values.ndim == 3 else values)

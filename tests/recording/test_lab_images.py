@@ -199,9 +199,7 @@ def test_white_and_transparency_that_contradict_are_refused(tmp_path: Path) -> N
         read_mask(tmp_path / "mask.png")
 
 
-def test_what_is_changed_about_a_sequences_files_is_said_when_it_is_opened(
-    tiny_sequence: Callable[..., Path],
-) -> None:
+def test_what_is_changed_about_a_sequences_files_is_said_when_it_is_opened(tiny_sequence: Callable[..., Path]) -> None:
     path = tiny_sequence()
     for number in (1, 2, 3):
         deep = read_image(path.parent / f"regular/left/{number:03d}.png").astype(np.uint16) * 16 + 3

@@ -9,12 +9,7 @@ from slow_references import visible_points_ref
 from torch import Tensor
 
 from carts_core.recording import Sequence
-from carts_core.rendering.points import (
-    SceneGeometry,
-    link_transforms,
-    vertices_in_camera,
-    visible_points,
-)
+from carts_core.rendering.points import SceneGeometry, link_transforms, vertices_in_camera, visible_points
 from carts_core.rendering.rasterizer import rasterize
 
 WIDTH, HEIGHT = 160, 120

@@ -11,19 +11,9 @@ from safetensors.torch import save_file
 from carts_core.errors import SettingsError, WeightsError
 from carts_core.files import output_path
 from carts_core.lab.baselines.networks import Baseline, read_baseline, save_baseline, start_from
-from carts_core.lab.baselines.training import (
-    SMOKE_STRENGTH,
-    TrainingFrames,
-    augmentation,
-    diamond_square,
-    make_chunk,
-    missing_chunks,
-    smoked,
-    train_baseline,
-)
-from carts_core.networks.weights import read_weights
+from carts_core.lab.baselines.training import TrainingFrames, make_chunk, missing_chunks, train_baseline
 from carts_core.settings import Architecture
-from carts_core.settings.training import Augmentation, BaselineName, BaselineNetwork, BaselineTraining
+from carts_core.settings.training import BaselineName, BaselineNetwork, BaselineTraining
 
 SMALLEST = {
     "unet": {"unet": Architecture(widths=(4, 6, 8, 8, 8), local_mean=False)},
@@ -89,52 +79,6 @@ def test_a_u_net_finds_the_square_after_some_steps_and_a_stopped_run_goes_on(tmp
         train_baseline(_smallest("unet"), other, _Frames(110), tmp_path)
 
 
-def test_on_a_processor_a_network_learns_in_float32_unless_bfloat16_is_asked_for(tmp_path: Path) -> None:
-    def weights(bfloat16: bool | None) -> dict[str, torch.Tensor]:
-        training = BaselineTraining(
-            augmentation="none", frames=104, steps=2, batch_size=2, warmup=0, threads=1, bfloat16=bfloat16
-        )
-        result = train_baseline(_smallest("unet"), training, _Frames(104), tmp_path / str(bfloat16))
-        return read_baseline(result.weights).network.state_dict()
-
-    default, single, half = weights(None), weights(False), weights(True)
-    assert all(torch.equal(default[key], single[key]) for key in default)
-    assert not all(torch.equal(default[key], half[key]) for key in default)
-
-
-@pytest.mark.parametrize("name", get_args(Augmentation))
-def test_every_augmentation_keeps_types_and_sizes_and_moves_the_mask_with_the_image(name: Augmentation) -> None:
-    torch.manual_seed(0)
-    change = augmentation(name, np.random.default_rng(0))
-    mask = torch.zeros(1, 96, 128)
-    mask[:, 30:60, 40:90] = 1
-    image = (200 * mask).to(torch.uint8).repeat(3, 1, 1) + 20
-    altered = moved = 0
-    for _ in range(20):
-        new_image, new_mask = change(image, mask)
-        assert new_image.dtype == torch.uint8 and new_image.shape == image.shape
-        assert new_mask.shape == mask.shape and bool(((new_mask == 0) | (new_mask == 1)).all())
-        altered += not torch.equal(new_image, image)
-        moved += not torch.equal(new_mask, mask)
-        if name in ("elastic", "projective") and bool((new_mask > 0).any()):
-            inside, outside = new_image[:, new_mask[0] > 0].float(), new_image[:, new_mask[0] == 0].float()
-            assert inside.mean() > outside.mean() + 80
-    assert (altered > 0) is (name != "none")
-    assert (moved > 0) is (name in ("autoaugment", "elastic", "projective"))
-
-
-def test_smoke_brightens_one_image_in_five_and_never_by_more_than_its_strength() -> None:
-    rng = np.random.default_rng(1)
-    image = torch.full((3, 48, 64), 55, dtype=torch.uint8)
-    smoky = [smoked(image, rng) for _ in range(300)]
-    share = np.mean([not torch.equal(one, image) for one in smoky])
-    assert 0.13 < share < 0.27
-    assert max(int(one.max()) for one in smoky) <= 55 + SMOKE_STRENGTH * 200 + 1
-    assert min(int(one.min()) for one in smoky) >= 55
-    field = diamond_square(65, rng)
-    assert field.shape == (65, 65) and field.min() == 0 and field.max() == 1 and np.isfinite(field).all()
-
-
 def test_frames_are_made_once_and_are_the_same_each_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("carts_core.lab.baselines.training.CHUNK", 2)
     folder, other = output_path(tmp_path / "a"), output_path(tmp_path / "b")
@@ -182,15 +126,6 @@ def test_an_encoder_starts_from_a_file_with_timms_names_and_refuses_one_of_anoth
         start_from(network, tmp_path / "x.safetensors")
 
 
-def test_a_u_net_starts_from_a_feature_network_of_the_same_architecture_only(small_weights: Path) -> None:
-    theirs = read_weights(small_weights).network
-    same = Baseline(BaselineNetwork("unet", unet=theirs.architecture))
-    start_from(same, small_weights)
-    assert all(torch.equal(value, same.body.state_dict()[key]) for key, value in theirs.state_dict().items())
-    with pytest.raises(WeightsError, match="Give a feature network of Architecture"):
-        start_from(Baseline(_smallest("unet")), small_weights)
-
-
 @pytest.mark.parametrize(
     ("options", "message"),
     [
@@ -204,14 +139,3 @@ def test_a_u_net_starts_from_a_feature_network_of_the_same_architecture_only(sma
 def test_settings_that_cannot_be_are_refused_in_words(options: dict, message: str) -> None:
     with pytest.raises(SettingsError, match=message):
         BaselineNetwork(**options)
-
-
-def test_an_encoder_that_timm_does_not_know_is_refused_in_words() -> None:
-    with pytest.raises(SettingsError, match="knows no encoder 'hrnet_w1'"):
-        Baseline(BaselineNetwork("hrnet", "hrnet_w1"))
-
-
-def test_the_encoder_is_that_of_the_network_unless_another_is_named() -> None:
-    names = {name: BaselineNetwork(name).timm_encoder for name in get_args(BaselineName)}
-    assert names["hrnet"] == "hrnet_w18_small" and names["swin"].startswith("swin_") and names["unet"] == ""
-    assert BaselineNetwork("hrnet", "hrnet_w48").timm_encoder == "hrnet_w48"

@@ -9,7 +9,7 @@ import pytest
 
 from carts_core.errors import SettingsError
 from carts_core.lab.benchmark import QUICK, plan, room_sources
-from carts_core.lab.benchmark.rooms import AnotherRoom, Room, made_rooms, pasted, photographs
+from carts_core.lab.benchmark.rooms import AnotherRoom, Room, made_rooms, photographs
 from carts_core.recording import Sequence
 
 SIZE = {"width": 160, "height": 120}
@@ -66,23 +66,6 @@ def test_without_an_arm_the_room_alone_is_seen_and_masks_are_empty(sequence: Seq
     frame = AnotherRoom(sequence, [GREEN], seed=1).frame_without_arm(1, GREEN.domain, ["left"])
     assert frame.masks is not None and not frame.masks["left"].any()
     assert np.abs(frame.images["left"].astype(float) - (40, 160, 90)).max() < 15
-
-
-def test_the_old_background_does_not_shine_through_the_rim() -> None:
-    image, room = np.full((60, 60, 3), 250, np.uint8), np.full((60, 60, 3), 250, np.uint8)
-    mask = np.zeros((60, 60), bool)
-    mask[20:40, 20:40] = True
-    image[22:38, 22:38] = 20
-    found = pasted(image, mask, room)
-    assert found[21:39, 21:39].max() < 120 and found[0, 0].min() == 250
-
-
-def test_light_and_noise_change_from_frame_to_frame_and_not_from_call_to_call(sequence: Sequence) -> None:
-    recording = AnotherRoom(sequence, [GREEN], seed=1)
-    one, again, other = (
-        recording.frame_without_arm(index, GREEN.domain, ["left"]).images["left"] for index in (0, 0, 1)
-    )
-    assert np.array_equal(one, again) and not np.array_equal(one, other)
 
 
 def test_the_benchmark_plans_rooms_for_every_camera_with_masks(tiny_sequence: Callable[..., Path]) -> None:

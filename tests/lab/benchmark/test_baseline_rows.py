@@ -13,7 +13,7 @@ from carts_core.lab.benchmark import Benchmark, Measurement, Target, plan
 from carts_core.lab.benchmark.scope import BASELINES
 from carts_core.lab.benchmark.statistics import Measurements
 from carts_core.lab.benchmark.tables import main_tables
-from carts_core.lab.benchmark.targets import image_alone_table, image_alone_targets
+from carts_core.lab.benchmark.targets import image_alone_targets
 from carts_core.lab.synthesis import DOMAINS
 from carts_core.settings import Architecture
 from carts_core.settings.training import BaselineNetwork
@@ -63,16 +63,6 @@ def _rows_of_two(networks: float, ours: float, least: float) -> list[Measurement
             value = least if blood and method == "unet" else dice
             found.append(make_measurement((0.5, value), method=method, domain=domain))
     return found
-
-
-def test_the_report_says_where_a_network_that_sees_the_image_alone_wins() -> None:
-    table = image_alone_table(Measurements(_rows_of_two(0.98, 0.965, 0.6)))
-    assert table is not None
-    cells = {row[1].text: [cell.text for cell in row[2:]] for row in table.rows}
-    assert cells["smoke"] == ["U-Net alone", "98.0", "96.5", "U-Net alone, by 1.5"]
-    assert cells["bleeding"] == ["Swin, simulated smoke", "88.0", "96.5", "ours, by 8.5"]
-    assert len(table.rows) == len(DOMAINS)
-    assert image_alone_table(Measurements([make_measurement((0.5, 0.9))])) is None
 
 
 def test_how_far_ours_is_ahead_is_that_of_the_worst_shifted_domains() -> None:

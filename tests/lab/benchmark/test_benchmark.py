@@ -1,6 +1,5 @@
 """A whole small benchmark: runs, stops, goes on, and reports."""
 
-import io
 import os
 import signal
 import subprocess
@@ -52,13 +51,29 @@ def count_runs(monkeypatch: pytest.MonkeyPatch) -> list[Measurement]:
     return measured
 
 
-def test_every_method_is_scored_in_every_domain_and_a_second_run_measures_nothing(
-    tiny_benchmark: Callable[..., Benchmark], count_runs: list[Measurement], tmp_path: Path
+def test_every_method_is_scored_in_every_domain_although_stopped_once_and_a_further_run_measures_nothing(
+    tiny_benchmark: Callable[..., Benchmark],
+    count_runs: list[Measurement],
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
 ) -> None:
+    measure = SourceBench.measure
+
+    def stop_at_five(self: SourceBench, *arguments) -> list[Measurement]:
+        if len(count_runs) == 5:
+            raise KeyboardInterrupt
+        return measure(self, *arguments)
+
+    monkeypatch.setattr(runner.SourceBench, "measure", stop_at_five)
+    with pytest.raises(KeyboardInterrupt):
+        tiny_benchmark().run(QUIET)
+    kept = tiny_benchmark().measurements()
+    assert [entry.run for entry in kept] == [entry.run for entry in count_runs] and len(kept) == 5
+    monkeypatch.setattr(runner.SourceBench, "measure", measure)
     benchmark = tiny_benchmark()
     benchmark.run(QUIET)
     measurements = benchmark.measurements()
-    assert len(measurements) == len(benchmark.runs) == len(count_runs) == RUNS
+    assert len(measurements) == len(benchmark.runs) == len(count_runs) == RUNS and measurements[:5] == kept
     by_method = {measurement.run.method: measurement for measurement in measurements}
     assert by_method["paper"].iterations == 2 and by_method["start"].iterations == 0
     assert 1 <= by_method["ours"].iterations <= 2
@@ -102,27 +117,6 @@ def test_synthetic_instruments_are_measured_in_other_rooms_with_joints_and_verdi
     assert by_method["ours"].verdict is not None and by_method["ours"].within is not None
 
 
-def test_a_stopped_benchmark_goes_on_where_it_was(
-    tiny_benchmark: Callable[..., Benchmark], count_runs: list[Measurement], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    measure = SourceBench.measure
-
-    def stop_at_five(self: SourceBench, *arguments) -> list[Measurement]:
-        if len(count_runs) == 5:
-            raise KeyboardInterrupt
-        return measure(self, *arguments)
-
-    monkeypatch.setattr(runner.SourceBench, "measure", stop_at_five)
-    with pytest.raises(KeyboardInterrupt):
-        tiny_benchmark().run(QUIET)
-    kept = tiny_benchmark().measurements()
-    assert [entry.run for entry in kept] == [entry.run for entry in count_runs] and len(kept) == 5
-    monkeypatch.setattr(runner.SourceBench, "measure", measure)
-    resumed = tiny_benchmark()
-    resumed.run(QUIET)
-    assert len(count_runs) == RUNS and resumed.measurements()[:5] == kept
-
-
 def test_a_file_gets_a_line_for_what_was_measured_as_soon_as_it_was(
     tiny_benchmark: Callable[..., Benchmark], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
@@ -141,23 +135,6 @@ def test_a_file_gets_a_line_for_what_was_measured_as_soon_as_it_was(
     assert [text.count("\n") for text in seen] == [0, 1, 2]
     assert [line.split(":")[0] for line in seen[2].splitlines()] == [f"1 of {RUNS}", f"2 of {RUNS}"]
     assert "synthetic, regular, frame 0: " in seen[2]
-
-
-def test_a_terminal_gets_a_bar_and_no_lines(
-    tiny_benchmark: Callable[..., Benchmark], count_runs: list[Measurement], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    measure = SourceBench.measure
-
-    def stop_at_two(self: SourceBench, *arguments) -> list[Measurement]:
-        if len(count_runs) == 2:
-            raise KeyboardInterrupt
-        return measure(self, *arguments)
-
-    monkeypatch.setattr(runner.SourceBench, "measure", stop_at_two)
-    screen = io.StringIO()
-    with pytest.raises(KeyboardInterrupt):
-        tiny_benchmark().run(Console(file=screen, force_terminal=True, width=120))
-    assert f"2/{RUNS}" in screen.getvalue() and f"of {RUNS}:" not in screen.getvalue()
 
 
 def test_measurements_of_other_frames_are_not_used(tiny_benchmark: Callable[..., Benchmark]) -> None:

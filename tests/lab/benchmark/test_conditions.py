@@ -30,28 +30,6 @@ def test_occluders_cover_the_wanted_share_of_the_instruments_and_look_unlike_the
     assert np.median(change[found.hidden]) > 10.0
 
 
-def test_far_from_occluders_the_picture_is_what_it_was(picture) -> None:
-    image, _ = picture
-    corner = np.zeros(image.shape[:2], bool)
-    corner[:30, :30] = True
-    found = occlude(image, corner, np.random.default_rng(1))
-    assert found.hidden[:30, :30].any()
-    assert np.array_equal(found.image[-60:, -60:], image[-60:, -60:])
-
-
-def test_the_same_seed_gives_the_same_occluders_and_another_one_others(picture) -> None:
-    image, mask = picture
-    first, again, other = (occlude(image, mask, np.random.default_rng(seed)) for seed in (5, 5, 6))
-    assert np.array_equal(first.image, again.image) and np.array_equal(first.hidden, again.hidden)
-    assert not np.array_equal(first.hidden, other.hidden)
-
-
-def test_a_picture_without_instruments_stays_as_it_is(picture) -> None:
-    image, mask = picture
-    found = occlude(image, np.zeros_like(mask), np.random.default_rng(0))
-    assert np.array_equal(found.image, image) and not found.hidden.any()
-
-
 def test_one_arm_hides_a_part_of_the_other_which_stays_in_view() -> None:
     recording = Sequence.open(sample_sequence())
     frame, original = crossed(recording, 3, "left"), recording.frame(3, "regular", ["left"])

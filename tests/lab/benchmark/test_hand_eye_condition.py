@@ -6,14 +6,7 @@ import pytest
 
 from carts_core.files import output_path
 from carts_core.lab.benchmark import hand_eye
-from carts_core.lab.benchmark.hand_eye import (
-    CONDITIONS,
-    HandEyeRun,
-    hand_eye_table,
-    hand_eye_targets,
-    known_hand_eye,
-    measure_hand_eye,
-)
+from carts_core.lab.benchmark.hand_eye import CONDITIONS, HandEyeRun, hand_eye_targets, known_hand_eye, measure_hand_eye
 from carts_core.networks.extractor import FeatureExtractor
 
 
@@ -44,14 +37,3 @@ def test_nine_of_ten_starts_meet_the_target_and_eight_do_not() -> None:
     for wrong, met in ((1, True), (2, False)):
         target, *others = hand_eye_targets([*runs(10, 0.1, "good")[wrong:], *runs(wrong, 40.0, "doubtful")])
         assert target.met is met and all(other.met is None for other in others)
-
-
-def test_without_masks_what_is_called_failed_is_right_and_wrong_ones_are_named() -> None:
-    failed = runs(10, 6.0, "failed", condition=2)
-    assert hand_eye_targets(failed)[2].met
-    assert not hand_eye_targets([*failed[1:], *runs(1, 6.0, "good", condition=2)])[2].met
-    table = hand_eye_table([*failed, *runs(1, 0.2, "good", condition=2)])
-    assert table is not None
-    assert [cell.text for cell in table.rows[0]][1:4] == ["1 of 11", "0.20", "1.0"]
-    assert table.rows[0][4].text == "10 failed"
-    assert hand_eye_table([]) is None

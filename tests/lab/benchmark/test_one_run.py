@@ -2,7 +2,6 @@
 
 import json
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -37,24 +36,10 @@ def test_the_best_of_some_steps_has_the_time_of_all_of_them() -> None:
     assert [score.dice for score in measurement.best_so_far()] == [0.5, 0.9, 0.9, 0.95]
 
 
-def test_what_the_optimizer_held_for_best_counts_although_an_earlier_loss_was_lower() -> None:
-    coarse, fine = make_measurement((0.9, 0.5)), (0, 1)
-    measurement = replace(coarse, best=fine)
-    best = measurement.best_of(1)
-    assert best is not None and best.dice == 0.5
-    with pytest.raises(ValueError, match="2 iterates"):
-        Measurement.from_json({**measurement.to_json(), "best": [0]})
-
-
 def test_a_run_that_was_cut_says_nothing_of_more_steps_but_one_that_converged_does() -> None:
     assert make_measurement((0.5, 0.9), stopped="iterations").best_of(2) is None
     converged = make_measurement((0.5, 0.9), stopped="converged").best_of(100)
     assert converged is not None and converged.dice == 0.9
-
-
-@pytest.mark.parametrize(("last", "worse"), [(0.48, True), (0.495, False), (0.6, False)])
-def test_a_frame_is_made_worse_when_dice_falls_by_more_than_a_hundredth(last: float, worse: bool) -> None:
-    assert make_measurement((0.5, last)).made_worse is worse
 
 
 def test_the_depth_of_the_tips_is_compared_along_the_cameras_axis(shipped_psm: Robot) -> None:

@@ -40,35 +40,6 @@ def test_frame_comes_after_frame_so_that_a_stopped_benchmark_has_some_of_everyth
     assert runs[: len(first)] == first
 
 
-def test_the_full_scope_has_every_error_in_every_domain() -> None:
-    runs = plan(FULL, BOTH)
-    for degrees in range(7):
-        for domain in DOMAINS:
-            assert Run("synthetic", domain, 0, "ours", float(degrees)) in runs
-
-
-def test_arms_that_cross_are_measured_beside_acs_from_the_same_starts() -> None:
-    runs = plan(FULL, BOTH)
-    for degrees, method in ((1.0, "ours"), (1.0, "acs"), (3.0, "ours"), (3.0, "acs")):
-        assert Run("synthetic", "crossing arms", 2, method, degrees) in runs
-    assert not any(run.domain == "crossing arms" for run in runs if run.source == "real")
-
-
-def test_frames_on_which_not_all_methods_are_evaluated_come_late_and_know_the_default_solver_alone() -> None:
-    runs = plan(FULL, BOTH)
-    further = [
-        run
-        for run in runs
-        if (run.source, run.frame) == ("synthetic", 1) and run.method not in ("sequence", "temporal")
-    ]
-    assert set(further) == {Run("synthetic", domain, 1, "ours", e) for domain in DOMAINS for e in (1.0, 2.0, 3.0, 5.0)}
-    first = min(map(runs.index, further))
-    assert all(run.method in ("ours", "calibrated", "sequence", "temporal") for run in runs[first:])
-    calibrated = [run.frame for run in runs if (run.source, run.method) == ("real", "calibrated")]
-    assert calibrated == [5, 0, 1] and Run("real", "regular", 0, "ours") not in runs
-    assert not [run for run in plan(QUICK, BOTH[:1]) if run.frame == 1 and run.method == "ours"]
-
-
 def test_several_cameras_and_calibration_are_planned_where_there_is_something_to_measure() -> None:
     runs = plan(QUICK, BOTH)
     assert {run.source for run in runs if run.method in ("stereo", "stereo_posed")} == {"real"}

@@ -16,12 +16,9 @@ from carts_core.lab.benchmark.tables import (
     calibration_table,
     camera_table,
     error_tables,
-    iteration_tables,
     main_tables,
     occlusion_table,
-    pair_table,
     sequence_table,
-    worse_table,
 )
 from carts_core.lab.benchmark.targets import accuracy_targets
 from carts_core.lab.synthesis import DOMAINS
@@ -113,11 +110,6 @@ def test_the_same_measurements_give_the_same_report_byte_by_byte(folder: Path, t
     assert all((folder / path).read_bytes() == (tmp_path / path).read_bytes() for path in files)
 
 
-def test_a_report_of_a_single_run_is_written_too(tmp_path: Path) -> None:
-    page = write_report(output_path(tmp_path), [make_measurement((0.5, 0.6))], FACTS, {}, [])
-    assert "not measured" in page.read_text()
-
-
 def test_the_main_table_has_mean_and_deviation_and_the_papers_number() -> None:
     table = main_tables(Measurements(_measurements()))[0]
     assert table.title == "Synthetic frames: Dice" and len(table.rows) == 6
@@ -125,17 +117,6 @@ def test_the_main_table_has_mean_and_deviation_and_the_papers_number() -> None:
     assert paper[1].text == "92.0 ± 2.0" and paper[1].note == "S-Reg 96.6 ± 2.7"
     real = next(t for t in main_tables(Measurements(_measurements())) if t.title == "Real frames: Dice")
     assert real.rows[0][1].note == "R-Reg 95.0 ± 2.7"
-
-
-def test_the_iteration_table_reads_shorter_runs_off_longer_ones() -> None:
-    table = iteration_tables(Measurements([make_measurement((0.5, 0.6, 0.9), method="paper")]))[0]
-    assert [cell.text for cell in table.rows[0][2:4]] == ["60.0", "90.0"]
-
-
-def test_the_error_tables_have_a_column_per_error_and_no_row_without_numbers() -> None:
-    dice, mae = error_tables(Measurements(_measurements()))
-    assert dice.columns[2:] == ("0°", "1°", "2°", "3°") and len(dice.rows) == 1
-    assert mae.rows[0][2].text == "0.50"
 
 
 def test_errors_are_tabled_over_frames_that_all_methods_know_and_count_for_targets_on_the_others_too() -> None:
@@ -175,25 +156,3 @@ def test_occluders_cameras_calibration_and_sequence_have_tables_over_common_fram
         "95.0 ± 0.0",
     ]
     assert not any(table(Measurements(_measurements())) for table in (occlusion_table, camera_table, sequence_table))
-
-
-def test_the_pair_table_says_how_much_faster_the_same_dice_is_reached() -> None:
-    pairs = [
-        make_measurement((0.5, 0.6, 0.7, 0.8), method="paper", seconds=10.0),
-        make_measurement((0.5, 0.9), seconds=2.0),
-    ]
-    table = pair_table(Measurements(pairs))
-    assert table is not None
-    assert [cell.text for cell in table.rows[0]] == ["synthetic", "as measured", "1", "40.00", "4.00", "10.0", "0", "1"]
-
-
-def test_every_frame_made_worse_is_listed_with_the_mode_in_which_it_was() -> None:
-    runs = [make_measurement((0.9, 0.8), method=method) for method in ("ours", "sequence", "paper")]
-    table = worse_table(Measurements([*runs, make_measurement((0.9, 0.8), domain="occlusion", frame=3)]))
-    assert table is not None
-    listed = [(row[1].text, row[2].text, row[3].text) for row in table.rows]
-    assert listed == [
-        ("regular", "0", "CaRTS, ours"),
-        ("occlusion", "3", "CaRTS, ours"),
-        ("regular", "0", "ours, sequence mode"),
-    ]

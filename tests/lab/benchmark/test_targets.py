@@ -29,11 +29,6 @@ def test_the_speedup_compares_the_times_to_the_papers_dice() -> None:
     assert _target("times faster", paper, never).reached == "0.0"
 
 
-def test_pairs_in_which_the_paper_gains_nothing_do_not_count_as_speedup() -> None:
-    paper = make_measurement((0.9, 0.905), method="paper", seconds=10.0)
-    assert _target("times faster", paper, make_measurement((0.9, 0.95))).met is None
-
-
 def test_the_worst_domain_decides_on_dice() -> None:
     good = [make_measurement((0.6, 0.99), domain=domain, error_deg=2.0) for domain in DOMAINS[1:]]
     fine = make_measurement((0.6, 0.981), domain="regular", error_deg=2.0)
@@ -45,34 +40,6 @@ def test_the_worst_domain_decides_on_dice() -> None:
     assert missed.met is False
     missed = _target("synthetic, 2° off, each frame alone: mean Dice", bad, *good)
     assert missed.met is False and missed.reached == "0.970" and "regular" in missed.basis
-
-
-def test_a_target_missed_by_less_than_is_written_says_so() -> None:
-    barely = make_measurement((0.6, 0.9798), error_deg=2.0)
-    target = _target("synthetic, 2° off, each frame alone: mean Dice", barely)
-    assert target.met is False and target.reached == "just below 0.980"
-
-
-def test_sequence_mode_has_verdicts_of_its_own() -> None:
-    good = [make_measurement((0.6, 0.99), domain=domain, error_deg=2.0, method="sequence") for domain in DOMAINS]
-    assert _target("synthetic, 2° off, in sequence mode: mean Dice", *good).met is True
-    assert _target("synthetic, 2° off, each frame alone: mean Dice", *good).met is None
-    worse = make_measurement((0.6, 0.5), error_deg=2.0, method="sequence")
-    assert _target("frames made worse", worse).reached == "100.0 %"
-    assert _target("sequence mode, seconds", *good).reached == "not measured", "times are those as measured"
-
-
-def test_iterations_count_until_near_the_final_dice() -> None:
-    run = make_measurement((0.6, 0.8, 0.954, 0.957, 0.958), error_deg=2.0)
-    assert _target("iterations to within", run).reached == "2"
-
-
-def test_recovery_and_made_worse_are_shares_of_runs() -> None:
-    runs = [make_measurement((0.5, dice), frame=i, error_deg=5.0) for i, dice in enumerate((0.96, 0.97, 0.4, 0.99))]
-    recovered = _target("synthetic, 5° off", *runs)
-    assert recovered.reached == "75 %" and recovered.met is False
-    worse = _target("frames made worse", *runs)
-    assert worse.reached == "25.0 %" and worse.met is False
 
 
 def test_real_frames_are_compared_with_their_clean_form() -> None:
@@ -92,11 +59,6 @@ def test_real_frames_are_compared_with_their_clean_form() -> None:
     assert lost.met is False and lost.reached == "0.065" and "bleeding" in lost.basis
 
 
-def test_visible_joints_have_no_verdict_as_long_as_nobody_says_which_they_are() -> None:
-    target = _target("synthetic, 1° off, each frame alone: joint MAE", make_measurement((0.9, 0.99), error_deg=1.0))
-    assert target.met is None and "all measured joints: 0.50°" in target.basis
-
-
 def test_pictures_with_occluders_count_for_occlusion_and_for_frames_made_worse_and_nowhere_else() -> None:
     covered = make_measurement((0.7, 0.6), domain="occlusion", error_deg=2.0)
     assert _target("synthetic, 2° off, each frame alone: mean Dice", covered).met is None
@@ -108,16 +70,6 @@ def test_pictures_with_occluders_count_for_occlusion_and_for_frames_made_worse_a
     assert reached.reached == "0.960" and reached.met is True and "occluder given 0.990" in reached.basis
     real = make_measurement((0.9, 0.94), domain="occlusion", source="real")
     assert _target("30 % of the visible instrument", *plain, real).met is False
-
-
-def test_stereo_and_calibration_have_their_own_lines_on_real_frames() -> None:
-    runs = [
-        make_measurement((0.87, dice), source="real", method=method)
-        for method, dice in (("stereo_posed", 0.97), ("calibrated", 0.93))
-    ]
-    assert _target("real frames, both cameras", *runs).met is True
-    assert _target("real frames, one calibration", *runs).met is False
-    assert _target("real frames, each alone", *runs).met is None
 
 
 def test_sequence_mode_counts_warm_frames_on_cpu_and_gpu_apart() -> None:

@@ -16,12 +16,11 @@ from carts_core.lab.randomization import (
     TrainingPair,
     arms,
 )
-from carts_core.lab.randomization.arms import RobotGeometry, perturbed, random_intrinsics, random_placement
+from carts_core.lab.randomization.arms import RobotGeometry, random_placement
 from carts_core.lab.randomization.backgrounds import MAKERS, Photographs, random_background
-from carts_core.lab.randomization.clutter import add_things, contact_shadow, occlude, random_thing
-from carts_core.lab.randomization.shading import render_gbuffer, shade, tone
+from carts_core.lab.randomization.clutter import occlude
+from carts_core.lab.randomization.shading import render_gbuffer
 from carts_core.model.robot import Robot
-from carts_core.settings import DARKEST_BRIGHTNESS
 
 SIZE = (192, 160)
 
@@ -47,24 +46,6 @@ def test_the_same_seed_makes_the_same_pairs_and_another_seed_others(shipped_psm:
     assert not np.array_equal(first.observed, other.observed)
 
 
-def test_images_show_instruments_of_many_sizes_at_every_border(pairs: list[TrainingPair]):
-    shares = [float((pair.observed_classes > 0).mean()) for pair in pairs]
-    assert min(shares) < 0.08
-    assert max(shares) > 0.15
-    masks = np.stack([pair.observed_classes > 0 for pair in pairs])
-    for border in (masks[:, 0], masks[:, -1], masks[:, :, 0], masks[:, :, -1]):
-        assert border.any(axis=1).sum() >= 2
-
-
-def test_about_half_of_the_hybrids_show_the_observed_kinematics(pairs: list[TrainingPair]):
-    overlaps = []
-    for pair in pairs:
-        a, b = pair.observed_classes > 0, pair.hybrid_classes > 0
-        overlaps.append(2 * (a & b).sum() / max(a.sum() + b.sum(), 1))
-    same = np.array(overlaps) > 0.97
-    assert 5 <= same.sum() <= len(pairs) - 5
-
-
 def test_with_a_perfect_model_the_hybrid_shows_what_is_observed(shipped_psm: Robot, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(arms, "PERFECT_MODEL", 1.0)
     settings = ImageSettings(same_kinematics=1.0, same_background=1.0, two_arms=0.0)
@@ -86,13 +67,6 @@ def test_low_light_cannot_be_asked_for():
         AppearanceRanges(brightness=(0.3, 1.0))
 
 
-def test_the_camera_never_darkens_below_the_floor():
-    ranges = AppearanceRanges(gamma=(1, 1), contrast=(1, 1))
-    rng = np.random.default_rng(0)
-    grey = np.full((8, 8, 3), 0.5, np.float32)
-    assert min(float(tone(rng, grey, ranges).mean()) for _ in range(300)) >= 0.5 * DARKEST_BRIGHTNESS - 1e-3
-
-
 @pytest.mark.parametrize("arguments", [{"noise": (0.1, 0.0)}, {"blur": (-1, 1)}, {"jpeg_quality": (50, 120)}])
 def test_a_range_that_makes_no_sense_is_refused(arguments: dict):
     with pytest.raises(SettingsError):
@@ -101,14 +75,7 @@ def test_a_range_that_makes_no_sense_is_refused(arguments: dict):
 
 @pytest.mark.parametrize(
     "arguments",
-    [
-        {"width": 100},
-        {"two_arms": 1.5},
-        {"things": -0.1},
-        {"absent": 2},
-        {"coverage": (0.5, 0.1)},
-        {"field_width": 64},
-    ],
+    [{"width": 100}, {"two_arms": 1.5}, {"things": -0.1}, {"absent": 2}, {"coverage": (0.5, 0.1)}, {"field_width": 64}],
 )
 def test_pair_settings_out_of_range_are_refused(arguments: dict):
     with pytest.raises(SettingsError, match="give"):
@@ -127,12 +94,6 @@ def test_every_kind_of_background_is_an_image_that_differs_from_seed_to_seed(kin
     images = [MAKERS[kind](np.random.default_rng(seed), *SIZE) for seed in range(12)]
     assert all(image.shape == (160, 192, 3) and np.isfinite(image).all() for image in images)
     assert np.std([image.mean((0, 1)) for image in images], axis=0).max() > 0.03
-
-
-def test_rooms_have_straight_dark_and_bright_bars():
-    images = [MAKERS["room"](np.random.default_rng(seed), *SIZE).clip(0, 1) for seed in range(30)]
-    spreads = [float(np.percentile(image.mean(2), 99) - np.percentile(image.mean(2), 1)) for image in images]
-    assert np.median(spreads) > 0.4
 
 
 @pytest.fixture
@@ -170,30 +131,6 @@ def test_a_folder_without_readable_photographs_is_refused(tmp_path: Path, conten
         Photographs(tmp_path)
 
 
-def test_things_are_of_centimetres_and_their_triangles_are_whole():
-    rng, longest = np.random.default_rng(1), []
-    for _ in range(60):
-        thing = random_thing(rng)
-        assert thing.faces.min() == 0 and thing.faces.max() == len(thing.vertices) - 1
-        assert len(thing.face_part) == len(thing.faces)
-        assert np.isfinite(thing.vertices).all()
-        lengths = np.linalg.norm(thing.normals[np.unique(thing.faces)], axis=1)
-        assert (np.abs(lengths - 1) < 1e-3).mean() > 0.9
-        longest.append(float(np.ptp(thing.vertices, axis=0).max()))
-    assert 0.003 < min(longest) and max(longest) < 0.7
-    assert np.ptp(np.log(longest)) > 1
-
-
-def test_things_lie_on_the_background_and_leave_most_of_it():
-    rng = np.random.default_rng(2)
-    image = np.full((160, 192, 3), 0.5, np.float32)
-    changed = [
-        float((np.abs(add_things(rng, image, (200.0, 200.0, 96.0, 80.0)) - image).max(2) > 0.1).mean())
-        for _ in range(40)
-    ]
-    assert 0.05 < np.median(changed) < 0.8
-
-
 def test_things_are_no_part_of_what_is_to_be_learnt(shipped_psm: Robot):
     bare, full = (SurfaceGenerator([shipped_psm], ImageSettings(things=share), 5)() for share in (0.0, 1.0))
     assert (bare.observed != full.observed).any()
@@ -209,12 +146,6 @@ def test_arms_may_be_claimed_that_are_not_there(shipped_psm: Robot):
     assert 0.7 < np.mean(claimed) < 1
 
 
-def test_one_arm_of_two_may_be_missing(shipped_psm: Robot):
-    generator = SurfaceGenerator([shipped_psm], ImageSettings(absent=1.0, two_arms=1.0), 5)
-    present = [bool((generator().surface > 0).any()) for _ in range(30)]
-    assert 0.3 < np.mean(present) < 1
-
-
 def test_the_shaft_is_found_and_points_away_from_the_jaws(geometry: RobotGeometry, shipped_psm: Robot):
     shaft = shipped_psm.meshes[geometry.shaft]
     assert np.ptp(shaft.vertices, axis=0).max() > 0.1
@@ -225,39 +156,6 @@ def test_the_shaft_is_found_and_points_away_from_the_jaws(geometry: RobotGeometr
     T_shaft_jaw = np.linalg.inv(Ts[shaft.link]) @ Ts[jaw.link]
     tip = T_shaft_jaw[:3, :3] @ jaw.vertices.mean(0) + T_shaft_jaw[:3, 3]
     assert (tip - geometry.shaft_end) @ geometry.shaft_axis < 0
-
-
-def test_placements_put_the_wrist_in_front_of_the_camera_near_the_image(geometry: RobotGeometry):
-    rng = np.random.default_rng(2)
-    for _ in range(20):
-        intrinsics = random_intrinsics(rng, *SIZE, 320)
-        placement = random_placement(rng, geometry, intrinsics, *SIZE)
-        T = placement.T_camera_base
-        np.testing.assert_allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-9)
-        assert np.linalg.det(T[:3, :3]) == pytest.approx(1)
-        x, y, z = _wrist(geometry, placement)
-        assert 0.05 <= z <= 0.25
-        fx, fy, cx, cy = intrinsics
-        assert -0.13 * SIZE[0] <= fx * x / z + cx <= 1.13 * SIZE[0]
-        assert -0.13 * SIZE[1] <= fy * y / z + cy <= 1.13 * SIZE[1]
-
-
-def _wrist(geometry: RobotGeometry, placement) -> np.ndarray:
-    shaft_link = geometry.part_link[geometry.shaft]
-    T = placement.T_camera_base @ geometry.link_transforms(placement.joint_positions)[shaft_link]
-    return T[:3, :3] @ geometry.shaft_end + T[:3, 3]
-
-
-def test_wrong_kinematics_move_the_wrist_by_millimetres(geometry: RobotGeometry):
-    rng = np.random.default_rng(4)
-    placement = random_placement(rng, geometry, random_intrinsics(rng, *SIZE, 320), *SIZE)
-    distances = [
-        np.linalg.norm(_wrist(geometry, perturbed(rng, geometry, placement, 1.0)) - _wrist(geometry, placement))
-        for _ in range(50)
-    ]
-    assert 0.002 < np.median(distances) < 0.01
-    unmoved = perturbed(rng, geometry, placement, 0.0)
-    np.testing.assert_allclose(unmoved.T_camera_base, placement.T_camera_base, atol=1e-9)
 
 
 def test_the_gbuffer_holds_points_on_the_ray_and_normals_towards_the_camera(geometry: RobotGeometry):
@@ -277,41 +175,6 @@ def test_the_gbuffer_holds_points_on_the_ray_and_normals_towards_the_camera(geom
     T = Ts[geometry.part_link[view.part]]
     moved = np.einsum("nij,nj->ni", T[:, :3, :3], view.points_link) + T[:, :3, 3]
     assert np.percentile(np.linalg.norm(moved - view.points, axis=1), 99) < 2e-4
-
-
-def test_shading_differs_from_draw_to_draw_and_stays_in_range(geometry: RobotGeometry):
-    rng = np.random.default_rng(7)
-    intrinsics = (200.0, 200.0, 96.0, 80.0)
-    placement = random_placement(rng, geometry, intrinsics, *SIZE)
-    Ts = placement.T_camera_base @ geometry.link_transforms(placement.joint_positions)
-    view = render_gbuffer([geometry], [geometry.posed(Ts)], intrinsics, *SIZE)
-    colors = [shade(rng, view, [geometry], np.array([0.6, 0.4, 0.4])) for _ in range(12)]
-    assert all(np.isfinite(color).all() and color.min() >= 0 and color.max() <= 1 for color in colors)
-    assert np.std([color.mean() for color in colors]) > 0.02
-
-
-def test_occluders_hide_some_of_the_arms_and_only_what_is_near_them():
-    rng = np.random.default_rng(3)
-    image, coverage = np.zeros((160, 192, 3), np.float32), np.zeros((160, 192), np.float32)
-    assert np.array_equal(occlude(rng, image, coverage), image)
-    coverage[60:90, :100] = 1
-    hidden = [(occlude(rng, image, coverage).max(2) > 0.02)[coverage > 0].mean() for _ in range(40)]
-    assert 0.02 < np.mean(hidden) < 0.4
-    assert np.min(hidden) > 0
-
-
-def test_a_contact_shadow_darkens_what_is_beside_the_arms_and_nothing_else():
-    rng, coverage = np.random.default_rng(4), np.zeros((120, 160), np.float32)
-    coverage[50:70, :90] = 1
-    image = rng.uniform(0.3, 0.9, (120, 160, 3)).astype(np.float32)
-    beside = 0
-    for _ in range(40):
-        shaded = contact_shadow(rng, image, coverage, 0.1)
-        assert shaded.dtype == np.float32 and (shaded <= image + 1e-6).all() and shaded.min() >= 0
-        darker = np.all(shaded < 0.8 * image, axis=2)
-        assert not darker[:20].any() and not darker[100:].any()
-        beside += int(darker[coverage == 0].sum() > 50)
-    assert beside > 30
 
 
 def test_no_occluder_is_red_as_blood_is():

@@ -10,8 +10,7 @@ from carts_core.errors import RobotError, SettingsError
 from carts_core.evaluation import dice
 from carts_core.lab.benchmark.hand_eye import write_arm
 from carts_core.lab.synthesis import EndoscopeConfig, MotionConfig, RenderConfig, SynthesisConfig, synthesize
-from carts_core.lab.synthesis.motion import enlarged, enlargement, measurement_error
-from carts_core.lab.synthesis.scene import place_cameras
+from carts_core.lab.synthesis.motion import measurement_error
 from carts_core.model.robot import Robot
 from carts_core.recording import Sequence
 from carts_core.rendering import Renderer
@@ -56,23 +55,6 @@ def test_one_arm_is_seen_from_so_far_and_its_masks_are_those_of_the_true_joints(
         T_camera_base = sequence.scene.cameras[0].T_camera_world @ arm.T_world_base
         tip = arm.robot.forward_kinematics(torch.from_numpy(frame.truth["arm"]))[-1].numpy()
         assert 0.5 * DISTANCE < (T_camera_base @ tip)[2, 3] < 1.4 * DISTANCE, "in metres, and not in the small world's"
-
-
-def test_all_domains_show_the_same_arm(sequence: Sequence) -> None:
-    clear, smoke = (sequence.frame(0, domain) for domain in ("regular", "smoke"))
-    assert clear.masks is not None
-    inside = clear.masks["left"]
-    assert clear.images["left"][inside].std() > 5
-    assert not np.array_equal(clear.images["left"], smoke.images["left"])
-
-
-def test_a_camera_of_a_large_world_has_its_distance_and_sees_the_same_picture() -> None:
-    (near,) = place_cameras(EndoscopeConfig(distance=0.1))
-    far = enlarged(near, 16.0)
-    point = np.array([0.01, 0.02, 0.0, 1.0])
-    small, large = near.T_camera_world @ point, far.T_camera_world @ (point * (16, 16, 16, 1))
-    np.testing.assert_allclose(large[:3], 16.0 * small[:3])
-    assert [enlargement(EndoscopeConfig(distance=d)) for d in (0.1, 0.3, 1.6)] == [1.0, 1.0, 16.0]
 
 
 def test_joints_of_each_kind_have_errors_of_their_own(tmp_path: Path) -> None:

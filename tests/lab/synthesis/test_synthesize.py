@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from carts_core.errors import SettingsError
-from carts_core.lab.synthesis import DOMAINS, SynthesisConfig, progress_bar, synthesize
+from carts_core.lab.synthesis import DOMAINS, SynthesisConfig, synthesize
 from carts_core.recording.sequence import Sequence
 from carts_core.rendering import Renderer
 
@@ -107,12 +107,6 @@ def test_one_domain_alone_is_rendered_with_the_same_pictures(
     assert [path.name for path in (output / "images").iterdir()] == ["smoke"]
     picture = Path("images", "smoke", "left", "001.jpg")
     assert (output / picture).read_bytes() == (small_sequence.parent / picture).read_bytes()
-
-
-def test_the_progress_bar_reaches_its_end(capsys: pytest.CaptureFixture[str]) -> None:
-    with progress_bar() as progress:
-        progress("frames", 3, 3)
-    assert "3/3" in capsys.readouterr().err
 
 
 def test_the_shipped_sequence_is_complete_and_small_enough(sample_sequence_path: Path) -> None:

@@ -18,7 +18,6 @@ from carts_core.lab.training.adaptation import (
     MadeFits,
     OwnFits,
     adapted_to,
-    edge_support,
     gain,
     made_images,
 )
@@ -239,14 +238,6 @@ def test_made_images_to_judge_by_are_whole_and_always_the_same(tmp_path: Path):
         assert first.frame.truth is not None
         off = np.abs(first.frame.measured[arm.name] - first.frame.truth[arm.name])
         assert off[0] == pytest.approx(np.deg2rad(2.0), abs=1e-3)
-
-
-def test_edges_are_stronger_where_the_outline_lies_on_them():
-    image = np.zeros((40, 60, 3), np.uint8)
-    image[10:30, 20:40] = 200
-    parts = np.full((40, 60), -1)
-    parts[10:30, 20:40] = 0
-    assert edge_support(image, parts) > 2 * edge_support(image, np.roll(parts, 8, axis=1))
 
 
 def test_one_wrong_pixel_where_no_arm_is_hardly_changes_the_score():

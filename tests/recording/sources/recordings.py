@@ -1,7 +1,11 @@
 """Recordings of the shipped robot in foreign formats, each written by its owners' own writer where there is one."""
 
+import atexit
+import shutil
+import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -245,3 +249,38 @@ def assert_refused(path: Path, message: str) -> None:
     with pytest.raises(CartsError, match=message):
         import_recording(path, path.parent / "out")
     assert list(path.parent.iterdir()) == [path]
+
+
+def write(name: str, content: str | bytes) -> Callable[[Path], object]:
+    """Replaces a file of a recording."""
+    data = content if isinstance(content, bytes) else content.encode()
+    return lambda folder: (folder / name).write_bytes(data)
+
+
+def cut(name: str, length: int) -> Callable[[Path], object]:
+    """Cuts a file of a recording off."""
+    return lambda folder: (folder / name).write_bytes((folder / name).read_bytes()[:length])
+
+
+def remove(name: str) -> Callable[[Path], object]:
+    """Removes a file of a recording."""
+    return lambda folder: (folder / name).unlink()
+
+
+def save(name: str, values: np.ndarray) -> Callable[[Path], object]:
+    """Replaces an array of a recording."""
+    return lambda folder: np.save(folder / name, values)
+
+
+@cache
+def _made(make: Callable[[Path], Path]) -> tuple[Path, Path]:
+    folder = Path(tempfile.mkdtemp(prefix="carts-made-"))
+    atexit.register(shutil.rmtree, folder)
+    return folder / "source", make(folder / "source")
+
+
+def copied(make: Callable[[Path], Path], folder: Path) -> Path:
+    """A copy of a recording that is made once; gives what `make` gives."""
+    source, path = _made(make)
+    shutil.copytree(source, folder)
+    return folder / path.relative_to(source)

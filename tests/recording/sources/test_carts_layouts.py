@@ -5,7 +5,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from recordings import SIZE, assert_refused, image, joints_at, write_images
+from recordings import SIZE, assert_refused, copied, image, joints_at, save, write, write_images
 
 from carts_core.errors import CartsError
 from carts_core.recording import Sequence
@@ -109,19 +109,11 @@ def test_missing_images_of_one_domain_are_left_out_in_all(tmp_path):
 
 
 MUTATIONS = {
-    "too few rows": (
-        cts,
-        lambda p: np.save(p / "green_screen/psm1_js.npy", np.zeros((2, 3, 6))),
-        "2 rows for 4 images",
-    ),
-    "not finite": (cts, lambda p: np.save(p / "green_screen/psm1_js.npy", np.full((4, 3, 6), np.nan)), "six finite"),
-    "five joints": (cts, lambda p: np.save(p / "green_screen/psm1_js.npy", np.zeros((4, 3, 5))), "six finite"),
-    "cut table": (cts, lambda p: (p / "green_screen/psm1_js.npy").write_bytes(b"\x93NUMPY"), "cannot be read"),
-    "pickled table": (
-        cts,
-        lambda p: np.save(p / "green_screen/psm1_js.npy", np.array([{}], object), allow_pickle=bool(1)),
-        "cannot be read",
-    ),
+    "too few rows": (cts, save("green_screen/psm1_js.npy", np.zeros((2, 3, 6))), "2 rows for 4 images"),
+    "not finite": (cts, save("green_screen/psm1_js.npy", np.full((4, 3, 6), np.nan)), "six finite"),
+    "five joints": (cts, save("green_screen/psm1_js.npy", np.zeros((4, 3, 5))), "six finite"),
+    "cut table": (cts, write("green_screen/psm1_js.npy", b"\x93NUMPY"), "cannot be read"),
+    "pickled table": (cts, save("green_screen/psm1_js.npy", np.array([{}], object)), "cannot be read"),
     "no kinematics": (
         cts,
         lambda p: [(p / f"green_screen/psm{arm}_js.npy").unlink() for arm in (1, 2)],
@@ -137,17 +129,17 @@ MUTATIONS = {
         lambda p: [f.rename(f.with_name(f"a{f.name}")) for f in (p / "smoke/images_l").iterdir()],
         "alike",
     ),
-    "seven columns": (ambf, lambda p: np.save(p / "kinematics.npy", np.zeros((4, 7))), "eight columns"),
-    "a cube": (ambf, lambda p: np.save(p / "kinematics.npy", np.zeros((4, 8, 2))), "eight columns"),
-    "texts": (ambf, lambda p: np.save(p / "kinematics.npy", np.full((4, 8), "a")), "eight columns"),
-    "cut image": (ambf, lambda p: (p / "images/0.png").write_bytes(b""), "damaged"),
-    "cut kinematics": (ambf, lambda p: (p / "kinematics.npy").write_bytes(b"12"), "kinematics.npy"),
+    "seven columns": (ambf, save("kinematics.npy", np.zeros((4, 7))), "eight columns"),
+    "a cube": (ambf, save("kinematics.npy", np.zeros((4, 8, 2))), "eight columns"),
+    "texts": (ambf, save("kinematics.npy", np.full((4, 8), "a")), "eight columns"),
+    "cut image": (ambf, write("images/0.png", b""), "damaged"),
+    "cut kinematics": (ambf, write("kinematics.npy", b"12"), "kinematics.npy"),
 }
 
 
 @pytest.mark.parametrize("name", MUTATIONS)
 def test_a_broken_set_is_an_error_in_words_and_leaves_nothing(tmp_path, name):
     make, mutate, message = MUTATIONS[name]
-    path = make(tmp_path / "set-1")
+    path = copied(make, tmp_path / "set-1")
     mutate(path)
     assert_refused(path, message)

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 import yaml
-from recordings import SIZE, K, assert_refused, image, joints_at, write_images, write_video
+from recordings import SIZE, K, assert_refused, copied, image, joints_at, remove, write, write_images, write_video
 
 from carts_core.errors import SequenceError
 from carts_core.model.psm_kinematics import forward
@@ -126,21 +126,17 @@ def rewritten(name: str, old: str, new: str) -> Callable[[Path], object]:
 
 
 MUTATIONS: dict[str, tuple[Callable[[Path], Path], Callable[[Path], object], str]] = {
-    "SurgPose, cut YAML": (surgpose, lambda p: (p / "api_jp_data.yaml").write_text("'0': {"), "is no YAML file"),
-    "SurgPose, a list": (surgpose, lambda p: (p / "api_jp_data.yaml").write_text("[1]"), "is no YAML file"),
-    "SurgPose, no arms": (surgpose, lambda p: (p / "api_jp_data.yaml").write_text("'0': {}"), "no joint positions of"),
-    "SurgPose, texts": (
-        surgpose,
-        lambda p: (p / "api_jp_data.yaml").write_text("'0': {PSM1: [a, b, c, d, e, f]}"),
-        "are no numbers",
-    ),
+    "SurgPose, cut YAML": (surgpose, write("api_jp_data.yaml", "'0': {"), "is no YAML file"),
+    "SurgPose, a list": (surgpose, write("api_jp_data.yaml", "[1]"), "is no YAML file"),
+    "SurgPose, no arms": (surgpose, write("api_jp_data.yaml", "'0': {}"), "no joint positions of"),
+    "SurgPose, texts": (surgpose, write("api_jp_data.yaml", "'0': {PSM1: [a, b, c, d, e, f]}"), "are no numbers"),
     "SurgPose, five joints": (
         surgpose,
-        lambda p: (p / "api_jp_data.yaml").write_text("'0': {PSM1: [0, 0, 0, 0, 0]}"),
+        write("api_jp_data.yaml", "'0': {PSM1: [0, 0, 0, 0, 0]}"),
         "needs six joint positions",
     ),
     "SurgPose, other frames": (surgpose, rewritten("api_jp_data.yaml", "':", "9':"), "no frame has joint positions"),
-    "SurgPose, no right video": (surgpose, lambda p: (p / "regular/right_video.mp4").unlink(), "right_video.mp4"),
+    "SurgPose, no right video": (surgpose, remove("regular/right_video.mp4"), "right_video.mp4"),
     "SurgPose, calibration": (surgpose, rewritten("StereoCalibrationDVRK.ini", "fc_x", "f"), "cannot be used"),
     "SurgPose, sections": (surgpose, rewritten("StereoCalibrationDVRK.ini", "Stereo", "S"), "cannot be used"),
     "EndoVis, calibration": (endovis, rewritten("camera_calibration.txt", "Camera-1-F", "F"), "lacks a readable"),
@@ -149,7 +145,7 @@ MUTATIONS: dict[str, tuple[Callable[[Path], Path], Callable[[Path], object], str
         lambda p: [f.rename(f.with_name(f"frame9{f.name[5:]}")) for f in (p / "right_frames").iterdir()],
         "no frame has an image of every camera",
     ),
-    "EndoVis, cut image": (endovis, lambda p: (p / "left_frames/frame000.png").write_bytes(b""), "damaged"),
+    "EndoVis, cut image": (endovis, write("left_frames/frame000.png", b""), "damaged"),
     "JIGSAWS, other columns": (jigsaws, lambda p: p.write_text("1 2 3\n"), "has 76 columns"),
     "JIGSAWS, ragged": (jigsaws, lambda p: p.write_text("1 2 3\n1 2\n"), "is no table of numbers"),
     "JIGSAWS, empty": (jigsaws, lambda p: p.write_text(""), "76 columns"),
@@ -170,7 +166,7 @@ MUTATIONS: dict[str, tuple[Callable[[Path], Path], Callable[[Path], object], str
 @pytest.mark.parametrize("name", MUTATIONS)
 def test_a_broken_recording_is_an_error_in_words(tmp_path, name):
     make, mutate, message = MUTATIONS[name]
-    path = make(tmp_path / "source")
+    path = copied(make, tmp_path / "source")
     mutate(path)
     assert_refused(path, message)
 

@@ -8,7 +8,21 @@ from typing import Any
 
 import numpy as np
 import pytest
-from recordings import SIZE, START, BagKind, assert_refused, image, joints_at, pose_of, write_bag, write_video
+from recordings import (
+    SIZE,
+    START,
+    BagKind,
+    assert_refused,
+    copied,
+    cut,
+    image,
+    joints_at,
+    pose_of,
+    remove,
+    write,
+    write_bag,
+    write_video,
+)
 
 from carts_core.cli import main
 from carts_core.model.psm_kinematics import forward
@@ -146,15 +160,15 @@ def changed(change: Callable[[dict[str, Any]], object], name: str = "stereo.json
 
 
 MUTATIONS: dict[str, tuple[Callable[[Path], object], str]] = {
-    "index is cut": (lambda p: (p / "index.json").write_text('{"videos": ['), "index.json is not readable JSON"),
-    "index lists nothing": (lambda p: (p / "index.json").write_text('{"videos": 3}'), 'no list "videos"'),
-    "index is a list": (lambda p: (p / "index.json").write_text("[]"), 'no list "videos"'),
+    "index is cut": (write("index.json", '{"videos": ['), "index.json is not readable JSON"),
+    "index lists nothing": (write("index.json", '{"videos": 3}'), 'no list "videos"'),
+    "index is a list": (write("index.json", "[]"), 'no list "videos"'),
     "no videos": (changed(lambda c: c.update(videos=[]), "index.json"), "no videos with sidecars"),
-    "video is missing": (lambda p: (p / "stereo.mp4").unlink(), r"stereo\.mp4 is missing"),
-    "video is cut": (lambda p: (p / "stereo.mp4").write_bytes((p / "stereo.mp4").read_bytes()[:200]), r"stereo\.mp4"),
-    "sidecar is missing": (lambda p: (p / "stereo.json").unlink(), "has no stereo.json"),
-    "sidecar is cut": (lambda p: (p / "stereo.json").write_text('{"frames": [{'), "stereo.json is not readable"),
-    "sidecar is a list": (lambda p: (p / "stereo.json").write_text("[1]"), "no named values"),
+    "video is missing": (remove("stereo.mp4"), r"stereo\.mp4 is missing"),
+    "video is cut": (cut("stereo.mp4", 200), r"stereo\.mp4"),
+    "sidecar is missing": (remove("stereo.json"), "has no stereo.json"),
+    "sidecar is cut": (write("stereo.json", '{"frames": [{'), "stereo.json is not readable"),
+    "sidecar is a list": (write("stereo.json", "[1]"), "no named values"),
     "no frames": (changed(lambda c: c.update(frames=[])), 'neither "frames" nor'),
     "frames without numbers": (changed(lambda c: c["frames"][1].pop("frame_index")), "lacks 'frame_index'"),
     "frames without times": (changed(lambda c: c["frames"][1].pop("cpu")), "lacks 'cpu'"),
@@ -177,6 +191,6 @@ MUTATIONS: dict[str, tuple[Callable[[Path], object], str]] = {
 @pytest.mark.parametrize("name", MUTATIONS)
 def test_a_broken_session_is_an_error_in_words_and_leaves_nothing(tmp_path, name):
     mutate, message = MUTATIONS[name]
-    path = session(tmp_path / "session")
+    path = copied(session, tmp_path / "session")
     mutate(path)
     assert_refused(path, message)

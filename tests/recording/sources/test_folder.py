@@ -10,7 +10,7 @@ import numpy as np
 import pyarrow
 import pyarrow.parquet
 import pytest
-from recordings import SIZE, START, K, image, joints_at, pose_of, write_images, write_video
+from recordings import SIZE, START, K, copied, image, joints_at, pose_of, write, write_images, write_video
 from scipy.io import savemat
 
 from carts_core.cli import main
@@ -42,7 +42,7 @@ def write_csv(path: Path, header: list[str], rows: np.ndarray, delimiter: str = 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
     """Of `lab`, under an awkward name."""
-    return lab(tmp_path / "Recording {1}")
+    return copied(lab, tmp_path / "Recording {1}")
 
 
 def lab(source: Path) -> Path:
@@ -228,30 +228,22 @@ def shorten(folder: Path) -> None:
 
 MUTATIONS: dict[str, tuple[Callable[[Path], object], dict, str]] = {
     "fewer rows than images": (shorten, {}, "has 5 images and log.csv has 3 rows.*--frame-rate"),
-    "ragged rows": (
-        lambda folder: (folder / "log.csv").write_text("a,b\n1\n"),
-        {"kinematics": Path("log.csv")},
-        "cells",
-    ),
+    "ragged rows": (write("log.csv", "a,b\n1\n"), {"kinematics": Path("log.csv")}, "cells"),
     "no joints": (rewrite("log.csv", "Joint3", "Motor"), {"kinematics": Path("log.csv")}, "not recognized. Name them"),
     "text in a cell": (rewrite("log.csv", "\n1.0,", "\n1.0,x"), {}, "cells that are no numbers"),
-    "empty table": (lambda folder: (folder / "log.csv").write_text(""), {"kinematics": Path("log.csv")}, "has no rows"),
-    "binary table": (
-        lambda f: (f / "log.csv").write_bytes(b"\xff\xfe"),
-        {"kinematics": Path("log.csv")},
-        "cannot be read",
-    ),
+    "empty table": (write("log.csv", ""), {"kinematics": Path("log.csv")}, "has no rows"),
+    "binary table": (write("log.csv", b"\xff\xfe"), {"kinematics": Path("log.csv")}, "cannot be read"),
     "missing table": (lambda folder: None, {"kinematics": Path("none.csv")}, "none.csv is missing"),
     "wrong column": (lambda folder: None, {"columns": {"yaw": "q9"}}, "has no column 'q9'. It has: image"),
     "fisheye": (rewrite("left.yaml", "plumb_bob", "equidistant"), {}, "distortion model 'equidistant'"),
     "broken YAML": (rewrite("left.yaml", "{rows", "{{{{rows"), {}, "cannot be used"),
-    "nested lists": (lambda f: (f / "left.yaml").write_text("camera_matrix: " + "[" * 50_000), {}, "levels deep"),
-    "nested dashes": (lambda f: (f / "left.yaml").write_text("camera_matrix:\n  " + "- " * 50_000), {}, "levels deep"),
+    "nested lists": (write("left.yaml", "camera_matrix: " + "[" * 50_000), {}, "levels deep"),
+    "nested dashes": (write("left.yaml", "camera_matrix:\n  " + "- " * 50_000), {}, "levels deep"),
     "no matrix": (rewrite("left.yaml", "data:", "values:"), {}, "cannot be used"),
     "other size": (rewrite("left.yaml", "image_height: 72", "image_height: 20"), {}, "another shape"),
     "missing folder": (lambda folder: None, {"images": {"left": "nothing"}}, "nothing has no images"),
-    "cut image": (lambda f: (f / "imgs_left/img_0000.png").write_bytes(b"\x89PNG\r\n\x1a\n123"), {}, "damaged"),
-    "names without numbers": (lambda f: (f / "imgs_left/last.png").write_bytes(b""), {}, ""),
+    "cut image": (write("imgs_left/img_0000.png", b"\x89PNG\r\n\x1a\n123"), {}, "damaged"),
+    "names without numbers": (write("imgs_left/last.png", b""), {}, ""),
     "no common frames": (
         lambda f: [p.rename(p.with_name(f"img_9{p.name[4:]}")) for p in (f / "imgs_left").iterdir()],
         {},

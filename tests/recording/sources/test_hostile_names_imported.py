@@ -88,7 +88,7 @@ def as_output(work: Path, name: str) -> list[str]:
 
 
 WAYS: list[Callable[[Path, str], list[str] | None]] = [
-    *(as_folder, as_camera, as_camera_folder, as_column, as_frame, as_arm, as_recorded_file, as_output),
+    *(as_folder, as_camera, as_camera_folder, as_column, as_frame, as_arm, as_recorded_file, as_output)
 ]
 
 

@@ -269,11 +269,7 @@ WRONG: list[tuple[str, Any, str]] = [
     ("mei.yaml", CAMODOCAL.replace("PINHOLE", "MEI"), "camera model 'MEI'"),
     ("opencv_fisheye.yml", opencv_yaml() + "fisheye_model: 1\n", "fisheye"),
     ("lines.yaml", "hello", "it holds no named values"),
-    (
-        "negative.json",
-        json.dumps({**OWN, "K": [[-700, 0, 330], [0, 705, 235], [0, 0, 1]]}),
-        "-700 and 705 px, which",
-    ),
+    ("negative.json", json.dumps({**OWN, "K": [[-700, 0, 330], [0, 705, 235], [0, 0, 1]]}), "-700 and 705 px, which"),
     ("millimetres.json", json.dumps({**OWN, "K": [[4.2, 0, 3.2], [0, 4.2, 2.4], [0, 0, 1]]}), "may be in millimetres"),
     (
         "other.json",

@@ -8,7 +8,7 @@ import numpy as np
 import pyarrow
 import pyarrow.parquet
 import pytest
-from recordings import assert_refused, image, jaw_at, joints_at, pose_of, write_video
+from recordings import assert_refused, copied, cut, image, jaw_at, joints_at, pose_of, remove, write, write_video
 
 from carts_core.cli import main
 from carts_core.errors import CartsError
@@ -124,7 +124,7 @@ def info_changed(change: Callable[[dict], object]) -> Callable[[Path], object]:
 FIRST = "data/chunk-000/episode_000000.parquet"
 VIDEO = "videos/chunk-000/observation.images.endoscope.left/episode_000000.mp4"
 MUTATIONS: dict[str, tuple[Callable[[Path], object], str]] = {
-    "info is cut": (lambda p: (p / "meta/info.json").write_text("{"), "no LeRobot description"),
+    "info is cut": (write("meta/info.json", "{"), "no LeRobot description"),
     "info without rate": (info_changed(lambda c: c.pop("fps")), "no LeRobot description"),
     "info without features": (info_changed(lambda c: c.pop("features")), "no LeRobot description"),
     "no state": (info_changed(lambda c: c["features"].pop("observation.state")), "has no feature observation.state"),
@@ -134,18 +134,18 @@ MUTATIONS: dict[str, tuple[Callable[[Path], object], str]] = {
         info_changed(lambda c: c["features"]["observation.state"].update(names=[f"motor{c}" for c in "abcdefgh"])),
         "not recognized",
     ),
-    "no episode": (lambda p: (p / FIRST).unlink(), "has no episode 0"),
-    "cut table": (lambda p: (p / FIRST).write_bytes((p / FIRST).read_bytes()[:100]), "cannot be read"),
-    "pointer instead of a table": (lambda p: (p / FIRST).write_text("version https://git-lfs"), "Git LFS pointers"),
+    "no episode": (remove(FIRST), "has no episode 0"),
+    "cut table": (cut(FIRST, 100), "cannot be read"),
+    "pointer instead of a table": (write(FIRST, "version https://git-lfs"), "Git LFS pointers"),
     "no rows": (lambda p: write_parquet(p / FIRST, {"observation.state": pyarrow.array([], "float32")}), "no rows"),
     "missing column": (lambda p: write_parquet(p / FIRST, {"state": [1.0]}), "has no feature observation.state"),
     "ragged rows": (lambda p: write_parquet(p / FIRST, {"observation.state": [[1.0], [1.0, 2.0]]}), "differ in length"),
-    "missing video": (lambda p: (p / VIDEO).unlink(), r"episode_000000\.mp4 is missing"),
+    "missing video": (remove(VIDEO), r"episode_000000\.mp4 is missing"),
     "short video": (
         lambda p: write_video(p / VIDEO, [image(0), image(1)], 30),
         "has 2 frames, but episode 0 is frames 0 to 3",
     ),
-    "cut video": (lambda p: (p / VIDEO).write_bytes((p / VIDEO).read_bytes()[:300]), r"episode_000000\.mp4"),
+    "cut video": (cut(VIDEO, 300), r"episode_000000\.mp4"),
     "poses elsewhere": (
         lambda p: write_parquet(p / FIRST, {"observation.state": [[1.0, 2, 3, 0, 0, 0, 1, 0]] * 4}),
         "the unit of the tip.s position is not clear",
@@ -160,7 +160,7 @@ MUTATIONS: dict[str, tuple[Callable[[Path], object], str]] = {
 @pytest.mark.parametrize("name", MUTATIONS)
 def test_a_broken_data_set_is_an_error_in_words_and_leaves_nothing(tmp_path, name):
     mutate, message = MUTATIONS[name]
-    path = dataset(tmp_path / "set")
+    path = copied(dataset, tmp_path / "set")
     mutate(path)
     assert_refused(path, message)
 

@@ -13,10 +13,12 @@ from recordings import (
     T_CAMERA_BASE,
     K,
     assert_refused,
+    copied,
     image,
     jaw_at,
     joints_at,
     pose_of,
+    write,
     write_images,
     write_video,
 )
@@ -112,39 +114,39 @@ def test_frames_without_kinematics_are_left_out(tmp_path):
 
 
 MUTATIONS: dict[str, tuple[Callable[[Path], Path], Callable[[Path], object], str]] = {
-    "cut table": (episode, lambda p: (p / "PSM1.parquet").write_bytes(b"PAR1"), "cannot be read"),
+    "cut table": (episode, write("PSM1.parquet", b"PAR1"), "cannot be read"),
     "no kinematics": (
         episode,
         lambda p: pyarrow.parquet.write_table(pyarrow.table({"frame_index": [0]}), p / "PSM1.parquet"),
         "has no kinematics of PSM1",
     ),
     "no videos": (episode, lambda p: [f.unlink() for f in (p / "video_raw").iterdir()], "has neither video_raw"),
-    "cut video": (episode, lambda p: (p / "video_raw/stereo_left.mkv").write_bytes(b"12"), "stereo_left.mkv"),
+    "cut video": (episode, write("video_raw/stereo_left.mkv", b"12"), "stereo_left.mkv"),
     "broken registration": (
         episode,
-        lambda p: (p / "calibration/hand_eye/PSM1-registration-open-cv.json").write_text("{"),
+        write("calibration/hand_eye/PSM1-registration-open-cv.json", "{"),
         "is not readable JSON",
     ),
-    "broken extrinsics": (episode, lambda p: (p / "calibration/stereo_calib_params.json").write_text("{"), "JSON"),
-    "broken calibration": (episode, lambda p: (p / "calibration/left.yaml").write_text("a: ["), "cannot be used"),
-    "cut JSON": (clip, lambda p: (p / "kinematic/PSM1/2.json").write_text("[{"), "2.json is not readable JSON"),
-    "empty list": (clip, lambda p: (p / "kinematic/PSM1/2.json").write_text("[]"), "no kinematics of one frame"),
-    "other names": (clip, lambda p: (p / "kinematic/PSM1/2.json").write_text('[{"a": 1}]'), "no kinematics of one"),
+    "broken extrinsics": (episode, write("calibration/stereo_calib_params.json", "{"), "JSON"),
+    "broken calibration": (episode, write("calibration/left.yaml", "a: ["), "cannot be used"),
+    "cut JSON": (clip, write("kinematic/PSM1/2.json", "[{"), "2.json is not readable JSON"),
+    "empty list": (clip, write("kinematic/PSM1/2.json", "[]"), "no kinematics of one frame"),
+    "other names": (clip, write("kinematic/PSM1/2.json", '[{"a": 1}]'), "no kinematics of one"),
     "texts": (
         clip,
-        lambda p: (p / "kinematic/PSM1/2.json").write_text(
-            '[{"arm": {"measured_data": {"measured_js": {"position": ["a", 1, 2, 3, 4, 5]}}}}]'
+        write(
+            "kinematic/PSM1/2.json", json.dumps([{"arm": {"measured_data": {"measured_js": {"position": ["a"] * 6}}}}])
         ),
         "no kinematics of one frame",
     ),
     "no files": (clip, lambda p: [f.unlink() for f in (p / "kinematic/PSM1").iterdir()], "has no kinematics of PSM1"),
-    "cut image": (clip, lambda p: (p / "image/left/0.png").write_bytes(b""), "damaged"),
+    "cut image": (clip, write("image/left/0.png", b""), "damaged"),
 }
 
 
 @pytest.mark.parametrize("name", MUTATIONS)
 def test_a_broken_recording_is_an_error_in_words(tmp_path, name):
     make, mutate, message = MUTATIONS[name]
-    path = make(tmp_path / "source")
+    path = copied(make, tmp_path / "source")
     mutate(path)
     assert_refused(path, message)
