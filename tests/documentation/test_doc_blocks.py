@@ -15,7 +15,7 @@ from typing import Any
 
 import pytest
 import tyro
-from doc_blocks import ROOT, Block, all_blocks, blocks
+from doc_blocks import ROOT, all_blocks
 
 from carts_core.cli.command_line import Command
 
@@ -120,24 +120,6 @@ def test_every_block_is_run_marked_or_tested_elsewhere() -> None:
     strange = [block for block in all_blocks() if block.language not in known and not block.language.startswith("{")]
     assert not strange, f"of which language are these? {', '.join(map(str, strange))}"
     assert {"README.md", "docs/tutorial/python.md", "docs/howto/exports.md"} <= set(TO_RUN)
-
-
-def test_a_mark_holds_for_the_next_block_only(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("doc_blocks.ROOT", tmp_path)
-    page = tmp_path / "page.md"
-    page.write_text(
-        "Text\n\n<!-- not run: needs a GPU -->\n    carts view \\\n        there  # a remark\n\n"
-        "Then\n\n    carts render it\n\n```python\nprint(1)\n```\n\n    no program\n\n"
-        "In Python:\n\n    import math\n    print(math.pi)\n"
-    )
-    found = blocks(page)
-    assert found == [
-        Block("page.md", 4, "console", "carts view \\\n    there  # a remark", "needs a GPU"),
-        Block("page.md", 9, "console", "carts render it", None),
-        Block("page.md", 11, "python", "print(1)", None),
-        Block("page.md", 19, "python", "import math\nprint(math.pi)", None),
-    ]
-    assert found[0].commands() == ["carts view      there"]
 
 
 def test_a_block_that_fails_fails_the_test(reader: tuple[Path, dict[str, str]]) -> None:

@@ -11,14 +11,26 @@ from awkward import ARMS, CAMERA, SOURCES, awkward
 from carts_core.export import Dataset, ExportFrame, Monitor, measured_frames
 from carts_core.recording import Sequence
 
-
-@pytest.fixture
-def sequence(tiny_sequence: Callable[..., Path]) -> Sequence:
-    return Sequence.open(tiny_sequence(masks=False, truth=False, width=161, height=127, edit=awkward))
+OPTIONS = {"masks": False, "truth": False, "width": 161, "height": 127, "edit": awkward}
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
+def sequence(shared_sequence: Callable[..., Path]) -> Sequence:
+    return Sequence.open(shared_sequence(**OPTIONS))
+
+
+@pytest.fixture(scope="module")
 def dataset(sequence: Sequence) -> Dataset:
+    return _edited(sequence)
+
+
+@pytest.fixture
+def own_dataset(tiny_sequence: Callable[..., Path]) -> Dataset:
+    """One whose files a test may change."""
+    return _edited(Sequence.open(tiny_sequence(**OPTIONS)))
+
+
+def _edited(sequence: Sequence) -> Dataset:
     """Frame 0 as rendered, frame 1 with an empty mask, frame 2 with a hole, a stroke and a single pixel."""
     frames = measured_frames(sequence, range(3))
     plain = Dataset(sequence, tuple(frames), sequence.scene, "regular")

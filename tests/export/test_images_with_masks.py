@@ -65,8 +65,8 @@ def _jpeg(dataset: Dataset) -> Dataset:
     return replace(dataset, sequence=Sequence.open(path))
 
 
-def test_labels_name_the_images_of_the_recording(dataset: Dataset, tmp_path: Path) -> None:
-    dataset = _jpeg(dataset)
+def test_labels_name_the_images_of_the_recording(own_dataset: Dataset, tmp_path: Path) -> None:
+    dataset = _jpeg(own_dataset)
     names = [name.replace(".png", ".jpg") for name in NAMES]
     coco, _ = _read_coco(export(dataset, "coco", tmp_path / "coco"))
     assert [image["file_name"] for image in coco.imgs.values()] == names
@@ -91,9 +91,9 @@ def test_labels_name_the_images_of_the_recording(dataset: Dataset, tmp_path: Pat
     ],
 )
 def test_copies_have_the_bytes_of_the_recording(
-    dataset: Dataset, tmp_path: Path, name: FormatName, images: Images, folder: str
+    own_dataset: Dataset, tmp_path: Path, name: FormatName, images: Images, folder: str
 ) -> None:
-    dataset = replace(_jpeg(dataset), images=images)
+    dataset = replace(_jpeg(own_dataset), images=images)
     copies = sorted((export(dataset, name, tmp_path / "out") / folder).iterdir())
     recorded = [dataset.sequence.path.parent / name.replace(".png", ".jpg") for name in NAMES]
     assert {copy.suffix for copy in copies} == {".jpg"}
@@ -103,13 +103,13 @@ def test_copies_have_the_bytes_of_the_recording(
 
 
 def test_images_that_are_no_files_of_the_recording_are_written_as_the_labels_see_them(
-    dataset: Dataset, tmp_path: Path
+    own_dataset: Dataset, tmp_path: Path
 ) -> None:
-    path = dataset.sequence.path
+    path = own_dataset.sequence.path
     path.write_text(
         path.read_text().replace('"regular/left/*.png"', '"regular/left/*.png"\ndistortion = [0.1, 0, 0, 0]')
     )
-    dataset = replace(dataset, sequence=Sequence.open(path))
+    dataset = replace(own_dataset, sequence=Sequence.open(path))
     folder = export(dataset, "coco", tmp_path / "out")
     assert dataset.remade_cameras == (CAMERA,)
     coco, _ = _read_coco(folder)
@@ -119,14 +119,14 @@ def test_images_that_are_no_files_of_the_recording_are_written_as_the_labels_see
 
 
 def test_images_outside_the_folder_of_the_sequence_are_named_from_the_folder_that_holds_all_of_them(
-    dataset: Dataset, tmp_path: Path
+    own_dataset: Dataset, tmp_path: Path
 ) -> None:
-    path = dataset.sequence.path
+    path = own_dataset.sequence.path
     (path.parent / "away").mkdir()
     moved = path.rename(path.parent / "away" / path.name)
     text = moved.read_text().replace('"regular/left/*.png"', '"../regular/left/*.png"')
     moved.write_text(text.replace('"kinematics.csv"', '"../kinematics.csv"'))
-    dataset = replace(dataset, sequence=Sequence.open(moved))
+    dataset = replace(own_dataset, sequence=Sequence.open(moved))
     assert dataset.image_folder == path.parent / "regular" / "left"
     assert [dataset.image_name(view) for view in all_views(dataset)] == ["001.png", "002.png", "003.png"]
 

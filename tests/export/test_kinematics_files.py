@@ -192,7 +192,7 @@ def test_a_video_shows_every_frame_and_the_arms(dataset: Dataset, tmp_path: Path
 
 
 @pytest.mark.parametrize(("given", "times", "expected"), [(30.0, True, 30.0), (None, True, 10.0), (None, False, 25.0)])
-def test_a_video_runs_as_set_or_recorded_or_at_25(dataset: Dataset, given, times: bool, expected: float) -> None:
+def test_a_video_runs_as_set_or_recorded_or_at_25(own_dataset: Dataset, given, times: bool, expected: float) -> None:
     if not times:
-        dataset.sequence.timestamps = None
-    assert frame_rate(replace(dataset, frame_rate=given)) == pytest.approx(expected)
+        own_dataset.sequence.timestamps = None
+    assert frame_rate(replace(own_dataset, frame_rate=given)) == pytest.approx(expected)

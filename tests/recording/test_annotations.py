@@ -19,9 +19,9 @@ from carts_core.recording.annotations.formats import mask_of_polygon, mask_of_ru
 HEIGHT, WIDTH = 72, 96
 
 
-@pytest.fixture
-def sequence(tiny_sequence: Callable[..., Path]) -> Sequence:
-    return Sequence.open(tiny_sequence(cameras=("left", "right"), masks=False))
+@pytest.fixture(scope="module")
+def sequence(shared_sequence: Callable[..., Path]) -> Sequence:
+    return Sequence.open(shared_sequence(cameras=("left", "right"), masks=False))
 
 
 def all_of(source: Path, sequence: Sequence, camera: str | None = None) -> tuple[dict, list[str], list[str]]:
