@@ -195,7 +195,9 @@ class Tab:
     def publish(self, attempt: Callable[[Callable[[], None]], None]) -> None:
         """Show a changed state; `attempt` calls a function and shows its errors."""
         controller, display = self.controller, None if self.view is None else self.view.display
-        if self._pictured is not controller.state and (display is None or display.ready_in() <= 0.0):
+        # The page of a tab that is away may come back; nobody sees the scores of one that has left.
+        due = self._left_at is not None if display is None else display.ready_in() <= 0.0
+        if due and self._pictured is not controller.state:
             attempt(controller.map)
             if display is not None:
                 attempt(lambda: display.show_picture(controller.state))

@@ -5,9 +5,9 @@ from types import SimpleNamespace
 
 from carts_core.optimization import BASE_FRAME_GAIN
 from carts_core.optimization.observability import Uncertainty
+from carts_viewer.choices import JointRange
 from carts_viewer.panels.optimize import undetermined_lines
 from carts_viewer.panels.sequence import calibration_line
-from carts_viewer.session import JointRange
 from carts_viewer.state import Maps, Phase, RunState
 
 
@@ -19,7 +19,7 @@ def _state(uncertainty: Uncertainty | None, phase: Phase) -> SimpleNamespace:
 
 
 SESSION = SimpleNamespace(
-    ranges=[JointRange("PSM1", "jaw", True, -1.0, 1.0)], joints=lambda scene: {"PSM1": [scene.jaw]}
+    ranges={"PSM1": (JointRange("PSM1", "jaw", True, -1.0, 1.0),)}, joints=lambda scene: {"PSM1": [scene.jaw]}
 )
 
 
