@@ -4,8 +4,7 @@
     python tools/ablate.py report RESULTS.jsonl
 
 `run` resumes where it stopped. Several processes share the work with `--share 0/2` and `--share 1/2`, each with a file
-of its own. Stages that two variants share are computed once and charged to both, so times are those of separate runs
-[s of one core]. `report` prints mean differences from the default solver.
+of its own. Times are processor time [s]. `report` prints mean differences from the default solver.
 """
 
 import argparse
@@ -13,7 +12,7 @@ import json
 import math
 import time
 from collections import defaultdict
-from collections.abc import Callable, Hashable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -23,12 +22,9 @@ from unittest.mock import patch
 import numpy as np
 import torch
 
-from carts_core.evaluation.evaluate import frame_score, start_positions
+from carts_core.evaluation.evaluate import Estimate, frame_score, start_positions
 from carts_core.networks.extractor import FeatureExtractor
 from carts_core.optimization import Backgrounds, FrameOptimizer
-from carts_core.optimization.frame_problem import FrameProblem
-from carts_core.optimization.observability import Evaluation
-from carts_core.optimization.observation import observe
 from carts_core.recording import Sequence
 from carts_core.rendering import Renderer
 from carts_core.settings import SurfaceSolver
@@ -36,13 +32,6 @@ from carts_core.settings.stages import AlignEdges, Descend, Given, Observe, Pref
 
 AS_IS = SurfaceSolver()
 """What variants are compared with."""
-
-_PARTS = {
-    "images": ("imaging.haze.", "optimization.observation.", "optimization.backgrounds."),
-    "surface": ("optimization.factors.surface.",),
-    "edges": ("imaging.haze.", "optimization.factors.edges."),
-}
-"""Which modules' constants what is shared depends on."""
 
 
 @dataclass(frozen=True)
@@ -54,11 +43,6 @@ class Variant:
     """Of the settings."""
     constants: Mapping[str, Any] = field(default_factory=dict)
     """Names below `carts_core` -> values."""
-
-    def constants_of(self, part: str) -> str:
-        """Those that a part of the computation depends on, as a key."""
-        known = {name: value for name, value in self.constants.items() if name.startswith(_PARTS[part])}
-        return f"{self.name}: {known}" if known else ""
 
 
 def _without(*places: int) -> Callable[[SurfaceSolver], SurfaceSolver]:
@@ -189,96 +173,24 @@ class Job:
         return f"{self.domain} {self.degrees:g}°" if self.degrees else f"real {self.camera}"
 
 
-class Shared:
-    """Results that runs of one frame have in common, with what they cost."""
-
-    def __init__(self) -> None:
-        self._kept: dict[Hashable, tuple[Any, float]] = {}
-        self._saved = 0.0
-
-    def clock(self) -> float:
-        """Processor time, as if nothing had been shared [s]."""
-        return time.process_time() + self._saved
-
-    def get(self, key: Hashable, make: Callable[[], Any]) -> Any:
-        """What was made for a key before, or made now."""
-        if key in self._kept:
-            found, seconds = self._kept[key]
-            self._saved += seconds
-        else:
-            began = self.clock()
-            found = make()
-            self._kept[key] = found, self.clock() - began
-        return found
-
-
-def shared_problem(shared: Shared, variant: Variant) -> type[FrameProblem]:
-    """A `FrameProblem` that shares what another variant computed from the same inputs."""
-    images_of, surface_of, edges_of = (variant.constants_of(part) for part in ("images", "surface", "edges"))
-
-    class SharedProblem(FrameProblem):
-        def images(self, scale: float):
-            key = "images", scale, self.settings.dehaze, images_of
-            return shared.get(key, lambda: FrameProblem.images(self, scale))
-
-        def observe(self, stage, offsets, *, whole: bool = False) -> None:
-            given = self.start if stage.given is Given.START else offsets
-            what = replace(stage, given=Given.ESTIMATE), given.numpy().tobytes(), whole
-            self.observation = shared.get(
-                ("observe", *what, self.settings.dehaze, images_of),
-                lambda: observe(
-                    self.images(stage.scale), self.predictor, self.variables.state(given), stage, whole=whole
-                ),
-            )
-
-        def _key(self, offsets) -> tuple[Hashable, ...]:
-            weights = replace(self.settings, stages=AS_IS.stages)
-            return id(self.observation), offsets.numpy().tobytes(), weights, images_of, surface_of
-
-        def costs(self, offsets, stage):
-            key = "costs", stage.blur, stage.robust, *self._key(offsets)
-            return shared.get(key, lambda: FrameProblem.costs(self, offsets, stage))
-
-        def evaluate(self, offsets, stage, *, gradient: bool = True) -> Evaluation:
-            def make() -> Evaluation:
-                found = FrameProblem.evaluate(self, offsets, stage, gradient=gradient)
-                none = torch.zeros(1, 3, 1, 1)
-                return replace(found, image=none, silhouette=none[0], similarity=none[0], attention=none[0])
-
-            return shared.get(("evaluate", stage.blur, stage.robust, gradient, *self._key(offsets)), make)
-
-        def aligned(self, stage, offsets, known):
-            key = "aligned", stage, id(known), edges_of, *self._key(offsets)
-            return shared.get(key, lambda: FrameProblem.aligned(self, stage, offsets, known))
-
-    return SharedProblem
-
-
-def run_one(job: Job, variant: Variant, shared: Shared, sequence: Sequence, extractor: FeatureExtractor) -> dict:
+def run_one(job: Job, variant: Variant, sequence: Sequence, extractor: FeatureExtractor) -> dict:
     """One variant on one frame."""
     scene = sequence.scene.with_cameras([job.camera])
     frame = sequence.frame(job.frame, job.domain, [job.camera])
     backgrounds = Backgrounds.of(sequence, (job.camera,), job.domain)
     start = start_positions(sequence, frame, job.degrees, 0)
     with ExitStack() as stack:
-        stack.enter_context(patch("carts_core.optimization.frame.FrameProblem", shared_problem(shared, variant)))
         for name, value in variant.constants.items():
             stack.enter_context(patch(f"carts_core.{name}", value))
-        began = shared.clock()
+        began = time.process_time()
         optimizer = FrameOptimizer(
             scene, frame, backgrounds, extractor, start=start, settings=variant.change(AS_IS), live=False
         )
         for _ in optimizer:
             pass
-        seconds = shared.clock() - began
-    best = optimizer.best
-    assert best is not None and optimizer.stop_reason is not None
-    steps, renderer = len(optimizer.history) - 1, Renderer(scene, cameras=[job.camera])
-    positions, deviations = best.joint_positions(), best.joint_std()
-    score = frame_score(
-        sequence, frame, job.camera, renderer, start, best.state, positions, deviations, steps, seconds,
-        optimizer.stop_reason,
-    )  # fmt: skip
+        seconds = time.process_time() - began
+    renderer = Renderer(scene, cameras=[job.camera])
+    score = frame_score(sequence, frame, job.camera, renderer, start, Estimate.best(optimizer, seconds))
     return {"variant": variant.name, "condition": job.condition, **asdict(job), **asdict(score), "frame": job.frame}
 
 
@@ -319,10 +231,10 @@ def run(args: argparse.Namespace) -> None:
             if number % shares != share or not missing:
                 continue
             if not number // shares:
-                run_one(job, missing[0], Shared(), _open(job.recording), extractor)  # Compiles kernels, loads meshes.
-            shared, began = Shared(), time.perf_counter()
+                run_one(job, missing[0], _open(job.recording), extractor)  # Compiles kernels, loads meshes.
+            began = time.perf_counter()
             for variant in missing:
-                row = run_one(job, variant, shared, _open(job.recording), extractor)
+                row = run_one(job, variant, _open(job.recording), extractor)
                 file.write(json.dumps(row) + "\n")
             file.flush()
             print(f"{job.condition}, {Path(job.recording).stem} {job.frame}: {time.perf_counter() - began:.0f} s")

@@ -2,7 +2,6 @@
 
 import json
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -77,7 +76,7 @@ class Evaluate:
 
     def run(self) -> None:
         """Print a table of means, and write the JSON file if a path is given."""
-        from ..evaluation import camera_groups, evaluate, evaluate_sequence, to_json
+        from ..evaluation import camera_groups, evaluate, to_json
         from ..files import write_text
         from ..optimization import Backgrounds
         from ..recording import Sequence
@@ -93,8 +92,7 @@ class Evaluate:
         sequence = self.source.corrected(sequence, frames, console)
         observer = self.network.observer(self.solving.chosen, sequence)
         observer.check(sequence, frames, cameras, domains)
-        run = evaluate if self.mode == "frame" else partial(evaluate_sequence, model=self.solving.sequence)
-        found = run(
+        found = evaluate(
             sequence,
             observer.predictor,
             frames=frames,
@@ -102,6 +100,7 @@ class Evaluate:
             domains=domains,
             settings=self.solving.chosen,
             free=self.solving.freed(self.free),
+            model=self.solving.sequence if self.mode == "sequence" else None,
             perturb_deg=self.start.perturb_deg,
             seed=self.start.seed,
             together=self.together,

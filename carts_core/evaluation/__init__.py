@@ -11,31 +11,9 @@ from .evaluate import Starts as Starts
 from .evaluate import camera_groups as camera_groups
 from .evaluate import dice as dice
 from .evaluate import evaluate as evaluate
-from .evaluate import evaluate_sequence as evaluate_sequence
 from .evaluate import joint_mae_deg as joint_mae_deg
 from .evaluate import joint_std_deg as joint_std_deg
 from .evaluate import mean_score as mean_score
 from .evaluate import normalized_surface_distance as normalized_surface_distance
 from .evaluate import start_positions as start_positions
 from .evaluate import to_json as to_json
-
-__all__ = [
-    "FrameResidual",
-    "FrameScore",
-    "Starts",
-    "calibration_json",
-    "camera_groups",
-    "dice",
-    "evaluate",
-    "evaluate_sequence",
-    "frame_residuals",
-    "joint_mae_deg",
-    "joint_std_deg",
-    "mean_dice",
-    "mean_score",
-    "normalized_surface_distance",
-    "remark",
-    "start_positions",
-    "to_json",
-    "write_calibration",
-]

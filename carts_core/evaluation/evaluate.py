@@ -4,6 +4,7 @@ import time
 from collections.abc import Iterator, Mapping
 from collections.abc import Sequence as Names
 from dataclasses import asdict, dataclass, fields, replace
+from itertools import product
 from typing import Any
 
 import cv2
@@ -27,6 +28,9 @@ from ..optimization import (
 )
 from ..recording import Frame, Sequence
 from ..rendering import Renderer
+
+Joints = dict[str, np.ndarray]
+"""Arm name -> joint positions [rad, m]."""
 
 
 def dice(a: Bool[np.ndarray, "h w"], b: Bool[np.ndarray, "h w"]) -> float:
@@ -129,6 +133,32 @@ class FrameScore:
     """Share of the residual that free base frames would explain [1]; None where not known."""
 
 
+@dataclass(frozen=True)
+class Estimate:
+    """Estimate of a frame by `FrameOptimizer` or `SequenceOptimizer`."""
+
+    state: SceneState
+    joint_positions: dict[str, np.ndarray]
+    """Arm name -> [rad, m]."""
+    joint_std: dict[str, np.ndarray]
+    """Arm name -> standard deviations [rad, m]."""
+    iterations: int
+    seconds: float
+    stopped: str
+    """Stop reason, or the source of the frame's values in sequence mode."""
+    base_frame_gain: float | None = None
+    assessment: Assessment | None = None
+
+    @staticmethod
+    def best(optimizer: FrameOptimizer, seconds: float) -> "Estimate":
+        """Best iterate of a finished optimizer."""
+        best, stopped = optimizer.best, optimizer.stop_reason
+        assert best is not None and stopped is not None
+        steps, gain = len(optimizer.history) - 1, optimizer.base_frame_gain()
+        positions, std = best.joint_positions(), best.joint_std()
+        return Estimate(best.state, positions, std, steps, seconds, stopped, gain, optimizer.assessment)
+
+
 def evaluate(
     sequence: Sequence,
     networks: FeatureExtractor | SurfacePredictor,
@@ -138,6 +168,7 @@ def evaluate(
     domains: Names[str],
     settings: SolverSettings,
     free: FreeParameters,
+    model: SequenceSettings | None = None,
     perturb_deg: float = 0.0,
     seed: int = 0,
     together: bool = False,
@@ -152,67 +183,112 @@ def evaluate(
         cameras: names; optimized one by one, unless `together`.
         domains: names.
         settings, free: of the optimization.
+        model: of sequence mode (see `SequenceOptimizer`); by default, each frame is optimized alone.
         perturb_deg: 0 starts at the measured joint positions. Otherwise starts at the true ones (the measured ones
             without ground truth) with each measured joint moved by this much; see `perturb`.
-        seed: of the perturbation, which is the same for a frame in all cameras and domains.
+        seed: of the perturbation, which is the same for a frame in all cameras and domains. In sequence mode it is the
+            same for all frames, like an error of calibration.
         together: optimize all cameras at once; the time is divided among their scores.
         given: masks that `networks` fits. Their ignored pixels are not compared, and they serve as ground truth for
             cameras without masks in the sequence.
     """
-    for domain in domains:
-        for group in camera_groups(cameras, together):
-            scene = sequence.scene.with_cameras(group)
-            renderers = {camera: Renderer(scene, cameras=[camera]) for camera in group}
-            backgrounds = Backgrounds.of(sequence, group, domain, required=settings.needs_background)
-            for index in frames:
-                frame = sequence.frame(index, domain, list(group))
-                frame = frame if given is None else given.filled(frame)
-                start = start_positions(sequence, frame, perturb_deg, seed)
-                began = time.perf_counter()
-                optimizer = FrameOptimizer(
-                    scene,
-                    frame,
-                    backgrounds,
-                    networks,
-                    ignore=None if given is None else given.ignored(index),
-                    start=start,
-                    settings=settings,
-                    free=free,
-                    live=False,
-                )
-                for _ in optimizer:
-                    pass
-                seconds = (time.perf_counter() - began) / len(group)
-                for camera, renderer in renderers.items():
-                    yield _optimized_score(sequence, frame, camera, renderer, start, optimizer, seconds)
+
+    def filled(frame: Frame) -> Frame:
+        return frame if given is None else given.filled(frame)
+
+    def alone(scene: Scene, domain: str, group: tuple[str, ...]) -> Iterator[tuple[Frame, Joints, Estimate]]:
+        backgrounds = Backgrounds.of(sequence, group, domain, required=settings.needs_background)
+        for index in frames:
+            frame = filled(sequence.frame(index, domain, list(group)))
+            start = start_positions(sequence, frame, perturb_deg, seed)
+            ignore = None if given is None else given.ignored(index)
+            began = time.perf_counter()
+            optimizer = FrameOptimizer(
+                scene,
+                frame,
+                backgrounds,
+                networks,
+                ignore=ignore,
+                start=start,
+                settings=settings,
+                free=free,
+                live=False,
+            )
+            for _ in optimizer:
+                pass
+            yield frame, start, Estimate.best(optimizer, time.perf_counter() - began)
+
+    def in_sequence(
+        scene: Scene, domain: str, group: tuple[str, ...], model: SequenceSettings
+    ) -> Iterator[tuple[Frame, Joints, Estimate]]:
+        starts = Starts(sequence, domain, group, perturb_deg, seed)
+        optimizer = SequenceOptimizer(
+            scene,
+            starts.frame,
+            starts.times(frames),
+            networks,
+            settings=settings,
+            model=model,
+            free=free,
+            ignore=None if given is None else given.ignored,
+            backgrounds=Backgrounds.of(sequence, group, domain),
+        )
+        for _ in optimizer:
+            pass
+        for index, found in sorted(optimizer.estimates.items()):
+            frame, joints = filled(starts.frame(index)), (found.joint_positions, found.joint_std)
+            spent = found.iterations, found.seconds
+            yield (
+                frame,
+                frame.measured,
+                Estimate(found.state, *joints, *spent, found.start, assessment=found.assessment),
+            )
+
+    for domain, group in product(domains, camera_groups(cameras, together)):
+        scene = sequence.scene.with_cameras(group)
+        renderers = {camera: Renderer(scene, cameras=[camera]) for camera in group}
+        found = alone(scene, domain, group) if model is None else in_sequence(scene, domain, group, model)
+        for frame, start, estimate in found:
+            share = replace(estimate, seconds=estimate.seconds / len(group))
+            for camera, renderer in renderers.items():
+                yield frame_score(sequence, frame, camera, renderer, start, share)
 
 
-def _optimized_score(
-    sequence: Sequence,
-    frame: Frame,
-    camera: str,
-    renderer: Renderer,
-    start: dict[str, np.ndarray],
-    optimizer: FrameOptimizer,
-    seconds: float,
+def frame_score(
+    sequence: Sequence, frame: Frame, camera: str, renderer: Renderer, start: Joints, found: Estimate
 ) -> FrameScore:
-    """Score of the best iterate of a finished optimizer."""
-    best = optimizer.best
-    assert best is not None and optimizer.stop_reason is not None
-    return frame_score(
-        sequence,
-        frame,
-        camera,
-        renderer,
-        start,
-        best.state,
-        best.joint_positions(),
-        best.joint_std(),
-        len(optimizer.history) - 1,
-        seconds,
-        optimizer.stop_reason,
-        optimizer.base_frame_gain(),
-        optimizer.assessment,
+    """Compare an estimate of a frame with the truth.
+
+    Args:
+        sequence, frame, camera: that were optimized.
+        renderer: of that camera in full size.
+        start: arm name -> joint positions before [rad, m].
+        found: the estimate.
+    """
+    mask, assessment = (frame.masks or {}).get(camera), found.assessment
+
+    def overlap(state: SceneState) -> float | None:
+        return None if mask is None else dice(renderer.segment(state)[0] >= 0, mask)
+
+    def mae(estimate: Joints) -> float | None:
+        return joint_mae_deg(sequence.scene, estimate, frame.truth or {}, sequence.measured_joints)
+
+    return FrameScore(
+        frame=frame.frame_id,
+        camera=camera,
+        domain=frame.domain,
+        dice_before=overlap(sequence.scene.with_cameras([camera]).state(start, mounts=frame.mounts)),
+        dice_after=overlap(found.state.to("cpu")),
+        joint_mae_deg_before=mae(start),
+        joint_mae_deg_after=mae(found.joint_positions),
+        iterations=found.iterations,
+        seconds=round(found.seconds, 4),
+        stopped=found.stopped,
+        joint_std_deg=joint_std_deg(sequence.scene, found.joint_std, sequence.measured_joints),
+        verdict=assessment and assessment.verdict.value,
+        reason=assessment and assessment.reason,
+        not_determined=undetermined_joints(sequence.scene, found.joint_std),
+        base_frame_gain=found.base_frame_gain,
     )
 
 
@@ -232,59 +308,6 @@ def start_positions(
     return perturb(sequence.scene, origin, perturb_deg, seed, sequence.measured_joints)
 
 
-def frame_score(
-    sequence: Sequence,
-    frame: Frame,
-    camera: str,
-    renderer: Renderer,
-    start: dict[str, np.ndarray],
-    state: SceneState,
-    joint_positions: dict[str, np.ndarray],
-    joint_std: dict[str, np.ndarray],
-    iterations: int,
-    seconds: float,
-    stopped: str,
-    base_frame_gain: float | None = None,
-    assessment: Assessment | None = None,
-) -> FrameScore:
-    """Compare an estimate of a frame with the truth.
-
-    Args:
-        sequence, frame, camera: that were optimized.
-        renderer: of that camera in full size.
-        start: arm name -> joint positions before [rad, m].
-        state, joint_positions, joint_std: after.
-        iterations, seconds, stopped, base_frame_gain: as in the score.
-        assessment: verdict on the estimate, if assessed.
-    """
-    mask = (frame.masks or {}).get(camera)
-    truth = frame.truth or {}
-
-    def overlap(state: SceneState) -> float | None:
-        return None if mask is None else dice(renderer.segment(state)[0] >= 0, mask)
-
-    def mae(estimate: dict[str, np.ndarray]) -> float | None:
-        return joint_mae_deg(sequence.scene, estimate, truth, sequence.measured_joints)
-
-    return FrameScore(
-        frame=frame.frame_id,
-        camera=camera,
-        domain=frame.domain,
-        dice_before=overlap(sequence.scene.with_cameras([camera]).state(start, mounts=frame.mounts)),
-        dice_after=overlap(state.to("cpu")),
-        joint_mae_deg_before=mae(start),
-        joint_mae_deg_after=mae(joint_positions),
-        iterations=iterations,
-        seconds=round(seconds, 4),
-        stopped=stopped,
-        joint_std_deg=joint_std_deg(sequence.scene, joint_std, sequence.measured_joints),
-        base_frame_gain=base_frame_gain,
-        verdict=None if assessment is None else assessment.verdict.value,
-        not_determined=undetermined_joints(sequence.scene, joint_std),
-        reason=None if assessment is None else assessment.reason,
-    )
-
-
 def mean_score(scores: Names[FrameScore]) -> dict[str, Any]:
     """Means over frames under the same keys; None for values that are missing or not numbers."""
     result: dict[str, Any] = {}
@@ -297,64 +320,6 @@ def mean_score(scores: Names[FrameScore]) -> dict[str, Any]:
 def to_json(scores: Names[FrameScore]) -> dict[str, Any]:
     """Content of `carts evaluate --json`."""
     return {"frames": [asdict(score) for score in scores], "mean": mean_score(scores)}
-
-
-def evaluate_sequence(
-    sequence: Sequence,
-    networks: FeatureExtractor | SurfacePredictor,
-    *,
-    frames: Names[int],
-    cameras: Names[str],
-    domains: Names[str],
-    settings: SolverSettings,
-    model: SequenceSettings,
-    free: FreeParameters,
-    perturb_deg: float = 0.0,
-    seed: int = 0,
-    together: bool = False,
-    given: GivenMasks | None = None,
-) -> Iterator[FrameScore]:
-    """As `evaluate`, with sequence mode for the frames of each domain and group of cameras; see `SequenceOptimizer`.
-
-    The perturbation is the same in all frames, like an error of calibration.
-    """
-    groups = camera_groups(cameras, together)
-    for domain in domains:
-        for group in groups:
-            scene = sequence.scene.with_cameras(group)
-            renderers = {camera: Renderer(scene, cameras=[camera]) for camera in group}
-            starts = Starts(sequence, domain, group, perturb_deg, seed)
-            optimizer = SequenceOptimizer(
-                scene,
-                starts.frame,
-                starts.times(frames),
-                networks,
-                settings=settings,
-                model=model,
-                free=free,
-                ignore=None if given is None else given.ignored,
-                backgrounds=Backgrounds.of(sequence, group, domain),
-            )
-            for _ in optimizer:
-                pass
-            for index, estimate in sorted(optimizer.estimates.items()):
-                frame = starts.frame(index)
-                frame = frame if given is None else given.filled(frame)
-                for camera, renderer in renderers.items():
-                    yield frame_score(
-                        sequence,
-                        frame,
-                        camera,
-                        renderer,
-                        frame.measured,
-                        estimate.state,
-                        estimate.joint_positions,
-                        estimate.joint_std,
-                        estimate.iterations,
-                        estimate.seconds / len(group),
-                        estimate.start,
-                        assessment=estimate.assessment,
-                    )
 
 
 @dataclass(frozen=True)
