@@ -1,33 +1,15 @@
-"""Components of HTML reports: tables, sections, figures and their style. All text is escaped."""
+"""Reports from the Jinja2 templates in `carts_core/templates`. In HTML, all text is escaped."""
 
+import json
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from html import escape
-from pathlib import PurePath
+from functools import cache
+from typing import TYPE_CHECKING
 
-STYLE = """
-body { font: 15px/1.5 system-ui, sans-serif; color: #1c1f23; max-width: 1180px; margin: 2rem auto; padding: 0 1rem; }
-h1 { font-size: 1.7rem; margin-bottom: .3rem; }
-h2 { margin-top: 2.6rem; border-bottom: 1px solid #d8dce0; padding-bottom: .2rem; }
-h3 { margin: 1.6rem 0 .2rem; }
-p { max-width: 62rem; margin: .3rem 0 .7rem; color: #4a5058; }
-.wide { overflow-x: auto; }
-table { border-collapse: collapse; font-variant-numeric: tabular-nums; }
-th, td { padding: .28rem .6rem; border-bottom: 1px solid #e4e7ea; text-align: left; vertical-align: top; }
-thead th { border-bottom: 2px solid #aab2ba; font-weight: 600; }
-td { white-space: nowrap; }
-.targets td, .facts td { white-space: normal; }
-.targets td:nth-child(n+2):nth-child(-n+4) { white-space: nowrap; }
-.targets td:nth-child(5) { max-width: 15rem; }
-small { display: block; color: #737b84; font-size: .8em; }
-.met { color: #17713a; font-weight: 600; }
-.missed { color: #b02a1c; font-weight: 600; }
-.open { color: #737b84; }
-.warning { border-left: 4px solid #d9a300; background: #fff8e0; padding: .4rem .8rem; color: #5a4500; }
-nav a { margin-right: .8rem; }
-figure { margin: 1.4rem 0 2rem; }
-figure img { max-width: 100%; }
-figcaption { color: #4a5058; max-width: 62rem; }
-"""
+from .console import in_markdown
+
+if TYPE_CHECKING:
+    from jinja2 import Environment
 
 
 @dataclass(frozen=True)
@@ -48,35 +30,32 @@ class Table:
     columns: tuple[str, ...]
     rows: tuple[tuple[Cell, ...], ...]
 
-
-def anchor(title: str) -> str:
-    """Anchor of the section for links."""
-    return title.lower().replace(" ", "-")
-
-
-def section_html(title: str, body: str) -> str:
-    """A section with a heading; `body` is HTML."""
-    return f'<section id="{anchor(title)}"><h2>{escape(title)}</h2>{body}</section>'
+    @staticmethod
+    def of(title: str, caption: str, rows: Sequence[Mapping[str, str | Cell]]) -> "Table | None":
+        """A table of rows with the same keys, which are its headings; None without rows."""
+        if not rows:
+            return None
+        cells = (tuple(cell if isinstance(cell, Cell) else Cell(cell) for cell in row.values()) for row in rows)
+        return Table(title, caption, tuple(rows[0]), tuple(cells))
 
 
-def table_html(table: Table) -> str:
-    """A table with its title and caption."""
-    header = "".join(f"<th>{escape(column)}</th>" for column in table.columns)
-    rows = "".join(f"<tr>{''.join(map(_cell, row))}</tr>" for row in table.rows)
-    return (
-        f"<h3>{escape(table.title)}</h3><p>{escape(table.caption)}</p>"
-        f'<div class="wide"><table><thead><tr>{header}</tr></thead><tbody>{rows}</tbody></table></div>'
+def render_page(template: str, **values: object) -> str:
+    """A page of a template by file name."""
+    return _templates().get_template(template).render(values)
+
+
+@cache
+def _templates() -> "Environment":
+    # Imported late, because the page of `carts view` needs no reports.
+    from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape  # noqa: PLC0415
+
+    templates = Environment(
+        loader=PackageLoader("carts_core"),
+        autoescape=select_autoescape(["html"]),
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
     )
-
-
-def figure_html(caption: str, path: PurePath) -> str:
-    """A picture with a caption."""
-    return (
-        f'<figure><img src="{escape(path.as_posix())}" alt="{escape(caption)}">'
-        f"<figcaption>{escape(caption)}</figcaption></figure>"
-    )
-
-
-def _cell(cell: Cell) -> str:
-    note = f"<small>{escape(cell.note)}</small>" if cell.note else ""
-    return f"<td>{escape(cell.text)}{note}</td>"
+    templates.filters |= {"md": in_markdown, "json": json.dumps}
+    return templates

@@ -3,9 +3,7 @@
 import json
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from html import escape
-from pathlib import Path, PurePath
-from string import Template
+from pathlib import Path
 
 import matplotlib
 import numpy as np
@@ -15,8 +13,8 @@ from ..errors import CartsError
 from ..evaluation.calibration import pose_distance
 from ..files import OutputPath, output_stream, write_bytes, write_text
 from ..files.reading import IMAGE, read_bytes
-from ..html import STYLE, Cell, Table, anchor, figure_html, section_html, table_html
-from .folder import ORDER, FrameFinding, KnownJob, known_jobs, most_urgent_first
+from ..html import Table, render_page
+from .folder import ORDER, KnownJob, known_jobs, most_urgent_first
 from .manifest import Job
 
 matplotlib.use("Agg")
@@ -24,36 +22,25 @@ matplotlib.rcParams["text.parse_math"] = False
 
 _SHOWN = 24
 """Number of worst frames on the page."""
-_PAGE = Template("""<!doctype html>
-<html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
-<title>$title</title><style>$style
-.gallery { display: grid; grid-template-columns: repeat(auto-fill, minmax(20rem, 1fr)); gap: 1rem; }
-.gallery figure { margin: 0; }
-</style></head><body><h1>$title</h1><nav>$contents</nav>$sections</body></html>
-""")
 _VERDICTS = ("good", "doubtful", "failed")
 
 
 def write_batch_report(batch: OutputPath, title: str, jobs: Sequence[Job]) -> Path:
-    """Write `report/report.html`, `report/report.json` and the pictures; returns the page's path.
-
-    Args:
-        batch: its folder.
-        title: of the page.
-        jobs: all of the manifest.
-    """
+    """Write `report/report.html`, `report/report.json` and the pictures; returns the page's path."""
     folder, known = batch / "report", known_jobs(batch, jobs)
     drifts, joints = _drifts(known), _joints(known)
-    sections = {
-        "Jobs": table_html(_job_table(known)),
-        "Verdicts": table_html(_verdict_table(known)),
-        "Worst frames": _worst(batch, folder, known),
-        "Base frames": table_html(_drift_table(drifts)),
-        "Joints": table_html(_joint_table(joints)) + _joint_figure(folder, joints),
-    }
-    contents = " ".join(f'<a href="#{anchor(name)}">{escape(name)}</a>' for name in sections)
-    body = "".join(section_html(name, html) for name, html in sections.items())
-    page = _PAGE.substitute(title=escape(title), style=STYLE, contents=contents, sections=body)
+    page = render_page(
+        "batch.html",
+        title=title,
+        sections={
+            "Jobs": _job_table(known),
+            "Verdicts": _verdict_table(known),
+            "Worst frames": _worst(batch, folder, known),
+            "Base frames": _drift_table(drifts),
+            "Joints": _joint_table(joints),
+        },
+        plot=_joint_figure(folder, joints),
+    )
     document = {
         "format": "carts-batch-report/1",
         "jobs": {entry.job.name: {"status": entry.status, "error": entry.state.error} for entry in known},
@@ -66,23 +53,22 @@ def write_batch_report(batch: OutputPath, title: str, jobs: Sequence[Job]) -> Pa
     return (folder / "report.html").path
 
 
-def _job_table(known: Sequence[KnownJob]) -> Table:
+def _job_table(known: Sequence[KnownJob]) -> Table | None:
     """Table of jobs, most urgent first."""
     counts = Counter(entry.status for entry in known)
-    return Table(
+    return Table.of(
         "Status of the jobs",
         ", ".join(f"{counts[status]} {status}" for status in ORDER if counts[status]),
-        ("job", "recording", "status", "seconds", "error"),
-        tuple(
-            (
-                Cell(entry.job.name),
-                Cell(str(entry.job.recording)),
-                Cell(entry.status),
-                Cell(f"{sum(step.seconds for step in entry.state.steps.values()):.1f}"),
-                Cell(entry.error),
-            )
+        [
+            {
+                "job": entry.job.name,
+                "recording": str(entry.job.recording),
+                "status": entry.status,
+                "seconds": f"{sum(step.seconds for step in entry.state.steps.values()):.1f}",
+                "error": entry.error,
+            }
             for entry in most_urgent_first(known)
-        ),
+        ],
     )
 
 
@@ -91,27 +77,28 @@ def _verdicts(entry: KnownJob) -> dict[str, int]:
     return {verdict: counts[verdict] for verdict in _VERDICTS}
 
 
-def _verdict_table(known: Sequence[KnownJob]) -> Table:
+def _verdict_table(known: Sequence[KnownJob]) -> Table | None:
     """Table of verdicts, sorted by the share of failed frames."""
-    counted = [(entry, _verdicts(entry)) for entry in known]
-    rows = [(entry.job.name, counts) for entry, counts in counted if sum(counts.values())]
+    rows = [(entry.job.name, counts) for entry in known if sum((counts := _verdicts(entry)).values())]
     rows.sort(key=lambda row: (-row[1]["failed"] / sum(row[1].values()), -row[1]["doubtful"] / sum(row[1].values())))
     total = {verdict: sum(counts[verdict] for _, counts in rows) for verdict in _VERDICTS}
-    lines = [*([("all jobs", total)] if rows else []), *rows]
-    return Table(
+    return Table.of(
         "Reliability of the results",
         "Frames by verdict, from their images alone, without ground truth.",
-        ("job", *_VERDICTS, "frames"),
-        tuple(
-            (Cell(name), *(Cell(str(counts[verdict])) for verdict in _VERDICTS), Cell(str(sum(counts.values()))))
-            for name, counts in lines
-        ),
+        [
+            {
+                "job": name,
+                **{verdict: str(count) for verdict, count in counts.items()},
+                "frames": str(sum(counts.values())),
+            }
+            for name, counts in [*([("all jobs", total)] if rows else []), *rows]
+        ],
     )
 
 
-def _worst(batch: OutputPath, folder: OutputPath, known: Sequence[KnownJob]) -> str:
-    """Gallery of the frames with the largest probability of a wrong mask; pictures are copied into the report."""
-    frames: list[tuple[Job, FrameFinding]] = [
+def _worst(batch: OutputPath, folder: OutputPath, known: Sequence[KnownJob]) -> list[tuple[str, str]]:
+    """Captions and pictures of the frames with the largest probability of a wrong mask, copied into the report."""
+    frames = [
         (entry.job, frame)
         for entry in known
         for frame in (entry.findings.frames if entry.findings else ())
@@ -130,9 +117,8 @@ def _worst(batch: OutputPath, folder: OutputPath, known: Sequence[KnownJob]) -> 
             f"{job.name}, frame {frame.frame}, {frame.camera}: {frame.verdict}, probability of a wrong mask "
             f"{frame.probability:.2f}. {frame.reason}"
         )
-        shown.append(figure_html(caption, PurePath(name)))
-    text = "<p>The outline of each mask over its image, the most doubtful frames of all jobs first.</p>"
-    return text + f'<div class="gallery">{"".join(shown)}</div>' if shown else "<p>No frame has a verdict.</p>"
+        shown.append((caption, name))
+    return shown
 
 
 def _drifts(known: Sequence[KnownJob]) -> list[dict[str, object]]:
@@ -147,20 +133,19 @@ def _drifts(known: Sequence[KnownJob]) -> list[dict[str, object]]:
     return found
 
 
-def _drift_table(drifts: list[dict[str, object]]) -> Table:
-    return Table(
+def _drift_table(drifts: list[dict[str, object]]) -> Table | None:
+    return Table.of(
         "Drift of base frames",
         "Change of each arm's base frame in a camera since the job before, in the manifest's order.",
-        ("base frame", "job", "turned [deg]", "moved [mm]"),
-        tuple(
-            (
-                Cell(str(row["base_frame"])),
-                Cell(str(row["job"])),
-                Cell(f"{row['rotation_deg']:.3f}"),
-                Cell(f"{row['translation_mm']:.2f}"),
-            )
+        [
+            {
+                "base frame": str(row["base_frame"]),
+                "job": str(row["job"]),
+                "rotation [deg]": f"{row['rotation_deg']:.3f}",
+                "translation [mm]": f"{row['translation_mm']:.2f}",
+            }
             for row in sorted(drifts, key=lambda row: str(row["base_frame"]))
-        ),
+        ],
     )
 
 
@@ -191,24 +176,29 @@ def _statistics(corrections: Sequence[float], deviations: Sequence[float]) -> di
     }
 
 
-def _joint_table(joints: Mapping[str, _Values]) -> Table:
+def _joint_table(joints: Mapping[str, _Values]) -> Table | None:
+    headings = {
+        "mean": "mean",
+        "deviation": "deviation",
+        "median_size": "median size",
+        "largest_size": "largest",
+        "median_reported": "median reported deviation",
+    }
     rows = []
     for name, values in joints.items():
         found = _statistics(*values)
-        numbers = [found[key] for key in ("mean", "deviation", "median_size", "largest_size", "median_reported")]
-        texts = ["–" if number is None else f"{number:.3f}" for number in numbers]
-        rows.append((Cell(name), Cell(str(found["frames"])), *map(Cell, texts)))
-    return Table(
-        "Error of measured joints",
-        "Corrected minus measured, over the frames of all jobs; degrees, or millimetres for prismatic joints.",
-        ("joint", "frames", "mean", "deviation", "median size", "largest", "median reported deviation"),
-        tuple(rows),
-    )
+        texts = {key: "–" if (number := found[key]) is None else f"{number:.3f}" for key in headings}
+        rows.append(
+            {"joint": name, "frames": str(found["frames"]), **{headings[key]: text for key, text in texts.items()}}
+        )
+    caption = "Corrected minus measured, over the frames of all jobs; degrees, or millimetres for prismatic joints."
+    return Table.of("Error of measured joints", caption, rows)
 
 
-def _joint_figure(folder: OutputPath, joints: Mapping[str, _Values]) -> str:
+def _joint_figure(folder: OutputPath, joints: Mapping[str, _Values]) -> tuple[str, str] | None:
+    """Caption and file of the plot."""
     if not joints:
-        return ""
+        return None
     figure = Figure(figsize=(max(5.0, 1.5 + 0.5 * len(joints)), 5.0), layout="constrained")
     axes = figure.subplots()
     axes.boxplot([corrections for corrections, _ in joints.values()], widths=0.6, showfliers=False)
@@ -218,5 +208,4 @@ def _joint_figure(folder: OutputPath, joints: Mapping[str, _Values]) -> str:
     axes.grid(axis="y", alpha=0.3)
     with output_stream(folder / "joints.png") as stream:
         figure.savefig(stream, format="png", dpi=110)
-    caption = "Corrections of each joint: median, quartiles, and 1.5 times their distance."
-    return figure_html(caption, PurePath("joints.png"))
+    return "Corrections of each joint: median, quartiles, and 1.5 times their distance.", "joints.png"

@@ -10,10 +10,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Float
 
-from ..console import in_markdown
 from ..files import OutputPath, output_stream, write_text
-from ..model.camera import Camera
-from ..model.scene import Arm, Scene
+from ..html import render_page
+from ..model.scene import Scene
 from ..optimization import CalibrationResult
 from ..recording import Frame, Sequence, calibrated_sequence_file
 from ..rendering import Renderer
@@ -60,12 +59,11 @@ def _overlap(scene: Scene, frame: Frame, renderers: dict[str, Renderer]) -> dict
 
 def mean_dice(residuals: Frames[FrameResidual], camera: str) -> tuple[float, float] | None:
     """Mean Dice of a camera before and after; None where no frame has a mask."""
-    pairs = [
-        (residual.dice_before[camera], residual.dice_after[camera])
-        for residual in residuals
-        if camera in residual.dice_before
-    ]
-    return (float(np.mean([pair[0] for pair in pairs])), float(np.mean([pair[1] for pair in pairs]))) if pairs else None
+    seen = [residual for residual in residuals if camera in residual.dice_before]
+    if not seen:
+        return None
+    before, after = (np.mean([getattr(one, f"dice_{when}")[camera] for one in seen]) for when in ("before", "after"))
+    return float(before), float(after)
 
 
 def calibration_json(before: Scene, result: CalibrationResult, residuals: Frames[FrameResidual]) -> dict[str, Any]:
@@ -96,19 +94,10 @@ def calibration_json(before: Scene, result: CalibrationResult, residuals: Frames
 
 def moved_frames(before: Scene, after: Scene) -> list[tuple[str, float, float]]:
     """Name, rotation [deg] and translation [mm] of each base frame and camera that moved."""
-    pairs: list[tuple[Arm | Camera, np.ndarray, np.ndarray]] = []
-    for old, new in zip(before.arms, after.arms, strict=True):
-        pairs.append((old, old.T_world_base, new.T_world_base))
-    for old, new in zip(before.cameras, after.cameras, strict=True):
-        pairs.append((old, old.T_camera_world, new.T_camera_world))
-    return [
-        (
-            ("T_world_base of " if isinstance(thing, Arm) else "T_camera_world of ") + thing.name,
-            *pose_distance(old, new),
-        )
-        for thing, old, new in pairs
-        if not np.array_equal(old, new)
-    ]
+    arms, cameras = (zip(*pair, strict=True) for pair in ((before.arms, after.arms), (before.cameras, after.cameras)))
+    poses = [(f"T_world_base of {old.name}", old.T_world_base, new.T_world_base) for old, new in arms]
+    poses += [(f"T_camera_world of {old.name}", old.T_camera_world, new.T_camera_world) for old, new in cameras]
+    return [(name, *pose_distance(old, new)) for name, old, new in poses if not np.array_equal(old, new)]
 
 
 def beyond_prior(before: Scene, result: CalibrationResult, known: Mapping[str, Float[np.ndarray, "6 6"]]) -> str | None:
@@ -144,12 +133,8 @@ def remark(before: Scene, result: CalibrationResult) -> str | None:
 
 def _difference(before: Float[np.ndarray, "4 4"], after: Float[np.ndarray, "4 4"]) -> dict[str, Any]:
     angle, distance = pose_distance(before, after)
-    return {
-        "before": before.tolist(),
-        "after": after.tolist(),
-        "rotation_deg": angle,
-        "translation_mm": distance,
-    }
+    poses = {"before": before.tolist(), "after": after.tolist()}
+    return {**poses, "rotation_deg": angle, "translation_mm": distance}
 
 
 def pose_distance(before: Float[np.ndarray, "4 4"], after: Float[np.ndarray, "4 4"]) -> tuple[float, float]:
@@ -179,7 +164,18 @@ def write_calibration(
     for name, figure in (("frames.png", _frames_figure(residuals)), ("unknowns.png", _unknowns_figure(result))):
         with output_stream(folder / name) as stream:
             figure.savefig(stream, format="png", dpi=110)
-    write_text(folder / "README.md", _page(sequence, result, residuals))
+    page = render_page(
+        "calibration.md",
+        name=sequence.name,
+        frames=counted(len(residuals), "frame"),
+        result=result,
+        unchanged=not any(unknown.change for unknown in result.unknowns),
+        dice={camera: mean_dice(residuals, camera) for camera in _cameras(residuals)},
+        moved=moved_frames(sequence.scene, result.scene),
+        remark=remark(sequence.scene, result),
+        residuals=residuals,
+    )
+    write_text(folder / "README.md", page)
 
 
 def _cameras(residuals: Frames[FrameResidual]) -> list[str]:
@@ -235,72 +231,3 @@ def _unknowns_figure(result: CalibrationResult) -> "Figure":
         panel.grid(alpha=0.3)
         panel.tick_params(labelsize=8)
     return figure
-
-
-def _verdict(result: CalibrationResult) -> list[str]:
-    found = result.assessment
-    if found is None:
-        return []
-    return [f"Verdict: **{found.verdict.value}**. {found.reason} {found.remedy}".rstrip(), ""]
-
-
-def _page(sequence: Sequence, result: CalibrationResult, residuals: Frames[FrameResidual]) -> str:
-    cameras = _cameras(residuals)
-    unchanged = not any(unknown.change for unknown in result.unknowns)
-    which = "The calibration, as it was," if unchanged else "The new calibration"
-    lines = [
-        f"# Calibration of {in_markdown(sequence.name)}",
-        "",
-        f"From {counted(len(residuals), 'frame')}, joints as measured in all figures below. The optimization ended: "
-        f"{result.stop_reason}. {which} is in `sequence.toml`, all numbers are in `calibration.json`.",
-        "",
-        *_verdict(result),
-        "| mean over the frames | before | after |",
-        "|---|---|---|",
-        f"| loss | {result.frame_losses_before.mean():.4f} | {result.frame_losses_after.mean():.4f} |",
-    ]
-    for camera in cameras:
-        if (means := mean_dice(residuals, camera)) is not None:
-            lines.append(f"| Dice, {in_markdown(camera)} | {means[0]:.4f} | {means[1]:.4f} |")
-    if moved := moved_frames(sequence.scene, result.scene):
-        lines += ["", "| what moved | by [deg] | by [mm] |", "|---|---|---|"]
-        lines += [f"| {in_markdown(name)} | {angle:.3f} | {distance:.3f} |" for name, angle, distance in moved]
-    if (text := remark(sequence.scene, result)) is not None:
-        lines += ["", f"**{in_markdown(text)}**"]
-    lines += [
-        "",
-        "## Unknowns",
-        "",
-        "Base frames turn and shift in their own axes, cameras in theirs. The *standard deviation* allows for errors",
-        "that frames share (of outlines, and 1 % of intrinsics that are held) and for how much the frames contradict",
-        "each other, which *between frames* is alone. That *of the curvature* takes pixels for independent and is too",
-        "small. An unknown whose deviation of the curvature is close to the prior's was not seen and stays where it",
-        "was.",
-        "",
-        "![unknowns](unknowns.png)",
-        "",
-        "Bars are two standard deviations.",
-        "",
-        "| unknown | change | standard deviation | between frames | of the curvature | prior | unit |",
-        "|---|---|---|---|---|---|---|",
-    ]
-    lines += [
-        f"| {in_markdown(unknown.name)} | {unknown.change:.3f} | {unknown.standard_deviation:.3f} | "
-        f"{'-' if unknown.deviation_between_frames is None else f'{unknown.deviation_between_frames:.3f}'} | "
-        f"{unknown.deviation:.3f} | {unknown.prior_deviation:.3f} | {unknown.unit} |"
-        for unknown in result.unknowns
-    ]
-    dice_columns = [f"Dice {in_markdown(camera)} {label}" for camera in cameras for label in ("before", "after")]
-    columns = ["frame", "weight", "loss before", "loss after", *dice_columns]
-    lines += ["", "## Frames", "", "![frames](frames.png)", ""]
-    lines += [f"| {' | '.join(columns)} |", "|---" * len(columns) + "|"]
-    for residual in residuals:
-        scores = [
-            f"{scores[camera]:.4f}" if camera in scores else "-"
-            for camera in cameras
-            for scores in (residual.dice_before, residual.dice_after)
-        ]
-        values = [f"{residual.weight:.2f}", f"{residual.loss_before:.4f}", f"{residual.loss_after:.4f}", *scores]
-        lines.append(f"| {' | '.join([in_markdown(residual.frame), *values])} |")
-    lines += ["", "Frames with outlying losses have lower weights.", ""]
-    return "\n".join(lines)

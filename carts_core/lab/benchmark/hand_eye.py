@@ -5,6 +5,7 @@ import tempfile
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -15,8 +16,7 @@ from roma import rotmat_to_rotvec, rotvec_to_rotmat
 
 from ...errors import CartsError
 from ...files import OutputPath, write_text
-from ...files.reading import VALUES, parse_json, read_bytes
-from ...html import Cell, Table
+from ...html import Table
 from ...model.camera import Camera
 from ...model.robot import Robot
 from ...model.scene import Arm, Scene
@@ -24,22 +24,23 @@ from ...networks.extractor import FeatureExtractor
 from ...optimization import CalibrationOptimizer, FreeParameters, MaskPredictor
 from ...recording import Frame
 from ...wording import counted
-from .measurement import code_fingerprint
+from .measurement import code_fingerprint, stored
 from .rooms import made_rooms
-from .statistics import NOTHING, Target, make_target
+from .statistics import NOTHING
+from .targets import Goal, Reached, Target
 
 _SECTIONS = (0.16, 0.18, 0.22, 0.19, 0.2, 0.19, 0.08)
-"""Length of what each joint turns [m]."""
+"""Lengths of the links [m]."""
 
 _RADII = (0.075, 0.07, 0.065, 0.06, 0.055, 0.05, 0.04)
 _COLOURS = ((0.85, 0.85, 0.83), (0.9, 0.45, 0.1))
 _LIMIT = 2.9
 _SIZE, _FOCAL = (640, 480), 620.0
 _SAMPLES = 3
-"""Rays per pixel and axis; odd, so that a mask of pixels that are covered by half is neither wide nor narrow."""
+"""Rays per pixel and axis; odd, so that thresholding coverage at a half does not bias the mask."""
 
 _HIDDEN = 0.25
-"""Largest brightness that a side turned from the light has [1]."""
+"""Largest brightness of a side turned from the light [1]."""
 
 
 def write_arm(folder: Path) -> Path:
@@ -90,14 +91,7 @@ class ArmViews:
 
 
 def arm_views(folder: Path, count: int, seed: int, room: UInt8[np.ndarray, "h w 3"] | None = None) -> ArmViews:
-    """Draw views of the arm.
-
-    Args:
-        folder: for the robot's URDF.
-        count: how many.
-        seed: of poses, camera and noise.
-        room: what is behind the arm, of 640 x 480 pixels; grey by default.
-    """
+    """Render views of the arm with random poses, camera and noise, before a room of 640x480 px (default: grey)."""
     rng = np.random.default_rng(seed)
     robot = Robot.load(write_arm(folder))
     angle, distance = rng.uniform(0, 2 * np.pi), rng.uniform(1.6, 2.2)
@@ -131,7 +125,7 @@ def arm_views(folder: Path, count: int, seed: int, room: UInt8[np.ndarray, "h w 
 def _rays(
     robot: Robot, joints: Float[np.ndarray, " dofs"], camera: Camera
 ) -> tuple[Float[np.ndarray, "h w"], Float[np.ndarray, "h w 3"]]:
-    """Which share of each pixel the robot covers, and its colour there times that share."""
+    """Coverage of each pixel by the robot, and its colour times the coverage."""
     Ts = robot.forward_kinematics(torch.tensor(joints)).numpy()
     parts, colours = [], []
     for mesh in robot.meshes:
@@ -166,7 +160,7 @@ _CODE = ("lab/benchmark/hand_eye.py", "lab/benchmark/rooms.py")
 
 @dataclass(frozen=True)
 class HandEyeCondition:
-    """Starts of one kind, and how near the base frame has to come."""
+    """Starts of one kind, with tolerances of the base frame."""
 
     name: str
     angle_deg: float
@@ -203,11 +197,7 @@ class HandEyeRun:
 
 def known_hand_eye(path: OutputPath, extractor: FeatureExtractor) -> list[HandEyeRun]:
     """Stored runs of this code and these weights."""
-    try:
-        stored = parse_json(read_bytes(path.path, VALUES))
-        return [HandEyeRun(**run) for run in stored["runs"]] if stored["of"] == _of(extractor) else []
-    except (OSError, ValueError, KeyError, TypeError):
-        return []
+    return [HandEyeRun(**run) for run in stored(path, "runs", _of(extractor)) or []]
 
 
 def measure_hand_eye(
@@ -232,41 +222,42 @@ def hand_eye_table(runs: list[HandEyeRun]) -> Table | None:
         if found := [run for run in runs if run.condition == condition.name]:
             right = [run for run in found if _near(run, condition)]
             others = Counter(run.verdict for run in found if run not in right)
-            cells = (
-                condition.name,
-                f"{len(right)} of {len(found)}",
-                f"{max(run.angle_deg for run in right):.2f}" if right else NOTHING,
-                f"{1e3 * max(run.distance for run in right):.1f}" if right else NOTHING,
-                ", ".join(f"{count} {verdict}" for verdict, count in others.items()),
+            rows.append(
+                {
+                    "target and start": condition.name,
+                    "near enough": f"{len(right)} of {len(found)}",
+                    "largest angle [deg]": f"{max(run.angle_deg for run in right):.2f}" if right else NOTHING,
+                    "largest distance [mm]": f"{1e3 * max(run.distance for run in right):.1f}" if right else NOTHING,
+                    "verdicts on others": ", ".join(f"{count} {verdict}" for verdict, count in others.items()),
+                }
             )
-            rows.append(tuple(map(Cell, cells)))
-    caption = (
-        f"A drawn robot of seven joints, which no network was trained on, in {_VIEWS} poses of 640 x 480 pixels; only "
-        "its base frame is free. Largest errors are those of the starts that ended near enough."
+    return Table.of(
+        "Hand-eye calibration of another robot",
+        f"A synthetic robot of seven joints, in no training data, in {_VIEWS} poses of 640 x 480 pixels; only its base "
+        "frame is free. Largest errors are those of the starts that ended near enough.",
+        rows,
     )
-    header = ("target and start", "near enough", "largest angle [deg]", "largest distance [mm]", "verdicts on others")
-    return Table("Hand-eye calibration of another robot", caption, header, tuple(rows)) if rows else None
 
 
 def hand_eye_targets(runs: list[HandEyeRun]) -> list[Target]:
     """Targets of hand-eye calibration."""
-    found = []
-    for condition in CONDITIONS:
-        own = [run for run in runs if run.condition == condition.name]
-        right = [run for run in own if _near(run, condition) or (not condition.masks and run.verdict == "failed")]
-        within = f"{condition.most_deg:g} degrees and {1e3 * condition.most_distance:g} mm"
-        found.append(
-            make_target(
-                f"hand-eye from {condition.name}: within {within}" + ("" if condition.masks else ", or called failed"),
-                0.9 if condition.masks else 1.0,
-                len(right) / len(own) if own else None,
-                counted(len(own), "start"),
-                at_least=True,
-                text=lambda value: f"{100 * value:.0f} %",
-                complete=len(own) >= _STARTS,
-            )
-        )
-    return found
+    return [
+        Goal(
+            f"hand-eye from {condition.name}: within {condition.most_deg:g} degrees and "
+            f"{1e3 * condition.most_distance:g} mm" + ("" if condition.masks else ", or called failed"),
+            0.9 if condition.masks else 1.0,
+            partial(_reached, condition),
+            lambda value: f"{100 * value:.0f} %",
+        ).target(runs)
+        for condition in CONDITIONS
+    ]
+
+
+def _reached(condition: HandEyeCondition, runs: list[HandEyeRun]) -> Reached:
+    own = [run for run in runs if run.condition == condition.name]
+    right = [run for run in own if _near(run, condition) or (not condition.masks and run.verdict == "failed")]
+    share = len(right) / len(own) if own else None
+    return Reached(share, counted(len(own), "start"), complete=len(own) >= _STARTS)
 
 
 def _near(run: HandEyeRun, condition: HandEyeCondition) -> bool:

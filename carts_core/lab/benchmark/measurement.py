@@ -55,21 +55,19 @@ _MEASURED = (
 
 
 def code_fingerprint(patterns: tuple[str, ...] = _MEASURED) -> str:
-    """SHA-256 over modules of the package; by default those that decide what a method returns, and how it is scored."""
+    """SHA-256 over modules of the package; by default those that influence estimates and scores."""
     return fingerprints.code_fingerprint(patterns)
 
 
 def run_fingerprint(
     run: Run, scope: Scope, extractor: FeatureExtractor, source: str, baseline: str | None = None
 ) -> str:
-    """SHA-256 over everything that a run's result depends on, but the machine.
+    """SHA-256 over all inputs of a run but the machine.
 
     Args:
-        run: the run.
-        scope: with the number of steps in the paper's setting.
-        extractor: the network and its device.
+        run, scope, extractor: of the benchmark.
         source: fingerprint of the images and kinematics.
-        baseline: of the weights of a baseline, where the run is one's.
+        baseline: SHA-256 of the weights of a baseline.
     """
     method = METHODS[run.method]
     settings = to_plain(method.settings(scope.steps(run))) if method.settings else {}
@@ -80,7 +78,7 @@ def run_fingerprint(
 
 
 BEST_OF = (30, 50)
-"""Steps after which the best iterate has a row of its own in the tables."""
+"""Numbers of steps whose best iterate is a row of the tables."""
 
 
 @dataclass(frozen=True)
@@ -102,8 +100,8 @@ class Score:
     seconds: float
     """Wall time from the frame's arrival until this estimate was known [s]; scoring does not count."""
     nsd_wide: float | None = None
-    """The same as `nsd` within `WIDE_TOLERANCE`; None on the way from start to end, but for what the optimizer
-    held for the best at the end, or after so many steps as `BEST_OF` says."""
+    """The same within `WIDE_TOLERANCE`; None for intermediate iterates, except the best ones at the end and after
+    the steps of `BEST_OF`."""
 
 
 @dataclass(frozen=True)
@@ -113,15 +111,15 @@ class Measurement:
     run: Run
     final: Score
     """Score of the method's result."""
-    trace: tuple[Score, ...]
-    """Scores of all iterates, the start first; empty for a method without iterates."""
-    best: tuple[int, ...]
-    """For each iterate, the place of the one that the optimizer held for the best when it had come there. Losses of a
-    coarse and a fine stage need not compare, so only the optimizer knows."""
     stopped: str
     """Reason why the optimization ended."""
     machine: str
     """Description of the machine."""
+    trace: tuple[Score, ...] = ()
+    """Scores of all iterates, the start first; empty for a method without iterates."""
+    best: tuple[int, ...] = ()
+    """For each iterate, the index of the optimizer's best one so far. Losses of different stages do not compare, so it
+    does not follow from the losses."""
     before: Score | None = None
     """Score of the start, where the trace does not begin with it."""
     verdict: str | None = None
@@ -161,7 +159,7 @@ class Measurement:
         return [self.trace[place] for place in self.best]
 
     def to_json(self) -> dict[str, Any]:
-        """The measurement without what identifies its settings; lists by column keep the line short."""
+        """The measurement as JSON values; the trace is stored by column to keep the line short."""
         names = [field.name for field in fields(Score)]
         return {
             "run": asdict(self.run),
@@ -211,10 +209,7 @@ def _rounded(values: dict[str, float | None]) -> dict[str, float | None]:
 
 
 class ResultsFile:
-    """Measurements on disk. A run that is killed loses at most the line that it was writing.
-
-    Args:
-        path: the file; it need not exist.
+    """File of measurements, one JSON line each; a killed run loses at most the last line.
 
     Raises:
         CartsError: the file cannot be read.
@@ -244,12 +239,7 @@ class ResultsFile:
         return self._known.get((run, fingerprint))
 
     def append(self, measurement: Measurement, fingerprint: str, **also: str) -> None:
-        """Append a measurement, and flush it to disk.
-
-        Args:
-            measurement: what was measured.
-            fingerprint: of all that it depends on; see `fingerprints`.
-            also: further facts for the line, for whoever reads the file.
+        """Append a measurement and its fingerprint, with further facts for readers of the file, and flush it to disk.
 
         Raises:
             OutputError: the file cannot be written.
@@ -257,7 +247,7 @@ class ResultsFile:
         entry = measurement.to_json()
         line = json.dumps({"fingerprint": fingerprint, **also, **entry}, separators=(",", ":"))
         append_line(self.path, line.encode())
-        # As it will be read again, so that a report does not depend on when it is written.
+        # Rounded as in the file, so that a report does not depend on the time of writing.
         self._known[measurement.run, fingerprint] = Measurement.from_json(entry)
 
 
@@ -351,13 +341,18 @@ def optimizer_figures(sequence: Sequence, iterations: int) -> dict[str, float]:
 _RUNS = 10
 
 
+def stored(path: OutputPath, name: str, of: list[str]) -> Any:
+    """Value of a name in a file that was written for the same machine, weights and code; None without one."""
+    try:
+        content = parse_json(read_bytes(path.path, VALUES))
+        return content[name] if content["of"] == of else None
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+
+
 def known_stages(path: OutputPath, extractor: FeatureExtractor) -> dict[str, float]:
     """Stored times of this machine and this code."""
-    try:
-        stored = parse_json(read_bytes(path.path, VALUES))
-        return stored["ms"] if stored["of"] == _of(extractor) else {}
-    except (OSError, ValueError, KeyError, TypeError):
-        return {}
+    return stored(path, "ms", _of(extractor)) or {}
 
 
 def measure_stages(path: OutputPath, extractor: FeatureExtractor) -> None:

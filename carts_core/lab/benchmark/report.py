@@ -5,9 +5,7 @@ import io
 import json
 from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass
-from html import escape
 from pathlib import Path
-from string import Template
 
 import matplotlib
 import numpy as np
@@ -16,18 +14,21 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
 from ...files import OutputPath, csv_cell, output_stream, write_text
-from ...html import STYLE, Table, anchor, figure_html, section_html, table_html
+from ...html import Table, render_page
 from ...wording import counted
 from . import paper
 from .hand_eye import HandEyeRun, hand_eye_table, hand_eye_targets
-from .measurement import BEST_OF, TOLERANCE, Measurement, Score
+from .measurement import BEST_OF, TOLERANCE, Measurement
 from .scope import SYNTHETIC
-from .statistics import DOMAIN_LABELS, SHORT_LABELS, Measurements, Spread, Target, scores
+from .statistics import DICE, DOMAIN_LABELS, JOINT_MAE, SHORT_LABELS, Measurements, scores
 from .tables import (
     ROWS,
     calibration_table,
     camera_table,
+    deviation_table,
     error_tables,
+    family_table,
+    image_alone_table,
     iteration_tables,
     main_tables,
     occlusion_table,
@@ -36,52 +37,10 @@ from .tables import (
     sequence_table,
     speed_table,
     stage_table,
+    verdict_table,
     worse_table,
 )
-from .targets import deviation_table, family_table, image_alone_table, targets, verdict_table
-
-PAGE = """<!doctype html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<title>CaRTS benchmark</title>
-<style>$style</style>
-</head>
-<body>
-<h1>CaRTS benchmark</h1>
-$facts
-<nav><a href="#targets">Targets</a> <a href="#figures">Figures</a> $contents
-<a href="#method">How it is measured</a></nav>
-<section id="targets"><h2>Targets</h2>
-<p>Of the default solver. Target, figure and verdict are computed from the runs of this report; the line below each says
-from how many. One that lacks a domain or a device it asks for is open. From 2 or 3 runs, as in the quick form, a
-verdict may be chance.</p>
-<div class="wide">$targets</div></section>
-<section id="figures"><h2>Figures</h2>$figures</section>
-$sections
-<section id="method"><h2>How it is measured</h2>
-<p>Every method gets the same image, the same mean background and the same wrong joint positions of a frame, and works
-on that frame alone, in one camera, unless a table says otherwise. Its mask is drawn by the renderer at the camera's
-size from the joint positions that it returns (the U-Net's is its own) and compared with the given mask.</p>
-<p><b>Dice</b>: overlap of the masks. <b>NSD</b>: share of both masks' outlines within $tolerance px of each other.
-<b>Joint MAE</b>: mean absolute error of the measured revolute joints of all arms.</p>
-<p><b>Paper's setting</b>: Adam with step size 1e-3, times 0.9 every 5 steps, the paper's form of the loss, no prior,
-with our renderer and network. It is not the original implementation, whose renderer has no silhouette gradient.
-<b>Best of n</b>: the iterate of the lowest loss among the first n steps, the start included.</p>
-<p><b>Synthetic frames</b> are path-traced and were made for this benchmark, with a seed that nothing was tuned on.
-<b>Real frames</b> are altered in memory: blood, smoke and low light by the code of the synthetic domains, over the
-depth of the arms as measured before a plane; another background by compositing with the given masks.</p>
-<p><b>Occluders</b> are laid over regular frames, synthetic and real ones: gauze, tissue or cloth with its own texture,
-folds and a soft shadow. Nothing is compared where they are. <i>Proposed</i>: a first solution, then a second one
-without the areas at the arms that contradict the first.</p>
-<p>Small grey numbers are the paper's, after the column where they stand there (R: its real recording, S: its synthetic
-one). They were taken on its own recordings, so they show trends and are no race: $source.</p>
-</section>
-</body>
-</html>
-"""
-
+from .targets import targets
 
 matplotlib.use("Agg")
 # Same measurements, same bytes.
@@ -129,18 +88,15 @@ def _domains(data: Measurements) -> Figure | None:
         domains = data.domains(source)
         lowest = 1.0
         for number, (label, method, steps) in enumerate(ROWS):
-            spreads = [
-                Spread.of(
-                    score.dice
-                    for score in scores(data.of(source=source, domain=d, method=method, error_deg=None), steps)
-                )
-                for d in domains
-            ]
-            places = [index + 0.13 * (number - 2.5) for index, spread in enumerate(spreads) if spread]
-            known = [spread for spread in spreads if spread]
-            axes.bar(places, [s.mean for s in known], 0.12, color=_BARS[number], label=label)
-            axes.errorbar(places, [s.mean for s in known], [s.deviation for s in known], fmt="none", color="#333", lw=1)
-            lowest = min([lowest, *(s.mean - s.deviation for s in known)])
+            found = {
+                index + 0.13 * (number - 2.5): np.array([score.dice for score in chosen])
+                for index, domain in enumerate(domains)
+                if (chosen := scores(data.of(source=source, domain=domain, method=method, error_deg=None), steps))
+            }
+            means, deviations = [dice.mean() for dice in found.values()], [dice.std() for dice in found.values()]
+            axes.bar(list(found), means, 0.12, color=_BARS[number], label=label)
+            axes.errorbar(list(found), means, deviations, fmt="none", color="#333", lw=1)
+            lowest = min([lowest, *(mean - deviation for mean, deviation in zip(means, deviations, strict=True))])
         axes.set_xticks(range(len(domains)), [DOMAIN_LABELS[domain] for domain in domains])
         axes.set(title=f"{source} frames", ylabel="Dice", ylim=(max(0.0, np.floor(10 * lowest - 0.5) / 10), 1.0))
         axes.grid(axis="y", alpha=0.3)
@@ -206,16 +162,16 @@ def _errors(data: Measurements) -> Figure | None:
         return None
     figure = Figure(figsize=(9, 3.4), layout="constrained")
     dice_axes, mae_axes = figure.subplots(1, 2)
-    for axes, value, table, scale in (
-        (dice_axes, _dice, paper.DICE_BY_ERROR, 0.01),
-        (mae_axes, _mae, paper.MAE_BY_ERROR, 1.0),
+    for axes, figure_of, table, scale in (
+        (dice_axes, DICE, paper.DICE_BY_ERROR, 0.01),
+        (mae_axes, JOINT_MAE, paper.MAE_BY_ERROR, 1.0),
     ):
         for method, color in COLORS.items():
             runs = data.of(source=SYNTHETIC, domain="regular", method=method)
             degrees = sorted({m.run.error_deg for m in runs if m.run.error_deg is not None})
-            spreads = [Spread.of(value(m.final) for m in runs if m.run.error_deg == error) for error in degrees]
-            known = [(error, spread) for error, spread in zip(degrees, spreads, strict=True) if spread]
-            _with_bars(axes, [(e, s.mean, s.deviation) for e, s in known], color, "o-", SHORT_LABELS[method])
+            found = {error: figure_of.values(m.final for m in runs if m.run.error_deg == error) for error in degrees}
+            known = [(e, float(np.mean(values)), float(np.std(values))) for e, values in found.items() if values]
+            _with_bars(axes, known, color, "o-", SHORT_LABELS[method])
         points = [(error, scale * mean, scale * deviation) for error, (mean, deviation) in table["S-Reg"].items()]
         _with_bars(axes, points, "#777", "x--", "paper's own numbers (S-Reg)")
     dice_axes.set(title="Dice", xlabel="error of every joint at the start [deg]", ylabel="Dice")
@@ -233,10 +189,10 @@ def _with_bars(axes: Axes, points: list[tuple[float, float, float]], color: str,
 
 def _scatter(data: Measurements) -> Figure | None:
     panels = [
-        (source, name, value)
+        (source, value)
         for source in data.sources()
-        for name, value in (("Dice", _dice), ("joint MAE [deg]", _mae))
-        if any(m.start is not None and value(m.final) is not None for m in data.of(source=source))
+        for value in (DICE, JOINT_MAE)
+        if value.values(m.final for m in data.of(source=source) if m.start)
     ]
     if not panels:
         return None
@@ -246,16 +202,17 @@ def _scatter(data: Measurements) -> Figure | None:
     grid = figure.subplots(rows, columns, squeeze=False).flatten()
     for axes in grid[len(panels) :]:
         axes.set_axis_off()
-    for axes, (source, name, value) in zip(grid, panels, strict=False):
+    for axes, (source, value) in zip(grid, panels, strict=False):
         for method, color in COLORS.items():
-            known = [m for m in data.of(source=source, method=method) if m.start and value(m.final) is not None]
-            x, y = [m.start.dice for m in known if m.start], [value(m.final) for m in known]
+            runs = data.of(source=source, method=method)
+            known = [m for m in runs if m.start and value.values([m.final])]
+            x, y = DICE.values(m.start for m in known), value.values(m.final for m in known)
             axes.scatter(x, y, s=12, color=color, alpha=0.6, label=SHORT_LABELS[method], lw=0)
-        if name == "Dice":
+        if value is DICE:
             limits = axes.get_xlim(), axes.get_ylim()
             axes.axline((0.9, 0.89), slope=1, color="#999", lw=1, ls="--")
             axes.set(xlim=limits[0], ylim=limits[1])
-        axes.set(title=f"{source} frames", xlabel="Dice at the start", ylabel=f"{name} after")
+        axes.set(title=f"{source} frames", xlabel="Dice at the start", ylabel=f"{value.heading} after")
     _finish(grid[: len(panels)])
     return figure
 
@@ -265,14 +222,6 @@ def _finish(axes_of_figure: Iterable[Axes]) -> None:
         axes.grid(alpha=0.3)
         if axes.get_legend_handles_labels()[0]:
             axes.legend(fontsize=8)
-
-
-def _dice(score: Score) -> float | None:
-    return score.dice
-
-
-def _mae(score: Score) -> float | None:
-    return score.joint_mae_deg
 
 
 @dataclass(frozen=True)
@@ -302,10 +251,10 @@ def write_report(
     """Write `report.html`, `figures/`, `results.json` and `results.csv`; returns the page's path.
 
     Args:
-        folder: where to.
+        folder: of these files.
         measurements: the runs.
-        facts: where they come from.
-        stages: of an iteration -> milliseconds; may be empty.
+        facts: their provenance.
+        stages: stage of an iteration -> milliseconds; may be empty.
         hand_eye: calibrations of another robot; may be empty.
 
     Raises:
@@ -322,7 +271,7 @@ def write_report(
         "measured": len(measurements),
         "machines": _machines(measurements),
         "targets": [asdict(target) for target in verdicts],
-        "tables": [asdict(table) for _, tables in sections for table in tables],
+        "tables": [asdict(table) for tables in sections.values() for table in tables],
         "stages_ms": stages,
         "hand_eye": [asdict(run) for run in hand_eye],
         "paper": {
@@ -336,45 +285,41 @@ def write_report(
     }
     write_text(folder / "results.json", json.dumps(document, indent=1))
     write_text(folder / "results.csv", _csv(rows))
-    page = Template(PAGE).substitute(
-        style=STYLE,
+    page = render_page(
+        "benchmark.html",
+        title="CaRTS benchmark",
         facts=_facts(facts, measurements),
-        targets=_targets(verdicts),
-        contents="".join(f'<a href="#{anchor(title)}">{escape(title)}</a> ' for title, _ in sections),
-        sections="".join(_section(title, tables) for title, tables in sections),
-        figures="".join(figure_html(caption, path.relative_to(folder.path)) for caption, path in figures.items()),
+        warnings=_warnings(facts, measurements),
+        targets=verdicts,
+        figures={caption: path.relative_to(folder.path).as_posix() for caption, path in figures.items()},
+        sections=sections,
         tolerance=f"{TOLERANCE:g}",
-        source=escape(paper.SOURCE),
+        source=paper.SOURCE,
     )
     path = folder / "report.html"
     write_text(path, page)
     return path.path
 
 
-def _sections(
-    data: Measurements, stages: dict[str, float], hand_eye: list[HandEyeRun]
-) -> list[tuple[str, list[Table]]]:
+def _sections(data: Measurements, stages: dict[str, float], hand_eye: list[HandEyeRun]) -> dict[str, list[Table]]:
     """Title -> tables."""
     compared = data.compared()
-    return [
-        ("Main table", [*main_tables(data), *_known(image_alone_table(compared))]),
-        ("Iterations", iteration_tables(data)),
-        ("Error at the start", error_tables(compared)),
-        ("Occlusion", _known(occlusion_table(data))),
-        ("Several cameras", _known(camera_table(data))),
-        ("Calibration", _known(calibration_table(data))),
-        ("Sequence mode", _known(sequence_table(data))),
-        ("Other rooms", _known(room_table(data))),
-        ("Other instruments", _known(family_table(data))),
-        ("Hand-eye calibration", _known(hand_eye_table(hand_eye))),
-        ("Verdicts and deviations", _known(verdict_table(data), deviation_table(data))),
-        ("Speed and safety", _known(speed_table(compared), pair_table(data), worse_table(data))),
-        ("Stages", [stage_table(stages)] if stages else []),
-    ]
-
-
-def _known(*tables: Table | None) -> list[Table]:
-    return [table for table in tables if table is not None]
+    sections: dict[str, list[Table | None]] = {
+        "Main table": [*main_tables(data), image_alone_table(compared)],
+        "Iterations": [*iteration_tables(data)],
+        "Error at the start": [*error_tables(compared)],
+        "Occlusion": [occlusion_table(data)],
+        "Several cameras": [camera_table(data)],
+        "Calibration": [calibration_table(data)],
+        "Sequence mode": [sequence_table(data)],
+        "Other rooms": [room_table(data)],
+        "Other instruments": [family_table(data)],
+        "Hand-eye calibration": [hand_eye_table(hand_eye)],
+        "Verdicts and deviations": [verdict_table(data), deviation_table(data)],
+        "Speed and safety": [speed_table(compared), pair_table(data), worse_table(data)],
+        "Stages": [stage_table(stages)],
+    }
+    return {title: [table for table in tables if table] for title, tables in sections.items()}
 
 
 def _row(measurement: Measurement) -> dict[str, object]:
@@ -417,36 +362,20 @@ def _machines(measurements: list[Measurement]) -> list[str]:
     return sorted({measurement.machine for measurement in measurements})
 
 
-def _facts(facts: Facts, measurements: list[Measurement]) -> str:
-    machines = _machines(measurements)
-    lines = {
+def _facts(facts: Facts, measurements: list[Measurement]) -> dict[str, str]:
+    return {
         "runs": f"{len(measurements)} of {facts.planned} measured ({facts.scope})",
         **{f"{name} frames": description for name, description in facts.sources.items()},
-        "machine": "; ".join(machines) or "-",
+        "machine": "; ".join(_machines(measurements)) or "-",
         "carts": f"{facts.version}, measured code {facts.code[:12]}",
         "weights": facts.weights[:12],
     }
-    rows = "".join(f"<tr><th>{escape(name)}</th><td>{escape(text)}</td></tr>" for name, text in lines.items())
-    warnings = []
+
+
+def _warnings(facts: Facts, measurements: list[Measurement]) -> list[str]:
+    found = []
     if len(measurements) < facts.planned:
-        warnings.append("Not everything has been measured yet; run the same command again to go on.")
-    if len(machines) > 1:
-        warnings.append("Runs come from more than one machine or number of threads, so seconds do not compare.")
-    notes = "".join(f'<p class="warning">{escape(warning)}</p>' for warning in warnings)
-    return f'<table class="facts">{rows}</table>{notes}'
-
-
-def _targets(verdicts: list[Target]) -> str:
-    words = {True: ("met", "met"), False: ("missed", "missed"), None: ("open", "open")}
-    rows = "".join(
-        f"<tr><td>{escape(target.what)}<small>{escape(target.basis)}</small></td>"
-        f"<td>{escape(target.target)}</td><td>{escape(target.reached)}</td>"
-        f'<td class="{words[target.met][0]}">{words[target.met][1]}</td><td>{escape(target.reference)}</td></tr>'
-        for target in verdicts
-    )
-    header = "".join(f"<th>{name}</th>" for name in ("what", "target", "reached", "verdict", "reference"))
-    return f'<table class="targets"><thead><tr>{header}</tr></thead><tbody>{rows}</tbody></table>'
-
-
-def _section(title: str, tables: list[Table]) -> str:
-    return section_html(title, "".join(map(table_html, tables)) or "<p>Not measured.</p>")
+        found.append("Not everything has been measured yet; run the same command again to resume.")
+    if len(_machines(measurements)) > 1:
+        found.append("Runs come from more than one machine or number of threads, so seconds do not compare.")
+    return found

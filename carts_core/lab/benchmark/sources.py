@@ -1,4 +1,4 @@
-"""Where the evaluated frames come from: a synthetic sequence that nothing was tuned on, and a real one if given."""
+"""Sources of frames: a synthetic sequence that served no tuning, a real one if given, other rooms and instruments."""
 
 import hashlib
 from collections.abc import Callable, Iterable
@@ -26,18 +26,18 @@ from .rooms import AnotherRoom, made_rooms, photographs
 from .scope import FAMILY, REAL, ROOMS, SYNTHETIC, Scope
 
 TEST_SEED = 730_511
-"""Of the synthetic sequence. Nothing else may use it: no training, no tuning, no shipped data."""
+"""Seed of the synthetic sequence, reserved for the benchmark."""
 HELD_OUT = ("curved_scissors", "clip_applier")
-"""Built-in instruments of the families that no training has."""
+"""Built-in instruments in no training data."""
 _FAMILY_DOMAINS = ("regular", "smoke")
 _MOTION_SECONDS = 6.0
-_SYNTHESIS = ("lab/synthesis/*.py", "settings/synthesis.py")
+_SYNTHESIS = ("lab/synthesis/*.py", "settings/synthesis.py", "templates/synthetic_sequence.toml")
 _ROOMS_CODE = ("lab/benchmark/rooms.py",)
 _ALTERING_CODE = ("lab/benchmark/counterfactual.py",)
 
 
 class Recording(Protocol):
-    """What `Sequence` and `Counterfactual` have in common."""
+    """Interface of `Sequence`, `Counterfactual` and `AnotherRoom`."""
 
     scene: Scene
     measured_joints: dict[str, tuple[str, ...]]
@@ -56,7 +56,7 @@ class Recording(Protocol):
         ...
 
     def mean_background(self, camera: str, domain: str | None = None) -> MeanBackground:
-        """The same with where it is known."""
+        """The mean background and the pixels where it is known."""
         ...
 
 
@@ -67,9 +67,9 @@ class Source:
     name: str
     """`synthetic`, `real`, or `rooms` and a camera."""
     description: str
-    """For people: which frames these are."""
+    """Description for the report."""
     camera: str
-    """The camera that takes part, and in which is scored."""
+    """The camera that is optimized and scored."""
     frames: list[int]
     """Positions of the frames on which all methods are evaluated."""
     fingerprint: str
@@ -80,9 +80,9 @@ class Source:
     consecutive: list[int] = field(default_factory=list)
     """Positions of frames that are corrected together."""
     rooms: list[str] = field(default_factory=list)
-    """The rooms that these frames are put into, where that is what the source does."""
+    """Rooms of a source of frames in other rooms."""
     domains: tuple[str, ...] = DOMAINS
-    """The synthetic domains that it has."""
+    """Its synthetic domains."""
     length: int = 1
     """Frames of the whole recording."""
 
@@ -93,7 +93,7 @@ class Source:
 
 
 def synthetic_source(scope: Scope, seed: int = TEST_SEED) -> Source:
-    """A synthetic sequence; it is made when it is first opened, and kept in the cache.
+    """A synthetic sequence, rendered into the cache when it is first opened.
 
     Raises:
         SettingsError: the seed is that of the shipped sequence.
@@ -129,7 +129,7 @@ def synthetic_source(scope: Scope, seed: int = TEST_SEED) -> Source:
 
 
 def family_sources(scope: Scope, seed: int = TEST_SEED) -> list[Source]:
-    """A synthetic sequence for each instrument of the families that no training has."""
+    """A synthetic sequence for each instrument in no training data."""
     frames, sources = scope.family_frames, []
     for robot in HELD_OUT if frames else ():
         config = SynthesisConfig(
@@ -158,7 +158,7 @@ def family_sources(scope: Scope, seed: int = TEST_SEED) -> list[Source]:
 
 
 def _made_once(config: SynthesisConfig) -> tuple[str, Callable[[Progress], Sequence]]:
-    """The fingerprint of a synthetic sequence, and what makes it in the cache, or finds it there."""
+    """The fingerprint of a synthetic sequence, and a function that opens it, rendered into the cache if missing."""
     fingerprint = hashlib.sha256(repr((config, code_fingerprint(_SYNTHESIS))).encode()).hexdigest()[:32]
     folder = output_path(cache_dir(), "benchmark", f"sequence_{config.seed}_{fingerprint[:8]}")
 
@@ -212,12 +212,7 @@ def real_source(path: Path, scope: Scope, seed: int = TEST_SEED) -> Source:
 
 
 def synthetic_room_source(sequence: Source, folder: Path | None, scope: Scope, seed: int = TEST_SEED) -> Source:
-    """The instruments of the synthetic sequence, put into other rooms.
-
-    Args:
-        sequence: the synthetic one.
-        folder, scope, seed: as for `room_sources`.
-    """
+    """The instruments of the synthetic sequence before other rooms; arguments as for `room_sources`."""
     rooms, fingerprint = _rooms(folder, scope, sequence.fingerprint, seed)
     frames = [sequence.frames[place] for place in spread(len(sequence.frames), scope.room_frames)]
 
@@ -239,7 +234,7 @@ def synthetic_room_source(sequence: Source, folder: Path | None, scope: Scope, s
 
 
 def _rooms(folder: Path | None, scope: Scope, *parts: object):
-    """The rooms, and a hash over them and what else is given."""
+    """The rooms, and a hash over them and `parts`."""
     rooms = (made_rooms() + (photographs(folder) if folder else []))[:: scope.room_share]
     fingerprint = hashlib.sha256(repr((*parts, code_fingerprint(_ROOMS_CODE))).encode())
     for photograph in sorted(folder.glob("*")) if folder else []:
@@ -248,12 +243,12 @@ def _rooms(folder: Path | None, scope: Scope, *parts: object):
 
 
 def room_sources(path: Path, folder: Path | None, scope: Scope, seed: int = TEST_SEED) -> list[Source]:
-    """The frames of a real sequence that have a mask, put into other rooms: a source for each camera that has masks.
+    """A source for each camera of a real sequence that has masks, with its instruments before other rooms.
 
     Args:
         path: of the sequence.
-        folder: with photographs, which are rooms beside the made ones; None for no photographs.
-        scope: how much is measured.
+        folder: of photographs, which are rooms beside the synthetic ones; may be None.
+        scope: of the benchmark.
         seed: of light and noise.
 
     Raises:

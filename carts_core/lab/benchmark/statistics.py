@@ -1,14 +1,15 @@
-"""Measurements of a benchmark: selection, means and deviations, pairs of methods, and labels of tables."""
+"""Measurements of a benchmark: selection, means and deviations, pairs of methods, and texts of tables."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
 
+from ...html import Cell
 from ...settings import DOMAINS
 from . import paper
 from .conditions import OCCLUSION
-from .measurement import Measurement, Score
+from .measurement import TOLERANCE, WIDE_TOLERANCE, Measurement, Score
 from .rooms import Half
 from .scope import FAMILY, MAIN, PAPERS_STEPS, ROOMS
 
@@ -16,23 +17,8 @@ ANY = object()
 """Matches every error at the start."""
 
 
-@dataclass(frozen=True)
-class Spread:
-    """Mean and standard deviation over frames."""
-
-    mean: float
-    deviation: float
-    count: int
-
-    @staticmethod
-    def of(values: Iterable[float | None]) -> "Spread | None":
-        """Spread of the known values; None without any."""
-        known = [value for value in values if value is not None]
-        return Spread(float(np.mean(known)), float(np.std(known)), len(known)) if known else None
-
-
 class Measurements:
-    """Measurements, and selections of them."""
+    """Measurements and selections of them."""
 
     def __init__(self, measurements: Iterable[Measurement]) -> None:
         self.all = list(measurements)
@@ -45,10 +31,10 @@ class Measurements:
         method: str | None = None,
         error_deg: object = ANY,
     ) -> list[Measurement]:
-        """The measurements that match; what is not named matches everything, `error_deg=None` the measured start.
+        """Measurements that match all given arguments; `error_deg=None` is the measured start.
 
-        Pictures with occluders, other rooms and instruments that no training has are none of the usual conditions: they
-        match only where their domain or source is named.
+        Frames with occluders or in other rooms, and instruments in no training data, match only if their domain or
+        source is given.
         """
         return [
             measurement
@@ -60,12 +46,12 @@ class Measurements:
         ]
 
     def compared(self) -> "Measurements":
-        """Those on frames on which all methods are evaluated; of the others only some methods know."""
+        """Measurements on frames on which all methods are evaluated."""
         frames = {(m.run.source, m.run.frame) for m in self.all if m.run.method in MAIN and m.run.error_deg is None}
         return Measurements(m for m in self.all if (m.run.source, m.run.frame) in frames)
 
     def default_solver(self) -> list[Measurement]:
-        """Its runs with one camera and nothing else to go by: each frame alone, occluders or not, and in sequences."""
+        """Runs of the default solver with one camera: each frame alone, with or without occluders, and in sequences."""
         return [*self.of(method="ours"), *self.of(method="ours", domain=OCCLUSION), *self.of(method="sequence")]
 
     def domains(self, source: str) -> list[str]:
@@ -73,17 +59,17 @@ class Measurements:
         return list(dict.fromkeys(measurement.run.domain for measurement in self.of(source=source)))
 
     def sources(self) -> list[str]:
-        """The usual sources that occur, without other rooms and other instruments."""
+        """The sources that occur, without other rooms and other instruments."""
         found = dict.fromkeys(measurement.run.source for measurement in self.all)
         return [source for source in found if _usual(source)]
 
     def families(self) -> list[str]:
-        """The sources that occur of instruments that no training has."""
+        """The sources that occur of instruments in no training data."""
         found = dict.fromkeys(measurement.run.source for measurement in self.all)
         return [source for source in found if source.startswith(FAMILY)]
 
     def in_rooms(self, camera: str, half: Half, method: str) -> list[Measurement]:
-        """Those of a camera's frames in the other rooms of one half."""
+        """Measurements of a camera's frames in the rooms of one half."""
         return [
             measurement
             for measurement in self.all
@@ -93,7 +79,7 @@ class Measurements:
         ]
 
     def room_cameras(self) -> list[str]:
-        """The cameras whose frames were put into other rooms."""
+        """The cameras with frames in other rooms."""
         found = dict.fromkeys(m.run.source for m in self.all if m.run.source.startswith(ROOMS))
         return [source.removeprefix(ROOMS).strip() for source in found]
 
@@ -123,43 +109,63 @@ NOTHING = "–"
 """Placeholder for a missing number."""
 
 
+@dataclass(frozen=True)
+class Figure:
+    """A figure of scores and its form in tables."""
+
+    heading: str
+    name: str
+    """Field of `Score`."""
+    scale: float = 1.0
+    digits: int = 2
+
+    def values(self, scores: Iterable[Score | None]) -> list[float]:
+        """The known values."""
+        found = (getattr(score, self.name) for score in scores if score is not None)
+        return [value for value in found if value is not None]
+
+    def text(self, scores: Iterable[Score | None]) -> str:
+        """Mean ± standard deviation; a single value has no deviation."""
+        if not (values := self.values(scores)):
+            return NOTHING
+        mean = f"{self.scale * np.mean(values):.{self.digits}f}"
+        return mean if len(values) == 1 else f"{mean} ± {self.scale * np.std(values):.{self.digits}f}"
+
+    def cell(self, scores: Iterable[Score | None], theirs: paper.Value | None = None, column: str = "") -> Cell:
+        """The text, and the paper's number below it with the name of its column there."""
+        note = "" if theirs is None else f"{column} {theirs[0]:.{self.digits}f} ± {theirs[1]:.{self.digits}f}"
+        return Cell(self.text(scores), note)
+
+
+DICE = Figure("Dice", "dice", 100.0, 1)
+NSD = Figure(f"NSD at {TOLERANCE:g} px", "nsd", 100.0, 1)
+WIDE_NSD = Figure(f"NSD at {WIDE_TOLERANCE:g} px", "nsd_wide", 100.0, 1)
+JOINT_MAE = Figure("joint MAE [deg]", "joint_mae_deg")
+VISIBLE_MAE = Figure("visible joints [deg]", "visible_joint_mae_deg")
+TIP_DEPTH = Figure("depth of the tips [mm]", "tip_depth_mm")
+
+
 def begun(error_deg: float | None) -> str:
     """Start of a run, for tables."""
     return "as measured" if error_deg is None else f"{error_deg:g}°"
 
 
-def spread_text(spread: Spread | None, scale: float = 100.0, digits: int = 1) -> str:
-    """Mean ± standard deviation, Dice and NSD in percent by default; of a single frame there is no deviation."""
-    if spread is None:
-        return NOTHING
-    if spread.count == 1:
-        return f"{scale * spread.mean:.{digits}f}"
-    return f"{scale * spread.mean:.{digits}f} ± {scale * spread.deviation:.{digits}f}"
-
-
-def paper_note(value: paper.Value | None, column: str | None, digits: int = 1) -> str:
-    """The paper's number and the column where it stands there."""
-    if value is None:
-        return ""
-    return f"{column} {value[0]:.{digits}f} ± {value[1]:.{digits}f}"
-
-
 GAINED = 0.01
-"""Dice that the paper's setting has to gain, or there is nothing to be faster at."""
+"""Least gain in Dice of the paper's setting for a comparison of speed."""
 
 
 @dataclass(frozen=True)
 class Pair:
-    """How long both take to the Dice that the paper's setting ends with."""
+    """Times of both methods to the final Dice of the paper's setting."""
 
     source: str
     error_deg: float | None
     gained: bool
     """Whether the paper's setting gained enough to compare."""
     papers: float
-    """Until the best iterate of the paper's setting first has the Dice of its best of `PAPERS_STEPS` [s]."""
+    """Time until the best iterate of the paper's setting has the Dice of its best of `PAPERS_STEPS` [s]."""
     ours: float | None
-    """Until ours has it [s]; None if it never does."""
+    """The same of ours [s]; None if it never has."""
 
     @property
     def ratio(self) -> float:
@@ -176,62 +182,14 @@ def pairs(data: Measurements) -> list[Pair]:
         other = ours.get((run.source, run.domain, run.frame, run.error_deg))
         if other is None or best is None or theirs.start is None:
             continue
-        papers = seconds_to(theirs, best.dice)
+        papers = _seconds_to(theirs, best.dice)
         assert papers is not None
         gained = best.dice >= theirs.start.dice + GAINED
-        found.append(Pair(run.source, run.error_deg, gained, papers, seconds_to(other, best.dice)))
+        found.append(Pair(run.source, run.error_deg, gained, papers, _seconds_to(other, best.dice)))
     return found
 
 
-def seconds_to(measurement: Measurement, dice: float) -> float | None:
-    """Seconds until the best iterate first had this Dice [s]; None if it never had."""
-    for now, best in zip(measurement.trace, measurement.best_so_far(), strict=True):
-        if best.dice >= dice:
-            return now.seconds
-    return None
-
-
-@dataclass(frozen=True)
-class Target:
-    """One line of the table."""
-
-    what: str
-    target: str
-    reached: str
-    met: bool | None
-    """None where it is open: nothing was measured, or nothing that misses it, but not all that it asks for."""
-    reference: str
-    basis: str
-    """Data that it was computed from."""
-
-
-def make_target(
-    what: str,
-    least_or_most: float,
-    value: float | None,
-    basis: str,
-    *,
-    at_least: bool,
-    text: Callable[[float], str],
-    reference: str = "",
-    complete: bool = True,
-) -> Target:
-    """A target with its verdict.
-
-    Args:
-        what: for people.
-        least_or_most: the bound.
-        value: what was reached; None where nothing was measured.
-        basis: what it was computed from.
-        at_least: whether the bound is the smallest value that meets it, or the largest.
-        text: writes a value.
-        reference: what others reached.
-        complete: whether everything was measured that the target asks for; otherwise it cannot be met, only missed.
-    """
-    bound = f"at {'least' if at_least else 'most'} {text(least_or_most)}"
-    if value is None:
-        return Target(what, bound, "not measured", None, reference, basis)
-    met = value >= least_or_most if at_least else value <= least_or_most
-    near = not met and text(value) == text(least_or_most)
-    reached = f"just {'below' if at_least else 'above'} {text(value)}" if near else text(value)
-    return Target(what, bound, reached, met if complete or not met else None, reference, basis)
+def _seconds_to(measurement: Measurement, dice: float) -> float | None:
+    """Time until the best iterate first had this Dice [s]; None if it never had."""
+    reached = zip(measurement.trace, measurement.best_so_far(), strict=True)
+    return next((now.seconds for now, best in reached if best.dice >= dice), None)

@@ -3,7 +3,6 @@
 import csv
 import hashlib
 import io
-import json
 import os
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -17,6 +16,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, TimeRemainingColumn
 from ...console import Bar, PlainColumn, Terminal
 from ...errors import CartsError, SettingsError
 from ...files import OutputPath, holds_file, published, write_bytes, write_text
+from ...html import render_page
 from ...model.camera import Camera
 from ...model.instruments import SCHEME, SHIPPED
 from ...model.scene import Arm
@@ -38,12 +38,12 @@ from .path_tracer import PathTracer, Stage
 from .scene import KINDS, Tissue, grow_tissue, is_instrument, load_robot, place_arms, place_cameras
 
 Progress = Callable[[str, int, int], None]
-"""Called with what is going on, how many steps are done and how many there are."""
+"""Called with a description, the number of finished steps, and the total."""
 
 
 @contextmanager
 def progress_bar() -> Iterator[Progress]:
-    """Something to give to `synthesize` as `progress`; the bar is drawn on standard error while the block runs."""
+    """Progress bar on standard error for `synthesize`."""
     columns = (PlainColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Bar(*columns, console=Terminal(stderr=True)) as bar:
         task = bar.add_task("starting", total=None)
@@ -76,7 +76,7 @@ def write_table(
     joints: Sequence[Float[np.ndarray, "frames dofs"]],
 ) -> None:
     """A CSV file with a row per frame: its id, its time [s], and the joint positions of every arm [rad, m]."""
-    columns = [_column(arm, joint) for arm in arms for joint in arm.robot.joint_names]
+    columns = [f"{arm.name}.{joint}" for arm in arms for joint in arm.robot.joint_names]
     text = io.StringIO()
     table = csv.writer(text, lineterminator="\n")
     table.writerow(["frame", "time", *columns])
@@ -90,46 +90,9 @@ def write_sequence_file(
     path: OutputPath, config: SynthesisConfig, output: Path, arms: Sequence[Arm], cameras: Sequence[Camera]
 ) -> None:
     """Write the sequence file; `output` is its final folder."""
-    domains = ", ".join(f'"{domain}"' for domain in config.domains)
-    sections = [
-        'format = "carts-sequence/1"\n'
-        f"name = {json.dumps(config.name)}\n"
-        f'description = "{_arms(arms)} over made-up tissue; carts synthesize, seed {config.seed}."\n'
-        f"domains = [{domains}]\n",
-        '[kinematics]\ntable = "kinematics.csv"\ntruth = "truth.csv"\nframe = "frame"\ntimestamp = "time"\n',
-        *(_camera_section(camera) for camera in cameras),
-        *(_arm_section(arm, config, output) for arm in arms),
-    ]
-    write_text(path, "\n".join(sections))
-
-
-def _arms(arms: Sequence[Arm]) -> str:
-    return "Two synthetic arms" if len(arms) > 1 else "A synthetic arm"
-
-
-def _camera_section(camera: Camera) -> str:
-    fx, fy, cx, cy = camera.intrinsics
-    return (
-        "[[cameras]]\n"
-        f'name = "{camera.name}"\n'
-        f'images = "images/{{domain}}/{camera.name}/{{frame}}.jpg"\n'
-        f'masks = "masks/{camera.name}/{{frame}}.png"\n'
-        f"size = [{camera.width}, {camera.height}]\n"
-        f"K = {{ fx = {fx!r}, fy = {fy!r}, cx = {cx!r}, cy = {cy!r} }}\n"
-        f"T_camera_world = {_matrix(camera.T_camera_world)}\n"
-    )
-
-
-def _arm_section(arm: Arm, config: SynthesisConfig, output: Path) -> str:
-    columns = "\n".join(f'{joint} = "{_column(arm, joint)}"' for joint in arm.robot.joint_names)
-    return (
-        "[[arms]]\n"
-        f'name = "{arm.name}"\n'
-        f'robot = "{_robot_reference(config.robot, output)}"\n'
-        f'base_link = "{arm.robot.base_link}"\n'
-        f"T_world_base = {_matrix(arm.T_world_base)}\n"
-        f"\n[arms.joints]\n{columns}\n"
-    )
+    robot = _robot_reference(config.robot, output)
+    page = render_page("synthetic_sequence.toml", config=config, robot=robot, arms=arms, cameras=cameras)
+    write_text(path, page)
 
 
 def _robot_reference(robot: Path, output: Path) -> str:
@@ -140,15 +103,6 @@ def _robot_reference(robot: Path, output: Path) -> str:
     return Path(os.path.relpath(robot.resolve(), output.resolve())).as_posix()
 
 
-def _column(arm: Arm, joint: str) -> str:
-    return f"{arm.name}.{joint}"
-
-
-def _matrix(values: np.ndarray) -> str:
-    rows = [", ".join(f"{value:.12g}" for value in row) for row in values]
-    return "[\n" + "".join(f"    [{row}],\n" for row in rows) + "]"
-
-
 def _write(path: OutputPath, suffix: str, pixels: np.ndarray, options: list[int]) -> None:
     encoded, data = cv2.imencode(suffix, pixels, options)
     if not encoded:
@@ -157,13 +111,13 @@ def _write(path: OutputPath, suffix: str, pixels: np.ndarray, options: list[int]
 
 
 def synthesize(config: SynthesisConfig, output: OutputPath | Path | str, progress: Progress | None = None) -> Path:
-    """Render a sequence of two instruments, or of one arm of any other robot, in all wanted domains.
+    """Render a sequence of two instruments, or of one arm of any other robot, in all domains of the settings.
 
-    The files appear under `output` when everything is there. Until then they lie beside it, and a run that was
-    stopped goes on where it was when it is started again with the same settings.
+    The files appear under `output` at the end. Until then they lie beside it, and a stopped run resumes when it is
+    started again with the same settings.
 
     Args:
-        config: what to render.
+        config: the settings.
         output: folder of the sequence; it must not exist, or be empty.
         progress: called after each frame.
 
@@ -245,7 +199,7 @@ class _Tracing:
     def _view(self, frame: int, number: int) -> tuple[View, np.ndarray]:
         camera, stage = self._cameras[number], self._stage
         if not self._gains:
-            # The exposure is fixed by the first frame for the whole sequence, as a camera set up by hand has it.
+            # The first frame fixes the exposure of the whole sequence, as of a camera without automatic exposure.
             first = [self._radiance(tracer, 0, 0) for tracer in self._tracers]
             self._gains = [exposure_gain(radiance, self._config.sensor) for radiance in first]
         light = [

@@ -13,9 +13,9 @@ from matplotlib.figure import Figure
 from torch import Tensor, nn
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
-from ...console import in_markdown
 from ...errors import SettingsError
 from ...files import OutputPath, locked_folder, output_path, output_stream, write_text
+from ...html import render_page
 from ...networks.network import Network, UNet, channels_last
 from ...networks.weights import read_weights, save_weights
 from ...settings import Architecture, TrainingConfig
@@ -149,9 +149,19 @@ def write_report(folder: OutputPath, config: dict, history: History, columns: di
         _curves(history, columns).savefig(stream, format="png", dpi=110)
     with output_stream(folder / "predictions.jpg") as stream:
         _predictions(examples).savefig(stream, format="jpg", dpi=110, pil_kwargs={"quality": 85})
-    page = folder / "README.md"
-    write_text(page, _page(config, history, columns))
-    return page.path
+    page = render_page(
+        "training.md",
+        config=config,
+        columns=columns,
+        validations=history.validations,
+        steps=counted(int(history.losses[-1]["step"]) if history.losses else 0, "step"),
+        samples=counted(config["batch_size"], "sample"),
+        minutes=counted(round(history.seconds / 60), "minute"),
+        settings=json.dumps(config, indent=2).replace("`", "\\u0060"),
+        nan=math.nan,
+    )
+    write_text(folder / "README.md", page)
+    return (folder / "README.md").path
 
 
 def _curves(history: History, columns: dict[str, str]) -> Figure:
@@ -187,42 +197,6 @@ def _predictions(examples: Panels) -> Figure:
     for axes, title in zip(rows[0], titles, strict=True):
         axes.set_title(title, fontsize=9)
     return figure
-
-
-def _page(config: dict, history: History, columns: dict[str, str]) -> str:
-    steps = int(history.losses[-1]["step"]) if history.losses else 0
-    lines = [
-        f"# Training of the {config['network']} network",
-        "",
-        f"{counted(steps, 'step')} of {counted(config['batch_size'], 'sample')}, "
-        f"{counted(round(history.seconds / 60), 'minute')}, robots: "
-        f"{', '.join(map(in_markdown, config['robots']))}.",
-        "",
-        "![curves](curves.png)",
-        "",
-        f"| step | {' | '.join(columns.values())} |",
-        "|---" * (1 + len(columns)) + "|",
-    ]
-    for entry in history.validations:
-        figures = " | ".join(f"{entry.get(name, math.nan):.4f}" for name in columns)
-        lines.append(f"| {entry['step']} | {figures} |")
-    lines += [
-        "",
-        "Validation images are made like the training images, from random numbers that training never sees.",
-        "",
-        "![example predictions](predictions.jpg)",
-        "",
-        "In predictions of masks, white is a true positive, black a true negative, orange a false positive and red a",
-        "false negative. Parts are red (shaft), green (wrist) and blue (jaws).",
-        "",
-        "## Settings",
-        "",
-        "```json",
-        json.dumps(config, indent=2).replace("`", "\\u0060"),
-        "```",
-        "",
-    ]
-    return "\n".join(lines)
 
 
 _LOG_EVERY = 10
@@ -407,7 +381,7 @@ def weights_file(config: TrainingConfig, output: Path) -> Path:
 
 
 def config_json(config: TrainingConfig) -> str:
-    """The settings as JSON; files by name, so that a run can move with its folder."""
+    """The settings as JSON, with files by name only, so that a run can be moved."""
     settings = asdict(config)
     settings["start"] = config.start.name if config.start else None
     settings["robots"] = [path.name for path in config.robots]
