@@ -52,13 +52,7 @@ class _Worker:
 
 
 class Pool:
-    """Worker processes that run one job after another.
-
-    Args:
-        work: function that runs a job; importable by name.
-        workers: number of processes.
-        threads: of each process.
-    """
+    """Worker processes with so many threads that run one job after another; `work` is importable by name."""
 
     def __init__(self, work: Work, workers: int, threads: int) -> None:
         self._work, self._workers, self._threads = work, workers, threads

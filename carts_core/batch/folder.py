@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping
 from collections.abc import Sequence as Rows
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict, dataclass, field, replace
-from pathlib import Path, PurePath
+from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import cv2
@@ -22,10 +22,9 @@ from ..export.kinematics import joint_columns, joint_units, position_values, std
 from ..files import BusyError, OutputPath, check_name, holds_file, locked_folder, set_aside, write_bytes, write_text
 from ..files.reading import IMAGE, VALUES, parse_json, read_bytes, typed
 from ..recording import Sequence
-from .manifest import STEPS, Job, Step
+from .manifest import Job
 
 JOB_FILE = "job.json"
-_JOB_FORMAT: Literal["carts-job/1"] = "carts-job/1"
 HEARTBEAT_SECONDS = 10.0
 """Interval of the heartbeat of a running job [s]."""
 
@@ -57,13 +56,7 @@ class JobState:
     """Machine and process of the last run."""
     heartbeat: float = 0.0
     """Time of the last heartbeat [s since 1970]."""
-
-
-@dataclass(frozen=True)
-class _WrittenState(JobState):
-    """Content of the file."""
-
-    format: Literal["carts-job/1"] = _JOB_FORMAT
+    format: Literal["carts-job/1"] = "carts-job/1"
 
 
 def read_state(folder: OutputPath) -> JobState:
@@ -84,13 +77,12 @@ def _read(folder: OutputPath) -> JobState:
     path = folder / JOB_FILE
     if not holds_file(path):
         return JobState()
-    values = vars(typed(parse_json(read_bytes(path.path, VALUES)), _WrittenState))
-    return JobState(**{name: value for name, value in values.items() if name != "format"})
+    return typed(parse_json(read_bytes(path.path, VALUES)), JobState)
 
 
 def write_state(folder: OutputPath, state: JobState) -> None:
     """Replace the state of a job."""
-    write_text(folder / JOB_FILE, json.dumps({"format": _JOB_FORMAT, **asdict(state)}, indent=1))
+    write_text(folder / JOB_FILE, json.dumps(asdict(state), indent=1))
 
 
 def present_status(folder: OutputPath) -> tuple[str, JobState]:
@@ -159,7 +151,6 @@ def this_worker() -> str:
 
 
 FINDINGS_FILE = "findings.json"
-_FINDINGS_FORMAT: Literal["carts-findings/1"] = "carts-findings/1"
 _WORST = 3
 """Number of frames of a job with pictures."""
 _WIDTH = 480
@@ -193,13 +184,7 @@ class Findings:
     """`ARM.JOINT` -> reported standard deviation, of each frame that has one [deg, mm]."""
     base_frames: dict[str, list[list[float]]] = field(default_factory=dict)
     """`ARM in CAMERA` -> T_camera_base, calibrated if that was a step [4 x 4, m]."""
-
-
-@dataclass(frozen=True)
-class _WrittenFindings(Findings):
-    """Content of the file."""
-
-    format: Literal["carts-findings/1"] = _FINDINGS_FORMAT
+    format: Literal["carts-findings/1"] = "carts-findings/1"
 
 
 def read_findings(folder: OutputPath) -> Findings | None:
@@ -211,20 +196,14 @@ def read_findings(folder: OutputPath) -> Findings | None:
     path = folder / FINDINGS_FILE
     if not holds_file(path):
         return None
-    found = typed(parse_json(read_bytes(path.path, VALUES)), _WrittenFindings)
+    found = typed(parse_json(read_bytes(path.path, VALUES)), Findings)
     if any(len(rows) != 4 or {len(row) for row in rows} != {4} for rows in found.base_frames.values()):
         raise ValueError("a base frame is no 4 x 4 matrix")
     return found
 
 
 def write_findings(job: Job, folder: OutputPath, sequence_file: Path) -> None:
-    """Write `findings.json`, and pictures of the worst frames.
-
-    Args:
-        job: finished job.
-        folder: of the job.
-        sequence_file: with the calibration of its last steps.
-    """
+    """Write `findings.json` of a finished job, and pictures of its worst frames."""
     sequence = Sequence.open(sequence_file)
     scene, found = sequence.scene, Findings(str(job.recording))
     for arm in scene.arms:
@@ -233,9 +212,7 @@ def write_findings(job: Job, folder: OutputPath, sequence_file: Path) -> None:
             moved = np.eye(4) if T_mount_world is None else T_mount_world
             seen_in = camera.name if T_mount_world is None else f"the first frame of {camera.name}"
             found.base_frames[f"{arm.name} in {seen_in}"] = (camera.T_camera_world @ moved @ arm.T_world_base).tolist()
-    steps = [step for step in ("sequence", "optimize") if step in job.steps]
-    parts = sorted((folder / steps[0]).path.glob("*/*/kinematics.csv")) if steps else []
-    for table in parts:
+    for table in kinematics_tables(folder, job):
         rows = read_kinematics_csv(table, scene)
         _add_corrections(found, sequence, rows)
         cameras = table.parent.name
@@ -246,7 +223,13 @@ def write_findings(job: Job, folder: OutputPath, sequence_file: Path) -> None:
             if (record := records.get(row.frame_id)) and record.get("verdict")
         ]
         found.frames.extend(_pictured(folder, sequence, table.parent, frames))
-    write_text(folder / FINDINGS_FILE, json.dumps({"format": _FINDINGS_FORMAT, **asdict(found)}))
+    write_text(folder / FINDINGS_FILE, json.dumps(asdict(found)))
+
+
+def kinematics_tables(folder: OutputPath, job: Job) -> list[Path]:
+    """Tables of corrected joints of a job, one for each domain and group of cameras; none without optimization."""
+    steps = [step for step in ("sequence", "optimize") if step in job.steps]
+    return sorted((folder / steps[0]).path.glob("*/*/kinematics.csv")) if steps else []
 
 
 def _add_corrections(found: Findings, sequence: Sequence, rows: list[KinematicsRow]) -> None:
@@ -288,7 +271,7 @@ def _pictured(folder: OutputPath, sequence: Sequence, part: Path, frames: list[F
         small = cv2.resize(shown, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
         name = f"worst-{part.name}-{frame.frame}.jpg"
         write_bytes(folder / name, cv2.imencode(".jpg", small[..., ::-1])[1].tobytes())
-        yield FrameFinding(**{**asdict(frame), "picture": name})
+        yield replace(frame, picture=name)
 
 
 BATCH_FILE = "batch.json"
@@ -339,28 +322,19 @@ def most_urgent_first(known: Rows[KnownJob]) -> list[KnownJob]:
 
 
 @dataclass(frozen=True)
-class _Row:
-    """A job in the file."""
-
-    name: str
-    recording: str
-    camera: str
-    domain: str
-    steps: tuple[Step, ...]
-
-
-@dataclass(frozen=True)
 class _Batch:
     """Content of the file."""
 
     format: Literal["carts-batch-jobs/1"]
-    jobs: list[_Row]
+    jobs: list[Job]
 
 
 def write_jobs(batch: OutputPath, jobs: Rows[Job]) -> None:
     """Write the list of jobs, for readers without the manifest."""
-    rows = [_Row(job.name, str(job.recording.resolve()), job.camera, job.domain, job.steps) for job in jobs]
-    write_text(batch / BATCH_FILE, json.dumps(asdict(_Batch("carts-batch-jobs/1", rows)), indent=1))
+    rows = [{**asdict(job), "recording": str(job.recording.resolve())} for job in jobs]
+    for row in rows:
+        del row["options"]
+    write_text(batch / BATCH_FILE, json.dumps({"format": "carts-batch-jobs/1", "jobs": rows}, indent=1))
 
 
 def is_batch(folder: Path) -> bool:
@@ -375,19 +349,13 @@ def read_jobs(folder: Path) -> list[Job]:
         SettingsError: it is no batch, or its list of jobs is damaged.
     """
     try:
-        content = typed(parse_json(read_bytes(folder / BATCH_FILE, VALUES)), _Batch)
-        jobs = [_job(row) for row in content.jobs]
+        jobs = typed(parse_json(read_bytes(folder / BATCH_FILE, VALUES)), _Batch).jobs
         for job in jobs:
             check_name(job.name, f"a job of {folder}")
+            if not job.recording.is_absolute():
+                raise ValueError(f"the recording {str(job.recording)!r} is no absolute path")
     except (OSError, ValueError) as error:
         raise SettingsError(
             f"{folder} is no batch that can be read: {error}. Name the folder that carts batch has written to."
         ) from error
     return jobs
-
-
-def _job(row: _Row) -> Job:
-    if not PurePath(row.recording).is_absolute():
-        raise ValueError(f"the recording {row.recording!r} is no absolute path")
-    steps: tuple[Step, ...] = tuple(step for step in STEPS if step in row.steps)
-    return Job(row.name, Path(row.recording), row.camera, row.domain, steps, {})

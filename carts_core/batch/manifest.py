@@ -2,7 +2,7 @@
 
 import glob
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from itertools import product
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -32,7 +32,7 @@ class Job:
     """Name; empty for the sequence's first one."""
     steps: tuple[Step, ...]
     """In this order; each one uses the results of those before."""
-    options: Mapping[str, tuple[str, ...]]
+    options: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     """Step -> further options of its command."""
 
 
@@ -64,11 +64,7 @@ def read_manifest(path: Path, output: Path | None = None) -> list[Job]:
         job for number, table in enumerate(tables, 1) for job in _jobs(path, output, f"{path}, jobs {number}", table)
     ]
     names = unique_file_names([job.name for job in found])
-    return [Job(name, *_fields(job)) for name, job in zip(names, found, strict=True)]
-
-
-def _fields(job: Job) -> tuple[Any, ...]:
-    return job.recording, job.camera, job.domain, job.steps, job.options
+    return [replace(job, name=name) for name, job in zip(names, found, strict=True)]
 
 
 def _jobs(manifest: Path, output: Path | None, where: str, table: dict[str, Any]) -> Iterator[Job]:

@@ -13,6 +13,7 @@ from ..files.reading import TABLE, VALUES, parse_json, read_bytes
 from ..fingerprints import fingerprint
 from ..project import FitVerdict, JointCorrection, Key, Project, Provenance
 from ..recording import Sequence
+from .folder import kinematics_tables
 from .manifest import Job
 
 _MADE = {"calibrate": "calibration", "import": "recording"}
@@ -20,12 +21,7 @@ _MADE = {"calibrate": "calibration", "import": "recording"}
 
 
 def sequence_file(folder: OutputPath, job: Job) -> Path:
-    """Sequence file of a job's results.
-
-    Args:
-        folder: of the job.
-        job: the job.
-    """
+    """Sequence file of a job's results, given its folder."""
     made = [folder / name / "sequence.toml" for step, name in _MADE.items() if step in job.steps]
     return next((path.path for path in made if holds_file(path)), job.recording)
 
@@ -33,14 +29,10 @@ def sequence_file(folder: OutputPath, job: Job) -> Path:
 def review_project(folder: OutputPath, job: Job) -> Path:
     """Project for the review of a job, created if missing. New results get a new project; old ones are kept.
 
-    Args:
-        folder: of the job.
-        job: the job.
-
     Raises:
         CartsError: the recording cannot be opened, the results are damaged, or the project cannot be written.
     """
-    tables = _tables(folder, job)
+    tables = kinematics_tables(folder, job)
     digest = fingerprint(*(read_bytes(table, TABLE) for table in tables))
     path = (folder / f"review-{digest[:12]}.carts").path
     if not path.exists():
@@ -51,11 +43,6 @@ def review_project(folder: OutputPath, job: Job) -> Path:
         finally:
             project.close()
     return path
-
-
-def _tables(folder: OutputPath, job: Job) -> list[Path]:
-    steps = [step for step in ("sequence", "optimize") if step in job.steps]
-    return sorted((folder / steps[0]).path.glob("*/*/kinematics.csv")) if steps else []
 
 
 def _edits(sequence: Sequence, table: Path) -> Iterator[tuple[Key[Any], Any]]:

@@ -12,7 +12,15 @@ from typing import Any, Literal
 import tyro
 
 from ..batch.engines import Outcome
-from ..batch.folder import FINDINGS_FILE, RunningJob, StepState, read_findings, running, write_findings
+from ..batch.folder import (
+    FINDINGS_FILE,
+    RunningJob,
+    StepState,
+    kinematics_tables,
+    read_findings,
+    running,
+    write_findings,
+)
 from ..batch.manifest import Job, Step
 from ..console import Terminal, log_to_stderr
 from ..errors import CartsError, SettingsError
@@ -196,8 +204,7 @@ def _table(job: Job, folder: OutputPath) -> Path | None:
     Raises:
         SettingsError: there are several, one for each camera.
     """
-    made = [step for step in ("sequence", "optimize") if step in job.steps]
-    found = sorted((folder / made[0]).path.glob("*/*/kinematics.csv")) if made else []
+    found = kinematics_tables(folder, job)
     if len(found) > 1:
         raise SettingsError(
             f"job {job.name}: {len(found)} cameras worked alone, and an export holds one table. Name a camera for each "

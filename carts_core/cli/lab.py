@@ -114,9 +114,9 @@ class Train:
             console.print("No step gained anything, so the weights are those of the start.")
         for line in found.lines:
             console.print(line, soft_wrap=True)
-        if found.weights is None:
+        if found.worse:
             console.print(f"not offered, since worse: {'; '.join(found.worse)}", soft_wrap=True)
-            console.print(f"The weights are in {found.refused}. Go on with the network as it was.", soft_wrap=True)
+            console.print(f"The weights are in {found.weights}. Go on with the network as it was.", soft_wrap=True)
             return
         console.print(f"weights: {found.weights}")
         console.print(f"Use: carts optimize {recording} --weights {found.weights}", soft_wrap=True)
