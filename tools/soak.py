@@ -24,6 +24,7 @@ from typing import Any
 from websockets.exceptions import ConnectionClosed
 
 from carts_core.resources import sample_sequence
+from tools.memory import resident_megabytes
 from tools.raw_tab import RawTab
 
 LARGEST_GROWTH, LARGEST_REST = 0.15, 0.2
@@ -195,10 +196,10 @@ def soak(
     with served(sequence, python) as (url, process):
         opened = [RandomTab(url, f"soak{number}", dice) for number in range(tabs)]
         time.sleep(_SETTLED)
-        seen, began = Soak(_megabytes(process)), time.monotonic()
+        seen, began = Soak(resident_megabytes(process)), time.monotonic()
         while (now := (time.monotonic() - began) / 60) < minutes:
             if now >= len(seen.minutes) + 1:
-                seen.minutes.append(_megabytes(process))
+                seen.minutes.append(resident_megabytes(process))
                 print(f"{now:5.1f} min {seen.minutes[-1]:6.0f} MB, {seen.actions} actions", flush=True)
             kind, number = dice.choice(only), dice.randrange(tabs)
             try:
@@ -214,14 +215,14 @@ def soak(
                     opened[number] = RandomTab(url, key, dice)
             seen.actions += 1
             time.sleep(_PACE * dice.random())
-        seen.minutes.append(_megabytes(process))
+        seen.minutes.append(resident_megabytes(process))
         for tab in opened:
             tab.close()
         left = time.monotonic()
         _wait_until_idle(process)
         seen.worked = time.monotonic() - left
         time.sleep(60 * rest)
-        seen.rest = _megabytes(process)
+        seen.rest = resident_megabytes(process)
     return seen
 
 
@@ -239,11 +240,6 @@ def _wait_until_idle(process: int) -> None:
 def _ticks(process: int) -> int:
     fields = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
     return int(fields[11]) + int(fields[12])
-
-
-def _megabytes(process: int) -> float:
-    pages = int(Path(f"/proc/{process}/statm").read_text().split()[1])
-    return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
 
 
 def main() -> None:

@@ -47,10 +47,10 @@ def segmentation_models() -> ModuleType:
 
 
 def _import_torchvision() -> None:
-    """Import torchvision, also beside another build of torch than its own.
+    """Import torchvision, also beside another build of torch.
 
-    PyPI has torchvision for CUDA alone. Beside a torch for CPUs its compiled operators cannot be loaded, which it takes
-    calmly but for those that it describes at once: their names must be known. None of them is used here.
+    PyPI has torchvision for CUDA only. Beside a torch for CPUs, its compiled operators are not loaded, and the import
+    fails for those that it registers at once, so their names are declared here. None of them is used.
     """
     while True:
         try:
@@ -75,9 +75,6 @@ _HEADS = (1, 2, 4, 8)
 
 class Baseline(nn.Module):
     """Baseline segmentation network.
-
-    Args:
-        settings: which, and how large.
 
     Raises:
         CartsError: the extra is not installed.
@@ -111,11 +108,11 @@ class Baseline(nn.Module):
     def forward(
         self, images: Float[Tensor, "batch 3 h w"], given: Float[Tensor, "batch 6 h w"] | None = None
     ) -> Float[Tensor, "batch 1 h w"]:
-        """Log odds that a pixel shows an instrument.
+        """Logits of the instrument mask.
 
         Args:
             images: RGB in [0, 1], of the size in the settings.
-            given: surface maps of the measured kinematics; only Colleoni's looks at them.
+            given: surface maps of the measured kinematics, for Colleoni's network.
         """
         if self.settings.name == "unet":
             return self.body(images)
@@ -126,7 +123,7 @@ class Baseline(nn.Module):
 
 
 class _TwoEncoders(nn.Module):
-    """Image and rendering in parallel, joined at every level, and one decoder: after Colleoni et al., 2007.09107.
+    """Image and rendering encoders, joined at every level, and one decoder, after Colleoni et al., 2007.09107.
 
     Their code is not public, so sizes are ours.
     """
@@ -228,7 +225,10 @@ def read_baseline(path: Path) -> TrainedBaseline:
                 raise ValueError(f"it says format {metadata.get('format')!r}; wanted is {FORMAT!r}")
             settings, training = _described(metadata)
             network = Baseline(settings)
-            _fill(network, {name: file.get_tensor(name) for name in file.keys()})
+            tensors = {name: file.get_tensor(name) for name in file.keys()}
+            if not all(bool(torch.isfinite(value).all()) for value in tensors.values()):
+                raise ValueError("some of its values are not finite")
+            network.load_state_dict(tensors)
     except (FileNotFoundError, IsADirectoryError) as error:
         raise WeightsError(f"weights file {path} is missing. {_REMEDY}") from error
     except (SafetensorError, SettingsError, OSError, KeyError, ValueError, TypeError, RuntimeError) as error:
@@ -263,7 +263,7 @@ def start_from(network: Baseline, path: Path) -> int:
             "safetensors; pickles are not read."
         ) from error
     own = network.state_dict()
-    # smp wraps timm's model, and features of HRNet and Swin are wrapped once more: names differ in what comes before.
+    # smp wraps timm's model, and features of HRNet and Swin are wrapped once more, so names have different prefixes.
     ends = {name.split("model.", 1)[-1]: name for name in own if "rendering." not in name}
     fitting = {
         ends[name]: value for name, value in given.items() if name in ends and own[ends[name]].shape == value.shape
@@ -286,9 +286,3 @@ def _described(metadata: dict[str, str]) -> tuple[BaselineNetwork, dict[str, Any
     width, height = values.pop("size")
     decoder = tuple(int(n) for n in values.pop("decoder"))
     return BaselineNetwork(**values, decoder=decoder, size=(int(width), int(height)), unet=unet), training
-
-
-def _fill(network: Baseline, tensors: dict[str, Tensor]) -> None:
-    if not all(bool(torch.isfinite(value).all()) for value in tensors.values()):
-        raise ValueError("some of its values are not finite")
-    network.load_state_dict(tensors)

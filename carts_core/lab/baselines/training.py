@@ -64,13 +64,7 @@ def smoked(image: UInt8[Tensor, "3 h w"], rng: np.random.Generator) -> UInt8[Ten
 
 
 def diamond_square(side: int, rng: np.random.Generator, roughness: float = 0.6) -> Float[np.ndarray, "side side"]:
-    """A plasma fractal, scaled to [0, 1].
-
-    Args:
-        side: one more than a power of two.
-        rng: source of randomness.
-        roughness: amplitude of each level relative to the one before.
-    """
+    """A plasma fractal in [0, 1]; `side` is a power of two plus one, `roughness` the ratio of amplitudes per level."""
     field = np.zeros((side, side), np.float32)
     step, amplitude = side - 1, 1.0
     field[::step, ::step] = rng.normal(size=(2, 2))
@@ -98,7 +92,7 @@ def diamond_square(side: int, rng: np.random.Generator, roughness: float = 0.6) 
 
 
 class _AutoAugment:
-    """torchvision's AutoAugment with ImageNet's policy; what moves the image moves the mask with it."""
+    """torchvision's AutoAugment with ImageNet's policy; geometric changes apply to image and mask."""
 
     def __init__(self) -> None:
         segmentation_models()
@@ -143,17 +137,13 @@ def _warped(name: Augmentation) -> Change:
 SIZE = (256, 192)
 """Width and height of a training frame [px]: a whole image, not a crop."""
 IMAGES = ImageSettings(width=SIZE[0], height=SIZE[1], field_width=SIZE[0], occluded=0.0, things=0.0, absent=0.0)
-"""Regular images: no smoke, blood or low light, nothing that hides the arms or looks like one, and no arm missing."""
+"""Regular images: no smoke, blood, low light, occluders, distractors or absent arms."""
 CHUNK = 250
 """Frames of a file."""
 
 
 class TrainingFrames:
-    """Images, what is rendered of kinematics that are a few degrees off, and masks.
-
-    Args:
-        folder: with the files that `make_chunk` wrote.
-        chunks: numbers of the files.
+    """Images, surface maps of erroneous kinematics, and masks, from the numbered files of `make_chunk`.
 
     Raises:
         WeightsError: a file cannot be read, or holds other frames.
@@ -188,14 +178,8 @@ def chunks_of(count: int) -> int:
     return -(-count // CHUNK)
 
 
-def make_chunk(folder: OutputPath, chunk: int, seed: int, progress: Callable[[int], None] = lambda done: None) -> None:
-    """Write one file of frames; its contents depend on the seed and its number only.
-
-    Args:
-        folder: where it is written.
-        chunk: its number.
-        seed: of all frames.
-        progress: is called with the number of frames that are made.
+def make_chunk(folder: OutputPath, chunk: int, seed: int) -> None:
+    """Write one file of frames, which depends on the seed and its number only.
 
     Raises:
         OutputError: it cannot be written.
@@ -208,7 +192,6 @@ def make_chunk(folder: OutputPath, chunk: int, seed: int, progress: Callable[[in
         given.append(sample.given.transpose(2, 0, 1))
         covered = sample.surface[..., COVERAGE].sum(-1, dtype=np.int16)
         masks.append((2 * covered > SURFACE_UNIT).astype(np.uint8))
-        progress(number + 1)
     arrays = {"images": images, "given": given, "masks": masks}
     tensors = {name: torch.from_numpy(np.stack(values)).contiguous() for name, values in arrays.items()}
     write_bytes(_file(folder, chunk), tensor_bytes(tensors, {"settings": _settings(), "seed": str(seed)}))
@@ -281,11 +264,10 @@ def train_baseline(
     """Train a baseline, or resume the run in `output`.
 
     Args:
-        network: which, and how large.
-        training: how.
-        frames: what is learned from.
+        network, training: settings.
+        frames: training and validation frames.
         output: folder of `checkpoint.safetensors` and, at the end, `baseline.safetensors`.
-        say: is called with a line now and then.
+        say: called with lines of progress.
 
     Raises:
         CartsError: the extra is not installed.

@@ -43,10 +43,10 @@ def occlude(
     """Lay one to three pieces of one kind over the instruments, with folds, soft edges and a soft shadow.
 
     Args:
-        image: the picture without them.
-        instruments: where instruments are visible.
-        rng: decides places, shapes and kind.
-        share: part of these pixels that is covered, exactly; where there are none, nothing is.
+        image: without occluders.
+        instruments: visible pixels of the instruments.
+        rng: of places, shapes and kind.
+        share: exact share of these pixels that is covered.
     """
     if not instruments.any():
         return Occluded(image, np.zeros_like(instruments))
@@ -68,7 +68,7 @@ def occlude(
 
 
 def _pieces(instruments: np.ndarray, scale: float, rng: np.random.Generator) -> Float[np.ndarray, "h w"]:
-    """A field that falls with the distance from the pieces' middles, which lie on the instruments; noise frays it."""
+    """A noisy field that falls with the distance from the pieces' centres, which lie on the instruments."""
     rows, columns = np.indices(instruments.shape, dtype=np.float32)
     places = np.argwhere(instruments)
     level = np.full(instruments.shape, -np.inf, np.float32)
@@ -107,7 +107,7 @@ def _gauze(shape: tuple[int, int], scale: float, normal: np.ndarray, rng: np.ran
 
 
 def _tissue(shape: tuple[int, int], scale: float, normal: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Red to pink, with fat, and wet: it glints where it faces the lamp."""
+    """Red to pink, with fat, and highlights where it faces the lamp."""
     fat = smoothstep(smooth_noise(shape, 70.0 * scale, rng, octaves=4), 0.2, 1.4)[..., None]
     red = np.array([0.50, 0.14, 0.11]) * rng.uniform(0.7, 1.3)
     flesh = red * (1.0 + 0.2 * smooth_noise(shape, 25.0 * scale, rng, octaves=4)[..., None])
@@ -143,16 +143,10 @@ _BLUR, _NOISE = 0.65, 2.0
 def crossed(recording: Recording, index: int, camera: str, seed: int = 0) -> Frame:
     """A frame of the regular domain with its arms moved so that one crosses the other.
 
-    Measured joints keep the errors of that frame. Arms may pass through each other where they cross.
-
-    Args:
-        recording: of two arms with known joints.
-        index: position of the frame.
-        camera: that takes part.
-        seed: of the draws and of the noise.
+    Measured joints keep the errors of that frame. Arms may intersect where they cross.
 
     Raises:
-        SettingsError: no draw crosses, or the recording has no two arms or no truth.
+        SettingsError: no draw crosses, or the recording lacks two arms with known joints.
     """
     frame, scene = recording.frame(index, "regular", [camera]), recording.scene.with_cameras([camera])
     if len(scene.arms) != 2 or not frame.truth:
@@ -175,7 +169,7 @@ def crossed(recording: Recording, index: int, camera: str, seed: int = 0) -> Fra
 
 
 def _crossing_joints(scene: Scene, around: dict[str, np.ndarray], rng: np.random.Generator) -> dict[str, np.ndarray]:
-    """Joint positions of both arms [rad, m] near others, at which they cross."""
+    """Random joint positions of both arms near the given ones [rad, m] at which the arms cross."""
     width, height = _COARSE, round(_COARSE * scene.cameras[0].height / scene.cameras[0].width)
     both = Renderer(scene, width=width, height=height)
     alone = {arm.name: scene.with_arms([arm.name]) for arm in scene.arms}
@@ -209,38 +203,21 @@ _STAND_INS = ("double_fenestrated_grasper", "clip_applier", "maryland_bipolar_fo
 
 
 def wrong_inputs(frames: int, cameras: int, *, built_in: bool) -> tuple[str, ...]:
-    """Kinds of wrong inputs that a recording allows.
-
-    Args:
-        frames: of the recording.
-        cameras: of the recording.
-        built_in: whether its arms are built-in instruments, whose base frames and joints others share.
-    """
+    """Kinds of wrong inputs that a recording allows; `built_in` robots share base frames and joints with others."""
     possible = (True, frames > 1, cameras > 1, built_in)
     return tuple(kind for kind, needed in zip(WRONG, possible, strict=True) if needed)
 
 
 def with_other_instruments(scene: Scene, index: int) -> Scene:
-    """The scene with an instrument in the place of each arm's that is not in the image.
-
-    Args:
-        scene: whose arms are built-in instruments.
-        index: position of the frame, which decides the instrument.
-    """
+    """The scene of built-in instruments with another one in each arm, which depends on the frame's position."""
     robot = Robot.load(f"builtin:{_STAND_INS[index % len(_STAND_INS)]}")
     return replace(scene, arms=tuple(replace(arm, robot=robot) for arm in scene.arms))
 
 
 def misled(recording: Recording, kind: str, index: int, camera: str) -> Frame:
-    """Frame of the regular domain whose image contradicts its kinematics.
+    """Frame of the regular domain whose image contradicts its kinematics in one of the ways of `WRONG`.
 
-    Its masks are those of the image that is shown, so the estimate can be scored as any other.
-
-    Args:
-        recording: with masks of its cameras.
-        kind: one of `WRONG`.
-        index: position of the frame.
-        camera: that takes part.
+    Its masks are those of the image that is shown.
     """
     frame = recording.frame(index, "regular", [camera])
     match kind:

@@ -49,21 +49,20 @@ def backdrop(width: int, height: int, seed: int) -> UInt8[np.ndarray, "h w 3"]:
 
 
 _CLEARANCE = 0.005
-"""Between the deepest tip and the plane behind it [m]."""
+"""Distance between the deepest tip and the plane behind it [m]."""
 DISTANCE = EndoscopeConfig().distance
-"""From the camera to the plane in the scaled world [m]: that for which blood and smoke are made."""
+"""Distance from the camera to the plane in the scaled world, for which blood and smoke are made [m]."""
 
 
 class RealSurface:
     """Instruments before a plane that is parallel to the image.
 
-    Everything is in a world like the synthetic one: the plane is z = 0, and the camera looks straight down at its
-    origin. The world is scaled such that it does so from the synthetic camera's distance; otherwise a camera that
-    stands farther away would see more smoke and smaller drops.
+    The world is like the synthetic one: the plane is z = 0, and the camera looks straight down at its origin. It is
+    scaled to the synthetic camera's distance, because smoke and the size of drops depend on it.
 
     Args:
         scene: with one camera.
-        recording: measured joint positions of frames of the recording, arm -> [dofs]; they place the plane.
+        recording: measured joint positions of frames, arm -> [dofs], which place the plane.
     """
 
     def __init__(self, scene: Scene, recording: Sequence[Mapping[str, np.ndarray]]) -> None:
@@ -89,11 +88,11 @@ class RealSurface:
         return dict(enumerate(self._T_world_camera @ Ts_camera_link))
 
     def of(self, mask: Bool[np.ndarray, "h w"], measured: Mapping[str, np.ndarray] | None) -> Surface:
-        """The surface of a frame: in the mask that of the nearest pixel of the arms as measured, elsewhere the plane.
+        """The surface of a frame: in the mask that of the nearest pixel of the measured arms, elsewhere the plane.
 
         Args:
             mask: the instruments' pixels.
-            measured: arm -> joint positions [rad, m]; None where there are no arms.
+            measured: arm -> joint positions [rad, m]; None without arms.
         """
         depth = np.full(mask.shape, DISTANCE)
         normal = np.zeros((*mask.shape, 3))
@@ -129,26 +128,19 @@ class RealSurface:
 _FRAME_INTERVAL = 0.25
 """Between frames of a recording without timestamps [s]."""
 _REFLECTANCE = 0.3
-"""Of the background, from which the strength of the lamp is guessed."""
+"""Assumed reflectance of the background, for the strength of the lamp."""
 _QUIET = SensorConfig(vignette=0.0, blur=0.0, sharpening=0.0, full_well=1e6, read_noise=0.0)
-"""A real frame has its lens and its noise already."""
+"""For real frames, which contain lens effects and noise already."""
 _NOISY = dataclasses.replace(SensorConfig(), vignette=0.0, blur=0.0, sharpening=0.0)
-"""In low light the sensor's noise takes over."""
+"""For low light, in which the sensor's noise dominates."""
 _MOMENTS = 5
 
 
 class Counterfactual:
-    """A real sequence in all domains of the synthetic ones, with their code for blood, smoke and low light.
+    """A real sequence in all synthetic domains, with their code for blood, smoke and low light.
 
-    Depth, which blood and smoke need, is that of the arms as measured, carried to the mask's pixels, before a plane
-    behind the deepest tip. In `background_change` the masked instrument is put before another background.
-
-    Args:
-        sequence: with masks of the camera.
-        camera: the camera that takes part.
-        backdrop: the other background, of the camera's size.
-        seed: of blood, smoke and noise.
-        strengths: of the conditions; those of the synthetic domains by default.
+    Depth for blood and smoke is that of the measured arms, carried to the mask's pixels, before a plane behind the
+    deepest tip. In `background_change`, the masked instrument is put before `backdrop`, of the camera's size.
     """
 
     def __init__(
@@ -204,7 +196,7 @@ class Counterfactual:
         return self._backgrounds[domain]
 
     def mean_background(self, camera: str, domain: str | None = None) -> MeanBackground:
-        """The same with where it is known."""
+        """The mean background and the pixels where it is known."""
         regular = self._sequence.mean_background(camera)
         return dataclasses.replace(regular, image=self.background(camera, domain))
 

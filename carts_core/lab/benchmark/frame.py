@@ -7,8 +7,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, UInt8
-from torch import Tensor
+from jaxtyping import Bool, Float
 
 from ...evaluation import dice, joint_mae_deg, normalized_surface_distance
 from ...model.keypoints import keypoints
@@ -33,7 +32,7 @@ from ...rendering import Renderer
 from ...settings import DescentSolver
 from ..baselines.networks import TrainedBaseline
 from .measurement import BEST_OF, TOLERANCE, WIDE_TOLERANCE, Measurement, Score, machine
-from .scope import METHODS, Run
+from .scope import METHODS, RENDERING, Run
 from .sources import Recording
 
 _SEED = 0
@@ -42,21 +41,17 @@ _SEED = 0
 
 @dataclass(frozen=True)
 class Truth:
-    """Truth of a frame in one camera.
-
-    Attributes:
-        camera: its name.
-        mask: the instruments' visible pixels.
-        joint_positions: arm -> true joint positions [rad, m]; empty where they are not known.
-        measured_joints: arm -> joints that count.
-        hidden: pixels that show an occluder; nothing is compared there.
-    """
+    """Truth of a frame in one camera."""
 
     camera: str
     mask: Bool[np.ndarray, "h w"]
+    """Visible pixels of the instruments."""
     joint_positions: Mapping[str, np.ndarray]
+    """Arm -> true joint positions [rad, m]; empty if not known."""
     measured_joints: Mapping[str, tuple[str, ...]]
+    """Arm -> joints that count."""
     hidden: Bool[np.ndarray, "h w"] | None = None
+    """Pixels of an occluder, which are not compared."""
 
     def score_mask(self, mask: Bool[np.ndarray, "h w"], seconds: float) -> Score:
         """Score of a mask without kinematics."""
@@ -76,34 +71,34 @@ class Truth:
 
         Args:
             state: the estimate.
-            known: what the images determine, where the optimizer says it.
-            loss: the optimizer's.
+            known: its uncertainty, if the optimizer reports it.
+            loss: of the optimizer.
             renderer: of the camera, at its size.
             seconds: until the estimate was known [s].
-            whole: whether to look for the tips and the second surface distance, too, which takes longer than all the
-                rest.
+            whole: whether to compute the depth of the tips and the second surface distance, the slowest figures.
         """
         state, scene = state.to("cpu"), renderer.scene
         names = [arm.name for arm in scene.arms]
         estimate = dict(zip(names, (v.double().numpy() for v in state.joint_positions), strict=True))
         visible = visible_joints(known, self.measured_joints)
         mask = renderer.segment(state)[0] >= 0
-        return Score(
+        score = Score(
             loss,
             *self._overlap(mask),
             joint_mae_deg=joint_mae_deg(scene, estimate, self.joint_positions, self.measured_joints),
             visible_joint_mae_deg=None
             if visible is None
             else joint_mae_deg(scene, estimate, self.joint_positions, visible),
-            tip_depth_mm=tip_depth_error_mm(scene.with_cameras([self.camera]), estimate, self.joint_positions)
-            if whole
-            else None,
+            tip_depth_mm=None,
             seconds=seconds,
-            nsd_wide=self._wide(mask) if whole else None,
         )
+        if not whole:
+            return score
+        depth = tip_depth_error_mm(scene.with_cameras([self.camera]), estimate, self.joint_positions)
+        return replace(score, tip_depth_mm=depth, nsd_wide=self._wide(mask))
 
     def with_wide(self, score: Score, state: SceneState, renderer: Renderer) -> Score:
-        """The score of an estimate, with the second surface distance where that was left out."""
+        """The score of an estimate, with the second surface distance."""
         if score.nsd_wide is not None:
             return score
         return replace(score, nsd_wide=self._wide(renderer.segment(state.to("cpu"))[0] >= 0))
@@ -111,12 +106,12 @@ class Truth:
     def within(
         self, scene: Scene, found: Mapping[str, np.ndarray], std: Mapping[str, np.ndarray]
     ) -> tuple[int, int, int] | None:
-        """How many measured joints have a truth and a deviation, and err by at most one and two of them; None if none.
+        """Counts of measured joints with truth and deviation, and of errors within one and two of them; None without.
 
         Args:
-            scene: whose arms these are.
+            scene: with the arms.
             found: arm -> joint positions [rad, m].
-            std: arm -> their standard deviations, NaN where they are not known.
+            std: arm -> their standard deviations; NaN where not known.
         """
         ratios = []
         for arm in scene.arms:
@@ -143,10 +138,7 @@ class Truth:
 def visible_joints(
     known: Uncertainty | None, measured_joints: Mapping[str, tuple[str, ...]]
 ) -> Mapping[str, tuple[str, ...]] | None:
-    """Arm -> measured joints that the image determines; None for losses that do not say which.
-
-    This is the one place that reads it: what is returned here appears as "visible joints" in the whole report.
-    """
+    """Arm -> measured joints that the image determines ("visible joints" of the report); None if not reported."""
     if known is None:
         return None
     return {
@@ -206,16 +198,16 @@ def optimize(
     """Run the optimizer on one frame, and score every iterate in one camera.
 
     Args:
-        run: which.
+        run: the run.
         scene: with the cameras that take part.
         frame: its images and kinematics.
         backgrounds: of these cameras.
-        networks: the networks, or what stands in their place.
+        networks: the networks, or another predictor.
         settings: of the method.
-        free: what is unknown.
-        truth: what estimates are compared with.
-        renderer: draws the masks of the camera that is scored, at its size.
-        ignore: camera name -> pixels that show an occluder.
+        free: the unknowns.
+        truth: for the scores.
+        renderer: of the camera that is scored, at its size.
+        ignore: camera name -> pixels of an occluder.
     """
     start = start_of(scene, frame, run, truth.measured_joints)
     began = time.perf_counter()
@@ -227,15 +219,15 @@ def optimize(
     end = optimizer.best
     final = truth.score(end.state, end.uncertainty, end.loss, renderer, seconds)
     assessment = optimizer.assessment
-    # Far from a given mask the first iterate is what a search has found.
+    # With given masks, the first iterate can be the result of a search.
     searched = METHODS[run.method].masks_given
     return Measurement(
         run,
         final,
-        tuple(trace),
-        tuple(best),
         optimizer.stop_reason,
         machine(networks.device),
+        tuple(trace),
+        tuple(best),
         truth.score(scene.state(start), None, None, renderer, 0.0) if searched else None,
         verdict=assessment and assessment.verdict.value,
         probability=assessment and assessment.probability,
@@ -246,7 +238,7 @@ def optimize(
 def _followed(
     optimizer: FrameOptimizer, truth: Truth, renderer: Renderer, seconds: float
 ) -> tuple[list[Score], list[int], float]:
-    """The scores of all iterates, for each the place of the best one then, and the seconds with those until then."""
+    """Scores of all iterates, index of the best one at each iterate, and total seconds."""
     trace: list[Score] = []
     best: list[int] = []
 
@@ -269,17 +261,40 @@ def _followed(
             complete()
 
 
-def segment(run: Run, image: UInt8[np.ndarray, "h w 3"], extractor: FeatureExtractor, truth: Truth) -> Measurement:
-    """The network's own mask of one image, at the size that it was trained for."""
+def segment(
+    run: Run, scene: Scene, frame: Frame, truth: Truth, extractor: FeatureExtractor, trained: TrainedBaseline | None
+) -> Measurement:
+    """A network's own mask of one image, at the size that it was trained for.
+
+    Args:
+        run: which.
+        scene: with the camera that is scored.
+        frame: its image, and the measured joint positions, which are rendered for networks with that input.
+        truth: what the mask is compared with.
+        extractor: the feature and the surface network, and the device.
+        trained: a baseline in their place.
+    """
+    device, image, scene = extractor.device, frame.images[truth.camera], scene.with_cameras([truth.camera])
+    if trained is None:
+        network, size, kinematics = None, extractor.working_size, run.method == RENDERING
+    else:
+        network, settings = trained.network.to(device), trained.network.settings
+        size, kinematics = settings.size, settings.looks_at_kinematics
+    renderer = Renderer(scene, width=size[0], height=size[1]) if kinematics else None
     began = time.perf_counter()
-    small = cv2.resize(image, extractor.working_size, interpolation=cv2.INTER_AREA)
-    tensor = torch.from_numpy(small).to(extractor.device).permute(2, 0, 1)[None].float() / 255.0
+    given = renderer and renderer.surface_maps(scene.state(frame.measured, mounts=frame.mounts)).to(device)
+    small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+    tensor = torch.from_numpy(small).to(device).permute(2, 0, 1)[None].float() / 255.0
     with torch.no_grad():
-        probability = extractor.probability(tensor)[0, 0].cpu().numpy()
-    height, width = image.shape[:2]
-    mask = cv2.resize(probability, (width, height), interpolation=cv2.INTER_LINEAR) >= 0.5
-    seconds = time.perf_counter() - began
-    return Measurement(run, truth.score_mask(mask, seconds), (), (), "not iterative", machine(extractor.device))
+        if network is not None:
+            probability = network(tensor, given).sigmoid()
+        elif given is not None:
+            probability = extractor.surface(tensor, given)[:, COVERAGE].sum(1, keepdim=True)
+        else:
+            probability = extractor.probability(tensor)
+    full = cv2.resize(probability[0, 0].cpu().numpy(), image.shape[1::-1], interpolation=cv2.INTER_LINEAR)
+    score = truth.score_mask(full >= 0.5, time.perf_counter() - began)
+    return Measurement(run, score, "not iterative", machine(device))
 
 
 def calibrated_scene(recording: Recording, camera: str, frames: int, extractor: FeatureExtractor) -> Scene:
@@ -307,15 +322,15 @@ def correct_together(
     truths: Mapping[int, Truth],
     renderer: Renderer,
 ) -> list[Measurement]:
-    """Correct frames as a sequence, and score them when all are done.
+    """Correct frames in sequence mode, and score the final estimates.
 
     Seconds are those spent on a frame over all visits, reading its image included.
 
     Args:
         runs: one per frame, of one domain and error at the start.
-        recording: where the frames are from.
+        recording: of the frames.
         extractor: the networks.
-        truths: position of the frame -> what its estimate is compared with.
+        truths: position of the frame -> truth.
         renderer: of the camera that takes part, at its size.
     """
     by_frame = {run.frame: run for run in runs}
@@ -346,11 +361,9 @@ def correct_together(
             Measurement(
                 by_frame[index],
                 after,
-                (),
-                (),
                 estimate.start,
                 machine(extractor.device),
-                before,
+                before=before,
                 verdict=assessment and assessment.verdict.value,
                 probability=assessment and assessment.probability,
                 within=truth.within(scene, estimate.joint_positions, estimate.joint_std),
@@ -360,7 +373,7 @@ def correct_together(
 
 
 STEPS = 10
-"""Of each frame but the first. TC-CaRTS (arXiv 2212.00072) is said to need far fewer than CaRTS's 30."""
+"""Steps of each frame but the first. TC-CaRTS (arXiv 2212.00072) claims to need far fewer than CaRTS's 30."""
 
 
 def correct_forwards(
@@ -373,15 +386,11 @@ def correct_forwards(
 ) -> list[Measurement]:
     """Correct frames in their order with ACS, each from its measured joints plus the previous frame's correction.
 
-    This is the first of the three modules that TC-CaRTS adds (arXiv 2212.00072). What we have of that paper, its
-    abstract, does not say enough of the others: a network that corrects kinematics, and a regularization.
+    This is the first of the three modules that TC-CaRTS adds (arXiv 2212.00072). Its abstract, all that we have of it,
+    does not describe the others well enough: a network that corrects kinematics, and a regularization.
 
     Args:
-        runs: one per frame, of one domain and error at the start.
-        recording: where the frames are from.
-        extractor: the networks.
-        truths: position of the frame -> what its estimate is compared with.
-        renderer: of the camera that takes part, at its size.
+        runs, recording, extractor, truths, renderer: as in `correct_together`.
         first: settings of the first frame; the others take `STEPS` steps of the same schedule.
     """
     scene, cameras = renderer.scene, [camera.name for camera in renderer.scene.cameras]
@@ -400,74 +409,8 @@ def correct_forwards(
         seconds, best = time.perf_counter() - began, optimizer.best
         assert best is not None and optimizer.stop_reason is not None
         correction = {arm: values - measured[arm] for arm, values in best.joint_positions().items()}
-        found.append(
-            Measurement(
-                run,
-                truth.score(best.state, best.uncertainty, best.loss, renderer, seconds),
-                (),
-                (),
-                "warm" if found else "cold",
-                machine(extractor.device),
-                truth.score(scene.state(measured), None, None, renderer, 0.0),
-            )
-        )
+        before = truth.score(scene.state(measured), None, None, renderer, 0.0)
+        after = truth.score(best.state, best.uncertainty, best.loss, renderer, seconds)
+        how = "warm" if found else "cold"
+        found.append(Measurement(run, after, how, machine(extractor.device), before=before))
     return found
-
-
-def segment_with(
-    trained: TrainedBaseline, run: Run, scene: Scene, frame: Frame, truth: Truth, device: torch.device
-) -> Measurement:
-    """The mask of one image, at the size that the network was trained for; what it is given counts for its time.
-
-    Args:
-        trained: the network.
-        run: which.
-        scene: with the camera that is scored.
-        frame: its image, and the measured joint positions.
-        truth: what the mask is compared with.
-        device: where the network runs.
-    """
-    network = trained.network.to(device)
-    size = network.settings.size
-    rendering = _Rendering(scene, truth.camera, size) if network.settings.looks_at_kinematics else None
-    image = frame.images[truth.camera]
-    began = time.perf_counter()
-    given = rendering.of(frame).to(device) if rendering else None
-    with torch.no_grad():
-        probability = network(_tensor(image, size, device), given).sigmoid()
-    return _measured(run, probability, image, began, truth)
-
-
-def segment_rendered(run: Run, scene: Scene, frame: Frame, extractor: FeatureExtractor, truth: Truth) -> Measurement:
-    """The surface network's mask, given the rendering at the measured joint positions."""
-    rendering = _Rendering(scene, truth.camera, extractor.working_size)
-    image = frame.images[truth.camera]
-    began = time.perf_counter()
-    tensor = _tensor(image, extractor.working_size, extractor.device)
-    surface = extractor.surface(tensor, rendering.of(frame).to(extractor.device))
-    return _measured(run, surface[:, COVERAGE].sum(1, keepdim=True), image, began, truth)
-
-
-class _Rendering:
-    """Rendering at the measured joint positions, at the network's size."""
-
-    def __init__(self, scene: Scene, camera: str, size: tuple[int, int]) -> None:
-        self._scene = scene.with_cameras([camera])
-        self._renderer = Renderer(self._scene, width=size[0], height=size[1])
-
-    def of(self, frame: Frame) -> Float[Tensor, "1 6 h w"]:
-        return self._renderer.surface_maps(self._scene.state(frame.measured, mounts=frame.mounts))
-
-
-def _tensor(image: UInt8[np.ndarray, "h w 3"], size: tuple[int, int], device: torch.device) -> Float[Tensor, "1 3 h w"]:
-    small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
-    return torch.from_numpy(small).to(device).permute(2, 0, 1)[None].float() / 255.0
-
-
-def _measured(
-    run: Run, probability: Float[Tensor, "1 1 h w"], image: UInt8[np.ndarray, "h w 3"], began: float, truth: Truth
-) -> Measurement:
-    full = cv2.resize(probability[0, 0].cpu().numpy(), image.shape[1::-1], interpolation=cv2.INTER_LINEAR)
-    seconds = time.perf_counter() - began
-    mask = full >= 0.5
-    return Measurement(run, truth.score_mask(mask, seconds), (), (), "not iterative", machine(probability.device))

@@ -19,7 +19,7 @@ COLUMNS = {
 """Our source and domain -> the paper's column."""
 
 DICE: dict[str, dict[str, Value]] = {
-    # The supplement's ablation of iterations, on its validation set: the only place where it gives the U-Net.
+    # From the supplement's ablation of iterations on its validation set, the only source for the U-Net.
     "unet": {
         "R-Reg": (95.0, 2.7),
         "R-LB": (84.1, 3.5),

@@ -5,7 +5,7 @@ import zlib
 from collections.abc import Callable, Iterable
 from collections.abc import Sequence as Items
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Literal
 
@@ -30,25 +30,25 @@ _PHOTOGRAPHS = (".jpg", ".jpeg", ".png")
 
 @dataclass(frozen=True)
 class Room:
-    """What is behind the instrument, in place of what was there."""
+    """Background of the instrument in place of the recorded one."""
 
     name: str
     half: Half
-    """Whether settings may be chosen on it."""
+    """Whether it may serve tuning."""
     draw: Callable[[int, int], UInt8[np.ndarray, "h w 3"]]
     """Its picture in a width and height [px]."""
 
     @property
     def domain(self) -> str:
-        """What runs in it are filed under."""
+        """Domain of its runs."""
         return f"{self.half}: {self.name}"
 
 
 def made_rooms() -> list[Room]:
-    """The rooms that code draws."""
+    """The synthetic rooms."""
     halves: list[tuple[Half, dict[str, Callable[..., Picture]]]] = [("tuning", _TUNING), ("held-out", _HELD_OUT)]
     return [
-        Room(f"{kind} {seed}", half, _Made(kind, draw, seed))
+        Room(f"{kind} {seed}", half, partial(_made, kind, draw, seed))
         for half, kinds in halves
         for kind, draw in kinds.items()
         for seed in range(_SEEDS)
@@ -65,38 +65,27 @@ def photographs(folder: Path) -> list[Room]:
     if not paths:
         raise SettingsError(f"{folder} holds no photograph. Give a folder with {', '.join(_PHOTOGRAPHS)} files.")
     halves: tuple[Half, Half] = ("tuning", "held-out")
-    return [Room(path.stem, halves[index % 2], _Photograph(path)) for index, path in enumerate(paths)]
+    return [Room(path.stem, halves[index % 2], partial(_photograph, path)) for index, path in enumerate(paths)]
 
 
-@dataclass(frozen=True)
-class _Made:
-    kind: str
-    made: Callable[..., Picture]
-    seed: int
-
-    def __call__(self, width: int, height: int) -> UInt8[np.ndarray, "h w 3"]:
-        rng = np.random.default_rng([zlib.crc32(self.kind.encode()), self.seed])
-        picture = self.made(rng, width, height)
-        picture *= 1.0 + 0.15 * _grain(rng, width, height, width / 3)[..., None]
-        picture = cv2.GaussianBlur(picture, (0, 0), rng.uniform(0.6, 1.4))
-        return np.rint(255 * picture.clip(0, 1)).astype(np.uint8)
+def _made(kind: str, draw: Callable[..., Picture], seed: int, width: int, height: int) -> UInt8[np.ndarray, "h w 3"]:
+    """Picture of a synthetic room."""
+    rng = np.random.default_rng([zlib.crc32(kind.encode()), seed])
+    picture = draw(rng, width, height)
+    picture *= 1.0 + 0.15 * _grain(rng, width, height, width / 3)[..., None]
+    picture = cv2.GaussianBlur(picture, (0, 0), rng.uniform(0.6, 1.4))
+    return np.rint(255 * picture.clip(0, 1)).astype(np.uint8)
 
 
-@dataclass(frozen=True)
-class _Photograph:
-    path: Path
-
-    @cached_property
-    def _whole(self) -> UInt8[np.ndarray, "h w 3"]:
-        return read_image(self.path)
-
-    def __call__(self, width: int, height: int) -> UInt8[np.ndarray, "h w 3"]:
-        rows, columns, _ = self._whole.shape
-        scale = max(width / columns, height / rows)
-        size = max(round(scale * columns), width), max(round(scale * rows), height)
-        picture = cv2.resize(self._whole, size, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC)
-        top, left = (size[1] - height) // 2, (size[0] - width) // 2
-        return np.ascontiguousarray(picture[top : top + height, left : left + width])
+def _photograph(path: Path, width: int, height: int) -> UInt8[np.ndarray, "h w 3"]:
+    """Central part of a photograph."""
+    whole = read_image(path)
+    rows, columns, _ = whole.shape
+    scale = max(width / columns, height / rows)
+    size = max(round(scale * columns), width), max(round(scale * rows), height)
+    picture = cv2.resize(whole, size, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC)
+    top, left = (size[1] - height) // 2, (size[0] - width) // 2
+    return np.ascontiguousarray(picture[top : top + height, left : left + width])
 
 
 def _grain(rng: np.random.Generator, width: int, height: int, size: float) -> Float[np.ndarray, "h w"]:
@@ -301,31 +290,26 @@ _HELD_OUT = {"plates": _plates, "rails": _rails, "ceramic": _ceramic, "cables": 
 
 
 _PARALLAX = 24
-"""How far the room of one camera is moved against that of the camera before [px]."""
+"""Shift of the room between one camera and the next [px]."""
 
 _RIM = 2
-"""Width of the rim whose colours come from further inside, since the old background shines through it [px]."""
+"""Width of the rim whose colours are taken from further inside, free of the old background [px]."""
 
 _SEAM = 0.8
 """Deviation of the blur of the cut [px]."""
 
 _MATCH = (0.85, 1.15)
-"""How far the instrument's brightness follows the room's [1]."""
+"""Range of the factor that adapts the instrument's brightness to the room [1]."""
 
 _GAIN, _NOISE = 0.03, 1.5
 """Largest change of the light from frame to frame [1], and the sensor's noise [grey levels]."""
 
 
 class AnotherRoom:
-    """A real sequence in which each domain is a room.
+    """A real sequence, with masks, in which each domain is a room of that name.
 
-    The room stands still through the recording; light and noise vary from frame to frame. The mean background is
-    estimated as that of any recording: as the median over its frames of what the arms, as measured, do not cover.
-
-    Args:
-        sequence: with masks of the cameras.
-        rooms: each is a domain of that name.
-        seed: of light and noise.
+    The room stands still; light and noise vary from frame to frame, by the seed. The mean background is estimated as of
+    any recording: as the median over frames of what the measured arms do not cover.
     """
 
     def __init__(self, sequence: Sequence, rooms: Items[Room], seed: int) -> None:
@@ -345,32 +329,18 @@ class AnotherRoom:
         room = domain or next(iter(self.rooms))
         frame = self._sequence.frame(index, cameras=cameras or self._cameras)
         assert frame.masks is not None
-        images = {
-            camera: self._photographed(
-                pasted(image, frame.masks[camera], self.empty(room, camera)), room, camera, index
-            )
-            for camera, image in frame.images.items()
-        }
+        images = {}
+        for camera, image in frame.images.items():
+            picture = pasted(image, frame.masks[camera], self._picture(room, camera))
+            images[camera] = self._photographed(picture, room, camera, index)
         return dataclasses.replace(frame, domain=room, images=images)
-
-    def frame_without_arm(self, index: int, room: str, cameras: Iterable[str] | None = None) -> Frame:
-        """The same with nothing in the room; the masks are empty."""
-        frame = self._sequence.frame(index, cameras=cameras or self._cameras)
-        assert frame.masks is not None
-        images = {camera: self._photographed(self.empty(room, camera), room, camera, index) for camera in frame.images}
-        masks = {camera: np.zeros_like(mask) for camera, mask in frame.masks.items()}
-        return dataclasses.replace(frame, domain=room, images=images, masks=masks)
-
-    def empty(self, room: str, camera: str) -> UInt8[np.ndarray, "h w 3"]:
-        """The room as a camera sees it, without light's and noise's changes."""
-        return self._picture(room, camera)
 
     def background(self, camera: str, domain: str | None = None) -> UInt8[np.ndarray, "h w 3"]:
         """The mean background, estimated from the recording in the room."""
         return self.mean_background(camera, domain).image.copy()
 
     def mean_background(self, camera: str, domain: str | None = None) -> MeanBackground:
-        """The same with where it is known."""
+        """The mean background and the pixels where it is known."""
         return self._background(domain or next(iter(self.rooms)), camera)
 
     def _make_picture(self, room: str, camera: str) -> UInt8[np.ndarray, "h w 3"]:

@@ -1,4 +1,4 @@
-"""Plan of a benchmark's runs, and the runner that does those that are not known yet."""
+"""Plan of a benchmark's runs, and the runner of those that are not measured yet."""
 
 from collections.abc import Iterable, Mapping
 from collections.abc import Sequence as Items
@@ -36,8 +36,6 @@ from .frame import (
     correct_together,
     optimize,
     segment,
-    segment_rendered,
-    segment_with,
 )
 from .measurement import Measurement, ResultsFile, code_fingerprint, run_fingerprint
 from .scope import FAMILY, MAIN, METHODS, REAL, RENDERING, ROOMS, SYNTHETIC, Run, Scope
@@ -47,15 +45,10 @@ _UNDER_OCCLUDERS = ("ours", "ours_given", "ours_proposed")
 
 
 def plan(scope: Scope, sources: Items[Source], baselines: Items[str] = ()) -> list[Run]:
-    """All runs, frame after frame, so that a benchmark that was stopped has measured some of everything.
+    """All runs, frame after frame, so that a stopped benchmark has some measurements of every kind.
 
     Frames on which not all methods are evaluated come after that, then frames that are corrected together, other rooms,
-    and instruments that no training has last.
-
-    Args:
-        scope: how much is measured.
-        sources: where frames come from.
-        baselines: names in `methods.BASELINES` whose weights are given.
+    and instruments that no training has. `baselines` are names in `scope.BASELINES` whose weights are given.
     """
     rooms, families = ([s for s in sources if s.name.startswith(kind)] for kind in (ROOMS, FAMILY))
     sources = [source for source in sources if source not in (*rooms, *families)]
@@ -138,15 +131,15 @@ _OCCLUDERS_SEED = 20
 
 
 class Benchmark:
-    """The runs of a scope over some sources, and the file that holds their results.
+    """The runs of a scope over some sources, and the file of their results.
 
     Args:
-        scope: how much is measured.
-        sources: where frames come from.
-        extractor: the feature network.
-        results: the results file.
-        runs: what is measured, in order.
-        baselines: name in `methods.BASELINES` -> its network; every baseline among the runs.
+        scope: of the benchmark.
+        sources: of frames.
+        extractor: the networks.
+        results: the file.
+        runs: to be measured, in this order.
+        baselines: name in `scope.BASELINES` -> its network; every baseline among the runs.
     """
 
     def __init__(
@@ -164,12 +157,12 @@ class Benchmark:
         self.runs = {run: self._fingerprint(run) for run in runs}
 
     def measurements(self) -> list[Measurement]:
-        """What is known of the runs."""
+        """Stored measurements of the runs."""
         found = (self.results.find(run, fingerprint) for run, fingerprint in self.runs.items())
         return [measurement for measurement in found if measurement is not None]
 
     def run(self, console: Console) -> None:
-        """Measure what is not known yet; stopping at any moment keeps what was measured.
+        """Measure the missing runs; a stopped benchmark keeps its measurements.
 
         Raises:
             CartsError: a sequence cannot be made or read, or the results cannot be written.
@@ -206,25 +199,25 @@ class Benchmark:
         return run_fingerprint(run, self.scope, self.extractor, self.sources[run.source].fingerprint, baseline)
 
     def _group(self, run: Run) -> list[Run]:
-        """The runs that are measured at once with this one."""
+        """Runs that are measured together with this one."""
         if not METHODS[run.method].together:
             return [run]
         return [other for other in self.runs if replace(other, frame=run.frame) == run]
 
 
 def _log(console: Console, line: str) -> None:
-    """Tell a file or a pipe, which no bar can be drawn in, how things go."""
+    """Print progress to a file or a pipe."""
     if not console.is_terminal:
         console.print(line, soft_wrap=True, highlight=False, markup=False)
 
 
 class SourceBench:
-    """One source, opened when its first run comes."""
+    """A source, opened at its first run."""
 
     def __init__(self, source: Source, bar: Bar, baselines: Mapping[str, TrainedBaseline] | None = None) -> None:
         self._source, self._bar, self._baselines = source, bar, baselines or {}
         self.opened: tuple[Recording, Renderer] | None = None
-        """What is measured on, once it is open."""
+        """The recording and its renderer, once it is open."""
         self._calibrated: Scene | None = None
 
     def measure(self, runs: list[Run], scope: Scope, extractor: FeatureExtractor) -> list[Measurement]:
@@ -253,12 +246,8 @@ class SourceBench:
         truth = self._truth(frame)
         if covered:
             frame, truth = self._covered(frame, truth)
-        if method.baseline:
-            return segment_with(self._baselines[run.method], run, recording.scene, frame, truth, extractor.device)
-        if run.method == RENDERING:
-            return segment_rendered(run, recording.scene, frame, extractor, truth)
         if method.settings is None:
-            return segment(run, frame.images[camera], extractor, truth)
+            return segment(run, recording.scene, frame, truth, extractor, self._baselines.get(run.method))
         settings = method.settings(scope.steps(run))
         domain = "regular" if covered or wrong or crossing else run.domain
         if method.masks_given:

@@ -13,7 +13,7 @@ REAL = "real"
 ROOMS = "rooms"
 """Instruments in other rooms; a source of that name and the camera's, or `synthetic`."""
 FAMILY = "family"
-"""Instruments of a family that no training has; a source of that name and the instrument's."""
+"""Instruments in no training data; a source of that name and the instrument's."""
 PAPERS_STEPS = 50
 """The paper's number of steps."""
 
@@ -25,14 +25,14 @@ class Run:
     source: str
     """`synthetic`, `real`, `rooms` and a camera, or `family` and an instrument."""
     domain: str
-    """One of the synthetic domains, `occlusion`, `crossing arms`, a room, or one of `wrong_inputs.WRONG`."""
+    """One of the synthetic domains, `occlusion`, `crossing arms`, a room, or one of `conditions.WRONG`."""
     frame: int
     """Position in the sequence."""
     method: str
-    """A name in `methods.METHODS`."""
+    """A name in `METHODS`."""
     error_deg: float | None = None
-    """How far every joint is off at the start [deg, mm for prismatic ones], from the true joint positions where they
-    are known; None starts at the measured ones."""
+    """Error of every joint at the start [deg; mm for prismatic joints], from the true joint positions if known; None
+    starts at the measured ones."""
 
 
 @dataclass(frozen=True)
@@ -49,14 +49,13 @@ class Scope:
     """Steps in the paper's setting from the measured joint positions, `PAPERS_STEPS` at most from others. Its schedule
     does not depend on their number, so one run holds all shorter ones."""
     error_domains: tuple[str, ...]
-    """Synthetic domains in which the start is put off on purpose."""
+    """Synthetic domains with errors at the start."""
     errors_deg: tuple[float, ...]
     """Sizes of that error for the default solver [deg]."""
     paper_errors_deg: tuple[float, ...]
     """The same for the paper's setting, in the regular domain [deg]."""
     further_errors_deg: tuple[float, ...]
-    """The same for the default solver on the frames of the synthetic sequence that are not among the evaluated ones, so
-    that its figures hang on more than these [deg]."""
+    """The same for the default solver on the other frames of the synthetic sequence [deg]."""
     real_errors_deg: tuple[float, ...]
     """The same on real frames, both methods, in the regular domain, from the measured joint positions [deg]."""
     hard_errors_deg: tuple[float, ...]
@@ -64,21 +63,21 @@ class Scope:
     crossing_errors_deg: tuple[float, ...]
     """The same on synthetic frames whose arms cross, for the default solver and ACS [deg]."""
     consecutive: int
-    """Frames of the beginning of each sequence that are corrected together, at most."""
+    """Largest number of first frames of each sequence that are corrected together."""
     consecutive_domains: tuple[str, ...]
-    """Domains in which they are."""
+    """Domains of these frames."""
     consecutive_errors_deg: tuple[float, ...]
     """Sizes of an error at the start that all synthetic frames share, in those domains [deg]."""
     calibration_frames: int
-    """Frames of a real sequence that are calibrated with, evenly spread."""
+    """Frames of a calibration of a real sequence, evenly spread."""
     room_frames: int
-    """Frames of a real sequence that are put into each of the other rooms, evenly spread."""
+    """Frames of a real sequence that are put before each of the other rooms, evenly spread."""
     room_consecutive: int
-    """Frames, likewise, that are corrected together there."""
+    """The same for frames that are corrected together there."""
     room_share: int
-    """Only every so many rooms are measured."""
+    """Every n-th room is measured."""
     family_frames: int
-    """Frames of each instrument that no training has; 0 leaves them out."""
+    """Frames of each instrument that is in no training data; may be 0."""
     hand_eye_starts: int
     """Starts of each hand-eye calibration of another robot."""
 
@@ -148,7 +147,7 @@ FULL = Scope(
 
 @dataclass(frozen=True)
 class Method:
-    """One way from images and measured kinematics to a mask."""
+    """A method of the comparison, from images and measured kinematics to a mask."""
 
     label: str
     """Label in tables."""
@@ -156,7 +155,7 @@ class Method:
     """From the number of steps in the paper's setting to the optimizer's settings; None takes the network's own mask
     and looks at no kinematics."""
     occluders_given: bool = False
-    """It is given the occluders' pixels."""
+    """The pixels of occluders are given."""
     every_camera: bool = False
     """All cameras enter one objective."""
     poses: bool = False
@@ -166,11 +165,11 @@ class Method:
     together: bool = False
     """Frames are corrected together, as a sequence."""
     masks_given: bool = False
-    """The given masks are what is fitted, and no network is used."""
+    """Given masks are fitted, without a network."""
     baseline: bool = False
-    """It is a network of others, whose weights have to be given."""
+    """A network from the literature, whose weights have to be given."""
     image_alone: bool = False
-    """It sees the image, and neither kinematics nor a rendering."""
+    """Its only input is the image."""
 
 
 def _ours(_: int) -> SolverSettings:
@@ -220,10 +219,10 @@ BASELINES = {
     for network, label in _NETWORKS.items()
     for change, what in _AUGMENTATIONS.items()
 }
-"""Rows of networks of others, by network and augmentation; measured where weights are given."""
+"""Networks from the literature, by network and augmentation; measured if weights are given."""
 METHODS |= BASELINES
 MAIN = ("unet", "start", "l1", "paper", "ours")
 """Methods of the main table: each frame alone, in one camera."""
 RENDERING = "surface"
-"""The surface network's mask of an image and of what is rendered at the measured joint positions: two inputs, as
-Colleoni et al. have them, and where ours begins."""
+"""The surface network's mask from an image and the rendering at the measured joint positions, the inputs of Colleoni et
+al."""

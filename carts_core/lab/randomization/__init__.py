@@ -10,16 +10,3 @@ from .samples import PairGenerator as PairGenerator
 from .samples import SurfaceGenerator as SurfaceGenerator
 from .samples import SurfaceSample as SurfaceSample
 from .samples import TrainingPair as TrainingPair
-
-__all__ = [
-    "BACKGROUND",
-    "HEAD",
-    "SHAFT",
-    "SURFACE_UNIT",
-    "AppearanceRanges",
-    "ImageSettings",
-    "PairGenerator",
-    "SurfaceGenerator",
-    "SurfaceSample",
-    "TrainingPair",
-]

@@ -4,7 +4,6 @@ import copy
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 import torch
@@ -33,51 +32,30 @@ class PosedRobot:
     normals: Float[np.ndarray, "V 3"]
 
 
-class Body(Protocol):
-    """Triangles that can be rasterised and shaded; see `RobotGeometry` for the attributes."""
+@dataclass
+class Body:
+    """Triangles of a robot or another object, by parts, to be rasterised and shaded."""
 
-    @property
-    def vertices(self) -> Float[np.ndarray, "V 3"]:
-        """Of all parts, each in the frame of its link [m]."""
-        ...
-
-    @property
-    def faces(self) -> Int[np.ndarray, "F 3"]:
-        """Triangles."""
-        ...
-
-    @property
-    def face_part(self) -> Int[np.ndarray, " F"]:
-        """Index of the part that a triangle belongs to."""
-        ...
-
-    @property
-    def shaft(self) -> int:
-        """Index of the longest part."""
-        ...
-
-    @property
-    def shaft_axis(self) -> Float[np.ndarray, "3"]:
-        """Unit vector along the shaft, pointing away from the tip."""
-        ...
-
-    @property
-    def shaft_end(self) -> Float[np.ndarray, "3"]:
-        """The shaft's end at the tip [m]."""
-        ...
+    vertices: Float[np.ndarray, "V 3"]
+    """Of all parts, each in the frame of its link [m]."""
+    normals: Float[np.ndarray, "V 3"]
+    faces: Int[np.ndarray, "F 3"]
+    face_part: Int[np.ndarray, " F"]
+    """Index of the part that a triangle belongs to."""
+    shaft: int
+    """Part that is painted as shafts are, mostly dark; -1 without one."""
+    shaft_axis: Float[np.ndarray, "3"]
+    """Unit vector along the shaft in its link's frame, pointing away from the tip."""
+    shaft_end: Float[np.ndarray, "3"]
+    """The shaft's end at the tip, in its link's frame [m]."""
 
 
-class RobotGeometry:
-    """Properties of a robot for placing and shading.
+class RobotGeometry(Body):
+    """A robot for placing and shading; parts are `Robot.meshes`, and the shaft is the longest one.
 
     Attributes:
-        vertices, normals: of all parts, each in the frame of its link [V, 3].
-        faces: triangles [F, 3].
-        face_part: index of the part (`Robot.meshes`) that a triangle belongs to [F].
+        part_link: link of each part.
         part_class: index into `carts_core.model.parts.PARTS` of each part.
-        shaft: index of the longest part, the instrument's shaft.
-        shaft_axis: unit vector along the shaft in its link's frame, pointing away from the tip [3].
-        shaft_end: the shaft's end at the tip, in its link's frame [3] [m].
     """
 
     def __init__(self, robot: Robot) -> None:
@@ -87,9 +65,8 @@ class RobotGeometry:
         starts = np.concatenate([[0], np.cumsum(counts)])
         self.vertices = np.concatenate([mesh.vertices for mesh in meshes]).astype(np.float32)
         self.normals = np.concatenate([mesh.normals for mesh in meshes]).astype(np.float32)
-        self.faces: Int[np.ndarray, "F 3"] = np.concatenate(
-            [mesh.faces + start for mesh, start in zip(meshes, starts[:-1], strict=True)]
-        ).astype(np.int32)
+        faces = [mesh.faces + start for mesh, start in zip(meshes, starts[:-1], strict=True)]
+        self.faces = np.concatenate(faces).astype(np.int32)
         self.face_part = np.repeat(np.arange(len(meshes)), [len(mesh.faces) for mesh in meshes]).astype(np.int32)
         self._vertex_part = np.repeat(np.arange(len(meshes)), counts)
         self._vertex_link = np.repeat([mesh.link for mesh in meshes], counts)
@@ -145,7 +122,7 @@ DEPTH = (0.05, 0.25)
 FOCAL_LENGTH = (0.7, 2.0)
 """Focal length in image widths [1]: of whole endoscope images, and of enlarged ones."""
 OUTSIDE = 0.12
-"""How far outside the image a wrist may be, in image sizes [1]."""
+"""Largest distance of a wrist from the image, in image sizes [1]."""
 ELEVATION = (-20.0, 60.0)
 """Angle at which the shaft comes towards the camera [deg]; negative goes away from it."""
 
@@ -255,8 +232,7 @@ def random_placement(
 def perturbed(rng: np.random.Generator, geometry: RobotGeometry, placement: Placement, scale: float) -> Placement:
     """The placement with wrong kinematics: joints off by some degrees, the arm turned and moved a little.
 
-    Args:
-        scale: 1 moves the wrist by some 3 mm and turns joints by some 3 degrees.
+    A scale of 1 moves the wrist by some 3 mm and turns joints by some 3 degrees.
     """
     joints = placement.joint_positions.copy()
     for index, kind in enumerate(geometry.robot.joint_types):
@@ -268,7 +244,7 @@ def perturbed(rng: np.random.Generator, geometry: RobotGeometry, placement: Plac
     T_camera_shaft_moved = placement.T_camera_base @ geometry.link_transforms(joints)[shaft_link]
     turn = turned(rng.normal(0, np.deg2rad(2.0) * scale, 3))
     wrist = T_camera_shaft[:3, :3] @ geometry.shaft_end + T_camera_shaft[:3, 3]
-    # Farther away, what moves the image by as much is a larger distance.
+    # At a larger distance, the same displacement in the image is a larger one in space.
     wrist = wrist + rng.normal(0, 0.003 * scale, 3) * max(1.0, np.linalg.norm(wrist) / DEPTH[1])
     R = turn @ T_camera_shaft[:3, :3]
     T = np.eye(4)
@@ -287,7 +263,7 @@ def _random_joints(rng: np.random.Generator, geometry: RobotGeometry) -> np.ndar
 
 
 def _frame(axis: np.ndarray, helper: np.ndarray) -> np.ndarray:
-    """A rotation whose last column is `axis`, turned about it by chance."""
+    """A rotation whose last column is `axis`; `helper` fixes the angle about it."""
     x = np.cross(axis, helper)
     x /= np.linalg.norm(x)
     return np.stack([x, np.cross(axis, x), axis], axis=1)
@@ -304,24 +280,21 @@ def turned(vector: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
 
 
 _FRAMES = 200
-"""Frames that joint positions are taken from, spread over the recording."""
+"""Number of frames of the recording with joint positions that are used."""
 _TURN = np.deg2rad(8.0)
-"""How far an arm is turned in front of the camera, standard deviation [rad]."""
+"""Standard deviation of an arm's rotation in front of the camera [rad]."""
 _SHIFT = 0.06
-"""How far it is moved, standard deviation in distances from the camera [1]."""
+"""Standard deviation of its translation, in distances from the camera [1]."""
 _JOINTS = 0.12
-"""How far joints are moved, standard deviation in parts of their range in the recording, and at least..."""
+"""Standard deviation of joint motion, in parts of the joint's range in the recording [1]."""
 _LEAST = np.deg2rad(6.0)
-"""...so many [rad], and a tenth of that in [m] for sliding joints."""
+"""Least standard deviation of joint motion [rad]; a tenth of that in [m] for sliding joints."""
 _ZOOM = 0.12
 """Standard deviation of the logarithm of the focal length [1]."""
 
 
 class RecordedPlacements:
-    """Placements like those of a recording.
-
-    Args:
-        path: sequence file.
+    """Placements like those of a sequence file.
 
     Raises:
         SequenceError: it cannot be read.
@@ -340,7 +313,7 @@ class RecordedPlacements:
     def __call__(
         self, rng: np.random.Generator, geometries: tuple[RobotGeometry, ...], size: tuple[int, int], field: int
     ) -> tuple[Intrinsics, list[Placement]]:
-        """A camera and a place for each robot, some part of the first of which is in the image.
+        """A camera and a place for each robot, with a part of the first one in the image.
 
         Args:
             rng: random numbers.
@@ -349,7 +322,7 @@ class RecordedPlacements:
             field: width of the camera's image [px].
 
         Raises:
-            SettingsError: a robot is none of the recording.
+            SettingsError: a robot is not in the recording.
         """
         camera = self._cameras[int(rng.integers(len(self._cameras)))]
         zoom = field / camera.width * float(np.exp(rng.normal(0, _ZOOM)))

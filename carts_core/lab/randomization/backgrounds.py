@@ -43,10 +43,7 @@ _DARKEST = 0.25
 
 
 class Photographs:
-    """Random views of the photographs in a folder.
-
-    Args:
-        folder: searched with its subfolders; files that are no images by their name are left out.
+    """Random views of the image files in a folder and its subfolders.
 
     Raises:
         SettingsError: there is no photograph, or one cannot be read.
@@ -69,7 +66,7 @@ class Photographs:
         rows, columns = image.shape[:2]
         if rng.random() < 0.5:
             image = image[:, ::-1]
-        # The part is never larger than the photograph, so that little lies beyond its border.
+        # The part is at most as large as the photograph, so that its border is rarely visible.
         largest = min(columns / width, rows / height)
         step = largest * np.exp(rng.uniform(np.log(0.3), 0.0))
         turn = rng.normal(0, 12) + 90 * int(rng.integers(4)) * (rng.random() < 0.3)
@@ -255,7 +252,7 @@ def _hand(rng: np.random.Generator, image: Image) -> Image:
 
 
 def _round(rng: np.random.Generator, t: np.ndarray, color: np.ndarray) -> Image:
-    """Colours over the width of a round thing, `t` from -1 to 1, lit from somewhere, dull or shiny."""
+    """Colours across a cylinder, `t` from -1 to 1, under a random light, dull or shiny."""
     normal = np.sqrt(np.clip(1 - t * t, 0, 1))
     light = rng.uniform(-0.7, 0.7)
     facing = np.clip(light * t + np.sqrt(1 - light**2) * normal, 0, 1)

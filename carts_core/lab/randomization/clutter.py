@@ -4,13 +4,11 @@ Solid objects (rods, plates, cables, tools) are shaded as the arms are, so that 
 an instrument. The occluded surface of an arm remains the label.
 """
 
-from dataclasses import dataclass
-
 import cv2
 import numpy as np
 from jaxtyping import Float
 
-from .arms import Intrinsics, PosedRobot
+from .arms import Body, Intrinsics, PosedRobot
 from .backgrounds import random_background, smooth_noise
 from .shading import render_gbuffer, shade
 
@@ -19,31 +17,10 @@ Image = Float[np.ndarray, "h w 3"]
 _SUPERSAMPLING = 2
 _DEPTH = (0.05, 0.40)
 """Distance from the camera [m]."""
-_NO_SHAFT = -1
-
-
-@dataclass(frozen=True)
-class Solid:
-    """A thing's triangles; see `Body`."""
-
-    vertices: Float[np.ndarray, "V 3"]
-    normals: Float[np.ndarray, "V 3"]
-    faces: np.ndarray
-    face_part: np.ndarray
-    shaft: int
-    """Part that is painted as shafts are, mostly dark; `_NO_SHAFT` if none is."""
-    shaft_axis: Float[np.ndarray, "3"]
-    shaft_end: Float[np.ndarray, "3"]
 
 
 def add_things(rng: np.random.Generator, image: Image, intrinsics: Intrinsics) -> Image:
-    """One to four things at random in front of a background, with shadows beside them.
-
-    Args:
-        rng: random numbers.
-        image: the background.
-        intrinsics: fx, fy, cx, cy [px].
-    """
+    """One to four random objects before a background, with shadows beside them."""
     height, width = image.shape[:2]
     things = [random_thing(rng) for _ in range(rng.choice([1, 2, 3, 4], p=[0.4, 0.3, 0.2, 0.1]))]
     posed = [_placed(rng, thing, intrinsics, width, height) for thing in things]
@@ -58,7 +35,7 @@ def add_things(rng: np.random.Generator, image: Image, intrinsics: Intrinsics) -
     return image * (1 - coverage[..., None]) + layers[..., :3]
 
 
-def random_thing(rng: np.random.Generator) -> Solid:
+def random_thing(rng: np.random.Generator) -> Body:
     """A rod, plate, rail, cable, tool or ring of centimetres, about its own origin."""
     kinds = [_rod, _plate, _rails, _cable, _tool, _ring]
     make = kinds[int(rng.choice(len(kinds), p=[0.3, 0.2, 0.12, 0.16, 0.14, 0.08]))]
@@ -71,8 +48,8 @@ def random_thing(rng: np.random.Generator) -> Solid:
     vertices -= vertices.mean(0)
     axis = np.array([0.0, 0.0, 1.0])
     end = axis * float(vertices[:, 2].min())
-    shaft = 0 if rng.random() < 0.5 else _NO_SHAFT
-    return Solid(vertices, _normals(vertices, faces), faces, face_part, shaft, axis, end)
+    shaft = 0 if rng.random() < 0.5 else -1
+    return Body(vertices, _normals(vertices, faces), faces, face_part, shaft, axis, end)
 
 
 Part = tuple[np.ndarray, np.ndarray]
@@ -159,7 +136,7 @@ def _ring(rng: np.random.Generator) -> list[Part]:
 
 
 def _straight(low: float, high: float, near: float, far: float, sides: int = 20) -> Part:
-    """A cylinder or cone along z with flat ends, whose vertices are its own so that edges stay sharp."""
+    """A cylinder or cone along z with flat ends and separate vertices for sharp edges."""
     rings = [(low, 0.0), (low, near), (low, near), (high, far), (high, far), (high, 0.0)]
     angles = np.linspace(0, 2 * np.pi, sides, endpoint=False)
     circle = np.column_stack([np.cos(angles), np.sin(angles)])
@@ -195,7 +172,7 @@ def _circle(radius: float) -> np.ndarray:
 
 
 def _box(extents: np.ndarray, centre: np.ndarray) -> Part:
-    """A box whose faces have vertices of their own."""
+    """A box with separate vertices for each face."""
     vertices, faces = [], []
     for axis in range(3):
         for sign in (-1.0, 1.0):
@@ -217,8 +194,8 @@ def _normals(vertices: np.ndarray, faces: np.ndarray) -> Float[np.ndarray, "V 3"
     return (normals / (np.linalg.norm(normals, axis=1, keepdims=True) + 1e-20)).astype(np.float32)
 
 
-def _placed(rng: np.random.Generator, thing: Solid, intrinsics: Intrinsics, width: int, height: int) -> PosedRobot:
-    """Somewhere in or near the image, turned any way."""
+def _placed(rng: np.random.Generator, thing: Body, intrinsics: Intrinsics, width: int, height: int) -> PosedRobot:
+    """Random pose in or near the image."""
     fx, fy, cx, cy = intrinsics
     depth = _log_uniform(rng, *_DEPTH)
     u, v = rng.uniform(-0.1, 1.1, 2) * (width, height)
@@ -239,7 +216,7 @@ def _turn_about_y(angle: float) -> np.ndarray:
 
 
 def occlude(rng: np.random.Generator, image: Image, coverage: Float[np.ndarray, "h w"]) -> Image:
-    """One to three things of any texture but a red one over the arms, ragged or smooth; none where there is no arm."""
+    """One to three objects of any texture but red over the arms, ragged or smooth; none without arms."""
     rows, columns = np.nonzero(coverage > 0.5)
     if not len(rows):
         return image
@@ -295,21 +272,14 @@ def cast_shadow(rng: np.random.Generator, image: Image, coverage: Float[np.ndarr
     reach = np.exp(rng.uniform(np.log(0.01), np.log(0.35))) * width
     moved = _displaced(rng, coverage, reach, turn=6, scale=(0.9, 1.15))
     soft = cv2.GaussianBlur(moved, (0, 0), np.clip(reach * rng.uniform(0.03, 0.2), 0.6, 8))
-    # Close to what casts it a shadow can be nearly black.
+    # Near its caster, a shadow can be nearly black.
     return _darken(rng, image, soft, 0.9 if reach < 0.08 * width else 0.6)
 
 
 def contact_shadow(
     rng: np.random.Generator, image: Image, coverage: Float[np.ndarray, "h w"], darkness: float
 ) -> Image:
-    """Sharp shadow beside the arms with similar brightness and colour, which only differs in shape.
-
-    Args:
-        rng: random numbers.
-        image: the background.
-        coverage: of the arms.
-        darkness: typical brightness of the arms [1].
-    """
+    """Sharp shadow beside the arms of about their brightness (`darkness` [1]), so that only its shape differs."""
     reach = np.exp(rng.uniform(np.log(0.006), np.log(0.06))) * coverage.shape[1]
     moved = _displaced(rng, coverage, reach, turn=2, scale=(1.0, 1.0))
     shape = cv2.GaussianBlur(moved, (0, 0), rng.uniform(0.4, 1.5))[..., None]
@@ -323,7 +293,7 @@ def contact_shadow(
 def _displaced(
     rng: np.random.Generator, coverage: np.ndarray, reach: float, turn: float, scale: tuple[float, float]
 ) -> np.ndarray:
-    """A silhouette moved by `reach` [px] any way, turned with a deviation of `turn` [deg] and scaled."""
+    """A silhouette moved by `reach` [px] in a random direction, turned with a deviation of `turn` [deg] and scaled."""
     height, width = coverage.shape
     heading = rng.uniform(0, 2 * np.pi)
     centre = rng.uniform(0, width), rng.uniform(0, height)

@@ -31,12 +31,12 @@ from .shading import GBuffer, photograph, render_gbuffer, shade, tone
 SUPERSAMPLING = 2
 _VARIANTS = 12
 _VARIANT_LIFE = 80
-"""How many images are made before another place of the pool is renewed."""
+"""Number of images between renewals of entries of the pool."""
 _OBSERVATIONS, _SCENES = 0, 1
 """Streams of random numbers."""
 _TRIES = 12
 _FAR = 100.0
-"""How far behind the camera an arm is that is not there [m]."""
+"""Distance of absent arms behind the camera [m]."""
 _CONTACT = 0.4
 """Share of images with a crisp shadow beside the arms."""
 
@@ -49,12 +49,12 @@ class Observation:
     """RGB in [0, 1]."""
     variant: Variant
     placements: list[Placement]
-    """Where the arms are."""
+    """Poses of the arms."""
     claimed: list[Placement]
     """Given poses of the arms: equal to the true ones, except for absent arms."""
     intrinsics: Intrinsics
     view: GBuffer
-    """What each pixel's centre sees."""
+    """Surfaces at the pixel centres."""
     fine: GBuffer
     """The same, `SUPERSAMPLING` times as fine."""
     coverage: Float[np.ndarray, "h w"]
@@ -62,17 +62,11 @@ class Observation:
     background: Float[np.ndarray, "h w 3"]
     """Without arms, before the camera."""
     camera_seed: int
-    """Seed of what the camera did to the image."""
+    """Seed of the camera effects."""
 
 
 class Observer:
-    """Makes observed images without end; each depends on the seed and its number only.
-
-    Args:
-        robots: the robots that arms are made of.
-        settings: what the images look like.
-        seed: seed of the random numbers.
-    """
+    """Generator of observed images; each depends on the seed and its number only."""
 
     def __init__(self, robots: Sequence[Robot], settings: ImageSettings, seed: int | Sequence[int]) -> None:
         self._seed = (seed,) if isinstance(seed, int) else tuple(seed)
@@ -107,7 +101,7 @@ class Observer:
         )
 
     def _variant(self, arms: int, number: int) -> Variant:
-        """A scene from a small pool, replaced now and then: building one costs as much as several images."""
+        """A scene from a small pool with gradual renewal; building one costs as much as several images."""
         place, settings = int(self.rng.integers(_VARIANTS)), self.settings
         # One place of the pool is renewed at a time.
         life = number // _VARIANT_LIFE + place
@@ -120,7 +114,7 @@ class Observer:
         return variant
 
     def _visible_placements(self, variant: Variant) -> tuple[Intrinsics, list[Placement], GBuffer]:
-        """Arms whose visible area is within bounds, or the last ones drawn after some attempts."""
+        """Arms whose visible area is within bounds, or the last ones of `_TRIES`."""
         settings, rng = self.settings, self.rng
         size = settings.width, settings.height
         tries = 0
@@ -183,7 +177,7 @@ def look(
     height: int,
     supersampling: int = 1,
 ) -> GBuffer:
-    """What the camera sees of placed arms."""
+    """G-buffer of placed arms."""
     posed = [
         geometry.posed(placement.T_camera_base @ geometry.link_transforms(placement.joint_positions))
         for geometry, placement in zip(geometries, placements, strict=True)
@@ -199,7 +193,7 @@ def to_uint8(image: np.ndarray) -> np.ndarray:
 
 
 BACKGROUND, SHAFT, HEAD = 0, 1, 2
-"""Classes of a pixel: no instrument, its shaft, or what the shaft carries (wrist and jaws)."""
+"""Classes of a pixel: no instrument, shaft, or wrist and jaws."""
 
 _BLURRED = 0.7
 _BLUR = (0.4, 1.8)
@@ -207,7 +201,7 @@ _BLUR = (0.4, 1.8)
 
 @dataclass(frozen=True)
 class TrainingPair:
-    """An observed image and a hybrid image, each with what it shows."""
+    """An observed image and a hybrid image, each with the classes of its pixels."""
 
     observed: Int[np.ndarray, "h w 3"]
     """RGB uint8."""
@@ -218,13 +212,7 @@ class TrainingPair:
 
 
 class PairGenerator:
-    """Makes training pairs without end; every pair depends on the generator's seed and its number only.
-
-    Args:
-        robots: the robots that arms are made of.
-        settings: what the pairs look like.
-        seed: seed of the random numbers.
-    """
+    """Generator of training pairs; each depends on the seed and its number only."""
 
     def __init__(self, robots: Sequence[Robot], settings: ImageSettings, seed: int | Sequence[int]) -> None:
         self._observer = Observer(robots, settings, seed)
@@ -295,7 +283,7 @@ def _classes(variant: Variant, view: GBuffer, mask: np.ndarray | None) -> np.nda
 
 
 SURFACE_UNIT = 127
-"""What 1 is in a surface map of a sample."""
+"""Scale of surface maps in samples."""
 
 _LARGEST_ERROR = 3.0
 """Scale of the largest error of the given kinematics; 1 is about 3 degrees and 3 mm."""
@@ -313,17 +301,11 @@ class SurfaceSample:
     given: Int[np.ndarray, "h w 6"]
     """Surface map of wrong kinematics, times `SURFACE_UNIT`, int8."""
     surface: Int[np.ndarray, "h w 6"]
-    """Surface map of what the image shows, times `SURFACE_UNIT`, int8."""
+    """True surface map of the image, times `SURFACE_UNIT`, int8."""
 
 
 class SurfaceGenerator:
-    """Makes samples without end; every one depends on the seed and its number only.
-
-    Args:
-        robots: the robots that arms are made of.
-        settings: what the images look like.
-        seed: seed of the random numbers.
-    """
+    """Generator of surface samples; each depends on the seed and its number only."""
 
     def __init__(self, robots: Sequence[Robot], settings: ImageSettings, seed: int | Sequence[int]) -> None:
         self._observer = Observer(robots, settings, seed)

@@ -67,7 +67,7 @@ def render_gbuffer(
     corner = faces[face]
     normal = np.einsum("nk,nkc->nc", weights, normals[corner])
     normal /= np.linalg.norm(normal, axis=1, keepdims=True) + 1e-12
-    away = _row_dot(normal, points) > 0
+    away = _dot(normal, points) > 0
     normal[away] *= -1
     return GBuffer(
         (width, height), rows, columns, face_arm[face], face_part[face], points, normal.astype(np.float32),
@@ -75,7 +75,7 @@ def render_gbuffer(
     )  # fmt: skip
 
 
-def _row_dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.einsum("nc,nc->n", a, b)
 
 
@@ -83,8 +83,8 @@ def _barycentric(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     """Weights [n, 3] of points [n, 3] in the planes of triangles [n, 3, 3]."""
     a = triangles[:, 0]
     u, v, w = triangles[:, 1] - a, triangles[:, 2] - a, points - a
-    uu, vv, uv = _row_dot(u, u), _row_dot(v, v), _row_dot(u, v)
-    wu, wv = _row_dot(w, u), _row_dot(w, v)
+    uu, vv, uv = _dot(u, u), _dot(v, v), _dot(u, v)
+    wu, wv = _dot(w, u), _dot(w, v)
     scale = 1.0 / np.maximum(uu * vv - uv * uv, 1e-24)
     s, t = (vv * wu - uv * wv) * scale, (uu * wv - uv * wu) * scale
     # Round-off on slivers must not extrapolate a normal.
@@ -131,7 +131,7 @@ def _vignette(rng: np.random.Generator, width: int, height: int, ranges: Appeara
         light = light * np.exp(
             rng.uniform(0, ranges.unevenness) * smooth_noise(rng, width, height, rng.uniform(2, 5), 1)
         )
-        # Light that is uneven is not low light: the image as a whole stays as bright as it was.
+        # The mean brightness is kept, because low light is no part of the training data.
         light = light / light.mean()
     return np.clip(light, 0.35, 1.6)[..., None]
 
@@ -178,8 +178,7 @@ def shade(
 ) -> Float[np.ndarray, "n 3"]:
     """Display colours in [0, 1] of the pixels of `gbuffer`, with random materials, lights and environment.
 
-    Args:
-        ambience: mean colour of the background [3], which the arms reflect.
+    The arms reflect `ambience`, the mean colour of the background.
     """
     if len(gbuffer.rows) == 0:
         return np.zeros((0, 3), np.float32)
@@ -196,10 +195,6 @@ def shade(
     color += _reflections(rng, gbuffer, view, n_v, surface.roughness, base, body, ambience)
     color *= np.exp(rng.normal(0, 0.25))
     return np.clip(color, 0, 1) ** _GAMMA
-
-
-def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    return np.einsum("nc,nc->n", a, b)
 
 
 def _light(gbuffer, view, n_v, roughness, base, body, position, radiance) -> np.ndarray:
@@ -223,7 +218,7 @@ def _light(gbuffer, view, n_v, roughness, base, body, position, radiance) -> np.
 
 
 def _random_lights(rng: np.random.Generator, distance: float) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Positions [m] and radiances of the lights: one or two at the lens, others on the camera's side."""
+    """Positions [m] and radiances of one or two lights at the lens and others on the camera's side."""
     lights = []
     at_lens = rng.integers(1, 3)
     for index in range(at_lens + rng.integers(0, 3)):

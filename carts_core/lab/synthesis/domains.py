@@ -15,7 +15,7 @@ from .scene import EXTENT, Tissue, sample, smooth_noise, smoothstep
 _ABSORPTION = np.array([620.0, 4200.0, 4600.0])
 """Absorption of blood for red, green and blue light [1/m]."""
 _SCATTERED = np.array([0.030, 0.0012, 0.0011])
-"""Light that blood itself sends back, as a reflectance."""
+"""Reflectance of blood itself."""
 _POOL_DEPTH = 0.0011
 _FILM_DEPTH = 0.00030
 _BLOOD_GRID = 64
@@ -24,13 +24,7 @@ _GRID_SIZE = 0.040
 
 
 class Bleeding:
-    """Blood at fixed places of the tissue, and fixed to the instruments while they move.
-
-    Args:
-        tissue: what bleeds; blood gathers in its hollows.
-        config: how much is covered.
-        rng: source of randomness.
-    """
+    """Blood at fixed places of the tissue, in its hollows, and fixed to the moving instruments."""
 
     def __init__(self, tissue: Tissue, config: DomainConfig, rng: np.random.Generator) -> None:
         shape = (len(tissue.albedo) // 2,) * 2
@@ -58,13 +52,13 @@ class Bleeding:
         lens: Float[np.ndarray, "3"],
         lamp: float,
     ) -> Float[np.ndarray, "h w 3"]:
-        """A picture with the blood in it: absorption twice through its depth, its own red, and its wet highlights.
+        """A picture with blood: absorption twice through its depth, its own red, and its wet highlights.
 
         Args:
             light: linear RGB without blood.
-            surface: what each pixel sees.
-            Ts_world_link: the place of each link that `surface.link` names.
-            lens: the lens, where the light is, too [m].
+            surface: of the pixels.
+            Ts_world_link: pose of each link of `surface.link`.
+            lens: position of the lens and the light [m].
             lamp: radiant intensity of the light, in the unit of `light` times square metres.
         """
         x, y = surface.position[..., 0], surface.position[..., 1]
@@ -76,7 +70,7 @@ class Bleeding:
                 depth[there] = self._film((surface.position[there] - T_world_link[:3, 3]) @ T_world_link[:3, :3])
         pooled = smoothstep(depth, 0.00002, 0.00025)
 
-        # Glints of the dry surface drown in the pool: what lies far above its surroundings is not under the blood.
+        # Highlights of the dry surface vanish below a pool.
         dull = np.minimum(light, 1.3 * cv2.GaussianBlur(light.astype(np.float32), (0, 0), light.shape[1] / 100))
         base = light + (dull - light) * (pooled * on_tissue)[..., None]
         through = np.exp(-2.0 * depth[..., None] * _ABSORPTION)
@@ -90,7 +84,7 @@ class Bleeding:
 
         normal = self._wet_normal(surface, x, y)
         aligned = np.clip((normal * to_eye).sum(axis=-1), 0.0, 1.0)
-        # Light and lens stand side by side, so the half vector is the way back: D of a Blinn lobe, Fresnel of water.
+        # The light is beside the lens, so the half vector is the view direction: D of a Blinn lobe, Fresnel of water.
         lobe = np.where(on_tissue, 350.0, 60.0)
         glint = 0.025 * (lobe + 2.0) / (8.0 * np.pi) * aligned**lobe * lamp / distance**2 * pooled
         return (base * through + own + glint[..., None]).astype(np.float32)
@@ -121,16 +115,11 @@ _CONTRAST = 0.95
 _BACKSCATTER = 0.024
 """Share of the extinguished light that comes back to the lens, per steradian, several scatterings included [1/sr]."""
 _LAMP_SIZE = 0.060
-"""Light scattered on the way hides the inverse square law nearer than this [m]."""
+"""Distance within which scattered light hides the inverse square law [m]."""
 
 
 class Smoke:
-    """A cloud of turbulent density that fills space, drifts, and changes its shape while it does.
-
-    Args:
-        config: density, size of the eddies and speed.
-        rng: source of randomness.
-    """
+    """A turbulent cloud that drifts and changes its shape."""
 
     def __init__(self, config: DomainConfig, rng: np.random.Generator) -> None:
         self._config = config
@@ -159,8 +148,8 @@ class Smoke:
 
         Args:
             light: linear RGB without smoke.
-            positions: the point that each pixel sees [m].
-            lens: the lens, where the light is, too [m].
+            positions: points that the pixels see [m].
+            lens: position of the lens and the light [m].
             lamp: radiant intensity of the light, in the unit of `light` times square metres.
             time: [s].
         """
@@ -186,7 +175,7 @@ class Smoke:
             optical += share * cv2.resize(slab, (width, height), interpolation=cv2.INTER_CUBIC)
             glow += share * cv2.resize(slab_glow.astype(np.float32), (width, height), interpolation=cv2.INTER_CUBIC)
             depth_so_far += slab
-        # The light has to cross the smoke too, but what smoke scatters forwards still arrives: hence less than twice.
+        # Light crosses the smoke twice, but forward scattering still arrives: hence a factor below 2.
         seen = light * np.exp(-1.2 * optical)[..., None]
         return seen + glow[..., None] * np.array([0.98, 1.0, 1.02], np.float32)
 
@@ -225,13 +214,13 @@ def expose(
     rng: np.random.Generator,
     motion: Float[np.ndarray, "h w 2"] | None = None,
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """The picture that an endoscope camera takes.
+    """The picture of an endoscope camera.
 
     Args:
         light: linear RGB, 1 = white.
         config: the sensor.
-        rng: source of the noise.
-        motion: how far the image moves while the shutter is open [px].
+        rng: of the noise.
+        motion: motion of the image while the shutter is open [px].
     """
     height, width = light.shape[:2]
     scale = width / 640.0
@@ -337,12 +326,7 @@ class View:
 
 
 class Conditions:
-    """Turns a view into the pictures of all domains.
-
-    Args:
-        config: what is wanted.
-        tissue: the regular background, which bleeds.
-    """
+    """Pictures of all domains of a view; `tissue` is the regular background, which bleeds."""
 
     def __init__(self, config: SynthesisConfig, tissue: Tissue) -> None:
         self._config = config

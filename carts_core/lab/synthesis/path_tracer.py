@@ -24,7 +24,7 @@ INTENSITY = 0.0055
 """Radiant intensity of each light [1/sr]; only ratios matter, since exposure is adjusted."""
 _TINT = (1.02, 1.0, 0.94)
 NEAR = 0.002
-"""Nothing nearer to the lens than this is seen [m]."""
+"""Distance of the near plane [m]."""
 
 
 @cache
@@ -61,7 +61,7 @@ class Part:
 
 @dataclass(frozen=True)
 class Surface:
-    """What each pixel's centre area sees, one ray per pixel."""
+    """Surface points of the pixels, one ray per pixel."""
 
     position: Float[np.ndarray, "h w 3"]
     """Point in the world [m]."""
@@ -93,21 +93,14 @@ class PathTracer:
             "clearcoat_gloss": 0.92,
         }
         mesh = self._mesh("tissue", vertices, faces, material, uv=uv, normals=normals)
-        # In a group of its own, the tissue is sorted into the ray tracer's tree once, and not anew for every picture.
+        # As a shape group, the tissue enters the ray tracer's tree only once.
         group = self._mi.load_dict({"type": "shapegroup", "mesh": mesh})
         self._tissue: dict[str, Any] = {"tissue": group, "tissue_place": {"type": "instance", "group": group}}
 
     def radiance(
         self, parts: Sequence[Part], camera: Camera, T_light_world: np.ndarray, seed: int
     ) -> Float[np.ndarray, "h w 3"]:
-        """Linear RGB radiance, in arbitrary units.
-
-        Args:
-            parts: the instruments.
-            camera: the camera.
-            T_light_world: frame that `LIGHTS_CAMERA` is given in: that of the camera beside which the light is.
-            seed: of the sampler.
-        """
+        """Linear RGB radiance, in arbitrary units; `T_light_world` is the frame of the camera beside the lights."""
         T_world_light = np.linalg.inv(T_light_world)
         scene = self._instruments(parts, _material)
         scene |= self._tissue
@@ -246,9 +239,9 @@ def _material(part: Part) -> dict[str, Any]:
 
 
 def _without_specks(image: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w 3"]:
-    """The picture with its fireflies cut down: rare paths that bring so much light that one pixel glares.
+    """Remove fireflies: no pixel may be far brighter than the third brightest of its 3 x 3 neighbours.
 
-    Real glints are wider than a pixel, so no pixel needs to be far brighter than the third brightest of its nine.
+    Real highlights are wider than a pixel.
     """
     limit = np.stack([rank_filter(image[..., channel], rank=-3, size=3) for channel in range(3)], axis=-1)
     return np.minimum(image, 1.25 * limit)

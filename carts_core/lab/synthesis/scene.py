@@ -26,8 +26,8 @@ def smooth_noise(
     Args:
         shape: size of the field, in samples per dimension.
         wavelength: typical distance between neighbouring crests of the first octave [samples].
-        rng: source of randomness.
-        octaves: how many bands are added, each of half the wavelength of the one before.
+        rng: of the noise.
+        octaves: number of bands, each of half the wavelength of the one before.
         gain: amplitude of each band relative to the one before.
     """
     spectrum = np.fft.rfftn(rng.standard_normal(shape).astype(np.float32))
@@ -138,7 +138,7 @@ EXTENT = 0.26
 
 @dataclass(frozen=True)
 class _Kind:
-    """What makes one organ look unlike another; colours are linear RGB."""
+    """Appearance of an organ; colours are linear RGB."""
 
     base: tuple[float, float, float]
     dark: tuple[float, float, float]
@@ -200,14 +200,7 @@ def sample(field: Float[np.ndarray, "n n"], x: np.ndarray, y: np.ndarray) -> np.
 
 
 def grow_tissue(kind: str, resolution: int, texels: int, rng: np.random.Generator) -> Tissue:
-    """Tissue of one kind.
-
-    Args:
-        kind: one of `KINDS`.
-        resolution: grid points of the height field along each side.
-        texels: texels of colour and roughness along each side.
-        rng: source of randomness.
-    """
+    """Tissue of one of `KINDS`, with `resolution` grid points and `texels` of colour and roughness along each side."""
     look, paint = _KINDS[kind], _Canvas(texels, rng)
 
     patches = paint.grown(0.060, 0.003, octaves=4, gain=0.42)
@@ -252,7 +245,7 @@ class _Canvas:
         return smooth_noise((self._texels,) * 2, wavelength * self.scale, self._rng, octaves=octaves, gain=gain)
 
     def grown(self, wavelength: float, amount: float, octaves: int = 1, gain: float = 0.5) -> np.ndarray:
-        """Noise looked up at displaced places, which turns round blobs into things that look grown."""
+        """Noise at displaced positions, which gives organic shapes."""
         rows, columns = np.indices((self._texels,) * 2, dtype=np.float32)
         shift = np.float32(amount * self.scale)
         columns, rows = columns + shift * self._warp[0], rows + shift * self._warp[1]
@@ -292,7 +285,7 @@ def _mix(color: np.ndarray, other: np.ndarray, share: np.ndarray) -> np.ndarray:
 
 
 def _cavity(resolution: int) -> np.ndarray:
-    """Walls that rise around the middle, so that no picture looks past the tissue's end."""
+    """Walls around the middle, so that the tissue fills every picture."""
     unit = np.linspace(-EXTENT / 2, EXTENT / 2, resolution)
     radius = np.hypot(*np.meshgrid(unit, unit))
     return (6.0 * np.maximum(radius - 0.050, 0.0) ** 2).astype(np.float32)

@@ -3,12 +3,13 @@
 import json
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from itertools import count
 from pathlib import Path
 
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Float, UInt8
 
 from ...files import locked_folder, output_path, remove_file, write_bytes, write_text
 from ...files.reading import WEIGHTS, read_bytes
@@ -21,7 +22,6 @@ from ...model.scene import Arm, Scene, SceneState
 from ...networks.extractor import FeatureExtractor
 from ...optimization import FrameOptimizer, Verdict
 from ...recording import Frame, Sequence, spread
-from ...recording import Sequence as Recording
 from ...rendering import Renderer
 from ...resources import shipped_weights
 from ...settings import TrainingConfig
@@ -33,87 +33,85 @@ JUDGING_STREAM = 2
 _SIZE = (320, 240)
 """Of a made image [px]."""
 _OFF_DEG = 2.0
-"""How far off every joint of a made image starts [deg], sliding ones as many [mm]."""
+"""Error of every joint of a synthetic image at the start [deg], of sliding ones [mm]."""
 _DICE, _PARTS, _TIPS, _EDGES = 0.002, 0.01, 0.2, 0.98
-"""What counts as worse: a mean Dice or share of parts lower by this much, tips farther off by so many pixels, and edges
-weaker than this share of before."""
+"""Thresholds of "worse": decrease of Dice and of the share of parts [1], increase of the tip error [px], and ratio of
+edge strengths [1]."""
 _MOVED = 3.0
-"""Tips of the recording that move farther than this have to find stronger edges [px]."""
+"""Distance of tips in the recording beyond which edges must become stronger [px]."""
 
 Progress = Callable[[str, int, int], None]
-"""Called with what is solved, and how many of how many."""
+"""Called with a description, the number of finished fits, and the total."""
 
 
 @dataclass(frozen=True)
-class MadeFits:
-    """Fits of made images: means over the images."""
+class Fits:
+    """Figures of fits of synthetic images with known joints, and of frames of the recording."""
 
     dice: float
-    """Of masks [1]."""
-    parts: float
-    """Share of the instrument's true pixels where the fit shows the same part [1]."""
-    tips: float
-    """Distance of tips from the truth [px]."""
-
-
-@dataclass(frozen=True)
-class OwnFits:
-    """Fits of frames of the recording: per frame."""
-
+    """Mean Dice of synthetic images [1]."""
+    made_parts: float
+    """Mean share of the instrument's true pixels of synthetic images where the fit shows the same part [1]."""
+    made_tips: float
+    """Mean distance of tips from the truth in synthetic images [px]."""
     good: int
-    """Frames with a good verdict."""
+    """Frames of the recording with a good verdict."""
     edges: float
-    """Mean gradient of the images along the outlines of arms and parts, over that of the whole images [1]."""
+    """Mean gradient of frames along the outlines of arms and parts, over that of the whole images [1]."""
     parts: float
-    """Of rendered wrists and jaws, the smaller share that the network of the fit predicts as that part [1]."""
+    """Mean over frames: of rendered wrists and jaws, the smaller share that the network predicts as that part [1]."""
     tips: tuple[Float[np.ndarray, "tips 2"], ...]
-    """Of each frame, where tips are in the first camera [px]; NaN out of view."""
+    """Of each frame, the tips in the first camera [px]; NaN out of view."""
 
 
 @dataclass(frozen=True)
 class Judgement:
     """Fits with the weights of the start and with adapted ones, on the same images."""
 
-    made: tuple[MadeFits, MadeFits]
-    own: tuple[OwnFits, OwnFits]
+    before: Fits
+    after: Fits
 
     @property
     def tips_moved(self) -> float:
-        """How far tips of the recording's own fits have moved in the mean [px]."""
-        pairs = zip(self.own[0].tips, self.own[1].tips, strict=True)
-        steps = [np.linalg.norm(after - before, axis=1) for before, after in pairs]
-        known = np.concatenate([*steps, np.empty(0)])
-        known = known[np.isfinite(known)]
+        """Mean distance between the tips of both fits of the recording [px]."""
+        pairs = zip(self.before.tips, self.after.tips, strict=True)
+        steps = np.concatenate([*(np.linalg.norm(after - before, axis=1) for before, after in pairs), np.empty(0)])
+        known = steps[np.isfinite(steps)]
         return float(known.mean()) if len(known) else 0.0
 
     def worse(self) -> list[str]:
-        """What is worse with the adapted weights, in words; nothing where they may be offered."""
-        (before, after), (was, now), moved = self.made, self.own, self.tips_moved
-        found = []
-        if after.dice < before.dice - _DICE:
-            found.append(f"masks of made images (Dice {before.dice:.3f} -> {after.dice:.3f})")
-        if after.parts < before.parts - _PARTS:
-            found.append(f"parts of made images ({before.parts:.3f} -> {after.parts:.3f} of the pixels)")
-        if after.tips > before.tips + _TIPS:
-            found.append(f"tips of made images ({before.tips:.1f} -> {after.tips:.1f} px)")
-        if now.good < was.good:
-            found.append(f"verdicts of the recording ({was.good} -> {now.good} good)")
-        if now.parts < was.parts - _PARTS:
-            found.append(f"parts of the recording ({was.parts:.3f} -> {now.parts:.3f} of the pixels)")
-        if now.edges < _EDGES * was.edges:
-            found.append(f"edges of the recording ({was.edges:.2f} -> {now.edges:.2f})")
-        elif moved > _MOVED and now.edges <= was.edges:
-            found.append(f"tips of the recording (moved by {moved:.1f} px without stronger edges)")
-        return found
+        """What is worse with the adapted weights; nothing if they may be offered."""
+        was, now, moved = self.before, self.after, self.tips_moved
+        checks = [
+            (now.dice < was.dice - _DICE, f"masks of made images (Dice {was.dice:.3f} -> {now.dice:.3f})"),
+            (
+                now.made_parts < was.made_parts - _PARTS,
+                f"parts of made images ({was.made_parts:.3f} -> {now.made_parts:.3f} of the pixels)",
+            ),
+            (
+                now.made_tips > was.made_tips + _TIPS,
+                f"tips of made images ({was.made_tips:.1f} -> {now.made_tips:.1f} px)",
+            ),
+            (now.good < was.good, f"verdicts of the recording ({was.good} -> {now.good} good)"),
+            (
+                now.parts < was.parts - _PARTS,
+                f"parts of the recording ({was.parts:.3f} -> {now.parts:.3f} of the pixels)",
+            ),
+            (now.edges < _EDGES * was.edges, f"edges of the recording ({was.edges:.2f} -> {now.edges:.2f})"),
+            (
+                moved > _MOVED and _EDGES * was.edges <= now.edges <= was.edges,
+                f"tips of the recording (moved by {moved:.1f} px without stronger edges)",
+            ),
+        ]
+        return [text for worse, text in checks if worse]
 
     def lines(self) -> list[str]:
-        """Summary of metrics before and after."""
-        (before, after), (was, now) = self.made, self.own
-        count = len(was.tips)
+        """Summary of figures before and after."""
+        was, now = self.before, self.after
         return [
-            f"fits of made images: Dice {before.dice:.3f} -> {after.dice:.3f}, parts {before.parts:.3f} -> "
-            f"{after.parts:.3f}, tips {before.tips:.1f} -> {after.tips:.1f} px",
-            f"fits of {count} frames of the recording: {was.good} -> {now.good} good, parts {was.parts:.3f} -> "
+            f"fits of made images: Dice {was.dice:.3f} -> {now.dice:.3f}, parts {was.made_parts:.3f} -> "
+            f"{now.made_parts:.3f}, tips {was.made_tips:.1f} -> {now.made_tips:.1f} px",
+            f"fits of {len(was.tips)} frames of the recording: {was.good} -> {now.good} good, parts {was.parts:.3f} -> "
             f"{now.parts:.3f}, edges {was.edges:.2f} -> {now.edges:.2f}, tips moved by {self.tips_moved:.1f} px",
         ]
 
@@ -121,12 +119,12 @@ class Judgement:
 def judge(
     config: TrainingConfig, before: Path, after: Path, *, made: int, own: int, progress: Progress = lambda *_: None
 ) -> Judgement:
-    """Solve made images and frames of the recording with two weights files.
+    """Solve synthetic images and frames of the recording with two weights files.
 
     Args:
         config: of the run that adapts, with its recording, robots and images.
         before, after: weights of the surface network.
-        made, own: how many made images, and frames of the recording, spread over it.
+        made, own: number of synthetic images, and of frames of the recording, spread over it.
         progress: called before every fit.
 
     Raises:
@@ -135,29 +133,23 @@ def judge(
     """
     assert config.images.recording is not None
     networks = [FeatureExtractor.load(path) for path in (before, after)]
-    images, recording = list(made_images(config, made)), Recording.open(config.images.recording)
+    images, recording = list(made_images(config, made)), Sequence.open(config.images.recording)
     chosen = spread(len(recording), min(own, len(recording)))
-    total, done = 2 * (len(images) + len(chosen)), 0
+    total, done = 2 * (len(images) + len(chosen)), count()
 
-    def say() -> None:
-        nonlocal done
-        progress("comparing fits before and after", done, total)
-        done += 1
-
-    of_made, of_own = [], []
-    for network in networks:
-        scores = []
+    def fits(network: FeatureExtractor) -> Fits:
+        scores, found = [], []
         for image in images:
-            say()
+            progress("comparing fits before and after", next(done), total)
             scores.append(image.score(network))
-        of_made.append(MadeFits(*np.mean(scores, axis=0).tolist()))
-        found = []
         for index in chosen:
-            say()
+            progress("comparing fits before and after", next(done), total)
             found.append(_own_fit(recording, recording.frame(index), network))
         good, edges, parts, tips = zip(*found, strict=True)
-        of_own.append(OwnFits(sum(good), float(np.mean(edges)), float(np.mean(parts)), tuple(tips)))
-    return Judgement((of_made[0], of_made[1]), (of_own[0], of_own[1]))
+        made_figures = np.mean(scores, axis=0).tolist()
+        return Fits(*made_figures, sum(good), float(np.mean(edges)), float(np.mean(parts)), tuple(tips))
+
+    return Judgement(fits(networks[0]), fits(networks[1]))
 
 
 @dataclass(frozen=True)
@@ -185,16 +177,16 @@ class MadeImage:
         return dice, right, float(known.mean()) if len(known) else 0.0
 
 
-def made_images(config: TrainingConfig, count: int) -> Iterator[MadeImage]:
+def made_images(config: TrainingConfig, number_of_images: int) -> Iterator[MadeImage]:
     """Images like those of training, whole and without occluders, that neither training nor validation sees."""
     width, height = _SIZE
     images = replace(
         config.images, width=width, height=height, field_width=width, occluded=0.0, absent=0.0, coverage=(0.02, 0.5)
     )
     observer = Observer([Robot.load(path) for path in config.robots], images, (config.seed, JUDGING_STREAM))
-    for number in range(count):
+    for number in range(number_of_images):
         seen = observer(number)
-        # The arms as they are, thickness and all, so that the truth is exact.
+        # The varied arms, including their thickness, so that the truth is exact.
         robots = [geometry.robot for geometry in seen.variant.geometries]
         names = [f"arm{place}" for place in range(len(robots))]
         arms = tuple(
@@ -209,40 +201,30 @@ def made_images(config: TrainingConfig, count: int) -> Iterator[MadeImage]:
         yield MadeImage(scene, frame)
 
 
-def _own_fit(recording: Recording, frame: Frame, network: FeatureExtractor) -> tuple[bool, float, float, np.ndarray]:
+def _own_fit(recording: Sequence, frame: Frame, network: FeatureExtractor) -> tuple[bool, float, float, np.ndarray]:
     """Whether a fit of a frame is good, its edges, its parts and its tips."""
     optimizer = FrameOptimizer(recording.scene, frame, {}, network, live=False)
     for _ in optimizer:
         pass
     assert optimizer.best is not None
     state, found = optimizer.best.state.to("cpu"), optimizer.assessment
-    edges = [
-        edge_support(frame.images[camera.name], _parts(recording.scene, _renderer(recording.scene, camera), state))
-        for camera in recording.scene.cameras
-    ]
+    edges = []
+    for camera in recording.scene.cameras:
+        renderer = Renderer(recording.scene, width=camera.width, height=camera.height, cameras=[camera.name])
+        edges.append(edge_support(frame.images[camera.name], _parts(recording.scene, renderer, state)))
     parts = 1.0 if found is None else found.evidence.parts_predicted
     good = found is not None and found.verdict is Verdict.GOOD
     return good, float(np.mean(edges)), parts, _tips_in_view(recording.scene, state)
-
-
-def _renderer(scene: Scene, camera: Camera) -> Renderer:
-    return Renderer(scene, width=camera.width, height=camera.height, cameras=[camera.name])
 
 
 def edge_support(image: UInt8[np.ndarray, "h w 3"], parts: np.ndarray) -> float:
     """Mean gradient of an image along the outlines of parts, over its mean everywhere [1]; 1 where there is none."""
     grey = cv2.GaussianBlur(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32), (0, 0), 1.0)
     gradient = np.hypot(cv2.Sobel(grey, cv2.CV_32F, 1, 0), cv2.Sobel(grey, cv2.CV_32F, 0, 1))
-    outline = _outlines(parts)
-    return float(gradient[outline].mean() / max(float(gradient.mean()), 1e-6)) if outline.any() else 1.0
-
-
-def _outlines(parts: np.ndarray) -> Bool[np.ndarray, "h w"]:
-    """Pixels of a part whose right or lower neighbour is of another one."""
     outline = np.zeros(parts.shape, bool)
     outline[:, :-1] |= parts[:, :-1] != parts[:, 1:]
     outline[:-1] |= parts[:-1] != parts[1:]
-    return outline
+    return float(gradient[outline].mean() / max(float(gradient.mean()), 1e-6)) if outline.any() else 1.0
 
 
 def _parts(scene: Scene, renderer: Renderer, state: SceneState) -> np.ndarray:
@@ -267,7 +249,7 @@ def _tips_in_view(scene: Scene, state: SceneState) -> Float[np.ndarray, "tips 2"
 
 
 STEPS = 400
-"""Steps of a run for which neither steps nor time are given: a busy machine takes longer and learns as much."""
+"""Steps of a run without given steps or time."""
 _VALIDATION_EVERY = 40
 BACKGROUNDS = "backgrounds"
 """Folder of a run with the empty backgrounds of the recording."""
@@ -286,26 +268,24 @@ REFUSED = "refused.safetensors"
 
 @dataclass(frozen=True)
 class Offer:
-    """What becomes of adapted weights."""
+    """Adapted weights after the comparison."""
 
-    weights: Path | None
-    """To be used; None where something became worse."""
-    refused: Path | None
-    """Where weights are that are not offered."""
+    weights: Path
+    """Weights file, renamed if something became worse."""
     worse: list[str]
-    """What became worse."""
+    """What became worse; empty if the weights are offered."""
     lines: list[str]
-    """Summary of metrics before and after."""
+    """Summary of figures before and after."""
 
 
 def adapted_to(recording: Path, output: Path, given: TrainingConfig) -> TrainingConfig:
-    """The settings of a run that adapts the surface network to a recording, and its backgrounds in `output`.
+    """Settings that adapt the surface network to a recording; its backgrounds are written to `output`.
 
-    Robots, start, steps and time are those of `given` where they are not its defaults.
+    Robots, start, steps and time are those of `given` unless they are defaults.
 
     Args:
-        recording: sequence file; no image of it but the empty background is learnt from.
-        output: folder of the run, which is made once the recording could be read.
+        recording: sequence file; of its images, only the empty background enters the training.
+        output: folder of the run, created once the recording could be read.
         given: settings for everything else.
 
     Raises:
@@ -369,20 +349,18 @@ def offer(config: TrainingConfig, result: TrainingResult, progress: Progress, ma
     Args:
         config: as from `adapted_to`.
         result: of the run.
-        progress: called before every fit.
-        made, own: how many made images, and frames of the recording.
+        progress, made, own: as in `judge`.
     """
     assert config.start is not None
     aside = output_path(result.weights.parent, REFUSED)
     if not result.weights.is_file():
-        return Offer(None, aside.path, ["the weights were refused before; see report/fits.json"], [])
+        return Offer(aside.path, ["the weights were refused before; see report/fits.json"], [])
     judgement = judge(config, config.start, result.weights, made=made, own=own, progress=progress)
     worse = judgement.worse()
     report = {"worse": worse, "figures": judgement.lines(), "made": made, "own": own}
     write_text(output_path(result.weights.parent, "report") / "fits.json", json.dumps(report, indent=1))
-    if not worse:
-        return Offer(result.weights, None, [], judgement.lines())
-    # The page and later commands look for weights under their usual name only.
-    write_bytes(aside, read_bytes(result.weights, WEIGHTS))
-    remove_file(output_path(result.weights.parent, result.weights.name))
-    return Offer(None, aside.path, worse, judgement.lines())
+    if worse:
+        # The page and later commands look for weights under their usual name only.
+        write_bytes(aside, read_bytes(result.weights, WEIGHTS))
+        remove_file(output_path(result.weights.parent, result.weights.name))
+    return Offer(aside.path if worse else result.weights, worse, judgement.lines())

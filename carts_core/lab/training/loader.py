@@ -82,7 +82,7 @@ def _outlive_signals(closing: Event, parent: int, worker: int) -> None:
 
     def end_if_closing(*_: object) -> None:
         if closing.is_set():
-            # Not by an exception: what waits for the parent would be waited for.
+            # An exception would wait for threads that wait for the parent.
             os._exit(0)
 
     signal.signal(signal.SIGTERM, end_if_closing)

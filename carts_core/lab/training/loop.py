@@ -53,16 +53,7 @@ def save_checkpoint(
     config_json: str,
     history: History,
 ) -> None:
-    """Write `checkpoint.safetensors`; a kill at any moment leaves the old file or the new one.
-
-    Args:
-        folder: folder of the run.
-        modules: modules whose state is kept, by name.
-        optimizer: its moments and step counts are kept.
-        step: number of steps done.
-        config_json: the settings; `load_checkpoint` gives them back.
-        history: curves so far.
-    """
+    """Write `checkpoint.safetensors` with the state of modules by name, optimizer and run, atomically."""
     tensors = {f"{name}/{key}": value for name, module in modules.items() for key, value in module.state_dict().items()}
     for index, state in optimizer.state_dict()["state"].items():
         tensors |= {f"optimizer/{index}/{key}": value for key, value in state.items()}
@@ -79,6 +70,7 @@ class Checkpoint:
     config_json: str
     history: History
     tensors: dict[str, Tensor]
+    """Of modules by name, and of the optimizer."""
 
     def restore(self, modules: dict[str, torch.nn.Module], optimizer: torch.optim.Optimizer) -> None:
         """Load the state into modules and optimizer."""
@@ -189,7 +181,7 @@ class TrainingLoop:
 
         Args:
             batches: training batches.
-            loss: of a batch: the weighted loss, and each term before weighting.
+            loss: batch -> the weighted loss, and each term before weighting.
             log_every: steps between entries of the history.
             logged: called with the mean loss and terms since the last entry, and the wall time per step [s].
             updated: called after each optimizer step.

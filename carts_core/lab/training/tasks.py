@@ -53,7 +53,7 @@ class Task(Protocol):
         ...
 
     def worse(self, now: dict[str, float], first: dict[str, float]) -> bool:
-        """Whether a figure besides `score` has become worse than at the start, so that weights are not kept."""
+        """Whether a metric other than `score` is worse than at the start, so that weights are rejected."""
         ...
 
     def panels(self, network: Any, batch: Batch) -> list[list[tuple[str, np.ndarray]]]:
@@ -129,7 +129,7 @@ def feature_loss(
     """The weighted loss of a batch of pairs, and each term before weighting.
 
     Args:
-        network: the network that is trained.
+        network: in training.
         images: observed image and hybrid image of each pair, RGB in [0, 1].
         classes: 0 background, 1 shaft, 2 head.
         weights: of the terms.
@@ -158,7 +158,7 @@ def consistency_loss(
     classes_a: Int[Tensor, "batch h w"],
     classes_b: Int[Tensor, "batch h w"],
 ) -> Float[Tensor, ""]:
-    """How far cosine similarities are from what alignment needs, near the instruments (where ACS attends).
+    """Deviation of cosine similarities from their targets near the instruments, where ACS attends.
 
     Where both images show the same class the cosine should be 1; where one shows background and the other an
     instrument, not above 0; where one shows the shaft and the other the head, not above 0.6. Each of these counts by
@@ -265,7 +265,7 @@ def _confusion(predicted: np.ndarray, truth: np.ndarray) -> np.ndarray:
 
 
 _PART_WORSE, _TIP_WORSE = 0.005, 0.2
-"""What counts as worse: a part's Dice lower by this much [1], tips farther off by this much [px]."""
+"""Thresholds of "worse": decrease of a part's Dice [1], increase of the tip error [px]."""
 _LOST = 20.0
 """Error of a tip that is not predicted, and the most that one counts [px]."""
 _SMOOTH = 0.2
@@ -334,7 +334,8 @@ class SurfaceTask:
         known = given[:, COVERAGE].sum(1) > 0.5
         ours, theirs = seen.movedim(1, -1)[true], surface.movedim(1, -1)[true]
         cosine = functional.cosine_similarity(ours[:, NORMALS], theirs[:, NORMALS], dim=1)
-        parts = {f"dice_{name}": _pooled_part(seen, surface, part) for part, name in enumerate(PARTS)}
+        ours_parts, true_parts = (maps[:, COVERAGE].movedim(1, 0) > 0.5 for maps in (seen, surface))
+        parts = {f"dice_{name}": pooled_dice(*pair) for name, *pair in zip(PARTS, ours_parts, true_parts, strict=True)}
         return {
             **parts,
             "tip_error": tip_error(seen, surface),
@@ -369,11 +370,6 @@ class SurfaceTask:
                 ]
             )
         return rows
-
-
-def _pooled_part(seen: Tensor, surface: Tensor, part: int) -> float:
-    guess, true = (maps[:, COVERAGE][:, part] > 0.5 for maps in (seen, surface))
-    return pooled_dice(guess, true)
 
 
 def tip_error(seen: Float[Tensor, "n channels h w"], surface: Float[Tensor, "n channels h w"]) -> float:

@@ -7,9 +7,8 @@ from pathlib import Path
 import pytest
 
 from carts_core.files import output_path
-from carts_core.lab.benchmark import Benchmark, ResultsFile, Scope, Source, plan
+from carts_core.lab.benchmark import Benchmark, ResultsFile, Scope, Source, plan, runner
 from carts_core.lab.benchmark.scope import METHODS
-from carts_core.lab.synthesis import DOMAINS
 from carts_core.networks import FeatureExtractor
 from carts_core.optimization import SolverSettings
 from carts_core.recording import Sequence
@@ -52,10 +51,14 @@ def few_steps(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture
-def tiny_benchmark(tiny_sequence: Callable[..., Path], tmp_path: Path, few_steps: None) -> Callable[..., Benchmark]:
-    """Factory of the same benchmark over one frame of a tiny sequence in all domains, and two in sequence mode, on the
+def tiny_benchmark(
+    tiny_sequence: Callable[..., Path], tmp_path: Path, few_steps: None, monkeypatch: pytest.MonkeyPatch
+) -> Callable[..., Benchmark]:
+    """Factory of the same benchmark over one frame of a tiny sequence in two domains, and two in sequence mode, on the
     same results file."""
-    path = tiny_sequence(frames=2, domains=DOMAINS, cameras=("left", "right"), width=160, height=128)
+    domains = "regular", "smoke"
+    monkeypatch.setattr(runner, "DOMAINS", domains)
+    path = tiny_sequence(frames=2, domains=domains, cameras=("left", "right"), width=160, height=128)
 
     def make(fingerprint: str = "tiny", name: str = "synthetic") -> Benchmark:
         source = Source(

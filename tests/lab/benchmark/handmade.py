@@ -28,4 +28,4 @@ def make_measurement(
         for place, value in ((seconds * (step + 1), value) for step, value in enumerate(dice))
     )
     best = tuple(max(range(place + 1), key=lambda i: dice[i]) for place in range(len(dice)))
-    return Measurement(Run(source, domain, frame, method, error_deg), trace[-1], trace, best, stopped, "a machine")
+    return Measurement(Run(source, domain, frame, method, error_deg), trace[-1], stopped, "a machine", trace, best)

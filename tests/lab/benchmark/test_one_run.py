@@ -23,7 +23,7 @@ def test_a_measurement_survives_its_json_line() -> None:
 
 def test_a_measurement_without_iterates_survives_too_and_has_no_start() -> None:
     score = Score(None, 0.9, 0.8, None, None, None, 0.1)
-    measurement = Measurement(Run("real", "smoke", 3, "unet"), score, (), (), "not iterative", "a machine")
+    measurement = Measurement(Run("real", "smoke", 3, "unet"), score, "not iterative", "a machine")
     again = Measurement.from_json(json.loads(json.dumps(measurement.to_json())))
     assert again == measurement
     assert again.start is None and again.best_of(30) is None and not again.made_worse and again.iterations == 0

@@ -34,7 +34,7 @@ def _measurements() -> list[Measurement]:
             for frame, dice in enumerate((0.9, 0.94)):
                 unet = Score(None, 0.8, 0.7, None, None, None, 0.1)
                 run = Run(source, domain, frame, "unet")
-                found.append(Measurement(run, unet, (), (), "not iterative", "a machine"))
+                found.append(Measurement(run, unet, "not iterative", "a machine"))
                 place = {"source": source, "domain": domain, "frame": frame}
                 found.append(make_measurement((0.8,), method="start", **place))
                 for method in ("l1", "paper", "ours"):

@@ -33,13 +33,6 @@ def campaign(sandbox: Path, monkeypatch: pytest.MonkeyPatch, count: int) -> int:
 
 
 @pytest.mark.slow
-def test_hostile_names_lead_nowhere_when_synthesized(
-    tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    campaign(tmp_path_factory.mktemp("sandbox"), monkeypatch, 8)
-
-
-@pytest.mark.slow
 @pytest.mark.timeout(7200)
 def test_500_hostile_names_lead_nowhere_when_synthesized(
     tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch

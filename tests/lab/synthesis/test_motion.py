@@ -79,15 +79,6 @@ def test_both_instruments_are_seen_in_every_frame(
             assert (ids == arm).mean() > 0.01
 
 
-def test_the_same_seed_gives_the_same_motion_and_another_seed_another(
-    arms: tuple[Arm, ...], camera: Camera, flat_tissue: Tissue, joints: Sequence[np.ndarray]
-) -> None:
-    again = plan_motion(arms, [flat_tissue], camera, CONFIG)
-    other = plan_motion(arms, [flat_tissue], camera, SynthesisConfig(seed=12, motion=CONFIG.motion))
-    assert all(np.array_equal(a, b) for a, b in zip(joints, again, strict=True))
-    assert not np.allclose(joints[0], other[0])
-
-
 def test_a_motion_that_cannot_be_done_says_why(arms: tuple[Arm, ...], camera: Camera, flat_tissue: Tissue) -> None:
     config = SynthesisConfig(motion=MotionConfig(frames=8, reach=(0.1, 0.1, 0.001)))
     with pytest.raises(SettingsError, match=r"none of \d+ random motions fits.*a tip leaves the picture.*motion.reach"):

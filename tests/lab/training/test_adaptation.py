@@ -14,9 +14,8 @@ from carts_core.lab.randomization.arms import RecordedPlacements, RobotGeometry
 from carts_core.lab.training.adaptation import (
     BACKGROUNDS,
     STEPS,
+    Fits,
     Judgement,
-    MadeFits,
-    OwnFits,
     adapted_to,
     gain,
     made_images,
@@ -190,23 +189,22 @@ def test_the_tip_is_the_end_of_the_jaws():
     assert tip_error(seen, surface) == pytest.approx((3.0 + 20.0) / 2, abs=0.3)
 
 
-def _judgement(made: dict | None = None, own: dict | None = None, moved: float = 0.0) -> Judgement:
-    before, was = MadeFits(0.97, 0.95, 2.7), OwnFits(4, 2.0, 0.7, (np.array([[10.0, 10.0], [np.nan, np.nan]]),))
-    now = replace(was, tips=(was.tips[0] + moved,), **(own or {}))
-    return Judgement((before, replace(before, **(made or {}))), (was, now))
+def _judgement(moved: float = 0.0, **now: float) -> Judgement:
+    before = Fits(0.97, 0.95, 2.7, 4, 2.0, 0.7, (np.array([[10.0, 10.0], [np.nan, np.nan]]),))
+    return Judgement(before, replace(before, tips=(before.tips[0] + moved,), **now))
 
 
 @pytest.mark.parametrize(
     ("judgement", "worse"),
     [
         (_judgement(), []),
-        (_judgement({"dice": 0.98, "tips": 2.0}, {"edges": 2.2}, moved=5.0), []),
-        (_judgement({"dice": 0.98, "tips": 10.9}), ["tips of made images (2.7 -> 10.9 px)"]),
-        (_judgement({"dice": 0.96}), ["masks of made images (Dice 0.970 -> 0.960)"]),
-        (_judgement({"parts": 0.9}), ["parts of made images (0.950 -> 0.900 of the pixels)"]),
-        (_judgement(own={"good": 3}), ["verdicts of the recording (4 -> 3 good)"]),
-        (_judgement(own={"parts": 0.1}), ["parts of the recording (0.700 -> 0.100 of the pixels)"]),
-        (_judgement(own={"edges": 1.5}), ["edges of the recording (2.00 -> 1.50)"]),
+        (_judgement(dice=0.98, made_tips=2.0, edges=2.2, moved=5.0), []),
+        (_judgement(dice=0.98, made_tips=10.9), ["tips of made images (2.7 -> 10.9 px)"]),
+        (_judgement(dice=0.96), ["masks of made images (Dice 0.970 -> 0.960)"]),
+        (_judgement(made_parts=0.9), ["parts of made images (0.950 -> 0.900 of the pixels)"]),
+        (_judgement(good=3), ["verdicts of the recording (4 -> 3 good)"]),
+        (_judgement(parts=0.1), ["parts of the recording (0.700 -> 0.100 of the pixels)"]),
+        (_judgement(edges=1.5), ["edges of the recording (2.00 -> 1.50)"]),
         (_judgement(moved=5.0), ["tips of the recording (moved by 7.1 px without stronger edges)"]),
     ],
 )
@@ -218,7 +216,7 @@ def test_what_is_worse_is_named(judgement: Judgement, worse: list[str]):
 def test_weights_are_offered_only_where_nothing_is_worse(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tips: float
 ):
-    monkeypatch.setattr("carts_core.lab.training.adaptation.judge", lambda *_, **__: _judgement({"tips": tips}))
+    monkeypatch.setattr("carts_core.lab.training.adaptation.judge", lambda *_, **__: _judgement(made_tips=tips))
     small = "--steps 1 --batch-size 1 --workers 0 --threads 1 --validation-samples 1".split()
     command = ["train", str(tmp_path / "run"), "--for", str(sample_sequence()), *small]
     main(command)
