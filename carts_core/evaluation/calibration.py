@@ -94,9 +94,14 @@ def calibration_json(before: Scene, result: CalibrationResult, residuals: Frames
 
 def moved_frames(before: Scene, after: Scene) -> list[tuple[str, float, float]]:
     """Name, rotation [deg] and translation [mm] of each base frame and camera that moved."""
-    arms, cameras = (zip(*pair, strict=True) for pair in ((before.arms, after.arms), (before.cameras, after.cameras)))
-    poses = [(f"T_world_base of {old.name}", old.T_world_base, new.T_world_base) for old, new in arms]
-    poses += [(f"T_camera_world of {old.name}", old.T_camera_world, new.T_camera_world) for old, new in cameras]
+    poses = [
+        (f"T_world_base of {old.name}", old.T_world_base, new.T_world_base)
+        for old, new in zip(before.arms, after.arms, strict=True)
+    ]
+    poses += [
+        (f"T_camera_world of {old.name}", old.T_camera_world, new.T_camera_world)
+        for old, new in zip(before.cameras, after.cameras, strict=True)
+    ]
     return [(name, *pose_distance(old, new)) for name, old, new in poses if not np.array_equal(old, new)]
 
 

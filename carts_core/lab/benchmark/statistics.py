@@ -133,7 +133,7 @@ class Figure:
 
     def cell(self, scores: Iterable[Score | None], theirs: paper.Value | None = None, column: str = "") -> Cell:
         """The text, and the paper's number below it with the name of its column there."""
-        note = "" if theirs is None else f"{column} {theirs[0]:.{self.digits}f} ± {theirs[1]:.{self.digits}f}"
+        note = "" if theirs is None else f"{column} {theirs[0]:.1f} ± {theirs[1]:.1f}"
         return Cell(self.text(scores), note)
 
 

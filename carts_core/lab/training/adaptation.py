@@ -146,8 +146,9 @@ def judge(
             progress("comparing fits before and after", next(done), total)
             found.append(_own_fit(recording, recording.frame(index), network))
         good, edges, parts, tips = zip(*found, strict=True)
-        made_figures = np.mean(scores, axis=0).tolist()
-        return Fits(*made_figures, sum(good), float(np.mean(edges)), float(np.mean(parts)), tuple(tips))
+        dice, made_parts, made_tips = np.mean(scores, axis=0).tolist()
+        means = float(np.mean(edges)), float(np.mean(parts))
+        return Fits(dice, made_parts, made_tips, sum(good), *means, tuple(tips))
 
     return Judgement(fits(networks[0]), fits(networks[1]))
 

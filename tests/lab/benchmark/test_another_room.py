@@ -62,12 +62,6 @@ def test_the_instrument_is_put_into_the_room_and_nothing_else_is_left_of_the_old
     assert np.abs(recording.background("left", GREEN.domain).astype(float) - (40, 160, 90)).mean() < 6
 
 
-def test_without_an_arm_the_room_alone_is_seen_and_masks_are_empty(sequence: Sequence) -> None:
-    frame = AnotherRoom(sequence, [GREEN], seed=1).frame_without_arm(1, GREEN.domain, ["left"])
-    assert frame.masks is not None and not frame.masks["left"].any()
-    assert np.abs(frame.images["left"].astype(float) - (40, 160, 90)).max() < 15
-
-
 def test_the_benchmark_plans_rooms_for_every_camera_with_masks(tiny_sequence: Callable[..., Path]) -> None:
     path = tiny_sequence(frames=3, **SIZE)
     (source,) = room_sources(path, None, QUICK)

@@ -31,8 +31,8 @@ from carts_core.lab.benchmark.statistics import Measurements
 from carts_core.lab.benchmark.tables import sequence_table
 
 QUIET = Console(quiet=True)
-RUNS = 62
-"""30 of the main table, 6 of the surface network alone, 2 with an error at the start, 4 with something wrong, 6 with
+RUNS = 38
+"""10 of the main table, 2 of the surface network alone, 2 with an error at the start, 4 with something wrong, 6 with
 occluders, 4 with both cameras, 2 with masks as the target, 4 in sequence mode, 4 of TC-CaRTS."""
 
 

@@ -9,7 +9,7 @@ import pytest
 from handmade import make_measurement
 
 from carts_core.files import output_path
-from carts_core.lab.benchmark import Facts, Measurement, Run, Score, write_report
+from carts_core.lab.benchmark import Facts, Measurement, Run, Score, targets, write_report
 from carts_core.lab.benchmark.hand_eye import HandEyeRun
 from carts_core.lab.benchmark.statistics import Measurements
 from carts_core.lab.benchmark.tables import (
@@ -20,7 +20,6 @@ from carts_core.lab.benchmark.tables import (
     occlusion_table,
     sequence_table,
 )
-from carts_core.lab.benchmark.targets import accuracy_targets
 from carts_core.lab.synthesis import DOMAINS
 
 HAND_EYE = [HandEyeRun("masks, 15 degrees and 10 cm", 0, 0.05, 0.001, "good")]
@@ -126,7 +125,7 @@ def test_errors_are_tabled_over_frames_that_all_methods_know_and_count_for_targe
     data = Measurements([*main, *errors, further])
     (row,) = [row for row in error_tables(data.compared())[0].rows if row[0].text == "ours"]
     assert row[2].text == "90.0"
-    (target,) = [t for t in accuracy_targets(data) if t.what.startswith("synthetic, 2° off, each frame alone: mean")]
+    (target,) = [t for t in targets(data) if t.what.startswith("synthetic, 2° off, each frame alone: mean")]
     assert target.reached == "0.800" and "2 frames" in target.basis
 
 

@@ -18,7 +18,7 @@ from carts_core.lab.benchmark.conditions import (
 )
 from carts_core.lab.benchmark.sources import HELD_OUT, synthetic_room_source
 from carts_core.lab.benchmark.statistics import Measurements
-from carts_core.lab.benchmark.targets import deviation_table, family_table, verdict_table
+from carts_core.lab.benchmark.tables import deviation_table, family_table, verdict_table
 from carts_core.recording import Sequence
 
 
