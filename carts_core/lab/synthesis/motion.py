@@ -59,14 +59,14 @@ _BORDER = 0.08
 _MARGIN = 0.1
 """Collisions are looked for in the picture and in a margin around it, a part of its size."""
 _INWARDS = (np.array([0.55, 0.45, -0.70]), np.array([-0.60, 0.35, -0.72]))
-"""Direction of the jaws in the middle of their range, in the world: to the other arm and down."""
+"""Where the jaws point in the middle of their range, in the world: to the other arm and down."""
 
 
 Motion = TypeVar("Motion")
 
 
 class Rejected(Exception):
-    """Reason why a random motion cannot be used."""
+    """Why a random motion cannot be used."""
 
 
 def plan_motion(
@@ -91,10 +91,14 @@ def plan_motion(
 
 
 def random_motion(draw: Callable[[np.random.Generator], Motion], config: SynthesisConfig) -> Motion:
-    """The first of many random motions for which `draw` does not raise `Rejected`.
+    """The first of many random motions that is not rejected.
+
+    Args:
+        draw: makes one, or raises `Rejected`.
+        config: with the seed.
 
     Raises:
-        SettingsError: all are rejected.
+        SettingsError: all are.
     """
     reasons: dict[str, int] = {}
     for attempt in range(_ATTEMPTS):
@@ -140,30 +144,26 @@ def _tips(robot: Robot, tip_link: str, joints: torch.Tensor) -> torch.Tensor:
     return robot.link_transform(joints, tip_link)[..., :3, 3]
 
 
-def _spline(
-    config: SynthesisConfig, rng: np.random.Generator, spread: Float[np.ndarray, " n"]
-) -> Float[np.ndarray, "frames n"]:
-    """A smooth random curve within +/- `spread`."""
-    times = sample_times(config)
-    controls = max(4, int(np.ceil(times[-1] / config.motion.control_interval)) + 1)
-    values = rng.uniform(-1.0, 1.0, (controls, len(spread))) * spread
-    return CubicSpline(np.linspace(0.0, max(times[-1], 1e-3), controls), values, bc_type="clamped")(times)
-
-
 def _draw(
     arm: Arm, number: int, camera: Camera, config: SynthesisConfig, rng: np.random.Generator
 ) -> Float[np.ndarray, "frames dofs"]:
     """One random motion of one arm, within its limits and in view."""
     motion = config.motion
-    targets = np.asarray(WORK_POINTS[number]) + _spline(config, rng, np.asarray(motion.reach))
+    times = sample_times(config)
+    controls = max(4, int(np.ceil(times[-1] / motion.control_interval)) + 1)
+    knots = np.linspace(0.0, max(times[-1], 1e-3), controls)
+
+    def spline(spread: np.ndarray) -> np.ndarray:
+        return CubicSpline(knots, rng.uniform(-1.0, 1.0, (controls, len(spread))) * spread, bc_type="clamped")(times)
+
+    targets = np.asarray(WORK_POINTS[number]) + spline(np.asarray(motion.reach))
     if not in_view(targets, camera):
         raise Rejected("a tip leaves the picture")
-    joints = np.zeros((len(targets), len(arm.robot.joint_names)))
+    joints = np.zeros((len(times), len(arm.robot.joint_names)))
     joints[:, 2] = 0.14
-    middle = _wrist_middle(arm, number, config, rng)
-    joints[:, 3:6] = middle + _spline(config, rng, np.full(3, motion.wrist_range))
+    joints[:, 3:6] = _wrist_middle(arm, number, config, rng) + spline(np.full(3, motion.wrist_range))
     low, high = motion.jaw_range
-    joints[:, 6:] = np.clip((low + high) / 2 + _spline(config, rng, np.array([0.75 * (high - low)])), low, high)
+    joints[:, 6:] = np.clip((low + high) / 2 + spline(np.array([0.75 * (high - low)])), low, high)
     joints = reach_tip(arm, config.tip_link, targets, joints)
     lowest, highest = arm.robot.joint_limits.numpy()[:6].T
     margin = _LIMIT_MARGIN * (highest - lowest)
@@ -240,7 +240,7 @@ def clouds(arm: Arm, positions: np.ndarray, body: list[np.ndarray]) -> list[np.n
 ARM_NAME = "arm"
 
 _ENDOSCOPE = 0.3
-"""Largest camera distance without scaling of the world [m]."""
+"""Cameras up to this distance look at the world as it is [m]."""
 
 _USUAL = 0.1
 """Distance for which the small world is made [m]."""
@@ -252,7 +252,7 @@ _ERROR = {"revolute": (0.02, 0.004, 0.0005), "prismatic": (0.002, 0.0004, 0.0000
 """Bias, drift and noise of a joint [rad, m], where the settings are those of an instrument."""
 
 _TURN = 0.6
-"""Random deviation of the arm's direction [rad]."""
+"""How far, at random, the arm comes from elsewhere than its instrument would [rad]."""
 
 
 def enlargement(config: EndoscopeConfig) -> float:
@@ -290,7 +290,7 @@ def plan_arm(
 
     Args:
         robot: of the arm.
-        tissues: obstacles, in the small world.
+        tissues: that it must not touch, in the small world.
         camera: in the small world.
         config: motion and seed.
         scale: of the large world.
@@ -320,11 +320,15 @@ def _tip_link(robot: Robot, config: SynthesisConfig) -> str:
 
 def _draw_arm(robot: Robot, config: SynthesisConfig, rng: np.random.Generator) -> Float[np.ndarray, "frames dofs"]:
     """A random motion about a random pose, within the joints' limits."""
+    times, motion = sample_times(config), config.motion
+    controls = max(4, int(np.ceil(times[-1] / motion.control_interval)) + 1)
+    knots = np.linspace(0.0, max(times[-1], 1e-3), controls)
     low, high = robot.joint_limits.numpy().T
     low, high = np.where(np.isfinite(low), low, -_FREE), np.where(np.isfinite(high), high, _FREE)
-    reach = np.minimum(config.motion.wrist_range, 0.25 * (high - low))
+    reach = np.minimum(motion.wrist_range, 0.25 * (high - low))
     middle = rng.uniform(low + 1.2 * reach, high - 1.2 * reach)
-    return np.clip(middle + _spline(config, rng, np.ones(len(low))) * reach, low, high)
+    waves = CubicSpline(knots, rng.uniform(-1.0, 1.0, (controls, len(low))), bc_type="clamped")(times)
+    return np.clip(middle + waves * reach, low, high)
 
 
 def _placed(
@@ -350,10 +354,10 @@ def _placed(
 
 
 def check_instrument_distance(config: EndoscopeConfig) -> None:
-    """Check the camera distance for instruments, whose scene cannot be scaled.
+    """Raise where a camera is too far off for instruments, whose scene cannot be enlarged.
 
     Raises:
-        SettingsError: it is too large.
+        SettingsError: it is.
     """
     if enlargement(config) != 1.0:
         raise SettingsError(
