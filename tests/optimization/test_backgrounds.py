@@ -155,7 +155,7 @@ def test_a_real_instrument_is_found_in_a_room_that_deceives_the_network(shared_d
     assert frame.masks is not None
     scene, renderer = sequence.scene.with_cameras(["left"]), Renderer(sequence.scene, cameras=["left"])
     found = []
-    for backgrounds in ({}, {"left": recording.empty(room.domain, "left")}):
+    for backgrounds in ({}, {"left": recording.background("left", room.domain)}):
         optimizer = FrameOptimizer(scene, frame, backgrounds, extractor, live=False)
         list(optimizer)
         assert optimizer.best is not None
