@@ -140,6 +140,8 @@ class Tab:
         self._pictured: ViewState | None = None
         self._left_at: float | None = None
         """When the page left [s, monotonic]; None while there is one, and once its run is ended."""
+        self._gone = False
+        """Whether the page has left for good, so that nobody sees scores."""
 
     def put(self, intent: Intent) -> None:
         """Queue an intent for the worker. Thread-safe."""
@@ -160,6 +162,7 @@ class Tab:
         self.person.present = True
         self.view = View(client, self.session, renderer, storage, self.controller.state, self.put, self.waits)
         self._shown = self._pictured = self._left_at = None
+        self._gone = False
 
     def detach(self) -> None:
         """Detach the closed page; its run continues for `AWAY` seconds."""
@@ -178,7 +181,7 @@ class Tab:
             CartsError: it could not be saved.
         """
         if self.away_in() == 0.0:
-            self._left_at = None
+            self._left_at, self._gone = None, True
             self.controller.leave()
 
     @property
@@ -195,8 +198,7 @@ class Tab:
     def publish(self, attempt: Callable[[Callable[[], None]], None]) -> None:
         """Show a changed state; `attempt` calls a function and shows its errors."""
         controller, display = self.controller, None if self.view is None else self.view.display
-        # The page of a tab that is away may come back; nobody sees the scores of one that has left.
-        due = self._left_at is not None if display is None else display.ready_in() <= 0.0
+        due = not self._gone if display is None else display.ready_in() <= 0.0
         if due and self._pictured is not controller.state:
             attempt(controller.map)
             if display is not None:
