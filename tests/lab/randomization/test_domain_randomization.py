@@ -78,7 +78,7 @@ def test_a_range_that_makes_no_sense_is_refused(arguments: dict):
     [{"width": 100}, {"two_arms": 1.5}, {"things": -0.1}, {"absent": 2}, {"coverage": (0.5, 0.1)}, {"field_width": 64}],
 )
 def test_pair_settings_out_of_range_are_refused(arguments: dict):
-    with pytest.raises(SettingsError, match="allowed|give"):
+    with pytest.raises(SettingsError, match=r"allowed|give"):
         ImageSettings(**arguments)
 
 

@@ -224,7 +224,7 @@ def test_the_learning_rate_rises_and_then_falls_to_a_hundredth():
     ],
 )
 def test_settings_out_of_range_are_refused(changes: dict):
-    with pytest.raises(SettingsError, match="allowed|give"):
+    with pytest.raises(SettingsError, match=r"allowed|give"):
         small_config(**changes)
 
 
