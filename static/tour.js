@@ -139,5 +139,5 @@
     event.preventDefault();
     event.stopImmediatePropagation();
   }, { capture: true });
-  Object.assign(window.carts, { startTour: start });
+  Object.assign(window.carts, { startTour: start, offerTour: offer });
 })();

@@ -28,11 +28,14 @@ signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
 
 @pytest.fixture(scope="session", autouse=True)
-def _mesh_cache_beside_the_tests(pytestconfig: pytest.Config) -> Iterator[None]:
-    """Decimated meshes are cached between test runs, but not in the home folder."""
+def _nothing_in_the_home_folder(
+    pytestconfig: pytest.Config, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[None]:
+    """Decimated meshes are cached between test runs, but not in the home folder; neither are the user's data there."""
     assert pytestconfig.cache is not None
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("CARTS_CACHE", str(pytestconfig.cache.mkdir("meshes")))
+        patch.setenv("CARTS_DATA", str(tmp_path_factory.mktemp("session data")))
         yield
 
 

@@ -1,37 +1,52 @@
-"""A running viewer of a tiny sequence, a tab without a browser, and a real browser."""
+"""A running viewer of a tiny sequence, tabs in a real browser, and a controller without either."""
 
 import os
 import re
 import shutil
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from pathlib import Path
 
 import pytest
 import torch
 from playwright.sync_api import Browser, expect, sync_playwright
-from viewer_canvas import Canvas, mark_frames
 from viewer_desk import Desk
-from viewer_tab import Tab
+from viewer_tab import OpenTab, OpenViewer, Tab, mark_frames, new_context
 
+from carts_core.networks import FeatureExtractor
 from carts_core.networks.network import FeatureNetwork
 from carts_core.networks.weights import save_weights
-from carts_core.project import Project
-from carts_core.recording import Sequence
 from carts_core.settings import Architecture
 from carts_viewer.actions import intents
 from carts_viewer.app import ViewerApp
-from carts_viewer.jobs.optimizers import OptimizerFactory
+from carts_viewer.jobs.optimizers import NetworkOptions
 
 FLAGS = (
     "--no-sandbox --disable-quic --no-first-run --disable-background-networking --disable-component-update "
     "--disable-sync"
 ).split()
 
-# Without a graphics card, and with others at work, a page may need long for what a person sees at once.
-_LONGEST, _LONGEST_EXPECTED = 90_000, 20_000
-"""Waits for the page, and for what a test expects of it [ms]."""
-expect.set_options(timeout=_LONGEST_EXPECTED)
+# Without a graphics card, and on a busy machine, a page may need long.
+expect.set_options(timeout=20_000)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _networks_loaded_once() -> Iterator[None]:
+    """Networks from the same files are loaded once for all tests."""
+    load, loaded = FeatureExtractor.load, {}
+
+    def load_once(*weights: Path | str, **options) -> FeatureExtractor:
+        files = [Path(path) for path in weights]
+        if not all(path.is_file() for path in files):
+            return load(*weights, **options)
+        key = (*((path, path.stat().st_mtime_ns) for path in files), *sorted(options.items()))
+        if key not in loaded:
+            loaded[key] = load(*weights, **options)
+        return loaded[key]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(FeatureExtractor, "load", load_once)
+        yield
 
 
 @pytest.fixture(scope="session")
@@ -45,27 +60,52 @@ def untrained_weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def open_viewer(tiny_sequence: Callable[..., Path], untrained_weights: Path) -> Iterator[Callable[..., ViewerApp]]:
-    """Opens the viewer of a tiny sequence; arguments are those of `tiny_sequence`, and
-    `prepare`, which gets the sequence's folder before it is opened."""
+def open_viewer(tiny_sequence: Callable[..., Path], untrained_weights: Path) -> Iterator[OpenViewer]:
+    """Opens the viewer of a tiny sequence; further options are those of `tiny_sequence`.
+
+    `prepare` gets the sequence's folder before it is opened, `networks` the options of the networks. A `marked` one
+    has discs in its frames, an uneven lens whose centre is not the image's, and a solid mask.
+    """
+
+    def uneven(text: str) -> str:
+        return re.sub(r"K = .*", "K = [[390.0, 0.0, 130.0], [0.0, 372.0, 128.0], [0.0, 0.0, 1.0]]", text)
+
     with ExitStack() as stack:
 
-        def make(prepare: Callable[[Path], None] = lambda folder: None, **options) -> ViewerApp:
+        def make(
+            prepare: Callable[[Path], object] = lambda folder: None,
+            *,
+            marked: bool = False,
+            networks: NetworkOptions | None = None,
+            **options,
+        ) -> ViewerApp:
+            if marked:
+                options |= {"width": 320, "height": 240, "edit": uneven, "masks": False}
             path = tiny_sequence(**options)
-            prepare(path.parent)
-            app = stack.enter_context(ViewerApp.open(path, port=0, weights=(untrained_weights,)))
+            (mark_frames if marked else prepare)(path.parent)
+            chosen: NetworkOptions = {"weights": (untrained_weights,), **(networks or {})}
+            app = stack.enter_context(ViewerApp.open(path, port=0, **chosen))
+            if marked:
+                app.queue.put(intents.SetOpacity(1.0))
             app.wait_until_shown(60)
             return app
 
         yield make
 
 
+@pytest.fixture(scope="module")
+def shared_viewer(shared_sequence: Callable[..., Path], untrained_weights: Path) -> Iterator[ViewerApp]:
+    """The viewer of a tiny sequence, for tests that leave it as it is."""
+    with ViewerApp.open(shared_sequence(), port=0, weights=(untrained_weights,)) as app:
+        app.wait_until_shown(60)
+        yield app
+
+
 @pytest.fixture
 def desk(tiny_sequence: Callable[..., Path], untrained_weights: Path) -> Desk:
     """A controller with three frames of two cameras in two domains."""
-    sequence = Sequence.open(tiny_sequence(frames=3, cameras=("left", "right"), domains=("regular", "smoke")))
-    factory = OptimizerFactory(weights=(untrained_weights,), report=lambda line: None)
-    return Desk(sequence, Project.open(sequence), factory)
+    path = tiny_sequence(frames=3, cameras=("left", "right"), domains=("regular", "smoke"))
+    return Desk.open(path, weights=(untrained_weights,))
 
 
 @pytest.fixture(scope="session")
@@ -81,43 +121,33 @@ def browser() -> Iterator[Browser]:
 
 
 @pytest.fixture
-def open_tab(browser: Browser) -> Iterator[Callable[..., Tab]]:
+def open_tab(browser: Browser, open_viewer: OpenViewer) -> Iterator[OpenTab]:
     """Opens a tab of a viewer, in a window of any size, when the first picture is there.
 
-    The browser has seen the page before, unless it is a `new` one. `asked` gets every address that the page asks for.
+    Without a viewer one is opened, with the options of `open_viewer`. The browser has seen the page before, unless it
+    is a `new` one. `asked` gets every address that the page asks for; `query` is appended to the page's address.
     """
     with ExitStack() as stack:
 
         def make(
-            app: ViewerApp, window: tuple[int, int] = (1280, 800), *, new: bool = False, asked: list[str] | None = None
+            app: ViewerApp | None = None,
+            window: tuple[int, int] = (1100, 720),
+            *,
+            new: bool = False,
+            asked: list[str] | None = None,
+            query: str = "",
+            **options,
         ) -> Tab:
-            context = browser.new_context(viewport={"width": window[0], "height": window[1]}, accept_downloads=True)
-            stack.callback(context.close)
-            context.set_default_timeout(_LONGEST)
+            app = app or open_viewer(**options)
+            context = stack.enter_context(closing(new_context(browser, window)))
             if not new:
                 context.add_init_script("localStorage.setItem('carts-tour', 'seen')")
             page = context.new_page()
             if asked is not None:
                 page.on("request", lambda request: asked.append(request.url))
-            page.goto(app.url)
-            tab = Tab(app, page, Canvas(app, page))
+            page.goto(app.url + query)
+            tab = Tab(app, page)
             tab.wait_until_ready()
             return tab
 
         yield make
-
-
-@pytest.fixture
-def open_marked(open_viewer: Callable[..., ViewerApp]) -> Callable[..., ViewerApp]:
-    """Opens a viewer whose frames carry discs, through an uneven lens off the centre, with a solid mask on top."""
-
-    def uneven(text: str) -> str:
-        return re.sub(r"K = .*", "K = [[390.0, 0.0, 130.0], [0.0, 372.0, 128.0], [0.0, 0.0, 1.0]]", text)
-
-    def make() -> ViewerApp:
-        app = open_viewer(width=320, height=240, edit=uneven, masks=False, prepare=mark_frames)
-        app.queue.put(intents.SetOpacity(1.0))
-        app.wait_until_shown()
-        return app
-
-    return make

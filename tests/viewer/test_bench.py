@@ -7,6 +7,7 @@ from multiprocessing import get_context
 from pathlib import Path
 
 import pytest
+from viewer_tab import OpenViewer
 
 from carts_viewer.actions import intents
 from carts_viewer.app import ViewerApp
@@ -17,7 +18,7 @@ from tools.freshness import Soaking
 
 @pytest.mark.slow
 def test_no_drag_ends_with_a_stale_overlay_and_every_move_becomes_visible(
-    open_viewer: Callable[..., ViewerApp],
+    open_viewer: OpenViewer,
 ) -> None:
     app = open_viewer(width=640, height=480)
     for draws in (True, False):
@@ -26,15 +27,13 @@ def test_no_drag_ends_with_a_stale_overlay_and_every_move_becomes_visible(
         assert 0 < latency.median <= latency.p95 <= latency.worst and isfinite(latency.worst)
 
 
-def test_every_key_brings_its_frame_with_its_overlay(open_viewer: Callable[..., ViewerApp]) -> None:
+def test_every_key_brings_its_frame_with_its_overlay(open_viewer: OpenViewer) -> None:
     latency = frame_latency(open_viewer(frames=3), moves=6, frames=3, pause=0.0)
     assert not latency.stale and 0 < latency.median <= latency.p95 <= latency.worst
 
 
 @pytest.mark.slow
-def test_a_short_soak_sees_what_it_is_there_for(
-    open_viewer: Callable[..., ViewerApp], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_short_soak_sees_what_it_is_there_for(open_viewer: OpenViewer, monkeypatch: pytest.MonkeyPatch) -> None:
     app = open_viewer()
     seen = Soaking(app, run=0.5).soak(0.01)
     assert seen.rounds == seen.reloads == 1 and seen.frames == 40 and seen.iterations > 0

@@ -23,7 +23,7 @@ from carts_core.files import output_path
 from carts_core.optimization.hand_eye import ImagePoint
 from carts_core.project.identity import data_dir
 from carts_core.settings.interchange import ImportOptions
-from carts_viewer.jobs.job_list import JobState
+from carts_viewer.jobs.job_list import Job, JobState
 from carts_viewer.jobs.networks import STARTED
 from carts_viewer.start.site import Site
 from carts_viewer.start.start_page import RecentProject
@@ -87,14 +87,8 @@ class Case:
 def places(content: Any, way: Steps = ()) -> Iterator[Steps]:
     """Every field, and the first entry of every list."""
     yield way
-    inner = (
-        content.items()
-        if isinstance(content, dict)
-        else list(enumerate(content))[:1]
-        if isinstance(content, list)
-        else ()
-    )
-    for key, value in inner:
+    inner = content.items() if isinstance(content, dict) else []
+    for key, value in list(enumerate(content))[:1] if isinstance(content, list) else inner:
         yield from places(value, (*way, key))
 
 
@@ -132,20 +126,8 @@ def plant(path: Path, content: Any, case: Case) -> None:
 
 
 def job(number: int, kind: str, **options: Any) -> dict[str, Any]:
-    return {
-        "number": number,
-        "kind": kind,
-        "title": "Harmless",
-        "options": options,
-        "state": "waiting",
-        "done": 0,
-        "total": 0,
-        "began": 0.0,
-        "ended": 0.0,
-        "text": "",
-        "log": ["12:00:00 begun"],
-        "token": "0" * 32,
-    }
+    row = asdict(Job(number, kind, "Harmless", {}, log=("12:00:00 begun",)))  # pyright: ignore[reportArgumentType]
+    return row | {"options": options, "state": "waiting", "token": "0" * 32}
 
 
 JOBS = [
@@ -158,25 +140,22 @@ JOBS = [
 """Of another user; all of them wait."""
 JOB_PLACES = [*places(JOBS), *((row, "options", *way) for row in range(1, 5) for way in places(JOBS[row]["options"]))]
 POINT = asdict(ImagePoint(0, "left", "PSM1", "wrist", (10.0, 20.0)))
-OPTIONS = {
-    **asdict(ImportOptions()),
-    "source": "folder",
-    "images": {"left": "images"},
-    "calibration": {"left": "camera.yaml"},
-    "kinematics": "kinematics.csv",
-    "columns": {"time": "time"},
-    "angle_unit": "rad",
-    "length_unit": "m",
-    "flip": ["yaw"],
-    "clock": "s",
-    "time_offset": 0.1,
-    "frame_rate": 30.0,
-    "arms": {"PSM1": "PSM1"},
-    "robot": {"PSM1": "builtin:psm_lnd"},
-    "wrist_length": 0.0091,
-    "base": {"PSM1": "base.json"},
-    "axes": "opencv",
-}
+OPTIONS = asdict(
+    ImportOptions(
+        source="folder",
+        images={"left": "images"},
+        calibration={"left": "camera.yaml"},  # pyright: ignore[reportArgumentType]
+        kinematics="kinematics.csv",  # pyright: ignore[reportArgumentType]
+        columns={"time": "time"},
+        flip=("yaw",),
+        time_offset=0.1,
+        frame_rate=30.0,
+        arms={"PSM1": "PSM1"},
+        robot={"PSM1": "builtin:psm_lnd"},
+        wrist_length=0.0091,
+        base={"PSM1": "base.json"},  # pyright: ignore[reportArgumentType]
+    )
+)
 POSE = [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.1], [0.0, 0.0, 0.0, 1.0]]
 CALIBRATION = {"arms": {"PSM1": POSE}, "cameras": {"left": POSE}, "intrinsics": {"left": [100.0, 100.0, 48.0, 36.0]}}
 
@@ -256,11 +235,8 @@ class World:
         self.do(self.site.show_start)
         shown = self.site.document.content
         said = "list of recent recordings" in shown or str(sequence) in shown
-        return (
-            ""
-            if said or case.wrong in ("empty list", REMOVED, *MISSING) or case.place == (0, "sequence")
-            else "nothing is said"
-        )
+        none = case.wrong in ("empty list", REMOVED, "a link to nothing") or case.place == (0, "sequence")
+        return "" if said or none else "nothing is said"
 
     def open_thumbnail(self, case: Case, place: Path) -> str:
         sequence = self.recording(place)
@@ -351,15 +327,10 @@ class World:
         return self.serves()
 
 
-def fields(companion: str, ways: Iterable[Steps]) -> list[Case]:
-    """Every wrong value in every one of these places, and each place without its field."""
-    wrong = [*VALUES, REMOVED]
-    return [Case(companion, way, name) for way in ways for name in wrong if way or name != REMOVED]
-
-
-def files(companion: str) -> list[Case]:
-    """A whole file replaced."""
-    return [Case(companion, None, name) for name in CONTENTS]
+def wrong_cases(companion: str, ways: Iterable[Steps] = ()) -> list[Case]:
+    """Every wrong value in each of these places, each place without its field, and a whole file replaced."""
+    values = [Case(companion, way, name) for way in ways for name in (*VALUES, REMOVED) if way or name != REMOVED]
+    return [*values, *(Case(companion, None, name) for name in CONTENTS)]
 
 
 def cases(world: World, group: str) -> list[Case]:
@@ -374,9 +345,9 @@ def cases(world: World, group: str) -> list[Case]:
         "draft hand-eye": [way for way in places(draft) if way[:1] in (("points",), ("calibration",))],
     }
     if group == "beside":
-        return [case for name in BESIDE for case in files(f"beside {name}")]
+        return [case for name in BESIDE for case in wrong_cases(f"beside {name}")]
     if not group.startswith("batch"):
-        return fields(group, known.get(group, ())) + files(group)
+        return wrong_cases(group, known.get(group, ()))
     name = group.partition(" ")[2]
     batch, job = world.batch(world.folder / "example")
     file = batch / name if name == "batch.json" else next(job.rglob(name))
@@ -387,10 +358,9 @@ def cases(world: World, group: str) -> list[Case]:
         ways = [way for way in ways if way[:1] != ("frames",) or way[1:2] in ((), (first,))]
     elif name == "findings.json":
         ways = [way for way in ways if way[:1] not in (("corrections",), ("deviations",)) or len(way) < 3]
-    return fields(f"batch {file.name}", ways) + files(f"batch {file.name}")
+    return wrong_cases(f"batch {file.name}", ways)
 
 
-MISSING = ("a link to nothing",)
 NEVER = ("nested", "half a character", "10**30", "brackets", "zeros", "no text")
 """Wrong in every place."""
 CHECKS: dict[str, Callable[[World, Case, Path], str]] = {
@@ -406,22 +376,14 @@ CHECKS: dict[str, Callable[[World, Case, Path], str]] = {
     "batch": World.open_batch,
 }
 BESIDE = (
-    "sequence.carts",
-    "sequence.carts-wal",
-    "sequence.carts-journal",
-    "sequence.carts-shm",
-    "sequence.rescued-20260101-000000.carts",
-    "sequence_adapted_1",
-    "sequence_adapted_1/surface.safetensors",
-    "sequence_adapted_1/checkpoint.safetensors",
-    "sequence_exports",
+    *(f"sequence.carts{suffix}" for suffix in ("", "-wal", "-journal", "-shm")),
+    *("sequence.rescued-20260101-000000.carts", "sequence_adapted_1", "sequence_exports"),
+    *(f"sequence_adapted_1/{name}.safetensors" for name in ("surface", "checkpoint")),
 )
+OF_A_BATCH = ("batch.json", "job.json", "findings.json", "results.json", "kinematics.csv", "*.jpg")
 GROUPS = (
     *("jobs", "network", "beside", "decision", "recent", "thumbnail", "draft", "draft hand-eye"),
-    *(
-        f"batch {name}"
-        for name in ("batch.json", "job.json", "findings.json", "results.json", "kinematics.csv", "*.jpg")
-    ),
+    *(f"batch {name}" for name in OF_A_BATCH),
 )
 SEEN = (
     Case("jobs", (0, "number"), "text"),
@@ -433,14 +395,10 @@ SEEN = (
 
 
 @pytest.fixture
-def world(tiny_sequence: Callable[..., Path], tmp_path: Path, untrained_weights: Path) -> Iterator[World]:
+def world(shared_sequence: Callable[..., Path], tmp_path: Path, untrained_weights: Path) -> Iterator[World]:
     """A recording of two frames and a batch of one job, which is done."""
-    recording = tiny_sequence(frames=2)
-    original = tmp_path / "original"
-    original.mkdir()
-    for name in ("sequence.toml", "kinematics.csv", "truth.csv", "regular", "masks"):
-        shutil.move(tmp_path / name, original / name)
-    world = World(tmp_path / "work", untrained_weights, original / recording.name)
+    original = shutil.copytree(shared_sequence(frames=2).parent, tmp_path / "original")
+    world = World(tmp_path / "work", untrained_weights, original / "sequence.toml")
     with world.site:
         yield world
 

@@ -1,16 +1,51 @@
 """What intents do to the state, with the real optimizer, without threads or a page."""
 
+import inspect
+import pkgutil
+import threading
+from importlib import import_module
+
 import numpy as np
 import pytest
-from viewer_canvas import decoded
 from viewer_desk import Desk
+from viewer_tab import decoded
 
 from carts_core.errors import CartsError, SettingsError
 from carts_core.optimization import FrameOptimizer, FreeParameters
 from carts_core.project import Source
+from carts_viewer import actions, controller
 from carts_viewer.actions import intents
+from carts_viewer.actions.context import Handler
 from carts_viewer.picture.layers import Layer
 from carts_viewer.state import Phase
+from carts_viewer.tabs import IntentQueue
+
+
+def _taken(queue: IntentQueue[str], timeout: float) -> list[intents.Intent]:
+    return [asked.intent for asked in queue.take(timeout)]
+
+
+def test_the_queue_keeps_the_newest_value_of_each_joint_and_every_press_in_order() -> None:
+    queue = IntentQueue[str]()
+    for value in range(100):
+        queue.put("one", intents.SetJoint("PSM1", 0, float(value)))
+    queue.put("one", intents.SetJoint("PSM2", 0, 3.0))
+    for _ in range(3):
+        queue.put("one", intents.MoveFrame(1))
+    queue.put("one", intents.SetJoint("PSM1", 0, 100.0))
+    assert queue.waits("one", intents.SetJoint("PSM1", 0, 0.0).key) and not queue.empty()
+    moves = [intents.MoveFrame(1)] * 3
+    assert _taken(queue, 0) == [intents.SetJoint("PSM2", 0, 3.0), *moves, intents.SetJoint("PSM1", 0, 100.0)]
+    assert _taken(queue, 0) == [] and queue.empty() and not queue.waits("one", intents.SetJoint("PSM1", 0, 0.0).key)
+
+
+def test_a_wait_for_the_queue_ends_with_a_put_from_another_thread_and_with_nothing_when_woken() -> None:
+    queue = IntentQueue[str]()
+    threading.Timer(0.05, lambda: queue.put("one", intents.ShowFrame(1))).start()
+    assert _taken(queue, 20) == [intents.ShowFrame(1)]
+    threading.Timer(0.05, queue.wake).start()
+    assert _taken(queue, 20) == []
+
 
 ENDING_A_RUN = (
     intents.SetJoint("PSM1", 0, 0.1),
@@ -19,6 +54,19 @@ ENDING_A_RUN = (
     intents.ShowDomain("smoke"),
 )
 """Intents that change what a run works on."""
+
+
+def test_every_intent_has_a_handler() -> None:
+    modules = [
+        controller,
+        *(import_module(f"carts_viewer.actions.{each.name}") for each in pkgutil.iter_modules(actions.__path__)),
+    ]
+    handlers = {
+        one for module in modules for one in vars(module).values() if inspect.isclass(one) and issubclass(one, Handler)
+    }
+    handled = {name.removeprefix("_on_") for handler in handlers for name in vars(handler) if name.startswith("_on_")}
+    kinds = {kind for kind in vars(intents).values() if inspect.isclass(kind) and issubclass(kind, intents.Intent)}
+    assert handled == {kind.__name__ for kind in kinds if not any(base in kind.__subclasses__() for base in kinds)}
 
 
 def test_frames_beyond_the_ends_are_the_ends(desk: Desk) -> None:
@@ -55,36 +103,6 @@ def test_numbers_out_of_range_are_clamped(desk: Desk) -> None:
     assert desk.joint() == pytest.approx(desk.session.ranges["PSM1"][0].upper, abs=1e-6)
 
 
-def test_a_correction_survives_a_visit_to_other_frames_cameras_and_domains(desk: Desk) -> None:
-    desk.do(intents.SetJoint("PSM1", 0, 0.2), intents.ShowCamera("right"), intents.ShowDomain("smoke"))
-    assert desk.joint() == pytest.approx(0.2)
-    desk.do(intents.MoveFrame(1))
-    assert desk.state.pose.source is Source.MEASURED
-    desk.do(intents.MoveFrame(-1))
-    assert desk.joint() == pytest.approx(0.2) and desk.state.pose.source is Source.HAND
-
-
-def test_back_to_measured_forgets_the_correction(desk: Desk) -> None:
-    before = desk.joint()
-    desk.do(intents.Perturb(3.0, 1), intents.BackToMeasured())
-    assert desk.joint() == pytest.approx(before) and not desk.state.project.joints(0)
-
-
-def test_moving_a_joint_until_it_is_let_go_of_is_one_step_of_undo(desk: Desk) -> None:
-    desk.do(intents.SetJoint("PSM1", 0, 0.1), intents.SetJoint("PSM1", 0, 0.2))
-    assert desk.state.undoable == 1
-    desk.do(intents.SetJoint("PSM1", 1, 0.2))
-    assert desk.state.undoable == 2
-    desk.do(intents.Released(), intents.SetJoint("PSM1", 1, 0.1))
-    assert desk.state.undoable == 3
-
-
-def test_undo_returns_to_the_frame_of_the_change(desk: Desk) -> None:
-    before = desk.joint()
-    desk.do(intents.SetJoint("PSM1", 0, 0.2), intents.MoveFrame(2), intents.Undo())
-    assert desk.state.index == 0 and desk.joint() == pytest.approx(before) and desk.state.undoable == 0
-
-
 def test_a_run_follows_every_iterate_and_ends_at_the_best(desk: Desk) -> None:
     desk.do(intents.Perturb(2.0, 0), intents.Run())
     assert desk.state.run.phase is Phase.RUNNING
@@ -99,18 +117,6 @@ def test_a_run_follows_every_iterate_and_ends_at_the_best(desk: Desk) -> None:
     assert state.run.curves.loss[state.run.curves.best] == state.maps.iterate.loss
     assert state.pose.source is Source.OPTIMIZER
     assert desk.saved.joints(0)["PSM1"].joint_positions == tuple(state.pose.scene.joint_positions[0].tolist())
-
-
-@pytest.mark.parametrize("intent", [*ENDING_A_RUN, intents.SetFreeGroup("base_frames", True), intents.Run()])
-def test_a_suspicion_against_base_frames_lasts_until_something_changes(
-    desk: Desk, monkeypatch: pytest.MonkeyPatch, intent: intents.Intent
-) -> None:
-    monkeypatch.setattr(FrameOptimizer, "base_frame_gain", lambda self: 0.4)
-    desk.do(intents.Run())
-    desk.advance()
-    assert desk.state.run.base_frame_gain is None
-    assert desk.finish().run.base_frame_gain == 0.4
-    assert desk.do(intent).run.base_frame_gain is None
 
 
 def test_pause_holds_the_run_and_run_goes_on_with_it(desk: Desk) -> None:
@@ -141,15 +147,6 @@ def test_reset_returns_to_the_start_of_the_run(desk: Desk, finished: bool) -> No
     state = desk.do(intents.Reset())
     assert desk.joint() == pytest.approx(start)
     assert state.run.curves.loss == () and state.run.phase is Phase.IDLE
-
-
-def test_a_whole_run_is_one_step_of_undo(desk: Desk) -> None:
-    desk.do(intents.Perturb(2.0, 0))
-    start = desk.joint()
-    desk.do(intents.Run())
-    desk.finish()
-    desk.do(intents.Undo())
-    assert desk.joint() == pytest.approx(start)
 
 
 @pytest.mark.parametrize("intent", ENDING_A_RUN)
@@ -231,7 +228,39 @@ def test_an_error_of_what_is_going_on_stops_it_and_is_part_of_the_state(desk: De
     assert desk.do(intents.DismissError()).error is None
 
 
-def test_an_error_of_something_else_leaves_the_run_alone(desk: Desk) -> None:
+@pytest.mark.parametrize("intent", [ENDING_A_RUN[0], intents.SetFreeGroup("base_frames", True), intents.Run()])
+def test_a_suspicion_against_base_frames_lasts_until_something_changes(
+    desk: Desk, monkeypatch: pytest.MonkeyPatch, intent: intents.Intent
+) -> None:
+    monkeypatch.setattr(FrameOptimizer, "base_frame_gain", lambda self: 0.4)
     desk.do(intents.Run())
-    desk.controller.fail(CartsError("no such frame"), stop=False)
-    assert desk.state.run.phase is Phase.RUNNING and desk.state.error == "no such frame"
+    desk.advance()
+    assert desk.state.run.base_frame_gain is None
+    assert desk.finish().run.base_frame_gain == 0.4
+    assert desk.do(intent).run.base_frame_gain is None
+
+
+def test_playing_goes_round_in_the_range_and_solving_and_jobs_keep_to_it(desk: Desk) -> None:
+    assert desk.do(intents.SetRange((2, 1))).range == (1, 2)
+    desk.do(intents.ShowFrame(0), intents.Play(True))
+    seen = []
+    for _ in range(4):
+        desk.controller._browsing._next_frame_at = 0.0
+        desk.advance()
+        seen.append(desk.state.index)
+    assert seen == [1, 2, 1, 2]
+    desk.do(intents.Play(False), intents.OptimizeFrames("range"))
+    assert desk.state.jobs[-1].title == "Optimize 2 frames, each alone"
+    desk.do(intents.CancelJob(1), intents.SetSetting("solver", "surface"), intents.Solve(whole=True))
+    assert desk.state.jobs[-1].title == "Solve frames 002 to 003"
+    desk.finish()
+    assert desk.state.solve is not None and desk.state.solve.frames == range(1, 3)
+    assert not desk.saved.joints(0)
+
+
+def test_a_range_is_marked_frame_by_frame_and_the_whole_sequence_is_none(desk: Desk) -> None:
+    assert desk.do(intents.ShowFrame(1), intents.MarkRange()).range == (1, 2)
+    assert desk.do(intents.MarkRange(end=True)).range == (1, 1)
+    assert desk.do(intents.ShowFrame(0), intents.MarkRange(end=True)).range == (0, 0)
+    assert desk.do(intents.SetRange((-3, 10**8))).range is None
+    assert desk.do(intents.SetRange((1, 2)), intents.SetRange(None)).range is None

@@ -5,7 +5,8 @@ from collections.abc import Iterator
 import pytest
 from playwright.sync_api import Browser
 from playwright.sync_api import Page as Tab
-from viewer_canvas import eventually
+from viewer_tab import new_context
+from waiting import eventually, wait_in
 
 from carts_viewer.transport.document import Document
 from carts_viewer.transport.events import Chosen
@@ -14,10 +15,10 @@ from carts_viewer.transport.page import Page
 pytestmark = pytest.mark.browser
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def opened(browser: Browser) -> Iterator[tuple[Document, Tab]]:
     page = Page(host="127.0.0.1", port=0, title="Document")
-    context = browser.new_context()
+    context = new_context(browser)
     try:
         document, tab = Document(page), context.new_page()
         show(document, 1)
@@ -42,8 +43,12 @@ def test_a_button_that_is_written_anew_while_it_is_pressed_is_pressed(opened: tu
     document.page.listen(Chosen, lambda _, event: chosen.append((event.name, event.value)))
     tab.locator("main button").hover()
     tab.mouse.down()
+    tab.evaluate("""() => {
+        const show = carts.showDocument;
+        carts.showDocument = (...what) => { window.shown = true; show(...what); };
+    }""")
     show(document, 2)
-    tab.wait_for_timeout(500)
+    wait_in(tab, "window.shown")
     tab.mouse.up()
     eventually(lambda: chosen, lambda said: said == [("stop", "")])
     tab.get_by_text("step 2").wait_for()
@@ -51,11 +56,13 @@ def test_a_button_that_is_written_anew_while_it_is_pressed_is_pressed(opened: tu
 
 def test_text_being_typed_survives_what_the_server_writes(opened: tuple[Document, Tab]) -> None:
     document, tab = opened
+    show(document, 3)
+    tab.get_by_text("step 3").wait_for()
     field = tab.locator("main input[data-do=name]")
     field.focus()
     field.press("End")
     tab.keyboard.type(" na")
-    show(document, 2)
-    tab.get_by_text("step 2").wait_for()
+    show(document, 4)
+    tab.get_by_text("step 4").wait_for()
     tab.keyboard.type("me")
     assert field.input_value() == "old name"

@@ -18,6 +18,7 @@ import numpy as np
 import pytest
 from playwright.sync_api import Browser
 from playwright.sync_api import Page as Tab
+from viewer_tab import READY, dismiss_warning, new_context
 from waiting import wait_in
 
 from carts_core.batch.folder import Findings, FrameFinding, write_jobs, write_state
@@ -34,7 +35,7 @@ from carts_viewer.jobs.job_list import AdaptOptions, CalibrateOptions, Job, JobS
 from carts_viewer.start.site import Site
 
 pytestmark = pytest.mark.browser
-WINDOWS = [(1280, 800), (390, 844)]
+WINDOWS = [(1000, 640), (390, 700)]
 LEAKS = """() => [...window.ran, ...[...document.querySelectorAll("[onerror], [onload], [onfocus], [href^=javascript]")]
   .map((one) => one.outerHTML)]"""
 """Markers of scripts that have run, and elements that a text has become."""
@@ -169,31 +170,46 @@ UNFOLD = """() => { for (const label of document.querySelectorAll(".mantine-Pape
 """Open every folder of the shown tabs that is closed."""
 
 
+SETTLED = """() => new Promise((done) => {
+  let frames = 0, all = 0;
+  const observer = new MutationObserver(() => { frames = 0; });
+  observer.observe(document.body, { subtree: true, childList: true });
+  const look = () => {
+    if (++frames > 3 || ++all > 100) { observer.disconnect(); done(); } else requestAnimationFrame(look);
+  };
+  look();
+})"""
+"""Resolves once nothing was added to the page, or removed, for three frames, or after a hundred."""
+
+
+def check_settled(page: Tab, texts: Texts) -> None:
+    """Check a page once all that was asked for is there."""
+    page.evaluate(SETTLED)
+    check(page, texts)
+
+
 def walk(page: Tab, texts: Texts, *, lists: bool) -> None:
     """Open every tab, folder and sheet of the viewer, and every list where that is asked for."""
     seen: set[str] = set()
     for number in range(page.locator("[role=tab]").count()):
         page.evaluate(f"({CHOOSE})({number})")
         page.evaluate(UNFOLD)
-        page.wait_for_timeout(200)
+        page.evaluate(SETTLED)
         for name in set(page.evaluate(LISTS)) - seen if lists else ():
             seen.add(name)
             page.evaluate("(name) => document.getElementById(name)?.click()", name)
-            page.wait_for_timeout(50)
-            check(page, texts)
+            check_settled(page, texts)
         rest_on_everything(page)
-        page.wait_for_timeout(100)
-        check(page, texts)
+        check_settled(page, texts)
     for key in ("?", "Escape", "Control+k", "Escape", "v", "v", "n"):
         page.keyboard.press(key)
-        page.wait_for_timeout(150)
-        check(page, texts)
+        check_settled(page, texts)
 
 
 @pytest.fixture
 def opened(browser: Browser) -> Iterator[Callable[..., Tab]]:
     """Opens tabs without the page's policy."""
-    with closing(browser.new_context(bypass_csp=True)) as context:
+    with closing(new_context(browser, bypass_csp=True)) as context:
 
         def make(address: str, window: tuple[int, int], name: str = "") -> Tab:
             page = context.new_page()
@@ -215,8 +231,8 @@ def test_texts_of_a_recording_and_its_project_stay_texts_in_the_viewer(
         app.wait_until_shown(60)
         pages = [opened(app.url, window, "<img src onerror=ran.push(0)>") for window in WINDOWS]
         for page in pages:
-            wait_in(page, "window.carts && window.__viserMutable?.nodeRefFromName['/overlay']")
-            page.locator(".mantine-Notification-closeButton").first.click(timeout=30_000)
+            wait_in(page, READY)
+            dismiss_warning(page)
             check(page, texts)
         small = pages[1]
         small.locator(".carts-review-bar").wait_for()
@@ -239,22 +255,12 @@ def test_texts_of_a_recording_and_its_project_stay_texts_in_the_viewer(
             for page in pages:
                 check(page, texts)
         walk(pages[0], texts, lists=True)
+        pages[0].close()
         small.get_by_role("button", name="All controls").click()
         walk(small, texts, lists=False)
-        of_recording = {
-            "sequence",
-            "domain",
-            "camera",
-            "arm",
-            "frame",
-            "joint yaw",
-            "file",
-            "folder",
-            "label",
-            "import",
-        }
-        of_project = {"step", "note", "reason", "remedy", "job's text", "job's log", "missing domain"}
-        assert texts.reached > of_recording | of_project
+        recording = ("sequence", "domain", "camera", "arm", "frame", "joint yaw", "file", "folder", "label", "import")
+        project = ("step", "note", "reason", "remedy", "job's text", "job's log", "missing domain")
+        assert texts.reached > {*recording, *project}
 
 
 def test_names_of_files_columns_and_drafts_stay_texts_on_the_start_page_and_in_new_recording(
@@ -275,30 +281,27 @@ def test_names_of_files_columns_and_drafts_stay_texts_on_the_start_page_and_in_n
         site.post(lambda: site.open_sequence(recording))
         site.post(site.show_start)
         site.wait(120)
-        for window in WINDOWS:
-            page = opened(site.url, window)
-            main = page.locator("main")
-            main.get_by_role("heading", name="CaRTS").wait_for(timeout=60_000)
-            check(page, texts)
-            main.get_by_role("button", name="Open a sequence file …").click()
-            main.locator(".files button:enabled", has_text="toml").first.click()
-            main.get_by_role("alert").wait_for()
-            check(page, texts)
-            main.get_by_role("button", name="New recording").click()
-            main.locator(".files button").first.click()
-            main.get_by_role("button", name="Choose this folder").click()
-            main.get_by_role("heading", name="Arms and joints").wait_for(timeout=60_000)
-            for details in main.locator("summary").all():
-                details.click()
-            rest_on_everything(page)
-            page.wait_for_timeout(300)
-            check(page, texts)
-            main.get_by_role("button", name="All recordings").click()
-            main.get_by_role("heading", name="Not finished").wait_for()
-            check(page, texts)
-            page.close()
-            assert texts.reached > {"root", "folder", "images", "table", "column", "broken", "format"}
-            assert texts.reached > {"file", "sequence"}, "the recent recording"
+        page = opened(site.url, WINDOWS[0])
+        main = page.locator("main")
+        main.get_by_role("heading", name="CaRTS").wait_for(timeout=60_000)
+        check(page, texts)
+        main.get_by_role("button", name="Open a sequence file …").click()
+        main.locator(".files button:enabled", has_text="toml").first.click()
+        main.get_by_role("alert").wait_for()
+        check(page, texts)
+        main.get_by_role("button", name="New recording").click()
+        main.locator(".files button").first.click()
+        main.get_by_role("button", name="Choose this folder").click()
+        main.get_by_role("heading", name="Arms and joints").wait_for(timeout=60_000)
+        for details in main.locator("summary").all():
+            details.click()
+        rest_on_everything(page)
+        check_settled(page, texts)
+        main.get_by_role("button", name="All recordings").click()
+        main.get_by_role("heading", name="Not finished").wait_for()
+        check(page, texts)
+        assert texts.reached > {"root", "folder", "images", "table", "column", "broken", "format"}
+        assert texts.reached > {"file", "sequence"}, "the recent recording"
 
 
 def test_texts_of_a_batch_stay_texts_in_its_page_and_in_its_report(
@@ -320,13 +323,10 @@ def test_texts_of_a_batch_stay_texts_in_its_page_and_in_its_report(
         (place.path / "findings.json").write_text(json.dumps(content))
     report = write_batch_report(output_path(batch), texts("title"), jobs)
     with Site([tmp_path], port=0, batch=batch) as site:
-        for window in WINDOWS:
-            page = opened(site.url, window)
-            page.locator("main .jobs tbody tr").nth(1).wait_for(timeout=60_000)
-            rest_on_everything(page)
-            check(page, texts)
-            page.goto(report.as_uri())
-            page.wait_for_timeout(300)
-            check(page, texts)
-            assert texts.reached > {"batch", "job", "error", "verdict", "reason", "frame", "camera", "title", "joint"}
-            page.close()
+        page = opened(site.url, WINDOWS[1])
+        page.locator("main .jobs tbody tr").nth(1).wait_for(timeout=60_000)
+        rest_on_everything(page)
+        check(page, texts)
+        page.goto(report.as_uri())
+        check_settled(page, texts)
+        assert texts.reached > {"batch", "job", "error", "verdict", "reason", "frame", "camera", "title", "joint"}

@@ -1,22 +1,27 @@
-"""Jobs: one after the other, with progress and a log, and what becomes of them when the viewer ends."""
+"""Jobs: one after the other, with progress and a log, and after the viewer has ended; the adaptation of the network."""
 
 import json
+import shutil
+import subprocess
+import sys
+import time
 import weakref
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
-from playwright.sync_api import expect
-from viewer_canvas import eventually
 from viewer_desk import Desk
-from viewer_tab import Tab
+from viewer_tab import OpenViewer, widget
+from waiting import eventually
 
 from carts_core.errors import CartsError
 from carts_core.project import ReviewState, Source
 from carts_core.project.identity import data_dir
+from carts_core.resources import shipped_weights
 from carts_viewer.actions import intents
-from carts_viewer.app import ViewerApp
+from carts_viewer.jobs import work
 from carts_viewer.jobs.companions import Decisions
 from carts_viewer.jobs.job_list import (
     AdaptOptions,
@@ -29,7 +34,10 @@ from carts_viewer.jobs.job_list import (
     SolveOptions,
     read_options,
 )
+from carts_viewer.jobs.networks import STARTED, Networks
+from carts_viewer.jobs.optimizers import OptimizerFactory
 from carts_viewer.panels.jobs import job_line, jobs_question
+from tools.raw_tab import RawTab
 
 
 def states(desk: Desk) -> list[tuple[str, str]]:
@@ -180,16 +188,6 @@ def test_jobs_of_another_user_run_when_they_are_accepted(desk: Desk) -> None:
     assert desk.state.jobs[-1].options == AdaptOptions(240, 2)
 
 
-def test_discarded_jobs_of_another_user_do_not_run(desk: Desk) -> None:
-    project = desk.session.editor.project.path
-    row = {"number": 1, "kind": "calibrate", "title": "", "options": {"frames": 2}, "state": "waiting"}
-    project.with_name(f"{project.stem}_jobs.json").write_text(json.dumps([row]))
-    desk = desk.reopened()
-    desk.do(intents.AnswerJobs(False))
-    assert states(desk) == [("calibrate", "cancelled")] and desk.wait_time() is None
-    assert states(desk.reopened()) == [("calibrate", "cancelled")]
-
-
 def test_a_damaged_list_is_kept_beside_the_new_one(tmp_path: Path) -> None:
     file = tmp_path / "work_jobs.json"
     for number, content in enumerate(('[{"number": "x"}]', '{"not": "a list"}'), 1):
@@ -231,21 +229,182 @@ def test_a_line_says_how_far_a_job_is_and_how_long_it_will_take() -> None:
     assert "10 of 40" not in solve and "Frame 10" in solve and 'value="25"' in solve
 
 
-@pytest.mark.browser
-def test_the_page_asks_for_jobs_of_another_user_and_runs_them(
-    open_viewer: Callable[..., ViewerApp], open_tab: Callable[..., Tab]
-) -> None:
-    def plant(folder: Path) -> None:
-        row = {"number": 1, "kind": "export", "title": "Harmless", "options": EXPORT, "state": "waiting"}
-        (folder / "sequence_jobs.json").write_text(json.dumps([row]))
+# ---- The network adapted to the recording ---------------------------------------------------------------------------
 
-    app = open_viewer(plant, frames=2)
-    tab = open_tab(app)
-    expect(tab.page.get_by_text("wait for your decision")).to_be_visible()
-    assert [job.state for job in app.state.jobs] == [JobState.ASKED]
-    tab.page.get_by_text("Jobs", exact=True).first.click()
-    expect(tab.page.get_by_text("so they do not run: Export all as")).to_be_visible()
-    tab.button("Run jobs")
-    eventually(lambda: app.state.jobs[0].state, lambda state: state is JobState.DONE, 60)
-    expect(tab.page.get_by_text("wait for your decision")).to_have_count(0)
-    expect(tab.page.get_by_role("button", name="Run jobs")).to_have_count(0)
+
+SMALL = (
+    "--steps 2 --batch-size 1 --workers 1 --threads 1 --validation-samples 2 --images.width 64 --images.height 48 "
+    "--images.field-width 64 --fits 1"
+).split()
+
+
+OVER = 240.0
+"""Time for a small run on a busy machine [s]."""
+
+
+@pytest.fixture
+def at_desk(tiny_sequence: Callable[..., Path]) -> Desk:
+    """A desk with the shipped networks."""
+    return Desk.open(tiny_sequence(frames=2), inference="torch")
+
+
+def networks(project: Path, *, kept: bool = True, **options: Any) -> Networks:
+    """The networks of a project, as a new viewer finds them."""
+    factory = OptimizerFactory(inference="torch", report=lambda line: None, **options)
+    return Networks(project, kept=kept, optimizers=factory, decisions=Decisions())
+
+
+def ended(desk: Desk) -> Job:
+    """The newest job, once it is over."""
+    until = time.monotonic() + OVER
+    while not desk.state.jobs[-1].over:
+        assert time.monotonic() < until, desk.state.jobs[-1]
+        time.sleep(desk.wait_time() or 0.0)
+        desk.advance()
+    return desk.state.jobs[-1]
+
+
+@pytest.fixture
+def planted(tmp_path: Path) -> Path:
+    """A project with a network that another user has made and chosen."""
+    folder = tmp_path / "work_adapted_1"
+    folder.mkdir()
+    (folder / "surface.safetensors").write_bytes(shipped_weights()[1].read_bytes())
+    (tmp_path / "work_network.json").write_text('{"network": "Adapted 1"}')
+    return tmp_path / "work.carts"
+
+
+@pytest.mark.parametrize("kept", [True, False])
+def test_weights_of_another_user_are_asked_for_once_a_file(
+    planted: Path, kept: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first = networks(planted, kept=kept)
+    assert (first.used, first.asked) == (STARTED, "Adapted 1")
+    first.answer(True)
+    assert (first.used, first.asked) == ("Adapted 1", "")
+    with pytest.raises(CartsError, match="No network waits"):
+        first.answer(True)
+    again = networks(planted, kept=kept)
+    assert (again.used, again.asked) == ("Adapted 1", "")
+    monkeypatch.setenv("CARTS_DATA", str(tmp_path / "other user"))
+    other = networks(planted, kept=kept)
+    assert (other.used, other.asked) == (STARTED, "Adapted 1")
+    other.answer(False)
+    refused = networks(planted, kept=kept)
+    assert (refused.used, refused.asked) == (STARTED, "")
+    refused.use("Adapted 1")
+    assert (refused.used, refused.asked) == (STARTED, "Adapted 1")
+
+
+def test_weights_that_were_replaced_are_asked_for_again(planted: Path) -> None:
+    first = networks(planted)
+    first.answer(True)
+    planted.with_name("work_adapted_1").joinpath("surface.safetensors").write_bytes(b"others")
+    again = networks(planted)
+    assert (again.used, again.asked) == (STARTED, "Adapted 1")
+
+
+@pytest.mark.parametrize("content", ["", "[]", '{"network": 1}', '{"network": null}', "{}", "[" * 100])
+def test_a_damaged_choice_is_kept_and_the_first_network_runs(planted: Path, content: str) -> None:
+    file = planted.with_name("work_network.json")
+    file.write_text(content)
+    found = networks(planted)
+    assert (found.used, found.asked) == (STARTED, "") and "choice of a network work_network.json" in found.problem
+    assert file.with_name("work_network.json.damaged-1").read_text() == content and not file.exists()
+
+
+def test_training_that_is_cancelled_goes_on_in_its_folder_and_its_network_is_used_and_remembered(
+    at_desk: Desk, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(work, "OPTIONS", ("--steps", "100000", "--checkpoint-every", "1", *SMALL[2:]))
+    trainings: list[subprocess.Popen] = []
+    popen = subprocess.Popen
+
+    def watched(*arguments: Any, **options: Any) -> subprocess.Popen:
+        trainings.append(popen(*arguments, **options))
+        return trainings[-1]
+
+    monkeypatch.setattr(subprocess, "Popen", watched)
+    project = at_desk.session.editor.project.path
+    folder = project.with_name("sequence_adapted_1")
+    at_desk.do(intents.Adapt(1))
+    # The page stays usable meanwhile.
+    assert at_desk.do(intents.ShowFrame(1)).index == 1
+
+    def checkpoint() -> bool:
+        at_desk.advance()
+        return (folder / "checkpoint.safetensors").is_file()
+
+    eventually(checkpoint, timeout=OVER)
+    at_desk.do(intents.CancelJob(1))
+    assert at_desk.state.jobs[0].state is JobState.CANCELLED and at_desk.wait_time() is None
+    assert trainings[0].wait(OVER) != 0
+    assert any("step 0" in line for line in at_desk.state.jobs[0].log)
+    monkeypatch.setattr(work, "OPTIONS", tuple(SMALL))
+    at_desk.do(intents.RepeatJob(1))
+    job = ended(at_desk)
+    assert job.state is JobState.DONE and job.options == AdaptOptions(1, 1)
+    assert "Dice" in job.text and "of the error is left" in job.text
+    at_desk.do(intents.RepeatJob(2), intents.CancelJob(3))
+    assert at_desk.state.jobs[-1].options == AdaptOptions(1, 2)
+    # The network is offered, and used when it is chosen.
+    assert at_desk.state.networks == (STARTED, "Adapted 1") and at_desk.state.network == STARTED
+    before = at_desk.factory.prepare().sha256
+    assert at_desk.do(intents.UseNetwork("Adapted 1")).network == "Adapted 1"
+    assert at_desk.factory.prepare().sha256 != before and networks(project).used == "Adapted 1"
+    # Weights of the command line count more, and weights that are damaged are not used.
+    assert networks(project, weights=(shipped_weights()[1],)).used == STARTED
+    (folder / "surface.safetensors").write_bytes(b"nothing")
+    assert networks(project).used == STARTED
+    at_desk.do(intents.UseNetwork("Adapted 1"))
+    with pytest.raises(CartsError, match=r"surface\.safetensors"):
+        at_desk.do(intents.AnswerNetwork(True))
+    assert at_desk.do(intents.UseNetwork(STARTED)).network == STARTED
+    assert at_desk.factory.prepare().sha256 == before
+    with pytest.raises(CartsError, match=r"no network '\.\./\.\./else'"):
+        at_desk.do(intents.UseNetwork("../../else"))
+
+
+def test_an_adapted_network_is_offered_and_used_by_a_button(open_viewer: OpenViewer) -> None:
+    def plant(folder: Path) -> None:
+        (folder / "sequence_adapted_1").mkdir()
+        shutil.copy(shipped_weights()[1], folder / "sequence_adapted_1" / "surface.safetensors")
+
+    app = open_viewer(plant, frames=2, networks={"weights": ()})
+    with RawTab(app.url) as tab:
+        offered = widget(app, tab, "Use the newest network")
+        assert offered.visible
+        tab.set(app.page.element_id(offered), True)
+        eventually(lambda: app.state.asked_network or app.state.network != STARTED)
+        app.queue.put(intents.AnswerNetwork(True))
+        assert app.wait_until_shown().network == "Adapted 1" and not offered.visible
+
+
+def test_a_program_that_ends_while_it_trains_does_not_hang(tiny_sequence: Callable[..., Path], tmp_path: Path) -> None:
+    program = (
+        "import pathlib, sys; from carts_viewer.jobs.work import adapt\n"
+        "training = adapt(pathlib.Path(sys.argv[1]), pathlib.Path(sys.argv[2]), 1.0); next(training)"
+    )
+    subprocess.run([sys.executable, "-c", program, tiny_sequence(frames=2), tmp_path / "run"], check=True, timeout=OVER)
+
+
+def test_training_that_fails_says_why(at_desk: Desk, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(work, "OPTIONS", ("--steps", "0"))
+    at_desk.do(intents.Adapt(1))
+    with pytest.raises(CartsError, match="steps is 0; allowed is 1 or more"):
+        ended(at_desk)
+    assert at_desk.state.jobs[0].state is JobState.FAILED and at_desk.state.networks == (STARTED,)
+
+
+def test_a_run_says_what_the_network_does_not_know_once_and_what_helps(
+    at_desk: Desk, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    at_desk.do(intents.SetSetting("solver", "surface"), intents.SetSetting("iterations", 1))
+    state = at_desk.do(intents.Step())
+    assert all("Fit masks (Fit to), or adapt the network" in line for line in state.unfamiliar)
+    monkeypatch.setattr(sys.modules["carts_core.optimization.verdict"], "RECOGNIZED", 1.01)
+    at_desk.factory.use(None)
+    at_desk.factory._unfamiliar.clear()
+    state = at_desk.do(intents.Reset(), intents.Step())
+    assert "may not know this robot" in state.unfamiliar[0]
+    assert at_desk.do(intents.Reset(), intents.SetObserved("masks", "recording"), intents.Step()).unfamiliar == ()

@@ -1,45 +1,50 @@
-"""The app is killed at any moment: what the page has called saved is there afterwards, and nothing is half-written."""
+"""The viewer is killed or asked to end at any moment.
 
-import multiprocessing
+What the page has called saved is there, every job resumes or has failed, and nothing is half-written.
+"""
+
+import os
 import random
+import signal
 import threading
+import time
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
-import viewer_victim
-from viewer_client import Client
-from viewer_victim import Widgets
+from victims import Client, Widgets, begin, check_whole, queue_jobs, serve_until_signal
+from waiting import eventually
 
-from carts_core.project import Project
+from carts_core.project import Project, SequenceIdentity
 from carts_core.recording import Sequence
+from carts_viewer.jobs.companions import Decisions
+from carts_viewer.jobs.job_list import JobList
 from tools.raw_tab import RawTab
 
 FRAMES = 24
 WIDTH, HEIGHT = 96, 72
+SIGNALS = (signal.SIGKILL, signal.SIGTERM, signal.SIGHUP)
 
 
 @dataclass
 class Tally:
-    """What all lives of the app together saw."""
+    """What all lives of the viewer together saw."""
 
-    kills: int = 0
     acknowledged: int = 0
-    steps: int = 0
     runs: int = 0
     strokes: int = 0
-    exports: int = 0
     acknowledged_exports: int = 0
     whole_exports: int = 0
     interrupted_exports: int = 0
 
 
 class Lives:
-    """One project through many lives of the app, each of which ends with a kill."""
+    """One project through many lives of the viewer, each of which ends with a signal."""
 
     def __init__(self, sequence_path: Path, weights: Path) -> None:
-        self._sequence_path, self._weights = sequence_path, weights
+        self._path, self._weights = sequence_path, weights
         self._sequence = Sequence.open(sequence_path)
         self._project_path = sequence_path.with_suffix(".carts")
         self._exports = sequence_path.with_name(f"{sequence_path.stem}_exports")
@@ -50,40 +55,36 @@ class Lives:
         """Exports, finished or not, that were there before this life."""
         self._unique = iter(range(1, 10**9))
         self._pixels = iter([(row, column) for row in range(HEIGHT) for column in range(WIDTH)])
-        self._processes = multiprocessing.get_context("forkserver")
-        # Every life is forked from a process that has imported everything and done nothing.
-        self._processes.set_forkserver_preload(["carts_viewer.app"])
         self.tally = Tally()
 
-    def live(self, seed: int) -> None:
-        """Work in a new process until it is killed, and look what is left."""
-        ours, theirs = self._processes.Pipe(duplex=False)
-        # A daemon, so that a test that fails before the kill does not keep pytest from ending.
-        victim = self._processes.Process(
-            target=viewer_victim.serve, args=(self._sequence_path, self._weights, theirs), daemon=True
-        )
-        victim.start()
-        theirs.close()
-        assert ours.poll(120), "the app did not start"
-        url = ours.recv()
-        dice = random.Random(seed)
-        with RawTab(url, keep=1) as tab:
-            ids: Widgets = ours.recv()
+    def live(self, seed: int, least: int = 0) -> None:
+        """Work in a new process until a signal ends it, after so many edits at least; look what is left."""
+        number, dice = SIGNALS[seed % len(SIGNALS)], random.Random(seed)
+        victim, told = begin(serve_until_signal, self._path, self._weights)
+        with RawTab(told.recv(), keep=1) as tab:
+            ids: Widgets = told.recv()
+            assert told.recv() == "ready" and victim.pid is not None
             client = Client(tab, ids, FRAMES, dice, self._unique, self._pixels)
-            killer = threading.Timer(0.05 + 2.5 * dice.random(), victim.kill)
+            pid, delay = victim.pid, 0.05 + 2.0 * dice.random()
+
+            def end() -> None:
+                patience = time.monotonic() + 60
+                while len(client.seen) < least and time.monotonic() < patience:
+                    time.sleep(0.05)
+                time.sleep(delay)
+                os.kill(pid, number)
+
+            killer = threading.Thread(target=end)
             killer.start()
             client.work()
             killer.join()
-        victim.join()
-        assert victim.exitcode == -9, f"the app ended by itself, with code {victim.exitcode}"
+        victim.join(60)
+        assert victim.exitcode == (-9 if number == signal.SIGKILL else 0), victim.exitcode
         self._check_project(client)
         self._check_exports()
-        self.tally.kills += 1
         self.tally.acknowledged += len(client.seen)
-        self.tally.steps = len(self._names)
         self.tally.runs += client.runs
         self.tally.strokes += client.strokes
-        self.tally.exports += client.exports
         self.tally.acknowledged_exports += len(client.exported)
 
     def _check_project(self, client: Client) -> None:
@@ -112,11 +113,11 @@ class Lives:
             if path.name.startswith("."):
                 self.tally.interrupted_exports += 1
             else:
-                viewer_victim.check_whole(path, FRAMES)
+                check_whole(path, FRAMES)
                 self.tally.whole_exports += 1
         project_files = {self._project_path.name + end for end in ("", "-wal", "-shm")}
         project_files.add(f"{self._project_path.stem}_jobs.json")
-        new = {path.name for path in self._sequence_path.parent.iterdir()} - self._beside
+        new = {path.name for path in self._path.parent.iterdir()} - self._beside
         assert new <= project_files, new
 
 
@@ -125,19 +126,132 @@ def lives(tiny_sequence: Callable[..., Path], untrained_weights: Path) -> Lives:
     return Lives(tiny_sequence(frames=FRAMES, width=WIDTH, height=HEIGHT), untrained_weights)
 
 
-def test_nothing_that_the_page_called_saved_is_lost_when_the_app_is_killed(lives: Lives) -> None:
-    for seed in range(6):
-        lives.live(seed)
+def test_nothing_that_the_page_called_saved_is_lost_to_a_kill_or_a_signal(lives: Lives) -> None:
+    for seed in range(4):
+        lives.live(seed, least=4)
     tally = lives.tally
-    assert tally.acknowledged > 6 and tally.strokes > 0 and tally.whole_exports > 0, tally
+    assert tally.acknowledged >= 16 and tally.strokes > 0 and tally.whole_exports > 0, tally
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(3600)
-def test_nothing_is_lost_in_200_kills(lives: Lives) -> None:
+def test_nothing_is_lost_in_200_kills_and_signals(lives: Lives) -> None:
     for seed in range(200):
         lives.live(seed)
     tally = lives.tally
     print(tally)
     assert tally.acknowledged > 200 and tally.strokes > 50 and tally.runs > 20, tally
     assert tally.acknowledged_exports > 20 and tally.interrupted_exports > 20, tally
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, pytest.param(signal.SIGHUP, marks=pytest.mark.slow), signal.SIGINT])
+def test_a_note_under_the_cursor_is_saved(
+    tiny_sequence: Callable[..., Path], untrained_weights: Path, number: signal.Signals
+) -> None:
+    path = tiny_sequence(frames=2)
+    victim, told = begin(serve_until_signal, path, untrained_weights)
+    with RawTab(told.recv(), keep=1) as tab:
+        ids: Widgets = told.recv()
+        assert told.recv() == "ready" and victim.pid is not None
+        tab.set(ids.note, "half a th")
+        eventually(lambda: "Not saved" in tab.widgets.get(ids.saved, {}).get("content", ""))
+        os.kill(victim.pid, number)
+        victim.join(60)
+    assert victim.exitcode == 0
+    with Project.open(Sequence.open(path), read_only=True) as project:
+        assert project.state.review(0).note == "half a th"
+
+
+# ---- Jobs -----------------------------------------------------------------------------------------------------------
+
+JOB_FRAMES = 4
+OVER = ("done", "failed", "cancelled")
+
+
+class JobLives:
+    """One project and its queue through many lives of the viewer.
+
+    Attributes:
+        known: the newest state of every job that a page has shown.
+        tally: jobs that `ran` at a kill and have failed, `waited` then and still do, and `resumed` in a later life.
+    """
+
+    def __init__(self, sequence: Path, weights: Path) -> None:
+        self._path, self._weights = sequence, weights
+        self._sequence = Sequence.open(sequence)
+        self.known: dict[int, str] = {}
+        self.tally = Counter[str]()
+
+    def live(self, seed: int, *, kill: bool = True) -> None:
+        """Queue and do jobs in a new process until it is killed, or until nothing is left; look what there is then."""
+        victim, told = begin(queue_jobs, self._path, self._weights, seed, kill)
+        told.recv()
+        end = time.monotonic() + (random.Random(seed).uniform(0.1, 5.0) if kill else 300.0)
+        waited = {number for number, state in self.known.items() if state == "waiting"}
+        while True:
+            # A kill may come in the middle of a message.
+            try:
+                said = told.recv() if told.poll(max(0.0, end - time.monotonic())) else None
+            except (EOFError, OSError):
+                break
+            if said is None:
+                break
+            for number, _, state in said:
+                resumed = number in waited and state == "running" and self.known.get(number) == "waiting"
+                self.tally["resumed"] += resumed
+                self.known[number] = state
+        if kill:
+            victim.kill()
+        victim.join(60)
+        assert victim.exitcode == (-9 if kill else 0)
+        self._check()
+
+    def _check(self) -> None:
+        """The list as the next viewer will read it, the project, and what was exported."""
+        identity = SequenceIdentity.of(self._sequence)
+        path = self._path.with_suffix(".carts")
+        recording = {"frame_ids": identity.frame_ids, "recording": identity.kinematics_sha256}
+        jobs = {job.number: job for job in JobList(path, kept=True, decisions=Decisions(), **recording).jobs}
+        for number in sorted(self.known)[-40:]:
+            assert number in jobs, f"job {number} is gone"
+            now, shown = str(jobs[number].state), self.known[number]
+            if shown in OVER:
+                assert now == shown, f"job {number} was {shown}, and is {now}"
+            elif shown == "running":
+                # It may have ended since the page has last said so.
+                assert now in OVER, f"job {number} ran, and is {now}"
+                assert now != "failed" or jobs[number].text
+                self.tally["ran"] += now == "failed"
+            else:
+                self.tally["waited"] += now == "waiting"
+            self.known[number] = now
+        with Project.open(self._sequence, path) as project:
+            assert project.writable and project.state.position == len(project.state.steps)
+            for export in project.state.exports:
+                check_whole(Path(export.path), JOB_FRAMES)
+            done = sum(str(job.state) == "done" and job.kind == "export" for job in jobs.values())
+            assert done <= len(project.state.exports)
+
+
+@pytest.fixture
+def job_lives(tiny_sequence: Callable[..., Path], untrained_weights: Path) -> JobLives:
+    return JobLives(tiny_sequence(frames=JOB_FRAMES, width=WIDTH, height=HEIGHT), untrained_weights)
+
+
+@pytest.mark.timeout(600)
+def test_jobs_of_a_viewer_that_was_killed_resume_or_have_failed(job_lives: JobLives) -> None:
+    for seed in range(2):
+        job_lives.live(seed)
+    job_lives.live(99, kill=False)
+    assert job_lives.known and set(job_lives.known.values()) <= set(OVER), job_lives.known
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(3600)
+def test_no_job_is_lost_in_50_kills(job_lives: JobLives) -> None:
+    for seed in range(50):
+        job_lives.live(seed)
+    job_lives.live(99, kill=False)
+    print(job_lives.tally)
+    assert job_lives.tally["ran"] > 10 and job_lives.tally["resumed"] > 5, job_lives.tally
+    assert set(job_lives.known.values()) <= set(OVER), job_lives.known

@@ -2,16 +2,15 @@
 
 import shutil
 import socket
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 from playwright.sync_api import expect
-from viewer_canvas import eventually
-from viewer_tab import Tab
+from viewer_tab import OpenTab
+from waiting import eventually
 
 from carts_core.live import FrameMessage, ImageMessage, packed
 from carts_core.recording import Sequence
@@ -27,15 +26,20 @@ SECONDS = 120.0
 def app(tmp_path: Path) -> Iterator[ViewerApp]:
     folder = tmp_path / "recording"
     shutil.copytree(sample_sequence().parent, folder)
+    # Without times of its images, a replay has a field for their rate.
+    lines = (folder / "sequence.toml").read_text().splitlines()
+    (folder / "sequence.toml").write_text("\n".join(line for line in lines if not line.startswith("timestamp")) + "\n")
     with ViewerApp.open(folder / "sequence.toml", port=0) as app:
         app.wait_until_shown(SECONDS)
         yield app
 
 
 @pytest.mark.browser
-def test_a_replay_is_followed_recorded_and_cannot_be_edited(app: ViewerApp, open_tab: Callable[..., Tab]) -> None:
+def test_a_replay_is_followed_recorded_and_cannot_be_edited(app: ViewerApp, open_tab: OpenTab) -> None:
     tab = open_tab(app)
-    tab.page.get_by_role("tab", name="Live").click()
+    tab.open("Live")
+    expect(tab.page.get_by_label("Images per second")).to_have_value("30")
+    tab.page.get_by_label("Images per second").fill("10")
     tab.page.get_by_label("Record").check()
     tab.page.get_by_label("Repeat").check()
     tab.button("Start")
@@ -47,7 +51,7 @@ def test_a_replay_is_followed_recorded_and_cannot_be_edited(app: ViewerApp, open
     eventually(lambda: tab.state.pose.scene.joint_positions, lambda now: now is not joints)
     assert not tab.state.project.position
     # The next frame may take the scores away between two looks at them.
-    scores = eventually(lambda: tab.state.scores, bool)
+    scores = eventually(lambda: tab.state.scores)
     assert scores is not None and scores.dice is not None and scores.dice > 0.9
     tab.button("Stop")
     expect(tab.page.get_by_text("Recorded: carts view")).to_be_visible(timeout=30_000)
@@ -71,7 +75,7 @@ def test_another_program_sends_frames_and_gets_results(app: ViewerApp) -> None:
     with socket.create_connection(("127.0.0.1", free)) as connection:
         for number in range(3):
             connection.sendall(packed(FrameMessage(float(number), joints=joints, images=images, id=f"sent {number}")))
-            time.sleep(0.2)
+        eventually(lambda: app.state.frame.frame_id.startswith("sent"), timeout=SECONDS)
         live = eventually(lambda: app.state.live, lambda live: live is not None and not live.busy, SECONDS)
         assert live is not None and app.state.frame.frame_id.startswith("sent") and app.state.verdict is None
         assert len(connection.recv(4)) == 4  # the result of a frame, for who sent it
@@ -97,24 +101,3 @@ def test_a_port_in_use_and_a_source_that_the_page_does_not_open_are_refused(app:
 
 def _png(image: np.ndarray) -> ImageMessage:
     return ImageMessage(cv2.imencode(".png", image[..., ::-1])[1].tobytes(), "png")
-
-
-@pytest.mark.browser
-def test_a_replay_of_images_without_times_has_a_field_for_their_rate(
-    tmp_path: Path, open_tab: Callable[..., Tab]
-) -> None:
-    folder = tmp_path / "recording"
-    shutil.copytree(sample_sequence().parent, folder)
-    text = (folder / "sequence.toml").read_text()
-    lines = [line for line in text.splitlines() if not line.startswith("timestamp")]
-    (folder / "sequence.toml").write_text("\n".join(lines) + "\n")
-    with ViewerApp.open(folder / "sequence.toml", port=0) as app:
-        app.wait_until_shown(SECONDS)
-        assert app.state.frame.timestamp is None
-        tab = open_tab(app)
-        tab.page.get_by_role("tab", name="Live").click()
-        expect(tab.page.get_by_label("Images per second")).to_have_value("30")
-        tab.page.get_by_label("Images per second").fill("10")
-        tab.button("Start")
-        eventually(lambda: tab.state.live, lambda live: live is not None and live.on, SECONDS)
-        tab.button("Stop")

@@ -1,43 +1,34 @@
-"""From raw files to a calibrated overlay, in a browser, as a person does it."""
+"""From raw files to a calibrated overlay, in a browser."""
 
 import csv
-import os
 import shutil
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack
-from dataclasses import replace
+from contextlib import ExitStack, closing
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
-import torch
 from clicked_points import clicked
 from playwright.sync_api import Browser, expect
-from scipy.spatial.transform import Rotation
-from swaying import write_log, write_swaying
-from viewer_canvas import eventually
+from viewer_tab import READY, dismiss_warning, new_context
 from visitor import Visitor, write_lab_files
-from waiting import wait_in
+from waiting import eventually, wait_in
 
 from carts_core.evaluation.evaluate import dice
-from carts_core.imaging.working_image import Window
 from carts_core.model.camera import HALF_PIXEL
 from carts_core.model.psm_kinematics import JOINT_NAMES
-from carts_core.model.robot import Robot
 from carts_core.model.scene import Scene
-from carts_core.networks import FeatureExtractor
-from carts_core.optimization import CalibrationOptimizer, ImagePredictor
+from carts_core.optimization import CalibrationOptimizer
 from carts_core.project.identity import data_dir
 from carts_core.recording import Sequence
 from carts_core.rendering import Renderer
 from carts_viewer.start.site import Site
 from carts_viewer.wizard.calibration import CalibrationJob
-from carts_viewer.wizard.draft import Draft, DraftFile, Step
 from carts_viewer.wizard.wizard import RecordingWizard
 
 pytestmark = pytest.mark.browser
+
 SHIFT = np.array([[0.0, 0.0, HALF_PIXEL], [0.0, 0.0, HALF_PIXEL], [0.0, 0.0, 0.0]])
 """From our K to OpenCV's."""
 
@@ -49,8 +40,7 @@ def visit(browser: Browser) -> Iterator[Callable[[Path], Visitor]]:
 
         def make(root: Path) -> Visitor:
             site = stack.enter_context(Site([root], port=0))
-            context = browser.new_context(viewport={"width": 1280, "height": 800})
-            stack.callback(context.close)
+            context = stack.enter_context(closing(new_context(browser)))
             return Visitor(site, context.new_page())
 
         yield make
@@ -101,7 +91,7 @@ def test_two_folders_a_table_and_calibrations_become_a_sequence_with_its_arm_in_
     visitor.reads("Each row belongs to one image.", 90)
     visitor.press("Continue to hand-eye")
     visitor.reads("Click the tip")
-    visitor.dismiss_warning()
+    dismiss_warning(visitor.page)
     click_what_is_asked_for(visitor, made.scene, true, 0.5)
     visitor.reads("All points are there")
     # Taken back and done again, and still there after a restart.
@@ -128,7 +118,7 @@ def test_two_folders_a_table_and_calibrations_become_a_sequence_with_its_arm_in_
     visitor.press("Save and open")
     app = eventually(lambda: visitor.site.app, lambda now: now is not None, 120)
     assert app is not None
-    wait_in(visitor.page, "window.__viserMutable?.nodeRefFromName['/overlay']")
+    wait_in(visitor.page, READY)
     saved = app.sequence
     assert saved.path == root / "day 3_sequence" / "sequence.toml"
     overlap = [agreement(saved.scene, made, camera) for camera in ("left", "right")]
@@ -154,126 +144,6 @@ def agreement(found: Scene, truth: Sequence, camera: str) -> float:
     return float(np.mean(scores))
 
 
-def test_a_wrong_column_is_explained_where_it_is_and_mended_there(
-    tiny_sequence: Callable[..., Path], tmp_path: Path, visit: Callable[[Path], Visitor]
-) -> None:
-    made = Sequence.open(tiny_sequence(frames=3, cameras=("left",), width=96, height=72))
-    root = tmp_path / "labs"
-    shutil.copytree(made.path.parent / "regular" / "left", root / "run")
-    write_lab_files(root, range(1, 4), made.measured["PSM1"], [])
-    table = root / "robot_log.csv"
-    table.write_text(table.read_text().replace("axis_3", "depth of insertion").replace("axis_4", "spin"))
-    visitor = visit(root)
-    visitor.press("New recording")
-    visitor.press("Choose this folder")
-    visitor.press("Other table …")
-    visitor.press_entry("robot_log.csv")
-    visitor.reads("Six joints are not recognized")
-    assert visitor.button("Continue to hand-eye").is_disabled()
-    names = dict(zip(JOINT_NAMES, ("axis_1", "axis_2", "depth of insertion", "spin", "axis_5", "axis_6"), strict=True))
-    for joint, column in names.items():
-        visitor.page.get_by_label(joint.replace("_", " "), exact=True).select_option(column)
-        eventually(
-            lambda joint=joint: place_of(visitor).draft.options.columns.get(joint), lambda found: found is not None
-        )
-    wait_in(visitor.page, "!document.querySelector('main').innerText.includes('not recognized')")
-    place = place_of(visitor)
-    assert place.draft.options.columns == names
-    assert visitor.button("Continue to hand-eye").is_enabled()
-    # A sign that is the other way round.
-    visitor.page.get_by_label("other sign").first.check()
-    eventually(lambda: place.draft.options.flip, lambda flip: flip == ("yaw",))
-    visitor.press("Undo")
-    eventually(lambda: place.draft.options.flip, lambda flip: flip == ())
-
-
-def test_a_delay_between_video_and_log_is_proposed_taken_and_undone(
-    tmp_path: Path, shipped_psm: Robot, visit: Callable[[Path], Visitor]
-) -> None:
-    folder = write_swaying(tmp_path / "labs" / "run", shipped_psm, 3, 7.0).parent
-    write_log(folder / "log.csv", shipped_psm, 3, 7.0, late=0.12)
-    (folder / "sequence.toml").unlink()
-    visitor = visit(tmp_path / "labs")
-    visitor.press("New recording")
-    visitor.press_folder("run")
-    visitor.press("Choose this folder")
-    visitor.press("Estimate from the motion", 90)
-    visitor.reads("Proposed.", 90)
-    place = place_of(visitor)
-    assert place.draft.options.time_offset is None
-    visitor.page.locator("main").get_by_role("button", name="Use 0.1").click()
-    eventually(lambda: place.draft.options.time_offset or 0.0, lambda offset: abs(offset - 0.12) < 0.010)
-    visitor.press("Estimate from the motion", 90)
-    visitor.reads("Images and kinematics fit as they are", 90)
-    visitor.press("Undo")
-    eventually(lambda: place.draft.options.time_offset, lambda offset: offset is None)
-
-
-class Truths(ImagePredictor):
-    """Predicts the true surface map of one of three frames: the red, the green or the blue one."""
-
-    device = torch.device("cpu")
-    stride = 16
-
-    def __init__(self, made: Sequence) -> None:
-        renderer = Renderer(made.scene, width=640, height=480)
-        frames = map(made.frame, range(len(made)))
-        maps = [renderer.surface(made.scene.state(frame.measured)).maps for frame in frames]
-        self.maps = [torch.nn.functional.avg_pool2d(each, 2) for each in maps]
-
-    def predict(self, images: torch.Tensor, given: torch.Tensor, window: Window) -> torch.Tensor:
-        """The truth in a window."""
-        return window.of(self.maps[int(images[0].mean((1, 2)).argmax())])[: len(images)]
-
-
-@pytest.mark.parametrize("agreeing", [True, False])
-def test_a_calibration_shows_its_figures_and_is_kept_where_clicked_points_agree(
-    tiny_sequence: Callable[..., Path],
-    tmp_path: Path,
-    visit: Callable[[Path], Visitor],
-    monkeypatch: pytest.MonkeyPatch,
-    agreeing: bool,
-) -> None:
-    made = Sequence.open(tiny_sequence(frames=3, cameras=("left",), width=320, height=240))
-    folder = tmp_path / "labs" / "day"
-    (folder / "left").mkdir(parents=True)
-    for number in range(3):
-        cv2.imwrite(str(folder / f"left/{number}.png"), np.full((240, 320, 3), 200 * np.eye(3)[2 - number], np.uint8))
-    write_lab_files(folder, range(3), made.measured["PSM1"], [("left", (320, 240), made.scene.cameras[0].K - SHIFT)])
-    turn = np.eye(4)
-    turn[:3, :3] = Rotation.from_rotvec([0.0, 0.0 if agreeing else 6.0, 0.0], degrees=True).as_matrix()
-    (arm,) = made.scene.arms
-    seen = replace(made.scene, arms=(replace(arm, T_world_base=turn @ arm.T_world_base),))
-    points = tuple(clicked(seen, made.measured, range(3), ("left",), noise=1.0))
-    DraftFile().write(Draft(Step.HAND_EYE, str(folder), "day", points=points))
-    monkeypatch.setattr(FeatureExtractor, "load", lambda *_, **__: Truths(made))
-    visitor = visit(tmp_path / "labs")
-    visitor.press("Go on with day")
-    visitor.reads("Of the calibration from points", 90)
-    visitor.dismiss_warning()
-    known = visitor.page.locator("main").get_by_text("±").all_inner_texts()
-    visitor.press("Calibrate")
-    visitor.reads("Calibrated" if agreeing else "Calibration not kept", 240)
-    visitor.reads("Loss")
-    if (pictures := os.environ.get("CARTS_PICTURES")) is not None:
-        visitor.page.screenshot(path=f"{pictures}/calibrated_{agreeing}.png")
-    assert visitor.page.locator("main").get_by_text("±").all_inner_texts() != known
-    assert visitor.page.locator("main details tr").count() >= 1 + len(points)
-    draft = place_of(visitor).draft
-    assert draft.report is not None
-    print(draft.report)
-    if agreeing:
-        assert draft.calibration is not None and not draft.report.disagreeing
-        return
-    assert draft.calibration is None and visitor.page.locator("tr.wrong").count() == len(draft.report.disagreeing) > 0
-    visitor.press("Keep anyway")
-    visitor.reads("Kept by choice")
-    visitor.press("Undo")
-    visitor.press("Discard")
-    visitor.reads("Of the calibration from points")
-    assert place_of(visitor).draft.calibration is None
-
-
 @pytest.mark.slow
 @pytest.mark.timeout(1200)
 def test_real_stereo_frames_without_any_hand_eye_are_calibrated_within_25_clicks(
@@ -295,7 +165,7 @@ def test_real_stereo_frames_without_any_hand_eye_are_calibrated_within_25_clicks
     visitor.press("Choose this folder")
     visitor.press("Continue to hand-eye", 90)
     visitor.reads("Click the tip", 90)
-    visitor.dismiss_warning()
+    dismiss_warning(visitor.page)
     click_what_is_asked_for(visitor, reference.scene, dict(reference.measured), 2.0)
     visitor.press("Calibrate")
     visitor.reads("Calibrated", 900)
@@ -309,7 +179,7 @@ def test_real_stereo_frames_without_any_hand_eye_are_calibrated_within_25_clicks
     visitor.press("Save and open")
     app = eventually(lambda: visitor.site.app, lambda now: now is not None, 120)
     assert app is not None
-    wait_in(visitor.page, "window.__viserMutable?.nodeRefFromName['/overlay']")
+    wait_in(visitor.page, READY)
     saved = app.sequence.scene
     assert masks_agreement(saved, reference, "left") == pytest.approx(scores["left"], abs=0.002)
 

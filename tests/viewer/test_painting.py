@@ -1,24 +1,143 @@
-"""What painting does: layers in the project, steps of undo, corrected masks, and what the optimizer is given."""
+"""Painting: strokes as browsers send them, layers of the project, classes, prompts, and what the optimizer gets."""
 
+import json
+from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import cv2
+import msgspec
 import numpy as np
 import pytest
 from viewer_desk import Desk
 
+from carts_core.errors import CartsError, SettingsError
 from carts_core.evaluation.evaluate import dice
-from carts_core.optimization import SurfaceSolver
+from carts_core.model.camera import Camera
+from carts_core.model.parts import part_classes
 from carts_core.project import IgnoreRegion, Key, MaskCorrection
+from carts_core.segmentation import Prompt
 from carts_viewer.actions import intents
 from carts_viewer.jobs.optimizers import OptimizerFactory
-from carts_viewer.picture.strokes import Stroke, Target, Tool
+from carts_viewer.picture.layers import (
+    ADDED_COLOR,
+    IGNORED_COLOR,
+    REMOVED_COLOR,
+    Layer,
+    nothing,
+    paint_over,
+)
+from carts_viewer.picture.strokes import LONGEST_STROKE, Painted, Stroke, Target, Tool, corrected, ignored, read_stroke
+
+CAMERA = Camera("left", 64, 48, (60.0, 60.0, 32.0, 24.0), np.eye(4))
+
+
+GOOD: dict[str, Any] = {
+    "number": 1,
+    "frame": 2,
+    "camera": "left",
+    "target": "Mask",
+    "erase": False,
+    "polygon": False,
+    "diameter": 7,
+    "points": [[10.0, 12.0], [40.5, 30.5]],
+}
+
+
+def _read(**changes: Any) -> Stroke:
+    painted = msgspec.json.decode(json.dumps({"type": "Painted", **GOOD, **changes}), type=Painted)
+    return read_stroke(painted, 3, {"left": CAMERA})
+
+
+def test_a_single_point_is_a_dot() -> None:
+    covered = _read(points=[[20.5, 20.5]], diameter=9).covers(CAMERA)
+    y, x = np.mgrid[:48, :64] + 0.5
+    distance = np.hypot(x - 20.5, y - 20.5)
+    assert covered[distance < 4].all() and not covered[distance > 5.5].any()
+
+
+def test_a_polygon_is_filled_and_knows_no_brush() -> None:
+    covered = _read(polygon=True, points=[[10, 10], [50, 10], [50, 40], [10, 40]], diameter=200).covers(CAMERA)
+    assert covered[11:39, 11:49].all() and covered.sum() <= 41 * 31
+
+
+def test_points_far_outside_and_brushes_too_thick_are_clamped() -> None:
+    stroke = _read(points=[[-1e9, 20], [1e300, 20]], diameter=1e9)
+    assert stroke.points.tolist() == [[-64, 20], [128, 20]] and stroke.diameter == 300
+    assert stroke.covers(CAMERA).all()
+
+
+@pytest.mark.parametrize(
+    ("name", "values"),
+    [
+        ("points", ([[float("nan"), 1.0]], [[1.0, float("inf")]], [], [[1, 2]] * (LONGEST_STROKE + 1), [[10**400, 1]])),
+        ("points", ([[1, 2, 3]], [[1, 2], [3]], [None], {"0": [1, 2]})),
+        ("diameter", (-3, float("nan"), "5")),
+        ("frame", (3, -1, 1.5, True)),
+        ("number", (None,)),
+        ("camera", ("../left", ["left"])),
+        ("target", ("Review",)),
+        ("polygon", (True,)),
+    ],
+)
+def test_what_no_page_would_send_is_refused(name: str, values: tuple[Any, ...]) -> None:
+    for value in values:
+        with pytest.raises((SettingsError, msgspec.DecodeError)):
+            _read(**{name: value})
+
+
+def test_a_later_stroke_wins_and_what_is_rendered_needs_no_adding() -> None:
+    rendered, stroke = np.zeros((4, 6), bool), np.zeros((4, 6), bool)
+    rendered[:, :3], stroke[1] = True, True
+    added = corrected(None, stroke, rendered, erase=False)
+    assert added is not None and not added.removed().any()
+    assert np.array_equal(added.added(), stroke & ~rendered)
+    # Erasing the same takes the addition back and the rendered part out.
+    removed = corrected(added, stroke, rendered, erase=True)
+    assert removed is not None and not removed.added().any()
+    assert np.array_equal(removed.removed(), stroke & rendered)
+    assert np.array_equal(removed.applied_to(rendered), rendered & ~stroke)
+    # And painting it again leaves the rendered mask with the addition.
+    again = corrected(removed, stroke, rendered, erase=False)
+    assert again is not None and np.array_equal(again.applied_to(rendered), rendered | stroke)
+
+
+def test_a_layer_of_which_nothing_is_left_is_none() -> None:
+    stroke, rendered = np.ones((4, 6), bool), np.zeros((4, 6), bool)
+    assert corrected(corrected(None, stroke, rendered, erase=False), stroke, rendered, erase=True) is None
+    assert ignored(ignored(None, stroke, erase=False), stroke, erase=True) is None
+    assert ignored(None, stroke, erase=True) is None
+
+
+def test_painted_pixels_are_seen_in_their_colours() -> None:
+    added, removed, region = np.zeros((3, 40, 60), bool)
+    added[:20, :20], removed[:20, 20:40], region[25:38, 10:50] = True, True, True
+    picture = nothing(40, 60)
+    paint_over(picture, MaskCorrection.of(added, removed), IgnoreRegion.of(region), 0.5)
+    assert (picture[added] == (*ADDED_COLOR, 128)).all() and (picture[removed] == (*REMOVED_COLOR, 128)).all()
+    hatched = picture[region][:, 3] > 0
+    assert 0.3 < hatched.mean() < 0.9 and (picture[region][hatched][:, :3] == IGNORED_COLOR).all()
+    rest = ~(added | removed | region)
+    assert not picture[rest].any()
+
+
+def test_a_line_is_that_of_opencv() -> None:
+    wanted = np.zeros((48, 64), np.uint8)
+    cv2.line(wanted, (10, 12), (40, 30), 1, 7)
+    covered = _read(points=[[10.5, 12.5], [40.5, 30.5]]).covers(CAMERA)
+    assert np.array_equal(covered, wanted.astype(bool))
+
+
+# ---- Layers of the project ------------------------------------------------------------------------------------------
+
 
 CORNERS = ((5.0, 5.0), (60.0, 5.0), (60.0, 40.0), (5.0, 40.0))
 
 
-def _polygon(target: Target, *, erase: bool = False, frame: int = 0, camera: str = "left", number: int = 1) -> Any:
-    return intents.Paint(7, Stroke(number, frame, camera, target, erase, True, 1, np.array(CORNERS)))
+def _polygon(
+    target: Target, *, erase: bool = False, frame: int = 0, camera: str = "left", number: int = 1, label: int = 0
+) -> intents.Paint:
+    return intents.Paint(7, Stroke(number, frame, camera, target, erase, True, 1, np.array(CORNERS), label))
 
 
 def _pixels(desk: Desk) -> np.ndarray:
@@ -93,27 +212,6 @@ def test_a_corrected_mask_keeps_the_optimizers_loss_and_an_ignore_region_does_no
     assert after is not None and after.loss is None and after.dice is not None
 
 
-def test_exports_hold_the_corrected_mask(desk: Desk) -> None:
-    desk.do(_polygon(Target.MASK), _polygon(Target.MASK, erase=True, frame=1, number=2), intents.ExportMask(3))
-    wanted = desk.renderer.mask(desk.state.pose.scene, "left") | _pixels(desk)
-    assert np.array_equal(_image(desk.delivered[-1][2]), wanted)
-    desk.do(intents.Export("masks", "All", "arms", False, False))
-    export = desk.finish().export
-    assert export is not None and export.path is not None
-    found = {path.stem: _image(path.read_bytes()) for path in (export.path / "binary").iterdir()}
-    assert np.array_equal(found["left_001"], wanted)
-    rendered = desk.renderer.mask(desk.session.pose(desk.session.frame(1, "regular", "left")).scene, "left")
-    assert np.array_equal(found["left_002"], rendered & ~_pixels(desk))
-    # The other camera's masks are as rendered.
-    assert np.array_equal(found["right_001"], desk.renderer.mask(desk.state.pose.scene, "right"))
-
-
-def _image(png: bytes) -> np.ndarray:
-    image = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_UNCHANGED)
-    assert image is not None
-    return image > 0
-
-
 def test_the_optimizer_is_given_the_ignore_region_of_its_cameras(desk: Desk, monkeypatch: pytest.MonkeyPatch) -> None:
     given = []
     make = OptimizerFactory.make
@@ -130,16 +228,6 @@ def test_the_optimizer_is_given_the_ignore_region_of_its_cameras(desk: Desk, mon
     assert given[-1] == {}
     desk.do(intents.SetCameras(True), intents.Step())
     assert list(given[-1]) == ["left"]
-
-
-def test_ignored_pixels_change_the_surface_loss(desk: Desk) -> None:
-    for name, value in {"solver": "surface", "iterations": 2, "working_width": 96}.items():
-        desk.do(intents.SetSetting(name, value))
-    assert desk.state.settings == SurfaceSolver(iterations=2, working_width=96)
-    desk.do(intents.Step())
-    loss = desk.state.run.curves.loss[0]
-    desk.do(intents.Reset(), _polygon(Target.IGNORE), intents.Step())
-    assert desk.state.run.curves.loss[0] != loss
 
 
 def test_painting_ends_a_run_and_keeps_what_it_reached(desk: Desk) -> None:
@@ -162,14 +250,6 @@ def test_clearing_is_one_step_and_touches_one_layer_of_one_frame(desk: Desk) -> 
     assert _correction(desk) is None
 
 
-def test_painted_layers_survive_a_restart(desk: Desk) -> None:
-    desk.do(_polygon(Target.MASK))
-    before = _correction(desk)
-    again = desk.reopened()
-    assert again.state.mask_correction == before is not None
-    assert np.array_equal(again.do(intents.Undo()).project.position, 0) and again.state.mask_correction is None
-
-
 def test_the_brush_grows_and_shrinks_within_its_limits(desk: Desk) -> None:
     assert desk.do(intents.ToggleTool(Tool.BRUSH)).brush.tool is Tool.BRUSH
     assert desk.do(intents.ToggleTool(Tool.BRUSH)).brush.tool is Tool.OFF
@@ -182,9 +262,174 @@ def test_the_brush_grows_and_shrinks_within_its_limits(desk: Desk) -> None:
     assert desk.do(intents.SetTarget()).brush.target is Target.MASK
 
 
-def test_a_project_that_takes_no_edits_shows_strokes_until_another_frame_is(desk: Desk) -> None:
-    reader = desk.reopened(read_only=True)
-    reader.do(_polygon(Target.IGNORE))
-    assert reader.state.ignore_region is not None and not reader.saved.steps
-    reader.do(intents.MoveFrame(1), intents.MoveFrame(-1))
-    assert reader.state.ignore_region is None
+# ---- Classes --------------------------------------------------------------------------------------------------------
+
+
+def _labels(desk: Desk) -> np.ndarray:
+    found = desk.saved.get(Key.part_labels(0, "left"))
+    return np.zeros(desk.state.frame.images["left"].shape[:2], np.uint8) if found is None else found.labels()
+
+
+def test_a_painted_class_is_part_of_the_mask_and_one_step_of_undo(desk: Desk) -> None:
+    jaws = next(one for one in part_classes(desk.session.scene.arms) if one.part == "jaws")
+    covered = _pixels(desk)
+    desk.do(intents.SetPaintClass(jaws.number))
+    assert desk.state.layer is Layer.PARTS and desk.state.brush.label == jaws.number
+    desk.do(_polygon(Target.MASK, number=1, label=jaws.number))
+    assert [step.name for step in desk.saved.steps] == ["Paint PSM1 jaws, frame 001"]
+    np.testing.assert_array_equal(_labels(desk) == jaws.number, covered)
+    shown = desk.renderer.classes(
+        desk.state.pose.scene, "left", desk.state.mask_correction, desk.state.part_labels_of("left")
+    )
+    assert (shown[covered] == jaws.number).all()
+    assert desk.renderer.mask(desk.state.pose.scene, "left", desk.state.mask_correction)[covered].all()
+    # A stroke without a class leaves the class alone, one that erases takes both out.
+    desk.do(_polygon(Target.MASK, number=2))
+    assert (_labels(desk)[covered] == jaws.number).all() and desk.saved.position == 1
+    desk.do(_polygon(Target.MASK, number=3, erase=True))
+    assert not _labels(desk).any() and desk.saved.position == 2
+    desk.do(intents.Undo())
+    assert (_labels(desk)[covered] == jaws.number).all()
+    desk.do(intents.Undo())
+    assert not _labels(desk).any() and desk.state.mask_correction is None
+
+
+def test_the_layer_of_parts_shows_what_the_links_of_the_robot_say(desk: Desk) -> None:
+    rendered = desk.renderer.arm_ids(desk.state.pose.scene, "left")
+    classes = desk.renderer.classes(desk.state.pose.scene, "left", None, None)
+    np.testing.assert_array_equal(classes > 0, rendered >= 0)
+    assert set(np.unique(classes)) == {0, *(one.number for one in part_classes(desk.session.scene.arms))}
+
+
+def test_a_class_that_does_not_exist_is_refused(desk: Desk) -> None:
+    with pytest.raises(CartsError, match="no class 99"):
+        desk.do(intents.SetPaintClass(99))
+
+
+def test_what_was_painted_as_a_class_is_exported_as_that_part(desk: Desk) -> None:
+    jaws = next(one for one in part_classes(desk.session.scene.arms) if one.part == "jaws")
+    desk.do(_polygon(Target.MASK, number=1, label=jaws.number), intents.Export("masks", "All", "parts", False, True))
+    exported = desk.finish().export
+    assert exported is not None and exported.path is not None
+    meaning = json.loads((exported.path / "labels.json").read_text())["parts"]
+    value = next(int(key) for key, name in meaning.items() if name == "PSM1.jaws")
+    image = cv2.imread(str(sorted((exported.path / "parts").iterdir())[0]), cv2.IMREAD_UNCHANGED)
+    covered = _pixels(desk)
+    assert image is not None and (image[covered] == value).all()
+
+
+# ---- Prompts --------------------------------------------------------------------------------------------------------
+
+
+RADIUS = 9.0
+
+
+class Discs:
+    """A plug-in: discs around the points, without those around the points beside it; or the box."""
+
+    def __init__(self) -> None:
+        self.asked: list[Prompt] = []
+
+    def segment(self, image: np.ndarray, prompt: Prompt) -> np.ndarray:
+        self.asked.append(prompt)
+        rows, columns = np.mgrid[: image.shape[0], : image.shape[1]] + 0.5
+        mask = np.zeros(image.shape[:2], bool)
+        if prompt.box is not None:
+            left, top, right, low = prompt.box
+            mask |= (columns > left) & (columns < right) & (rows > top) & (rows < low)
+        for u, v in prompt.inside:
+            mask |= np.hypot(columns - u, rows - v) < RADIUS
+        for u, v in prompt.outside:
+            mask &= np.hypot(columns - u, rows - v) >= RADIUS
+        return mask
+
+
+@pytest.fixture
+def discs() -> Discs:
+    return Discs()
+
+
+@pytest.fixture
+def prompted(tiny_sequence: Callable[..., Path], untrained_weights: Path, discs: Discs) -> Desk:
+    """A desk whose segmenter is a plug-in."""
+    return Desk.open(tiny_sequence(frames=2), weights=(untrained_weights,), segmenter=discs)
+
+
+def _ignored(desk: Desk) -> np.ndarray:
+    region = _region(desk)
+    return np.zeros(desk.state.frame.images["left"].shape[:2], bool) if region is None else region.region()
+
+
+def _point(number: int, *points: tuple[float, float], erase: bool = False) -> intents.Paint:
+    stroke = Stroke(number, 0, "left", Target.IGNORE, erase, False, 1, np.array(points), prompt=True)
+    return intents.Paint(7, stroke)
+
+
+def test_clicks_are_about_one_thing_until_it_is_finished_and_each_is_a_step(prompted: Desk, discs: Discs) -> None:
+    prompted.do(_point(1, (20.0, 20.0)))
+    first = _ignored(prompted)
+    prompted.do(_point(2, (34.0, 20.0)))
+    prompted.do(_point(3, (20.0, 12.0), erase=True))
+    assert discs.asked[-1] == Prompt(inside=((20.0, 20.0), (34.0, 20.0)), outside=((20.0, 12.0),))
+    assert not _ignored(prompted)[12, 20] and _ignored(prompted)[24, 20] and _ignored(prompted)[20, 34]
+    assert [step.name for step in prompted.saved.steps] == ["Segment by a prompt, frame 001"] * 3
+    # The next one begins anew and adds to what is there.
+    before = _ignored(prompted)
+    prompted.do(intents.NextObject(), _point(4, (50.0, 40.0)))
+    assert discs.asked[-1] == Prompt(inside=((50.0, 40.0),))
+    assert (_ignored(prompted) & before).sum() == before.sum() < _ignored(prompted).sum()
+    for _ in range(3):
+        prompted.do(intents.Undo())
+    np.testing.assert_array_equal(_ignored(prompted), first)
+
+
+def test_after_undo_or_other_paint_a_click_is_about_something_new(prompted: Desk, discs: Discs) -> None:
+    prompted.do(_point(1, (20.0, 20.0)), intents.Undo(), _point(2, (40.0, 30.0)))
+    assert discs.asked[-1] == Prompt(inside=((40.0, 30.0),))
+    assert not _ignored(prompted)[20, 20] and _ignored(prompted)[30, 40]
+
+
+def test_shift_on_something_new_takes_it_away_and_a_box_adds(prompted: Desk, discs: Discs) -> None:
+    prompted.do(_point(1, (50.0, 40.0), (10.0, 10.0)))
+    assert discs.asked[-1] == Prompt(box=(10.0, 10.0, 50.0, 40.0))
+    assert _ignored(prompted).sum() == 40 * 30
+    prompted.do(intents.NextObject(), _point(2, (30.0, 25.0), erase=True))
+    assert not _ignored(prompted)[25, 30] and _ignored(prompted)[12, 12]
+
+
+def test_in_a_box_the_mask_becomes_what_is_segmented_whatever_is_rendered(prompted: Desk, discs: Discs) -> None:
+    rendered = prompted.renderer.mask(prompted.state.pose.scene, "left")
+    height, width = rendered.shape
+    corners = np.array([[0.0, 0.0], [float(width), float(height)]])
+    wanted = np.zeros_like(rendered)
+    wanted[5:15, 5:15] = True
+    discs.segment = lambda image, prompt: wanted  # type: ignore[method-assign]
+    prompted.do(intents.Paint(7, Stroke(1, 0, "left", Target.MASK, False, False, 1, corners, prompt=True)))
+    mask = prompted.renderer.mask(prompted.state.pose.scene, "left", prompted.state.mask_correction)
+    assert rendered.any()
+    np.testing.assert_array_equal(mask, wanted)
+
+
+def test_a_mask_and_its_class_come_from_one_prompt(prompted: Desk) -> None:
+    stroke = Stroke(1, 0, "left", Target.MASK, False, False, 1, np.array([[20.0, 20.0]]), 3, prompt=True)
+    prompted.do(intents.Paint(7, stroke))
+    labels = prompted.saved.get(Key.part_labels(0, "left"))
+    disc = Discs().segment(prompted.state.frame.images["left"], Prompt(inside=((20.0, 20.0),)))
+    assert labels is not None and (labels.labels() == 3).sum() == disc.sum()
+    assert prompted.renderer.mask(prompted.state.pose.scene, "left", prompted.state.mask_correction)[20, 20]
+    prompted.do(intents.Undo())
+    assert prompted.saved.get(Key.part_labels(0, "left")) is None and prompted.state.mask_correction is None
+
+
+def test_the_shipped_network_segments_the_arm_under_a_click_and_in_a_box(tiny_sequence: Callable[..., Path]) -> None:
+    desk = Desk.open(tiny_sequence(frames=1, width=640, height=480))
+    assert desk.state.frame.masks is not None
+    truth = desk.state.frame.masks["left"]
+    rows, columns = np.nonzero(truth)
+    middle = int(np.median(np.arange(len(rows))))
+    desk.do(_point(1, (columns[middle] + 0.5, rows[middle] + 0.5)))
+    assert dice(_ignored(desk), truth) > 0.8
+    desk.do(intents.Undo(), _point(2, (600.0, 440.0), (40.0, 40.0)))
+    inside = np.zeros_like(truth)
+    inside[40:440, 40:600] = True
+    assert dice(_ignored(desk), truth & inside) > 0.8

@@ -1,19 +1,43 @@
-"""What is said about a frame follows what it is: a judgement is on what was seen, the rest on who made the joints."""
+"""Reviews, verdicts, filters and warnings of frames."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from viewer_desk import Desk
 
-from carts_core.project import ReviewState
+from carts_core.errors import CartsError
+from carts_core.optimization import BASE_FRAME_GAIN
+from carts_core.optimization.observability import Uncertainty
+from carts_core.project import Figures, FitVerdict, Key, Review, ReviewState, Source
 from carts_viewer.actions import intents
-from carts_viewer.actions.exchange import FRAME_CHOICES
-from carts_viewer.actions.frame_filter import BY_HAND, SOLVED, UNJUDGED, FrameFilter, copied, found, review_name
+from carts_viewer.actions.exchange import FRAME_CHOICES, export_warnings
+from carts_viewer.actions.frame_filter import (
+    BY_HAND,
+    NOT_CHECKED,
+    SOLVED,
+    UNJUDGED,
+    FrameFilter,
+    copied,
+    found,
+    review_name,
+)
+from carts_viewer.choices import Against, Compare, JointRange, composed, other_pose
+from carts_viewer.jobs.comparison import Fit
+from carts_viewer.panels.fit import fit_text
+from carts_viewer.panels.optimize import note, undetermined_lines
+from carts_viewer.panels.sequence import calibration_line
+from carts_viewer.picture.layers import Layer
 from carts_viewer.picture.strokes import Stroke, Target
+from carts_viewer.state import Curves, Maps, Phase, RunState
 
 CORNERS = np.array(((5.0, 5.0), (60.0, 5.0), (60.0, 40.0), (5.0, 40.0)))
+
+
 ACCEPT = intents.SetReview(ReviewState.ACCEPTED)
+
+
 MOVES = {
     "a slider": (intents.SetJoint("PSM1", 0, 0.1), intents.Released()),
     "a nudge": (intents.Nudge(1.0),),
@@ -101,3 +125,194 @@ def test_accept_and_next_stays_in_the_range_and_says_when_it_is_done(desk: Desk)
     assert desk.do(intents.ShowFrame(0)).notice is None
     # Outside of the range, and without one, it is about the whole sequence.
     assert desk.do(intents.AcceptAndNext()).notice == "All 3 frames are reviewed."
+
+
+# ---- Frames that are looked for, and poses that are compared --------------------------------------------------------
+
+
+@pytest.fixture
+def known(desk: Desk) -> Desk:
+    """Frame 0 was moved by hand, 1 has failed and a note, 2 is accepted."""
+    desk.do(intents.SetJoint("PSM1", 0, 0.1), intents.Released())
+    project = desk.session.editor.project
+    edits = {
+        Key.verdict(1): FitVerdict("failed", "", "", 0.9),
+        Key.review(1): Review(ReviewState.NEEDS_WORK, "Smoke on the left"),
+        Key.review(2): Review(ReviewState.ACCEPTED),
+    }
+    project.apply("Prepare", edits)
+    project.record_figures({1: Figures(dice=0.6), 2: Figures(dice=0.95)}, project.state)
+    desk.do(intents.Refresh())
+    return desk
+
+
+@pytest.mark.parametrize(
+    ("wanted", "frames"),
+    [
+        (FrameFilter(), [0, 1, 2]),
+        (FrameFilter(review=BY_HAND), [0]),
+        (FrameFilter(review="accepted"), [2]),
+        (FrameFilter(fit="failed"), [1]),
+        (FrameFilter(fit=NOT_CHECKED), [0, 2]),
+        (FrameFilter(dice=0.9), [0, 1]),
+        (FrameFilter(note="SMOKE"), [1]),
+        (FrameFilter(arm="PSM1"), [0]),
+        (FrameFilter(fit="failed", review="accepted"), []),
+    ],
+)
+def test_frames_are_found_by_what_is_known_of_them(known: Desk, wanted: FrameFilter, frames: list[int]) -> None:
+    assert found(known.saved, wanted) == frames
+
+
+def test_all_found_frames_are_reviewed_in_one_step_and_notes_stay(known: Desk) -> None:
+    steps = len(known.saved.steps)
+    known.do(intents.SetFilter("fit", "failed"), intents.ReviewFound(ReviewState.REJECTED))
+    assert known.saved.review(1) == Review(ReviewState.REJECTED, "Smoke on the left")
+    known.do(intents.ClearFilter(), intents.SetFilter("review", "accepted"), intents.ReviewFound(ReviewState.UNTOUCHED))
+    assert known.saved.review(2) == Review() and len(known.saved.steps) == steps + 2
+    known.do(intents.Undo())
+    assert known.saved.review(2).state is ReviewState.ACCEPTED
+    with pytest.raises(CartsError, match="No frame is like that"):
+        known.do(intents.SetFilter("note", "xyz"), intents.ShowFound())
+    with pytest.raises(CartsError, match="cannot be looked for by 'colour'"):
+        known.do(intents.SetFilter("colour", "red"))
+
+
+def test_next_and_previous_go_round_the_found_frames(known: Desk) -> None:
+    known.do(intents.SetFilter("fit", NOT_CHECKED), intents.ShowFrame(0))
+    assert [known.do(intents.ShowFound(step)).index for step in (1, 1, -1)] == [2, 0, 2]
+
+
+def test_the_other_pose_is_seen_up_to_the_swipe_or_all_over_while_a_key_is_held(known: Desk) -> None:
+    own, other = np.full((4, 10, 4), 1, np.uint8), np.full((4, 10, 4), 2, np.uint8)
+    assert composed(own, other, 0.4)[0, :, 0].tolist() == [2, 2, 2, 255, 255, 1, 1, 1, 1, 1]
+    assert (composed(own, other, 1.0) == 2).all()
+    assert Compare().share == 0.0 and Compare(peek=True).share == 1.0
+    state = known.do(intents.ShowFrame(0), intents.CompareWith(Against.MEASURED), intents.SetSwipe(7.0))
+    assert state.compare.share == 1.0
+    measured = known.session.measured(state.frame)
+    assert other_pose(state.compare, measured, None) is measured
+    assert other_pose(Compare(Against.BEFORE_RUN), measured, state.pose.scene) is state.pose.scene
+
+
+# ---- Verdicts -------------------------------------------------------------------------------------------------------
+
+
+GOOD, DOUBTFUL = FitVerdict("good", "", "", 0.02), FitVerdict("doubtful", "In part.", "Look.", 0.2)
+
+
+@pytest.mark.parametrize(
+    ("after", "before", "worse"),
+    [
+        (Fit(GOOD, 0.02), Fit(DOUBTFUL, 0.06), None),
+        (Fit(DOUBTFUL, 0.02), Fit(GOOD, 0.06), "doubtful, was good"),
+        (Fit(FitVerdict("good", "", "", 0.09), 0.02), Fit(GOOD, 0.02), "probably wrong by 9%, was 2%"),
+        (Fit(GOOD, 0.03), Fit(GOOD, 0.02), "loss 0.03, was 0.02"),
+        (Fit(GOOD, 0.02, 0.564), Fit(DOUBTFUL, 0.06, 0.701), "Dice 0.564, was 0.701"),
+        (Fit(DOUBTFUL, 0.09, 0.95), Fit(GOOD, 0.02, 0.90), None),
+    ],
+)
+def test_a_fit_is_worse_by_what_the_images_say_and_by_the_truth_where_it_is_known(
+    after: Fit, before: Fit, worse: str | None
+) -> None:
+    assert after.worse_than(before) == worse
+
+
+def test_a_verdict_is_read_with_reason_remedy_and_cameras() -> None:
+    verdict = FitVerdict("failed", "Camera right: <no>", "Run again.", 0.8, (("left", 0.01), ("right", 0.8)))
+    text = fit_text(verdict, running=False, scores={"left": 0.98, "right": 0.663})
+    for part in (
+        "<b>Mask failed</b><br>Camera right: &lt;no&gt;",
+        "Run again.",
+        "left good Dice 0.980",
+        "right failed Dice 0.663",
+    ):
+        assert part in text
+    good = FitVerdict("good", "The image supports the fit.")
+    text = fit_text(good, running=False, scores={}, undetermined=["PSM1.roll", "PSM1.wrist_yaw"])
+    assert '<b>Mask good</b>, <b title="PSM1.roll, PSM1.wrist yaw">2 joints not determined</b>' in text
+    assert "all joints determined" in fit_text(good, running=False, scores={}, undetermined=[])
+    assert "not checked" in fit_text(None, running=False, scores={})
+
+
+def test_losses_are_only_said_to_compare_when_they_do() -> None:
+    assert "only compare within a stage" in note(Curves(loss=(1.0,)), False)
+    ended = note(Curves(loss=(1.0,), comparable=True), False)
+    assert "● the result" in ended and "only compare" not in ended
+    assert "changed since" in note(Curves(loss=(1.0,), comparable=True), True)
+
+
+def test_a_check_says_what_every_camera_sees_and_moves_nothing(desk: Desk) -> None:
+    before = desk.joint()
+    state = desk.do(intents.Assess())
+    assert state.verdict is not None and [name for name, _ in state.verdict.cameras] == ["left", "right"]
+    assert desk.joint() == before and state.pose.source is Source.MEASURED
+    assert not desk.saved.steps and not state.unsaved and desk.saved.verdict(0) == state.verdict
+    # It is of this pose alone, and a run says it anew.
+    assert desk.do(intents.SetJoint("PSM1", 0, 0.1), intents.Released()).verdict is None
+    desk.do(intents.Run())
+    assert desk.state.verdict is None
+    state = desk.finish()
+    assert state.verdict is not None and state.run.curves.comparable and not state.run_outdated
+    assert desk.saved.verdict(0) == state.verdict
+    assert desk.do(intents.SetJoint("PSM1", 0, 0.1)).run_outdated
+
+
+def test_the_attention_map_of_a_pose_says_nothing_about_a_run(desk: Desk) -> None:
+    desk.do(intents.SetSetting("solver", "surface"), intents.ShowLayer(Layer.ATTENTION))
+    desk.controller.map()
+    assert desk.state.maps is not None and desk.state.maps.iterate.uncertainty is not None
+    assert undetermined_lines(desk.state, desk.session) == ""
+
+
+def _state(uncertainty: Uncertainty | None, phase: Phase) -> SimpleNamespace:
+    iterate = SimpleNamespace(uncertainty=uncertainty)
+    start, end = (SimpleNamespace(jaw=value) for value in (0.1, 0.12))
+    run = replace(RunState(), phase=phase, start=start)
+    return SimpleNamespace(maps=Maps(iterate, ("left",)), run=run, pose=SimpleNamespace(scene=end))  # pyright: ignore
+
+
+SESSION = SimpleNamespace(
+    ranges={"PSM1": [JointRange("PSM1", "jaw", True, -1.0, 1.0)]}, joints=lambda scene: {"PSM1": [scene.jaw]}
+)
+
+
+KNOWN = Uncertainty(("PSM1/outer_yaw", "PSM1/wrist_yaw", "PSM1/jaw"), (0.01, 0.03, 0.05), (0.05, 0.05, 0.05))
+
+
+def test_joints_that_the_image_leaves_open_are_named_by_how_much() -> None:
+    lines = undetermined_lines(_state(KNOWN, Phase.IDLE), SESSION)  # pyright: ignore
+    assert "Weakly determined by this image: PSM1 wrist yaw<" in lines
+    assert "Not determined by this image: PSM1 jaw (moved by +1.1°)<" in lines
+    assert "outer" not in lines
+
+
+def test_nothing_is_said_while_running_or_by_losses_that_cannot_say() -> None:
+    assert undetermined_lines(_state(KNOWN, Phase.RUNNING), SESSION) == ""  # pyright: ignore
+    assert undetermined_lines(_state(None, Phase.IDLE), SESSION) == ""  # pyright: ignore
+
+
+def test_base_frames_are_named_only_above_the_threshold() -> None:
+    for gain, said in ((None, False), (BASE_FRAME_GAIN - 0.01, False), (BASE_FRAME_GAIN + 0.01, True)):
+        line = calibration_line(gain)
+        assert ("13 %" in line) == said and bool(line) == said
+
+
+def test_frames_that_failed_or_were_fitted_to_one_camera_are_named_before_an_export(desk: Desk) -> None:
+    cameras = ["left", "right"]
+    desk.do(intents.ShowFrame(2), intents.SetReview(ReviewState.ACCEPTED))
+    assert export_warnings(desk.saved, range(3), cameras) == ["2 of 3 frames are not accepted"]
+    assert export_warnings(desk.saved, range(1, 3), cameras) == ["1 of 2 frames is not accepted"]
+    assert export_warnings(desk.saved, [2], cameras) == []
+    desk.do(intents.ShowFrame(0))
+    desk.do(intents.SetCameras(False), intents.Step(), intents.Pause(), intents.MoveFrame(1))
+    project = desk.session.editor.project
+    verdicts = {1: FitVerdict("failed", "", "", 0.9), 2: FitVerdict("doubtful", "", "", 0.2)}
+    project.apply("Check", {Key.verdict(index): verdict for index, verdict in verdicts.items()})
+    assert export_warnings(desk.saved, range(3), cameras) == [
+        "2 of 3 frames are not accepted",
+        "1 of these frames failed: 002",
+        "1 of these frames are doubtful: 003",
+        "1 of these frames were fitted to fewer cameras than are exported: 001",
+    ]
+    assert export_warnings(desk.saved, [0], ["left"]) == ["1 of 1 frames is not accepted"]

@@ -3,13 +3,14 @@
 import http.server
 import threading
 from collections.abc import Iterator
-from contextlib import closing
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
 
 import pytest
 from playwright.sync_api import Browser
 from playwright.sync_api import Page as Tab
-from waiting import get, wait_for, wait_in
+from viewer_tab import new_context
+from waiting import eventually, get, wait_in
 
 from carts_viewer.transport.document import Document
 from carts_viewer.transport.page import Page
@@ -55,9 +56,10 @@ def page() -> Iterator[Page]:
     page.close()
 
 
-@pytest.fixture
-def tab(browser: Browser, page: Page) -> Iterator[Tab]:
-    with closing(browser.new_context()) as context:
+@contextmanager
+def opened(browser: Browser, page: Page) -> Iterator[Tab]:
+    """A page that notes what has run and what was blocked."""
+    with closing(new_context(browser)) as context:
         tab = context.new_page()
         tab.add_init_script(
             "window.ran = []; window.blocked = [];"
@@ -65,6 +67,18 @@ def tab(browser: Browser, page: Page) -> Iterator[Tab]:
         )
         tab.goto(page.url)
         wait_in(tab, "window.carts && window.__viserMutable?.canvas")
+        yield tab
+
+
+@pytest.fixture(scope="module")
+def attacked(browser: Browser, page: Page) -> Iterator[Tab]:
+    with opened(browser, page) as tab:
+        yield tab
+
+
+@pytest.fixture
+def tab(browser: Browser, page: Page) -> Iterator[Tab]:
+    with opened(browser, page) as tab:
         yield tab
 
 
@@ -86,15 +100,19 @@ def tab(browser: Browser, page: Page) -> Iterator[Tab]:
     ],
 )
 def test_what_is_injected_into_the_page_neither_runs_nor_loads(
-    tab: Tab, other_site: OtherSite, directive: str, injected: str
+    attacked: Tab, other_site: OtherSite, directive: str, injected: str
 ) -> None:
+    tab = attacked
+    tab.evaluate("() => { ran.length = blocked.length = 0; }")
     box = "const box = document.body.appendChild(document.createElement('div')); box."
     tab.evaluate(f"() => {{ const OTHER = '{other_site.address}'; {box}{injected}; }}")
-    wait_for(lambda: directive in tab.evaluate("blocked"))
+    eventually(lambda: directive in tab.evaluate("blocked"))
     assert tab.evaluate("ran") == [] and other_site.asked == []
 
 
-def test_a_script_of_the_server_is_no_code_in_the_page(tab: Tab) -> None:
+def test_a_script_of_the_server_is_no_code_in_the_page(attacked: Tab) -> None:
+    tab = attacked
+    tab.evaluate("() => { ran.length = 0; }")
     for source in ("ran.push(1)", 'carts.tell("x")', "return ran"):
         assert tab.evaluate("(source) => typeof Function(source)() + typeof new Function(source)()", source)
     call = '{"name": "setHints", "args": [{}]}'
@@ -128,7 +146,7 @@ def test_another_sites_page_loads_nothing_of_the_viewer_and_may_link_to_it(
         f"<img id=icon src='{icon}'><script src='{script}' onload='window.loaded = 1'></script>"
         f"<iframe src='{page.url}'></iframe><a href='{page.url}'>go</a>"
     )
-    with closing(browser.new_context()) as context:
+    with closing(new_context(browser)) as context:
         tab = context.new_page()
         tab.goto(other_site.address)
         assert tab.evaluate("[window.loaded, icon.naturalWidth]") == [None, 0]

@@ -1,12 +1,24 @@
-"""The start page: what may be looked into, what was opened lately, and half-made imports."""
+"""The start page and a batch: allowed folders, recent recordings, half-made imports, and jobs that were done."""
 
+import json
 import os
+import shutil
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 
 import pytest
+from cut_off import hardly_legible
+from playwright.sync_api import Browser, expect
+from viewer_tab import READY, new_context
+from waiting import eventually, wait_in
 
-from carts_core.errors import SettingsError
+from carts_core.batch.folder import is_batch, known_jobs, read_jobs, write_jobs
+from carts_core.batch.manifest import read_manifest
+from carts_core.batch.review import review_project
+from carts_core.cli.batch_job import BatchWork
+from carts_core.errors import CartsError, SettingsError
+from carts_core.files import output_path
 from carts_core.optimization.hand_eye import ImagePoint
 from carts_core.project import JointCorrection, Key, Project, Provenance, Review, ReviewState, Source
 from carts_core.project.identity import data_dir
@@ -17,6 +29,7 @@ from carts_viewer.start.roots import Roots
 from carts_viewer.start.site import Site
 from carts_viewer.start.start_page import StartPage, forget, recent_projects, thumbnail
 from carts_viewer.transport.document import escaped, render
+from carts_viewer.transport.events import Chosen
 from carts_viewer.wizard.draft import Draft, DraftFile, Step, delete_draft, drafts
 from carts_viewer.wizard.wizard import RecordingWizard
 
@@ -72,14 +85,6 @@ def test_nothing_outside_of_the_roots_can_be_reached(roots: Roots, path: str) ->
 def test_a_root_that_is_not_there_is_refused(tmp_path: Path) -> None:
     with pytest.raises(SettingsError, match=r"--root .*nothing is no folder"):
         Roots([tmp_path / "nothing"])
-
-
-def test_a_root_that_is_a_link_itself_is_what_the_person_named(tmp_path: Path) -> None:
-    (tmp_path / "real").mkdir()
-    (tmp_path / "real" / "a.csv").write_text("x")
-    (tmp_path / "named").symlink_to(tmp_path / "real")
-    roots = Roots([tmp_path / "named"])
-    assert [entry.name for entry in roots.entries(roots.folders[0])] == ["a.csv"]
 
 
 @pytest.fixture
@@ -242,3 +247,130 @@ def test_what_is_foreign_is_escaped_in_documents() -> None:
     nasty = "<img src=x onerror=alert(1)>\"'&"
     for text in (escaped(nasty), render("message.html", title=nasty, text=nasty)):
         assert "<img" not in text and "onerror=alert(1)>" not in text and "\"'&" not in text
+
+
+# ---- A batch --------------------------------------------------------------------------------------------------------
+
+NOTE_NOTES = """
+new MutationObserver((changes) => {
+  for (const node of changes.flatMap((change) => [...change.addedNodes])) {
+    if (node.className === "carts-note") localStorage.setItem("noted", node.textContent);
+  }
+}).observe(document, { childList: true, subtree: true });
+"""
+"""Keeps what short notes say, which go away by themselves."""
+
+
+@pytest.fixture(scope="module")
+def done_batch(shared_sequence: Callable[..., Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Of one job that is done and one that has failed."""
+    sequence = shared_sequence(frames=2)
+    manifest = sequence.parent / "archive.toml"
+    job = f'[[jobs]]\nrecordings = ["{sequence.name}"]\nsteps = ["optimize"]\n'
+    options = '[jobs.options]\noptimize = ["--settings", "iterations=2", "--frames", "001,002"]\n'
+    manifest.write_text(f'format = "carts-batch/1"\n{job}{options}{job}domains = ["foggy"]\n')
+    jobs, folder = read_manifest(manifest), output_path(tmp_path_factory.mktemp("batches") / "batch")
+    write_jobs(folder, jobs)
+    assert [outcome.status for outcome in map(BatchWork(folder, inference="torch"), jobs)] == ["done", "failed"]
+    return folder.path
+
+
+@pytest.fixture
+def batch(done_batch: Path, tmp_path: Path) -> Path:
+    return shutil.copytree(done_batch, tmp_path / "batch")
+
+
+@pytest.mark.browser
+def test_failures_of_a_batch_come_first_and_a_frame_opens_with_what_was_found(batch: Path, browser: Browser) -> None:
+    roots = [batch.parent, read_jobs(batch)[0].recording.parent]
+    with Site(roots, port=0, batch=batch) as site, closing(new_context(browser)) as context:
+        page = context.new_page()
+        for window in ((390, 844), (1280, 800)):
+            page.set_viewport_size({"width": window[0], "height": window[1]})
+            page.goto(site.url)
+            rows = page.locator(".jobs tbody tr")
+            expect(rows).to_have_count(2)
+            expect(rows.first).to_contain_text("domain 'foggy' is not in")
+            expect(page.locator(".card img").first).to_be_visible()
+            dark, light = "rgb(20, 24, 27)", "rgb(248, 250, 252)"
+            for colour in (dark, light, dark):
+                assert page.locator("main").evaluate("one => getComputedStyle(one).backgroundColor") == colour
+                assert hardly_legible(page, 4.5) == []
+                page.get_by_role("button", name="Light or dark").click()
+            page.get_by_role("button", name="Light or dark").click()
+            # No text is shortened, and none is a column of single letters.
+            cut = "one => one.scrollWidth > one.clientWidth + 1"
+            assert not any(text.evaluate(cut) for text in page.locator(".card b, .card small, .jobs td").all())
+            box = page.locator(".jobs td").first.bounding_box()
+            assert box is not None and box["width"] > 150 and box["height"] < 150
+        page.locator(".card", has_text="frame 002").get_by_role("button", name="Open").click()
+        app = eventually(lambda: site.app, timeout=60)
+        assert app is not None
+        eventually(lambda: app.state.index, lambda index: index == 1, 60)
+        assert app.state.verdict is not None and app.state.pose.source.value == "optimizer"
+        assert app.project.path.parent == batch / "jobs" / read_jobs(batch)[0].name
+        # A page that is closed while it loads may keep the browser waiting.
+        wait_in(page, READY)
+
+
+def test_new_results_get_a_project_of_their_own_and_what_was_reviewed_stays(batch: Path) -> None:
+    job = read_jobs(batch)[0]
+    folder = output_path(batch) / "jobs" / job.name
+    first = review_project(folder, job)
+    assert review_project(folder, job) == first
+    (table,) = (folder / "optimize").path.glob("*/*/kinematics.csv")
+    lines = table.read_text().splitlines()
+    table.write_text("\n".join(lines[:-1]) + "\n")
+    second = review_project(folder, job)
+    assert second != first and first.exists()
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        "",
+        "{}",
+        '{"format": "carts-batch-jobs/1", "jobs": [{}]}',
+        '{"format": "carts-batch-jobs/1", "jobs": [{"name": "../x", "recording": "/r", "camera": "", "domain": "", '
+        '"steps": []}]}',
+        '{"format": "carts-batch-jobs/1", "jobs": [{"name": "x", "recording": "r", "camera": "", "domain": "", '
+        '"steps": []}]}',
+    ],
+)
+def test_a_list_of_jobs_that_is_damaged_or_leads_elsewhere_is_refused(tmp_path: Path, content: str) -> None:
+    (tmp_path / "batch.json").write_text(content)
+    with pytest.raises(CartsError):
+        read_jobs(tmp_path)
+
+
+def test_a_recording_outside_of_the_allowed_folders_is_not_opened(batch: Path, tmp_path: Path) -> None:
+    content = json.loads((batch / "batch.json").read_text())
+    content["jobs"][0]["recording"] = "/etc/passwd"
+    (batch / "batch.json").write_text(json.dumps(content))
+    assert is_batch(batch) and len(known_jobs(output_path(batch), read_jobs(batch))) == 2
+    with Site([batch.parent], port=0, batch=batch) as site:
+        site.wait()
+        place = site.shown
+        assert place is not None
+        site.post(lambda: site._dispatch(Chosen("review", content["jobs"][0]["name"])))
+        site.wait()
+        assert site.app is None and "outside of the allowed folders" in site.document.content
+
+
+@pytest.mark.browser
+def test_another_recording_in_the_same_tab_is_not_taken_for_a_wrong_link(
+    tiny_sequence: Callable[..., Path], tmp_path: Path, browser: Browser
+) -> None:
+    first = tiny_sequence(frames=2, width=160, height=128)
+    second = first.with_name("other.toml")
+    second.write_text(first.read_text().replace('name = "tiny"', 'name = "other"', 1))
+    with Site([tmp_path], port=0) as site:
+        page = browser.new_page(viewport={"width": 1280, "height": 800})
+        page.add_init_script(NOTE_NOTES)
+        page.goto(site.url)  # and at once, before it is connected:
+        for path, name in ((first, "tiny"), (second, "other")):
+            site.post(lambda path=path: site.open_sequence(path))
+            expect(page.get_by_text(f"in {path.stem}.carts")).to_be_visible(timeout=60_000)
+            wait_in(page, f"location.href.includes('project={name}')")
+        assert page.evaluate("localStorage.getItem('noted')") is None
+        page.close()

@@ -1,21 +1,20 @@
-"""Several tabs at once, in headless Chromium: everybody their own place in one project, whoever comes or goes."""
+"""Several tabs in headless Chromium: each has its own frame and settings in one project; addresses and tokens."""
 
 import math
 import socket
 import time
 from collections.abc import Callable
 from contextlib import closing
+from pathlib import Path
 
 import pytest
 from playwright.sync_api import Browser, Route, expect
-from viewer_canvas import Canvas, eventually
-from viewer_run import run_without_end
-from viewer_tab import Tab
-from waiting import wait_in
+from viewer_tab import OpenTab, Tab, box_of, new_context, place_of
+from waiting import eventually, wait_in
 
 from carts_viewer.actions import intents
 from carts_viewer.app import ViewerApp
-from carts_viewer.state import Phase
+from tools.raw_tab import RawTab
 
 pytestmark = pytest.mark.browser
 
@@ -23,215 +22,110 @@ EVERYWHERE = ".".join("0000")
 WINDOW = (1100, 720)
 
 
-def _shows_its_own(tab: Tab) -> None:
-    """Wait until a tab shows what the viewer has of it: frame, joint, opacity, note, history and the picture itself."""
-    app = tab.app
-    app.wait_until_shown()
+def shows_its_own(tab: Tab) -> None:
+    """Wait until a tab shows its state in the viewer: frame, joint, opacity, note, history and the picture itself."""
+    tab.app.wait_until_shown()
     state, joint = tab.state, tab.slider("PSM1", 0)
     for handle, value in (
         (tab.find("Frame"), state.index + 1),
         (joint, joint.value),
         (tab.find("Opacity %"), round(100 * state.opacity)),
     ):
-        field = tab.page.locator(f"[id='{app.page.element_id(handle)}'] + * input")
-        expect(field).to_have_value(f"{value:g}", timeout=20_000)
-    expect(tab.page.get_by_text(f"({state.index + 1} of {len(app.sequence)})")).to_be_visible(timeout=20_000)
-    tab.page.get_by_text("Review", exact=True).first.click()
+        expect(tab.field(handle)).to_have_value(f"{value:g}")
+    expect(tab.page.get_by_text(f"({state.index + 1} of {len(tab.app.sequence)})")).to_be_visible()
+    tab.open("Review")
     expect(tab.page.locator(".mantine-TextInput-input:visible").first).to_have_value(state.review.note)
-    history = tab.page.locator(f"[id='{app.page.element_id(tab.find('Go to'))}']")
-    expect(history).to_have_value(tab.find("Go to").value)
-    assert tab.canvas.eventually_registered() <= 1.5
-    tab.page.get_by_text("Optimize", exact=True).first.click()
+    expect(tab.page.locator(tab.element(tab.find("Go to")))).to_have_value(tab.find("Go to").value)
+    tab.canvas.wait_until_registered()
+    tab.open("Optimize")
 
 
-def _joint(tab: Tab) -> float:
+def joint_of(tab: Tab) -> float:
     return math.degrees(float(tab.state.pose.scene.joint_positions[0][0]))
 
 
-def test_three_tabs_are_at_three_places_and_one_that_reloads_is_where_it_was(
-    open_marked: Callable[..., ViewerApp], open_tab: Callable[..., Tab]
+def test_tabs_have_frames_of_their_own_and_one_project_also_after_a_reload_and_a_close_in_mid_drag(
+    open_tab: OpenTab,
 ) -> None:
-    app = open_marked()
-    first, second, third = (open_tab(app, WINDOW) for _ in range(3))
-    for tab in (second, third):
-        tab.place_in_viewer.put(intents.SetOpacity(1.0))
+    first = open_tab(window=WINDOW, marked=True)
+    app = first.app
+    second = open_tab(app, WINDOW)
+    second.put(intents.SetOpacity(1.0))
     first.type_value(first.find("Frame"), 2)
     eventually(lambda: first.state.index, lambda index: index == 1)
     value = round(second.slider("PSM1", 0).value - 3.0, 2)
     second.type_value(second.slider("PSM1", 0), value)
-    eventually(lambda: _joint(second), lambda at: abs(at - value) < 1e-3)
-    third.type_value(third.find("Opacity %"), 95)
-    eventually(lambda: third.state.opacity, lambda opacity: opacity == 0.95)
-    # The frame is everybody's own, the project is not.
-    assert [tab.state.index for tab in (first, second, third)] == [1, 0, 0]
-    assert abs(_joint(third) - value) < 1e-3 and [len(t.state.project.steps) for t in (first, second, third)] == [1] * 3
-    for tab in (first, second, third):
-        _shows_its_own(tab)
+    eventually(lambda: joint_of(second), lambda at: abs(at - value) < 1e-3)
+    assert [tab.state.index for tab in (first, second)] == [1, 0]
+    eventually(lambda: [tab.state.undoable for tab in (first, second)], lambda steps: steps == [1, 1])
+    shows_its_own(first)
+    shows_its_own(second)
     first.page.reload()
     first.wait_until_ready()
     assert first.state.index == 1 and "frame=2" in first.page.url
-    _shows_its_own(first)
-
-
-def test_a_tab_that_is_closed_in_mid_drag_leaves_a_saved_edit_and_does_not_hold_up_the_others(
-    open_marked: Callable[..., ViewerApp], open_tab: Callable[..., Tab]
-) -> None:
-    app = open_marked()
-    dragged, second = open_tab(app, WINDOW), open_tab(app, WINDOW)
-    second.place_in_viewer.put(intents.SetOpacity(1.0))
-    place = dragged.place_in_viewer
-    start = _joint(dragged)
-    box = dragged.page.locator(f"[id='{app.page.element_id(dragged.slider('PSM1', 0))}'] [role=slider]").bounding_box()
-    assert box is not None
-    x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
-    dragged.page.mouse.move(x, y)
-    dragged.page.mouse.down()
-    for step in range(15):
-        dragged.page.mouse.move(x + step, y)
-    eventually(lambda: abs(_joint(dragged) - start), lambda moved: moved > 1.0)
+    shows_its_own(first)
+    # One is closed in the middle of a drag, whose edit is saved when its time is over.
+    place, start = first.place_in_viewer, joint_of(first)
+    thumb = box_of(first.page.locator(f"{first.element(first.slider('PSM1', 0))} [role=slider]"))
+    x, y = thumb["x"] + thumb["width"] / 2, thumb["y"] + thumb["height"] / 2
+    first.page.mouse.move(x, y)
+    first.page.mouse.down()
+    first.page.mouse.move(x + 15, y, steps=15)
+    eventually(lambda: abs(joint_of(first) - start), lambda moved: moved > 1.0)
     assert place.controller.state.unsaved
-    dragged.page.close()
-    # Nobody has let go of the slider, so the edit is saved when its time is over.
-    eventually(lambda: place.controller.state.unsaved, lambda unsaved: not unsaved)
-    eventually(lambda: second.state.undoable, lambda steps: steps == 1)
-    _shows_its_own(second)
-    value = round(second.slider("PSM1", 0).value - 4.0, 2)
-    second.type_value(second.slider("PSM1", 0), value)
-    eventually(lambda: second.state.undoable, lambda steps: steps == 2)
-    _shows_its_own(second)
-
-
-def test_undo_and_redo_can_be_pressed_as_soon_as_the_other_tab_has_left(
-    open_viewer: Callable[..., ViewerApp], open_tab: Callable[..., Tab]
-) -> None:
-    app = open_viewer()
-    first, second = open_tab(app, WINDOW), open_tab(app, WINDOW)
-    first.type_value(first.slider("PSM1", 0), round(first.slider("PSM1", 0).value - 3.0, 2))
-    eventually(lambda: second.state.undoable, lambda steps: steps == 1)
-    undo, redo = (second.page.get_by_role("button", name=name, exact=True) for name in ("Undo", "Redo"))
-    expect(undo).to_be_disabled()
     first.page.close()
-    expect(undo).to_be_enabled()
-    undo.click()
-    eventually(lambda: app.project.state.joints(0), lambda joints: not joints)
-    expect(redo).to_be_enabled()
+    eventually(lambda: place.controller.state.unsaved, lambda unsaved: not unsaved)
+    eventually(lambda: second.state.undoable, lambda steps: steps == 2)
+    shows_its_own(second)
 
 
-def test_one_worker_does_what_three_tabs_ask_for_and_loses_nothing_of_it(
-    open_viewer: Callable[..., ViewerApp], open_tab: Callable[..., Tab]
-) -> None:
-    app = open_viewer(frames=12)
-    tabs = [open_tab(app, WINDOW) for _ in range(3)]
-    for count, tab in enumerate(tabs, start=1):
-        for _ in range(count):
-            tab.page.keyboard.press("n")
-    eventually(lambda: [tab.state.index for tab in tabs], lambda places: places == [1, 2, 3])
-    for tab in tabs:
-        tab.page.keyboard.press("o")
-    eventually(lambda: app.state.undoable, lambda steps: steps == 3)
-    for count, tab in enumerate(tabs, start=2):
-        expect(tab.page.get_by_text(f"({count} of 12)")).to_be_visible(timeout=20_000)
+def test_undo_and_redo_can_be_pressed_as_soon_as_the_other_tab_has_left(shared_viewer: ViewerApp) -> None:
+    app = shared_viewer
+    with RawTab(app.url) as raw:
+        undo, redo = (place_of(app, raw).view.page.find(name) for name in ("Undo", "Redo"))  # type: ignore[union-attr]
+        with RawTab(app.url) as other:
+            place_of(app, other).put(intents.Nudge(1.0))
+            app.wait_until_shown()
+            assert undo.disabled
+        eventually(lambda: not undo.disabled)
+        place_of(app, raw).put(intents.Undo())
+        app.wait_until_shown()
+        assert not app.project.state.joints(0) and not redo.disabled
 
 
-def test_a_run_goes_on_while_its_tab_reloads_and_others_work(
-    open_viewer: Callable[..., ViewerApp], open_tab: Callable[..., Tab]
-) -> None:
-    app = open_viewer()
-    run_without_end(app)
-    first, second = open_tab(app, WINDOW), open_tab(app, WINDOW)
-    first.button("Run")
-    expect(first.page.locator(".carts-status")).to_contain_text("running", timeout=30_000)
-    assert second.state.run.phase is Phase.IDLE
-    second.page.keyboard.press("n")
-    eventually(lambda: second.state.index, lambda index: index == 1)
-    second.page.keyboard.press("o")
-    eventually(lambda: second.state.undoable, lambda steps: steps >= 1)
-    before = len(first.state.run.curves.loss)
-    first.page.reload()
-    first.wait_until_ready()
-    assert first.state.index == 0 and first.state.run.phase is Phase.RUNNING
-    eventually(lambda: len(first.state.run.curves.loss), lambda count: count > before)
-    first.button("Pause")
-    eventually(lambda: first.state.run.phase, lambda phase: phase is Phase.PAUSED)
-
-
-def test_a_link_opens_its_frame_camera_and_domain_and_takes_nobody_along(
-    open_viewer: Callable[..., ViewerApp], open_tab: Callable[..., Tab], browser: Browser
-) -> None:
-    app = open_viewer(cameras=("left", "right"), domains=("regular", "smoke"))
-    first = open_tab(app, WINDOW)
-    place = first.place_in_viewer
-    for intent in (intents.ShowFrame(2), intents.ShowCamera("right"), intents.ShowDomain("smoke")):
-        place.put(intent)
-    app.wait_until_shown()
-    wait_in(first.page, "location.search.includes('domain=smoke') && location.search.includes('frame=3')")
-    link = first.page.url
-    first.type_value(first.find("Frame"), 1)
-    with closing(browser.new_context()) as context:
-        page = context.new_page()
-        page.goto(link)
-        other = Tab(app, page, Canvas(app, page))
-        other.wait_until_ready()
-        state = other.state
-        assert (state.index, state.camera, state.domain) == (2, "right", "smoke") and page.url == link
-        assert first.state.index == 0
-        page.goto(link.replace("project=tiny", "project=elsewhere"))
-        expect(page.get_by_text("This link is for elsewhere")).to_be_visible(timeout=20_000)
-
-
-def test_the_history_says_who_did_what_and_undo_takes_back_ones_own(
-    open_viewer: Callable[..., ViewerApp], open_tab: Callable[..., Tab]
-) -> None:
-    app = open_viewer()
-    ann, bob = open_tab(app, WINDOW), open_tab(app, WINDOW)
-    for tab, name in ((ann, "Ann"), (bob, "Bob")):
-        tab.page.get_by_text("Review", exact=True).first.click()
-        field = tab.page.locator(".mantine-TextInput-input:visible").last
-        field.fill(name)
-        field.press("Enter")
-        eventually(lambda tab=tab: tab.state.name, lambda known, name=name: known == name)
-        field.blur()
-    bob.page.keyboard.press("n")
-    eventually(lambda: bob.state.index, lambda index: index == 1)
-    ann.page.keyboard.press("o")
-    eventually(lambda: app.state.undoable, lambda steps: steps == 1)
-    bob.page.keyboard.press("o")
-    eventually(lambda: app.state.undoable, lambda steps: steps == 2)
-    names = [step.name for step in app.project.state.steps]
-    assert names[0].startswith("Ann: Nudge") and names[1].startswith("Bob: Nudge")
-    expect(ann.page.get_by_text("on frame 002")).to_be_visible(timeout=20_000)
-    ann.button("Undo")
-    eventually(lambda: app.state.undoable, lambda steps: steps == 3)
-    assert app.project.state.steps[2].name.startswith("Ann: Undo: Nudge")
-    assert not app.project.state.joints(0) and app.project.state.joints(1)
-    assert (ann.state.index, bob.state.index) == (0, 1)
+def test_a_link_opens_its_frame_camera_and_domain_and_takes_no_other_tab_along(open_tab: OpenTab) -> None:
+    query = "/?project=tiny&frame=3&camera=right&domain=smoke"
+    tab = open_tab(query=query, cameras=("left", "right"), domains=("regular", "smoke"))
+    state = tab.state
+    assert (state.index, state.camera, state.domain) == (2, "right", "smoke")
+    wait_in(tab.page, "location.search.includes('domain=smoke') && location.search.includes('frame=3')")
+    link = tab.page.url
+    with RawTab(tab.app.url) as other:
+        assert place_of(tab.app, other).controller.state.index == 0
+    tab.type_value(tab.find("Frame"), 1)
+    wait_in(tab.page, "location.search.includes('frame=1')")
+    tab.page.goto(link.replace("project=tiny", "project=elsewhere"))
+    expect(tab.page.get_by_text("This link is for elsewhere")).to_be_visible()
 
 
 def test_the_token_of_the_address_is_used_up_by_the_page_and_reloading_works(
-    tiny_sequence: Callable[..., object], untrained_weights: object, browser: Browser
+    tiny_sequence: Callable[..., Path], untrained_weights: Path, browser: Browser
 ) -> None:
-    with ViewerApp.open(tiny_sequence(), host=EVERYWHERE, port=0, weights=(untrained_weights,)) as app:  # type: ignore[arg-type]
+    with ViewerApp.open(tiny_sequence(), host=EVERYWHERE, port=0, weights=(untrained_weights,)) as app:
         plain = f"http://127.0.0.1:{app.page.server.get_port()}/"
-        context, stranger = browser.new_context(), browser.new_context()
-        try:
+        with closing(new_context(browser)) as context, closing(new_context(browser)) as stranger:
             page = context.new_page()
             page.goto(plain + "?" + app.url.partition("?")[2])
-            tab = Tab(app, page, Canvas(app, page))
+            tab = Tab(app, page)
             tab.wait_until_ready()
-            assert (
-                page.url.startswith(plain)
-                and "token" not in page.url
-                and "carts-" not in page.evaluate("document.cookie")
-            )
+            assert page.url.startswith(plain) and "token" not in page.url
+            assert "carts-" not in page.evaluate("document.cookie")
             page.reload()
             tab.wait_until_ready()
-            tab.page.keyboard.press("n")
+            tab.press("n")
             eventually(lambda: app.state.index, lambda index: index == 1)
             answer = stranger.new_page().goto(plain)
             assert answer is not None and answer.status == 403
-        finally:
-            context.close()
-            stranger.close()
 
 
 def _call_of_a_link(app: ViewerApp, browser: Browser, timeout: float, *, policy: bool = True) -> float | None:
@@ -241,12 +135,12 @@ def _call_of_a_link(app: ViewerApp, browser: Browser, timeout: float, *, policy:
         app: Whose page it is.
         browser: Which follows the link.
         timeout: How long to wait when the page is there [s].
-        policy: Whether the page comes with the header that says whom it may call.
+        policy: Whether the page comes with the header that restricts which servers it may call.
 
     Returns:
         The time from the click to the call [s]; None when there is none.
     """
-    with closing(browser.new_context()) as context, closing(socket.create_server(("127.0.0.1", 0))) as listener:
+    with closing(new_context(browser)) as context, closing(socket.create_server(("127.0.0.1", 0))) as listener:
         listener.settimeout(timeout)
         link = f"{app.url}/?websocket=ws://127.0.0.1:{listener.getsockname()[1]}"
         page = context.new_page()
@@ -268,10 +162,7 @@ def _without_policy(route: Route) -> None:
     route.fulfill(response=answer, headers=headers)
 
 
-def test_a_link_cannot_make_the_page_obey_another_server(
-    open_viewer: Callable[..., ViewerApp], browser: Browser
-) -> None:
-    app = open_viewer()
-    delay = _call_of_a_link(app, browser, 60.0, policy=False)
+def test_a_link_cannot_make_the_page_obey_another_server(shared_viewer: ViewerApp, browser: Browser) -> None:
+    delay = _call_of_a_link(shared_viewer, browser, 60.0, policy=False)
     assert delay is not None, "the link does nothing anyway, so this shows nothing"
-    assert _call_of_a_link(app, browser, 3.0 + 2.0 * delay) is None
+    assert _call_of_a_link(shared_viewer, browser, 3.0 + 2.0 * delay) is None

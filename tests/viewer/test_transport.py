@@ -1,15 +1,376 @@
-"""Private parts of viser and websockets: which ones are used, and that nothing outside `transport/` uses any."""
+"""Who may talk to the viewer, what may be sent, messages queued by several threads, and private names of viser."""
 
 import ast
+import asyncio
+import random
 import re
+import socket
+import threading
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
+from urllib.parse import parse_qs, urlsplit
+
+import msgspec
+import pytest
+from viser import _messages
+from viser._messages import GuiUpdateMessage
+from viser.infra import _infra
+from viser.infra._async_message_buffer import AsyncMessageBuffer
+from websockets.datastructures import Headers
 
 import carts_viewer
+from carts_core.errors import SettingsError
 from carts_core.resources import static_dir
+from carts_viewer.serving import opened_in_browser, webbrowser
+from carts_viewer.transport.guard import Guard, check_address, refusal
+from carts_viewer.transport.viser_private import LoopEvent, MessageBuffer, queue_safely
+
+EVERYWHERE = ".".join("0000")
+
+
+def _refusal(guard: Guard, host: str | None, *, target: str = "/", **headers: str) -> str | None:
+    return guard.refusal(target, Headers(**({} if host is None else {"Host": host}), **headers))
+
+
+@pytest.fixture
+def local() -> Guard:
+    """Of a server that only this computer reaches."""
+    return Guard("127.0.0.1")
+
+
+@pytest.fixture
+def shared() -> Guard:
+    """Of a server that everybody reaches."""
+    return Guard(EVERYWHERE)
+
+
+def _with_token(guard: Guard) -> str:
+    return f"/?token={guard.token}"
+
+
+def _cookie(guard: Guard, host: str = "192.168.0.7:8080") -> str:
+    """The cookie that a browser would send back."""
+    answer = guard.cookie(_with_token(guard), Headers(Host=host))
+    assert answer is not None
+    return answer.partition(";")[0]
+
+
+@pytest.mark.parametrize(
+    "host", ["127.0.0.1:8080", "localhost:8080", "localhost", "[::1]:8080", "127.0.0.1:9000", "127.0.0.2:8080"]
+)
+def test_this_computers_own_names_are_answered(local: Guard, host: str) -> None:
+    assert _refusal(local, host) is None
+    assert _refusal(local, host, Origin=f"http://{host}") is None
+
+
+@pytest.mark.parametrize(
+    "host",
+    [
+        *("evil.example", "evil.example:8080", "127.0.0.1.evil.example", "", "192.168.0.7:8080"),
+        *("[", "localhost:x", "localhost/x", "localhost?x", "a; b@localhost", "localhost:1 localhost", "@localhost"),
+    ],
+)
+def test_a_foreign_host_name_is_refused_so_that_dns_rebinding_does_not_work(local: Guard, host: str) -> None:
+    assert "was asked for" in (_refusal(local, host) or "")
+
+
+@pytest.mark.parametrize(
+    "origin", ["http://evil.example", "https://localhost:8080", "http://localhost:3000", "null", "http://localhost"]
+)
+def test_another_sites_page_is_refused_even_on_this_computer(local: Guard, origin: str) -> None:
+    assert "own page only" in (_refusal(local, "localhost:8080", Origin=origin) or "")
+
+
+@pytest.mark.parametrize("host", ["127.0.0.2", "127.0.0.1", "::1", "localhost", EVERYWHERE])
+def test_the_printed_address_is_answered(host: str) -> None:
+    guard = Guard(host)
+    url = urlsplit(guard.url(8080))
+    assert guard.refusal(f"{url.path or '/'}?{url.query}", Headers(Host=url.netloc)) is None
+
+
+_NAVIGATION = {"Sec-Fetch-Mode": "navigate", "Sec-Fetch-Dest": "document"}
+
+
+@pytest.mark.parametrize(
+    ("site", "target", "more", "answered"),
+    [
+        ("same-origin", "/thumbnail/0/0/0.jpg", {}, True),
+        ("none", "/thumbnail/0/0/0.jpg", _NAVIGATION, True),
+        ("cross-site", "/thumbnail/0/0/0.jpg", {"Sec-Fetch-Mode": "no-cors", "Sec-Fetch-Dest": "image"}, False),
+        ("same-site", "/thumbnail/0/0/0.jpg", {"Sec-Fetch-Mode": "no-cors", "Sec-Fetch-Dest": "image"}, False),
+        ("cross-site", "/thumbnail/0/0/0.jpg", _NAVIGATION, False),
+        ("cross-site", "/static/page.js", {"Sec-Fetch-Dest": "script"}, False),
+        ("cross-site", "/?frame=3", _NAVIGATION, True),
+        ("cross-site", "/", {"Sec-Fetch-Mode": "navigate", "Sec-Fetch-Dest": "iframe"}, False),
+        ("cross-site", "/", {"Sec-Fetch-Mode": "cors", "Sec-Fetch-Dest": "empty"}, False),
+    ],
+)
+def test_another_sites_page_may_link_to_the_page_and_load_nothing(
+    local: Guard, site: str, target: str, more: dict[str, str], answered: bool
+) -> None:
+    headers = Headers({"Host": "localhost:8080", "Sec-Fetch-Site": site} | more)
+    assert (local.refusal(target, headers) is None) == answered
+
+
+def test_a_request_with_two_hosts_or_none_is_refused(local: Guard) -> None:
+    both = Headers(Host="localhost:8080")
+    both["Host"] = "evil.example"
+    assert local.refusal("/", both) is not None
+    assert _refusal(local, None) is not None
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1", "127.1.2.3", "::1", "localhost"])
+def test_a_server_that_only_this_computer_reaches_needs_no_token(host: str) -> None:
+    guard = Guard(host)
+    assert guard.token is None and guard.cookie("/?token=", Headers(Host="localhost")) is None
+    assert guard.url(8080) == f"http://{'[::1]' if host == '::1' else host}:8080"
+
+
+@pytest.mark.parametrize("host", [EVERYWHERE, "192.168.0.7", "::", "fe80::1", "example.org"])
+def test_any_other_server_needs_a_token_of_its_own(host: str) -> None:
+    first, second = Guard(host), Guard(host)
+    assert first.token and second.token and first.token != second.token and len(first.token) >= 43
+    url = urlsplit(first.url(8080))
+    assert parse_qs(url.query) == {"token": [first.token]} and url.port == 8080
+    assert url.hostname not in (EVERYWHERE, "::")
+
+
+def test_with_the_token_or_its_cookie_every_request_is_answered_and_without_none(shared: Guard) -> None:
+    host = "192.168.0.7:8080"
+    assert "with the token" in (_refusal(shared, host) or "")
+    assert _refusal(shared, host, target=_with_token(shared)) is None
+    assert _refusal(shared, host, target=_with_token(shared) + "&fixedDpr=1") is None
+    assert _refusal(shared, host, target="/static/page.js", Cookie=f"other=1; {_cookie(shared)}; last=2") is None
+    # This computer's own names need it as well: anybody here could ask by them.
+    assert _refusal(shared, "localhost:8080") is not None
+
+
+def test_a_wrong_token_or_cookie_is_refused(shared: Guard) -> None:
+    host, other = "192.168.0.7:8080", Guard(EVERYWHERE)
+    token = shared.token or ""
+    for wrong in ("", token[:-1], token + "x", token.swapcase(), "%00", "ä", str(other.token), "%ff%fe"):
+        assert _refusal(shared, host, target=f"/?token={wrong}") is not None
+        assert shared.cookie(f"/?token={wrong}", Headers(Host=host)) is None
+    name = _cookie(shared).partition("=")[0]
+    # The token is no cookie, and a cookie of another server or of another port is none of ours.
+    for wrong in (f"{name}={token}", _cookie(other), f"{name}=", name, _cookie(shared, "192.168.0.7:9000"), ";=;"):
+        assert _refusal(shared, host, Cookie=wrong) is not None
+    assert _refusal(shared, host, target=f"/?other={token}") is not None
+
+
+def test_no_script_and_no_other_site_gets_at_the_cookie(shared: Guard) -> None:
+    answer = shared.cookie(_with_token(shared), Headers(Host="192.168.0.7:8080")) or ""
+    assert {"HttpOnly", "SameSite=Strict", "Path=/"} <= set(answer.split("; "))
+    assert shared.token is not None and shared.token not in answer
+
+
+@pytest.mark.parametrize("origin", ["http://evil.example", "null", "http://192.168.0.7"])
+def test_another_sites_page_is_refused_with_the_right_token_too(shared: Guard, origin: str) -> None:
+    refusal = _refusal(shared, "192.168.0.7:8080", target=_with_token(shared), Origin=origin)
+    assert "own page only" in (refusal or "")
+
+
+def test_where_others_reach_the_server_it_answers_by_address_and_own_name_but_by_no_other_name(shared: Guard) -> None:
+    for host in ("192.168.0.7:8080", "[fe80::1]:8080", "localhost:8080", f"{socket.gethostname()}:8080"):
+        assert _refusal(shared, host, target=_with_token(shared)) is None
+    assert "was asked for" in (_refusal(shared, "evil.example:8080", target=_with_token(shared)) or "")
+    assert _refusal(Guard("example.org"), "Example.org:8080", Cookie="x") == _refusal(shared, "192.168.0.7:8080")
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1", "::1", "localhost", EVERYWHERE])
+def test_addresses_of_this_computer_may_be_listened_on(host: str) -> None:
+    check_address(host, 0)
+
+
+@pytest.mark.parametrize("host", ["192.0.2.7", "not a name", "", "\udcff"])
+def test_an_address_of_another_computer_is_an_error_that_names_it(host: str) -> None:
+    with pytest.raises(SettingsError, match=r"cannot listen on .* Use 127\.0\.0\.1"):
+        check_address(host, 0)
+
+
+@pytest.mark.parametrize("port", [-1, 65536])
+def test_a_port_that_is_none_is_an_error(port: int) -> None:
+    with pytest.raises(SettingsError, match="Ports go from 1 to 65535"):
+        check_address("127.0.0.1", port)
+
+
+def test_a_token_is_not_on_the_command_line_of_the_browser(monkeypatch: pytest.MonkeyPatch) -> None:
+    opened: list[str] = []
+    monkeypatch.setattr(webbrowser, "open", opened.append)
+    url = "http://192.168.0.7:8080/?token=secret&more"
+    with opened_in_browser(url):
+        (given,) = opened
+        page = Path(given.removeprefix("file://"))
+        assert "secret" not in given and "url=http://192.168.0.7:8080/?token=secret&amp;more" in page.read_text()
+        assert page.stat().st_mode & 0o777 == 0o600 and page.parent.stat().st_mode & 0o777 == 0o700
+    assert not page.parent.exists()
+    with opened_in_browser("http://127.0.0.1:8080"):
+        assert opened[1:] == ["http://127.0.0.1:8080"]
+
+
+# ---- Incoming messages; a real viewer under fire is in test_hostile.py ----------------------------------------------
+
+
+WIDGETS = {"slider": 1.5, "frame": 3, "box": True, "text": "a", "colour": (1, 2, 3)}
+
+
+def _refused(data: Any) -> str | None:
+    packed = data if isinstance(data, bytes | str) else msgspec.msgpack.encode(data)
+    return refusal(packed, WIDGETS.get)
+
+
+def _update(element: str, value: Any, **more: Any) -> dict[str, Any]:
+    return {"type": "GuiUpdateMessage", "uuid": element, "updates": {"value": value}, **more}
+
+
+@pytest.mark.parametrize(
+    ("element", "values"),
+    [("slider", (2.5, 2, -1e9)), ("frame", (2, 2.0)), ("box", (False,)), ("text", ("ä" * 999,))],
+)
+def test_a_value_of_the_widgets_own_kind_is_taken(element: str, values: tuple[Any, ...]) -> None:
+    assert [_refused(_update(element, value)) for value in values] == [None] * len(values)
+
+
+@pytest.mark.parametrize("element", ["slider", "frame"])
+def test_a_number_that_is_none_or_beyond_all_range_is_refused(element: str) -> None:
+    for value in (float("nan"), float("inf"), -float("inf"), 1e300, -1e17, 2**63):
+        assert _refused(_update(element, value)) == "a number out of all range"
+
+
+@pytest.mark.parametrize(
+    ("element", "values"),
+    [
+        ("slider", ("nan", "9" * 4000, True, None, [1.0], {"a": 1}, b"1")),
+        ("frame", ("1", False, [])),
+        ("text", (1, 1.0, True, None, ["a"])),
+        ("box", (1, "True", None)),
+        ("colour", (1, "a", [1, 2, 3])),
+        ("no such widget", (1, "a", True)),
+    ],
+)
+def test_a_value_of_another_kind_is_refused(element: str, values: tuple[Any, ...]) -> None:
+    for value in values:
+        assert _refused(_update(element, value)), value
+
+
+@pytest.mark.parametrize(
+    "name", ["removed", "sync_cb", "update_cb", "uuid", "disabled", "label", "max", "options", "is_button", "content"]
+)
+def test_only_the_value_of_a_widget_can_be_set(name: str) -> None:
+    assert _refused({"type": "GuiUpdateMessage", "uuid": "text", "updates": {name: "a"}})
+    assert _refused({"type": "GuiUpdateMessage", "uuid": "text", "updates": {"value": "a", name: "a"}})
+    assert _refused(_update("text", "a", **{name if name != "uuid" else "id": "a"}))
+
+
+def test_of_the_messages_of_viser_three_are_taken_and_all_others_refused() -> None:
+    taken = {"GuiUpdateMessage", "CommandTriggerMessage", "ViewerCameraMessage"}
+    known = {kind.__name__ for kind in _messages.Message.get_subclasses()}
+    assert known >= taken | {"ShareUrlRequest", "FileTransferStartUpload", "FileTransferPart"}
+    for name in known - taken:
+        assert _refused({"type": name, "uuid": "text"}), name
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        *(b"", b"\xc1", b"\x93\x01\x02", "text", b"\x81\xa4type\xa2\xff\xfe"),
+        b"\x82\xa1a" + b"\x91" * 200_000 + b"\xc0\xa4type\xb0GuiUpdateMessage",
+        msgspec.msgpack.encode(_update("text", "a")) + b"\x00",
+        msgspec.msgpack.encode([_update("text", "a")]),
+        msgspec.msgpack.encode({"uuid": "text"}),
+    ],
+    ids=lambda data: repr(data[:20]),
+)
+def test_what_is_no_message_at_all_is_refused(data: bytes | str) -> None:
+    assert _refused(data)
+
+
+def test_no_bytes_whatever_raise_anything_else() -> None:
+    dice, whole = random.Random(0), msgspec.msgpack.encode(_update("slider", 2.5))
+    refused = 0
+    for _ in range(5000):
+        data = bytearray(whole)
+        for _ in range(dice.randrange(1, 4)):
+            data[dice.randrange(len(data))] = dice.randrange(256)
+        refused += refusal(bytes(data), WIDGETS.get) is not None
+    assert refused > 4000
+
+
+# ---- Outgoing messages ----------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def event_loop_in_a_thread():
+    loop = asyncio.new_event_loop()
+    thread = threading.Thread(target=loop.run_forever)
+    thread.start()
+    yield loop
+    loop.call_soon_threadsafe(loop.stop)
+    thread.join()
+    loop.close()
+
+
+def test_an_event_is_set_by_its_loop_only(event_loop_in_a_thread: asyncio.AbstractEventLoop) -> None:
+    event = LoopEvent(event_loop_in_a_thread)
+    waiting = asyncio.run_coroutine_threadsafe(event.wait(), event_loop_in_a_thread)
+    event.set()
+
+    async def set_on_another_loop() -> None:
+        event.set()
+
+    other = threading.Thread(target=lambda: asyncio.run(set_on_another_loop()))
+    other.start()
+    other.join()
+    assert not event.is_set()
+    event_loop_in_a_thread.call_soon_threadsafe(event.set)
+    assert waiting.result(10) and event.is_set()
+
+
+def test_every_tab_gets_what_threads_queue_at_the_same_time(event_loop_in_a_thread: asyncio.AbstractEventLoop) -> None:
+    loop, tabs, threads, messages = event_loop_in_a_thread, 8, 3, 1000
+    buffer = MessageBuffer(loop, persistent_messages=True, window_duration_sec=0.0)
+    failures: list[BaseException] = []
+
+    async def receive(tab: int) -> set[str]:
+        seen: set[str] = set()
+        async for window in buffer.window_generator(tab):
+            seen |= {message.uuid for message in window if isinstance(message, GuiUpdateMessage)}
+            if len(seen) == threads * messages:
+                break
+        return seen
+
+    def send(thread: int) -> None:
+        try:
+            for number in range(messages):
+                buffer.push(GuiUpdateMessage(f"{thread}-{number}", {"value": number}))
+        except BaseException as error:
+            failures.append(error)
+
+    received = [asyncio.run_coroutine_threadsafe(receive(tab), loop) for tab in range(tabs)]
+    senders = [threading.Thread(target=send, args=(thread,)) for thread in range(threads)]
+    for sender in senders:
+        sender.start()
+    for sender in senders:
+        sender.join()
+    assert not failures
+    expected = {f"{thread}-{number}" for thread in range(threads) for number in range(messages)}
+    assert all(future.result(60) == expected for future in received)
+
+
+def test_servers_and_tabs_use_safe_queues(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(_infra, "AsyncMessageBuffer", AsyncMessageBuffer)
+    queue_safely()
+    assert _infra.AsyncMessageBuffer is MessageBuffer  # pyright: ignore[reportPrivateImportUsage]
+
+
+# ---- Private names of viser and websockets --------------------------------------------------------------------------
+
 
 PACKAGE = Path(carts_viewer.__file__).parent
 TOOLS = PACKAGE.parent / "tools"
+
+
 USED = {
     "transport/viser_private.py": {
         "viser._gui_api",
@@ -25,6 +386,8 @@ USED = {
     },
 }
 """Every private name of theirs, by the module that uses it. Look at each when viser is updated."""
+
+
 REPLACED = {
     "transport/viser_private.py": {
         "_infra.AsyncMessageBuffer",
@@ -34,9 +397,9 @@ REPLACED = {
     "transport/guard.py": {"websockets.asyncio.server.serve"},
 }
 """What is replaced in their modules while a server starts."""
+
+
 SCRIPTS = ("page.js", "paint.js", "marks.js", "loupe.js", "drag.js", "timeline.js", "shell.js", "document.js")
-IN_THE_PAGE = {name: {"__viserMutable"} for name in SCRIPTS}
-"""What our scripts use of viser's page that it does not document."""
 
 
 def private_names(module: ast.Module) -> Iterator[str]:
@@ -54,12 +417,8 @@ def private_names(module: ast.Module) -> Iterator[str]:
 
 def replaced_names(module: ast.Module) -> Iterator[str]:
     """Attributes of imported modules that are assigned to, by their full names."""
-    modules = {
-        (alias.asname or alias.name).split(".")[0]
-        for node in ast.walk(module)
-        if isinstance(node, ast.Import | ast.ImportFrom)
-        for alias in node.names
-    }
+    imports = [node for node in ast.walk(module) if isinstance(node, ast.Import | ast.ImportFrom)]
+    modules = {(alias.asname or alias.name).split(".")[0] for node in imports for alias in node.names}
     for node in ast.walk(module):
         for target in node.targets if isinstance(node, ast.Assign) else ():
             name = ast.unparse(target)
@@ -67,26 +426,16 @@ def replaced_names(module: ast.Module) -> Iterator[str]:
                 yield name
 
 
-def _found(search, folder: Path) -> dict[str, set[str]]:
-    texts = {path.relative_to(folder).as_posix(): path.read_text(encoding="utf-8") for path in folder.rglob("*.py")}
-    found = {name: set(search(ast.parse(text))) for name, text in texts.items()}
-    assert found
-    return {name: names for name, names in found.items() if names}
-
-
-def test_every_private_name_of_viser_that_is_used_is_in_the_list() -> None:
-    assert _found(private_names, PACKAGE) == USED
-
-
-def test_everything_that_is_replaced_in_other_packages_is_in_the_list() -> None:
-    assert _found(replaced_names, PACKAGE) == REPLACED
-
-
-def test_the_measuring_tools_use_nothing_private() -> None:
-    assert _found(private_names, TOOLS) == {}
+def test_every_private_name_of_viser_that_is_used_or_replaced_is_in_the_lists() -> None:
+    modules = {
+        path.relative_to(PACKAGE).as_posix(): ast.parse(path.read_text("utf-8")) for path in PACKAGE.rglob("*.py")
+    }
+    for search, known in ((private_names, USED), (replaced_names, REPLACED)):
+        found = {name: set(search(module)) for name, module in modules.items()}
+        assert {name: names for name, names in found.items() if names} == known
+    assert not any(set(private_names(ast.parse(path.read_text("utf-8")))) for path in TOOLS.rglob("*.py"))
 
 
 def test_what_our_scripts_use_of_the_page_of_viser_is_in_the_list() -> None:
-    texts = {path.name: path.read_text(encoding="utf-8") for path in static_dir().glob("*.js")}
-    found = {name: set(re.findall(r"__viser\w*", text)) for name, text in texts.items()}
-    assert {name: names for name, names in found.items() if names} == IN_THE_PAGE
+    found = {path.name: set(re.findall(r"__viser\w*", path.read_text("utf-8"))) for path in static_dir().glob("*.js")}
+    assert {name: names for name, names in found.items() if names} == {name: {"__viserMutable"} for name in SCRIPTS}

@@ -1,13 +1,12 @@
 """Two people in two tabs, on different frames, at random: nothing of one gets into the other's work."""
 
 import random
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 import pytest
-from places import place_of
+from viewer_tab import OpenViewer, place_of
 
 from carts_core.project import ReviewState
 from carts_viewer.actions import intents
@@ -111,10 +110,10 @@ def _campaign(app: ViewerApp, actions: int, seed: int) -> None:
         assert edits > 0 and any(step.name.startswith("Tab 2: ") for step in app.project.state.steps)
 
 
-def test_two_people_on_different_frames_do_not_disturb_one_another(open_viewer: Callable[..., ViewerApp]) -> None:
+def test_two_people_on_different_frames_do_not_disturb_one_another(open_viewer: OpenViewer) -> None:
     _campaign(open_viewer(frames=FRAMES, masks=False), 40, 1)
 
 
 @pytest.mark.slow
-def test_two_people_do_two_thousand_things_each(open_viewer: Callable[..., ViewerApp]) -> None:
+def test_two_people_do_two_thousand_things_each(open_viewer: OpenViewer) -> None:
     _campaign(open_viewer(frames=FRAMES, masks=False), 2000, 2)

@@ -1,5 +1,6 @@
 """A controller at work without threads or a page, with the real optimizer."""
 
+from pathlib import Path
 from typing import Any
 
 from carts_core.optimization import DescentSolver, FreeParameters
@@ -49,6 +50,12 @@ class Desk:
 
         self.background = Background(state, own, self.renderer, factory, deliver)
         self.controller = Controller(state, self.session, self.renderer, factory, self.background, deliver)
+
+    @classmethod
+    def open(cls, sequence: Path, *, project: Path | None = None, **networks: Any) -> "Desk":
+        """The desk of a sequence file, by options of the networks; without any, they are the shipped ones."""
+        opened = Sequence.open(sequence)
+        return cls(opened, Project.open(opened, project), OptimizerFactory(report=lambda line: None, **networks))
 
     def reopened(self, *, read_only: bool = False) -> "Desk":
         """Another desk for the same project, after this one is closed."""

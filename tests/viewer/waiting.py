@@ -1,29 +1,33 @@
-"""Asking a running viewer, and waiting for it."""
+"""Requests to a running viewer, and waits for conditions."""
 
 import http.client
 import time
 from collections.abc import Callable
+from typing import TypeVar
 
 from playwright.sync_api import Error, Page
 
+T = TypeVar("T")
+
 
 def get(url: str, path: str = "/", **headers: str) -> http.client.HTTPResponse:
-    """The answer to a request, to the server that an address names."""
+    """The answer to a request, from the server that an address names."""
     connection = http.client.HTTPConnection(url.removeprefix("http://").partition("/")[0], timeout=20)
     connection.request("GET", path, headers=headers)
     return connection.getresponse()
 
 
-def wait_for(condition: Callable[[], bool], seconds: float = 20.0) -> None:
-    """Return once a condition holds; an error if it does not in time."""
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end, f"it did not come true in {seconds:g} s"
+def eventually(read: Callable[[], T], good: Callable[[T], object] = bool, timeout: float = 30.0) -> T:
+    """Read until the value is good; an error with the last value after `timeout` [s]."""
+    end = time.monotonic() + timeout
+    while not good(value := read()):
+        assert time.monotonic() < end, f"still {value!r} after {timeout:g} s"
         time.sleep(0.02)
+    return value
 
 
-def wait_in(page: Page, expression: str, seconds: float = 60.0) -> None:
-    """Return once an expression holds in a tab; an error if it does not in time.
+def wait_in(page: Page, expression: str, timeout: float = 60.0) -> None:
+    """Return once an expression holds in a tab.
 
     Playwright's own `wait_for_function` evaluates a text in the page, which the page's policy forbids.
     """
@@ -36,4 +40,4 @@ def wait_in(page: Page, expression: str, seconds: float = 60.0) -> None:
                 return False
             raise
 
-    wait_for(holds, seconds)
+    eventually(holds, timeout=timeout)

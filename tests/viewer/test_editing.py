@@ -1,0 +1,466 @@
+"""Edits of a project: history, keypoints, dragged links, poses of frames, and people who work at the same time."""
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from viewer_desk import Desk
+
+from carts_core.errors import CartsError
+from carts_core.model.keypoints import Keypoint, project_keypoints
+from carts_core.model.scene import Scene
+from carts_core.project import Figures, Key, Kind, Project, Provenance, Review, ReviewState, Source
+from carts_core.recording import Sequence
+from carts_viewer.actions import intents
+from carts_viewer.editing import People
+from carts_viewer.picture.overlay import keypoints_in_image, labelled_keypoints
+from carts_viewer.session import Session
+from carts_viewer.state import Pose, ViewState
+
+
+def _drag(desk: Desk, *values: float, joint: int = 0) -> None:
+    desk.do(*(intents.SetJoint("PSM1", joint, value) for value in values), intents.Released())
+
+
+def test_a_drag_is_saved_when_it_is_let_go_of_and_not_before(desk: Desk) -> None:
+    desk.do(intents.SetJoint("PSM1", 0, 0.1))
+    assert desk.state.unsaved and not desk.saved.steps
+    desk.do(intents.SetJoint("PSM1", 0, 0.2), intents.Released())
+    assert not desk.state.unsaved and [step.name for step in desk.saved.steps] == ["Move PSM1 yaw, frame 001"]
+    assert desk.saved.joints(0)["PSM1"].provenance.source is Source.HAND
+
+
+def test_saved_edits_come_with_the_figures_of_the_pose(desk: Desk) -> None:
+    _drag(desk, 0.1)
+    figures = desk.saved.figures(0)
+    assert figures is not None and desk.state.scores is not None and figures.dice == desk.state.scores.dice
+    desk.do(intents.SetNote("half hidden"), intents.Released())
+    assert desk.saved.figures(0) == figures
+
+
+def test_looking_at_a_frame_keeps_its_figures_and_is_no_step(desk: Desk) -> None:
+    desk.controller.score()
+    figures = desk.saved.figures(0)
+    assert figures is not None and figures.dice is not None and not desk.saved.steps
+
+
+def test_a_kept_run_is_one_step_with_loss_settings_and_review(desk: Desk) -> None:
+    desk.do(intents.Perturb(2.0, 0), intents.Run())
+    desk.advance()
+    assert desk.state.unsaved and len(desk.saved.steps) == 1
+    desk.finish()
+    step, correction = desk.saved.steps[-1], desk.saved.joints(0)["PSM1"]
+    assert step.name == "Optimize, frame 001" and len(desk.saved.steps) == 2
+    assert '"iterations": 4' in (correction.provenance.settings or "")
+    assert correction.provenance.weights_sha256 is not None
+    figures = desk.saved.figures(0)
+    assert figures is not None and figures.loss == min(desk.state.run.curves.loss)
+    assert desk.state.review.state is ReviewState.OPTIMIZED
+
+
+def test_resetting_a_run_that_goes_on_leaves_no_trace_and_a_finished_one_a_step(desk: Desk) -> None:
+    desk.do(intents.Run())
+    desk.advance()
+    desk.advance()
+    desk.do(intents.Reset())
+    assert not desk.saved.steps and desk.state.pose.source is Source.MEASURED
+    desk.do(intents.Run())
+    desk.finish()
+    desk.do(intents.Reset())
+    assert [step.name.split(",")[0] for step in desk.saved.steps] == ["Optimize", "Reset to the start of the run"]
+    assert not desk.state.project.joints(0) and desk.state.review.state is ReviewState.UNTOUCHED
+
+
+def test_accept_and_next_goes_on_until_all_frames_are_reviewed(desk: Desk) -> None:
+    desk.do(intents.ShowFrame(1), intents.AcceptAndNext())
+    assert desk.state.index == 2
+    desk.do(intents.SetReview(ReviewState.REJECTED), intents.ShowUnreviewed())
+    assert desk.state.index == 0
+    assert desk.do(intents.AcceptAndNext()).index == 0
+    with pytest.raises(CartsError, match="Every frame has been reviewed"):
+        desk.do(intents.ShowUnreviewed())
+    states = [desk.state.project.review(index).state for index in range(3)]
+    assert states == [ReviewState.ACCEPTED, ReviewState.ACCEPTED, ReviewState.REJECTED]
+
+
+def test_a_note_is_one_step_and_stays_when_the_state_changes(desk: Desk) -> None:
+    pose = desk.state.pose
+    # The picture does not change, so it need not be sent again.
+    assert desk.do(intents.SetNote("s")).pose is pose
+    desk.do(intents.SetNote("sm"), intents.SetNote("smoke"), intents.SetReview(ReviewState.NEEDS_WORK))
+    review = desk.saved.review(0)
+    assert (review.state, review.note) == (ReviewState.NEEDS_WORK, "smoke") and len(desk.saved.steps) == 2
+    desk.do(intents.SetNote("x" * 100_000), intents.Released())
+    assert len(desk.saved.review(0).note) == 10_000
+
+
+def test_the_worst_frame_that_is_not_settled_comes_first(desk: Desk) -> None:
+    project = desk.session.editor.project
+    project.record_figures({index: Figures(dice=dice) for index, dice in enumerate((0.9, 0.5, 0.7))}, project.state)
+    desk.do(intents.Refresh(), intents.ShowFrame(1))
+    visited = [
+        desk.state.index,
+        *(desk.do(intents.ShowWorse()).index for _ in range(2)),
+        desk.do(intents.ShowWorse(-1)).index,
+    ]
+    assert visited == [1, 2, 0, 2]
+    desk.do(intents.ShowFrame(1), intents.SetReview(ReviewState.ACCEPTED), intents.ShowFrame(2))
+    assert [desk.do(intents.ShowWorse()).index for _ in range(2)] == [0, 2]
+
+
+def test_keys_nudge_the_joint_that_was_moved_last_or_chosen(desk: Desk) -> None:
+    _drag(desk, 0.1, joint=1)
+    desk.do(intents.Nudge(1.0))
+    assert np.degrees(desk.joint(1)) == pytest.approx(np.degrees(0.1) + 1.0, abs=1e-4)
+    before = desk.joint(2)
+    desk.do(intents.ChooseJoint(), intents.Nudge(-0.1))
+    assert desk.joint(2) == pytest.approx(before - 1e-4, abs=1e-7)
+    with pytest.raises(CartsError, match="no joint"):
+        desk.do(intents.ChooseJoint(("PSM9", 0)))
+    assert len(desk.saved.steps) == 3
+
+
+def _pixels(desk: Desk) -> dict[str, list[float]]:
+    """Where the keypoints truly are in the shown camera."""
+    scene, points = desk.session.scene, labelled_keypoints(desk.session.scene)
+    state = scene.state(desk.state.frame.truth or {})
+    pixels = project_keypoints(scene, state, list(points.values()), desk.state.camera).tolist()
+    return dict(zip(points, pixels, strict=True))
+
+
+def test_clicks_on_two_keypoints_bring_a_badly_wrong_arm_back(desk: Desk) -> None:
+    desk.do(intents.Perturb(5.0, 0))
+    desk.controller.score()
+    assert desk.state.scores is not None and desk.state.scores.dice is not None and desk.state.scores.dice < 0.6
+    for label in ("jaw 1 tip", "wrist pitch joint"):
+        u, v = _pixels(desk)[label]
+        desk.do(intents.ChooseKeypoint(label), intents.PointAt(u, v), intents.Released())
+    assert max(desk.state.keypoints.residuals) < 0.5
+    figures = desk.saved.figures(0)
+    assert figures is not None and (figures.dice or 0.0) > 0.9
+    assert [step.name for step in desk.saved.steps][1:] == [
+        "Place jaw 1 tip, frame 001",
+        "Place wrist pitch joint, frame 001",
+    ]
+
+
+def test_a_dragged_keypoint_is_the_one_that_was_nearest_and_one_step(desk: Desk) -> None:
+    points = labelled_keypoints(desk.session.scene)
+    scene = desk.session.scene
+    shown = project_keypoints(scene, desk.state.pose.scene, list(points.values()), "left")
+    u, v = shown[list(points).index("wrist pitch joint")].tolist()
+    desk.do(*(intents.PointAt(u + step, v) for step in (0.5, 3.0, 6.0)), intents.Released())
+    (pin,) = desk.state.keypoints.pins
+    assert pin.keypoint.name == "wrist pitch joint" and pin.pixel == pytest.approx((u + 6.0, v))
+    assert len(desk.saved.steps) == 1 and desk.state.keypoints.residuals[0] < 0.5
+
+
+@pytest.mark.parametrize(
+    "intent", [intents.SetJoint("PSM1", 0, 0.1), intents.MoveFrame(1), intents.Undo(), intents.ForgetPins()]
+)
+def test_pins_are_forgotten_when_the_pose_is_changed_otherwise(desk: Desk, intent: intents.Intent) -> None:
+    desk.do(intents.PointAt(40.0, 30.0), intents.Released())
+    assert desk.state.keypoints.pins
+    assert not desk.do(intent).keypoints.pins
+
+
+def test_a_place_that_is_none_is_refused_and_one_outside_the_image_is_at_its_edge(desk: Desk) -> None:
+    with pytest.raises(CartsError, match="no place in the image"):
+        desk.do(intents.PointAt(float("nan"), 3.0))
+    with pytest.raises(CartsError, match="There is no keypoint"):
+        desk.do(intents.ChooseKeypoint("elbow"))
+    desk.do(intents.PointAt(1e9, -1e9))
+    assert desk.state.keypoints.pins[0].pixel == (96.0, 0.0)
+
+
+def test_keypoints_that_the_image_shows_are_named_with_their_places(desk: Desk) -> None:
+    state, scene = desk.state, desk.session.scene
+    points = labelled_keypoints(scene)
+    pixels = project_keypoints(scene, state.pose.scene, list(points.values()), "left").tolist()
+    found = keypoints_in_image(scene, state.pose.scene, "left", points)
+    assert found and len(found) <= len(points)
+    for label, u, v in found:
+        assert (96 * u, 72 * v) == pytest.approx(pixels[list(points).index(label)], abs=1e-2)
+
+
+def test_clicks_stay_when_the_optimizer_runs_and_say_how_far_off_they_are_then(desk: Desk) -> None:
+    desk.do(intents.PointAt(40.0, 30.0), intents.Released())
+    (pin,) = desk.state.keypoints.pins
+    desk.do(intents.Run())
+    state = desk.finish()
+    assert state.keypoints.pins == (pin,)
+    at = project_keypoints(desk.session.scene, state.pose.scene, [pin.keypoint], "left")[0]
+    assert state.keypoints.residuals == pytest.approx([math.dist(at.tolist(), pin.pixel)], abs=1e-3)
+    # The next click starts from where the run has ended, not from before it.
+    before = state.pose.scene
+    desk.do(intents.PointAt(*at.tolist()), intents.Released())
+    pairs = zip(before.joint_positions, desk.state.pose.scene.joint_positions, strict=True)
+    assert all(np.allclose(one, other, atol=2e-3) for one, other in pairs)
+
+
+def test_a_click_in_another_camera_is_of_that_camera(desk: Desk) -> None:
+    desk.do(intents.PointAt(40.0, 30.0, "right"))
+    assert desk.state.keypoints.pins[0].camera == "right" and desk.state.camera == "left"
+
+
+def test_edits_of_a_project_that_takes_none_are_shown_until_another_frame_is(desk: Desk) -> None:
+    _drag(desk, 0.1)
+    other = desk.reopened(read_only=True)
+    _drag(other, 0.3)
+    _drag(other, 0.4, joint=1)
+    assert other.state.unsaved and other.joint() == pytest.approx(0.3) and other.joint(1) == pytest.approx(0.4)
+    other.do(intents.Undo())
+    assert not other.state.unsaved and other.joint() == pytest.approx(0.1)
+    with pytest.raises(CartsError, match="cannot be changed"):
+        other.do(intents.Undo())
+    assert isinstance(other.session.editor.project, Project) and len(other.saved.steps) == 1
+
+
+# ---- Links that are dragged -----------------------------------------------------------------------------------------
+
+
+def _seen(scene: Scene, state: ViewState, point: Keypoint) -> tuple[float, float]:
+    u, v = project_keypoints(scene, state.pose.scene, [point], state.camera)[0].tolist()
+    return u, v
+
+
+def _taken(desk: Desk) -> tuple[tuple[float, float], Keypoint]:
+    """A place of the image where the arm is, and what is there."""
+    rows, columns = np.nonzero(desk.renderer.arm_ids(desk.state.pose.scene, desk.state.camera) == 0)
+    place = float(np.median(columns)) + 0.5, float(rows[np.abs(columns - np.median(columns)).argmin()]) + 0.5
+    point = desk.renderer.pick(desk.state.pose.scene, desk.state.camera, place, 15.0)
+    assert point is not None
+    return place, point
+
+
+def test_the_point_that_was_taken_follows_the_pointer_and_a_gesture_is_one_step(desk: Desk) -> None:
+    place, point = _taken(desk)
+    before, start = _seen(desk.session.scene, desk.state, point), desk.state.pose.scene
+    for share in (0.3, 0.7, 1.0):
+        end = place[0] + share * 9.0, place[1] - share * 6.0
+        desk.do(intents.DragLink(1.0, "left", place, end))
+    after = _seen(desk.session.scene, desk.state, point)
+    assert (after[0] - before[0], after[1] - before[1]) == pytest.approx((9.0, -6.0), abs=0.5)
+    desk.do(intents.Released())
+    assert desk.saved.position == 1 and desk.saved.steps[0].name.startswith("Drag PSM1 ")
+    desk.do(intents.Undo())
+    for one, other in zip(desk.state.pose.scene.joint_positions, start.joint_positions, strict=True):
+        assert torch.equal(one, other)
+
+
+def test_dragging_a_link_back_brings_the_joints_back(desk: Desk) -> None:
+    place, _ = _taken(desk)
+    start = desk.session.joints(desk.state.pose.scene)
+    desk.do(intents.DragLink(1.0, "left", place, (place[0] + 20.0, place[1])))
+    away = desk.session.joints(desk.state.pose.scene)
+    assert max(np.abs(away[arm] - start[arm]).max() for arm in start) > 0.005
+    desk.do(intents.DragLink(1.0, "left", place, place))
+    back = desk.session.joints(desk.state.pose.scene)
+    assert max(np.abs(back[arm] - start[arm]).max() for arm in start) < 1e-4
+
+
+def test_joints_stay_within_their_limits_however_far_a_link_is_dragged(desk: Desk) -> None:
+    place, _ = _taken(desk)
+    desk.do(intents.DragLink(1.0, "left", place, (1e6, -1e6)))
+    for arm in desk.session.scene.arms:
+        values = desk.session.joints(desk.state.pose.scene)[arm.name]
+        low, high = arm.robot.joint_limits.double().numpy().T
+        assert (values >= low - 1e-6).all() and (values <= high + 1e-6).all()
+
+
+def test_where_no_arm_is_that_is_said_once_and_nothing_moves(desk: Desk) -> None:
+    ids = desk.renderer.arm_ids(desk.state.pose.scene, "left")
+    corners = [(0, 0), (0, ids.shape[1] - 1), (ids.shape[0] - 1, 0), (ids.shape[0] - 1, ids.shape[1] - 1)]
+    row, column = next((r, c) for r, c in corners if (ids[max(r - 20, 0) : r + 20, max(c - 20, 0) : c + 20] < 0).all())
+    with pytest.raises(CartsError, match="no arm under the pointer"):
+        desk.do(intents.DragLink(1.0, "left", (column + 0.5, row + 0.5), (column + 9.0, row + 9.0)))
+    desk.do(intents.DragLink(1.0, "left", (column + 0.5, row + 0.5), (column + 30.0, row + 9.0)))
+    assert desk.saved.position == 0 and not desk.state.unsaved
+
+
+# ---- Poses of frames ------------------------------------------------------------------------------------------------
+
+
+HAND = Provenance(Source.HAND)
+
+
+@pytest.fixture
+def session(tiny_sequence: Callable[..., Path]) -> Session:
+    sequence = Sequence.open(tiny_sequence(cameras=("left", "right"), domains=("regular", "smoke")))
+    return Session(sequence, People(Project.open(sequence)))
+
+
+def _pose(session: Session, index: int, camera: str = "left", domain: str = "regular") -> Pose:
+    return session.pose(session.frame(index, domain, camera))
+
+
+def _first_joint(session: Session, index: int, camera: str = "left", domain: str = "regular") -> float:
+    return float(session.joints(_pose(session, index, camera, domain).scene)["PSM1"][0])
+
+
+def _correct(session: Session, index: int, value: float, provenance: Provenance = HAND) -> None:
+    frame = session.frame(index, "regular", "left")
+    scene = session.with_joint(session.pose(frame).scene, "PSM1", 0, value)
+    session.editor.project.apply("Correct", session.edits(frame, scene, provenance))
+
+
+def test_a_frame_starts_at_its_measured_joints(session: Session) -> None:
+    pose = _pose(session, 1)
+    assert pose.source is Source.MEASURED
+    assert session.joints(pose.scene)["PSM1"] == pytest.approx(session.sequence.measured["PSM1"][1], abs=1e-6)
+
+
+def test_a_correction_is_of_its_frame_in_every_camera_and_domain(session: Session) -> None:
+    _correct(session, 1, 0.25)
+    assert _first_joint(session, 1) == pytest.approx(0.25)
+    assert _first_joint(session, 1, "right", "smoke") == pytest.approx(0.25)
+    assert _first_joint(session, 0) != pytest.approx(0.25)
+
+
+def test_a_pose_that_is_as_measured_needs_no_correction(session: Session) -> None:
+    _correct(session, 1, 0.25)
+    frame = session.frame(1, "regular", "left")
+    assert session.edits(frame, session.measured(frame), HAND) == {Key.joints(1, "PSM1"): None}
+
+
+def test_a_pose_that_is_as_saved_keeps_who_made_it(session: Session) -> None:
+    optimizer = Provenance.made_by_optimizer({}, "0" * 64)
+    _correct(session, 1, 0.25, optimizer)
+    frame = session.frame(1, "regular", "left")
+    edits = session.edits(frame, session.pose(frame).scene, HAND)
+    assert edits[Key.joints(1, "PSM1")].provenance == optimizer and len(edits) == 1
+    assert session.pose(frame).source is Source.OPTIMIZER
+
+
+def test_a_corrected_calibration_holds_in_every_frame(session: Session) -> None:
+    frame = session.frame(1, "regular", "left")
+    state = session.pose(frame).scene
+    extrinsics, intrinsics, bases = state.T_camera_world.clone(), state.intrinsics.clone(), state.T_world_base.clone()
+    extrinsics[1, 0, 3] += 0.01
+    intrinsics[0, 0] += 5.0
+    bases[0, 1, 3] += 0.02
+    moved = replace(state, T_camera_world=extrinsics, intrinsics=intrinsics, T_world_base=bases)
+    edits = session.edits(frame, moved, HAND)
+    assert {key.name for key in edits if key.kind in (Kind.EXTRINSICS, Kind.INTRINSICS)} == {"right", "left"}
+    session.editor.project.apply("Calibrate", edits)
+    other = _pose(session, 0).scene
+    assert torch.equal(other.T_camera_world, extrinsics) and torch.equal(other.T_world_base, bases)
+    assert torch.equal(other.intrinsics, intrinsics)
+
+
+def test_a_copied_correction_moves_the_measured_joints_by_as_much(session: Session) -> None:
+    measured = session.sequence.measured["PSM1"]
+    _correct(session, 0, measured[0][0] + 0.07)
+    frames = [session.sequence.frame(index) for index in (1, 0)]
+    copied = session.joints(session.copied(*frames))["PSM1"]
+    assert copied - measured[1] == pytest.approx([0.07, *[0.0] * 6], abs=1e-6)
+    with pytest.raises(CartsError, match="Frame 002 is as measured"):
+        session.copied(*frames[::-1])
+
+
+def test_a_perturbation_moves_every_joint_by_the_same_amount_and_repeats_with_its_seed(session: Session) -> None:
+    start = session.pose(session.frame(0, "regular", "left")).scene
+    first, again, other = (session.joints(session.perturbed(start, 0, 2.0, seed))["PSM1"] for seed in (5, 5, 6))
+    difference = np.abs(first - session.joints(start)["PSM1"])
+    revolute = [kind == "revolute" for kind in session.scene.arms[0].robot.joint_types]
+    assert difference == pytest.approx(np.where(revolute, np.radians(2.0), 2e-3), abs=1e-6)
+    assert np.array_equal(first, again) and not np.array_equal(first, other)
+
+
+# ---- People at the same time ----------------------------------------------------------------------------------------
+
+
+ACCEPTED, REJECTED = Review(ReviewState.ACCEPTED), Review(ReviewState.REJECTED)
+
+
+@pytest.fixture
+def people(tiny_sequence) -> People:
+    path: Path = tiny_sequence(frames=4)
+    return People(Project.open(Sequence.open(path)))
+
+
+def _reviews(people: People) -> list[str]:
+    return [str(people.project.state.review(frame).state) for frame in range(4)]
+
+
+def test_somebody_alone_goes_back_and_forth_in_the_history_as_it_is(people: People) -> None:
+    ann = people.join()
+    people.apply(ann, "Accept", {Key.review(0): ACCEPTED})
+    assert people.project.state.steps[0].name == "Accept"
+    people.undo(ann)
+    assert people.project.state.position == 0 and len(people.project.state.steps) == 1 and people.can_redo(ann)
+    people.redo(ann)
+    assert people.project.state.position == 1 and not people.can_redo(ann)
+
+
+def test_undo_takes_back_ones_own_last_step_and_leaves_what_others_did(people: People) -> None:
+    ann, bob = people.join(), people.join()
+    people.apply(ann, "Accept", {Key.review(0): ACCEPTED})
+    people.apply(ann, "Accept", {Key.review(1): ACCEPTED})
+    people.apply(bob, "Reject", {Key.review(2): REJECTED})
+    people.undo(ann)
+    people.undo(ann)
+    assert _reviews(people) == ["untouched", "untouched", "rejected", "untouched"] and not people.can_undo(ann)
+    people.redo(ann)
+    people.redo(ann)
+    assert _reviews(people) == ["accepted", "accepted", "rejected", "untouched"] and not people.can_redo(ann)
+    people.undo(ann)
+    people.undo(bob)
+    assert _reviews(people) == ["accepted", "untouched", "untouched", "untouched"]
+    assert people.project.state.steps[0].name == "Tab 1: Accept"
+    assert people.project.state.steps[-1].name == "Tab 2: Undo: Reject"
+
+
+def test_what_somebody_else_has_changed_since_is_not_taken_back(people: People) -> None:
+    ann, bob = people.join(), people.join()
+    people.apply(ann, "Accept", {Key.review(1): ACCEPTED})
+    people.apply(ann, "Accept", {Key.review(0): ACCEPTED})
+    people.apply(bob, "Reject", {Key.review(0): REJECTED})
+    with pytest.raises(CartsError, match=r"step 3 \(Tab 2: Reject\) has changed the same since.*Undo again"):
+        people.undo(ann)
+    assert _reviews(people)[:2] == ["rejected", "accepted"]
+    people.undo(ann)
+    assert _reviews(people)[:2] == ["rejected", "untouched"]
+
+
+def test_nobody_goes_back_over_the_steps_of_somebody_at_work(people: People) -> None:
+    ann, bob = people.join(), people.join()
+    people.apply(ann, "Accept", {Key.review(0): ACCEPTED})
+    people.apply(bob, "Reject", {Key.review(2): REJECTED})
+    with pytest.raises(CartsError, match="steps of Tab 2"):
+        people.go_to(ann, 0)
+    bob.present = False
+    people.go_to(ann, 0)
+    assert people.project.state.position == 0
+
+
+def test_steps_from_before_the_viewer_started_can_be_taken_back(people: People) -> None:
+    people.project.apply("Accept", {Key.review(0): ACCEPTED})
+    ann = people.join()
+    assert people.can_undo(ann)
+    people.undo(ann)
+    assert _reviews(people)[0] == "untouched"
+
+
+def test_beside_others_ones_last_step_from_before_the_viewer_started_is_taken_back_and_theirs_are_not(
+    people: People,
+) -> None:
+    people.project.apply("Ann: Accept", {Key.review(0): ACCEPTED})
+    people.project.apply("Accept", {Key.review(1): ACCEPTED})
+    people.project.apply("Bob: Reject", {Key.review(2): REJECTED})
+    ann, bob = people.join(), people.join()
+    ann.chosen, bob.chosen = "Ann", "Bob"
+    people.apply(bob, "Reject", {Key.review(3): REJECTED})
+    for expected in (["accepted", "untouched"], ["untouched", "untouched"]):
+        assert people.can_undo(ann)
+        people.undo(ann)
+        assert _reviews(people) == [*expected, "rejected", "rejected"]
+    assert not people.can_undo(ann) and people.undo(ann) is None
+    people.redo(ann)
+    people.undo(bob)
+    people.undo(bob)
+    assert _reviews(people) == ["accepted", "untouched", "untouched", "untouched"] and not people.can_undo(bob)

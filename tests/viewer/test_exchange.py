@@ -1,0 +1,458 @@
+"""Exports of the page, masks and keypoints of others, and what a run fits."""
+
+import json
+import zipfile
+from collections.abc import Callable
+from io import BytesIO
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from viewer_desk import Desk
+from viewer_tab import decoded
+
+from carts_core.errors import CartsError, SettingsError
+from carts_core.evaluation import dice
+from carts_core.export import FORMATS, ExportFormat, FormatName, read_kinematics_csv
+from carts_core.export.formats import FORMATS as REGISTERED
+from carts_core.project import (
+    Figures,
+    FitVerdict,
+    IgnoreRegion,
+    ImportedLabels,
+    ImportedMask,
+    JointCorrection,
+    Key,
+    MaskCorrection,
+    Provenance,
+    ReviewState,
+    Source,
+    import_annotations,
+)
+from carts_core.recording import Sequence
+from carts_core.recording.annotations import read_annotations
+from carts_viewer.actions import exchange as exporting
+from carts_viewer.actions import intents
+from carts_viewer.app import ViewerApp
+from carts_viewer.editing import People
+from carts_viewer.picture.layers import Layer, imported, label_color
+from carts_viewer.picture.overlay import with_imported
+from carts_viewer.session import Session
+
+
+def exported(desk: Desk, intent: intents.Export) -> Path:
+    """What an export wrote."""
+    desk.do(intent)
+    assert desk.state.export is not None and desk.state.export.path is None
+    path = (desk.finish().export or desk.state.export).path
+    assert path is not None
+    return path
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_every_format_is_written_beside_the_project_and_logged(desk: Desk, name: FormatName) -> None:
+    path = exported(desk, intents.Export(name, "All"))
+    project = desk.session.editor.project
+    assert path.parent == project.path.with_name("sequence_exports")
+    assert path.suffix == FORMATS[name].suffix and (path.is_file() if path.suffix else any(path.iterdir()))
+    assert [(record.format, record.path, record.frames) for record in project.state.exports] == [(name, str(path), 3)]
+
+
+def test_an_earlier_export_is_never_replaced(desk: Desk) -> None:
+    first, second = (exported(desk, intents.Export("csv", "All")) for _ in range(2))
+    assert (first.name, second.name) == ("kinematics.csv", "kinematics-2.csv") and first.is_file()
+    folders = [exported(desk, intents.Export("masks", "All", shown_camera=True)) for _ in range(2)]
+    assert [folder.name for folder in folders] == ["masks", "masks-2"]
+
+
+@pytest.mark.parametrize("name", ["masks", "csv"])
+@pytest.mark.parametrize("kind", ["folder of exports", "temporary folder", "export", "dangling export"])
+def test_links_that_came_with_a_recording_are_not_followed(
+    desk: Desk, tmp_path: Path, name: FormatName, kind: str
+) -> None:
+    precious = tmp_path / "home" / "thesis.tex"
+    precious.parent.mkdir()
+    precious.write_text("years of work")
+    folder = desk.session.editor.project.path.with_name("sequence_exports")
+    stem = {"masks": "masks", "csv": "kinematics.csv"}[name]
+    if kind == "folder of exports":
+        folder.symlink_to(precious.parent)
+        with pytest.raises(CartsError, match="sequence_exports is a link, where a folder is needed"):
+            exported(desk, intents.Export(name, "All"))
+    else:
+        folder.mkdir()
+        place = folder / {"temporary folder": f".{stem}.part"}.get(kind, stem)
+        place.symlink_to(precious.parent if kind != "dangling export" else tmp_path / "home" / "new")
+        path = exported(desk, intents.Export(name, "All"))
+        assert not path.is_symlink() and path.parent == folder and place.is_symlink()
+    assert [path.name for path in precious.parent.iterdir()] == ["thesis.tex"]
+    assert precious.read_text() == "years of work"
+
+
+def test_an_export_says_what_the_project_knows_of_each_frame(desk: Desk) -> None:
+    project = desk.session.editor.project
+    desk.do(intents.ShowFrame(1), intents.SetReview(ReviewState.REJECTED))
+    project.record_verdict(1, FitVerdict("doubtful", "it may be another one", "look at it", 0.4))
+    project.record_figures({1: Figures(dice=0.91)}, project.state)
+    views = json.loads((exported(desk, intents.Export("masks", "All")) / "export.json").read_text())["views"]
+    known = [(view["verdict"], view["review"], view["dice"]) for view in views if view["camera"] == "left"]
+    assert known[1] == ("doubtful", "rejected", 0.91) and known[2] == (None, "untouched", None)
+    header, *rows = exported(desk, intents.Export("csv", "All")).read_text().splitlines()
+    assert header.endswith(",verdict,not_determined")
+    assert [row.rsplit(",", 2)[1] for row in rows] == ["", "doubtful", ""]
+
+
+def test_only_frames_of_the_timelines_range_are_written(desk: Desk) -> None:
+    desk.do(intents.ShowFrame(0), intents.SetReview(ReviewState.ACCEPTED))
+    path = exported(desk, intents.Export("masks", "All", shown_camera=True, range=(1, 2)))
+    assert sorted(file.name for file in (path / "binary").iterdir()) == ["left_002.png", "left_003.png"]
+    assert desk.state.jobs[-1].title == "Export all as PNG masks, frames 002 to 003"
+    # Both choices count, and a job that is repeated is about the same frames.
+    with pytest.raises(SettingsError, match=r"accepted, in the timeline's range"):
+        desk.do(intents.Export("csv", "Accepted", range=(1, 2)))
+    desk.do(intents.RepeatJob(1))
+    export = desk.finish().export
+    assert export is not None and export.path not in (None, path)
+    assert sorted(file.name for file in (export.path / "binary").iterdir())[0] == "left_002.png"  # type: ignore[operator]
+
+
+def test_masks_are_those_that_somebody_corrected_and_only_where_they_did(desk: Desk) -> None:
+    rendered = desk.renderer.arm_ids(desk.state.pose.scene, "left") >= 0
+    added, removed = np.zeros_like(rendered), rendered.copy()
+    added[2:6, 3:9] = ~rendered[2:6, 3:9]
+    removed[:, : removed.shape[1] // 2] = False
+    edit = {Key.mask_correction(0, "left"): MaskCorrection.of(added, removed)}
+    desk.session.editor.project.apply("Paint", edit)
+    folder = exported(desk, intents.Export("masks", "All")) / "binary"
+    expected = (rendered | added) & ~removed
+    assert removed.any() and np.array_equal(read_mask(folder / "left_001.png"), expected)
+    for name, index, camera in (("right_001", 0, "right"), ("left_002", 1, "left")):
+        pose = desk.session.pose(desk.session.sequence.frame(index, cameras=[])).scene
+        assert np.array_equal(read_mask(folder / f"{name}.png"), desk.renderer.arm_ids(pose, camera) >= 0)
+    coco = exported(desk, intents.Export("coco", "All", images=False)) / "annotations" / "instances_default.json"
+    views = json.loads(coco.read_text())["images"]
+    assert [(view["frame"], view["camera"]) for view in views if view.get("painted")] == [("001", "left")]
+    desk.do(intents.Refresh(), intents.ShowCamera("left"), intents.ExportMask(7))
+    _, name, content = desk.delivered[-1]
+    shown = decoded(content)
+    assert name == "tiny_001_left.png" and np.array_equal(shown > 0, expected)
+
+
+def test_kinematics_say_where_each_row_comes_from_and_how_sure_it_is(desk: Desk) -> None:
+    desk.do(intents.SetJoint("PSM1", 0, 0.2), intents.Released())
+    joints = sum(map(len, desk.session.ranges.values()))
+    known = JointCorrection((0.1,) * joints, Provenance(Source.PROPAGATED), (0.01,) * (joints - 1) + (None,))
+    desk.session.editor.project.apply("Solve", {Key.joints(1, "PSM1"): known})
+    rows = read_kinematics_csv(exported(desk, intents.Export("csv", "All")), desk.session.scene)
+    assert [row.source for row in rows] == ["edited", "propagated", "measured"]
+    assert rows[0].joint_positions["PSM1"][0] == pytest.approx(0.2, abs=1e-6)
+    assert rows[1].joint_std is not None and rows[0].joint_std is not None
+    assert rows[1].joint_std["PSM1"] == pytest.approx([0.01] * (joints - 1) + [np.nan], nan_ok=True)
+    assert np.isnan(rows[0].joint_std["PSM1"]).all()
+
+
+def test_an_export_is_of_the_project_as_it_was_when_it_began(desk: Desk) -> None:
+    desk.do(intents.Export("csv", "All"), intents.SetJoint("PSM1", 0, 0.3), intents.Released())
+    export = desk.finish().export
+    assert export is not None and export.path is not None
+    assert read_kinematics_csv(export.path, desk.session.scene)[0].source == "measured"
+
+
+@pytest.mark.parametrize("written", [0, 1])
+def test_cancelling_leaves_nothing(desk: Desk, monkeypatch: pytest.MonkeyPatch, written: int) -> None:
+    monkeypatch.setattr(exporting, "_BIT", 0.0)  # So that it cannot be done already.
+    desk.do(intents.Export("coco", "All"))
+    desk.advance()
+    while desk.state.export is not None and desk.state.export.done < written:
+        desk.advance()
+    desk.do(intents.CancelExport())
+    folder = desk.session.editor.project.path.with_name("sequence_exports")
+    assert desk.state.export is None and desk.wait_time() is None
+    assert list(folder.glob("*")) == [] and not desk.saved.exports
+    exported(desk, intents.Export("coco", "All"))
+
+
+@pytest.mark.parametrize(
+    "intent",
+    [
+        intents.Export("../../etc", "All"),  # type: ignore[arg-type]
+        intents.Export("coco", "Everything"),
+        intents.Export("coco", "All", "pixels"),  # type: ignore[arg-type]
+    ],
+)
+def test_what_no_page_of_ours_offers_is_refused(desk: Desk, intent: intents.Export) -> None:
+    with pytest.raises(CartsError, match=r"There is no export|This job cannot be queued"):
+        desk.do(intent)
+    with pytest.raises(CartsError, match="Nothing has been exported"):
+        desk.do(intents.Download(1))
+
+
+def test_a_package_that_is_missing_is_named(desk: Desk, monkeypatch: pytest.MonkeyPatch) -> None:
+    def write(*_: object) -> None:
+        raise ModuleNotFoundError("No module named 'pycocotools'", name="pycocotools")
+
+    monkeypatch.setitem(REGISTERED, "coco", ExportFormat("COCO", write))
+    desk.do(intents.Export("coco", "All"))
+    with pytest.raises(CartsError, match="COCO needs the package pycocotools"):
+        desk.finish()
+    assert desk.state.export is None and desk.wait_time() is None
+
+
+def test_a_download_is_the_last_export_whole(desk: Desk, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = exported(desk, intents.Export("coco", "All"))
+    desk.do(intents.Download(4))
+    client, name, content = desk.delivered[-1]
+    with zipfile.ZipFile(BytesIO(content)) as archived:
+        assert (client, name) == (4, "coco.zip")
+        assert json.loads(archived.read("coco/export.json"))["format"] == "coco"
+        assert len(archived.namelist()) == sum(file.is_file() for file in path.rglob("*"))
+    table = exported(desk, intents.Export("csv", "All"))
+    desk.do(intents.Download(4))
+    assert desk.delivered[-1] == (4, "kinematics.csv", table.read_bytes())
+    monkeypatch.setattr(exporting, "LARGEST", 10)
+    with pytest.raises(CartsError, match="Copy it from there"):
+        desk.do(intents.Download(4))
+    table.unlink()
+    with pytest.raises(CartsError, match="not there any more"):
+        desk.do(intents.Download(4))
+
+
+def test_who_looks_on_read_only_can_export(desk: Desk) -> None:
+    reader = desk.reopened(read_only=True)
+    assert exported(reader, intents.Export("csv", "All")).is_file() and not reader.saved.exports
+
+
+# ---- Imports --------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def plain(tiny_sequence: Callable[..., Path], untrained_weights: Path) -> Desk:
+    """A desk for a recording without masks of its own."""
+    return Desk.open(tiny_sequence(frames=3, masks=False), weights=(untrained_weights,))
+
+
+def write_theirs(folder: Path, frames: tuple[int, ...] = (1, 2)) -> np.ndarray:
+    """A COCO file of others beside the recording, with a rectangle and a keypoint in some frames; gives the mask."""
+    images = [{"id": n, "file_name": f"{n:03d}.png", "width": 96, "height": 72} for n in frames]
+    square = [[30, 20, 60, 20, 60, 50, 30, 50]]
+    marked = [
+        {"id": n, "image_id": n, "category_id": 1, "segmentation": square, "keypoints": [40.0, 30.0, 2]} for n in frames
+    ]
+    categories = [{"id": 1, "name": "grasper", "keypoints": ["tip"]}]
+    content = {"images": images, "annotations": marked, "categories": categories}
+    (folder / "theirs.json").write_text(json.dumps(content))
+    mask = np.zeros((72, 96), bool)
+    mask[20:50, 30:60] = True
+    return mask
+
+
+def bring_in(desk: Desk, **options) -> np.ndarray:
+    mask = write_theirs(desk.session.sequence.path.parent)
+    desk.do(intents.ImportMasks("theirs.json", **options))
+    return mask
+
+
+def test_an_import_is_one_step_shown_at_once_and_undone(plain: Desk) -> None:
+    bring_in(plain)
+    assert plain.state.layer is Layer.IMPORTED and plain.state.imported.startswith("Imported 2 masks and keypoints")
+    assert [step.name for step in plain.saved.steps] == ["Import from theirs.json"]
+    layer = plain.saved.get(Key.imported_mask(0, "left"))
+    assert layer is not None and layer.mask().sum() == 900
+    plain.do(intents.Undo())
+    assert plain.saved.get(Key.imported_mask(0, "left")) is None
+    plain.do(intents.Redo())
+    assert plain.reopened().saved.get(Key.imported_mask(1, "left")) is not None
+
+
+def test_without_masks_of_its_own_a_recording_is_compared_with_the_imported_ones(plain: Desk) -> None:
+    plain.controller.score()
+    assert plain.state.scores is not None and plain.state.scores.dice is None
+    mask = bring_in(plain)
+    plain.controller.score()
+    rendered = plain.renderer.mask(plain.state.pose.scene, "left")
+    assert plain.state.scores.dice == pytest.approx(dice(rendered, mask))
+    figures = plain.saved.figures(0)
+    assert figures is not None and figures.dice == plain.state.scores.dice
+    plain.do(intents.Undo())
+    plain.controller.score()
+    assert plain.state.scores.dice is None
+
+
+def test_masks_of_the_recording_itself_stay_the_truth(desk: Desk) -> None:
+    before = desk.session.frame(0, "regular", "left")
+    bring_in(desk, camera="left")
+    after = with_imported(before, desk.session.scene, desk.session.editor.view)
+    assert before.masks is not None and after.masks is not None
+    assert np.array_equal(after.masks["left"], before.masks["left"])
+
+
+def test_an_import_replaces_neither_what_was_painted_nor_silently_what_was_imported(plain: Desk) -> None:
+    painted = MaskCorrection.of(np.eye(72, 96, dtype=bool), np.zeros((72, 96), bool))
+    plain.session.editor.project.apply("Paint", {Key.mask_correction(0, "left"): painted})
+    bring_in(plain)
+    folder = plain.session.sequence.path.parent
+    (folder / "others").mkdir()
+    cv2.imwrite(str(folder / "others" / "001.png"), np.full((72, 96), 255, np.uint8))
+    with pytest.raises(CartsError, match="1 layer imported before would be replaced"):
+        plain.do(intents.ImportMasks("others"))
+    assert plain.saved.get(Key.imported_mask(0, "left")).mask().sum() == 900  # type: ignore[union-attr]
+    plain.do(intents.ImportMasks("others", replace=True))
+    assert plain.saved.get(Key.imported_mask(0, "left")).mask().all()  # type: ignore[union-attr]
+    assert plain.saved.get(Key.mask_correction(0, "left")) == painted
+
+
+@pytest.mark.parametrize("place", ["", "/etc", "../elsewhere", "nothing.json", "linked"])
+def test_nothing_outside_of_the_allowed_folders_is_read(plain: Desk, tmp_path: Path, place: str) -> None:
+    folder = plain.session.sequence.path.parent
+    (folder / "linked").symlink_to("/etc")
+    with pytest.raises(CartsError, match=r"Type where|outside of the allowed|cannot be opened|is a link"):
+        plain.do(intents.ImportMasks(place))
+    assert not plain.saved.steps
+
+
+def test_folders_that_were_allowed_may_be_imported_from(plain: Desk, tmp_path_factory: pytest.TempPathFactory) -> None:
+    folder = tmp_path_factory.mktemp("allowed")
+    write_theirs(folder)
+    with pytest.raises(CartsError, match="outside of the allowed folders"):
+        plain.do(intents.ImportMasks(str(folder / "theirs.json")))
+    session = Session(plain.session.sequence, People(plain.session.editor.project), folders=[folder])
+    assert session.roots.checked(folder / "theirs.json") == folder / "theirs.json"
+
+
+def test_labels_have_colours_and_keypoints_are_crosses() -> None:
+    labels = np.zeros((40, 60), np.uint8)
+    labels[5:10], labels[20:25] = 1, 9
+    picture = imported(labels, [("tip", 30.5, 32.5), ("far", -5.0, 1e9)], (40, 60), 0.5)
+    assert picture[0, 0, 3] == 0 and tuple(picture[7, 0]) == (*label_color(1), 128)
+    assert tuple(picture[22, 0]) == (*label_color(9), 128)
+    assert tuple(picture[32, 30]) == (*label_color(1), 255)
+    assert len({label_color(number) for number in range(1, 40)}) == 39
+
+
+def test_masks_below_an_allowed_folder_are_imported(tiny_sequence: Callable[..., Path], tmp_path: Path) -> None:
+    path = tiny_sequence(masks=False)
+    folder = path.parent.rename(tmp_path.parent / f"{tmp_path.name}_recording")
+    elsewhere = tmp_path.parent / f"{tmp_path.name}_elsewhere"
+    elsewhere.mkdir()
+    assert cv2.imwrite(str(elsewhere / "001.png"), np.full((72, 96), 255, np.uint8))
+    for allowed, said in ((), "outside of the allowed folders"), ((elsewhere,), "Imported 1 mask"):
+        with ViewerApp.open(folder / path.name, port=0, folders=allowed) as app:
+            app.queue.put(intents.ImportMasks(str(elsewhere)))
+            state = app.wait_until_shown(60)
+            assert said in (state.error or state.imported)
+
+
+# ---- What a run fits ------------------------------------------------------------------------------------------------
+
+
+SIZE = {"width": 160, "height": 128}
+
+
+@pytest.fixture
+def recording(tiny_sequence: Callable[..., Path]) -> Sequence:
+    """Two frames of a recording without masks; those that are right lie in its folder."""
+    return Sequence.open(tiny_sequence(frames=2, masks=False, **SIZE))
+
+
+@pytest.fixture
+def at_desk(recording: Sequence, tmp_path: Path) -> Desk:
+    """A desk whose networks cannot be loaded."""
+    desk = Desk.open(recording.path, weights=(tmp_path / "missing.safetensors",))
+    desk.do(intents.SetSetting("solver", "surface"))
+    return desk
+
+
+def right_mask(recording: Sequence, index: int = 0) -> np.ndarray:
+    return read_mask(recording.path.parent / "masks" / "left" / f"{recording.frame_ids[index]}.png")
+
+
+def overlap(desk: Desk, recording: Sequence, index: int = 0) -> float:
+    pose = desk.session.pose(recording.frame(index, cameras=[]))
+    return dice(desk.renderer.mask(pose.scene, "left"), right_mask(recording, index))
+
+
+def test_imported_masks_are_fitted_without_a_network_and_the_project_keeps_what_was_fitted(
+    at_desk: Desk, recording: Sequence
+) -> None:
+    found = read_annotations(recording.path.parent / "masks" / "left", recording)
+    import_annotations(at_desk.session.editor.project, found, source="masks")
+    before = overlap(at_desk, recording)
+    at_desk.do(intents.SetObserved("masks", "imported"), intents.Run())
+    state = at_desk.finish()
+    assert before < 0.95 and overlap(at_desk, recording) > 0.97 and state.verdict is not None
+    made = at_desk.saved.joints(0)["PSM1"].provenance
+    assert made.source is Source.OPTIMIZER and made.weights_sha256 is None
+    used = json.loads(made.settings or "")
+    assert (used["observe"], used["masks"]) == ("masks", "imported")
+    at_desk.do(intents.Solve(True))
+    assert at_desk.finish().solve is not None and overlap(at_desk, recording, 1) > 0.97
+    assert at_desk.saved.joints(1)["PSM1"].provenance.weights_sha256 is None
+
+
+def test_a_painted_mask_is_fitted_as_it_was_when_the_run_began(at_desk: Desk, recording: Sequence) -> None:
+    rendered, wanted = at_desk.renderer.mask(at_desk.state.pose.scene, "left"), right_mask(recording)
+    correction = MaskCorrection.of(wanted & ~rendered, rendered & ~wanted)
+    at_desk.session.editor.project.apply("Paint", {Key.mask_correction(0, "left"): correction})
+    at_desk.do(intents.Refresh(), intents.SetObserved("masks", "painted"), intents.Run())
+    at_desk.finish()
+    assert overlap(at_desk, recording) > 0.97
+    verdict = at_desk.state.verdict
+    assert verdict is not None and verdict.verdict == "good"
+
+
+def test_what_cannot_be_fitted_is_said(at_desk: Desk) -> None:
+    at_desk.do(intents.SetObserved("masks", "imported"))
+    with pytest.raises(CartsError, match=r"frame 001 has no imported mask of camera 'left' to be fitted\. Give one"):
+        at_desk.do(intents.Run())
+    at_desk.do(intents.SetObserved("masks", "recording"))
+    with pytest.raises(CartsError, match=r"frame 001 has no mask of camera 'left'"):
+        at_desk.do(intents.Run())
+    at_desk.do(intents.SetSetting("solver", "acs"))
+    with pytest.raises(CartsError, match=r"cannot fit masks\. Choose the solver Surface maps"):
+        at_desk.do(intents.Run())
+    with pytest.raises(CartsError, match=r"'eyes' cannot be observed\. Choose one of: network, masks, both"):
+        at_desk.do(intents.SetObserved("eyes", "imported"))
+    at_desk.do(intents.SetSetting("solver", "surface"), intents.SetObserved("both", "imported"))
+    with pytest.raises(CartsError, match=r"missing\.safetensors"):
+        at_desk.do(intents.Run())
+
+
+def test_a_job_on_all_frames_leaves_out_those_without_a_mask(at_desk: Desk, recording: Sequence) -> None:
+    mask = ImportedMask.of(right_mask(recording, 1).astype(np.uint8))
+    edits = {Key.imported_mask(1, "left"): mask, Key.imported_labels(): ImportedLabels(("tool",))}
+    at_desk.session.editor.project.apply("Import", edits)
+    at_desk.do(intents.SetObserved("masks", "imported"), intents.OptimizeFrames("all"))
+    (job,) = at_desk.finish().jobs
+    assert job.state == "done" and any("001: no mask to fit, not touched" in line for line in job.log)
+    assert not at_desk.saved.joints(0) and overlap(at_desk, recording, 1) > 0.97
+
+
+def test_pixels_to_be_ignored_come_from_the_brush_and_from_a_label(at_desk: Desk) -> None:
+    labels = np.zeros((SIZE["height"], SIZE["width"]), np.uint8)
+    labels[:10], labels[10:20] = 1, 2
+    painted = np.zeros(labels.shape, bool)
+    painted[:, :5] = True
+    edits = {
+        Key.imported_mask(0, "left"): ImportedMask.of(labels),
+        Key.imported_labels(): ImportedLabels(("tool", "Ignore")),
+        Key.ignore_region(0, "left"): IgnoreRegion.of(painted),
+    }
+    at_desk.session.editor.project.apply("Import", edits)
+    state = at_desk.do(intents.SetObserved("masks", "imported"))
+    target = at_desk.session.target(state.observed)
+    assert target.given is not None and np.array_equal(target.given.masks(0)["left"], labels == 1)
+    assert np.array_equal(at_desk.session.ignored(0, ["left"], target)["left"], painted | (labels == 2))
+    assert np.array_equal(at_desk.session.ignored(0, ["left"])["left"], painted)
+    assert at_desk.session.ignored(1, ["left"], target) == {}
+
+
+def test_a_result_of_an_optimizer_says_which_network_was_run_unless_masks_alone_were_fitted() -> None:
+    assert Provenance.made_by_optimizer({"observe": "masks"}, None).weights_sha256 is None
+    for settings in ({"observe": "both"}, {}):
+        with pytest.raises(CartsError, match="needs its settings and the hash"):
+            Provenance.made_by_optimizer(settings, None)
+
+
+def read_mask(path: Path) -> np.ndarray:
+    return decoded(path.read_bytes()) > 0

@@ -1,0 +1,245 @@
+"""The picture in headless Chromium, with real pixels: views, the overlay's place, and edits by mouse in the picture."""
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from playwright.sync_api import expect
+from viewer_tab import MARKERS, Hand, OpenTab, Tab, box_of, decoded
+from waiting import eventually, wait_in
+
+from carts_core.model.keypoints import project_keypoints
+from carts_viewer.actions import intents
+from carts_viewer.picture.overlay import OverlayRenderer
+
+pytestmark = pytest.mark.browser
+
+_LINKS_IN_3D = """() => {
+    const { nodeRefFromName: nodes, camera, canvas } = window.__viserMutable;
+    const depth = nodes['/frame'].position.z;
+    const inverse = nodes[''].matrixWorld.clone().invert();
+    const places = [];
+    for (const [name, node] of Object.entries(nodes)) {
+        if (!/^\\/world\\/\\d+\\/[^/]+$/.test(name) || !node) continue;
+        const at = camera.position.clone().setFromMatrixPosition(node.matrixWorld);
+        if (at.clone().applyMatrix4(inverse).length() > 14 * depth) continue;
+        at.project(camera);
+        places.push([(at.x + 1) / 2 * canvas.clientWidth, (1 - at.y) / 2 * canvas.clientHeight]);
+    }
+    return places;
+}"""
+"""Positions on the canvas [px] of the links near the image."""
+
+
+def test_the_overlay_stays_on_the_frame_in_any_window_zoom_and_view(open_tab: OpenTab) -> None:
+    tab = open_tab(window=(1700, 620), marked=True)
+    canvas, mouse = tab.canvas, tab.page.mouse
+    canvas.wait_until_registered()
+    tab.page.set_viewport_size({"width": 1280, "height": 800})
+    canvas.wait_until_registered()
+    # The wheel zooms about the pointer.
+    before, box = canvas.where(), box_of(tab.page.locator("canvas"))
+    mouse.move(640, 400)
+    mouse.wheel(0, -400)
+    after = canvas.where(lambda map_: map_[0, 0] > 1.7 * before[0, 0])
+    pointer = np.array([640 - box["x"], 400 - box["y"]])
+    image = np.linalg.solve(before[:, :2], pointer - before[:, 2])
+    assert after @ [*image, 1.0] == pytest.approx(pointer, abs=2.0)
+    tab.drag((640, 400), (670, 415))
+    dragged = canvas.where(lambda map_: abs(map_[0, 2] - after[0, 2]) > 25)
+    assert dragged[:, 2] - after[:, 2] == pytest.approx([30, 15], abs=2.0)
+    canvas.wait_until_registered()
+    straight = canvas.screenshot()
+    tab.button("3D view")
+    eventually(canvas.screenshot, lambda image: np.abs(image.astype(int) - straight).mean() > 5)
+    tab.drag((640, 400), (740, 440), steps=5)
+    tab.button("Endoscope view")
+    canvas.wait_until_registered()
+    # In the endoscope view, a drag does not turn the camera.
+    tab.drag((640, 400), (740, 440), steps=5)
+    canvas.wait_until_registered()
+
+
+def test_the_3d_view_shows_the_whole_arms_with_grid_axes_and_the_measured_arms(open_tab: OpenTab) -> None:
+    tab = open_tab(window=(1280, 800), width=160, height=120)
+    tab.put(intents.Perturb(6.0, 0))
+    tab.press("v")
+    strip, canvas = (box_of(tab.page.locator(name)) for name in (".carts-strip", "canvas"))
+
+    def seen_whole() -> bool:
+        places = tab.page.evaluate(_LINKS_IN_3D)
+        bottom = strip["y"] - canvas["y"]
+        return len(places) >= 3 and all(0 < x < canvas["width"] and 40 < y < bottom for x, y in places)
+
+    eventually(seen_whole)
+    # Fit brings them back from anywhere.
+    x, y = canvas["x"], canvas["y"] + 300
+    tab.drag((x + 560, y), (x + 40, y), button="right", steps=6)
+    eventually(seen_whole, lambda whole: not whole)
+    tab.page.get_by_role("button", name="Fit", exact=True).click()
+    eventually(seen_whole)
+
+    def at_rest() -> np.ndarray:
+        """The picture once the camera has stopped moving."""
+        pictures = [tab.canvas.screenshot().astype(int)]
+
+        def still() -> bool:
+            pictures.append(tab.canvas.screenshot().astype(int))
+            return np.array_equal(pictures[-2], pictures[-1])
+
+        eventually(still)
+        return pictures[-1]
+
+    for name in ("Grid", "Measured"):
+        before = at_rest()
+        tab.page.get_by_role("button", name=name, exact=True).click()
+        eventually(
+            lambda before=before: (np.abs(before - tab.canvas.screenshot()).max(axis=-1) > 12).sum(),
+            lambda count: count > 150,
+        )
+    axes = "Object.keys(window.__viserMutable.nodeRefFromName).filter(name => name.endsWith('/axes')).length"
+    assert tab.page.evaluate(axes) == 2
+    tab.press("v")
+    wait_in(tab.page, "carts.imageOnScreen() !== null")
+
+
+def test_a_dragged_slider_ends_with_the_overlay_of_its_last_value_and_is_one_step(open_tab: OpenTab) -> None:
+    tab = open_tab(marked=True)
+    app, slider = tab.app, tab.slider("PSM1", 0)
+    thumb = box_of(tab.page.locator(f"{tab.element(slider)} [role=slider]"))
+    x, y = thumb["x"] + thumb["width"] / 2, thumb["y"] + thumb["height"] / 2
+    tab.drag((x, y), *((x + 12 * math.sin(step / 5), y) for step in range(30)), (x - 10, y))
+    final = eventually(
+        lambda: float(app.state.pose.scene.joint_positions[0][0]),
+        lambda at: abs(at - math.radians(slider.value)) < 1e-3,
+    )
+    tab.canvas.wait_until_registered()
+    assert math.degrees(final) < slider.max - 5.5 and app.state.undoable == 1
+    eventually(lambda: app.state.unsaved, lambda unsaved: not unsaved)
+    tab.drag((x - 10, y), (x + 5, y), (x + 8, y))
+    eventually(lambda: app.state.undoable, lambda count: count == 2)
+
+
+def test_keypoints_are_placed_and_dragged_with_shift_and_links_with_ctrl_one_step_each(open_tab: OpenTab) -> None:
+    tab = open_tab(marked=True)
+    app, mouse, keyboard = tab.app, tab.page.mouse, tab.page.keyboard
+    hand = Hand(tab)
+    keyboard.down("Shift")
+    mouse.click(*hand.at(150.0, 110.0))
+    eventually(lambda: app.state, lambda state: state.undoable == 1 and not state.unsaved)
+    (pin,) = app.state.keypoints.pins
+    # A screen pixel is less than half an image pixel here.
+    assert pin.pixel == pytest.approx((150.0, 110.0), abs=1.0) and app.state.keypoints.residuals[0] < 1.0
+    keyboard.up("Shift")
+    # A field that has the focus loses it to the drag, which does not end the drag, nor does a rest on the way.
+    tab.field(tab.find("Frame")).click()
+    keyboard.down("Shift")
+    mouse.move(*hand.at(150.0, 110.0))
+    mouse.down()
+    mouse.move(*hand.at(154.0, 112.0))
+    eventually(lambda: app.state.unsaved)
+    wait_in(tab.page, "document.activeElement === document.body")
+    app.wait_until_shown()
+    mouse.move(*hand.at(164.0, 117.0))
+    eventually(lambda: app.state.keypoints.pins[-1].pixel, lambda at: at == pytest.approx((164.0, 117.0), abs=1.0))
+    assert app.state.unsaved and app.state.undoable == 2
+    mouse.up()
+    keyboard.up("Shift")
+    eventually(lambda: app.state, lambda state: state.undoable == 2 and not state.unsaved)
+    # A link follows the pointer with the button down, and the picture stays in place.
+    renderer = OverlayRenderer(app.sequence)
+    rows, columns = np.nonzero(renderer.arm_ids(app.state.pose.scene, "left") == 0)
+    middle = int(np.median(np.arange(len(rows))))
+    place = columns[middle] + 0.5, rows[middle] + 0.5
+    point = renderer.pick(app.state.pose.scene, "left", place, 0.0)
+    assert point is not None
+
+    def seen() -> np.ndarray:
+        return np.array(project_keypoints(app.scene, app.state.pose.scene, [point], "left")[0].tolist())
+
+    before, drawn = seen(), tab.page.evaluate("carts.drawnOverlay()")
+    keyboard.down("Control")
+    mouse.move(*hand.at(*place))
+    mouse.down()
+    mouse.move(*hand.at(place[0] + 6.0, place[1] + 4.0))
+    eventually(lambda: tab.page.evaluate("carts.drawnOverlay()"), lambda now: now != drawn)
+    mouse.move(*hand.at(place[0] + 12.0, place[1] + 8.0))
+    eventually(seen, lambda at: at - before == pytest.approx([12.0, 8.0], abs=1.5))
+    mouse.up()
+    keyboard.up("Control")
+    eventually(lambda: app.project.state.position, lambda position: position == 3)
+    assert tab.canvas.where() == pytest.approx(hand.map, abs=0.5)
+    tab.press("Control+z")
+    eventually(seen, lambda at: at == pytest.approx(before, abs=0.05))
+
+
+_COUNT = """() => {
+  const mutable = window.__viserMutable, send = mutable.sendMessage;
+  window.sent = [];
+  mutable.sendMessage = (message) => { window.sent.push(message.type); send(message); };
+}"""
+
+
+def _loupe(tab: Tab) -> dict[str, Any] | None:
+    return tab.page.evaluate("(() => { const b = document.querySelector('.carts-loupe');"
+                             " return b && !b.hidden ? { ...b.dataset } : null; })()")  # fmt: skip
+
+
+def test_the_loupe_shows_position_and_colour_of_the_pixel_under_the_pointer_and_asks_nobody(open_tab: OpenTab) -> None:
+    tab = open_tab(marked=True)
+    tab.canvas.where()
+    tab.page.evaluate(_COUNT)
+    u, v = MARKERS[1][0] * 320, MARKERS[1][1] * 240
+    tab.page.mouse.move(*tab.place(u, v))
+    # While the key is held, it is shown; pressed shortly, it stays, and follows the pointer.
+    tab.page.keyboard.press(",", delay=450)
+    eventually(lambda: _loupe(tab), lambda loupe: loupe is None)
+    tab.press(",")
+    loupe = eventually(lambda: _loupe(tab))
+    assert loupe is not None and loupe["camera"] == "left"
+    assert (float(loupe["u"]), float(loupe["v"])) == pytest.approx((u, v), abs=0.5)
+    # The frame is sent as JPEG, so a colour is off by some levels.
+    assert np.abs(np.array(loupe["rgb"].split(), float) - (255, 0, 0)).max() < 30
+    shown = decoded(tab.page.locator(".carts-loupe canvas").screenshot())[..., 2::-1]
+    assert np.abs(shown[65, 65].astype(float) - (255, 0, 0)).max() < 40
+    tab.page.mouse.move(*tab.place(160, 12))
+    loupe = eventually(lambda: _loupe(tab), lambda loupe: loupe is not None and abs(float(loupe["v"]) - 12) < 0.5)
+    assert loupe is not None and max(map(float, loupe["rgb"].split())) < 30
+    tab.page.get_by_role("button", name="Loupe").click()
+    eventually(lambda: _loupe(tab), lambda loupe: loupe is None)
+    assert "GuiUpdateMessage" not in tab.page.evaluate("window.sent")
+
+
+def test_two_cameras_lie_beside_each_other_and_a_click_chooses_one(open_tab: OpenTab) -> None:
+    tab = open_tab(cameras=("left", "right"), width=160, height=120)
+    app = tab.app
+    wait_in(tab.page, "carts.shown().cameras.length == 2 && carts.imageOnScreen(1)")
+    left, right = (tab.page.evaluate(f"carts.imageOnScreen({index})") for index in (0, 1))
+    apart = abs(left["left"] - right["left"]) >= left["width"] or abs(left["top"] - right["top"]) >= left["height"]
+    assert apart and left["width"] == pytest.approx(right["width"], abs=1.0)
+    # The fit of both is in view, whichever is chosen, and a run is about both.
+    for camera in ("left", "right"):
+        expect(tab.page.locator(f".carts-marks [data-camera={camera}] text").first).to_contain_text("Dice")
+    assert app.state.every_camera
+    # A keypoint can be placed in either; a plain click chooses the camera that is painted on.
+    tab.page.keyboard.down("Shift")
+    tab.page.mouse.click(*tab.place(80, 48, camera=1))
+    tab.page.keyboard.up("Shift")
+    (pin,) = eventually(lambda: app.state.keypoints.pins, lambda pins: len(pins) == 1)
+    assert pin.camera == "right" and pin.pixel == pytest.approx((80.0, 48.0), abs=1.0)
+    tab.page.mouse.click(*tab.place(32, 24, camera=1))
+    eventually(lambda: app.state.camera, lambda camera: camera == "right")
+    # Rings have names, are open, fade near the pointer, and do not grow with the zoom.
+    expect(tab.page.locator(".carts-point text").first).not_to_be_empty()
+    ring = tab.page.locator(".carts-point circle").first
+    eventually(lambda: ring.evaluate("one => getComputedStyle(one).fill"), lambda fill: fill == "none")
+    wait_in(tab.page, "carts.imageOnScreen(1)")  # The two images change places.
+    width = "document.querySelector('.carts-point circle').getBoundingClientRect().width"
+    before, shown = tab.page.evaluate(width), tab.page.evaluate("carts.imageOnScreen(1).width")
+    box = box_of(ring)
+    tab.page.mouse.move(box["x"] + 9, box["y"] + 9)
+    expect(tab.page.locator(".carts-point.near")).not_to_have_count(0)
+    tab.page.evaluate("carts.zoomAt(4, 0.5, 0.5)")
+    wait_in(tab.page, f"carts.imageOnScreen(1)?.width > {3 * shown}")
+    assert tab.page.evaluate(width) == pytest.approx(before, abs=0.5)

@@ -1,0 +1,187 @@
+"""Pictures over the frame, when they are sent, the timeline's curves and thumbnails, and the table of keys."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from viewer_desk import Desk
+from viewer_tab import decoded
+from waiting import get
+
+from carts_core.project import Figures, Key, Review, ReviewState
+from carts_viewer.actions import intents
+from carts_viewer.app import ViewerApp
+from carts_viewer.panels.help import key_table, shortcuts, with_keys
+from carts_viewer.panels.timeline import HEIGHT, Traces, code
+from carts_viewer.picture import layers
+from carts_viewer.picture.display import LONGEST_WAIT, RateLimit
+
+
+@pytest.fixture
+def arm_ids() -> np.ndarray:
+    """Two arms, the second over a corner of the first."""
+    ids = np.full((48, 64), -1)
+    ids[10:30, 10:40] = 0
+    ids[20:40, 30:60] = 1
+    return ids
+
+
+def test_the_mask_covers_exactly_the_arms_in_their_colours(arm_ids: np.ndarray) -> None:
+    picture = layers.mask(arm_ids, 0.5)
+    assert np.array_equal(picture[..., 3] > 0, arm_ids >= 0)
+    assert tuple(picture[12, 12]) == (*layers.ARM_COLORS[0], 128)
+    assert tuple(picture[25, 35]) == (*layers.ARM_COLORS[1], 128)
+
+
+def test_the_contour_runs_along_the_arms_and_leaves_their_inside_open(arm_ids: np.ndarray) -> None:
+    picture = layers.contour(arm_ids, 1.0)
+    assert picture[10, 20, 3] == 255 and picture[20, 10, 3] == 255
+    assert picture[15, 20, 3] == 0 and picture[2, 2, 3] == 0
+    assert tuple(picture[39, 45, :3]) == layers.ARM_COLORS[1]
+
+
+def test_the_comparison_uses_the_papers_colours() -> None:
+    predicted = np.array([[True, True, False, False]])
+    truth = np.array([[True, False, True, False]])
+    picture = layers.against_truth(predicted, truth, 0.6)
+    names = ("true positive", "false positive", "false negative", "true negative")
+    assert [tuple(pixel[:3]) for pixel in picture[0]] == [layers.TRUTH_COLORS[name] for name in names]
+    assert set(picture[..., 3].ravel()) == {153}
+
+
+def test_the_shaded_arm_shows_the_rendering_where_the_arm_is(arm_ids: np.ndarray) -> None:
+    image = np.full((3, 48, 64), 2.0, np.float32)
+    image[:, 12, 12] = (0.0, 0.5, 1.0)
+    picture = layers.shaded(image, arm_ids, 1.0)
+    assert tuple(picture[12, 12]) == (0, 128, 255, 255)
+    assert tuple(picture[25, 35]) == (255, 255, 255, 255)
+    assert tuple(picture[2, 2]) == (0, 0, 0, 0)
+
+
+def test_a_map_of_a_lower_resolution_fills_the_picture_from_dark_to_bright() -> None:
+    values = np.tile(np.linspace(0, 1, 16, dtype=np.float32), (12, 1))
+    picture = layers.heat(values, 0.0, 1.0, (48, 64), 0.5)
+    assert picture.shape == (48, 64, 4)
+    brightness = picture[24, :, :3].astype(int).sum(-1)
+    assert brightness[2] < brightness[32] < brightness[61]
+    assert set(picture[..., 3].ravel()) == {128}
+
+
+def test_values_that_are_not_numbers_do_not_break_a_map() -> None:
+    values = np.full((4, 4), np.nan, np.float32)
+    assert layers.heat(values, 0.0, 1.0, (8, 8), 1.0).shape == (8, 8, 4)
+
+
+def test_no_arm_in_view_gives_an_empty_picture() -> None:
+    empty = np.full((8, 8), -1)
+    assert not layers.mask(empty, 1.0)[..., 3].any()
+    assert not layers.contour(empty, 1.0)[..., 3].any()
+
+
+class Clock:
+    now = 100.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+@pytest.fixture
+def clock() -> Clock:
+    return Clock()
+
+
+def test_the_first_picture_may_go_at_once(clock: Clock) -> None:
+    assert RateLimit(clock).ready_in() == 0.0
+
+
+def test_a_tab_that_draws_nothing_gets_pictures_at_a_steady_rate(clock: Clock) -> None:
+    limit = RateLimit(clock)
+    limit.sent()
+    assert limit.ready_in() == pytest.approx(LONGEST_WAIT)
+    clock.now += LONGEST_WAIT
+    assert limit.ready_in() == 0.0
+
+
+def test_a_tab_that_has_drawn_gets_the_next_picture_at_once(clock: Clock) -> None:
+    limit = RateLimit(clock)
+    limit.sent()
+    clock.now += 0.02
+    limit.drawn()
+    assert limit.ready_in() == 0.0
+
+
+# ---- The timeline ---------------------------------------------------------------------------------------------------
+
+
+def test_a_curve_is_the_lowest_and_highest_value_of_each_column_and_follows_what_is_corrected(desk: Desk) -> None:
+    traces, project = Traces(desk.session), desk.session.editor.project
+    assert traces.names[:2] == ["Loss [1]", "Dice [1]"] and traces.names[3].endswith("[°]")
+    yaw = traces.names[3]
+    measured = np.degrees(desk.session.sequence.measured["PSM1"][:, 0])
+    found = traces.between(yaw, 0, 3, 100)
+    assert found is not None and found["edges"] == [0, 1, 2, 3]
+    assert found["curves"][0] == [pytest.approx(measured, rel=1e-4)] * 2 and found["curves"][1] == [[None] * 3] * 2
+    desk.do(intents.ShowFrame(1), intents.SetJoint("PSM1", 0, 0.1), intents.Released())
+    traces.follow(project.state, [1])
+    whole = traces.between(yaw, 0, 3, 1)
+    assert whole is not None and whole["edges"] == [0, 3]
+    assert whole["curves"][0] == [[pytest.approx(measured.min(), rel=1e-4)], [pytest.approx(measured.max(), rel=1e-4)]]
+    assert whole["curves"][1] == [[pytest.approx(np.degrees(0.1), rel=1e-4)]] * 2
+    project.record_figures({2: Figures(loss=0.25)}, project.state)
+    traces.follow(project.state, [2])
+    loss = traces.between("Loss [1]", 0, 3, 100)
+    assert loss is not None and loss["curves"] == [[[None, None, 0.25]] * 2]
+
+
+@pytest.mark.parametrize("asked", [("Nothing", 0, 3, 9), ("Loss [1]", 2, 2, 9), ("Loss [1]", 0, 3, 0), ("", -5, -3, 1)])
+def test_a_curve_that_there_is_not_is_none(desk: Desk, asked: tuple[str, int, int, int]) -> None:
+    assert Traces(desk.session).between(*asked) is None
+
+
+def test_a_frame_of_which_the_fit_is_not_known_has_no_height_and_one_that_fits_well_has_some(desk: Desk) -> None:
+    editor = desk.session.editor
+    editor.apply("Accept", {Key.review(1): Review(ReviewState.ACCEPTED), Key.review(2): Review(ReviewState.ACCEPTED)})
+
+    def high() -> list[int]:
+        return [code(editor.project.state, frame, desk.session.scene) >> 8 for frame in (0, 1, 2)]
+
+    assert high() == [0, 0, 0]
+    editor.project.record_figures({1: Figures(dice=1.0), 2: Figures(dice=0.5)}, editor.project.state)
+    assert high() == [0, 1, 255]
+
+
+def test_thumbnails_are_served_of_frames_that_there_are(shared_viewer: ViewerApp) -> None:
+    answer = get(shared_viewer.url, "/thumbnail/0/0/2.jpg")
+    assert answer.status == 200 and decoded(answer.read()).shape == (HEIGHT, HEIGHT * 96 // 72, 3)
+    for path in (
+        "0/0/3.jpg",
+        "1/0/0.jpg",
+        "0/1/0.jpg",
+        "0/0/-1.jpg",
+        "../0/0/0.jpg",
+        "0/0/0.png",
+        "0/0/99999999999.jpg",
+    ):
+        assert get(shared_viewer.url, f"/thumbnail/{path}").status == 404, path
+
+
+# ---- Keys -----------------------------------------------------------------------------------------------------------
+
+
+PAGE = Path(__file__).resolve().parents[2] / "docs" / "reference" / "keys.md"
+
+
+def test_no_two_shortcuts_share_a_key_and_none_flies_the_camera() -> None:
+    keys = [(shortcut.hotkey, shortcut.modifier) for shortcut in shortcuts()]
+    assert len(set(keys)) == len(keys)
+    assert not {hotkey for hotkey, _ in keys} & set("WASDQE")
+
+
+def test_the_page_of_keys_lists_them_as_they_are() -> None:
+    text = PAGE.read_text(encoding="utf-8")
+    assert with_keys(text) == text and key_table() in text
+
+
+def test_a_text_without_a_place_for_the_table_is_refused() -> None:
+    with pytest.raises(ValueError, match="no lines"):
+        with_keys("# Nothing")

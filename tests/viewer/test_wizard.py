@@ -1,0 +1,377 @@
+"""New recording without a browser: its form, delays, and calibrations that are stopped, kept or offered."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from clicked_points import clicked
+from scipy.spatial.transform import Rotation
+from swaying import write_log, write_swaying
+from visitor import write_lab_files
+from waiting import eventually
+
+from carts_core.imaging.working_image import Window
+from carts_core.model.camera import HALF_PIXEL
+from carts_core.model.psm_kinematics import JOINT_NAMES
+from carts_core.model.robot import Robot
+from carts_core.model.scene import Scene
+from carts_core.networks import FeatureExtractor
+from carts_core.optimization import CalibrationOptimizer, ImagePredictor, StopReason
+from carts_core.optimization.hand_eye import PoseDeviation
+from carts_core.recording import Sequence
+from carts_core.rendering import Renderer
+from carts_viewer.start.site import Site
+from carts_viewer.wizard import calibration, hand_eye
+from carts_viewer.wizard.calibration import CalibrationJob
+from carts_viewer.wizard.check import Guess, check_form, guess
+from carts_viewer.wizard.draft import Draft, DraftFile, Step, changed
+from carts_viewer.wizard.wizard import RecordingWizard
+
+FRAMES = 6
+
+
+JOINTS = np.array([0.1, 0.05, 0.12, 0.5, 0.1, -0.2])
+
+
+def recording(folder: Path, header: list[str], values: np.ndarray) -> Draft:
+    (folder / "left").mkdir(parents=True)
+    for number in range(FRAMES):
+        cv2.imwrite(str(folder / f"left/{number:03d}.png"), np.zeros((48, 64, 3), np.uint8))
+    np.savetxt(folder / "log.csv", np.tile(values, (FRAMES, 1)), delimiter=",", header=",".join(header), comments="")
+    return Draft(source=str(folder), name="rec")
+
+
+def after(draft: Draft, *choices: tuple[str, str]) -> tuple[Draft, Guess]:
+    for name, value in choices:
+        made = changed(draft, name, value, {})
+        assert made is not None
+        draft = made
+    return draft, guess(draft)
+
+
+def test_a_table_of_unknown_columns_is_shown_with_values_and_the_cameras_stay(tmp_path: Path) -> None:
+    draft = recording(tmp_path / "rec", [f"{letter} thing" for letter in "abcdef"], JOINTS)
+    found = guess(draft)
+    assert found.recording is not None and [camera.name for camera in found.recording.cameras] == ["left"]
+    assert "not recognized" in found.problems["columns"]
+    form = check_form(draft, found, {})
+    assert "c thing (0.12)" in form and "log.csv" in form and "64 × 48" in form
+    joints = [(f"column {joint}", f"{letter} thing") for joint, letter in zip(JOINT_NAMES, "abcdef", strict=True)]
+    _, found = after(draft, *joints)
+    assert found.recording is not None and not found.problems
+    assert found.recording.arms[0].values is not None and found.recording.arms[0].values[0] == pytest.approx(JOINTS)
+    _, found = after(draft, ("no-table", ""))
+    assert found.recording is not None and not found.problems
+
+
+def test_a_question_about_units_and_rates_is_answered_in_the_form(tmp_path: Path) -> None:
+    decimetres = JOINTS * np.where(np.arange(6) == 2, 10, 1)
+    draft = recording(tmp_path / "rec", list(JOINT_NAMES), decimetres)
+    found = guess(draft)
+    assert "insertion is not clear" in found.problems["columns"]
+    assert 'value="dm"' in check_form(draft, found, {})
+    for choice in (("length_unit", "dm"), ("unit insertion", "dm")):
+        _, found = after(draft, choice)
+        assert found.recording is not None and not found.problems
+        assert found.recording.arms[0].values is not None
+        assert found.recording.arms[0].values[0] == pytest.approx(JOINTS)
+    _, found = after(draft, ("length_unit", "dm"), ("frame_rate", "10"))
+    assert found.recording is not None and found.recording.frame_times == pytest.approx(np.arange(FRAMES) / 10)
+
+
+def test_columns_that_were_chosen_or_named_are_not_called_guessed(tmp_path: Path) -> None:
+    draft = recording(tmp_path / "named", list(JOINT_NAMES), JOINTS)
+    form = check_form(draft, guess(draft), {})
+    assert "yaw (by name)" in form and "(guessed)" not in form
+    draft = recording(tmp_path / "numbered", [f"q{number}" for number in range(6)], JOINTS)
+    assert "q0 (guessed)" in check_form(draft, guess(draft), {})
+    chosen = after(draft, *((f"column {joint}", f"q{number}") for number, joint in enumerate(JOINT_NAMES)))
+    assert "(guessed)" not in check_form(*chosen, {})
+
+
+def test_a_pose_table_that_raises_a_question_is_not_called_missing(tmp_path: Path) -> None:
+    poses = np.array([0.1, 0.2, 30.0, 0.0, 0.0, 0.0, 1.0])
+    draft = recording(tmp_path / "rec", [*"xyz", "qx", "qy", "qz", "qw"], poses)
+    found = guess(draft)
+    form = check_form(draft, found, {})
+    assert found.problems and "log.csv" in form and "64 × 48" in form
+    assert "no table" not in form
+
+
+def test_the_trials_of_a_folder_of_jigsaws_are_offered(tmp_path: Path) -> None:
+    folder = tmp_path / "JIGSAWS/Suturing/kinematics/AllGestures"
+    folder.mkdir(parents=True)
+    for number in (1, 2):
+        (folder / f"Suturing_B00{number}.txt").write_text("1 2 3\n")
+    draft = Draft(source=str(tmp_path / "JIGSAWS"), name="JIGSAWS")
+    found = guess(draft)
+    form = check_form(draft, found, {})
+    assert "Choose one" in form and f'<option value="{folder / "Suturing_B002.txt"}">Suturing_B002</option>' in form
+
+
+def test_a_delay_between_video_and_log_is_proposed_taken_and_undone(tmp_path: Path, shipped_psm: Robot) -> None:
+    folder = write_swaying(tmp_path / "labs" / "run", shipped_psm, 3, 7.0).parent
+    write_log(folder / "log.csv", shipped_psm, 3, 7.0, late=0.12)
+    (folder / "sequence.toml").unlink()
+    file = DraftFile()
+    file.write(Draft(source=str(folder), name="run"))
+    with Site([tmp_path / "labs"], port=0) as site:
+        site.post(lambda: site.show_recording(file.key))
+        place = place_of(site)
+
+        def chosen(name: str) -> float | None:
+            site.post(lambda: place.choose(name, ""))
+            site.wait(120)
+            return place.draft.options.time_offset
+
+        assert chosen("estimate-delay") is None and "Proposed." in site.document.content
+        assert chosen("accept-delay") == pytest.approx(0.12, abs=0.01)
+        chosen("estimate-delay")
+        assert "Images and kinematics fit as they are" in site.document.content
+        assert chosen("undo") is None
+
+
+# ---- Calibrations; this part stands for any step of the optimizer ---------------------------------------------------
+
+
+CALIBRATE, STOP = ("calibrate", ""), ("cancel", "")
+
+
+CALIBRATE, STOP = ("calibrate", ""), ("cancel", "")
+
+
+class OneStep:
+    """Stands for `CalibrationOptimizer`: one step, and the scene as it is for a result."""
+
+    def __init__(self, scene: Scene, *_: object, **__: object) -> None:
+        self._scene = scene
+
+    def __iter__(self) -> Iterator[SimpleNamespace]:
+        yield SimpleNamespace(stage=0, stages=1, index=0, loss=0.5, scene=self._scene)
+
+    def result(self) -> SimpleNamespace:
+        return SimpleNamespace(
+            scene=self._scene,
+            frame_losses_before=np.array([0.5]),
+            frame_losses_after=np.array([0.25]),
+            stop_reason=StopReason.CONVERGED,
+            assessment=None,
+            beyond=(),
+            deviations={("PSM1", "left"): PoseDeviation(7.1, 8.2, 9.3)},
+        )
+
+
+@pytest.fixture
+def jobs(monkeypatch: pytest.MonkeyPatch) -> list[CalibrationJob]:
+    """The jobs that are begun."""
+    begun: list[CalibrationJob] = []
+
+    def begin(*arguments, **options) -> CalibrationJob:
+        begun.append(CalibrationJob(*arguments, **options))
+        return begun[-1]
+
+    monkeypatch.setattr(hand_eye, "CalibrationJob", begin)
+    monkeypatch.setattr(calibration, "CalibrationOptimizer", OneStep)
+    return begun
+
+
+def open_calibration(folder: Path, made: Sequence, seen: Scene) -> tuple[Path, str]:
+    """Write a recording whose points were clicked as in a scene, and its draft; gives the root and the draft's key."""
+    (folder / "labs" / "day" / "left").mkdir(parents=True)
+    for number in range(len(made)):
+        image = np.full((240, 320, 3), 200 * np.eye(3)[2 - number], np.uint8)
+        cv2.imwrite(str(folder / f"labs/day/left/{number}.png"), image)
+    (camera,) = made.scene.cameras
+    K = camera.K - np.array([[0, 0, HALF_PIXEL], [0, 0, HALF_PIXEL], [0, 0, 0]])
+    write_lab_files(folder / "labs" / "day", range(len(made)), made.measured["PSM1"], [("left", (320, 240), K)])
+    points = clicked(seen, made.measured, range(len(made)), ("left",), noise=0.5)
+    file = DraftFile()
+    file.write(Draft(Step.HAND_EYE, str(folder / "labs" / "day"), "day", points=tuple(points)))
+    return folder / "labs", file.key
+
+
+@pytest.fixture
+def made(tiny_sequence: Callable[..., Path]) -> Sequence:
+    return Sequence.open(tiny_sequence(frames=3, width=320, height=240))
+
+
+@pytest.fixture
+def site(made: Sequence, tmp_path: Path) -> Iterator[Site]:
+    """At the last step of New recording, with the points clicked."""
+    root, key = open_calibration(tmp_path / "new", made, made.scene)
+    with Site([root], port=0) as opened:
+        opened.post(lambda: opened.show_recording(key))
+        yield opened
+
+
+def place_of(site: Site) -> RecordingWizard:
+    site.wait()
+    assert isinstance(site.shown, RecordingWizard) and 'role="alert"' not in site.document.content
+    return site.shown
+
+
+def ended(site: Site, text: str, timeout: float = 30.0) -> Draft:
+    """The draft once this is to be read."""
+    eventually(lambda: site.document.content, lambda content: text in content, timeout)
+    return place_of(site).draft
+
+
+def test_a_calibration_that_had_ended_before_it_was_stopped_is_not_taken_either(
+    site: Site, jobs: list[CalibrationJob]
+) -> None:
+    place = place_of(site)
+
+    def stop_when_it_has_ended() -> None:
+        place.choose(*CALIBRATE)
+        jobs[-1].join(60)
+        place.choose(*STOP)
+
+    site.post(stop_when_it_has_ended)
+    assert ended(site, "Stopped; the calibration from your points is as it was.").calibration is None
+    site.post(lambda: place.choose(*CALIBRATE))
+    assert ended(site, "Calibrated").calibration is not None, "the next one is not stopped"
+
+
+@pytest.mark.parametrize("moment", ["images are read", "a step", "the result"])
+def test_a_calibration_is_stopped_at_any_moment(
+    site: Site, jobs: list[CalibrationJob], monkeypatch: pytest.MonkeyPatch, moment: str
+) -> None:
+    place = place_of(site)
+
+    def pressed() -> None:
+        site.post(lambda: place.choose(*STOP))
+        assert site.shown is place
+        eventually(lambda: jobs and jobs[-1].cancelled)
+
+    def spread(count: int, _: int) -> Iterator[int]:
+        yield 0
+        pressed()
+        yield from range(1, count)
+
+    class Stopped(OneStep):
+        def __iter__(self) -> Iterator[SimpleNamespace]:
+            assert moment != "images are read"
+            yield from super().__iter__()
+            if moment == "a step":
+                pressed()
+                yield from super().__iter__()
+
+        def result(self) -> SimpleNamespace:
+            assert moment == "the result"
+            pressed()
+            return super().result()
+
+    if moment == "images are read":
+        monkeypatch.setattr(calibration, "spread", spread)
+    monkeypatch.setattr(calibration, "CalibrationOptimizer", Stopped)
+    site.post(lambda: place.choose(*CALIBRATE))
+    assert ended(site, "Stopped; the calibration from your points is as it was.").calibration is None
+
+
+def test_stop_is_answered_at_once(site: Site, jobs: list[CalibrationJob], monkeypatch: pytest.MonkeyPatch) -> None:
+    place = place_of(site)
+    shown: list[str] = []
+
+    class Slow(CalibrationOptimizer):
+        def step(self):
+            if self.history:
+                site.post(lambda: place.choose(*STOP))
+                site.wait()
+                shown.append(site.document.content)
+            return super().step()
+
+    monkeypatch.setattr(calibration, "CalibrationOptimizer", Slow)
+    site.post(lambda: place.choose(*CALIBRATE))
+    assert ended(site, "Stopped; the calibration from your points is as it was.").calibration is None
+    (content,) = shown
+    assert "Stopping …" in content
+
+
+def test_a_calibration_that_points_agree_with_is_kept_with_its_figures(site: Site, jobs: list[CalibrationJob]) -> None:
+    place = place_of(site)
+    assert "± 8.2 mm" not in site.document.content
+    site.post(lambda: place.choose(*CALIBRATE))
+    draft = ended(site, "Calibrated")
+    assert draft.report is not None and draft.offered is None
+    assert draft.report.before == pytest.approx(draft.report.after, abs=1e-6) and len(draft.report.before) == 12
+    content = site.document.content
+    for text in ("Loss 0.5000 → 0.2500", "± 8.2 mm", "± 9.3 mm", "± 7.1°", "<td>0.00°</td><td>0.0 mm</td>"):
+        assert text in content
+    assert Draft.from_json(draft.to_json()) == draft
+    site.post(lambda: place.choose("undo", ""))
+    assert "Loss" not in ended(site, "Of the calibration from points").to_json()
+    assert place_of(site).draft.calibration is None and "± 8.2 mm" not in site.document.content
+
+
+def test_a_calibration_that_moves_off_the_points_is_offered_and_not_kept(
+    site: Site, jobs: list[CalibrationJob], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Moved(OneStep):
+        """An optimizer that turns the base frame by two degrees."""
+
+        def __init__(self, scene: Scene, *_: object, **__: object) -> None:
+            turn = np.eye(4)
+            turn[:3, :3] = Rotation.from_rotvec([0.0, 2.0, 0.0], degrees=True).as_matrix()
+            super().__init__(
+                replace(scene, arms=tuple(replace(a, T_world_base=turn @ a.T_world_base) for a in scene.arms))
+            )
+
+    monkeypatch.setattr(calibration, "CalibrationOptimizer", Moved)
+    place = place_of(site)
+    site.post(lambda: place.choose(*CALIBRATE))
+    offer = ended(site, "Calibration not kept")
+    assert offer.calibration is None and offer.offered is not None
+    assert offer.report is not None and offer.report.objection
+    assert "px allowed" in site.document.content and "<td>2.00°</td>" in site.document.content
+    for choice, text, kept in (
+        ("keep", "Kept by choice", True),
+        ("undo", "Calibration not kept", False),
+        ("discard", "Of the calibration from points", False),
+        ("undo", "Calibration not kept", False),
+    ):
+        site.post(lambda choice=choice: place.choose(choice, ""))
+        assert (ended(site, text).calibration is not None) is kept
+        assert ("Keep anyway" in site.document.content) is (text == "Calibration not kept")
+
+
+class Truths(ImagePredictor):
+    """Predicts the true surface map of one of three frames: the red, the green or the blue one."""
+
+    device = torch.device("cpu")
+    stride = 16
+
+    def __init__(self, made: Sequence) -> None:
+        renderer = Renderer(made.scene, width=640, height=480)
+        frames = map(made.frame, range(len(made)))
+        maps = [renderer.surface(made.scene.state(frame.measured)).maps for frame in frames]
+        self.maps = [torch.nn.functional.avg_pool2d(each, 2) for each in maps]
+
+    def predict(self, images: torch.Tensor, given: torch.Tensor, window: Window) -> torch.Tensor:
+        """The truth in a window."""
+        return window.of(self.maps[int(images[0].mean((1, 2)).argmax())])[: len(images)]
+
+
+@pytest.mark.parametrize("agreeing", [True, False])
+def test_a_calibration_by_true_maps_is_kept_where_clicked_points_agree(
+    made: Sequence, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, agreeing: bool
+) -> None:
+    turn = np.eye(4)
+    turn[:3, :3] = Rotation.from_rotvec([0.0, 0.0 if agreeing else 6.0, 0.0], degrees=True).as_matrix()
+    (arm,) = made.scene.arms
+    seen = replace(made.scene, arms=(replace(arm, T_world_base=turn @ arm.T_world_base),))
+    root, key = open_calibration(tmp_path / "new", made, seen)
+    monkeypatch.setattr(FeatureExtractor, "load", lambda *_, **__: Truths(made))
+    with Site([root], port=0) as site:
+        site.post(lambda: site.show_recording(key))
+        place = place_of(site)
+        site.post(lambda: place.choose(*CALIBRATE))
+        draft = ended(site, "Calibrated" if agreeing else "Calibration not kept", 240)
+    assert draft.report is not None and (draft.calibration is not None) is agreeing
+    assert bool(draft.report.objection) is not agreeing
+    rows = site.document.content.count('class="wrong"')
+    assert rows == len(draft.report.disagreeing)
