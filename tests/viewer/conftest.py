@@ -30,19 +30,22 @@ FLAGS = (
 expect.set_options(timeout=20_000)
 
 
-@pytest.fixture(scope="session", autouse=True)
+_LOADED: dict[tuple[object, ...], FeatureExtractor] = {}
+
+
+@pytest.fixture(scope="module", autouse=True)
 def _networks_loaded_once() -> Iterator[None]:
-    """Networks from the same files are loaded once for all tests."""
-    load, loaded = FeatureExtractor.load, {}
+    """Networks from the same files are loaded once for all tests of this folder, and anew for those of others."""
+    load = FeatureExtractor.load
 
     def load_once(*weights: Path | str, **options) -> FeatureExtractor:
         files = [Path(path) for path in weights]
         if not all(path.is_file() for path in files):
             return load(*weights, **options)
         key = (*((path, path.stat().st_mtime_ns) for path in files), *sorted(options.items()))
-        if key not in loaded:
-            loaded[key] = load(*weights, **options)
-        return loaded[key]
+        if key not in _LOADED:
+            _LOADED[key] = load(*weights, **options)
+        return _LOADED[key]
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(FeatureExtractor, "load", load_once)
