@@ -135,7 +135,7 @@ def test_polygon_eraser_shift_and_classes_change_the_mask_as_exported(open_tab: 
     tab.page.keyboard.up("Shift")
     hand.steps(3)
     wanted |= _line((240.0, 60.0), (300.0, 80.0))
-    assert _same(_mask(app), wanted)
+    eventually(lambda: _same(_mask(app), wanted), bool)
     tab.open("Export")
     with tab.page.expect_download() as started:
         tab.button("Export mask")
