@@ -72,6 +72,17 @@ def test_loss_falls_and_dice_rises(sequence: Sequence, extractor: FeatureExtract
     assert after > before
 
 
+def test_the_best_iterate_is_a_copy_that_later_steps_leave_alone(
+    sequence: Sequence, extractor: FeatureExtractor
+) -> None:
+    optimizer = optimizer_of(sequence, extractor, cameras=["left"])
+    first = optimizer.step()
+    assert first is not None
+    before = first.state.joint_positions[0].clone()
+    list(optimizer)
+    assert np.array_equal(first.state.joint_positions[0].numpy(), before.numpy())
+
+
 def test_two_cameras_share_one_objective(sequence: Sequence, extractor: FeatureExtractor) -> None:
     iterate = optimizer_of(sequence, extractor).step()
     assert iterate is not None

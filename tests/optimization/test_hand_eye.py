@@ -285,8 +285,22 @@ def test_a_refinement_keeps_to_what_the_points_left_open_and_to_known_cameras(
     assert "--beyond-hand-eye" in said and not (tmp_path / "moved").exists()
 
 
+def test_covariances_of_base_frames_are_as_large_as_their_errors(scene: Scene) -> None:
+    one = replace(scene, arms=scene.arms[:1])
+    measured = {"PSM1": joints()}
+    (arm,), squares = one.arms, []
+    for seed in range(12):
+        points = clicked(one, measured, range(4), ["left"], seed=seed)
+        result = solve_hand_eye(unknown(one), measured, points)
+        T = np.linalg.inv(result.scene.arms[0].T_world_base) @ arm.T_world_base
+        error = np.concatenate([Rotation.from_matrix(T[:3, :3]).as_rotvec(), T[:3, 3]])
+        squares.append(error @ np.linalg.solve(result.base_covariances["PSM1"], error))
+    assert 3.0 < np.mean(squares) < 9.0, "six degrees of freedom"
+
+
 @pytest.mark.parametrize(
-    ("turn_deg", "noise", "agrees"), [(0.0, 2.0, True), (0.0, 5.0, True), (2.0, 2.0, False), (0.02, 0.1, True)]
+    ("turn_deg", "noise", "agrees"),
+    [(0.0, 2.0, True), (0.0, 5.0, True), (2.0, 2.0, False), (4.0, 2.0, False), (0.02, 0.1, True)],
 )
 def test_points_agree_with_the_truth_and_speak_against_another_calibration(
     scene: Scene, turn_deg: float, noise: float, agrees: bool
@@ -302,6 +316,8 @@ def test_points_agree_with_the_truth_and_speak_against_another_calibration(
         assert compared.agrees is agrees
         assert compared.before == pytest.approx(found.distances, nan_ok=True)
         assert agrees or compared.rms_after > 1.3 * compared.rms_limit
+        # A smaller turn is within what joint positions explain in single points, but not in all of them.
+        assert turn_deg < 4.0 or len(compared.disagreeing) > len(points) / 4
 
 
 def test_a_point_that_contradicts_the_others_does_not_speak_against_a_calibration(scene: Scene) -> None:

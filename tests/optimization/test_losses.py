@@ -14,6 +14,16 @@ def square(size: int, half: int) -> torch.Tensor:
     return image
 
 
+def test_attention_dilates_by_its_radius() -> None:
+    point = torch.zeros(1, 21, 21)
+    point[0, 10, 10] = 1
+    assert attention(point, 3).sum() == 49
+
+
+def test_attention_has_no_gradient() -> None:
+    assert not attention(torch.rand(1, 8, 8, requires_grad=True), 2).requires_grad
+
+
 def test_equal_features_have_similarity_one_and_empty_ones_too() -> None:
     features = torch.rand(1, 4, 5, 5)
     features[..., 0] = 0

@@ -72,6 +72,13 @@ def test_joint_limits_clamp_the_offsets(scene: Scene) -> None:
     assert torch.allclose(joints, scene.arms[0].robot.joint_limits[:, 1].float(), atol=1e-5)
 
 
+def test_a_start_outside_the_limits_may_stay(scene: Scene) -> None:
+    q = np.array([0.1, 0.2, 0.15, 0.0, 0.1, -0.1, 3.0])
+    parameters = Variables(scene, scene.state({"PSM1": q}), FreeParameters(), LENGTH_SCALE)
+    assert float(parameters.clamp(torch.zeros(7)).abs().max()) == 0.0
+    assert float(parameters.clamp(torch.ones(7))[-1]) == 0.0
+
+
 def test_nothing_free_is_an_error(scene: Scene) -> None:
     with pytest.raises(SettingsError, match="nothing is free"):
         vector(scene, FreeParameters(joints=False))
