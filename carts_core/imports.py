@@ -29,12 +29,17 @@ def needs_extra(module: str, extra: str) -> None:
 
 @contextmanager
 def uncollected() -> Iterator[None]:
-    """Disable garbage collection in the block, since imports create no garbage; the viewer starts 0.6 s sooner."""
+    """Pause garbage collection in a block that creates many objects and no garbage.
+
+    Imports (the viewer starts 0.6 s sooner) and large JSON (seven times faster).
+    """
+    running = gc.isenabled()
     gc.disable()
     try:
         yield
     finally:
-        gc.enable()
+        if running:
+            gc.enable()
 
 
 class _Later(ModuleType):

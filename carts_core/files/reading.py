@@ -21,7 +21,7 @@ from xml.etree import ElementTree
 import msgspec
 
 from ..errors import CartsError
-from ..imports import needs_extra
+from ..imports import needs_extra, uncollected
 from ..wording import shortened
 
 T = TypeVar("T")
@@ -32,6 +32,8 @@ LARGEST_DEPTH = 32
 """Largest nesting depth of TOML, JSON and YAML."""
 MOST_YAML_EVENTS = 500_000
 """Largest number of YAML events: values, and beginnings and ends of lists and tables."""
+MOST_JSON_PARTS = 3_000_000
+"""Largest number of lists and objects in JSON."""
 MOST_INI_LINES = 10_000
 LARGEST_NAME = 255
 """Longest name of a file or folder [bytes]."""
@@ -176,13 +178,17 @@ def parse_json(text: str | bytes, *, finite: bool = True) -> Any:
     Raises:
         ValueError: it is not JSON, or is beyond the limits of this module.
     """
+    parts = text.count("[") + text.count("{") if isinstance(text, str) else text.count(b"[") + text.count(b"{")
+    if parts > MOST_JSON_PARTS:
+        raise ValueError(f"it has more than {MOST_JSON_PARTS:,} lists and objects")
     try:
-        values = json.loads(text)
+        with uncollected():
+            values = json.loads(text)
+            _check_values(values)
+            if finite and not all_finite(values):
+                raise ValueError("a number in it is not finite")
     except RecursionError as error:
         raise ValueError(f"it is nested more than {LARGEST_DEPTH} deep") from error
-    _check_values(values)
-    if finite and not all_finite(values):
-        raise ValueError("a number in it is not finite")
     return values
 
 

@@ -100,13 +100,16 @@ def test_names_that_no_file_can_have_are_missing_files(tmp_path: Path, name: str
     ],
 )
 def test_toml_without_end_is_refused_at_once(text: str):
-    start = time.monotonic()
+    start = time.process_time()
     with pytest.raises(ValueError):
         parse_toml(text)
-    assert time.monotonic() - start < 2.0
+    assert time.process_time() - start < 5.0
 
 
-@pytest.mark.parametrize("text", ["[" * 100_000, "[" * 50 + "]" * 50, "NaN", "[1e999]", "9" * 5000, "-" + "9" * 30])
+@pytest.mark.parametrize(
+    "text",
+    ["[" * 100_000, "[" * 50 + "]" * 50, "[" + "[]," * 3_000_000 + "0]", "NaN", "[1e999]", "9" * 5000, "-" + "9" * 30],
+)
 def test_json_without_end_or_with_numbers_that_are_not_finite_is_refused(text: str):
     with pytest.raises(ValueError):
         parse_json(text)

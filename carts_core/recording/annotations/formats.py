@@ -21,6 +21,8 @@ from ..images import read_labels
 MOST_LABELS = 255
 """Largest number of labels of a layer, whose pixels have 8 bits."""
 MOST_IMAGES = 100_000
+MOST_SHAPES = 5_000
+"""In one image, and polygons of one annotation."""
 """Largest number of images of a source."""
 MOST_KEYPOINTS = 200
 """Largest number of keypoints of an image."""
@@ -178,6 +180,11 @@ def _few_enough(images: Iterable[Any]) -> list[Any]:
     return images
 
 
+def _check_shapes(count: int) -> None:
+    if count > MOST_SHAPES:
+        raise ValueError(f"it has {count} shapes; {MOST_SHAPES} are allowed")
+
+
 def _size(image: Any) -> tuple[int, int]:
     """Height and width of an image [px]."""
     size = int(image["height"]), int(image["width"])
@@ -196,6 +203,7 @@ def _coco_image(
     where = f"{path}: image {image.get('file_name')!r}"
     try:
         size, name = _size(image), str(image["file_name"])
+        _check_shapes(len(marked))
     except _MALFORMED as error:
         raise SequenceError(f"{where} cannot be read ({_why(error)}). Export it again.") from error
     points: dict[str, tuple[float, float]] = {}
@@ -240,6 +248,7 @@ def _coco_mask(segmentation: Any, height: int, width: int) -> Bool[np.ndarray, "
         return mask_of_runs(runs, height, width, by_columns=True)
     # Some tools write a single polygon without the enclosing list.
     polygons = [segmentation] if all(isinstance(value, int | float) for value in segmentation) else segmentation
+    _check_shapes(len(polygons))
     mask = np.zeros((height, width), bool)
     for polygon in polygons:
         if len(polygon) % 2 or len(polygon) < 2 * _FEWEST_CORNERS:
@@ -290,6 +299,7 @@ def _cvat_image(path: Path, image: Element, remarks: Counter[str]) -> ForeignIma
     name = image.get("name", "")
     try:
         size, points = _size(image.attrib), dict(_cvat_keypoints(image))
+        _check_shapes(len(image))
         if len(points) > MOST_KEYPOINTS:
             raise ValueError(f"it has {len(points)} keypoints; {MOST_KEYPOINTS} are allowed")
     except _MALFORMED as error:
