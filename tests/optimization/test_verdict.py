@@ -13,6 +13,7 @@ from tiny import tiny_scene
 from carts_core.cli.printing import calibration_hint, sequence_hint, verdict_hints, verdict_line
 from carts_core.evaluation import evaluate
 from carts_core.imaging.working_image import Window
+from carts_core.model.parts import COVERAGE
 from carts_core.model.robot import Robot
 from carts_core.model.scene import SceneState
 from carts_core.networks import FeatureExtractor
@@ -29,7 +30,7 @@ from carts_core.optimization import (
     Verdict,
     check_domain,
 )
-from carts_core.optimization.evidence import evidence
+from carts_core.optimization.evidence import _SHOWN, evidence
 from carts_core.optimization.observability import Uncertainty
 from carts_core.optimization.observation import FrameImages
 from carts_core.optimization.verdict import (
@@ -230,6 +231,47 @@ def test_an_arm_behind_another_one_is_in_view_and_one_outside_the_image_has_left
     hidden, gone = (evidence(images, start, end, predictor, 0.01) for end in (beside(0.0, 0.004), beside(0.2, 0.004)))
     assert hidden.still_in_view > 0.7 and "left the image" not in assess(hidden).reason
     assert gone.still_in_view < 0.3 and "left the image" in assess(gone).reason
+
+
+class _FirstArm(ImagePredictor):
+    """Predicts the coverage of one state, whatever the image."""
+
+    device, stride = torch.device("cpu"), 8
+
+    def __init__(self, coverage: torch.Tensor) -> None:
+        self._coverage = coverage
+
+    def predict(self, images: torch.Tensor, given: torch.Tensor, window: Window) -> torch.Tensor:
+        maps = window.of(given).clone()
+        maps[:, COVERAGE] = window.of(self._coverage[: len(given)])
+        return maps
+
+
+def test_an_arm_too_small_to_be_assessed_alone_is_so_whatever_the_number_of_cameras(
+    shipped_psm: Robot, tiny_sequence: Callable[..., Path]
+) -> None:
+    tiny = tiny_scene(shipped_psm, 3, ("left",), 320, 240)
+    camera, arm = tiny.scene.cameras[0], tiny.scene.arms[0]
+    frame = Sequence.open(tiny_sequence(frames=1, width=320, height=240)).frame(0)
+    found = []
+    for names in (("left",), ("left", "right")):
+        scene = replace(
+            tiny.scene,
+            arms=(arm, replace(arm, name="PSM2")),
+            cameras=tuple(replace(camera, name=name) for name in names),
+        )
+        T_world_base = torch.from_numpy(np.stack([arm.T_world_base, arm.T_world_base])).float()
+        # Far away, the second arm covers a share of the images between half of the least one that counts, and it.
+        T_world_base[1, :3, 3] += torch.from_numpy(camera.T_camera_world[:3, :3].T @ [1.0, 0.0, 2.7]).float()
+        state = replace(scene.state({name: tiny.truth[0] for name in ("PSM1", "PSM2")}), T_world_base=T_world_base)
+        share = float((Renderer(scene).segment(state) == 1).mean())
+        assert _SHOWN / 2 < share < _SHOWN
+        predictor = _FirstArm(torch.zeros(2, 4, 240, 320))
+        images = FrameImages.of(scene, {name: frame.images["left"] for name in names}, {}, SurfaceSolver(), predictor)
+        alone = images.renderer.surface_maps(replace(state, T_world_base=torch.stack([T_world_base[0]] * 2)))
+        found.append(evidence(images, state, state, _FirstArm(alone[:, COVERAGE]), 0.01))
+    one, two = found
+    assert one.agreement > 0.8 and two.agreement == pytest.approx(one.agreement, abs=1e-3)
 
 
 RIGHT = replace(CONVINCING, changed=None, overlap_with_change=None)
