@@ -80,14 +80,47 @@ def polygons(mask: Bool[np.ndarray, "height width"]) -> list[Int[np.ndarray, "po
 
 def _with_holes(rim: np.ndarray, holes: list[np.ndarray]) -> np.ndarray:
     """One closed line along the rim and all holes. The shortest link is chosen first, so that it crosses no other
-    hole."""
-    while holes:
-        distances = [cdist(rim, hole, "sqeuclidean") for hole in holes]
-        nearest = min(range(len(holes)), key=lambda index: distances[index].min())
-        at, start = np.unravel_index(distances[nearest].argmin(), distances[nearest].shape)
-        hole = np.roll(holes.pop(nearest), -start, axis=0)
-        rim = np.concatenate([rim[: at + 1], hole, hole[:1], rim[at:]])
+    hole; the links of the other holes are then compared with those to the new points alone."""
+    if not holes:
+        return rim
+    points, first = np.concatenate(holes), np.cumsum([0, *map(len, holes)])
+    length, at, start = _links(rim, points, first)
+    for _ in holes:
+        nearest = int(length.argmin())
+        joint, hole = int(at[nearest]), np.roll(holes[nearest], -int(start[nearest]), axis=0)
+        rim = np.concatenate([rim[: joint + 1], hole, hole[:1], rim[joint:]])
+        at[at > joint] += len(hole) + 2
+        new_length, new_at, new_start = _links(hole, points, first)
+        # Of links of one length, the first along the line.
+        better = (new_length < length) | ((new_length == length) & (at > joint))
+        better &= np.isfinite(length)
+        length[better], at[better], start[better] = new_length[better], joint + 1 + new_at[better], new_start[better]
+        length[nearest] = np.inf
     return rim
+
+
+_ROWS = 512
+"""Points whose distances are computed at a time."""
+
+
+def _links(line: np.ndarray, points: np.ndarray, first: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The shortest link from a line to each hole: squared length [px^2], index along the line, index along the hole.
+
+    Args:
+        points: of all holes, those of hole n from `first[n]` to `first[n + 1]`.
+    """
+    length, at = np.full(len(points), np.inf), np.zeros(len(points), np.int64)
+    for row in range(0, len(line), _ROWS):
+        distances = cdist(line[row : row + _ROWS], points, "sqeuclidean")
+        nearest = distances.argmin(0)
+        shorter = distances[nearest, np.arange(len(points))]
+        at = np.where(shorter < length, row + nearest, at)
+        length = np.minimum(length, shorter)
+    rank = length * len(line) + at
+    least = np.minimum.reduceat(rank, first[:-1])
+    equal = np.flatnonzero(rank == least.repeat(np.diff(first)))
+    chosen = equal[np.searchsorted(equal, first[:-1])]
+    return length[chosen], at[chosen], chosen - first[:-1]
 
 
 def _corners(line: np.ndarray) -> np.ndarray:

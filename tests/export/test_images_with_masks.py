@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+import tracemalloc
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -338,6 +339,16 @@ def test_filling_gives_the_mask_back_within_a_pixel(seed: int) -> None:
     near = cv2.dilate(mask.astype(np.uint8), np.ones((3, 3), np.uint8)).astype(bool)
     assert not (wrong & ~near).any() and not (wrong & mask).any()
     assert wrong.mean() < 1e-3
+
+
+def test_a_mask_with_many_holes_takes_little_memory_and_comes_back() -> None:
+    mask = np.pad(np.random.default_rng(0).random((200, 300)) > 0.01, 4)
+    tracemalloc.start()
+    filled = _filled(mask)
+    _, most = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert most < 50 * 2**20
+    np.testing.assert_array_equal(filled, mask)
 
 
 def test_every_part_is_one_polygon() -> None:
