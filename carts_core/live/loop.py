@@ -89,7 +89,12 @@ def follow(
     statistics = statistics or LiveStatistics()
     latest, taken = LatestFrame(source), deque[float](maxlen=_RECENT)
     try:
-        while (moment := latest.take(_patience(list(taken), tracker.live.oldest_seconds))) is not None:
+        while True:
+            # A frame whose result would be older than allowed is dropped.
+            usual = float(np.percentile(list(taken), _USUAL)) if taken else 0.0
+            moment = latest.take(max(tracker.live.oldest_seconds - usual, _FRESH))
+            if moment is None:
+                break
             estimate = tracker.track(moment.frame, moment.camera_poses)
             taken.append(estimate.seconds)
             tracked = Tracked(moment, estimate, time.monotonic() - moment.arrived)
@@ -102,12 +107,6 @@ def follow(
         statistics.ended = time.monotonic()
         statistics.arrived, statistics.dropped = latest.arrived, latest.dropped
     return statistics
-
-
-def _patience(taken: Sequence[float], oldest: float) -> float:
-    """Longest waiting time of a frame whose result is to be at most `oldest` old [s]."""
-    usual = float(np.percentile(taken, _USUAL)) if taken else 0.0
-    return max(oldest - usual, _FRESH)
 
 
 class Results:

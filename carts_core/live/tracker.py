@@ -206,7 +206,8 @@ class LiveTracker:
             if self._arm_is_elsewhere(frame, variables, correction.mean, measurement.loss, now):
                 self.verdict = LiveVerdict.DOUBTFUL
         else:
-            self.verdict = self._missed(now)
+            gone = self._filtered is None or now - self._seen > self.live.lost_seconds
+            self.verdict = LiveVerdict.LOST if gone else LiveVerdict.DOUBTFUL
             correction, measurement = self._known(errors, now).expected, measurement.left_out()
         prior = errors.correction(errors.initial())
         visit = Visit(frame.frame_id, variables, measurement, Origin.WARM, 0.0)
@@ -306,17 +307,11 @@ class LiveTracker:
         if attempt.effort is Effort.SEARCH:
             # A search starts far away, and ends less close than tracking.
             return measurement.loss <= self.live.bad_loss
-        if self._bad(measurement):
+        usual = statistics.median(self._losses) if self._losses else math.inf
+        worst = max(self.live.bad_factor * usual, 0.5 * self.live.bad_loss)
+        if measurement.loss > min(self.live.bad_loss, worst):
             return False
         return self._filtered is not None and not measurement.information.contradicts(attempt.expected)
-
-    def _bad(self, measurement: Measurement) -> bool:
-        usual = statistics.median(self._losses) if self._losses else math.inf
-        return measurement.loss > min(self.live.bad_loss, max(self.live.bad_factor * usual, 0.5 * self.live.bad_loss))
-
-    def _missed(self, now: float) -> LiveVerdict:
-        gone = self._filtered is None or now - self._seen > self.live.lost_seconds
-        return LiveVerdict.LOST if gone else LiveVerdict.DOUBTFUL
 
     def _take(self, errors: ErrorModel, attempt: _Attempt, measurement: Measurement) -> None:
         """Update the filter by a good frame, weighted for the correlation with the one before."""

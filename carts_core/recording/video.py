@@ -8,7 +8,6 @@ import hashlib
 import threading
 from bisect import bisect_right
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import lru_cache
@@ -87,21 +86,13 @@ def index_video(path: Path) -> VideoIndex:
     return _index(path.resolve(), status.st_mtime_ns, status.st_size)
 
 
-@contextmanager
-def opened(path: Path, *, parsed: bool = True) -> Iterator[tuple[InputContainer, VideoStream]]:
-    """Context of an open video file and its video stream.
+def open_video(path: Path, *, parsed: bool = True) -> tuple[InputContainer, VideoStream]:
+    """An open video file, which is a context, and its video stream.
 
     Args:
         path: the file.
         parsed: parse packets for data missing in the container, which takes as long as reading them.
     """
-    container, stream = open_video(path, parsed=parsed)
-    with container:
-        yield container, stream
-
-
-def open_video(path: Path, *, parsed: bool = True) -> tuple[InputContainer, VideoStream]:
-    """Open video file and its video stream; the caller closes the container."""
     options = _OPTIONS if parsed else {**_OPTIONS, "fflags": "+noparse"}
     try:
         container = av.open(str(path.absolute()), container_options=options, timeout=_SECONDS)
@@ -148,7 +139,8 @@ def _by_table(path: Path) -> VideoIndex | None:
     are decoded; it lacks what a file's later fragments hold, and has what was cut off its end. So packets here and
     there, and all from the last key frame on, are compared with it.
     """
-    with opened(path, parsed=False) as (container, stream):
+    container, stream = open_video(path, parsed=False)
+    with container:
         complete = any(name in container.format.name for name in _COMPLETE) and not stream.codec_context.has_b_frames
         entries, time_base = tuple(stream.index_entries) if complete else (), stream.time_base
         times = tuple(entry.timestamp for entry in entries)
@@ -183,7 +175,8 @@ def _as_in_table(
 
 def _by_packets(path: Path, *, parsed: bool) -> VideoIndex | None:
     """Index from the packets; None where their times are not reliable."""
-    with opened(path, parsed=parsed) as (container, stream):
+    container, stream = open_video(path, parsed=parsed)
+    with container:
         if not parsed and not any(name in container.format.name for name in _COMPLETE):
             return None
         exact = any(name in container.format.name for name in _EXACT)
@@ -212,7 +205,8 @@ def _by_packets(path: Path, *, parsed: bool) -> VideoIndex | None:
 
 def _by_decoding(path: Path) -> VideoIndex:
     """Index from decoding the whole file in order."""
-    with opened(path) as (container, stream):
+    container, stream = open_video(path)
+    with container:
         times = [frame.pts for frame in decoded_frames(container, stream)]
         time_base = stream.time_base or Fraction(1)
     if not times:
