@@ -2,6 +2,7 @@
 
 import io
 import warnings
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 PNG = b"\x89PNG\r\n\x1a\n"
@@ -50,17 +51,23 @@ def image_traits(content: bytes) -> ImageTraits:
     return ImageTraits(orientation, turned_already=True)
 
 
+def png_chunks(content: bytes) -> Iterator[tuple[bytes, int, int]]:
+    """Kind, and begin and end of the data, of each chunk of a PNG; the last one may be cut off."""
+    begin = len(PNG) + 8
+    while begin + 4 <= len(content):
+        end = begin + int.from_bytes(content[begin - 8 : begin - 4], "big")
+        yield content[begin - 4 : begin], begin, end
+        begin = end + 12
+
+
 def _png_traits(content: bytes) -> ImageTraits:
     kind = content[25] if len(content) > 25 else 0
-    orientation, position = 1, len(PNG)
-    while position + 12 <= len(content):
-        length = int.from_bytes(content[position : position + 4], "big")
-        name, data = content[position + 4 : position + 8], content[position + 8 : position + 8 + length]
+    orientation = 1
+    for name, begin, end in png_chunks(content):
         if name == b"eXIf":
-            orientation = _tiff_orientation(data)
+            orientation = _tiff_orientation(content[begin:end])
         elif name == b"tRNS" and kind != _PALETTE:
             kind = 6
-        position += 12 + length
     return ImageTraits(orientation, alpha=kind in _ALPHA, palette=kind == _PALETTE)
 
 

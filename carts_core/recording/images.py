@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Bool, UInt8
 
 from ..errors import SequenceError
-from ..files.image_size import JPEG, PNG, TIFF, ImageTraits, image_traits, size_problem
+from ..files.image_size import JPEG, PNG, TIFF, ImageTraits, image_traits, png_chunks, size_problem
 from ..files.reading import IMAGE, open_regular, read_bytes
 
 _START_OF_SCAN, _END_OF_IMAGE = b"\xff\xda", b"\xff\xd9"
@@ -432,16 +432,11 @@ def find_damage(content: bytes) -> str | None:
 
 
 def _png_damage(content: bytes) -> str | None:
-    position = len(PNG)
-    while position + 12 <= len(content):
-        length = int.from_bytes(content[position : position + 4], "big")
-        kind = content[position + 4 : position + 8]
-        end = position + 12 + length
-        if end > len(content):
+    for kind, begin, end in png_chunks(content):
+        if end + 4 > len(content):
             break
-        if zlib.crc32(content[position + 4 : end - 4]) != int.from_bytes(content[end - 4 : end], "big"):
+        if zlib.crc32(content[begin - 4 : end]) != int.from_bytes(content[end : end + 4], "big"):
             return f"the checksum of its {kind.decode('latin-1')} chunk is wrong"
         if kind == b"IEND":
             return None
-        position = end
     return "the PNG ends before its last pixel"
