@@ -59,10 +59,11 @@ def widen(silhouette: Bool[np.ndarray, "height width"], margins: int = 1) -> Boo
 def background_of_recording(
     scene: Scene, camera: str, states: Items[SceneState], image: Callable[[int], UInt8[np.ndarray, "height width 3"]]
 ) -> MeanBackground:
-    """The mean background of a recording: see `estimate_background`.
+    """The mean background of a recording: the median of each pixel over the views in which no arm covers it.
 
-    A pixel is known where the arms are far away in most of the views that it is the median of, or where many views
-    agree: an arm that is there despite wrong kinematics moves and changes its shading.
+    A pixel that is always covered is filled in from its surroundings. A pixel is known where the arms are far away in
+    most of the views that it is the median of, or where many views agree: an arm that is there despite wrong
+    kinematics moves and changes its shading.
 
     Args:
         scene: with the camera.
@@ -81,8 +82,8 @@ def background_of_recording(
     covers = [widen(silhouette) for silhouette in arms]
     clear = len(arms) - np.sum([widen(silhouette, _LARGEST_ERROR) for silhouette in arms], axis=0)
     used = len(arms) - np.sum(covers, axis=0)
-    estimate, deviation = _median((image(place), cover) for place, cover in enumerate(covers))
-    estimate = _filled(estimate, used == 0)
+    estimate, deviation = uncovered_median((image(place), cover) for place, cover in enumerate(covers))
+    estimate = filled_in(estimate, used == 0)
     agree = (used >= _FEWEST) & (deviation <= _AGREE[0] * np.median(deviation[used > 0]) + _AGREE[1])
     always, usually = (used == 0).sum(), np.mean([cover.sum() for cover in covers])
     problem = None
@@ -95,21 +96,7 @@ def background_of_recording(
     return MeanBackground(estimate, (2 * clear > used) | agree, problem)
 
 
-def estimate_background(
-    views: Iterable[tuple[UInt8[np.ndarray, "height width 3"], Bool[np.ndarray, "height width"]]],
-) -> UInt8[np.ndarray, "height width 3"]:
-    """Median of every pixel over the views in which it is not covered.
-
-    A pixel that is covered in every view is filled in from its surroundings.
-
-    Raises:
-        SequenceError: the whole image is covered in every view.
-    """
-    known = list(views)
-    return _filled(_median(known)[0], np.all([cover for _, cover in known], axis=0))
-
-
-def _median(
+def uncovered_median(
     views: Iterable[tuple[UInt8[np.ndarray, "height width 3"], Bool[np.ndarray, "height width"]]],
 ) -> tuple[UInt8[np.ndarray, "height width 3"], Float[np.ndarray, "height width"]]:
     """Median of every pixel over the views in which it is not covered, and the median deviation from it [grey levels].
@@ -146,7 +133,7 @@ def _middle(values: Int[np.ndarray, "views ..."], count: Int[np.ndarray, "rows c
     return np.where(count.reshape(middle.shape[1:]) > 0, (low + high + 1) // 2, 0)
 
 
-def _filled(
+def filled_in(
     image: UInt8[np.ndarray, "height width 3"], hole: Bool[np.ndarray, "height width"]
 ) -> UInt8[np.ndarray, "height width 3"]:
     """`image` with the pixels that are never seen filled in from their surroundings."""

@@ -165,15 +165,11 @@ def take_frame_list(section: TomlTable) -> FrameList:
 
 
 def list_of_rows(table: Table, names: FrameNames, timestamp: str, section: TomlTable, counted: str) -> FrameList:
-    """One frame per row of a table; takes the key `video_frame`.
+    """One frame per row of a table that a section describes, its key `video_frame` included.
 
     Args:
-        table: the table.
-        names: where it has the frames' ids.
-        timestamp: its column with the time [s]; empty for frames without times.
-        section: table of the sequence file that describes it.
-        counted: number of frames, as a clause for errors.
-    """
+        timestamp: column with the time [s]; empty for frames without times.
+        counted: number of frames, as a clause for errors."""
     frame_ids = names.of(table)
     times = table.numbers(timestamp, section.name("timestamp")) if timestamp else None
     column = section.take("video_frame", str, "")
@@ -258,8 +254,13 @@ def _matching(base: Path, key: str) -> tuple[Path, list[Path]]:
             f"{key}: {str(wild)!r} would search whole trees of folders. Wildcards are allowed from the last "
             f"{_MOST_WILD_PARTS} parts of the path on, and ** is not; name the folder."
         )
+
+    def natural(path: Path) -> list[tuple[int, str]]:
+        # `frame9` comes before `frame10`.
+        return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", path.name)]
+
     try:
-        return fixed, sorted(filter(is_regular, fixed.glob(str(wild))), key=_natural)
+        return fixed, sorted(filter(is_regular, fixed.glob(str(wild))), key=natural)
     except (ValueError, OSError) as error:
         raise SequenceError(f"{key}: {str(wild)!r} cannot be searched for: {error}. Examples: {EXAMPLES}.") from error
 
@@ -274,8 +275,3 @@ def check_present(key: str, files: tuple[Path, ...], frames: FrameList, hint: st
             f"{key}: {len(missing)} of {counted(len(files), 'file')} missing: {shown}{rest}, but {frames.counted} "
             f"and every one needs its file: put them back, correct the pattern, or remove the rows.{hint}"
         )
-
-
-def _natural(path: Path) -> list[tuple[int, str]]:
-    """Sort key by which `frame9` comes before `frame10`."""
-    return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", path.name)]

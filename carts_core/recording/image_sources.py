@@ -50,11 +50,7 @@ class Cropped:
         return self.source.name(index)
 
     def read(self, index: int) -> UInt8[np.ndarray, "height width 3"]:
-        """The rectangle, RGB.
-
-        Raises:
-            SequenceError: the image cannot be read, or the rectangle leaves it.
-        """
+        """The rectangle, RGB; `SequenceError` if the image cannot be read or the rectangle leaves it."""
         image = self.source.read(index)
         left, top, width, height = self.crop
         if left + width > image.shape[1] or top + height > image.shape[0]:
@@ -133,11 +129,6 @@ _SHARED: "weakref.WeakValueDictionary[tuple[Path, int], Bag]" = weakref.WeakValu
 """Open bags by path and modification time [ns], shared between cameras."""
 
 
-def _shared(path: Path) -> Bag:
-    key = path.absolute(), path.stat().st_mtime_ns if path.exists() else 0
-    return _SHARED.get(key) or _SHARED.setdefault(key, Bag(path))
-
-
 class BagImages:
     """Images of one topic of a ROS bag, each found by the time at which it was recorded; safe to use from threads.
 
@@ -154,7 +145,8 @@ class BagImages:
         self.path = path
         self.topic = topic
         self._times = times
-        self._bag = _shared(path)
+        key = path.absolute(), path.stat().st_mtime_ns if path.exists() else 0
+        self._bag = _SHARED.get(key) or _SHARED.setdefault(key, Bag(path))
         names = {name for name, _ in self._bag.topics}
         if topic not in names:
             raise SequenceError(f"bag {path} has no topic {topic!r}. Its topics are: {', '.join(sorted(names))}.")
@@ -164,19 +156,11 @@ class BagImages:
         return f"{self.path}, {self.topic} at {self._times[index]} ns"
 
     def read(self, index: int) -> UInt8[np.ndarray, "height width 3"]:
-        """The image of the sequence's frame `index`, RGB.
-
-        Raises:
-            SequenceError: there is none at that time, or it is damaged.
-        """
+        """The image of the sequence's frame `index`, RGB; `SequenceError` if it is missing or damaged."""
         return decode_message(self._message(index), self.name(index))
 
     def fingerprint(self, index: int) -> str:
-        """SHA-256 of the message's fields.
-
-        Raises:
-            SequenceError: there is none at that time.
-        """
+        """SHA-256 of the message's fields; `SequenceError` if it is missing."""
         fields = vars(self._message(index))
         data = np.asarray(fields.pop("data"), np.uint8).tobytes()
         return hashlib.sha256(repr(fields).encode() + data).hexdigest()
@@ -193,11 +177,7 @@ class BagImages:
 
 
 def decode_message(message: Any, what: str) -> UInt8[np.ndarray, "height width 3"]:
-    """Pixels of a `sensor_msgs` image message, RGB.
-
-    Raises:
-        SequenceError: it is damaged or of an encoding that is not known.
-    """
+    """Pixels of a `sensor_msgs` image message, RGB; `SequenceError` if it is damaged or of an unknown encoding."""
     if not hasattr(message, "encoding"):
         return decode_image(np.asarray(message.data, np.uint8).tobytes(), what)
     encoding = message.encoding.lower()

@@ -4,6 +4,7 @@ Unusable files are a `SequenceError`; a truncated one gives no half grey image.
 """
 
 import hashlib
+import io
 import zlib
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
@@ -18,6 +19,7 @@ from jaxtyping import Bool, UInt8
 from ..errors import SequenceError
 from ..files.image_size import JPEG, PNG, TIFF, ImageTraits, image_traits, png_chunks, size_problem
 from ..files.reading import IMAGE, open_regular, read_bytes
+from .background import spread
 
 _START_OF_SCAN, _END_OF_IMAGE = b"\xff\xda", b"\xff\xd9"
 _REMEDY = "Copy or export it again."
@@ -112,11 +114,7 @@ def read_image(path: Path, bits: Callable[[], int] | None = None) -> UInt8[np.nd
 
 
 def decode_image(content: bytes, what: str) -> UInt8[np.ndarray, "height width 3"]:
-    """As `read_image`, for an encoded image in memory.
-
-    Raises:
-        SequenceError: it is damaged, too large or not an image.
-    """
+    """As `read_image`, for an encoded image in memory."""
     return _eight_bits(_raster(content, what, colour=True), what)
 
 
@@ -249,10 +247,7 @@ def bits_of_files(files: Sequence[Path]) -> int:
 
 def spread_files(files: Sequence[Path], most: int = _SAMPLED) -> list[Path]:
     """Evenly spaced files, from the first to the last."""
-    if not files:
-        return []
-    rows = np.unique(np.linspace(0, len(files) - 1, min(most, len(files))).round().astype(int))
-    return [files[row] for row in rows]
+    return [files[row] for row in spread(len(files), most)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -317,7 +312,11 @@ def _raster(content: bytes, what: str, *, colour: bool) -> _Raster:
     if image.dtype not in (np.uint8, np.uint16):
         raise SequenceError(f"{what} has pixels of the type {image.dtype}. Save it with 8 or 16 bits.")
     traits = image_traits(content)
-    indices = _palette_indices(content) if traits.palette and not colour else None
+    indices = None
+    if traits.palette and not colour:
+        from PIL import Image  # noqa: PLC0415 - OpenCV gives the colours alone
+
+        indices = np.array(Image.open(io.BytesIO(content), formats=("PNG",)))
     if not traits.turned_already:
         image = _TURNS[traits.orientation](image)
         indices = None if indices is None else _TURNS[traits.orientation](indices)
@@ -341,14 +340,6 @@ _TURNS: dict[int, Callable[[np.ndarray], np.ndarray]] = {
     8: np.rot90,
 }
 """EXIF orientation -> operation that turns stored pixels upright."""
-
-
-def _palette_indices(content: bytes) -> np.ndarray:
-    import io  # noqa: PLC0415
-
-    from PIL import Image  # noqa: PLC0415 - OpenCV gives the colours alone
-
-    return np.array(Image.open(io.BytesIO(content), formats=("PNG",)))
 
 
 def _fewest_bits(largest: int) -> int:
@@ -426,12 +417,8 @@ def find_damage(content: bytes) -> str | None:
         # In compressed data a byte 0xff is never followed by 0xd9, so this marker after the last scan is the end.
         scan = content.rfind(_START_OF_SCAN)
         return None if content.find(_END_OF_IMAGE, scan + 2) > scan >= 0 else "the JPEG ends before its last pixel"
-    if content.startswith(PNG):
-        return _png_damage(content)
-    return None
-
-
-def _png_damage(content: bytes) -> str | None:
+    if not content.startswith(PNG):
+        return None
     for kind, begin, end in png_chunks(content):
         if end + 4 > len(content):
             break

@@ -10,7 +10,6 @@ from functools import lru_cache
 from itertools import combinations
 from operator import itemgetter
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -70,10 +69,18 @@ class Table:
 
 def read_table(path: Path, delimiter: str = ",", what: str = "kinematics table") -> Table:
     """Read a CSV file, named `what` in errors; blank lines are skipped."""
+    rows: list[tuple[str, ...]] = []
+    lines: list[int] = []
+    cells = 0
     try:
         with io.TextIOWrapper(open_regular(path, TABLE), encoding="utf-8-sig", newline="") as handle:
             reader = csv.reader(handle, delimiter=delimiter, skipinitialspace=True)
-            rows, lines = _filled_rows(reader, path, what)
+            for row in filter(any, reader):
+                rows.append(tuple(row))  # Python's garbage collector untracks tuples, but not lists.
+                lines.append(reader.line_num)
+                cells += len(row)
+                if cells > MOST_CELLS:
+                    raise SequenceError(f"{what} {path} has more than {MOST_CELLS:,} cells. Divide the recording.")
     except (FileNotFoundError, IsADirectoryError) as error:
         raise SequenceError(f"{what} {path} is missing. Correct the path in the sequence file.") from error
     except (OSError, ValueError, csv.Error) as error:
@@ -95,21 +102,6 @@ def read_table(path: Path, delimiter: str = ",", what: str = "kinematics table")
             f"{path}, line {line} has {len(row)} cells, but the header has {len(header)}. Complete the row."
         )
     return Table(path, header, tuple(rows[1:]), tuple(lines[1:]))
-
-
-def _filled_rows(reader: Any, path: Path, what: str) -> tuple[list[tuple[str, ...]], list[int]]:
-    """Cells and last line number of every row that is not empty."""
-    rows: list[tuple[str, ...]] = []
-    lines: list[int] = []
-    cells = 0
-    for row in reader:
-        if any(row):
-            rows.append(tuple(row))  # Python's garbage collector untracks tuples, but not lists.
-            lines.append(reader.line_num)
-            cells += len(row)
-            if cells > MOST_CELLS:
-                raise SequenceError(f"{what} {path} has more than {MOST_CELLS:,} cells. Divide the recording.")
-    return rows, lines
 
 
 def _number(cell: str) -> float:

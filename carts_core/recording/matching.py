@@ -152,8 +152,17 @@ class Rows:
     def read(self, path: Path) -> Table:
         """Another table with the same frames, or of the same clock."""
         table = read_table(path, self.delimiter)
-        if self.names is not None:
-            _check_same_frames(table, self.names.of(table), self.frames.frame_ids)
+        if self.names is None:
+            return table
+        ids, wanted = self.names.of(table), self.frames.frame_ids
+        same = "All tables of a sequence must have the same frames in the same order."
+        if len(ids) != len(wanted):
+            rows = counted(len(ids), "row")
+            raise SequenceError(f"{path} has {rows}, but the kinematics table has {len(wanted)}. {same}")
+        for given, expected, line in zip(ids, wanted, table.lines, strict=True):
+            if given != expected:
+                text = f"is frame {given!r}, but the kinematics table has frame {expected!r} there. {same}"
+                raise SequenceError(f"{path}, line {line} {text}")
         return table
 
     def samples(self, table: Table, values: np.ndarray) -> Samples:
@@ -173,12 +182,7 @@ class Rows:
 
 
 def take_rows(section: TomlTable, frames_section: TomlTable | None) -> Rows:
-    """Read the tables that `[kinematics]` and `[frames]` describe.
-
-    Args:
-        section: `[kinematics]`.
-        frames_section: `[frames]`, whose times the rows are matched with; None where every row is a frame.
-    """
+    """Read the tables that `[kinematics]` and `[frames]` describe; without the latter, every row is a frame."""
     delimiter = take_delimiter(section)
     table = read_table(section.path(section.take("table", str)), delimiter)
     timestamp, truth = section.take("timestamp", str, ""), section.take("truth", str, "")
@@ -200,20 +204,6 @@ def take_rows(section: TomlTable, frames_section: TomlTable | None) -> Rows:
         frames_section.finish()
     section.finish()
     return Rows(frames, matching, table, section.path(truth) if truth else None, delimiter, names, timestamp)
-
-
-def _check_same_frames(table: Table, ids: tuple[str, ...], wanted: tuple[str, ...]) -> None:
-    if len(ids) != len(wanted):
-        raise SequenceError(
-            f"{table.path} has {counted(len(ids), 'row')}, but the kinematics table has {len(wanted)}. "
-            "All tables of a sequence must have the same frames in the same order."
-        )
-    for given, expected, line in zip(ids, wanted, table.lines, strict=True):
-        if given != expected:
-            raise SequenceError(
-                f"{table.path}, line {line} is frame {given!r}, but the kinematics table has frame {expected!r} there. "
-                "All tables of a sequence must have the same frames in the same order."
-            )
 
 
 POSES = ("T_world_mount", "T_mount_world")

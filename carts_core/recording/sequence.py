@@ -114,14 +114,10 @@ class Sequence:
         return Sequence(read_description(Path(path).absolute(), progress))
 
     def with_time_offset(self, time_offset: float) -> "Sequence":
-        """The same images with joint positions at another time offset; the sequence file is not changed.
-
-        Args:
-            time_offset: time in the kinematics tables minus time of the image [s].
+        """The same images with joint positions at another time offset (kinematics minus image) [s].
 
         Raises:
-            SequenceError: rows are not matched by time, or a frame has no row near enough.
-        """
+            SequenceError: rows are not matched by time, or a frame has no row near enough."""
         matching = replace(self.checked_matching(), time_offset=time_offset)
         moved = Sequence(replace(self._description, matching=matching))
         # Images and masks do not depend on it.
@@ -129,12 +125,7 @@ class Sequence:
         return moved
 
     def corrected(self, scene: Scene, measured: Mapping[str, Float[np.ndarray, "frames dofs"]]) -> "Sequence":
-        """The same images with another calibration of the same arms and cameras, and other joint positions.
-
-        Args:
-            scene: arms and cameras.
-            measured: arm -> joint positions of all frames [rad, m], in place of the measured ones.
-        """
+        """The same images with another calibration and joint positions of all frames [rad, m] of the same arms."""
         corrected = copy(self)
         corrected.scene, corrected.measured = scene, dict(measured)
         # The background depends on the poses of the arms.
@@ -181,22 +172,14 @@ class Sequence:
         return {camera: Ts[index].copy() for camera, Ts in self._mounts.items()}
 
     def logged_at(self, times: Float[np.ndarray, " times"]) -> Logged:
-        """Logged values at times of the tables' clock [s].
-
-        Raises:
-            SequenceError: rows are not matched by time.
-        """
+        """Logged values at times of the tables' clock [s]; `SequenceError` if rows are not matched by time."""
         self.checked_matching()
         arms = {name: arm.measured.logged_at(times) for name, arm in self._description.arms.items()}
         cameras = {name: camera.motion for name, camera in self._cameras.items() if camera.motion is not None}
         return Logged(arms, {name: motion.logged_at(times) for name, motion in cameras.items()})
 
     def checked_matching(self) -> TimeMatching:
-        """Matching of frames and rows by time.
-
-        Raises:
-            SequenceError: they are not.
-        """
+        """Matching of frames and rows by time; `SequenceError` without it."""
         if self.matching is None:
             raise SequenceError(
                 f"{self.path} has a row of joint positions for each frame, so there is no time to offset. "
@@ -205,11 +188,7 @@ class Sequence:
         return self.matching
 
     def recorded_camera(self, name: str) -> Camera:
-        """A camera with the distortion of its recorded images; `scene` has it without.
-
-        Raises:
-            SequenceError: there is no such camera.
-        """
+        """A camera with the distortion of its recorded images, which `scene` lacks; `SequenceError` if unknown."""
         return self._camera(name).camera
 
     def image_source(self, camera: str, domain: str | None = None) -> ImageSource:
@@ -365,11 +344,7 @@ class FrameReader:
         self._stride = 1
 
     def frame(self, index: int, domain: str, *cameras: str) -> Frame:
-        """One frame with the images of some cameras.
-
-        Raises:
-            SequenceError: there is no such frame, domain or camera, or the image is not usable.
-        """
+        """One frame with the images of some cameras; errors as `Sequence.frame`."""
         self._replace_plan(())
         frame = self._sequence.frame(index, domain, list(cameras))
         moved = 0 if self._last is None else index - self._last

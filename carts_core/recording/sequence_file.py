@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -69,7 +70,10 @@ def take_transform(table: TomlTable, key: str, default: Any) -> np.ndarray:
 def take_camera(table: TomlTable) -> Camera:
     """The camera that a `[[cameras]]` table describes."""
     name = table.take("name", str)
-    width, height = _take_size(table)
+    size = take_value(table, "size", [])
+    if not (isinstance(size, list) and len(size) == 2 and all(isinstance(value, int) and value > 0 for value in size)):
+        raise table.error("size", f"is {shown(size)}. Give [width, height] in whole pixels, say size = [640, 480].")
+    width, height = size
     intrinsics = _take_intrinsics(table)
     distortion = take_value(table, "distortion", [])
     if not isinstance(distortion, list) or not all(_is_number(value) for value in distortion):
@@ -81,13 +85,6 @@ def take_camera(table: TomlTable) -> Camera:
         return Camera(name, width, height, intrinsics, T_camera_world, tuple(float(value) for value in distortion))
     except SettingsError as error:
         raise SequenceError(f"{table.file}: {table.where}: {error}") from error
-
-
-def _take_size(table: TomlTable) -> tuple[int, int]:
-    size = take_value(table, "size", [])
-    if not (isinstance(size, list) and len(size) == 2 and all(isinstance(value, int) and value > 0 for value in size)):
-        raise table.error("size", f"is {shown(size)}. Give [width, height] in whole pixels, say size = [640, 480].")
-    return size[0], size[1]
 
 
 def _take_intrinsics(table: TomlTable) -> tuple[float, float, float, float]:
@@ -122,17 +119,6 @@ def _is_number(value: object) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool)
 
 
-def resolve_robot(table: TomlTable) -> Path:
-    """URDF that the key `robot` names: a path, or `builtin:NAME`."""
-    value = table.take("robot", str)
-    if value.startswith(SCHEME):
-        try:
-            return robot_file(value)
-        except RobotError as error:
-            raise table.error("robot", f"is not known: {error}") from error
-    return table.path(value)
-
-
 @dataclass(frozen=True)
 class CameraInput:
     """A camera with its images, masks and backgrounds by domain."""
@@ -149,7 +135,10 @@ class CameraInput:
         """Remarks on changes to images and masks before they are used, and on unusual calibrations."""
         camera = self.camera
         files = {file: None for domain in self.masks.values() for file in domain if file is not None}
-        found = [text for source in self.images.values() for text in _remarks_of(source)]
+        found: list[str] = []
+        for source in self.images.values():
+            with suppress(SequenceError):  # It is an error where the image is used.
+                found += source.remarks()
         found += mask_remarks(list(files))
         unusual = implausible_intrinsics(camera.width, camera.height, camera.intrinsics, camera.distortion)
         found += [f"its calibration has {unusual}. Check `size`, `K` and `distortion`."] if unusual else []
@@ -179,13 +168,6 @@ def take_camera_input(table: TomlTable, rows: Rows, domains: tuple[str, ...]) ->
 def _path(table: TomlTable, key: str, pattern: str, domain: str, camera: str) -> Path:
     """Path of a pattern that is the same for every frame."""
     return table.path(expand(pattern, table.name(key), domain=domain, camera=camera))
-
-
-def _remarks_of(source: ImageSource) -> tuple[str, ...]:
-    try:
-        return source.remarks()
-    except SequenceError:  # It is an error where the image is used.
-        return ()
 
 
 def _by_domain(table: TomlTable, key: str, domains: tuple[str, ...], required: bool = False) -> dict[str, str]:
@@ -366,7 +348,11 @@ def _take_arm(
     table: TomlTable, rows: Rows, robots: dict[tuple[Path, str | None], Robot], progress: Callable[[str], None] | None
 ) -> ArmInput:
     name = table.take("name", str)
-    urdf = resolve_robot(table)
+    value = table.take("robot", str)
+    try:
+        urdf = robot_file(value) if value.startswith(SCHEME) else table.path(value)
+    except RobotError as error:
+        raise table.error("robot", f"is not known: {error}") from error
     base_link = table.take("base_link", str, None)
     if (key := (urdf.resolve(), base_link)) not in robots:
         robots[key] = Robot.load(urdf, base_link=base_link, progress=progress)
@@ -383,17 +369,14 @@ def calibrated_sequence_file(
 ) -> str:
     """Text of a copy of a sequence file for another folder, with another calibration.
 
-    What differs between the scenes is written as numbers; everything else, comments included, stays. Paths, which are
-    relative to the file's folder, are changed for the new one; absolute paths stay.
+    What differs between the scenes is written as numbers; everything else, comments included, stays. Relative paths are
+    changed for the new folder.
 
     Args:
-        path: a valid sequence file.
-        folder: of the new file.
         before: the scene that `path` describes.
         after: the same with other base frames, extrinsics or intrinsics.
         command: the `carts` command that found them, for the heading.
-        time_offset: the key of that name in `[frames]` [s]; None leaves it as it is.
-    """
+        time_offset: the key of that name in `[frames]` [s]; None leaves it as it is."""
     document: dict[str, Any] = tomlkit.parse(read_text(path, SEQUENCE))
     source, target = path.parent.resolve(), folder.resolve()
 

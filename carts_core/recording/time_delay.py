@@ -223,7 +223,10 @@ class _Delays:
 
         def unexplained(offset: float) -> float:
             parts = self._parts(offset)
-            return 1.0 if parts is None else 1.0 - _explained(parts, blocks)
+            if parts is None:
+                return 1.0
+            XX, XY, YY = (part[blocks].sum(0) for part in parts)
+            return 1.0 - float((XY * _fitted(XX, XY)).sum() / max(float(YY), 1e-12))
 
         bounds = around - 1.5 * _GRID, around + 1.5 * _GRID
         found: Any = minimize_scalar(unexplained, bounds=bounds, method="bounded", options={"xatol": 2e-4})
@@ -293,12 +296,6 @@ def _points(robot: Robot, joints: Float[np.ndarray, "rows dofs"]) -> Float[np.nd
     Ts = robot.forward_kinematics(torch.from_numpy(np.nan_to_num(joints))).numpy()
     middles = [Ts[:, mesh.link, :3, :3] @ mesh.vertices.mean(0) + Ts[:, mesh.link, :3, 3] for mesh in robot.meshes]
     return np.where(np.isfinite(joints).all(1, keepdims=True), np.concatenate(middles, 1), np.nan)
-
-
-def _explained(parts: tuple[np.ndarray, np.ndarray, np.ndarray], blocks: np.ndarray) -> float:
-    """Share of the flow of some blocks that a linear function of the motion explains, fitted to it [1]."""
-    XX, XY, YY = (part[blocks].sum(0) for part in parts)
-    return float((XY * _fitted(XX, XY)).sum() / max(float(YY), 1e-12))
 
 
 def _predicted(parts: tuple[np.ndarray, np.ndarray, np.ndarray]) -> float:

@@ -62,8 +62,10 @@ class TomlTable:
         self._known.append(key)
         if key not in self._values:
             if default is _REQUIRED:
-                given = [name for name in self._values if name not in self._known]
-                raise self.error(key, f"is missing. Add it (docs/reference/sequence_format.md).{_typo(key, given)}")
+                given = [name for name in self._values if name not in self._known][:_MOST_COMPARED]
+                matches = difflib.get_close_matches(key, given, n=1, cutoff=0.5)
+                typo = f" Is {matches[0]!r} a misspelling of it?" if matches else ""
+                raise self.error(key, f"is missing. Add it (docs/reference/sequence_format.md).{typo}")
             return default
         value = self._values[key]
         kinds = kind if isinstance(kind, tuple) else (kind,)
@@ -137,8 +139,3 @@ def check_file_name(table: TomlTable, key: str, verb: str, name: str) -> None:
     """Check that a name can be part of file names."""
     if fault := name_fault(name):
         raise table.error(key, f"{verb} {name!r}, {fault}. {allowed_names()}.")
-
-
-def _typo(key: str, given: list[str]) -> str:
-    matches = difflib.get_close_matches(key, given[:_MOST_COMPARED], n=1, cutoff=0.5)
-    return f" Is {matches[0]!r} a misspelling of it?" if matches else ""

@@ -278,11 +278,7 @@ class Video:
         return f"{self.path}, frame number {self._numbers[index]}"
 
     def read(self, index: int) -> UInt8[np.ndarray, "height width 3"]:
-        """The image of the sequence's frame `index`, RGB, upright.
-
-        Raises:
-            SequenceError: the video is damaged there.
-        """
+        """The image of the sequence's frame `index`, RGB, upright; `SequenceError` if the video is damaged there."""
         with self._lock:
             frame = self._frame(self._numbers[index])
             interlaced = self._deinterlace and frame.interlaced_frame
@@ -290,11 +286,7 @@ class Video:
             return np.ascontiguousarray(_turned(image, _display_matrix(frame)))
 
     def fingerprint(self, index: int) -> str:
-        """SHA-256 of the file, with the number of the frame and whether fields are separated.
-
-        Raises:
-            SequenceError: it is missing or cannot be read.
-        """
+        """SHA-256 of the file, with the number of the frame and whether fields are separated."""
         try:
             status = self.path.stat()
             content = _file_digest(self.path, status.st_mtime_ns, status.st_size)
@@ -303,11 +295,7 @@ class Video:
         return f"{content} {self._numbers[index]} {self._deinterlace}"
 
     def remarks(self) -> tuple[str, ...]:
-        """Remarks on the frames, from the first of them: rotation, deinterlacing, pixels that are not square.
-
-        Raises:
-            SequenceError: the video is damaged there.
-        """
+        """Remarks on rotation, deinterlacing and pixels that are not square, from the first frame."""
         with self._lock:
             frame = self._frame(self._numbers[0])
             matrix, stream = _display_matrix(frame), None if self._open is None else self._open[1]

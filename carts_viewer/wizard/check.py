@@ -16,7 +16,7 @@ from carts_core.recording import Sequence, TimeOffsetEstimate, estimate_time_off
 from carts_core.recording.importing.cameras import find_images
 from carts_core.recording.importing.columns import ColumnMeanings, guess_columns, sample
 from carts_core.recording.importing.foreign_tables import ForeignTable
-from carts_core.recording.importing.found import FoundArm, FoundRecording, Note
+from carts_core.recording.importing.found import FoundArm, FoundRecording, Note, PartError
 from carts_core.recording.importing.importer import detect, find
 from carts_core.recording.importing.writing import write_sequence
 from carts_core.recording.sources.datasets import JIGSAWS, jigsaws_trials
@@ -152,7 +152,7 @@ def guess(draft: Draft) -> Guess:
         recording = find(source, options)
     except CartsError as error:
         if not problems:
-            problems[_part_of(str(error), options)] = str(error)
+            problems[error.part if isinstance(error, PartError) else "recording"] = str(error)
         about_table = not any(place.startswith(("calibration", "images")) for place in problems)
         recording = _images_alone(source, options) if kind == FOLDER and about_table else None
     if kind == FOLDER:
@@ -192,28 +192,6 @@ def _problems_of_parts(source: Path, options: ImportOptions) -> dict[str, str]:
     for camera, place in options.images.items():
         attempt(f"images {camera}", lambda place=place: find_images(source / place))
     return found
-
-
-def _part_of(message: str, options: ImportOptions) -> str:
-    """Which part of the form an error is about, by the files that it names."""
-    for camera, path in options.calibration.items():
-        if str(path) in message:
-            return f"calibration {camera}"
-    if (camera := re.search(r"--calibration (.+?) FILE", message)) is not None:
-        return f"calibration {camera[1]}"
-    if options.kinematics is not None and options.kinematics.name in message:
-        return "columns" if "column" in message else "kinematics"
-    for word, place in (
-        ("--images", "images"),
-        ("camera_matrix", "calibration"),
-        ("column", "columns"),
-        ("-unit", "columns"),
-        ("--clock", "columns"),
-        ("--frame-rate", "columns"),
-    ):
-        if word in message:
-            return place
-    return "recording"
 
 
 def estimated_delay(recording: FoundRecording) -> TimeOffsetEstimate:

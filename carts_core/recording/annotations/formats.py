@@ -58,21 +58,6 @@ class FrameAnnotation:
     """Name -> column and row in the undistorted image [px]."""
 
 
-class Labels:
-    """Names of labels, numbered in order of appearance."""
-
-    def __init__(self) -> None:
-        self.names: list[str] = []
-
-    def number(self, name: str) -> int:
-        """Number of a label, from 1."""
-        if name not in self.names:
-            if len(self.names) == MOST_LABELS:
-                raise SequenceError(f"there are more than {MOST_LABELS} labels, say {name!r}. Join some of them.")
-            self.names.append(name)
-        return self.names.index(name) + 1
-
-
 @dataclass(frozen=True, eq=False)
 class Annotations:
     """Annotations of a source for a sequence. Frames are decoded while iterating, which is possible once."""
@@ -93,11 +78,7 @@ _BITS, _MORE, _SIGN, _FIRST = 5, 0x20, 0x10, 48
 
 
 def runs_of_text(text: str) -> list[int]:
-    """COCO's compressed run lengths as numbers.
-
-    Raises:
-        ValueError: the text is none.
-    """
+    """COCO's compressed run lengths as numbers; `ValueError` for other texts."""
     runs: list[int] = []
     value = place = 0
     for character in text:
@@ -117,11 +98,7 @@ def runs_of_text(text: str) -> list[int]:
 
 
 def mask_of_runs(runs: Sequence[int], height: int, width: int, *, by_columns: bool) -> Bool[np.ndarray, "height width"]:
-    """A mask from alternating run lengths; the first run is outside.
-
-    Raises:
-        ValueError: they are not as many pixels as the mask has.
-    """
+    """A mask from alternating run lengths, the first of them outside; `ValueError` if their sum is another size."""
     lengths = np.asarray(runs, np.int64)
     if lengths.ndim != 1 or (lengths < 0).any() or (lengths > height * width).any() or lengths.sum() != height * width:
         raise ValueError(f"the run lengths do not make {width} x {height} pixels")
@@ -398,10 +375,8 @@ def read_mask_folder(path: Path, remarks: Counter[str], *, confined: bool = Fals
     """The images below a folder; files of the same name in sibling folders belong to the same frame.
 
     Args:
-        path: of the folder.
         remarks: numbers of files with a change or decision are added while they are decoded.
-        confined: whether links are left out, and names of values are not looked for above the folder.
-    """
+        confined: whether links are left out, and names of values are not looked for above the folder."""
     # An export of carts has a folder with links, which are the finest labels.
     finest = path / "links" if (path / "labels.json").is_file() and (path / "links").is_dir() else path
     usable = [file for file in _files(finest) if not (confined and file.is_symlink())]

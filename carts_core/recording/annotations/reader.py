@@ -14,10 +14,10 @@ from ...model.camera import HALF_PIXEL, Camera
 from ..importing.cameras import side_of
 from ..sequence import Sequence
 from .formats import (
+    MOST_LABELS,
     Annotations,
     ForeignImage,
     FrameAnnotation,
-    Labels,
     read_coco,
     read_cvat,
     read_mask_folder,
@@ -71,9 +71,10 @@ def read_annotations(
             "keypoints of SurgPose (.yaml), or a folder of PNG masks."
         )
     own = any((folder / _OWN_EXPORT).is_file() for folder in (place, *list(place.parents)[:3]))
-    labels, unknown = Labels(), []
+    labels: list[str] = []
+    unknown: list[str] = []
     reader = _FrameReader(sequence, camera, source.name, labels, unknown, undistorted=own)
-    return Annotations(kind, reader.frames(images), labels.names, unknown, remarks)
+    return Annotations(kind, reader.frames(images), labels, unknown, remarks)
 
 
 class _FrameReader:
@@ -84,7 +85,7 @@ class _FrameReader:
         sequence: Sequence,
         camera: str | None,
         source: str,
-        labels: Labels,
+        labels: list[str],
         unknown: list[str],
         *,
         undistorted: bool,
@@ -155,8 +156,12 @@ class _FrameReader:
                         f"{camera.width} x {camera.height}. Give masks of the images' own size."
                     )
                 labels = np.zeros(mask.shape, np.uint8) if labels is None else labels
+                if label and label not in self._labels:
+                    if len(self._labels) == MOST_LABELS:
+                        raise SequenceError(f"there are more than {MOST_LABELS} labels, say {label!r}. Join some.")
+                    self._labels.append(label)
                 if label:
-                    labels[mask] = self._labels.number(label)
+                    labels[mask] = self._labels.index(label) + 1
         if not self._undistorted:
             labels = None if labels is None else camera.undistort(labels, cv2.INTER_NEAREST)
             points = _undistorted(points, camera)

@@ -52,12 +52,7 @@ class Calibration:
 
 
 def read_calibration(path: Path, side: str) -> Calibration:
-    """The calibration of the left or right camera in a file.
-
-    Args:
-        path: of the file.
-        side: "left" or "right", which counts for files of a pair.
-    """
+    """The calibration of the left or right camera (`side`) in a file."""
     if not is_regular(path):
         raise SequenceError(f"calibration {path} is missing. Correct the path.")
     try:
@@ -79,11 +74,7 @@ def read_calibration(path: Path, side: str) -> Calibration:
 
 
 def calibration_from_info(info: Any) -> Calibration | None:
-    """The calibration of a `sensor_msgs/CameraInfo`; None for an uncalibrated camera.
-
-    Raises:
-        ValueError: a distortion model that is not OpenCV's pinhole.
-    """
+    """Calibration of a `sensor_msgs/CameraInfo`, None if uncalibrated; `ValueError` unless it is a pinhole."""
 
     def numbers(name: str) -> np.ndarray:
         return np.array(getattr(info, name.lower(), getattr(info, name, ())), np.float64).reshape(-1)
@@ -98,11 +89,7 @@ def calibration_from_info(info: Any) -> Calibration | None:
 
 
 def check_model(model: str, camera_model: str = "") -> None:
-    """Check that a camera model is OpenCV's pinhole model.
-
-    Raises:
-        ValueError: it is another one.
-    """
+    """Check that a camera model is OpenCV's pinhole model; otherwise it is a `ValueError`."""
     pinhole = camera_model.lower() in _PINHOLES
     if not pinhole or model.lower() not in _MODELS:
         given = f"distortion model {model!r}" if pinhole else f"camera model {camera_model!r}"
@@ -326,15 +313,10 @@ class DvrkBaseFrame:
 
 
 def read_base_frames(path: Path, axes: Axes | None = None) -> tuple[DvrkBaseFrame, ...]:
-    """Base frames in a configuration file of the dVRK.
+    """Base frames in a JSON file of the dVRK (see `_BASE_FRAME_KINDS`).
 
     Args:
-        path: a JSON file of one of the kinds above.
-        axes: of the camera in the file; by default those of its kind and name.
-
-    Raises:
-        SequenceError: it is missing, of another kind, or of unknown axes.
-    """
+        axes: of the camera in the file; by default those of its kind and name."""
     try:
         content = parse_json(read_text(path, VALUES))
     except FileNotFoundError as error:

@@ -14,7 +14,7 @@ from ...model.camera import implausible_intrinsics
 from ..images import ImageFiles, bits_remark, image_remarks, is_deep
 from ..video import SUFFIXES, Video, index_video
 from .calibrations import Calibration, calibration_from_info, read_calibration
-from .found import FoundCamera, Import
+from .found import FoundCamera, Import, PartError
 
 _SAME_SHAPE = 0.01
 """Largest difference of aspect ratios due to rounding of image sizes [1]."""
@@ -38,7 +38,9 @@ def camera_from_info(camera: FoundCamera, info: Any, job: Import, *, rectified: 
     try:
         found = None if info is None else calibration_from_info(info)
     except ValueError as error:
-        raise SequenceError(f"{what} cannot be used: {error}. Or give --calibration {camera.name} FILE.") from error
+        raise PartError(
+            f"calibration {camera.name}", f"{what} cannot be used: {error}. Or give --calibration {camera.name} FILE."
+        ) from error
     return camera if found is None else _calibrated(camera, found, what, job, rectified=rectified)
 
 
@@ -59,7 +61,7 @@ def calibration_of(camera: FoundCamera, job: Import) -> FoundCamera:
     try:
         found = read_calibration(path, side)
     except SequenceError as error:
-        raise SequenceError(f"camera {camera.name}: {error}") from error
+        raise PartError(f"calibration {camera.name}", f"camera {camera.name}: {error}") from error
     return _calibrated(camera, found, str(path), job, rectified=rectified)
 
 
@@ -95,10 +97,11 @@ def _scaled(camera: FoundCamera, size: tuple[int, int], what: str, job: Import) 
         return camera
     x, y = camera.size[0] / size[0], camera.size[1] / size[1]
     if abs(x / y - 1) > _SAME_SHAPE:
-        raise SequenceError(
+        raise PartError(
+            f"calibration {camera.name}",
             f"{what} is for images of {size[0]} x {size[1]}, but those of {camera.name} are {camera.size[0]} x "
             f"{camera.size[1]}, which is another shape (cropped or turned?). Give the calibration of these images: "
-            f"--calibration {camera.name} FILE."
+            f"--calibration {camera.name} FILE.",
         )
     fx, fy, cx, cy = camera.intrinsics
     shift = 0.5 - camera.pixel_center
@@ -120,10 +123,11 @@ def check_intrinsics(camera: FoundCamera, job: Import) -> None:
     if camera.name in job.options.calibration_size and min(fx, fy) > 0:
         job.warning(f"{camera.name}: {text}")
         return
-    raise SequenceError(
+    raise PartError(
+        f"calibration {camera.name}",
         f"{text} Give another one (--calibration {camera.name} FILE), or the size of the images that were calibrated "
         f"(--calibration-size {camera.name} WIDTHxHEIGHT), from which it is scaled; the images' own size "
-        f"({camera.size[0]}x{camera.size[1]}) takes it as it is."
+        f"({camera.size[0]}x{camera.size[1]}) takes it as it is.",
     )
 
 
@@ -205,12 +209,7 @@ def image_files(folder: Path) -> list[Path]:
 
 
 def find_images(path: Path, only: str = "") -> Images:
-    """The frames of a folder of images, or of a video.
-
-    Args:
-        path: folder or video file.
-        only: keep files whose name ends with this, where a folder holds several kinds.
-    """
+    """The frames of a folder of images, of which names end with `only`, or of a video."""
     if path.is_file() and path.suffix.lower() in SUFFIXES:
         return _video(path)
     files = [file for file in image_files(path) if file.name.endswith(only)]

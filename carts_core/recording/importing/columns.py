@@ -13,7 +13,7 @@ from ...settings.interchange import ImportOptions
 from ..kinematics_table import LENGTH_UNITS, Joint, joints_of
 from .cameras import IMAGE_SUFFIXES
 from .foreign_tables import ForeignTable
-from .found import Import, Track
+from .found import Import, PartError, Track
 from .joint_units import in_si, length_unit, named_length_unit, psm_joints
 from .logs import ArmLog, track
 from .row_matching import LogRows
@@ -49,6 +49,7 @@ _FRAMES = (
 )
 _GENERAL = set("motor no nr number axis dof actuator encoder instrument tool robot arm arms channel ch".split())
 """Words of numbered columns that can be joints of a PSM; other words are names of other robots."""
+_PSM = set(JOINT_NAMES)
 _REACH = 0.5
 """Largest distance of a tip from its base or camera [m]."""
 
@@ -68,7 +69,12 @@ class ColumnMeanings:
 def guess_columns(table: ForeignTable, options: ImportOptions) -> ColumnMeanings:
     """Meanings of the columns of a table: user's choices first, then names, then positions."""
     others = other_robots(options)
-    _check_chosen(table, options, others)
+    known = [joint.name for joints in others.values() for joint in joints] or [*JOINT_NAMES, "jaw", *_POSE_ORDER]
+    for meaning, column in options.columns.items():
+        if meaning not in ("time", "frame", *known):
+            raise PartError("columns", f"--columns {meaning} is not known. Known are: {', '.join(known)}, time, frame.")
+        if column not in table.columns:
+            raise PartError("columns", f"{table.path} has no column {column!r}. It has: {', '.join(table.columns)}.")
     spoken = {column: _words(column) for column in table.columns}
     words = {column: text for column, text in spoken.items() if column not in _name_columns(table)}
     words |= {column: _words(name) for column, name in _named_places(table).items()}
@@ -95,7 +101,7 @@ def guess_columns(table: ForeignTable, options: ImportOptions) -> ColumnMeanings
     arms = {arm: _numbers_to_joints(found) for arm, found in arms.items()}
     if chosen:
         arms = {next(iter(options.arms), next(iter(arms), "")): chosen}
-    usable = {arm: found for arm, found in arms.items() if _has_joints(found) or set(_POSE_ORDER) <= set(found)}
+    usable = {arm: found for arm, found in arms.items() if found.keys() >= _PSM or set(_POSE_ORDER) <= set(found)}
     if not usable and not chosen:
         usable = _numbered_family(words, (time, frame))
     return ColumnMeanings(time, frame, usable, frozenset(stated))
@@ -107,23 +113,9 @@ def other_robots(options: ImportOptions) -> dict[str, tuple[Joint, ...]]:
     return {arm: joints for arm, joints in given.items() if not {joint.name for joint in joints} >= set(JOINT_NAMES)}
 
 
-def _check_chosen(table: ForeignTable, options: ImportOptions, others: dict[str, tuple[Joint, ...]]) -> None:
-    known = [joint.name for joints in others.values() for joint in joints] or [*JOINT_NAMES, "jaw", *_POSE_ORDER]
-    for meaning, column in options.columns.items():
-        if meaning not in ("time", "frame", *known):
-            raise SequenceError(f"--columns {meaning} is not known. Known are: {', '.join(known)}, time, frame.")
-        if column not in table.columns:
-            raise SequenceError(f"{table.path} has no column {column!r}. It has: {', '.join(table.columns)}.")
-
-
 @lru_cache(maxsize=64)
 def order_of_names(names: tuple[str, ...], joints: tuple[str, ...] = JOINT_NAMES) -> tuple[int, ...] | None:
-    """Order of the joints among named positions; None without usable names.
-
-    Args:
-        names: beside the positions, in their order; `outer_yaw` is yaw.
-        joints: that are wanted.
-    """
+    """Order of `joints` among the names beside positions, such as `outer_yaw`; None without usable names."""
     meanings = [_meaning(_words(name), pose=False) for name in names]
     if set(joints) <= set(meanings):
         return tuple(meanings.index(joint) for joint in joints)
@@ -144,9 +136,7 @@ def track_of(
 
     Args:
         groups: of `decoders.bags.rows`: names in the messages, times and values.
-        role: "joints", "jaw" or a pose.
-        joints: that are wanted.
-    """
+        role: "joints", "jaw" or a pose."""
     chosen = []
     for names, rows in groups:
         order = range(rows.shape[1] - 1)
@@ -189,9 +179,10 @@ def _joints_by_name(
         elif len(fitting) == 1:
             found[joint.name] = fitting[0]
     if missing := [joint.name for joint in joints if joint.name not in found and "finger" not in joint.name]:
-        raise SequenceError(
+        raise PartError(
+            "columns",
             f"{table.path} has no column of {', '.join(missing)}; its columns are {', '.join(table.columns)}. Name "
-            f"them: --columns {missing[0]} COLUMN ..."
+            f"them: --columns {missing[0]} COLUMN ...",
         )
     return found
 
@@ -212,9 +203,10 @@ def _named_places(table: ForeignTable) -> dict[str, str]:
     for column, match in _name_columns(table).items():
         names = {str(cell).strip() for cell in table.columns[column]}
         if len(names) != 1:
-            raise SequenceError(
+            raise PartError(
+                "columns",
                 f"{table.path}, column {column!r} has several names ({', '.join(sorted(names)[:3])}), so positions "
-                "change their meaning from row to row. Sort them, or name the columns of one order: --columns."
+                "change their meaning from row to row. Sort them, or name the columns of one order: --columns.",
             )
         place = re.compile(rf"(?i){re.escape(match[1])}(?:joint_?)?positions?[._ \[]*0*{int(match[3])}\]?")
         for other in table.columns:
@@ -267,7 +259,7 @@ def _numbered_family(words: dict[str, str], others: tuple[str | None, ...]) -> d
             families.setdefault(f"{number[1]}#{number[3]}", {})[f"#{int(number[2])}"] = column
     fitting = [family for family in families.values() if len(family) in (len(JOINT_NAMES), len(JOINT_NAMES) + 1)]
     found = _numbers_to_joints(fitting[0]) if len(fitting) == 1 else {}
-    return {"": found} if _has_joints(found) else {}
+    return {"": found} if found.keys() >= _PSM else {}
 
 
 def _first(words: dict[str, str], wanted: tuple[str, ...]) -> str | None:
@@ -305,10 +297,6 @@ def _numbers_to_joints(found: dict[str, str]) -> dict[str, str]:
     return named
 
 
-def _has_joints(found: dict[str, str]) -> bool:
-    return set(JOINT_NAMES) <= set(found)
-
-
 def arm_log(
     table: ForeignTable,
     arm: str,
@@ -320,15 +308,11 @@ def arm_log(
     """The log of one arm, in radians and metres.
 
     Args:
-        table: with the columns.
-        arm: its name.
         found: joint or part of a pose -> column.
         times: of the rows, or positions of their images; NaN for rows of no image.
-        job: the import, with units and signs.
-        stated: columns whose meaning is no guess.
-    """
+        stated: columns whose meaning is no guess."""
     other = other_robots(job.options).get(arm)
-    if other is None and not _has_joints(found):
+    if other is None and not found.keys() >= _PSM:
         return _pose_log(table, arm, found, times, job, stated)
     order = [joint.name for joint in other] if other is not None else [*JOINT_NAMES, "jaw"]
     known = dict(zip(order, other or psm_joints(arm, order, job), strict=True))

@@ -15,6 +15,7 @@ from ...files.decoding import decoded
 from ...files.reading import TABLE, read_text
 from ...imports import needs_extra
 from ...wording import shown
+from .found import PartError
 
 _LONGEST_UNIT = 12
 """Longest word that is taken for a unit."""
@@ -45,7 +46,7 @@ class ForeignTable:
     def numbers(self, column: str) -> np.ndarray:
         """A column as numbers [rows]; whole numbers stay exact."""
         if column not in self.columns:
-            raise SequenceError(f"{self.path} has no column {column!r}. It has: {', '.join(self.columns)}.")
+            raise PartError("columns", f"{self.path} has no column {column!r}. It has: {', '.join(self.columns)}.")
         values = self.columns[column]
         if values.dtype.kind in "iuf":
             return values
@@ -55,9 +56,10 @@ class ForeignTable:
             wrong = [row for row, cell in enumerate(values) if not _is_number(str(cell))]
             row = wrong[0] if wrong else 0
             where = f"line {self.lines[row]}" if self.lines else f"row {row + 1}"
-            raise SequenceError(
+            raise PartError(
+                "columns",
                 f"{self.path}, column {column!r} has cells that are no numbers: {len(wrong)} of {len(values)}, the "
-                f"first in {where}: {shown(str(values[row]))}. Correct them, or name another column: --columns."
+                f"first in {where}: {shown(str(values[row]))}. Correct them, or name another column: --columns.",
             ) from error
 
 
@@ -71,13 +73,15 @@ def read_foreign_table(path: Path) -> ForeignTable:
     try:
         columns = readers.get(path.suffix.lower(), _csv)(path)
     except FileNotFoundError as error:
-        raise SequenceError(f"table {path} is missing. Correct the path.") from error
+        raise PartError("kinematics", f"table {path} is missing. Correct the path.") from error
     except (OSError, ValueError, csv.Error) as error:
         kinds = ", ".join(TABLE_SUFFIXES)
-        raise SequenceError(f"table {path} cannot be read ({error}). Known are {kinds}. Export it again.") from error
+        raise PartError(
+            "kinematics", f"table {path} cannot be read ({error}). Known are {kinds}. Export it again."
+        ) from error
     table = columns if isinstance(columns, ForeignTable) else ForeignTable(path, columns)
     if not len(table):
-        raise SequenceError(f"table {path} has no rows. Export it again.")
+        raise PartError("kinematics", f"table {path} has no rows. Export it again.")
     return table
 
 

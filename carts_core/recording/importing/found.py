@@ -29,6 +29,14 @@ def read_json(path: Path) -> Any:
         raise SequenceError(f"{path} is not readable JSON ({error}). Copy the recording again.") from error
 
 
+class PartError(SequenceError):
+    """Unusable part of a recording: `images`, `calibration CAMERA`, `kinematics` or `columns`."""
+
+    def __init__(self, part: str, text: str) -> None:
+        super().__init__(text)
+        self.part = part
+
+
 @dataclass(frozen=True)
 class Note:
     """A line of the report."""

@@ -8,7 +8,7 @@ from ...errors import SequenceError
 from ...settings.interchange import ImportOptions
 from ...wording import closest, shown
 from ..sources import SOURCES, Source
-from .found import FoundRecording, Import
+from .found import FoundRecording, Import, PartError
 from .writing import completed, write_sequence
 
 _UNFINISHED = {
@@ -45,18 +45,15 @@ def detect(path: Path, name: str | None = None) -> Source:
 
 
 def find(path: Path, options: ImportOptions | None = None) -> FoundRecording:
-    """Content of a recording, completed with stand-ins; nothing is written.
-
-    Raises:
-        CartsError: it is of no known kind, damaged, or contradicts itself.
-    """
+    """Content of a recording, completed with stand-ins; nothing is written. `CartsError` for unusable content."""
     options = _with_places(path.absolute(), options or ImportOptions())
     source = detect(path, options.source)
     for name in ("images", "kinematics", "columns", "clock", "time_offset", "frame_rate"):
         if name not in source.uses and _is_given(options, name):
-            raise SequenceError(
+            raise PartError(
+                {"images": "images", "kinematics": "kinematics"}.get(name, "columns"),
                 f"--{name.replace('_', '-')} is not used for {source.label}: the recording has it. Leave it out, or "
-                "choose another kind: --source."
+                "choose another kind: --source.",
             )
     try:
         recording = source.read(path.absolute(), Import(options))
@@ -118,19 +115,12 @@ def _is_given(options: ImportOptions, name: str) -> bool:
 def import_recording(
     path: Path, folder: Path, options: ImportOptions | None = None, *, overwrite: bool = False
 ) -> tuple[Path, FoundRecording]:
-    """Write a sequence file for a recording, which is not copied.
-
-    Args:
-        path: file or folder of the recording.
-        folder: output folder for sequence.toml and its tables.
-        options: values that the recording lacks.
-        overwrite: replace an earlier import.
+    """Write a sequence file and tables into a folder for a recording, which is not copied.
 
     Returns:
         The sequence file, and the content of the recording.
 
     Raises:
-        CartsError: it is of no known kind, damaged, or contradicts itself; nothing is written then.
-    """
+        CartsError: it is of no known kind, damaged, or contradicts itself; nothing is written then."""
     recording = find(path, options)
     return write_sequence(recording, folder, overwrite=overwrite), recording

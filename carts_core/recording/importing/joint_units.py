@@ -9,7 +9,7 @@ from jaxtyping import Float
 from ...errors import SequenceError
 from ...model.instruments import robot_file
 from ..kinematics_table import ANGLE_UNITS, FAR, LENGTH_UNITS, OTHER_COLUMNS, PERCENT, Joint, joints_of, misfits
-from .found import FoundArm, Import
+from .found import FoundArm, Import, PartError
 
 _INSERTED = 0.03
 """Insertion [m] that the insertion axis exceeds in most recordings, since the tip is in view."""
@@ -24,20 +24,15 @@ def in_si(
     columns: Sequence[str] = (),
     instrument: bool = True,
 ) -> Float[np.ndarray, "rows joints"]:
-    """Logged positions in radians and metres, with the signs of the robot.
+    """Logged positions of an arm in radians and metres, with the signs of the robot.
 
     Args:
-        values: of each joint, by rows.
-        joints: of the columns.
-        job: the import, with units and signs.
-        arm: its name, for notes.
         columns: names of a table's columns, whose units are guessed; empty for messages, which are in SI units.
-        instrument: whether angles can be guessed to be degrees; those of other robots may be shares of their range.
-    """
+        instrument: whether angles can be guessed to be degrees; those of other robots may be shares of their range."""
     names, options = [joint.name for joint in joints], job.options
     for option, joint in [*(("flip", joint) for joint in options.flip), *(("units", joint) for joint in options.units)]:
         if joint not in (*names, "jaw"):
-            raise SequenceError(f"--{option} {joint} is no joint. Joints are: {', '.join(names)}.")
+            raise PartError("columns", f"--{option} {joint} is no joint. Joints are: {', '.join(names)}.")
     angle, length = options.angle_unit or "rad", options.length_unit or "m"
     if columns:
         rest = [index for index, name in enumerate(names) if name not in options.units]
@@ -58,7 +53,9 @@ def in_si(
         elif unit in factors:
             result[:, index] *= factors[unit]
         else:
-            raise SequenceError(f"--units {joint.name} {unit} does not fit: give {', '.join(factors)} or {PERCENT}.")
+            raise PartError(
+                "columns", f"--units {joint.name} {unit} does not fit: give {', '.join(factors)} or {PERCENT}."
+            )
         if joint.name in options.flip:
             result[:, index] *= -1.0
     return result
@@ -94,10 +91,11 @@ def _angle_unit(values: np.ndarray, joints: Sequence[Joint], arm: str, columns: 
 def _asked(values: np.ndarray, joints: Sequence[Joint], arm: str, chosen: list[int], why: str) -> SequenceError:
     worst = max(chosen, key=lambda index: float(np.nanmax(np.abs(values[:, index]))))
     joint, column = joints[worst], values[:, worst]
-    return SequenceError(
+    return PartError(
+        "columns",
         f"{arm}: the unit of the angles is not known, since {why}: {joint.name} is from {np.nanmin(column):.4g} to "
         f"{np.nanmax(column):.4g}, and its limits are {joint.lower:.4g} to {joint.upper:.4g} rad. Give it: "
-        "--angle-unit deg, percent (-100 to 100 of the range of each joint) or rad."
+        "--angle-unit deg, percent (-100 to 100 of the range of each joint) or rad.",
     )
 
 
@@ -129,18 +127,15 @@ def length_unit(highest: float, limit: float, arm: str, what: str, orders: Seque
         return "mm"
     listed = ", ".join(f"{unit} ({highest * LENGTH_UNITS[unit]:.3g} m)" for unit in (*fitting, "mm"))
     also = f" Or name the columns (--columns), since {' or '.join(orders)} would fit." if orders else ""
-    raise SequenceError(
+    raise PartError(
+        "columns",
         f"{arm}: the unit of {what} is not clear: it is up to {highest:.4g}, and at most {limit:.3g} m is possible. "
-        f"Give it: --length-unit {listed}.{also}"
+        f"Give it: --length-unit {listed}.{also}",
     )
 
 
 def check_limits(arm: FoundArm, job: Import) -> bool:
-    """Compare an arm's positions with its robot's limits; a note names violations and remedies.
-
-    Returns:
-        Whether all are within.
-    """
+    """Whether an arm's positions are within its robot's limits; a note names violations and remedies."""
     if arm.values is None or not len(arm.values):
         return True
     known = {joint.name: joint for joint in joints_of(arm.robot)}

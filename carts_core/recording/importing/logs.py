@@ -83,8 +83,7 @@ def fit_base_frame(
     """Base frame that fits joint positions [rad, m] to poses of the tip [m] at the same times.
 
     Raises:
-        CartsError: there are no rows with both.
-    """
+        CartsError: no row has both."""
     known = np.isfinite(joints).all(1) & np.isfinite(Ts_reference_tip).all((1, 2))
     if not known.any():
         raise CartsError(
@@ -165,16 +164,14 @@ def check_instrument(
     joints: Float[np.ndarray, "rows 6"],
     candidates: Mapping[str, PsmGeometry] = CANDIDATES,
 ) -> InstrumentCheck:
-    """Rank instruments by how constant the arm's base is with each.
+    """Rank instruments (name -> lengths) by how constant the arm's base is with each.
 
     Args:
         Ts_reference_tip: poses of the tip in any frame that does not move against the base [m].
         joints: joint positions at the same times [rad, m].
-        candidates: name -> lengths.
 
     Raises:
-        CartsError: fewer than 20 rows have both.
-    """
+        CartsError: fewer than 20 rows have both."""
     rows = int((np.isfinite(joints).all(1) & np.isfinite(Ts_reference_tip).all((1, 2))).sum())
     if rows < _FEWEST_ROWS:
         raise CartsError(f"{rows} rows have both joints and a pose, at least {_FEWEST_ROWS} are needed. Record longer.")
@@ -434,13 +431,10 @@ _MOVES = 5e-4, 0.1
 def endoscope_motion(poses: Track | None, joints: Track | None, start: float, job: Import) -> Track | None:
     """Pose of the camera over time, in a world with its origin at the first image; None if it is static.
 
-    The tip of the ECM counts as the camera, with the dVRK's axes; `carts calibrate` estimates the camera's pose there.
+    The tip of the ECM, by its poses or joints, counts as the camera, whose pose there `carts calibrate` estimates.
 
     Args:
-        poses: of the ECM's tip in some fixed frame.
-        joints: of the ECM, in place of poses.
-        start: time of the first image [s].
-    """
+        start: time of the first image [s]."""
     chosen = poses if poses is not None else joints
     if chosen is None or len(chosen.times) < 2:
         return None

@@ -17,7 +17,7 @@ from ...errors import SequenceError
 from ...settings.interchange import SECONDS, Clock
 from ...wording import counted
 from .cameras import Images
-from .found import FoundArm, Import
+from .found import FoundArm, Import, PartError
 
 _STAMPED_DIGITS = 13
 """Digits from which numbers in image names are times."""
@@ -134,12 +134,7 @@ def _numbered(ids: tuple[str, ...], job: Import) -> np.ndarray:
 
 
 def guess_clock(values: np.ndarray, span: float | None = None) -> Clock:
-    """Unit of times: by their magnitude if they count from 1970, else by spacing and expected duration.
-
-    Args:
-        values: of one column.
-        span: duration of the images, where that is known [s].
-    """
+    """Unit of times: by magnitude if they count from 1970, else by spacing and the images' duration `span` [s]."""
     values = np.asarray(values, np.float64)
     values = values[np.isfinite(values)]
     largest = float(np.max(np.abs(values))) if len(values) else 0.0
@@ -174,9 +169,10 @@ def row_seconds(
     steps = np.diff(values.astype(np.float64))
     if (steps < 0).any():
         row = int(np.flatnonzero(steps < 0)[0]) + 1
-        raise SequenceError(
+        raise PartError(
+            "columns",
             f"{rows.name}, column {rows.time_column!r}: times go back from {values[row - 1]} to {values[row]}, row "
-            f"{row + 1}. Sort the rows, or name another column: --columns time COLUMN."
+            f"{row + 1}. Sort the rows, or name another column: --columns time COLUMN.",
         )
     if repeated := int((steps == 0).sum()):
         job.warning(
@@ -191,13 +187,17 @@ def match_rows(frames: FrameTimes, rows: LogRows, job: Import) -> RowMatch:
     explicit = "frame" in options.columns
     named = _named(frames, rows, job)
     if explicit and named is None:
-        raise SequenceError(
+        raise PartError(
+            "columns",
             f"{rows.name}: column {rows.image_column!r} names no images (theirs are {frames.stems[0]} to "
-            f"{frames.stems[-1]}). Name another one: --columns frame COLUMN."
+            f"{frames.stems[-1]}). Name another one: --columns frame COLUMN.",
         )
     span = None if frames.times is None or len(frames.times) < 2 else float(frames.times[-1] - frames.times[0])
     times = row_seconds(rows, options.clock, job, span)
-    one_each = named if named is not None and _is_one_each(named, frames) else None
+    one_each = None
+    if named is not None and (named < 0).mean() <= _FEW:
+        known = named[named >= 0]
+        one_each = named if len(np.unique(known)) == len(known) >= 0.5 * len(frames.ids) else None
     in_order = one_each is None and named is None and rows.count == len(frames.ids)
     if in_order:
         one_each = np.arange(rows.count)
@@ -207,21 +207,25 @@ def match_rows(frames: FrameTimes, rows: LogRows, job: Import) -> RowMatch:
         if not (own_clock and one_each is not None):
             return _by_time(frames, rows, times, apart, named is not None, job)
     if explicit or named is not None:
-        assert named is not None
-        if not explicit and one_each is None and _counts_rows(named, rows):
-            raise SequenceError(
+        assert named is not None and rows.images is not None
+        general = rows.image_column.strip().lower().replace("_", " ").replace(":", "") in _INDEX
+        counts_rows = general and rows.images.dtype.kind in "iuf" and (named < 0).mean() > _FEW
+        if not explicit and one_each is None and counts_rows:
+            raise PartError(
+                "columns",
                 f"{rows.name}: column {rows.image_column!r} counts {rows.count} rows and there are "
                 f"{counted(len(frames.ids), 'image')}, so it does not match rows with images. Give the images' rate "
-                f"(--frame-rate), or confirm the column: --columns frame {rows.image_column!r}."
+                f"(--frame-rate), or confirm the column: --columns frame {rows.image_column!r}.",
             )
         return _by_image(frames, rows, named, times, f"column {rows.image_column!r}", job, stated=explicit)
     if in_order:
         return _by_image(frames, rows, np.arange(rows.count), times, "their order", job, stated=False)
     lacking = "the images have no times" if times is not None else "the table has no times"
-    raise SequenceError(
+    raise PartError(
+        "columns",
         f"the recording has {counted(len(frames.ids), 'image')} and {rows.name} has {counted(rows.count, 'row')}, and "
         f"{lacking}. Make them as many, name the column of times (--columns time COLUMN) or of the images' names "
-        "(--columns frame COLUMN), or give the images' rate (--frame-rate)."
+        "(--columns frame COLUMN), or give the images' rate (--frame-rate).",
     )
 
 
@@ -264,18 +268,6 @@ def _by_image(
             if frames.times is not None:
                 job.found(f"times of the images are those of their rows instead of those of {frames.source}.")
     return RowMatch(np.where(positions >= 0, positions.astype(float), np.nan), True, taken)
-
-
-def _counts_rows(named: np.ndarray, rows: LogRows) -> bool:
-    """Whether a column may count rows: it has a generic name, and many rows have no image."""
-    assert rows.images is not None
-    general = rows.image_column.strip().lower().replace("_", " ").replace(":", "") in _INDEX
-    return general and rows.images.dtype.kind in "iuf" and (named < 0).mean() > _FEW
-
-
-def _is_one_each(named: np.ndarray, frames: FrameTimes) -> bool:
-    known = named[named >= 0]
-    return len(np.unique(known)) == len(known) and (named < 0).mean() <= _FEW and len(known) >= 0.5 * len(frames.ids)
 
 
 def _named(frames: FrameTimes, rows: LogRows, job: Import) -> Int[np.ndarray, " rows"] | None:
@@ -326,16 +318,13 @@ def _numbers_to_positions(numbers: list[int | None], frames: FrameTimes, rows: L
 def by_rows(
     arms: Sequence[FoundArm], ids: Sequence[str], job: Import, times: Float[np.ndarray, " frames"] | None = None
 ) -> tuple[tuple[FoundArm, ...], tuple[str, ...], np.ndarray]:
-    """Arms whose times are frame numbers, restricted to the frames that all of them have.
+    """Arms whose times are positions in `ids`, restricted to the frames that all of them have.
 
     Args:
-        arms: `times` are positions in `ids`.
-        ids: of all frames.
         times: of the frames [s], which become those of the rows, so that a delay can be estimated.
 
     Returns:
-        The arms, the ids that remain, and their positions in `ids`.
-    """
+        The arms, the ids that remain, and their positions in `ids`."""
     positions = {arm.name: np.asarray(arm.times, int) for arm in arms if arm.times is not None}
     keep = np.all([np.isin(np.arange(len(ids)), rows) for rows in positions.values()], axis=0) & np.ones(len(ids), bool)
     if not keep.any():

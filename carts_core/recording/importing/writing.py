@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from ...errors import CartsError, SequenceError
 from ...files import MARKER, OutputPath, file_name, published, write_bytes, write_text
+from ...html import render_page
 from ...model.camera import T_DVRK_OPENCV
 from ...model.instruments import SCHEME, robot_file
 from ...model.psm_kinematics import CLASSIC, JOINT_NAMES, forward
@@ -25,7 +26,7 @@ from .. import Sequence
 from ..kinematics_table import joints_of
 from ..matching import ORIENTATION, POSITION
 from .cameras import check_intrinsics, placed_cameras
-from .found import FoundArm, FoundCamera, FoundRecording, Import
+from .found import FoundArm, FoundCamera, FoundRecording, Import, PartError
 from .joint_units import check_limits
 
 _ROWS = 200
@@ -112,8 +113,9 @@ def completed(recording: FoundRecording, options: ImportOptions) -> FoundRecordi
     Joints are compared with the limits of their robots, and base frames with the view of the cameras.
     """
     if not recording.cameras:
-        raise SequenceError(
-            f"{recording.name}: no images were found ({recording.kind}). Name them: --images left FOLDER_OR_VIDEO."
+        raise PartError(
+            "images",
+            f"{recording.name}: no images were found ({recording.kind}). Name them: --images left FOLDER_OR_VIDEO.",
         )
     if not recording.frame_ids:
         raise SequenceError(f"{recording.name}: there are no frames ({recording.kind}). Name other images.")
@@ -124,9 +126,10 @@ def completed(recording: FoundRecording, options: ImportOptions) -> FoundRecordi
             check_intrinsics(camera, job)
     cameras = placed_cameras(tuple(_with_intrinsics(camera, job) for camera in recording.cameras), job)
     if options.time_offset is not None and all(arm.times is None for arm in recording.arms):
-        raise SequenceError(
+        raise PartError(
+            "columns",
             f"{recording.name}: --time-offset needs times, and rows are matched with images without any. Give the "
-            "images' rate (--frame-rate), or leave it out."
+            "images' rate (--frame-rate), or leave it out.",
         )
     known = tuple(
         replace(arm, beyond_limits=not check_limits(arm, job)) if arm.values is not None else arm
@@ -161,9 +164,10 @@ def _frames_with_kinematics(recording: FoundRecording, job: Import) -> FoundReco
         return recording
     if not keep.any():
         spans = "; ".join(f"{name} {times[0]:.3f} to {times[-1]:.3f} s" for name, times in logs)
-        raise SequenceError(
+        raise PartError(
+            "columns",
             f"{recording.name}: no frame has joint positions within {MAX_GAP} s. Images are from {wanted[0]:.3f} to "
-            f"{wanted[-1]:.3f} s, kinematics: {spans}. Clocks or their units differ: give --time-offset or --clock."
+            f"{wanted[-1]:.3f} s, kinematics: {spans}. Clocks or their units differ: give --time-offset or --clock.",
         )
     job.warning(
         f"{int((~keep).sum())} of {counted(len(keep), 'frame')} left out: no joint positions within {MAX_GAP} s."
@@ -320,115 +324,44 @@ def _column(camera: FoundCamera) -> str:
 
 
 def _toml(recording: FoundRecording, place: Path) -> str:
-    timed = [arm for arm in recording.arms if arm.times is not None]
-    lines = [
-        f"# Made by carts import from {recording.kind}. Everything here may be edited: docs/sequence_format.md.",
-        *(f"# {note.kind}: {' '.join(note.text.split())}" for note in recording.notes),
-        "",
-        'format = "carts-sequence/1"',
-        f"name = {_text(recording.name)}",
-    ]
-    if recording.domains:
-        lines.append(f"domains = {_text(list(recording.domains))}")
-    if timed:
-        start = _start(recording)
-        lines += [
-            "",
-            "[frames]",
-            f"table = {_text(FRAMES)}                  # times count from {start:.6f} s of the recording",
-            f"time_offset = {recording.time_offset!r}  # [s] time in the log minus time of the image",
-            f"max_gap = {MAX_GAP}",
-            "",
-            "[kinematics]",
-            f"table = {_text(_table_of(timed[0]))}",
-            'timestamp = "timestamp"',
-        ]
-    else:
-        lines += ["", "[kinematics]", f"table = {_text(FRAMES)}                  # a row per frame"]
-        if recording.frame_times is not None:
-            lines.append('timestamp = "timestamp"')
+    arms, cameras = [], []
     for arm in recording.arms:
-        lines += _arm_lines(arm, place, bool(timed))
+        urdf = robot_file(arm.robot).absolute()
+        if not urdf.is_file():
+            raise SequenceError(
+                f"robot {arm.robot} of {arm.name} is missing. Give the path of a URDF (carts robot makes one)."
+            )
+        names = [joint.name for joint in joints_of(arm.robot)]
+        known = arm.columns if arm.values is not None else ()
+        columns = [name for name in known if name != "jaw" or "jaw" in names]
+        robot = arm.robot if arm.robot.startswith(SCHEME) else _relative(urdf, place)
+        arms.append((arm, robot, columns, [name for name in names if name not in known]))
     for camera in recording.cameras:
-        lines += _camera_lines(camera, place, _moves(recording))
-    return "\n".join(lines) + "\n"
-
-
-def _arm_lines(arm: FoundArm, place: Path, timed: bool) -> list[str]:
-    builtin = arm.robot.startswith(SCHEME)
-    urdf = robot_file(arm.robot).absolute()
-    if not urdf.is_file():
-        raise SequenceError(
-            f"robot {arm.robot} of {arm.name} is missing. Give the path of a URDF (carts robot makes one)."
-        )
-    names = [joint.name for joint in joints_of(arm.robot)]
-    has_jaw = "jaw" in names
-    lines = [
-        "",
-        "[[arms]]",
-        f"name = {_text(arm.name)}",
-        f"robot = {_text(arm.robot if builtin else _relative(urdf, place))}",
-        f"# The base frame is from {arm.base_from}.",
-        *_matrix("T_world_base", arm.T_world_base),
-    ]
-    if timed and arm.times is not None:
-        lines.append(f"table = {_text(_table_of(arm))}")
-    if arm.beyond_limits:
-        lines += ['angle_unit = "rad"   # Some are beyond the limits of the robot (see above).', 'length_unit = "m"']
-    known = arm.columns if arm.values is not None else ()
-    columns = [name for name in known if name != "jaw" or has_jaw]
-    prefix = "" if arm.times is not None else f"{arm.name}."
-    if columns:
-        lines += ["", "[arms.joints]", *(f"{name} = {_text(prefix + name)}" for name in columns)]
-    rest = [name for name in names if name not in known]
-    if rest:
-        lines += ["", "[arms.defaults]", *(f"{name} = 0.0" for name in rest)]
-    return lines
-
-
-def _camera_lines(camera: FoundCamera, place: Path, moves: bool) -> list[str]:
-    assert camera.intrinsics is not None
-    fx, fy, cx, cy = (float(value) for value in camera.intrinsics)
-    images = _relative(camera.images, place)
-    if camera.pattern:
-        images = f"{images.replace('{', '{{').replace('}', '}}')}/{camera.pattern}"
-    lines = [
-        "",
-        "[[cameras]]",
-        f"name = {_text(camera.name)}",
-        f"size = [{camera.size[0]}, {camera.size[1]}]",
-        f"K = {{ fx = {fx!r}, fy = {fy!r}, cx = {cx!r}, cy = {cy!r} }}",
-        f"pixel_center = {camera.pixel_center}",
-    ]
-    if any(camera.distortion):
-        lines.append(f"distortion = {[float(value) for value in camera.distortion]}")
-    lines.append(f"images = {_text(images)}")
-    if camera.bits is not None:
-        lines.append(f"bits = {camera.bits}")
-    if camera.crop is not None:
-        lines.append(f"crop = {list(camera.crop)}")
-    if camera.topic:
-        lines += [f"topic = {_text(camera.topic)}", f"message_time = {_text(_column(camera))}"]
-    elif camera.numbers is not None:
-        lines.append(f"video_frame = {_text(_column(camera))}")
-    if moves:
-        lines.append(f"motion = {_text(MOTION)}  # where the camera is, in the world that it is at the first image")
-    if camera.masks:
-        masks = Path(camera.masks)
-        parent = _relative(masks.parent, place).replace("{{", "{").replace("}}", "}")
-        lines.append(f"masks = {_text(f'{parent}/{masks.name}')}")
-        if camera.sparse_masks:
-            lines.append("sparse_masks = true")
-    pose = np.eye(4) if camera.T_camera_world is None else camera.T_camera_world
-    return [*lines, *_matrix("T_camera_world", pose)]
-
-
-def _matrix(key: str, values: np.ndarray | None) -> list[str]:
-    if values is None:
-        return []
-    # Adding 0 makes -0.0 a plain zero.
-    rows = (np.round(values, 12) + 0.0).tolist()
-    return [f"{key} = [", *(f"    {row}," for row in rows), "]"]
+        images, masks = _relative(camera.images, place), ""
+        if camera.pattern:
+            images = f"{images.replace('{', '{{').replace('}', '}}')}/{camera.pattern}"
+        if camera.masks:
+            parent = _relative(Path(camera.masks).parent, place).replace("{{", "{").replace("}}", "}")
+            masks = f"{parent}/{Path(camera.masks).name}"
+        pose = np.eye(4) if camera.T_camera_world is None else camera.T_camera_world
+        cameras.append((camera, images, masks, pose))
+    return render_page(
+        "imported_sequence.toml",
+        recording=recording,
+        arms=arms,
+        cameras=cameras,
+        timed=[arm for arm in recording.arms if arm.times is not None],
+        start=_start(recording),
+        moves=_moves(recording),
+        frames=FRAMES,
+        motion=MOTION,
+        max_gap=MAX_GAP,
+        table_of=_table_of,
+        column=_column,
+        text=_text,
+        K=lambda camera: zip(("fx", "fy", "cx", "cy"), map(float, camera.intrinsics), strict=True),
+        rows=lambda T: (np.round(T, 12) + 0.0).tolist(),  # Adding 0 makes -0.0 a plain zero.
+    )
 
 
 def _relative(path: Path, place: Path) -> str:

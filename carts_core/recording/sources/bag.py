@@ -16,7 +16,7 @@ from ...model.psm_kinematics import JOINT_NAMES
 from ..image_sources import BAG_SUFFIXES, Bag, decode_message
 from ..importing.cameras import calibration_of, camera_from_info, cameras_of, common_ids, find_images, side_of
 from ..importing.columns import order_of_names, strange_names, track_of
-from ..importing.found import FoundArm, FoundCamera, FoundRecording, Import, Source, Track, recording_name
+from ..importing.found import FoundArm, FoundCamera, FoundRecording, Import, PartError, Source, Track, recording_name
 from ..importing.logs import ArmLog, arm_from_log, endoscope_motion, nearest
 from ..importing.row_matching import frame_times
 
@@ -74,7 +74,7 @@ def separate_images(path: Path, topics: list[str], job: Import) -> SeparateImage
     first = next(iter(images.values()))
     times = frame_times(first, ids, job).times
     if times is None:
-        raise SequenceError(f"images in {first.path} have no times. Give their number per second: --frame-rate.")
+        raise PartError("columns", f"images in {first.path} have no times. Give their number per second: --frame-rate.")
     return SeparateImages(cameras_of(images, job), ids, times)
 
 
@@ -164,9 +164,10 @@ def _chosen_topics(bag: Bag, given: Mapping[str, str]) -> dict[str, str]:
     if unknown and len(unknown) < len(chosen):
         chosen = {name: found for name, found in chosen.items() if name not in unknown}
     elif len(unknown) > 1:
-        raise SequenceError(
+        raise PartError(
+            "images",
             f"{path} has {len(topics)} image topics, whose names are of no known camera: "
-            f"{', '.join(topics)}. Choose: --images left TOPIC right TOPIC."
+            f"{', '.join(topics)}. Choose: --images left TOPIC right TOPIC.",
         )
 
     def preference(topic: str) -> int:
@@ -180,7 +181,9 @@ def _cameras(bag: Bag, job: Import) -> tuple[tuple[FoundCamera, ...], np.ndarray
     times = {name: bag.image_times(topic) for name, topic in topics.items()}
     for name, topic in topics.items():
         if not len(times[name][0]):
-            raise SequenceError(f"{path}: topic {topic} has no messages. Choose another one: --images {name} TOPIC.")
+            raise PartError(
+                "images", f"{path}: topic {topic} has no messages. Choose another one: --images {name} TOPIC."
+            )
     leader = next(iter(sorted(topics, key=lambda name: (name != "left", name))), None)
     if leader is None:
         return (), np.empty(0)
@@ -220,7 +223,7 @@ def _read(path: Path, job: Import) -> FoundRecording:
         beside = separate_images(path, _image_topics(bag), job)
         if beside is None:
             if job.options.frame_rate is not None:
-                raise SequenceError("--frame-rate is not used: the images of the bag have times. Leave it out.")
+                raise PartError("columns", "--frame-rate is not used: the images of the bag have times. Leave it out.")
             cameras, frame_times = _cameras(bag, job)
             ids = tuple(f"{number:06d}" for number in range(len(frame_times)))
         else:

@@ -84,10 +84,6 @@ def _with_masks(camera: FoundCamera, folder: Path, ids: tuple[str, ...], job: Im
     return replace(camera, masks=str(folder / masks.pattern), sparse_masks=len(shared) < len(ids))
 
 
-def _detect_cts(path: Path) -> bool:
-    return any(image_files(each / "images_l") for each in _subfolders(path)) and (path / _TRUTH).is_dir()
-
-
 def _read_cts(path: Path, job: Import) -> FoundRecording:
     domains = _ordered(each.name for each in _subfolders(path) if image_files(each / "images_l"))
     images = _domain_images(path, domains, {"left": "images_l", "right": "images_r"}, job)
@@ -142,10 +138,6 @@ def _arm(name: str, values: np.ndarray, ids: tuple[str, ...], file: Path, job: I
     return FoundArm(name, columns, values[rows], None, job.options.robot.get(name, FoundArm.robot))
 
 
-def _detect_ambf(path: Path) -> bool:
-    return (path / "kinematics.npy").is_file() and bool(image_files(path / "images"))
-
-
 def _read_ambf(path: Path, job: Import) -> FoundRecording:
     images = find_images(path / "images")
     (camera,) = cameras_of({"camera": images}, job)
@@ -186,10 +178,6 @@ def _subsets(path: Path) -> list[Path]:
     return found
 
 
-def _detect_segstrong(path: Path) -> bool:
-    return path.is_dir() and (_is_subset(path) or any(_is_subset(each) for each in _subsets(path)))
-
-
 def _read_segstrong(path: Path, job: Import) -> FoundRecording:
     if not _is_subset(path):
         subsets = ", ".join(str(each.relative_to(path)) for each in _subsets(path))
@@ -206,7 +194,7 @@ CTS = Source(
     "cts",
     "a set of CaRTS (CTS)",
     "a folder with green_screen/psm1_js.npy and DOMAIN/images_l",
-    _detect_cts,
+    lambda path: any(image_files(each / "images_l") for each in _subfolders(path)) and (path / _TRUTH).is_dir(),
     ("time_offset", "frame_rate"),
     _read_cts,
 )
@@ -214,7 +202,7 @@ AMBF = Source(
     "ambf",
     "a simulated video of CaRTS (AMBF)",
     "a folder with kinematics.npy and images/",
-    _detect_ambf,
+    lambda path: (path / "kinematics.npy").is_file() and bool(image_files(path / "images")),
     ("time_offset", "frame_rate"),
     _read_ambf,
 )
@@ -222,7 +210,7 @@ SEGSTRONG_C = Source(
     "segstrong-c",
     "a subset of SegSTRONG-C",
     "a folder with ground_truth/ and DOMAIN/left",
-    _detect_segstrong,
+    lambda path: path.is_dir() and bool(_subsets(path)),
     (),
     _read_segstrong,
 )

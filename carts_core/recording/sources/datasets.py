@@ -45,10 +45,6 @@ def _surgpose_folder(path: Path) -> Path | None:
     return None
 
 
-def _detect_surgpose(path: Path) -> bool:
-    return _surgpose_folder(path) is not None and any(path.rglob("api_jp_data.yaml"))
-
-
 def _read_surgpose(path: Path, job: Import) -> FoundRecording:
     folder = _surgpose_folder(path)
     assert folder is not None
@@ -96,10 +92,6 @@ def _yaml_rows(file: Path) -> dict[int, dict]:
     except (OSError, AttributeError, TypeError, ValueError) as error:
         text = " ".join(str(error).split())
         raise SequenceError(f"{file} is no YAML file of frames with joints by arm ({text}). Copy it again.") from error
-
-
-def _detect_endovis(path: Path) -> bool:
-    return bool(image_files(path / "left_frames"))
 
 
 def _read_endovis(path: Path, job: Import) -> FoundRecording:
@@ -205,12 +197,17 @@ SURGPOSE = Source(
     "surgpose",
     "a trajectory of SurgPose",
     "a folder with api_jp_data.yaml and regular/left_video.mp4",
-    _detect_surgpose,
+    lambda path: _surgpose_folder(path) is not None and any(path.rglob("api_jp_data.yaml")),
     ("time_offset", "frame_rate"),
     _read_surgpose,
 )
 ENDOVIS = Source(
-    "endovis", "a sequence of EndoVis 2017 or 2018", "a folder with left_frames/", _detect_endovis, (), _read_endovis
+    "endovis",
+    "a sequence of EndoVis 2017 or 2018",
+    "a folder with left_frames/",
+    lambda path: bool(image_files(path / "left_frames")),
+    (),
+    _read_endovis,
 )
 JIGSAWS = Source(
     "jigsaws",
@@ -223,6 +220,7 @@ JIGSAWS = Source(
 
 
 _ARMS, _SIDES = ("PSM1", "PSM2", "PSM3"), ("left", "right")
+_CALIBRATION_FOLDERS = ("calibration", "camera_calibration")
 _TRACKS = ("joints", "poses", "local_poses", "jaw")
 _LENGTHS = {"joints": 6, "poses": 7, "local_poses": 7, "jaw": 1}
 
@@ -238,11 +236,15 @@ def _read_surgsync(path: Path, job: Import) -> FoundRecording:
     images = {side: find_images(place) for side, place in places.items() if place.exists()}
     if not images:
         raise SequenceError(f"{path} has neither video_raw/stereo_left.mkv nor image/left. Copy it again, whole.")
-    cameras = cameras_of(images, job, _side_calibrations(path, tuple(images)))
+    calibrations = {side: [path / folder / f"{side}.yaml" for folder in _CALIBRATION_FOLDERS] for side in images}
+    cameras = cameras_of(
+        images, job, {side: file for side, files in calibrations.items() for file in files if file.is_file()}
+    )
     if (extrinsics := next(iter(sorted(path.rglob("stereo_calib_params.json"))), None)) is not None:
         cameras = tuple(_with_extrinsics(camera, extrinsics, job) for camera in cameras)
     ids = common_ids(images, path)
-    job = job.with_options(base={**_registrations(path), **job.options.base})
+    files = sorted(path.rglob("*-registration-open-cv.json")) or sorted(path.rglob("*-registration-dVRK.json"))
+    job = job.with_options(base={**{file.name.partition("-")[0]: file for file in files}, **job.options.base})
     arms: list[FoundArm] = []
     for recorded in _ARMS:
         if (name := job.arm_name(recorded)) is None:
@@ -258,16 +260,6 @@ def _read_surgsync(path: Path, job: Import) -> FoundRecording:
         cameras = tuple(replace(camera, numbers=kept) for camera in cameras)
     kind = "an episode of SurgSync" if packed else "a clip of SurgSync"
     return job.recording(kind, path.name, cameras, found, kept_ids, found[0].times)
-
-
-def _side_calibrations(path: Path, sides: tuple[str, ...]) -> dict[str, Path]:
-    places = {side: (path / "calibration" / f"{side}.yaml", path / f"camera_calibration/{side}.yaml") for side in sides}
-    return {side: file for side, files in places.items() for file in files if file.is_file()}
-
-
-def _registrations(path: Path) -> dict[str, Path]:
-    files = sorted(path.rglob("*-registration-open-cv.json")) or sorted(path.rglob("*-registration-dVRK.json"))
-    return {file.name.partition("-")[0]: file for file in files}
 
 
 def _with_extrinsics(camera: FoundCamera, file: Path, job: Import) -> FoundCamera:

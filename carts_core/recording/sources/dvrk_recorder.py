@@ -181,11 +181,6 @@ def _logs(path: Path, start: float, job: Import) -> tuple[list[ArmLog], Track | 
         with Bag(bags[0]) as bag:
             motion = read_endoscope(bag, start, job)
             return read_arm_logs(bag, job), motion
-    return _extracted(path, job), None
-
-
-def _extracted(path: Path, job: Import) -> list[ArmLog]:
-    """Logs from CSV files named by topic, `_PSM1_measured_js.csv`."""
     roles = {
         "jaw_measured_js": "jaw",
         "local_measured_cp": "local_poses",
@@ -193,11 +188,12 @@ def _extracted(path: Path, job: Import) -> list[ArmLog]:
         "measured_cp": "poses",
     }
     found: dict[str, dict[str, Any]] = {}
+    # CSV files are named by topic, `_PSM1_measured_js.csv`.
     for file in sorted(path.glob("*.csv")):
         recorded, _, topic = file.stem.strip("_").partition("_")
         if recorded.startswith("PSM") and topic in roles and (arm := job.arm_name(recorded)) is not None:
             found.setdefault(arm, {})[roles[topic]] = _extracted_track(file, roles[topic])
-    return [ArmLog(arm, **tracks) for arm, tracks in found.items()]
+    return [ArmLog(arm, **tracks) for arm, tracks in found.items()], None
 
 
 def _extracted_track(file: Path, role: str) -> Track | None:

@@ -12,7 +12,7 @@ from ...settings.interchange import NO_TABLE, ImportOptions
 from ..importing.cameras import Images, cameras_of, common_ids, find_images, image_files, side_of
 from ..importing.columns import ColumnMeanings, arm_in, arm_log, guess_columns, log_rows, samples
 from ..importing.foreign_tables import TABLE_SUFFIXES, ForeignTable, read_foreign_table
-from ..importing.found import FoundArm, FoundRecording, Import, Source
+from ..importing.found import FoundArm, FoundRecording, Import, PartError, Source
 from ..importing.logs import arm_from_log
 from ..importing.row_matching import FrameTimes, RowMatch, by_rows, frame_times, match_rows, row_seconds
 from ..video import SUFFIXES
@@ -79,9 +79,10 @@ def _images(path: Path, options: ImportOptions) -> dict[str, Images]:
     named = {side: found for side, found in sides.items() if side}
     if not named or any(len(found) > 1 for found in named.values()):
         shown = ", ".join(str(place.relative_to(path)) for place in places)
-        raise SequenceError(
+        raise PartError(
+            "images",
             f"{path} has several places with images, and it is not clear which camera is which: {shown}. "
-            "Choose: --images left PLACE right PLACE."
+            "Choose: --images left PLACE right PLACE.",
         )
     return {side: find_images(found[0]) for side, found in sorted(named.items())}
 
@@ -158,9 +159,17 @@ def _kinematics(path: Path, job: Import) -> list[tuple[ForeignTable, ColumnMeani
     for table, meanings in found:
         if not meanings.arms:
             if options.kinematics is not None or options.columns or len(found) == 1:
-                raise _not_recognized(table)
+                raise PartError(
+                    "columns",
+                    f"{table.path} has {len(table)} rows with the columns {samples(table)}, among which six joints or "
+                    "a tip's pose are not recognized. Name them: --columns yaw COLUMN pitch COLUMN insertion COLUMN "
+                    "roll COLUMN wrist_pitch COLUMN wrist_yaw COLUMN; give the robot if it is no PSM (--robot NAME "
+                    "FILE.urdf); or leave it out (--kinematics none).",
+                )
             continue
-        named = _of_file(table, meanings)
+        named = meanings
+        if (name := arm_in(table.path.stem)) and "" in meanings.arms:
+            named = replace(meanings, arms={arm or name: columns for arm, columns in meanings.arms.items()})
         if taken := [arm for arm in named.arms if arm in known]:
             job.warning(
                 f"{table.path} has joints or poses of {taken[0] or 'an arm'} too, and is not used (change: "
@@ -170,23 +179,6 @@ def _kinematics(path: Path, job: Import) -> list[tuple[ForeignTable, ColumnMeani
         known |= dict.fromkeys(named.arms, table)
         chosen.append((table, named))
     return chosen
-
-
-def _not_recognized(table: ForeignTable) -> SequenceError:
-    return SequenceError(
-        f"{table.path} has {len(table)} rows with the columns {samples(table)}, among which six joints or a tip's pose "
-        "are not recognized. Name them: --columns yaw COLUMN pitch COLUMN insertion COLUMN roll COLUMN wrist_pitch "
-        "COLUMN wrist_yaw COLUMN; give the robot if it is no PSM (--robot NAME FILE.urdf); or leave it out "
-        "(--kinematics none)."
-    )
-
-
-def _of_file(table: ForeignTable, meanings: ColumnMeanings) -> ColumnMeanings:
-    """Name of an arm from the file's name, if that is a PSM."""
-    name = arm_in(table.path.stem)
-    if not name or "" not in meanings.arms:
-        return meanings
-    return replace(meanings, arms={arm or name: found for arm, found in meanings.arms.items()})
 
 
 def _frames(path: Path, images: Images, ids: tuple[str, ...], kinematics: list[Path], job: Import) -> FrameTimes:
@@ -267,15 +259,16 @@ def _matched(
         except SequenceError as error:
             others = [f"{other.path.name}, {len(other)} rows" for other, _ in found if other is not table]
             also = f" Beside it lies {'; '.join(others)}." if others else ""
-            raise SequenceError(f"{error}{also}") from error
+            raise PartError("columns", f"{error}{also}") from error
         arms += _arms(table, meanings, match.rows, job)
         matches.append(match)
     first = matches[0]
     if any((each.by_image, each.time_offset) != (first.by_image, first.time_offset) for each in matches):
         names = ", ".join(table.path.name for table, _ in found)
-        raise SequenceError(
+        raise PartError(
+            "columns",
             f"rows of {names} meet the images in several ways. Give them times of one clock and --time-offset, or name "
-            "one table: --kinematics FILE."
+            "one table: --kinematics FILE.",
         )
     return tuple(arms), first
 

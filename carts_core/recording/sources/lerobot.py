@@ -13,7 +13,7 @@ from ...imports import needs_extra
 from ..importing.cameras import calibration_of, find_images, side_of
 from ..importing.columns import arm_log, guess_columns, samples
 from ..importing.foreign_tables import ForeignTable, read_parquet
-from ..importing.found import FoundArm, FoundCamera, FoundRecording, Import, Source
+from ..importing.found import FoundArm, FoundCamera, FoundRecording, Import, PartError, Source
 from ..importing.logs import arm_from_log, nearest
 from ..importing.row_matching import by_rows
 
@@ -162,9 +162,10 @@ def _arms(root: Path, features: dict[str, Any], episode: _Episode, job: Import) 
     table = ForeignTable(root / "meta/info.json", {name: values[:, index] for index, name in enumerate(names)})
     meanings = guess_columns(table, job.options)
     if not meanings.arms:
-        raise SequenceError(
+        raise PartError(
+            "columns",
             f"{root}: {_STATE} has the columns {samples(table)}, among which six joints of a PSM or a tip's pose "
-            "are not recognized. Name them: --columns yaw COLUMN ..., or give the robot: --robot NAME FILE.urdf."
+            "are not recognized. Name them: --columns yaw COLUMN ..., or give the robot: --robot NAME FILE.urdf.",
         )
     times = np.arange(len(values), dtype=float)
     arms = []
