@@ -27,7 +27,7 @@ from carts_core.project import (
     default_path,
     rescued_copies,
 )
-from carts_core.project.calibrated import calibrated, corrected_state, source_of
+from carts_core.project.calibrated import calibrated_scene, corrected_state, source_of
 from carts_core.recording import Frame, FrameReader, Sequence
 from carts_viewer.choices import NETWORK, Observed, Target, joint_range
 from carts_viewer.editing import Editor, People, Person
@@ -131,7 +131,7 @@ class Session:
 
     def measured(self, frame: Frame) -> SceneState:
         """The state that the kinematics table gives, in the project's calibration."""
-        return calibrated(self.scene, self.scene.state(frame.measured, mounts=frame.mounts), self.editor.view)
+        return calibrated_scene(self.scene, self.editor.view).state(frame.measured, mounts=frame.mounts)
 
     def edits(
         self,

@@ -21,7 +21,6 @@ from ..imaging.working_image import Window, box_mean, pixel_weights, smoothed, s
 from ..model.parts import COVERAGE, SURFACE_CHANNELS
 from ..model.scene import Scene
 from ..recording import MeanBackground
-from ..threads import total
 from .predictor import FramePredictor
 
 _PATCH = 3
@@ -39,7 +38,7 @@ _FOREIGN = 0.06
 _UNTELLING = 0.15
 """Difference above which arms need not be visible as a change, as in moving smoke [1]."""
 
-_DECEPTIVE = 0.08
+DECEPTIVE = 0.08
 """Share of a background with false positives from which the network gets images without that background [1]."""
 
 _SMOOTH = 12.0
@@ -74,11 +73,6 @@ class Background:
     """Confidence that they show no arm, in [0, 1]."""
     seen: Float[Tensor, "cameras 1 h w"]
     """Predicted coverage where they are known: false positives."""
-
-    @property
-    def deceptive(self) -> bool:
-        """Whether the network has many false positives there."""
-        return total(self.seen) / self.seen.numel() > _DECEPTIVE
 
     def compared(self, images: Float[Tensor, "cameras 3 h w"], scale: float) -> "Change":
         """Images, RGB in [0, 1], beside the background under their light.

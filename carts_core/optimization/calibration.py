@@ -29,6 +29,7 @@ from ..settings.stages import Descend
 from .backgrounds import Backgrounds
 from .calibration_problem import CalibrationEvaluation, CalibrationProblem, Ignored, with_joint_errors
 from .frame import Progress
+from .hand_eye.files import RESTING
 from .hand_eye.result import PoseDeviation
 from .predictor import SurfacePredictor, predictor_of
 from .stages import Fit, Point, StopReason, run_stages
@@ -83,9 +84,6 @@ _TOO_FAR = 3.0
 
 _CORRELATED = SequenceSettings.measurement_noise / SurfaceSolver.noise
 """Ratio of a standard deviation to that of independent pixels, as in sequence mode [1]."""
-
-_STANDS = 1e-3
-"""Largest difference of the transforms of a resting mount [rad, m]."""
 
 
 @dataclass(frozen=True)
@@ -192,7 +190,14 @@ class CalibrationOptimizer:
         if free.joints_only:
             raise SettingsError("nothing of the calibration is free. Free base frames, extrinsics or intrinsics.")
         self._whole_scene, self._scene = scene, scene.with_cameras(cameras)
-        self.free = free if _some_camera_moves(frames) else with_fixed_gauge(self._scene, free)
+        # Moving cameras make both cameras and base frames observable.
+        still = frames[0].mounts
+        moves = any(
+            not np.allclose(T, still.get(camera, np.eye(4)), atol=RESTING)
+            for frame in frames
+            for camera, T in frame.mounts.items()
+        )
+        self.free = free if moves else with_fixed_gauge(self._scene, free)
         self._frames, self._predictor = frames, predictor_of(networks)
         self._known = known_base_frames or {}
         problem = self._scene, frames, self._predictor, self.free, settings
@@ -402,16 +407,6 @@ def _widened(
     freedom = (count - 1) * (variance / frames.clamp(min=1e-30)).square()
     wider = stdtrit(freedom.clamp(max=1e9).numpy(), ndtr(1.0))
     return variance.sqrt() * torch.from_numpy(wider)
-
-
-def _some_camera_moves(frames: Sequence[Frame]) -> bool:
-    """Whether a camera moves between frames, so that cameras and base frames are both observable."""
-    first = frames[0].mounts
-    return any(
-        not np.allclose(T, first.get(camera, np.eye(4)), atol=_STANDS)
-        for frame in frames
-        for camera, T in frame.mounts.items()
-    )
 
 
 def with_fixed_gauge(scene: Scene, free: FreeParameters) -> FreeParameters:

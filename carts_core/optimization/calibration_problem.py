@@ -260,7 +260,7 @@ class CalibrationProblem:
             return np.mean(found, axis=0)
 
         deviation = self.variables.spread(stage.joints_deg, stage.frames_deg, distance)
-        found, _ = search_silhouettes(distances, deviation, self.variables.clamp, stage)
+        found = search_silhouettes(distances, deviation, self.variables.clamp, stage)
         if self._given_prior:
             return found
         # Searched unknowns get the search range as prior; the others keep theirs.

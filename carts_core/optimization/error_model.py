@@ -121,9 +121,7 @@ class ErrorModel:
         """Corrections of all frames, each given all others (Rauch, Tung and Striebel, 1965).
 
         Args:
-            filtered: filtered states, after each frame.
-            seconds: from the frame before to each frame [s].
-        """
+            seconds: from the frame before to each frame [s]."""
         if not filtered:
             return []
         result = [filtered[-1]]

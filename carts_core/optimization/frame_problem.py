@@ -140,8 +140,8 @@ def search_silhouettes(
     deviation: Float[Tensor, " n"],
     clamp: Callable[[Tensor], Tensor],
     stage: SilhouetteSearch,
-) -> tuple[Float[Tensor, " n"], float]:
-    """Search for the smallest distance of silhouettes by the cross-entropy method; returns the point and distance [px].
+) -> Float[Tensor, " n"]:
+    """The point with the smallest distance of silhouettes, by the cross-entropy method.
 
     Args:
         distances: between silhouettes and masks at each of a batch of points [px].
@@ -166,7 +166,7 @@ def search_silhouettes(
                 best, lowest = best_here, float(costs[order[0]])
         if lowest < stage.enough:
             break
-    return best, lowest
+    return best
 
 
 _SHOWN_BLUR = 1.6
@@ -384,10 +384,9 @@ class FrameProblem:
         """Offsets whose silhouettes are nearest to the masks."""
         compared, variables = self.silhouettes(stage.scale), self.variables
         deviation = variables.spread(stage.joints_deg, stage.frames_deg, self.distance)
-        found, _ = search_silhouettes(
+        return search_silhouettes(
             lambda trials: compared.distances(variables.state(trials)), deviation, variables.clamp, stage
         )
-        return found
 
     def _loss(self, factor: SurfaceFactor, compared) -> float:
         """Cost per pixel of the arms, averaged over the rendered and the observed area.

@@ -77,9 +77,17 @@ def fit_keypoints(
     variables = Variables(scene, start.map(torch.Tensor.double), FreeParameters(arms=arms), settings.length_scale)
     # Only joints are free, and the unknowns are in radian-like units.
     weight = 1.0 / math.radians(settings.prior_deg)
+    by_camera: dict[str, list[int]] = {}
+    for row, pin in enumerate(pins):
+        by_camera.setdefault(pin.camera, []).append(row)
 
     def distances(offsets: Float[Tensor, " n"]) -> Float[Tensor, "pins 2"]:
-        return _distances(scene, variables.state(offsets), pins)
+        state, found = variables.state(offsets), offsets.new_zeros(len(pins), 2)
+        for camera, rows in by_camera.items():
+            points = [pins[row].keypoint for row in rows]
+            wanted = offsets.new_tensor([pins[row].pixel for row in rows])
+            found = found.index_put((torch.tensor(rows),), project_keypoints(scene, state, points, camera) - wanted)
+        return found
 
     def residuals(offsets: Float[Tensor, " n"]) -> Float[Tensor, " m"]:
         return torch.cat([distances(offsets).flatten() / settings.pixel_error, weight * offsets])
@@ -107,15 +115,3 @@ def fit_keypoints(
     offsets = torch.from_numpy(fit.x)
     errors = distances(offsets).norm(dim=-1)
     return KeypointFit(variables.state(offsets).map(torch.Tensor.float), tuple(errors.tolist()), int(fit.nfev))
-
-
-def _distances(scene: Scene, state: SceneState, pins: Sequence[Pin]) -> Float[Tensor, "pins 2"]:
-    by_camera: dict[str, list[int]] = {}
-    for row, pin in enumerate(pins):
-        by_camera.setdefault(pin.camera, []).append(row)
-    found = state.intrinsics.new_zeros(len(pins), 2)
-    for camera, rows in by_camera.items():
-        points = [pins[row].keypoint for row in rows]
-        wanted = state.intrinsics.new_tensor([pins[row].pixel for row in rows])
-        found = found.index_put((torch.tensor(rows),), project_keypoints(scene, state, points, camera) - wanted)
-    return found

@@ -118,7 +118,7 @@ def uncertainty(
     Returns:
         None where the prior does not constrain an unknown.
     """
-    if not prior.informs_all:
+    if not (prior.precision.diagonal() > 0).all():
         return None
     covariance = torch.linalg.inv(curvature.double())
     return _uncertainty(variables, prior, covariance, covariance @ common.double())

@@ -17,7 +17,7 @@ from ..rendering import Renderer
 from ..settings import SurfaceSolver
 from ..settings.stages import Observe
 from ..threads import total
-from .backgrounds import Backgrounds, Change, without_background
+from .backgrounds import DECEPTIVE, Backgrounds, Change, without_background
 from .predictor import FramePredictor
 
 HAS_LEFT = 0.3
@@ -112,7 +112,8 @@ class FrameImages:
         if not predictor.masked and backgrounds is not None and backgrounds.covers(scene):
             background = backgrounds.at(scene, size, settings.dehaze, predictor)
             change = background.compared(stacked, size[0] / unit)
-            if background.deceptive if replaced is None else replaced:
+            deceptive = total(background.seen) / background.seen.numel() > DECEPTIVE
+            if deceptive if replaced is None else replaced:
                 stacked, through = without_background(stacked, change.surely, size[0] / unit), torch.ones_like(through)
             else:
                 explained = background.seen * (1.0 - change.surely)

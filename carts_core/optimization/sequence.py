@@ -64,13 +64,9 @@ def initial_correction(
     open_frame: Callable[[int], tuple[Frame, Variables]],
     allowance: float,
 ) -> Float[np.ndarray, " n"]:
-    """Correction with the lowest mean loss over the frames that were solved alone.
+    """Correction [rad] with the lowest mean loss over the frames (by position) that were solved alone.
 
-    Those that do not fit the first frame are excluded, since the error may have jumped before the others.
-
-    Args:
-        corrections: position of each of these frames -> its measured correction [rad].
-        allowance: largest ratio to the lowest loss in the first frame [1].
+    Those whose loss in the first frame is beyond `allowance` times the lowest are excluded: the error may have jumped.
     """
     candidates = list(corrections.values())
     losses = np.array([solver.losses(*open_frame(index), candidates) for index in corrections])

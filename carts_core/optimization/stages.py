@@ -404,16 +404,12 @@ def run_first_order(stage: FirstOrder, fit: Fit) -> Iterator[Point]:
         point = fit.evaluate(stage)
         fit.losses.append(point.evaluation.loss)
         fit.offsets, fit.stop_reason = fit.descent.step(point.evaluation.gradient), StopReason.ITERATIONS
-        if _stalled(fit.losses, settings.tolerance, settings.patience):
+        earlier = fit.losses[: -settings.patience]
+        if settings.tolerance > 0 and earlier and min(earlier) - min(fit.losses) < settings.tolerance:
             fit.budget, fit.stop_reason = fit.used, StopReason.CONVERGED
         yield point
         if fit.exhausted:
             return
-
-
-def _stalled(losses: list[float], tolerance: float, patience: int) -> bool:
-    """Whether the best loss has improved by less than the tolerance over so many steps."""
-    return tolerance > 0 and len(losses) > patience and min(losses[:-patience]) - min(losses) < tolerance
 
 
 def _one_frame(fit: Fit) -> FrameProblem:

@@ -229,7 +229,15 @@ class Variables:
             elif block.kind == "extrinsics":
                 T_camera_world = _update(T_camera_world, block.index, lambda T, s=part: self._rigid(s) @ T)
             else:
-                intrinsics = _update(intrinsics, block.index, lambda K, s=part: _scaled_intrinsics(K, s), matrix=False)
+                # One unit of a focal length is a factor of e; a principal point moves by the focal length.
+                intrinsics = _update(
+                    intrinsics,
+                    block.index,
+                    lambda K, s=part: torch.cat(
+                        [K[..., :2] * torch.exp(s[..., :2]), K[..., 2:] + K[..., :2] * s[..., 2:]], -1
+                    ),
+                    matrix=False,
+                )
         return SceneState(tuple(joints), T_world_base, T_camera_world, intrinsics, start.T_mount_world)
 
     def around(self, offsets: Float[Tensor, " n"]) -> SceneState:
@@ -245,12 +253,6 @@ class Variables:
         top = torch.cat([rotation, translation[..., None]], -1)
         bottom = torch.tensor([0.0, 0.0, 0.0, 1.0], device=step.device).expand(*step.shape[:-1], 1, 4)
         return torch.cat([top, bottom], -2)
-
-
-def _scaled_intrinsics(K: Tensor, step: Tensor) -> Tensor:
-    # One unit of a focal unknown is a factor of e; a principal point moves by the focal length.
-    focal = K[..., :2] * torch.exp(step[..., :2])
-    return torch.cat([focal, K[..., 2:] + K[..., :2] * step[..., 2:]], -1)
 
 
 def _update(stack: Tensor, index: int, change, *, matrix: bool = True) -> Tensor:

@@ -85,11 +85,7 @@ def seal(connection: sqlite3.Connection, nonce: bytes) -> None:
 
 
 def check_seal(connection: sqlite3.Connection, total: int) -> Seal:
-    """The seal of a file whose rows are verified and whose digests add up to `total`.
-
-    Raises:
-        ProjectError: it does not fit.
-    """
+    """The seal of a file whose verified rows have digests that add up to `total`; `ProjectError` if it does not fit."""
     projects = connection.execute("SELECT identity, position, created FROM project").fetchmany(2)
     seals = connection.execute("SELECT nonce, total, digest FROM seal").fetchmany(2)
     if len(projects) != 1 or len(seals) != 1:
@@ -106,11 +102,7 @@ def check_seal(connection: sqlite3.Connection, total: int) -> Seal:
 
 
 def checked_rows(connection: sqlite3.Connection, table: str) -> Iterable[tuple]:
-    """Verified rows of a table, with their digests as numbers in the last column.
-
-    Raises:
-        ProjectError: a row is not as it was written.
-    """
+    """Verified rows of a table, with their digests as numbers in the last column; `ProjectError` for a changed row."""
     columns = TABLES[table]
     # No index is trusted: rows are read in the order in which they lie.
     query = f"SELECT {', '.join(columns)}, digest FROM {table} NOT INDEXED ORDER BY rowid"
@@ -121,18 +113,15 @@ def checked_rows(connection: sqlite3.Connection, table: str) -> Iterable[tuple]:
 
 
 def verify(connection: sqlite3.Connection) -> Seal:
-    """The seal of a file after verification of every row; values are not decoded.
-
-    Raises:
-        ProjectError: something is not as it was written.
-    """
+    """The seal of a file after verification of every row; values are not decoded. `ProjectError` for any change."""
     return check_seal(connection, sum(row[-1] for table in TABLES for row in checked_rows(connection, table)))
 
 
 APPLICATION_ID = 0x43415254
 """Marks an SQLite file as a project of carts ("CART")."""
 
-VERSION_1 = """
+MIGRATIONS: tuple[str, ...] = (
+    """
 CREATE TABLE project (            -- one row
     identity TEXT NOT NULL,       -- of the sequence, JSON
     position INTEGER NOT NULL,    -- how many steps are done; those after it are undone
@@ -171,13 +160,9 @@ CREATE VIEW current AS            -- the last change of every value that is done
         SELECT kind, frame, name, max(step) AS step FROM changes
         WHERE step <= (SELECT position FROM project) GROUP BY kind, frame, name
     ) USING (kind, frame, name, step);
-"""
-
-VERSION_2 = """
--- The same tables. Changes may be of the kind time_offset, which version 1 would take for damage.
-"""
-
-VERSION_3 = """
+""",
+    "-- The same tables. Changes may be of the kind time_offset, which version 1 would take for damage.\n",
+    """
 ALTER TABLE steps ADD COLUMN digest BLOB;    -- of the row, see digests.py
 ALTER TABLE changes ADD COLUMN digest BLOB;
 ALTER TABLE figures ADD COLUMN digest BLOB;
@@ -187,21 +172,11 @@ CREATE TABLE seal (               -- one row
     total BLOB NOT NULL,          -- sum of the digests of all rows
     digest BLOB NOT NULL          -- over nonce, total, identity, position and time of creation
 );
-"""
-
-VERSION_4 = """
--- The same tables. Changes may be of the kind verdict, which version 3 would take for damage.
-"""
-
-VERSION_5 = """
--- The same tables. Changes may be of the kinds imported_mask, imported_keypoints and imported_labels.
-"""
-
-VERSION_6 = """
--- The same tables. Changes may be of the kind part_labels.
-"""
-
-MIGRATIONS: tuple[str, ...] = (VERSION_1, VERSION_2, VERSION_3, VERSION_4, VERSION_5, VERSION_6)
+""",
+    "-- The same tables. Changes may be of the kind verdict, which version 3 would take for damage.\n",
+    "-- The same tables. Changes may be of the kinds imported_mask, imported_keypoints and imported_labels.\n",
+    "-- The same tables. Changes may be of the kind part_labels.\n",
+)
 """Script number n migrates a project from schema n to n + 1; a new project runs all of them. Never change one."""
 SEALED = 3
 """First schema with digests."""
@@ -252,11 +227,7 @@ def _authorized(action: int, _first: object, _second: object, _schema: object, i
 
 @contextmanager
 def time_limit(connection: sqlite3.Connection, seconds: float) -> Iterator[None]:
-    """Interrupt SQLite when the block takes longer [s], which only crafted files do.
-
-    Raises:
-        sqlite3.OperationalError: it was interrupted.
-    """
+    """Interrupt SQLite (`sqlite3.OperationalError`) when the block takes longer [s], which only crafted files do."""
     end = time.monotonic() + seconds
     connection.set_progress_handler(lambda: time.monotonic() > end, _STEPS_BETWEEN_LOOKS)
     try:
@@ -296,11 +267,7 @@ def migrate(connection: sqlite3.Connection, nonce: bytes) -> None:
 
 
 def check_version(connection: sqlite3.Connection, path: Path) -> None:
-    """Refuse files that are no project, or of a newer version.
-
-    Raises:
-        ProjectError: it is.
-    """
+    """Refuse files that are no project, or of a newer version, by a `ProjectError`."""
     if connection.execute("PRAGMA application_id").fetchone()[0] != APPLICATION_ID:
         raise not_a_project(path)
     found = version(connection)
@@ -312,11 +279,7 @@ def check_version(connection: sqlite3.Connection, path: Path) -> None:
 
 
 def check_schema(connection: sqlite3.Connection) -> None:
-    """Compare the schema with the expected one, as text, so that no foreign trigger, view or expression runs.
-
-    Raises:
-        DamagedProject: it is another.
-    """
+    """Compare the schema with the expected one, as text, so that no foreign trigger, view or expression runs."""
     found = version(connection)
     ours = _schema_of(MIGRATIONS[:found]) if found > 0 else frozenset()
     theirs = frozenset(connection.execute("SELECT type, name, tbl_name, sql FROM sqlite_schema").fetchmany(1000))

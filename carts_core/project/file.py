@@ -60,12 +60,7 @@ def check_files(path: Path) -> bool:
 
 
 def open_regular(path: Path, *, write: bool = False) -> int:
-    """Descriptor of a regular file with one name; links are not followed, and pipes do not block.
-
-    Raises:
-        ProjectError: it is something else.
-        OSError: it cannot be opened.
-    """
+    """Descriptor of a regular file with one name; links are not followed, and pipes do not block."""
     _is_there(path)
     descriptor = os.open(path, (os.O_RDWR if write else os.O_RDONLY) | _OPEN)
     try:
@@ -106,11 +101,7 @@ _START, _LENGTH = 0x40000000, 512
 
 
 def try_lock(descriptor: int) -> bool:
-    """Lock an open project file for writing until it is closed; False if another process holds the lock.
-
-    Raises:
-        OSError: the file is not open for writing, or its file system knows no locks.
-    """
+    """Lock an open project file for writing until it is closed; False if another process holds the lock."""
     if sys.platform == "darwin":
         request = struct.pack("qqihh", _START, _LENGTH, 0, fcntl.F_WRLCK, os.SEEK_SET)
     else:
@@ -238,12 +229,7 @@ class Copy:
 
 
 def read_files(path: Path) -> Content:
-    """Content of project and log at one moment.
-
-    Raises:
-        ProjectError: it is not there, is no regular file, is too large, or never holds still.
-        OSError: it cannot be read.
-    """
+    """Content of project and log at one moment; `ProjectError` if it is missing, too large, or always changing."""
     if not check_files(path):
         raise ProjectError(f"there is no project {path}. Name an existing one, or open it for writing to begin one.")
     for _ in range(_TRIES):
@@ -284,7 +270,9 @@ def open_copy(content: Content, path: Path) -> Copy:
     try:
         patched[_WRITE_VERSION] = b"\1\1"
         # SQLite opens no truncated file; filled with zeros, the rest can be read.
-        missing = min(_promised(patched), LARGEST) - len(patched)
+        page_size = int.from_bytes(patched[16:18], "big")
+        promised = int.from_bytes(patched[28:32], "big") * (65536 if page_size == 1 else page_size)
+        missing = min(promised, LARGEST) - len(patched)
         patched.extend(bytes(max(missing, 0)))
         memory.deserialize(patched)
         database.hardened(memory)
@@ -299,11 +287,7 @@ def open_copy(content: Content, path: Path) -> Copy:
 
 
 def check_copy(copy: Copy) -> None:
-    """Check that a copy has the schema of carts and is a sound database, before rows are read.
-
-    Raises:
-        DamagedProject, sqlite3.Error: it is not.
-    """
+    """Check that a copy has the schema of carts and is a sound database, before rows are read."""
     memory = copy.connection
     if copy.fault is not None:
         raise database.DamagedProject(copy.fault)
@@ -313,12 +297,6 @@ def check_copy(copy: Copy) -> None:
         found = memory.execute("PRAGMA integrity_check(3)").fetchall()
     if found != [("ok",)]:
         raise database.DamagedProject("; ".join(str(row[0]) for row in found)[:300])
-
-
-def _promised(main: bytearray) -> int:
-    """Size of a database by its header [bytes]."""
-    size = int.from_bytes(main[16:18], "big")
-    return int.from_bytes(main[28:32], "big") * (65536 if size == 1 else size)
 
 
 def _content(descriptor: int, path: Path) -> bytes:
@@ -366,11 +344,7 @@ class ProjectFile:
 
     @classmethod
     def locked(cls, path: Path) -> "ProjectFile | None":
-        """Lock an existing project file; None if another process has it open for writing.
-
-        Raises:
-            ProjectError, OSError: it cannot be opened.
-        """
+        """Lock an existing project file; None if another process has it open for writing."""
         descriptor = open_regular(path, write=True)
         try:
             if try_lock(descriptor):
@@ -436,11 +410,7 @@ class ProjectFile:
         self._remember()
 
     def checkpoint(self) -> None:
-        """Move a large log into the file, and verify the result.
-
-        Raises:
-            LostFile: it is not what it should be.
-        """
+        """Move a large log into the file, and verify the result; `LostFile` if that fails."""
         if os.fstat(self._open_log()).st_size < LARGEST_LOG:
             return
         with suppress(sqlite3.Error):
@@ -452,11 +422,7 @@ class ProjectFile:
         self._remember()
 
     def check(self) -> None:
-        """Check that file and log are unchanged since this process last wrote.
-
-        Raises:
-            LostFile: they are not.
-        """
+        """Check that file and log are unchanged since this process last wrote; otherwise they are a `LostFile`."""
         self._check_names()
         if self._look() != self._left:
             # The file may have been touched without a change.
@@ -464,11 +430,7 @@ class ProjectFile:
             self._remember()
 
     def close(self) -> None:
-        """Move the log into the file, verify it, and release the lock.
-
-        Raises:
-            LostFile: it does not hold what was saved.
-        """
+        """Move the log into the file, verify its content (else `LostFile`), and release the lock."""
         if self._connection is not None:
             self.check()
             self._connection.close()

@@ -37,12 +37,18 @@ class SequenceIdentity:
     @staticmethod
     def of(sequence: "Sequence") -> "SequenceIdentity":
         """The identity of an open sequence; reads its kinematics tables once more."""
+        root = parse_toml(read_text(sequence.path, SEQUENCE))
+        tables = [root["kinematics"]["table"], *(arm["table"] for arm in root["arms"] if arm.get("table"))]
+        digest = hashlib.sha256()
+        for table in tables:
+            text = read_text(sequence.path.parent / table, TABLE)
+            digest.update("\n".join([*text.splitlines(), ""]).encode())
         return SequenceIdentity(
             name=sequence.name,
             frame_ids=tuple(sequence.frame_ids),
             arms={arm.name: tuple(arm.robot.joint_names) for arm in sequence.scene.arms},
             cameras={camera.name: (camera.width, camera.height) for camera in sequence.scene.cameras},
-            kinematics_sha256=_kinematics_sha256(Path(sequence.path)),
+            kinematics_sha256=digest.hexdigest(),
         )
 
     def to_json(self) -> str:
@@ -52,11 +58,7 @@ class SequenceIdentity:
 
     @staticmethod
     def from_json(text: str) -> "SequenceIdentity":
-        """The identity from `to_json`.
-
-        Raises:
-            ValueError, TypeError, KeyError: it is something else.
-        """
+        """The identity from `to_json`; `ValueError`, `TypeError` or `KeyError` for other texts."""
         values: dict[str, Any] = json.loads(text)
         return SequenceIdentity(
             name=values["name"],
@@ -84,16 +86,6 @@ class SequenceIdentity:
 
 def _list(parts: Mapping[str, tuple]) -> str:
     return ", ".join(f"{name} ({' '.join(str(value) for value in values)})" for name, values in parts.items())
-
-
-def _kinematics_sha256(sequence_file: Path) -> str:
-    root = parse_toml(read_text(sequence_file, SEQUENCE))
-    tables = [root["kinematics"]["table"], *(arm["table"] for arm in root["arms"] if arm.get("table"))]
-    digest = hashlib.sha256()
-    for table in tables:
-        text = read_text(sequence_file.parent / table, TABLE)
-        digest.update("\n".join([*text.splitlines(), ""]).encode())
-    return digest.hexdigest()
 
 
 SUFFIX = ".carts"

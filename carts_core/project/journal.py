@@ -48,9 +48,7 @@ def load(connection: sqlite3.Connection) -> tuple[ProjectState, Seal]:
     """State and seal of a project. Every row is verified, including undone values.
 
     Raises:
-        DamagedProject, ValueError, TypeError and others of `rescue.UNREADABLE`, ProjectError, sqlite3.Error: something
-            in it cannot be read, or is not as it was written.
-    """
+        ProjectError, sqlite3.Error and those of `store.UNREADABLE`: it cannot be read, or is not as it was written."""
     row = connection.execute("SELECT identity, position FROM project").fetchone()
     if row is None:
         raise DamagedProject("it does not say which sequence it belongs to")

@@ -17,11 +17,7 @@ _HEADER = b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR"
 
 @dataclass(frozen=True)
 class Layer:
-    """A painted layer. Made by the `of` of its subclasses.
-
-    Raises:
-        ProjectError: the bytes are no PNG.
-    """
+    """A painted layer, made by the `of` of its subclasses; `ProjectError` for bytes that are no PNG."""
 
     png: bytes
 
@@ -40,19 +36,11 @@ class Layer:
 
     @classmethod
     def decode(cls, data: bytes) -> Self:
-        """The layer from `encode`.
-
-        Raises:
-            ProjectError: it is something else.
-        """
+        """The layer from `encode`; `ProjectError` for other bytes."""
         return cls(bytes(data))
 
     def pixels(self) -> UInt8[np.ndarray, "height width"]:
-        """Values of the PNG; read-only.
-
-        Raises:
-            ProjectError: the PNG is damaged.
-        """
+        """Values of the PNG, read-only; `ProjectError` if it is damaged."""
         return _decoded(self.png, self.size)
 
 
@@ -61,11 +49,7 @@ class MaskCorrection(Layer):
 
     @classmethod
     def of(cls, added: Bool[np.ndarray, "height width"], removed: Bool[np.ndarray, "height width"]) -> Self:
-        """A correction of these pixels.
-
-        Raises:
-            ProjectError: the shapes differ, or a pixel is both.
-        """
+        """A correction of these pixels; `ProjectError` if the shapes differ or a pixel is both."""
         added, removed = np.asarray(added, bool), np.asarray(removed, bool)
         if added.shape != removed.shape or added.ndim != 2 or (added & removed).any():
             raise ProjectError(
@@ -93,11 +77,7 @@ class IgnoreRegion(Layer):
 
     @classmethod
     def of(cls, region: Bool[np.ndarray, "height width"]) -> Self:
-        """The region of these pixels.
-
-        Raises:
-            ProjectError: it is not a mask.
-        """
+        """The region of these pixels; `ProjectError` unless they are a mask."""
         region = np.asarray(region, bool)
         if region.ndim != 2:
             raise ProjectError(f"an ignore region has shape {region.shape}. Give a mask [height, width].")
@@ -113,11 +93,7 @@ class LabelLayer(Layer):
 
     @classmethod
     def of(cls, labels: UInt8[np.ndarray, "height width"]) -> Self:
-        """The layer of these numbers.
-
-        Raises:
-            ProjectError: they are no picture of 8 bits.
-        """
+        """The layer of these numbers; `ProjectError` unless they are an image of 8 bits."""
         labels = np.asarray(labels)
         if labels.ndim != 2 or labels.dtype != np.uint8:
             raise ProjectError(f"labels are {labels.dtype} {labels.shape}. Give 8 bits per pixel [height, width].")

@@ -35,11 +35,7 @@ Masks = dict[str, Bool[np.ndarray, "height width"]]
 
 
 def project_masks(layer: MaskLayer, state: ProjectState, recording: Recording) -> GivenMasks:
-    """Masks of a project in this state, without its ignore regions.
-
-    Args:
-        layer: imported masks, or rendered masks corrected with a brush.
-    """
+    """Imported masks, or rendered masks corrected with a brush, of a project in this state; without ignore regions."""
     cameras = [camera.name for camera in recording.scene.cameras]
     if layer == "imported":
         known = state.get(Key.imported_labels())

@@ -139,7 +139,12 @@ class Project:
             if not changed:
                 self.record_figures(figures or {}, state)
                 return None
-            step = Step(state.position + 1, _step_name(name), time.time())
+            title = " ".join(name.encode("utf-8", "replace").decode().split())
+            if not title:
+                raise ProjectError("a step's name is empty. Give one.")
+            # Names of arms, joints and frames, of which steps' names are made, may be long.
+            title = title if len(title) <= LONGEST_NAME else f"{title[: LONGEST_NAME - 1]}…"
+            step = Step(state.position + 1, title, time.time())
             after = state.after(step, changed)
             known = by_revision(after, figures or {})
             store = self._writer()
@@ -148,11 +153,7 @@ class Project:
             return self._saved(after.with_figures(known), "apply", step, changed.keys())
 
     def undo(self) -> Change | None:
-        """Undo the last step; None if there is none.
-
-        Raises:
-            ProjectError: it could not be saved.
-        """
+        """Undo the last step; None if there is none. `ProjectError` if it could not be saved."""
         with self._edit:
             return self.go_to(max(self.state.position - 1, 0))
 
@@ -240,11 +241,7 @@ class Project:
             self._saved(self.state.with_entries({key: entry}), "figures", frames=[frame])
 
     def log_export(self, format: str, path: Path, frames: int, settings: Mapping[str, Any]) -> None:
-        """Log a finished export. Not an undo step.
-
-        Raises:
-            ProjectError: it could not be saved.
-        """
+        """Log a finished export, which is no undo step. `ProjectError` if it could not be saved."""
         record = ExportRecord(time.time(), format, str(path), frames, json.dumps(settings, allow_nan=False))
         with self._edit:
             self._writer().commit(journal.add_export(record))
@@ -261,11 +258,7 @@ class Project:
         return remove
 
     def close(self) -> None:
-        """Close the file for other writers. The state can still be read.
-
-        Raises:
-            ProjectError: what was saved is nowhere on disk any more.
-        """
+        """Close the file for other writers; the state stays readable. `ProjectError` if saved edits are lost."""
         with self._edit:
             if self._store is not None:
                 store, self._store = self._store, None
@@ -317,18 +310,6 @@ class Project:
 
 
 def read_state(path: Path) -> ProjectState:
-    """State of a project file of any sequence; the file may be open elsewhere.
-
-    Raises:
-        ProjectError: it is not there, or cannot be read.
-    """
+    """State of a project file of any sequence, also one that is open elsewhere; `ProjectError` if unreadable."""
     with database.errors_explained(path):
         return read_project(path, None)
-
-
-def _step_name(name: str) -> str:
-    text = " ".join(name.encode("utf-8", "replace").decode().split())
-    if not text:
-        raise ProjectError("a step's name is empty. Give one.")
-    # Names of arms, joints and frames, of which steps' names are made, may be long.
-    return text if len(text) <= LONGEST_NAME else f"{text[: LONGEST_NAME - 1]}…"

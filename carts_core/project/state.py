@@ -233,7 +233,13 @@ class ProjectState:
 
     def after(self, step: Step, edits: Edits) -> "ProjectState":
         """The state after one more step, without the redoable ones."""
-        state = self if self.redoable is None else self._without_undone_steps()
+        state = self
+        if self.redoable is not None:
+            records = {
+                frame: Record(record.entries, {r: value for r, value in record.figures.items() if r <= self.position})
+                for frame, record in self.records.items()
+            }
+            state = replace(self, steps=self.steps[: self.position], records=records)
         changed = {key: Entry(step.number, value) for key, value in edits.items()}
         return replace(state.with_entries(changed), steps=(*state.steps, step), position=step.number)
 
@@ -265,20 +271,9 @@ class ProjectState:
     def _record(self, frame: int) -> Record:
         return self.records.get(frame, _EMPTY)
 
-    def _without_undone_steps(self) -> "ProjectState":
-        records = {
-            frame: Record(record.entries, {r: value for r, value in record.figures.items() if r <= self.position})
-            for frame, record in self.records.items()
-        }
-        return replace(self, steps=self.steps[: self.position], records=records)
-
 
 def by_revision(state: ProjectState, figures: Mapping[int, Figures]) -> dict[tuple[int, int], Figures]:
-    """Figures by frame and revision in this state.
-
-    Raises:
-        ProjectError: there is no such frame.
-    """
+    """Figures by frame and revision in this state; `ProjectError` for an unknown frame."""
     for frame in figures:
         check_edit(state.identity, Key.review(frame), None)
     return {(frame, state.revision(frame)): value for frame, value in figures.items()}

@@ -176,11 +176,7 @@ class Store:
         return self._file is not None
 
     def commit(self, script: Script) -> None:
-        """Write a transaction; it is on disk, in `path`, when this returns.
-
-        Raises:
-            ProjectError: it could not be written; nothing of it was.
-        """
+        """Write a transaction to `path`; `ProjectError` if nothing of it could be written."""
         position = self._position if script.position is None else script.position
         seal = self._seal.plus(script.digests)
         row = seal.row(position)
@@ -202,19 +198,11 @@ class Store:
         self._guarded(lambda file: file.checkpoint())
 
     def check(self) -> None:
-        """Check that the file is unchanged since the last write; otherwise rescue everything.
-
-        Raises:
-            ProjectError: it is lost, and nothing could be rescued to a disk yet.
-        """
+        """Check that the file is unchanged since the last write; otherwise rescue everything (or `ProjectError`)."""
         self._guarded(lambda file: file.check())
 
     def close(self) -> None:
-        """Close the file and verify its content.
-
-        Raises:
-            ProjectError: what was acknowledged is nowhere on disk.
-        """
+        """Close the file and verify its content; `ProjectError` if acknowledged edits are on no disk."""
         for _ in range(_TRIES):
             try:
                 self._usable().close()
@@ -290,15 +278,11 @@ class Store:
 
 
 def open_or_begin(path: Path, identity: SequenceIdentity) -> tuple[ProjectState, Store | str]:
-    """Open the project of a sequence; a missing one is created.
-
-    Returns:
-        Its state, and its store or, if another process writes to it, the reason why there is none.
+    """State and store of the project of a sequence, created if missing; for a store in use elsewhere, the reason.
 
     Raises:
         DamagedProject: it is damaged; what can be read of it is in a new file by now.
-        ProjectError, OSError, sqlite3.Error: it cannot be opened; nothing is changed.
-    """
+        ProjectError, OSError, sqlite3.Error: it cannot be opened; nothing is changed."""
     if not check_files(path):
         _begin(path, identity)
     file = ProjectFile.locked(path)
@@ -317,11 +301,7 @@ def open_or_begin(path: Path, identity: SequenceIdentity) -> tuple[ProjectState,
 
 
 def read_project(path: Path, identity: SequenceIdentity | None) -> ProjectState:
-    """State of the project of a sequence, or with None of any sequence.
-
-    Raises:
-        DamagedProject, ProjectError, OSError, sqlite3.Error: it cannot be read.
-    """
+    """State of the project of a sequence, or with None of any sequence; errors as `open_or_begin`."""
     memory, state, _ = _load(path, identity, keep_what_is_left=False)
     memory.close()
     return state

@@ -49,17 +49,15 @@ class Provenance:
 
     def __post_init__(self) -> None:
         _set(self, "source", _choice(Source, self.source, "provenance"))
-        if self.settings is not None:
-            _check_json(self.settings)
-        if self.source is Source.OPTIMIZER and (self.settings is None or not self._network_known(self.settings)):
+        try:
+            used = None if self.settings is None else json.loads(self.settings)
+        except ValueError as error:
+            raise ProjectError(f"settings are not JSON ({error}). Give what json.dumps writes.") from error
+        masks_alone = isinstance(used, dict) and used.get("observe") == "masks"
+        if self.source is Source.OPTIMIZER and (self.settings is None or not (self.weights_sha256 or masks_alone)):
             raise ProjectError("an optimizer's value needs its settings and the hash of its weights. Give both.")
         if self.weights_sha256 is not None and not re.fullmatch("[0-9a-f]{64}", self.weights_sha256):
             raise ProjectError(f"{self.weights_sha256!r} is not a SHA-256 hash. Give 64 hexadecimal digits.")
-
-    def _network_known(self, settings: str) -> bool:
-        """Whether the network, if one was run, is given."""
-        used = json.loads(settings)
-        return self.weights_sha256 is not None or (isinstance(used, dict) and used.get("observe") == "masks")
 
     @staticmethod
     def made_by_optimizer(
@@ -84,11 +82,7 @@ class JsonValue:
 
     @classmethod
     def decode(cls, text: str) -> Self:
-        """The value from `encode`.
-
-        Raises:
-            ValueError, TypeError, ProjectError: it is something else.
-        """
+        """The value from `encode`; `ValueError`, `TypeError` or `ProjectError` for other texts."""
         values = json.loads(text)
         if "provenance" in values:
             values["provenance"] = _shared_provenance(**values["provenance"])
@@ -123,11 +117,7 @@ class JointCorrection(JsonValue):
 
 @dataclass(frozen=True)
 class CorrectedTransform(JsonValue):
-    """A rigid transform of the calibration: `T_world_base` of an arm or `T_camera_world` of a camera.
-
-    Raises:
-        ProjectError: it is not a rigid transform.
-    """
+    """A rigid transform of the calibration: `T_world_base` of an arm or `T_camera_world` of a camera."""
 
     transform: tuple[tuple[float, ...], ...]
     """4 rows of 4 numbers [m]."""
@@ -149,11 +139,7 @@ class CorrectedTransform(JsonValue):
 
 @dataclass(frozen=True)
 class CorrectedIntrinsics(JsonValue):
-    """Intrinsics of a camera.
-
-    Raises:
-        ProjectError: not four finite numbers, or a focal length that is not positive.
-    """
+    """Intrinsics of a camera: four finite numbers, the focal lengths positive."""
 
     intrinsics: tuple[float, ...]
     """fx, fy, cx, cy [px]."""
@@ -168,11 +154,7 @@ class CorrectedIntrinsics(JsonValue):
 
 @dataclass(frozen=True)
 class TimeOffset(JsonValue):
-    """Time in the kinematics table minus time of the image, overriding the sequence's; see `TimeMatching`.
-
-    Raises:
-        ProjectError: it is not finite.
-    """
+    """Time in the kinematics table minus time of the image, overriding the sequence's; see `TimeMatching`."""
 
     seconds: float
     """[s]"""
@@ -204,11 +186,7 @@ UNREVIEWED = frozenset({ReviewState.UNTOUCHED, ReviewState.OPTIMIZED})
 
 @dataclass(frozen=True)
 class Review(JsonValue):
-    """Review state of a frame and a note about it.
-
-    Raises:
-        ProjectError: there is no such state, or the note is too long.
-    """
+    """Review state of a frame and a note about it, of at most `LONGEST_NOTE` characters."""
 
     state: ReviewState = ReviewState.UNTOUCHED
     note: str = ""
@@ -221,11 +199,7 @@ class Review(JsonValue):
 
 @dataclass(frozen=True)
 class Figures:
-    """Quality of the fit of a frame.
-
-    Raises:
-        ProjectError: a figure is not finite.
-    """
+    """Quality of the fit of a frame; finite numbers."""
 
     loss: float | None = None
     """Loss of the optimizer; smaller is better."""
@@ -286,20 +260,9 @@ def _deviation(value: float | None) -> float | None:
     return float(value)
 
 
-def _check_json(text: str) -> None:
-    try:
-        json.loads(text)
-    except ValueError as error:
-        raise ProjectError(f"settings are not JSON ({error}). Give what json.dumps writes.") from error
-
-
 @dataclass(frozen=True)
 class ImportedLabels(JsonValue):
-    """Label names of imported masks.
-
-    Raises:
-        ProjectError: there are more than 255 names, or one is no text.
-    """
+    """Label names of imported masks: at most 255 texts."""
 
     names: tuple[str, ...]
     """Names of the labels from 1."""
@@ -312,11 +275,7 @@ class ImportedLabels(JsonValue):
 
 @dataclass(frozen=True)
 class ImportedKeypoints(JsonValue):
-    """Imported keypoints of a frame.
-
-    Raises:
-        ProjectError: a place is not finite, or a name is no text.
-    """
+    """Imported keypoints of a frame, at finite places."""
 
     points: tuple[tuple[str, float, float], ...]
     """Name, column and row in the undistorted image [px]."""
@@ -341,11 +300,7 @@ LONGEST_TEXT = 2_000
 
 @dataclass(frozen=True)
 class FitVerdict(JsonValue):
-    """Reliability of a frame's fit; see `ProjectState.verdict` for its lifetime.
-
-    Raises:
-        ProjectError: there is no such verdict, a text is too long, or the probability is none.
-    """
+    """Reliability of a frame's fit; see `ProjectState.verdict` for its lifetime."""
 
     verdict: str
     """One of `VERDICTS`."""
@@ -507,11 +462,7 @@ Edits = Mapping[Key[Any], Any]
 
 
 def decode(kind: Kind, stored: str | bytes | None) -> Any:
-    """Decode a value of this kind from a project file.
-
-    Raises:
-        ValueError, TypeError, ProjectError: it is something else.
-    """
+    """Decode a value of this kind from a project file; `ValueError`, `TypeError` or `ProjectError` if it is none."""
     if stored is None:
         return None
     return _decoded_mark(kind, stored) if kind in _MARKS else VALUE_TYPES[kind].decode(stored)
@@ -524,11 +475,7 @@ def _decoded_mark(kind: Kind, stored: str | bytes) -> Any:
 
 
 def check_edit(identity: SequenceIdentity, key: Key[Any], value: object) -> None:
-    """Check that a key fits the sequence and the value fits the key.
-
-    Raises:
-        ProjectError: it does not.
-    """
+    """Check that a key fits the sequence and the value fits the key; otherwise it is a `ProjectError`."""
     frames = len(identity.frame_ids)
     if key.kind in _OF_FRAME and not 0 <= key.frame < frames:
         raise ProjectError(f"the sequence has no frame number {key.frame}; its frames are 0 to {frames - 1}.")

@@ -225,11 +225,7 @@ SolverSettings = SurfaceSolver | DescentSolver
 
 
 def surface_solver(settings: SolverSettings | None, what: str) -> SurfaceSolver:
-    """The settings, or the default ones.
-
-    Raises:
-        SettingsError: they are those of another solver.
-    """
+    """The settings, or the default ones; `SettingsError` if they are those of another solver."""
     if settings is None or isinstance(settings, SurfaceSolver):
         return settings or SurfaceSolver()
     raise SettingsError(
@@ -258,11 +254,7 @@ class SolverName(StrEnum):
 
 
 def solver(name: SolverName | str) -> SolverSettings:
-    """The solver of a name, with its default settings.
-
-    Raises:
-        SettingsError: there is none of this name.
-    """
+    """The solver of a name, with its default settings; `SettingsError` for another name."""
     require(name in set(SolverName), "solver", str(name), ", ".join(SolverName))
     match SolverName(name):
         case SolverName.SURFACE:

@@ -45,11 +45,7 @@ NotNegative = Annotated[float, Range(0)]
 
 
 def require(condition: bool, name: str, value: object, allowed: object) -> None:
-    """Check a setting.
-
-    Raises:
-        SettingsError: the condition is false.
-    """
+    """Check a setting; `SettingsError` if the condition is false."""
     if not condition:
         raise SettingsError(f"{name} is {value!r}; allowed is {allowed}. Change it, or leave it at its default.")
 
@@ -58,11 +54,7 @@ class Ranged:
     """Base of dataclasses whose fields have a `Range` in their types; None is allowed where the type has it."""
 
     def __post_init__(self) -> None:
-        """Check all ranges.
-
-        Raises:
-            SettingsError: a value is out of its range.
-        """
+        """Check all ranges; `SettingsError` for a value outside of its range."""
         for field in fields(self):  # pyright: ignore[reportArgumentType]
             for allowed in getattr(field.type, "__metadata__", ()):
                 value = getattr(self, field.name)

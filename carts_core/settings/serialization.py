@@ -61,11 +61,7 @@ def to_plain(value: Any) -> Any:
 
 
 def changed(base: _Settings, table: Mapping[str, Any], where: str) -> _Settings:
-    """Settings with some fields replaced by those of a table.
-
-    Raises:
-        SettingsError: a name is unknown, or a value has another type or is out of range.
-    """
+    """Settings with some fields replaced by those of a table; `SettingsError` for unknown or unusable ones."""
     types = get_type_hints(type(base))
     values: dict[str, Any] = {}
     for name, value in table.items():

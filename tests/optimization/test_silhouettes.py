@@ -48,13 +48,13 @@ def test_nothing_in_view_is_as_far_as_can_be_and_ignored_pixels_do_not_count() -
 
 def test_a_search_finds_what_lies_several_deviations_off() -> None:
     wanted = torch.tensor([2.0, -1.5, 0.5])
-    found, distance = search_silhouettes(
+    found = search_silhouettes(
         lambda trials: 10 * (trials - wanted).square().sum(1).sqrt().numpy(),
         torch.ones(3),
         lambda trials: trials,
         SilhouetteSearch(starts=1, enough=0.0),
     )
-    assert (found - wanted).abs().max() < 0.1 and distance < 1.5
+    assert (found - wanted).abs().max() < 0.1
 
 
 def arm_before_camera(folder: Path) -> tuple[Scene, list[Frame]]:

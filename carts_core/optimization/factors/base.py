@@ -66,8 +66,3 @@ class Prior:
     def marginal_precision(self) -> Float[Tensor, " n"]:
         """Inverse variance of each unknown [1/rad^2]."""
         return 1.0 / torch.linalg.inv(self.precision.double()).diagonal().to(self.precision)
-
-    @property
-    def informs_all(self) -> bool:
-        """Whether every unknown has a prior of its own."""
-        return bool((self.precision.diagonal() > 0).all())

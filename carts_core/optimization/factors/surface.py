@@ -111,7 +111,9 @@ class SurfaceFactor:
         residual = self._observed - model
         weight = ratio.square() * self._channels * self._precision * self.certainty
         grown = torch.zeros_like(residual)
-        grown[:, COVERAGE.start] = _growth(model[:, COVERAGE.start]) / math.sqrt(self.area)
+        # Increase of coverage if outlines move outwards by a pixel.
+        down, right = torch.gradient(model[:, COVERAGE.start], dim=(-2, -1))
+        grown[:, COVERAGE.start] = torch.hypot(down, right) / math.sqrt(self.area)
         gradient, hessian, outline = self._normal_equations(
             rendering.jacobian, residual, grown, weight, len(self._variables)
         )
@@ -136,7 +138,10 @@ class SurfaceFactor:
         """Compared channels of surface maps: all, or the total coverage if no parts are known."""
         if self._total_only:
             return smoothed(maps[..., COVERAGE, :, :].sum(-3, keepdim=True), self._blur)
-        return with_total(smoothed(maps, self._blur))
+        blurred = smoothed(maps, self._blur)
+        # The coverage of all parts is compared in place of the first part's.
+        blurred[..., COVERAGE.start, :, :] = blurred[..., COVERAGE, :, :].sum(-3)
+        return blurred
 
     def _normal_equations(
         self, jacobian: tuple[JacobianBlock, ...], residual: Tensor, grown: Tensor, weight: Tensor, unknowns: int
@@ -185,15 +190,3 @@ class SurfaceLinearization(Linearization):
     comparison: Comparison
     outline: Float[Tensor, " n"]
     """Decrease of the gradient if all observed outlines move outwards by a pixel of the working image [1/px]."""
-
-
-def _growth(coverage: Float[Tensor, "cameras h w"]) -> Float[Tensor, "cameras h w"]:
-    """Increase of coverage if outlines move outwards by a pixel."""
-    down, right = torch.gradient(coverage, dim=(-2, -1))
-    return torch.hypot(down, right)
-
-
-def with_total(maps: Float[Tensor, "*batch 6 h w"]) -> Float[Tensor, "*batch 6 h w"]:
-    """Replace the coverage of the first part by that of all parts, in place."""
-    maps[..., COVERAGE.start, :, :] = maps[..., COVERAGE, :, :].sum(-3)
-    return maps

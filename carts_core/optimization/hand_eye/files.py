@@ -144,7 +144,7 @@ def result_json(
     }
 
 
-_STANDS = 1e-3
+RESTING = 1e-3
 """Largest difference of the transforms of a resting mount [rad, m]."""
 
 
@@ -160,7 +160,7 @@ def mounts_of_points(recording: Sequence, points: Rows[ImagePoint]) -> dict[str,
             raise SettingsError(f"there is no frame {point.frame}; frames are 0 to {len(recording) - 1}.")
         for camera, T in recording.mounts(point.frame).items():
             frame, first = found.setdefault(camera, (point.frame, T))
-            if not np.allclose(T, first, atol=_STANDS):
+            if not np.allclose(T, first, atol=RESTING):
                 ids = recording.frame_ids
                 raise SettingsError(
                     f"camera {camera!r} moves between frames {ids[frame]!r} and {ids[point.frame]!r}, which have "
@@ -170,12 +170,7 @@ def mounts_of_points(recording: Sequence, points: Rows[ImagePoint]) -> dict[str,
 
 
 def moved_cameras(scene: Scene, mounts: Mapping[str, Float[np.ndarray, "4 4"]], *, back: bool = False) -> Scene:
-    """Scene with its cameras moved by their mounts, or back.
-
-    Args:
-        mounts: camera -> T_mount_world [m], of the cameras that move.
-        back: from the world to the mounts.
-    """
+    """Scene with its cameras moved from their mounts (camera -> T_mount_world [m]) to the world, or back."""
     steps = {camera: np.linalg.inv(T) if back else T for camera, T in mounts.items()}
     cameras = (
         replace(camera, T_camera_world=camera.T_camera_world @ steps.get(camera.name, np.eye(4)))

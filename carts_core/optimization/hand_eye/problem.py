@@ -93,15 +93,11 @@ class View:
 def views_of(
     scene: Scene, measured: Mapping[str, Float[np.ndarray, "frames dofs"]], points: Sequence[ImagePoint]
 ) -> list[View]:
-    """Points by camera and arm, in the scene's order.
-
-    Args:
-        measured: arm -> joint positions of all frames [rad, m].
+    """Points by camera and arm, in the scene's order; `measured` has the joint positions of all frames [rad, m].
 
     Raises:
         SettingsError: a point names a frame or a landmark that does not exist, or lies at no place.
-        RobotError: a point names an arm or a camera that does not exist.
-    """
+        RobotError: a point names an arm or a camera that does not exist."""
     grouped: dict[tuple[int, int], list[int]] = {}
     for row, point in enumerate(points):
         camera, arm = scene.cameras.index(scene.camera(point.camera)), scene.arms.index(scene.arm(point.arm))
@@ -163,22 +159,17 @@ def poses_of(
     that some subset is free of outliers; each pose is rated by the robust cost of all points.
 
     Args:
-        view: at least `FEWEST_POINTS` points.
         intrinsics: fx, fy, cx, cy [px].
-        pixel_error: expected error of a point [px].
-    """
+        pixel_error: expected error of a point [px]."""
     found: list[tuple[float, np.ndarray]] = []
     for rows in _subsets(view):
         for T in _perspective(view, rows, intrinsics):
             if (T[2, :3] @ view.starts[view.is_point].T + T[2, 3] > 0).all():
-                found.append((robust_cost(view.distances(T, intrinsics) / pixel_error), T))
+                # Cauchy's loss of the distances, in expected errors.
+                squared = ((view.distances(T, intrinsics) / pixel_error) ** 2).sum(-1)
+                found.append((float(np.log1p(squared / 4.0).sum()), T))
     found.sort(key=lambda entry: entry[0])
     return found[:_KEPT]
-
-
-def robust_cost(scaled: Float[np.ndarray, "points 2"]) -> float:
-    """Sum of Cauchy's loss of the distances, in expected errors."""
-    return float(np.log1p((scaled**2).sum(-1) / 4.0).sum())
 
 
 def _subsets(view: View) -> Iterator[Bool[np.ndarray, " points"]]:

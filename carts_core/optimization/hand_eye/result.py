@@ -37,11 +37,7 @@ class PoseDeviation:
 
     @staticmethod
     def of(covariance: Float[np.ndarray, "6 6"]) -> "PoseDeviation":
-        """Standard deviations from the covariance of rotation and translation in the camera's frame.
-
-        Args:
-            covariance: of both [rad, m].
-        """
+        """Standard deviations from the covariance of rotation and translation in the camera's frame [rad, m]."""
         turn, sideways = (max(np.linalg.eigvalsh(covariance[part, part])[-1], 0.0) for part in (_TURN, _SIDEWAYS))
         return PoseDeviation(
             rotation_deg=float(np.degrees(np.sqrt(turn))),
@@ -79,18 +75,19 @@ class HandEyeResult:
 
 
 def result_of(problem: HandEyeProblem, fit: OptimizeResult, count: int) -> HandEyeResult:
-    """Result at a minimum.
-
-    Raises:
-        SettingsError: the points leave a direction undetermined.
-    """
+    """Result at a minimum; `SettingsError` if the points leave a direction undetermined."""
     bases, cameras, intrinsics = problem.poses(fit.x)
     distances = np.full(count, np.nan)
     for view, found in zip(problem.views, problem.distances(fit.x), strict=True):
         distances[list(view.rows)] = np.linalg.norm(found, axis=-1)
     # Variance of the points over the expected one [1].
     excess = max(2.0 * fit.cost / _spare(problem, fit), 1.0)
-    covariance = excess * _inverse_curvature(fit)
+    information = fit.jac.T @ fit.jac
+    scale = np.sqrt(np.maximum(np.diag(information), 1e-300))
+    values, vectors = np.linalg.eigh(information / np.outer(scale, scale))
+    if values[0] < _SINGULAR:
+        raise SettingsError("the points leave a direction open. Click others, in frames where the arm is elsewhere.")
+    covariance = excess * ((vectors / values) @ vectors.T / np.outer(scale, scale))
     names = [camera.name for camera in problem.scene.cameras]
     arms = [arm.name for arm in problem.scene.arms]
     start = len(fit.x) - len(problem.focal)
@@ -129,16 +126,6 @@ def _noise(problem: HandEyeProblem, fit: OptimizeResult, excess: float) -> float
     spare = _spare(problem, fit)
     typical = float(np.median(np.concatenate(points))) / np.sqrt(2.0 * np.log(2.0))
     return float(max(problem.settings.pixel_error * np.sqrt(excess), typical * np.sqrt(1.0 + len(fit.x) / spare)))
-
-
-def _inverse_curvature(fit: OptimizeResult) -> np.ndarray:
-    """Covariance of the unknowns for the expected noise of points."""
-    information = fit.jac.T @ fit.jac
-    scale = np.sqrt(np.maximum(np.diag(information), 1e-300))
-    values, vectors = np.linalg.eigh(information / np.outer(scale, scale))
-    if values[0] < _SINGULAR:
-        raise SettingsError("the points leave a direction open. Click others, in frames where the arm is elsewhere.")
-    return (vectors / values) @ vectors.T / np.outer(scale, scale)
 
 
 def _base_covariance(
