@@ -164,11 +164,7 @@ class Cluster:
         self._work, self._scheduler, self._workers, self._threads = work, scheduler, workers, threads
 
     def run(self, jobs: Sequence[Job]) -> Iterator[Outcome]:
-        """Run all jobs; yields outcomes as they arrive.
-
-        Raises:
-            SettingsError: the scheduler does not answer.
-        """
+        """Run all jobs; yields outcomes as they arrive. `SettingsError` if the scheduler does not answer."""
         # Optional dependencies, which worker processes on this machine do without.
         import dask.config  # noqa: PLC0415
         from distributed import Client, KilledWorker, LocalCluster, as_completed  # noqa: PLC0415

@@ -69,11 +69,7 @@ def read_state(folder: OutputPath) -> JobState:
 
 
 def _read(folder: OutputPath) -> JobState:
-    """State of a job.
-
-    Raises:
-        OSError, ValueError: the file is damaged.
-    """
+    """State of a job; `OSError` or `ValueError` for a damaged file."""
     path = folder / JOB_FILE
     if not holds_file(path):
         return JobState()
@@ -115,10 +111,6 @@ class RunningJob:
             self.state = replace(self.state, heartbeat=time.time(), **values)  # pyright: ignore[reportArgumentType]
             write_state(self._folder, self.state)
 
-    def step_done(self, name: str, step: StepState) -> None:
-        """Record a finished step."""
-        self.change(steps={**self.state.steps, name: step})
-
 
 @contextmanager
 def running(folder: OutputPath) -> Iterator[RunningJob | None]:
@@ -130,7 +122,9 @@ def running(folder: OutputPath) -> Iterator[RunningJob | None]:
             yield None
             return
         job, ended = RunningJob(folder), threading.Event()
-        job.change(status="running", error="", attempts=job.state.attempts + 1, worker=this_worker())
+        job.change(
+            status="running", error="", attempts=job.state.attempts + 1, worker=f"{socket.gethostname()}:{os.getpid()}"
+        )
 
         def beat() -> None:
             while not ended.wait(HEARTBEAT_SECONDS):
@@ -143,11 +137,6 @@ def running(folder: OutputPath) -> Iterator[RunningJob | None]:
         finally:
             ended.set()
             thread.join()
-
-
-def this_worker() -> str:
-    """Host name and process id."""
-    return f"{socket.gethostname()}:{os.getpid()}"
 
 
 FINDINGS_FILE = "findings.json"
@@ -188,11 +177,7 @@ class Findings:
 
 
 def read_findings(folder: OutputPath) -> Findings | None:
-    """Results of the job of a folder; None before it has ended.
-
-    Raises:
-        OSError, ValueError: the file is damaged.
-    """
+    """Results of the job of a folder, None before it has ended; `OSError` or `ValueError` for a damaged file."""
     path = folder / FINDINGS_FILE
     if not holds_file(path):
         return None
@@ -343,11 +328,7 @@ def is_batch(folder: Path) -> bool:
 
 
 def read_jobs(folder: Path) -> list[Job]:
-    """The jobs of a batch's folder, without their options.
-
-    Raises:
-        SettingsError: it is no batch, or its list of jobs is damaged.
-    """
+    """The jobs of a batch's folder, without their options; `SettingsError` if it is none or its list is damaged."""
     try:
         jobs = typed(parse_json(read_bytes(folder / BATCH_FILE, VALUES)), _Batch).jobs
         for job in jobs:

@@ -124,11 +124,7 @@ def _name(recording: Path, domain: str, camera: str) -> str:
 
 
 def shard(jobs: list[Job], text: str) -> list[Job]:
-    """Every n-th job, from the i-th on, of `i/n`; all shards together have every job once.
-
-    Raises:
-        SettingsError: the text is not `i/n` with 1 <= i <= n.
-    """
+    """Every n-th job, from the i-th on, of `i/n` with 1 <= i <= n; all shards together have every job once."""
     first, _, count = text.partition("/")
     if not (first.isdecimal() and count.isdecimal() and 1 <= int(first) <= int(count)):
         raise SettingsError(f"--shard {text!r} is not readable. Give I/N, from 1/N to N/N, such as 2/8.")

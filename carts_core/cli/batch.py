@@ -77,7 +77,8 @@ class Batch:
             console.print("this was one shard; --report-only writes the report once all are done")
         console.print(f"look at frames of any job: carts view {folder}")
         if failed:
-            named = "".join(f"\n  {name}: {_last_line(error)}" for name, error in list(failed.items())[:_NAMED])
+            lines = {name: (error.strip() or "no reason is known").splitlines()[-1] for name, error in failed.items()}
+            named = "".join(f"\n  {name}: {line}" for name, line in list(lines.items())[:_NAMED])
             raise CartsError(
                 f"{len(failed)} of {counted(len(chosen), 'job')} failed; the same command tries them again. Their logs "
                 f"are in {folder / 'jobs'}.{named}"
@@ -91,17 +92,15 @@ class Batch:
         from ..imports import needs_extra
         from .batch_job import BatchWork, with_project
 
-        workers, work = (
-            self.workers or os.cpu_count() or 1,
-            BatchWork(folder, self.again, _inference(folder), self.project),
-        )
+        work = BatchWork(folder, self.again, _inference(folder), self.project)
+        workers = min(self.workers or os.cpu_count() or 1, len(jobs))
         if self.scheduler is None:
-            engine = Pool(work, min(workers, len(jobs)), self.threads)
+            engine = Pool(work, workers, self.threads)
         else:
             needs_extra("distributed", "cluster")
             from ..batch.engines import Cluster
 
-            engine = Cluster(work, self.scheduler, min(workers, len(jobs)), self.threads)
+            engine = Cluster(work, self.scheduler, workers, self.threads)
         if self.project == "beside" and (those := sum(with_project(job) is not None for job in jobs)):
             counts_of = f"{those} of {counted(len(jobs), 'job')} evaluated or exported as the project beside corrects"
             console.print(f"{counts_of}; the logs have the counts; --project none for recordings as measured")
@@ -109,8 +108,7 @@ class Batch:
         kept = f"{folder} holds what is done; the same command goes on from there"
         with when_stopped(kept), Bar(console=console) as bar:
             task = bar.add_task("jobs", total=len(jobs))
-            outcomes = engine.run(jobs)
-            for outcome in outcomes:
+            for outcome in engine.run(jobs):
                 counts[outcome.status] += 1
                 bar.update(task, advance=1, description=f"jobs, {counts['failed']} failed")
                 if outcome.status == "failed":
@@ -129,7 +127,3 @@ def _inference(folder: "OutputPath") -> "Engine":
     path = folder / "inference.txt"
     write_new(path, FeatureExtractor.load(inference="auto").engine.encode())
     return "onnx" if read_text(path.path, SETTINGS) == "onnx" else "torch"
-
-
-def _last_line(text: str) -> str:
-    return text.strip().splitlines()[-1] if text.strip() else "no reason is known"

@@ -68,7 +68,7 @@ class BatchWork:
     def __call__(self, job: Job) -> Outcome:
         """Run the unfinished steps of a job."""
         began = time.perf_counter()
-        folder = job_folder(self.folder, job)
+        folder = self.folder / "jobs" / job.name
         with running(folder) as state:
             if state is None:
                 return Outcome(job.name, "busy")
@@ -85,11 +85,6 @@ class BatchWork:
         return Outcome(job.name, "done" if done else "known", seconds=time.perf_counter() - began)
 
 
-def job_folder(batch: OutputPath, job: Job) -> OutputPath:
-    """Folder of a job."""
-    return batch / "jobs" / job.name
-
-
 def with_project(job: Job) -> Path | None:
     """Project beside the recording of a job that only evaluates or exports; None for other jobs."""
     used = {"evaluate", "export"} & set(job.steps) and not set(_CORRECTING) & set(job.steps)
@@ -97,11 +92,7 @@ def with_project(job: Job) -> Path | None:
 
 
 def check_options(jobs: Sequence[Job]) -> None:
-    """Check the options of every step before anything runs.
-
-    Raises:
-        SettingsError: the command has no such option, or the batch sets it itself.
-    """
+    """Check the options of every step before anything runs; others than the command's are a `SettingsError`."""
     called: set[tuple[Step, tuple[str, ...]]] = set()
     for job in jobs:
         called |= {(step, job.options.get(step, ())) for step in job.steps}
@@ -149,7 +140,8 @@ def _steps(job: Job, folder: OutputPath, state: RunningJob, work: BatchWork) -> 
             remove_file(folder / FINDINGS_FILE)
             with _logged(folder / f"{step}.log"):
                 _parsed(step, [*_arguments(job, step, sequence, folder), *options]).run()
-            state.step_done(step, StepState(key, round(time.perf_counter() - began, 3)))
+            seconds = round(time.perf_counter() - began, 3)
+            state.change(steps={**state.state.steps, step: StepState(key, seconds)})
             done += 1
         if step in ("import", "calibrate"):
             sequence = (folder / _FOLDERS[step] / "sequence.toml").path

@@ -127,11 +127,7 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 def _parsed(arguments: list[str]) -> Any:
-    """Parse a command line; help and errors of tyro end the program.
-
-    Raises:
-        SettingsError: there is no such command.
-    """
+    """Parse a command line; help and errors of tyro end the program."""
     name, *options = arguments or [""]
     if name and not name.startswith("-") and name not in COMMANDS:
         meant = closest(name, COMMANDS)

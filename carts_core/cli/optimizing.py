@@ -65,11 +65,7 @@ class Optimizing:
         self._observer.check(self._sequence, self._frames, cameras, domains)
 
     def run(self) -> None:
-        """Optimize the frames without an up-to-date result.
-
-        Raises:
-            CartsError: an option or a file is not usable; most such errors are raised before anything is written.
-        """
+        """Optimize the frames without an up-to-date result; most errors are raised before anything is written."""
         scene, select = self._sequence.scene, self._asked.select
         groups = camera_groups(select.camera_names(scene), self._asked.together)
         parts = [self._part(domain, group) for domain in select.domain_names(self._sequence) for group in groups]

@@ -56,29 +56,17 @@ class Selection:
     """Domains, by name, or `all`; the sequence's first one if none is named."""
 
     def frame_indices(self, sequence: "Sequence") -> list[int]:
-        """Positions of the chosen frames.
-
-        Raises:
-            SettingsError: `frames` or `positions` is not readable, or names a frame that is not in the sequence.
-        """
+        """Positions of the chosen frames; errors as `chosen_frames`."""
         return chosen_frames(self.frames, self.positions, sequence.frame_ids)
 
     def camera_names(self, scene: "Scene") -> list[str]:
-        """Names of the chosen cameras.
-
-        Raises:
-            RobotError: there is no such camera.
-        """
+        """Names of the chosen cameras; `RobotError` for an unknown one."""
         if ALL in self.camera:
             return [camera.name for camera in scene.cameras]
         return [scene.camera(name).name for name in self.camera]
 
     def domain_names(self, sequence: "Sequence") -> list[str]:
-        """Names of the chosen domains.
-
-        Raises:
-            SettingsError: there is no such domain.
-        """
+        """Names of the chosen domains; `SettingsError` for an unknown one."""
         if not self.domain:
             return [sequence.domains[0]]
         if ALL in self.domain:
@@ -91,16 +79,10 @@ class Selection:
 
 
 def chosen_frames(frames: str | None, positions: str | None, ids: Names[str]) -> list[int]:
-    """0-based indices that `--frames` or `--positions` chooses.
-
-    Args:
-        frames: by id; all frames where neither is given.
-        positions: counted from 1.
-        ids: of the frames, in the recording's order.
+    """0-based indices that `--frames` (ids) or `--positions` (from 1) chooses; all where neither is given.
 
     Raises:
-        SettingsError: both are given, or one is not readable, or names a frame that the recording does not have.
-    """
+        SettingsError: both are given, or one is not readable or names a frame that the recording does not have."""
     if frames is not None and positions is not None:
         raise SettingsError("--frames and --positions are both given. Give one of them.")
     if positions is not None:
@@ -110,8 +92,10 @@ def chosen_frames(frames: str | None, positions: str | None, ids: Names[str]) ->
     try:
         return _chosen("--frames", text, ids, "Frames are named as in the recording and the page:")
     except SettingsError as error:
-        if (today := _counted_from_0(text, ids)) is None:
+        numbers = re.fullmatch(r"\d+(-\d+)?(,\d+(-\d+)?)*", text) and [int(one) for one in re.findall(r"\d+", text)]
+        if not numbers or max(numbers) >= len(ids):
             raise
+        today = re.sub(r"\d+", lambda number: ids[int(number[0])], text)
         raise SettingsError(f"{error} Earlier versions counted from 0; then this was --frames {today}.") from None
 
 
@@ -139,13 +123,6 @@ def _chosen(option: str, text: str, names: Names[str], known: str) -> list[int]:
     return sorted(chosen)
 
 
-def _counted_from_0(text: str, ids: Names[str]) -> str | None:
-    """A text of numbers and ranges counted from 0, as `--frames` once was, with ids instead; None for another one."""
-    if not re.fullmatch(r"\d+(-\d+)?(,\d+(-\d+)?)*", text) or max(map(int, re.findall(r"\d+", text))) >= len(ids):
-        return None
-    return re.sub(r"\d+", lambda number: ids[int(number[0])], text)
-
-
 NO_PROJECT = "none"
 """Value of `--project` for the recording as measured."""
 
@@ -164,11 +141,7 @@ class FromProject:
         return self.project not in (None, NO_PROJECT)
 
     def path(self, sequence_file: Path) -> Path | None:
-        """The project's file; None where there is none, or none is to be used.
-
-        Raises:
-            SettingsError: the file that was named is missing.
-        """
+        """The project's file, None without one; `SettingsError` if the named one is missing."""
         if self.project == NO_PROJECT:
             return None
         from ..project import default_path
@@ -181,12 +154,7 @@ class FromProject:
         return path
 
     def read(self, sequence: "Sequence") -> "ProjectState | None":
-        """The project as it is now; None where there is none, or none is to be used.
-
-        Raises:
-            SettingsError: the file that was named is missing.
-            ProjectError: it is of another sequence, or cannot be read.
-        """
+        """The project as it is now, None without one; `SettingsError` or `ProjectError` if it cannot be used."""
         path = self.path(sequence.path)
         if path is None:
             return None
@@ -210,11 +178,7 @@ class FromProject:
         )
 
     def corrected(self, sequence: "Sequence", frames: Names[int], console: "Console") -> "Sequence":
-        """The sequence as its project corrects it, which is printed; as it is without one.
-
-        Raises:
-            CartsError: as `read`, or the project's time offset leaves a frame without joint positions.
-        """
+        """The sequence as its project corrects it, which is printed; the same without one. Errors as `read`."""
         project = self.read(sequence)
         if project is None:
             return sequence
@@ -273,23 +237,14 @@ class Network:
         return _ENGINES.get(self.device, "auto")
 
     def load(self) -> "FeatureExtractor":
-        """The networks.
-
-        Raises:
-            WeightsError: a weights file cannot be used.
-            SettingsError: the device or engine is not available.
-        """
+        """The networks; `WeightsError` or `SettingsError` if weights, device or engine are not usable."""
         from ..networks.extractor import FeatureExtractor
 
         return FeatureExtractor.load(*self.weights, device=self.processor, inference=self.inference)
 
 
 def check_device(device: str) -> None:
-    """Check that a device exists.
-
-    Raises:
-        SettingsError: it does not.
-    """
+    """Check that a device exists; otherwise it is a `SettingsError`."""
     if device == "cpu":
         return
     import torch
@@ -303,20 +258,12 @@ def check_device(device: str) -> None:
 
 
 def output_folder(named: Path | None, *default: str) -> OutputPath:
-    """Output folder of a command: the one given, else the one with these names in `runs`.
-
-    Raises:
-        OutputError: one of the names cannot be part of a path.
-    """
+    """Output folder of a command: the one given, else the one with these names in `runs`."""
     return output_path(Path(), "runs", *default) if named is None else output_path(named)
 
 
 def check_writable(folder: Path) -> None:
-    """Check that a folder can be written to or created, before any work is done.
-
-    Raises:
-        SettingsError: it cannot.
-    """
+    """Check that a folder can be written to or created, before any work; otherwise it is a `SettingsError`."""
     there = next(path for path in (folder, *folder.absolute().parents) if path.exists())
     if not (there.is_dir() and os.access(there, os.W_OK)):
         raise SettingsError(f"{folder} cannot be made or written to, because of {there}. Name another folder.")
@@ -362,11 +309,7 @@ class SolverOptions:
         return changed(free, _table(self.settings, "free"), "[free]")
 
     def check_surface(self, what: str) -> None:
-        """Check that the solver is `surface`, which estimates standard deviations.
-
-        Raises:
-            SettingsError: it is not.
-        """
+        """Check that the solver, for `what`, is `surface`, which estimates standard deviations."""
         if not isinstance(self.chosen, SurfaceSolver):
             raise SettingsError(f"{what} needs the solver surface; given is --solver {self.solver}. Leave it out.")
 
@@ -397,11 +340,7 @@ class CalibrationOptions:
 
 
 def _table(given: tuple[str, ...], name: str) -> dict[str, Any]:
-    """A table of what --settings names; later ones win.
-
-    Raises:
-        SettingsError: a file cannot be read, or something is no TOML or has other tables.
-    """
+    """A table of what --settings names; later ones win."""
     found: dict[str, Any] = {}
     for text in given:
         remedy = "Give a file as --print-settings writes, or `NAME=VALUE`."
@@ -473,11 +412,7 @@ class Observer:
     def check(
         self, sequence: "Sequence", frames: Iterable[int], cameras: Iterable[str], domains: Iterable[str | None]
     ) -> None:
-        """Check that all frames have the masks to be fitted, before any of them is solved.
-
-        Raises:
-            SettingsError: masks are missing.
-        """
+        """Check that all frames have the masks to be fitted; otherwise it is a `SettingsError`."""
         if not self.masked:
             return
         frames = list(frames)
@@ -553,10 +488,7 @@ class Observing(Network):
         """Observer of a sequence, for a solver.
 
         Raises:
-            SettingsError: the solver compares features of images.
-            WeightsError: weights cannot be used.
-            ProjectError, SequenceError: masks cannot be read.
-        """
+            CartsError: the solver compares features of images, or weights or masks cannot be used."""
         if self.observe != "network" and not isinstance(settings, SurfaceSolver):
             raise SettingsError(
                 f"--observe {self.observe} needs the solver surface, occluded or none; the one given compares features "

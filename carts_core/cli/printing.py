@@ -38,12 +38,7 @@ def kept_start_hint(where: str, stopped: Sequence[str]) -> str | None:
 def verdict_line(
     where: str, verdicts: Sequence[str | None], undetermined: Sequence[Sequence[str] | None]
 ) -> str | None:
-    """Verdicts on masks, and numbers of undetermined joints; None where nothing was assessed.
-
-    Args:
-        verdicts: of each run, None where it was not assessed.
-        undetermined: `ARM.JOINT` of the undetermined joints of each run, None where that is not known.
-    """
+    """Verdicts on masks and numbers of undetermined joints (None: unknown) of runs; None where no run was assessed."""
     runs = [(verdict, joints) for verdict, joints in zip(verdicts, undetermined, strict=True) if verdict is not None]
     counts = Counter(
         fit_words(verdict, joints) for value in Verdict for verdict, joints in runs if verdict == value.value
@@ -82,11 +77,7 @@ def calibration_hint(found: Assessment | None, stopped: StopReason) -> str | Non
 
 
 def base_frame_hint(where: str, gains: Sequence[float | None]) -> str | None:
-    """Hint where base frames are probably wrong, on average over frames; None elsewhere.
-
-    Args:
-        gains: share of each frame's residual that free base frames would explain, None where that is not known.
-    """
+    """Hint where base frames are probably wrong, by the mean share of the residual that free ones would explain."""
     known = [gain for gain in gains if gain is not None]
     if not known or np.mean(known) < BASE_FRAME_GAIN:
         return None
@@ -104,13 +95,9 @@ _LARGE = 5.0
 
 
 def constant_correction_hint(where: str, sequence: recording.Sequence, rows: Sequence[KinematicsRow]) -> str | None:
-    """Hint on large corrections that are nearly equal in all frames; None if there are none.
+    """Hint on large corrections of optimized rows that are nearly equal in all frames; None if there are none.
 
-    Joints compensate for a wrong focal length or base frame: the image fits, and the joints are wrong.
-
-    Args:
-        rows: results; only optimized ones count.
-    """
+    Joints compensate for a wrong focal length or base frame: the image fits, and the joints are wrong."""
     scene, position = sequence.scene, {frame_id: index for index, frame_id in enumerate(sequence.frame_ids)}
     rows = [row for row in rows if row.source == "optimized"]
     if len(rows) < _FRAMES:

@@ -92,11 +92,7 @@ class FrameInputs:
         return self._common
 
     def of(self, index: int) -> InputHashes:
-        """Fingerprints of a frame that is corrected alone.
-
-        Raises:
-            SequenceError: one of its images is missing.
-        """
+        """Fingerprints of a frame that is corrected alone; `SequenceError` if an image is missing."""
         sequence, start = self._sequence, self._start(index)
         joints = [(name, start[name], sequence.measured[name][index]) for name in sorted(start)]
         joints += sorted(sequence.mounts(index).items())
@@ -162,13 +158,6 @@ class Record:
     """`ARM.JOINT` of joints that the images do not determine; None without standard deviations."""
 
 
-def judged(found: Assessment | None) -> dict[str, Any]:
-    """Fields of a record that describe the verdict."""
-    if found is None:
-        return {}
-    return {"verdict": found.verdict.value, "reason": found.reason, "probability": round(found.probability, 6)}
-
-
 def row_fingerprint(scene: Scene, row: KinematicsRow) -> str:
     """Fingerprint of a row of the table, with the digits written there."""
     values = np.concatenate([position_values(scene, row), std_values(scene, row)])
@@ -177,11 +166,7 @@ def row_fingerprint(scene: Scene, row: KinematicsRow) -> str:
 
 
 def read_records(path: OutputPath) -> dict[str, Record]:
-    """Records by frame; empty where the file is missing or damaged, so that all results are redone.
-
-    Raises:
-        SettingsError: a newer version of the program wrote the file.
-    """
+    """Records by frame, empty if the file is missing or damaged; `SettingsError` for a newer version's."""
     if not holds_file(path):
         return {}
     try:
@@ -249,13 +234,7 @@ class FrameFolder:
 
     @contextmanager
     def held(self) -> Iterator[None]:
-        """Read existing results and lock the folder for other processes.
-
-        Raises:
-            OutputError: another process writes there.
-            SequenceError: the table cannot be read.
-            SettingsError: the folder holds results of another sequence by now.
-        """
+        """Lock the folder for other processes and read existing results; errors as of the class."""
         with locked_folder(self.folder):
             self._check_settings()
             self._goes_on = holds_file(self._table) and not self._overwrite
@@ -292,9 +271,9 @@ class FrameFolder:
             return 0
         return len(set(self._written_before()) - set(chosen))
 
-    def write(self, found: Several[FrameResult]) -> None:
+    def write(self, results: Several[FrameResult]) -> None:
         """Write masks and rows of frames; signals are handled afterwards."""
-        if not found:
+        if not results:
             return
         with finished_first():
             if not self._goes_on:
@@ -304,22 +283,24 @@ class FrameFolder:
                 self._goes_on = True
             if self._settings_written() != self._settings:
                 write_text(self._settings_file, json.dumps(self._settings, indent=1))
-            for result in found:
+            for result in results:
                 frame_id, fingerprints = result.row.frame_id, {}
                 for camera, renderer in self._renderers.items():
                     png = mask_png(renderer.segment(result.state.to("cpu"))[0] >= 0)
                     write_bytes(self._masks[camera] / f"{frame_id}.png", png)
                     fingerprints[camera] = fingerprint(png)
-                row = row_fingerprint(self._scene, result.row)
+                found = result.assessment
                 self._records[frame_id] = Record(
                     result.origin,
                     fingerprints,
-                    row,
+                    row_fingerprint(self._scene, result.row),
                     torch.get_num_threads(),
-                    **judged(result.assessment),
-                    not_determined=result.row.undetermined(self._scene),
+                    "" if found is None else found.verdict.value,
+                    "" if found is None else found.reason,
+                    None if found is None else round(found.probability, 6),
+                    result.row.undetermined(self._scene),
                 )
-            new = {result.row.frame_id: result.row for result in found}
+            new = {result.row.frame_id: result.row for result in results}
             rows = {row.frame_id: row for row in self.rows} | new
             self.rows = sorted(rows.values(), key=lambda row: self._order[row.frame_id])
             # A frame counts if all three files list it, so that a kill between them has it redone.

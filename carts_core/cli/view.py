@@ -3,16 +3,13 @@
 import gc
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import tyro
 
 from ..errors import SettingsError
 from ..imports import uncollected
 from .options import Network
-
-if TYPE_CHECKING:
-    from ..segmentation import Segmenter
 
 
 @dataclass(frozen=True)
@@ -44,7 +41,11 @@ class View:
             from ..batch.folder import is_batch
         # Otherwise each garbage collection would search all modules and stop the page for 0.2 s.
         gc.freeze()
-        segmenter = self._segmenter()
+        segmenter = None
+        if self.segmenter is not None:
+            from ..segmentation.onnx_segmenter import OnnxSegmenter
+
+            segmenter = OnnxSegmenter.load(*self.segmenter)
         options: dict[str, Any] = {
             "host": self.host,
             "port": self.port,
@@ -62,10 +63,3 @@ class View:
         batch = None if self.sequence is None else self.sequence.resolve()
         roots = self.root or (Path(), *([self.sequence] if self.sequence is not None else []))
         serve_site(roots, batch=batch, **options)
-
-    def _segmenter(self) -> "Segmenter | None":
-        if self.segmenter is None:
-            return None
-        from ..segmentation.onnx_segmenter import OnnxSegmenter
-
-        return OnnxSegmenter.load(*self.segmenter)

@@ -73,11 +73,9 @@ def write_annotations(
     """Write images and an annotation file with the name that CVAT and Datumaro expect.
 
     Args:
-        dataset, folder, monitor: content, output, and progress.
         kind: `instances` or `person_keypoints`, as COCO names its files.
         categories: as COCO has them.
-        annotate: the objects of a view, without their numbers.
-    """
+        annotate: the objects of a view, without their numbers."""
     images, annotations = [], []
     for view in dataset.views(monitor):
         images.append(

@@ -182,19 +182,18 @@ class Dataset:
 
     def label_image(self, view: View, parts: Parts | None = None) -> UInt[np.ndarray, "height width"]:
         """Category of every pixel, 0 for background; 8 bits if that is enough for all categories, else 16."""
-        of_link = [0, *self._category_ids(parts or self.parts)]
-        return np.array(of_link, np.uint8 if max(of_link) <= 255 else np.uint16)[view.link_ids + 1]
-
-    def _category_ids(self, parts: Parts) -> list[int]:
-        """The category of every link, in the order of `View.link_ids`."""
+        parts = parts or self.parts
         if parts == "links":
-            return [link.id for link in self.links]
-        if parts == "arms":
-            ids = {arm.name: arm.id for arm in self.arms}
-            return [ids[link.arm] for link in self.links]
-        numbers = [one.number for one in part_classes(self.scene.arms)]
-        # Links without a mesh may have no class.
-        return [numbers.index(number) + 1 if number in numbers else 0 for number in self.link_classes.tolist()]
+            ids = [link.id for link in self.links]
+        elif parts == "arms":
+            arms = {arm.name: arm.id for arm in self.arms}
+            ids = [arms[link.arm] for link in self.links]
+        else:
+            numbers = [one.number for one in part_classes(self.scene.arms)]
+            # Links without a mesh may have no class.
+            ids = [numbers.index(number) + 1 if number in numbers else 0 for number in self.link_classes.tolist()]
+        of_link = [0, *ids]
+        return np.array(of_link, np.uint8 if max(of_link) <= 255 else np.uint16)[view.link_ids + 1]
 
     def instances(self, view: View) -> Iterator[tuple[Category, Bool[np.ndarray, "height width"]]]:
         """Visible categories with their masks."""
@@ -237,15 +236,13 @@ class Dataset:
         return Path(os.path.commonpath(folders))
 
     def image_name(self, view: View) -> str:
-        """The path by which labels name a view's image: the recording's own, from `image_folder`; `NAME.png` where the
-        image is no file of the recording."""
+        """The path by which labels name a view's image: the recording's own, from `image_folder`, or `NAME.png`."""
         return self._image_names[view.id - 1]
 
     def write_image(self, view: View, folder: OutputPath) -> str:
         """Write the view's image into `folder` if copies are wanted or it is no recorded file; its `image_name`.
 
-        Copies have the bytes of the recording's file; other images (see `remade_cameras`) are written as PNG.
-        """
+        Copies have the bytes of the recording's file; other images (see `remade_cameras`) are written as PNG."""
         name = self.image_name(view)
         if self.images == "none":
             return name
@@ -298,16 +295,10 @@ class Dataset:
 def labelled(
     mask: Bool[np.ndarray, "height width"], rendered: Int[np.ndarray, "height width"], where: str
 ) -> Int[np.ndarray, "height width"]:
-    """`rendered` labels restricted to `mask`; additional pixels get the label of the nearest rendered pixel.
-
-    Args:
-        mask: pixels of the arms.
-        rendered: labels from 0, -1 for background.
-        where: name of the view in errors.
+    """`rendered` labels (-1 for background) restricted to `mask`; additional pixels get the nearest rendered label.
 
     Raises:
-        CartsError: the mask has another size, or nothing is rendered that could name its pixels.
-    """
+        CartsError: the mask of the view `where` has another size, or nothing is rendered that could name its pixels."""
     if mask.shape != rendered.shape or mask.dtype != bool:
         raise CartsError(
             f"{where}: the mask is {mask.dtype} {mask.shape}, the camera's images are {rendered.shape}. "
@@ -336,18 +327,14 @@ def painted_links(
     classes: Int[np.ndarray, " links"],
     where: str,
 ) -> Int[np.ndarray, "height width"]:
-    """`link_ids` with painted classes: each painted pixel gets the nearest rendered link of its class.
+    """`link_ids` in which each pixel painted as a class (0 for none) has the nearest rendered link of that class.
 
     Args:
-        painted: number of a class, 0 for none.
-        link_ids: labels from 0, -1 for background.
-        rendered: the same before a mask was applied.
+        rendered: as `link_ids` (-1 for background), before a mask was applied.
         classes: number of the class of every link.
-        where: name of the view in errors.
 
     Raises:
-        CartsError: the labels have another size, or name a class that no link has.
-    """
+        CartsError: the labels of the view `where` have another size, or name a class that no link has."""
     if painted.shape != link_ids.shape:
         raise CartsError(f"{where}: painted classes are {painted.shape}, the camera's images are {link_ids.shape}.")
     numbers = np.unique(painted[painted > 0])

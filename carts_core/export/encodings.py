@@ -11,25 +11,21 @@ from ..errors import CartsError
 
 def mask_png(mask: Bool[np.ndarray, "height width"]) -> bytes:
     """A mask as a PNG file: 255 where an arm is, 0 elsewhere."""
-    return _png(mask.astype(np.uint8) * 255)
+    return label_png(mask.astype(np.uint8) * 255)
 
 
-def label_png(labels: UInt[np.ndarray, "height width"]) -> bytes:
-    """Labels of 8 or 16 bits as grey values of a PNG file."""
-    return _png(labels)
+def label_png(labels: UInt[np.ndarray, "height width *channels"]) -> bytes:
+    """Labels or grey values of 8 or 16 bits, or BGR(A), as a PNG file."""
+    ok, data = cv2.imencode(".png", labels)
+    if not ok:
+        raise CartsError(f"an image of shape {labels.shape} could not be written as PNG: OpenCV's encoder failed.")
+    return data.tobytes()
 
 
 def image_png(image: UInt8[np.ndarray, "height width channels"]) -> bytes:
     """An RGB or RGBA picture as a PNG file."""
     code = cv2.COLOR_RGBA2BGRA if image.shape[-1] == 4 else cv2.COLOR_RGB2BGR
-    return _png(cv2.cvtColor(image, code))
-
-
-def _png(image: np.ndarray) -> bytes:
-    ok, data = cv2.imencode(".png", image)
-    if not ok:
-        raise CartsError(f"an image of shape {image.shape} could not be written as PNG: OpenCV's encoder failed.")
-    return data.tobytes()
+    return label_png(cv2.cvtColor(image, code))
 
 
 def coco_rle(mask: Bool[np.ndarray, "height width"]) -> dict[str, object]:

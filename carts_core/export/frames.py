@@ -99,15 +99,11 @@ class _CorrectedMasks(Mapping[str, Bool[np.ndarray, "height width"]]):
 def project_frame(
     recording: Sequence, project: ProjectState, index: int, cameras: Iterable[str], render: RenderMask
 ) -> ExportFrame:
-    """A frame with the corrections of a project.
+    """A frame with the corrections of a project, and the painted masks and parts of some cameras.
 
     Args:
         recording: with the project's time offset; corrected or as measured.
-        project: its corrections.
-        index: 0-based position of the frame.
-        cameras: whose painted masks and parts are included.
-        render: called for cameras whose mask was corrected.
-    """
+        render: called for cameras whose mask was corrected."""
     frame = recording.frame(index, cameras=[])
     pose = corrected_state(recording.scene, frame, project)
     known = {name: value.standard_deviations for name, value in project.joints(index).items()}

@@ -178,12 +178,7 @@ class Decoder:
             shutil.rmtree(folder, ignore_errors=True)
 
     def _reply(self, request: bytes, limits: Limits) -> Any:
-        """The child's reply; None if it ended before it received the request.
-
-        Raises:
-            DecodingLimitError: it was ended by the limits.
-            ValueError: it has died, as of a fault in a library.
-        """
+        """The child's reply; None if it ended before it received the request. Errors as `decoded`."""
         self.start()
         assert self._process is not None and self._pipe is not None
         patience = limits.seconds * _PATIENCE

@@ -58,11 +58,7 @@ def allowed_names(most_bytes: int = NAME_BYTES) -> str:
 
 
 def check_name(text: str, what: str, most_bytes: int = NAME_BYTES) -> str:
-    """The name itself, seen to be one component of a path that leads nowhere else.
-
-    Raises:
-        OutputError: it cannot be the name of a file.
-    """
+    """The name itself; `OutputError` unless it is one component of a path that leads nowhere else."""
     if fault := name_fault(text, most_bytes):
         shown = text if len(text) <= _FILE_BYTES else f"{text[:60]}…"
         raise OutputError(f"the name of {what} is {shown!r}, {fault}. {allowed_names(most_bytes)}.")
@@ -116,12 +112,7 @@ def output_path(folder: Path, *names: str, draft: bool = False) -> OutputPath:
 
     Args:
         folder: named by the user, on the command line or in the environment; never by a recording.
-        names: components below it, which may be untrusted.
-        draft: see `OutputPath`.
-
-    Raises:
-        OutputError: a name is no single component of a path, or leads elsewhere.
-    """
+        names: components below it, which may be untrusted; others than single names are an `OutputError`."""
     path = OutputPath(folder, draft=draft)
     for name in names:
         path = path / name
@@ -199,11 +190,7 @@ def opened_folder(path: OutputPath, *, make: bool = False) -> Iterator[int]:
 
 
 def open_below(folder: int, name: str) -> int:
-    """A descriptor of the folder `name` in an open one.
-
-    Raises:
-        OSError: it is not there, a link, or no folder.
-    """
+    """A descriptor of the folder `name` in an open one; `OSError` if it is missing, a link or no folder."""
     return os.open(name, _FOLDER | os.O_NOFOLLOW, dir_fd=folder)
 
 

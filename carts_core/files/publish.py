@@ -65,11 +65,7 @@ class Staging:
 
 
 def make_staging(parent: int, output: str, key: str | None) -> Staging:
-    """A new staging folder in an open folder.
-
-    Raises:
-        OSError: it cannot be made.
-    """
+    """A new staging folder in an open folder; `OSError` if it cannot be made."""
     while True:
         name = f".carts-{secrets.token_hex(16)}"
         os.mkdir(name, 0o700, dir_fd=parent)
@@ -80,7 +76,9 @@ def make_staging(parent: int, output: str, key: str | None) -> Staging:
                 mark = _Mark(output, key, os.fstat(descriptor).st_ino)
                 staging = Staging(parent, name, descriptor, mark)
                 try:
-                    _write_mark(staging)
+                    flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
+                    with os.fdopen(os.open(_MARK, flags, 0o600, dir_fd=descriptor), "wb") as stream:
+                        stream.write(json.dumps(asdict(mark)).encode())
                 except BaseException:  # Such as that of a full disk.
                     staging.remove()
                     staging.close()
@@ -90,11 +88,7 @@ def make_staging(parent: int, output: str, key: str | None) -> Staging:
 
 
 def leftovers(parent: int, output: str, besides: Staging) -> Iterator[Staging]:
-    """Locked staging folders for the same output whose processes have ended.
-
-    Raises:
-        BusyError: a process that has not ended writes the same output.
-    """
+    """Locked staging folders for the same output whose processes have ended; `BusyError` if one is still running."""
     for name in os.listdir(parent):
         if not _NAME.fullmatch(name) or name == besides.name:
             continue
@@ -128,12 +122,6 @@ def _remove(folder: int, name: str) -> None:
             shutil.rmtree(name, ignore_errors=True, dir_fd=folder)
         else:
             os.unlink(name, dir_fd=folder)
-
-
-def _write_mark(staging: Staging) -> None:
-    flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
-    with os.fdopen(os.open(_MARK, flags, 0o600, dir_fd=staging.descriptor), "wb") as stream:
-        stream.write(json.dumps(asdict(staging.mark)).encode())
 
 
 def _read_mark(folder: int) -> _Mark | None:
@@ -192,11 +180,7 @@ def published(target: OutputPath | Path, *, overwrite: bool = False, key: str | 
 
 @contextmanager
 def published_file(target: OutputPath | Path, *, overwrite: bool = False) -> Iterator[OutputPath]:
-    """Path for a single file, to be written by `write_bytes` or `output_stream`, which are atomic.
-
-    Raises:
-        OutputError: the target exists and may not be replaced, or the disk refuses.
-    """
+    """Path for a single file, to be written by `write_bytes` or `output_stream`; errors as `published`."""
     output = as_output(target)
     with explained(output), opened_folder(output.parent, make=True) as folder:
         _check_free(folder, output, overwrite)

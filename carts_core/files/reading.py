@@ -117,20 +117,12 @@ def open_regular(path: Path, kind: Kind) -> BufferedReader:
 
 
 def check_regular(path: Path, kind: Kind) -> None:
-    """As `open_regular`, for a library that opens the file by its name.
-
-    Raises:
-        FileNotFoundError, IsADirectoryError, OSError, RefusedFileError: as there.
-    """
+    """As `open_regular`, for a library that opens the file by its path."""
     open_regular(path, kind).close()
 
 
 def read_bytes(path: Path, kind: Kind) -> bytes:
-    """The content of a file.
-
-    Raises:
-        FileNotFoundError, IsADirectoryError, OSError, RefusedFileError: as `open_regular`.
-    """
+    """The content of a file; errors as `open_regular`."""
     with open_regular(path, kind) as file:
         size = os.fstat(file.fileno()).st_size
         content = file.read(size + 1)  # Reading allocates the requested size.
@@ -152,11 +144,7 @@ def read_text(path: Path, kind: Kind) -> str:
 
 
 def parse_toml(text: str) -> dict[str, Any]:
-    """TOML as dictionaries and lists.
-
-    Raises:
-        ValueError: it is not TOML, or is beyond the limits of this module.
-    """
+    """TOML as dictionaries and lists; `ValueError` for other texts, and beyond the limits of this module."""
     # The parser's time and memory grow with the square of a key's parts, so long keys never reach it.
     if _LONG_KEY.search(text):
         raise ValueError(f"a key has more than {LARGEST_DEPTH} parts")
@@ -262,11 +250,7 @@ def parse_xml(text: str) -> ElementTree.Element:
 
 
 def parse_ini(text: str) -> configparser.ConfigParser:
-    """INI with unchanged values, without interpolation.
-
-    Raises:
-        ValueError: it is not INI, or has more than `MOST_INI_LINES` lines.
-    """
+    """INI with unchanged values, without interpolation; `ValueError` for other texts and more than `MOST_INI_LINES`."""
     if text.count("\n") > MOST_INI_LINES:
         raise ValueError(f"it has more than {MOST_INI_LINES:,} lines")
     parser = configparser.ConfigParser(inline_comment_prefixes=(";", "#"), interpolation=None)
@@ -279,11 +263,7 @@ def parse_ini(text: str) -> configparser.ConfigParser:
 
 
 def typed(value: Any, kind: type[T]) -> T:
-    """A value of `parse_json` or `parse_toml` as a dataclass or another type, with all fields checked.
-
-    Raises:
-        ValueError: a field is missing or of another type; the message names it.
-    """
+    """A value of `parse_json` or `parse_toml` as a dataclass or another type; `ValueError` names a wrong field."""
     try:
         return msgspec.convert(value, kind, dec_hook=_path)
     except (msgspec.ValidationError, OverflowError) as error:
@@ -306,11 +286,7 @@ def all_finite(root: Any) -> bool:
 
 
 def check_path(path: str | Path) -> None:
-    """Check the lengths of a path and of the names in it.
-
-    Raises:
-        ValueError: a part of the path, or the path, is too long.
-    """
+    """Check the lengths of a path and of the names in it; too long ones are a `ValueError`."""
     text = str(path)
     if len(text) <= LARGEST_NAME and text.isascii():
         return

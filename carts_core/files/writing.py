@@ -96,11 +96,7 @@ def write_new(path: OutputPath | Path, content: bytes) -> bool:
 
 @contextmanager
 def output_stream(path: OutputPath | Path) -> Iterator[BinaryIO]:
-    """A seekable and readable stream that becomes the file when the block ends without an exception.
-
-    Raises:
-        OutputError: as of `write_bytes`.
-    """
+    """A seekable and readable stream that becomes the file when the block succeeds; errors as `write_bytes`."""
     output = as_output(path)
     with explained(output), opened_folder(output.parent, make=True) as folder:
         if output.draft:
@@ -153,11 +149,7 @@ def append_line(path: OutputPath | Path, line: bytes, *, sync: bool = True) -> N
 
 
 def remove_file(path: OutputPath | Path) -> None:
-    """Remove a regular file, if it exists.
-
-    Raises:
-        OutputError: it is a link or no file, or may not be removed.
-    """
+    """Remove a regular file, if it exists; `OutputError` if it is a link or no file, or may not be removed."""
     output = as_output(path)
     with explained(output):
         try:
@@ -199,11 +191,7 @@ def holds_file(path: OutputPath | Path) -> bool:
 
 
 def check_own(folder: int, output: OutputPath) -> None:
-    """Check that writing to or removing an entry changes no other file.
-
-    Raises:
-        OutputError: it is a link, has a second name, or is no regular file.
-    """
+    """Check that writing to or removing an entry changes no other file; otherwise it is an `OutputError`."""
     found = status(folder, output.name)
     if found is None or (stat.S_ISREG(found.st_mode) and found.st_nlink == 1):
         return
@@ -263,11 +251,7 @@ def locked_folder(path: OutputPath | Path, *, wait: bool = False) -> Iterator[No
 
 
 def try_lock(descriptor: int) -> bool:
-    """Lock an open file or folder until it is closed; False if it is locked already.
-
-    Raises:
-        OSError: the file system has no locks.
-    """
+    """Lock an open file or folder until it is closed; False if it is locked. `OSError` without locks."""
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
