@@ -27,11 +27,7 @@ def sequence_file(folder: OutputPath, job: Job) -> Path:
 
 
 def review_project(folder: OutputPath, job: Job) -> Path:
-    """Project for the review of a job, created if missing. New results get a new project; old ones are kept.
-
-    Raises:
-        CartsError: the recording cannot be opened, the results are damaged, or the project cannot be written.
-    """
+    """Project for the review of a job, created if missing. New results get a new project; old ones are kept."""
     tables = kinematics_tables(folder, job)
     digest = fingerprint(*(read_bytes(table, TABLE) for table in tables))
     path = (folder / f"review-{digest[:12]}.carts").path

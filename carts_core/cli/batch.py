@@ -52,11 +52,7 @@ class Batch:
             raise SettingsError(f"--threads is {self.threads}; allowed is 1 or more.")
 
     def run(self) -> None:
-        """Run the jobs of the shard, and write the report on all.
-
-        Raises:
-            CartsError: the manifest is not usable, or jobs have failed.
-        """
+        """Run the jobs of the shard, and write the report on all; `CartsError` if jobs have failed."""
         from ..batch.folder import write_jobs
         from ..batch.manifest import read_manifest, shard
         from ..batch.report import write_batch_report

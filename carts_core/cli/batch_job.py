@@ -191,11 +191,7 @@ def _arguments(job: Job, step: Step, sequence: Path, folder: OutputPath) -> list
 
 
 def _table(job: Job, folder: OutputPath) -> Path | None:
-    """Kinematics table of an earlier step; None where nothing was optimized.
-
-    Raises:
-        SettingsError: there are several, one for each camera.
-    """
+    """Kinematics table of an earlier step, None without optimization; `SettingsError` if each camera has its own."""
     found = kinematics_tables(folder, job)
     if len(found) > 1:
         raise SettingsError(

@@ -259,11 +259,7 @@ class Calibrate:
 
 
 def frame_indices(frames: str | None, positions: str | None, sequence: "Sequence") -> list[int]:
-    """0-based indices that `--frames` or `--positions` chooses.
-
-    Raises:
-        SettingsError: they are not readable, or name no frame of the sequence.
-    """
+    """0-based indices that `--frames`, which may be `spread:COUNT`, or `--positions` chooses; errors as `Selection`."""
     frames = f"{_SPREAD}20" if frames is None and positions is None else frames
     if frames is None or not frames.startswith(_SPREAD):
         return Selection(frames, positions).frame_indices(sequence)

@@ -168,7 +168,7 @@ class Optimizing:
             return
         backgrounds = Backgrounds.of(sequence, cameras, domain, required=self._solver.needs_background)
         stopped, gains, assessed = [], [], {}
-        for index in track(todo, part.name, console=self._console, disable=not todo):
+        for index in track(todo, part.name, console=self._console):
             frame = sequence.frame(index, domain, cameras)
             optimizer = FrameOptimizer(
                 sequence.scene,
@@ -186,9 +186,8 @@ class Optimizing:
                 pass
             best = optimizer.best
             assert best is not None and optimizer.stop_reason is not None
-            assessed[frame.frame_id] = optimizer.assessment
+            found = assessed[frame.frame_id] = optimizer.assessment
             source = "measured" if optimizer.stop_reason is StopReason.FAILED else "optimized"
-            found = optimizer.assessment
             verdict = None if found is None else found.verdict.value
             row = KinematicsRow(frame.frame_id, source, best.joint_positions(), best.joint_std(), verdict)
             part.output.write([FrameResult(row, best.state, origins[index], found)])

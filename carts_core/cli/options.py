@@ -82,7 +82,8 @@ def chosen_frames(frames: str | None, positions: str | None, ids: Names[str]) ->
     """0-based indices that `--frames` (ids) or `--positions` (from 1) chooses; all where neither is given.
 
     Raises:
-        SettingsError: both are given, or one is not readable or names a frame that the recording does not have."""
+        SettingsError: both are given, or one is not readable or names a frame that the recording does not have.
+    """
     if frames is not None and positions is not None:
         raise SettingsError("--frames and --positions are both given. Give one of them.")
     if positions is not None:
@@ -488,7 +489,8 @@ class Observing(Network):
         """Observer of a sequence, for a solver.
 
         Raises:
-            CartsError: the solver compares features of images, or weights or masks cannot be used."""
+            CartsError: the solver compares features of images, or weights or masks cannot be used.
+        """
         if self.observe != "network" and not isinstance(settings, SurfaceSolver):
             raise SettingsError(
                 f"--observe {self.observe} needs the solver surface, occluded or none; the one given compares features "

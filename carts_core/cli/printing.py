@@ -97,7 +97,8 @@ _LARGE = 5.0
 def constant_correction_hint(where: str, sequence: recording.Sequence, rows: Sequence[KinematicsRow]) -> str | None:
     """Hint on large corrections of optimized rows that are nearly equal in all frames; None if there are none.
 
-    Joints compensate for a wrong focal length or base frame: the image fits, and the joints are wrong."""
+    Joints compensate for a wrong focal length or base frame: the image fits, and the joints are wrong.
+    """
     scene, position = sequence.scene, {frame_id: index for index, frame_id in enumerate(sequence.frame_ids)}
     rows = [row for row in rows if row.source == "optimized"]
     if len(rows) < _FRAMES:

@@ -246,11 +246,7 @@ class FrameFolder:
             yield
 
     def fault(self, frame_id: str, origin: InputHashes) -> str | None:
-        """Reason why the result of a frame is not up to date; None if it is.
-
-        Args:
-            origin: fingerprints of its present inputs; kinds that are missing here are not compared.
-        """
+        """Reason why a frame's result is outdated, by those of its inputs whose fingerprints are given; else None."""
         record = self._records.get(frame_id)
         row = self.rows[bisect_left(self.rows, self._order[frame_id], key=lambda row: self._order[row.frame_id])]
         if record is None:

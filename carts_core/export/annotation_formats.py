@@ -75,7 +75,8 @@ def write_annotations(
     Args:
         kind: `instances` or `person_keypoints`, as COCO names its files.
         categories: as COCO has them.
-        annotate: the objects of a view, without their numbers."""
+        annotate: the objects of a view, without their numbers.
+    """
     images, annotations = [], []
     for view in dataset.views(monitor):
         images.append(
@@ -230,11 +231,7 @@ _MOST_CATEGORIES = 254
 
 
 def write_voc(dataset: Dataset, folder: OutputPath, monitor: Monitor) -> None:
-    """Write the dataset in Pascal VOC's format, with lossless label images; images are copied in their own format.
-
-    Raises:
-        CartsError: there are more categories than VOC's label images can tell apart.
-    """
+    """Write the dataset in Pascal VOC's format, with lossless label images; images are copied in their own format."""
     if len(dataset.categories) > _MOST_CATEGORIES:
         raise CartsError(f"Pascal VOC holds {_MOST_CATEGORIES} categories, not {len(dataset.categories)}. Export COCO.")
     for view in dataset.views(monitor):

@@ -42,11 +42,7 @@ class Monitor:
     """Called before each step, such as `threading.Event().is_set`."""
 
     def track(self, steps: Items[T]) -> Iterator[T]:
-        """The steps one by one, with progress and cancellation.
-
-        Raises:
-            ExportCancelled: `cancelled` is true.
-        """
+        """The steps one by one, with progress and cancellation (`ExportCancelled`)."""
         for done, step in enumerate(steps):
             self._check()
             yield step
@@ -204,11 +200,7 @@ class Dataset:
                 yield category, mask
 
     def image(self, view: View) -> UInt8[np.ndarray, "height width 3"]:
-        """The view's image, RGB, undistorted.
-
-        Raises:
-            SequenceError: it is missing or damaged.
-        """
+        """The view's image, RGB, undistorted; `SequenceError` if it is missing or damaged."""
         return self.sequence.frame(view.frame.index, self.domain, [view.camera.name]).images[view.camera.name]
 
     @cached_property
@@ -242,7 +234,8 @@ class Dataset:
     def write_image(self, view: View, folder: OutputPath) -> str:
         """Write the view's image into `folder` if copies are wanted or it is no recorded file; its `image_name`.
 
-        Copies have the bytes of the recording's file; other images (see `remade_cameras`) are written as PNG."""
+        Copies have the bytes of the recording's file; other images (see `remade_cameras`) are written as PNG.
+        """
         name = self.image_name(view)
         if self.images == "none":
             return name
@@ -298,7 +291,8 @@ def labelled(
     """`rendered` labels (-1 for background) restricted to `mask`; additional pixels get the nearest rendered label.
 
     Raises:
-        CartsError: the mask of the view `where` has another size, or nothing is rendered that could name its pixels."""
+        CartsError: the mask of the view `where` has another size, or nothing is rendered that could name its pixels.
+    """
     if mask.shape != rendered.shape or mask.dtype != bool:
         raise CartsError(
             f"{where}: the mask is {mask.dtype} {mask.shape}, the camera's images are {rendered.shape}. "
@@ -334,7 +328,8 @@ def painted_links(
         classes: number of the class of every link.
 
     Raises:
-        CartsError: the labels of the view `where` have another size, or name a class that no link has."""
+        CartsError: the labels of the view `where` have another size, or name a class that no link has.
+    """
     if painted.shape != link_ids.shape:
         raise CartsError(f"{where}: painted classes are {painted.shape}, the camera's images are {link_ids.shape}.")
     numbers = np.unique(painted[painted > 0])

@@ -103,7 +103,8 @@ def project_frame(
 
     Args:
         recording: with the project's time offset; corrected or as measured.
-        render: called for cameras whose mask was corrected."""
+        render: called for cameras whose mask was corrected.
+    """
     frame = recording.frame(index, cameras=[])
     pose = corrected_state(recording.scene, frame, project)
     known = {name: value.standard_deviations for name, value in project.joints(index).items()}

@@ -83,11 +83,7 @@ def kinematics_csv(scene: Scene, rows: Iterable[KinematicsRow]) -> str:
 
 
 def read_kinematics_csv(path: Path, scene: Scene) -> list[KinematicsRow]:
-    """Rows of a table that `kinematics_csv` wrote.
-
-    Raises:
-        SequenceError: the file is missing, of other arms or joints, or not readable.
-    """
+    """Rows of a table that `kinematics_csv` wrote; `SequenceError` for other arms or joints, or an unreadable file."""
     try:
         return _read(path, scene)
     except (OSError, ValueError, csv.Error) as error:

@@ -112,7 +112,8 @@ def output_path(folder: Path, *names: str, draft: bool = False) -> OutputPath:
 
     Args:
         folder: named by the user, on the command line or in the environment; never by a recording.
-        names: components below it, which may be untrusted; others than single names are an `OutputError`."""
+        names: components below it, which may be untrusted; others than single names are an `OutputError`.
+    """
     path = OutputPath(folder, draft=draft)
     for name in names:
         path = path / name

@@ -236,11 +236,7 @@ def _plain_yaml(parser: Any) -> Any:
 
 
 def parse_xml(text: str) -> ElementTree.Element:
-    """Root of an XML document without document type and entities, which parsers expand without limit.
-
-    Raises:
-        ValueError: it is not XML, or declares a document type or entities.
-    """
+    """Root of an XML document; `ValueError` if it is none, or declares a document type or entities."""
     if "<!DOCTYPE" in text or "<!ENTITY" in text:
         raise ValueError("it declares a document type or entities")
     try:

@@ -203,11 +203,7 @@ class Backgrounds:
         return all(camera.name in self.images for camera in scene.cameras)
 
     def at(self, scene: Scene, size: tuple[int, int], dehaze: float, predictor: FramePredictor) -> Background:
-        """The backgrounds of a scene's cameras in a width and height [px].
-
-        Raises:
-            SettingsError: one is missing, or of another size than its camera.
-        """
+        """Backgrounds of a scene's cameras in a width and height [px]; `SettingsError` if one is missing or misfits."""
         key = tuple(camera.name for camera in scene.cameras), size, dehaze, predictor
         if key not in self._found:
             stacked = stacked_images(scene, self.images, size, "background").to(predictor.device)

@@ -219,10 +219,7 @@ class CalibrationOptimizer:
         self.stop_reason = self.stop_reason or StopReason.CANCELLED
 
     def step(self) -> CalibrationIterate | None:
-        """Evaluate the present calibration and move on; None once the optimization has stopped.
-
-        The first call gives iterate 0, the start.
-        """
+        """The next iterate; None once the optimization has stopped. The first one is iterate 0, the start."""
         if self.stop_reason is not None:
             return None
         began = time.perf_counter()
@@ -280,11 +277,7 @@ class CalibrationOptimizer:
         return iter(self.step, None)
 
     def result(self) -> CalibrationResult:
-        """Result of the best iterate, evaluated once more under the finest descent reached.
-
-        Raises:
-            SettingsError: no step was made yet.
-        """
+        """Result of the best iterate under the finest descent reached; `SettingsError` before the first step."""
         if self.best is None or self._problem.present is None:
             raise SettingsError("no step was made yet. Call `step` first.")
         offsets = self.best.offsets

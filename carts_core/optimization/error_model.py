@@ -118,10 +118,7 @@ class ErrorModel:
         return combined(state, information, self._sum)
 
     def smoothed(self, filtered: Sequence[Gaussian], seconds: Sequence[float]) -> list[Gaussian]:
-        """Corrections of all frames, each given all others (Rauch, Tung and Striebel, 1965).
-
-        Args:
-            seconds: from the frame before to each frame [s]."""
+        """Corrections of all frames, `seconds` apart, each given all others (Rauch, Tung and Striebel, 1965)."""
         if not filtered:
             return []
         result = [filtered[-1]]

@@ -141,11 +141,7 @@ def search_silhouettes(
     clamp: Callable[[Tensor], Tensor],
     stage: SilhouetteSearch,
 ) -> Float[Tensor, " n"]:
-    """The point with the smallest distance of silhouettes, by the cross-entropy method.
-
-    Args:
-        distances: between silhouettes and masks at each of a batch of points [px].
-    """
+    """The point with the smallest distance of silhouettes and masks [px], by the cross-entropy method."""
     best, lowest = torch.zeros_like(deviation), float("inf")
     for start in range(stage.starts):
         generator = torch.Generator().manual_seed(start)

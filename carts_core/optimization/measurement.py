@@ -209,11 +209,7 @@ class FrameSolver:
     def base_frame_gain(
         self, frame: Frame, variables: Variables, correction: np.ndarray, free: FreeParameters
     ) -> float:
-        """Share of the surface residual at a correction [n] that free base frames would explain [1].
-
-        Args:
-            correction: of the measured values [n].
-        """
+        """Share of the surface residual at a correction [n] that free base frames would explain [1]."""
         offsets = _offsets(correction, variables)
         problem = self._problem(frame, variables, None)
         problem.observe(Observe(), offsets)

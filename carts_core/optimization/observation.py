@@ -63,11 +63,7 @@ class FrameImages:
         before: tuple[Int[np.ndarray, "cameras h w"], SceneState],
         after: tuple[Int[np.ndarray, "cameras h w"], SceneState],
     ) -> float:
-        """Area of an arm relative to its area at the start [1]; parts behind another arm count as in view.
-
-        Args:
-            before, after: arm of each pixel and state, at the start and now.
-        """
+        """Area of an arm relative to the start's [1], by labels and state before and after; occluded parts count."""
         share = int((after[0] == arm).sum()) / max(int((before[0] == arm).sum()), 1)
         if share >= HAS_LEFT or len(self.renderer.scene.arms) < 2:
             return share

@@ -97,12 +97,7 @@ class Visit:
     seconds: float
 
     def estimate(self, scene: Scene, index: int, correction: Gaussian, prior: Gaussian) -> FrameEstimate:
-        """Estimate of the frame for a correction.
-
-        Args:
-            correction: of the measured values, with its covariance [rad].
-            prior: of the correction, before any image [rad].
-        """
+        """Estimate of the frame for a correction of the measured values, given its prior before any image [rad]."""
         variables = self.variables
         state, joint_positions = _positions(scene, variables, correction.mean)
         scales = variables.scales.cpu().double().numpy()

@@ -14,11 +14,7 @@ _SOURCE_ORDER = (Source.HAND, Source.PROPAGATED, Source.OPTIMIZER, Source.MEASUR
 
 
 def corrected_sequence(sequence: Sequence, project: ProjectState) -> Sequence:
-    """The recording with the project's time offset, calibration and joint positions in place of the measured ones.
-
-    Raises:
-        SequenceError: with the project's time offset, a frame has no joint positions.
-    """
+    """The recording with the project's time offset, calibration and joints; `SequenceError` if no row fits it."""
     offset = project.get(Key.time_offset())
     if offset is not None and sequence.matching is not None and offset.seconds != sequence.matching.time_offset:
         sequence = sequence.with_time_offset(offset.seconds)

@@ -66,11 +66,7 @@ class Seal:
 
 
 def seal(connection: sqlite3.Connection, nonce: bytes) -> None:
-    """Compute the digests of all rows, inside a transaction of the caller.
-
-    Args:
-        nonce: for one that has none yet.
-    """
+    """Compute the digests of all rows, inside a transaction of the caller; `nonce` is for a file without one."""
     total = 0
     for table, columns in TABLES.items():
         rows = connection.execute(f"SELECT rowid, {', '.join(columns)} FROM {table}").fetchall()
@@ -251,12 +247,7 @@ def empty(identity: SequenceIdentity) -> sqlite3.Connection:
 
 
 def migrate(connection: sqlite3.Connection, nonce: bytes) -> None:
-    """Run the missing migrations as one transaction. Without any, check that the file can be written.
-
-    Args:
-        connection: to a project whose schema and digests were checked.
-        nonce: for a project that has none.
-    """
+    """Run the missing migrations of a checked project as one transaction; without any, check that it can be written."""
     missing = MIGRATIONS[version(connection) :]
     with transaction(connection):
         for statement in _statements("".join(missing)):

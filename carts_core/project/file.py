@@ -256,12 +256,7 @@ def read_files(path: Path) -> Content:
 
 
 def open_copy(content: Content, path: Path) -> Copy:
-    """An unverified copy of a project in memory.
-
-    Raises:
-        ProjectError: it is no project, or of a newer version of carts.
-        sqlite3.Error: SQLite cannot read it at all.
-    """
+    """An unverified copy of a project in memory; `ProjectError` or `sqlite3.Error` if it is none or too new."""
     main = content.database
     if not main.startswith(_MAGIC) or len(main) < 512:
         raise database.not_a_project(path)

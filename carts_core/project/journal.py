@@ -48,7 +48,8 @@ def load(connection: sqlite3.Connection) -> tuple[ProjectState, Seal]:
     """State and seal of a project. Every row is verified, including undone values.
 
     Raises:
-        ProjectError, sqlite3.Error and those of `store.UNREADABLE`: it cannot be read, or is not as it was written."""
+        ProjectError, sqlite3.Error and those of `store.UNREADABLE`: it cannot be read, or is not as it was written.
+    """
     row = connection.execute("SELECT identity, position FROM project").fetchone()
     if row is None:
         raise DamagedProject("it does not say which sequence it belongs to")
@@ -86,11 +87,7 @@ def load(connection: sqlite3.Connection) -> tuple[ProjectState, Seal]:
 
 
 def append(memory: sqlite3.Connection, step: Step, edits: Edits, last: int) -> Script:
-    """Append a step at the present position and remove undone ones.
-
-    Args:
-        last: number of the last step, done or undone.
-    """
+    """Append a step at the present position and remove undone ones, up to the step numbered `last`."""
     script = Script(position=step.number)
     if last >= step.number:
         script.cut_at = step.number

@@ -66,12 +66,7 @@ def project_masks(layer: MaskLayer, state: ProjectState, recording: Recording) -
 
 
 def file_masks(source: Path, recording: Recording) -> GivenMasks:
-    """Masks from a file or folder, as read by `read_annotations`; they are not imported.
-
-    Raises:
-        SequenceError: it cannot be read.
-        ProjectError: it has no mask of any frame.
-    """
+    """Masks from a file or folder, as read by `read_annotations`; `ProjectError` if it has none of any frame."""
     found = read_annotations(source, recording)
     layers = {
         (frame.frame, frame.camera): ImportedMask.of(frame.labels) for frame in found.frames if frame.labels is not None

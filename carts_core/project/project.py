@@ -163,11 +163,7 @@ class Project:
             return self.go_to(min(self.state.position + 1, len(self.state.steps)))
 
     def go_to(self, position: int) -> Change | None:
-        """Undo or redo to a position of the history; None if it is the present one.
-
-        Raises:
-            ProjectError: the history has no such position, or it could not be saved.
-        """
+        """Undo or redo to a position of the history, None if it is the present one; `ProjectError` if there is none."""
         with self._edit:
             state = self.state
             if not 0 <= position <= len(state.steps):

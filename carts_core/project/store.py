@@ -282,7 +282,8 @@ def open_or_begin(path: Path, identity: SequenceIdentity) -> tuple[ProjectState,
 
     Raises:
         DamagedProject: it is damaged; what can be read of it is in a new file by now.
-        ProjectError, OSError, sqlite3.Error: it cannot be opened; nothing is changed."""
+        ProjectError, OSError, sqlite3.Error: it cannot be opened; nothing is changed.
+    """
     if not check_files(path):
         _begin(path, identity)
     file = ProjectFile.locked(path)

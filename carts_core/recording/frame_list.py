@@ -169,7 +169,8 @@ def list_of_rows(table: Table, names: FrameNames, timestamp: str, section: TomlT
 
     Args:
         timestamp: column with the time [s]; empty for frames without times.
-        counted: number of frames, as a clause for errors."""
+        counted: number of frames, as a clause for errors.
+    """
     frame_ids = names.of(table)
     times = table.numbers(timestamp, section.name("timestamp")) if timestamp else None
     column = section.take("video_frame", str, "")

@@ -117,7 +117,8 @@ class Sequence:
         """The same images with joint positions at another time offset (kinematics minus image) [s].
 
         Raises:
-            SequenceError: rows are not matched by time, or a frame has no row near enough."""
+            SequenceError: rows are not matched by time, or a frame has no row near enough.
+        """
         matching = replace(self.checked_matching(), time_offset=time_offset)
         moved = Sequence(replace(self._description, matching=matching))
         # Images and masks do not depend on it.
@@ -205,12 +206,7 @@ class Sequence:
         return source.files[index]
 
     def image_fingerprint(self, index: int, camera: str, domain: str | None = None) -> str:
-        """Text that changes with the recorded image of a frame. The image is not decoded, and its distortion does not
-        count.
-
-        Raises:
-            SequenceError: there is no such domain or camera, or the image is missing.
-        """
+        """Text that changes with the recorded image of a frame, which is not decoded; errors as `frame`."""
         return self._camera(camera).images[self._domain(domain)].fingerprint(index)
 
     def mask_fingerprint(self, index: int, camera: str, domain: str | None = None) -> str | None:
@@ -220,11 +216,7 @@ class Sequence:
         return None if path is None else hashlib.sha256(read_file(path)).hexdigest()
 
     def has_masks(self, camera: str, domain: str | None = None, index: int | None = None) -> bool:
-        """Whether the sequence file gives masks for a camera (in a domain), or one for the frame at a position.
-
-        Raises:
-            SequenceError: there is no such domain or camera.
-        """
+        """Whether the sequence file gives masks for a camera (in a domain), or one for the frame at a position."""
         masks = self._camera(camera).masks.get(self._domain(domain))
         return masks is not None and (index is None or masks[index] is not None)
 

@@ -376,7 +376,8 @@ def calibrated_sequence_file(
         before: the scene that `path` describes.
         after: the same with other base frames, extrinsics or intrinsics.
         command: the `carts` command that found them, for the heading.
-        time_offset: the key of that name in `[frames]` [s]; None leaves it as it is."""
+        time_offset: the key of that name in `[frames]` [s]; None leaves it as it is.
+    """
     document: dict[str, Any] = tomlkit.parse(read_text(path, SEQUENCE))
     source, target = path.parent.resolve(), folder.resolve()
 

@@ -41,11 +41,7 @@ class StreamAddress:
 
     @classmethod
     def parse(cls, text: str, joints_port: int | None = None) -> "StreamAddress":
-        """The address that a person has written.
-
-        Raises:
-            SettingsError: there is no such kind, its place does not fit, or joints are missing.
-        """
+        """The address that a person has written; `SettingsError` for unknown kinds and places, and missing joints."""
         kind, _, place = text.partition(":")
         fits = {
             "replay": not place,

@@ -68,8 +68,7 @@ class HandEyePrior:
 
 
 def read_prior(sequence: Sequence) -> HandEyePrior | None:
-    """Uncertainty of the hand-eye calibration that wrote a sequence file; None if there is none, or base frames have
-    changed since.
+    """Uncertainty of the hand-eye calibration that wrote a sequence file; None without one, or if base frames changed.
 
     Raises:
         SettingsError: `hand_eye.json` beside the sequence file cannot be read.

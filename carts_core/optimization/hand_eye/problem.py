@@ -97,7 +97,8 @@ def views_of(
 
     Raises:
         SettingsError: a point names a frame or a landmark that does not exist, or lies at no place.
-        RobotError: a point names an arm or a camera that does not exist."""
+        RobotError: a point names an arm or a camera that does not exist.
+    """
     grouped: dict[tuple[int, int], list[int]] = {}
     for row, point in enumerate(points):
         camera, arm = scene.cameras.index(scene.camera(point.camera)), scene.arms.index(scene.arm(point.arm))
@@ -160,7 +161,8 @@ def poses_of(
 
     Args:
         intrinsics: fx, fy, cx, cy [px].
-        pixel_error: expected error of a point [px]."""
+        pixel_error: expected error of a point [px].
+    """
     found: list[tuple[float, np.ndarray]] = []
     for rows in _subsets(view):
         for T in _perspective(view, rows, intrinsics):

@@ -376,7 +376,8 @@ def read_mask_folder(path: Path, remarks: Counter[str], *, confined: bool = Fals
 
     Args:
         remarks: numbers of files with a change or decision are added while they are decoded.
-        confined: whether links are left out, and names of values are not looked for above the folder."""
+        confined: whether links are left out, and names of values are not looked for above the folder.
+    """
     # An export of carts has a folder with links, which are the finest labels.
     finest = path / "links" if (path / "labels.json").is_file() and (path / "links").is_dir() else path
     usable = [file for file in _files(finest) if not (confined and file.is_symlink())]

@@ -185,11 +185,7 @@ def _from_camodocal(content: Mapping[str, Any]) -> Calibration:
 
 
 def _calibration(K: np.ndarray, D: np.ndarray | None, size: tuple[int, int] | None) -> Calibration:
-    """Calibration with a matrix of 9 numbers, or fx, fy, cx, cy.
-
-    Raises:
-        ValueError: it is no matrix of a camera, or has another number of coefficients than OpenCV's models.
-    """
+    """Calibration with a matrix of 9 numbers, or fx, fy, cx, cy; `ValueError` if it is none of OpenCV's models."""
     numbers, remarks = np.asarray(K, np.float64).reshape(-1), ()
     if numbers.size == 9:
         matrix = numbers.reshape(3, 3)
@@ -316,7 +312,8 @@ def read_base_frames(path: Path, axes: Axes | None = None) -> tuple[DvrkBaseFram
     """Base frames in a JSON file of the dVRK (see `_BASE_FRAME_KINDS`).
 
     Args:
-        axes: of the camera in the file; by default those of its kind and name."""
+        axes: of the camera in the file; by default those of its kind and name.
+    """
     try:
         content = parse_json(read_text(path, VALUES))
     except FileNotFoundError as error:

@@ -136,7 +136,8 @@ def track_of(
 
     Args:
         groups: of `decoders.bags.rows`: names in the messages, times and values.
-        role: "joints", "jaw" or a pose."""
+        role: "joints", "jaw" or a pose.
+    """
     chosen = []
     for names, rows in groups:
         order = range(rows.shape[1] - 1)
@@ -310,7 +311,8 @@ def arm_log(
     Args:
         found: joint or part of a pose -> column.
         times: of the rows, or positions of their images; NaN for rows of no image.
-        stated: columns whose meaning is no guess."""
+        stated: columns whose meaning is no guess.
+    """
     other = other_robots(job.options).get(arm)
     if other is None and not found.keys() >= _PSM:
         return _pose_log(table, arm, found, times, job, stated)

@@ -121,6 +121,7 @@ def import_recording(
         The sequence file, and the content of the recording.
 
     Raises:
-        CartsError: it is of no known kind, damaged, or contradicts itself; nothing is written then."""
+        CartsError: it is of no known kind, damaged, or contradicts itself; nothing is written then.
+    """
     recording = find(path, options)
     return write_sequence(recording, folder, overwrite=overwrite), recording

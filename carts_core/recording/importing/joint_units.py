@@ -28,7 +28,8 @@ def in_si(
 
     Args:
         columns: names of a table's columns, whose units are guessed; empty for messages, which are in SI units.
-        instrument: whether angles can be guessed to be degrees; those of other robots may be shares of their range."""
+        instrument: whether angles can be guessed to be degrees; those of other robots may be shares of their range.
+    """
     names, options = [joint.name for joint in joints], job.options
     for option, joint in [*(("flip", joint) for joint in options.flip), *(("units", joint) for joint in options.units)]:
         if joint not in (*names, "jaw"):

@@ -83,7 +83,8 @@ def fit_base_frame(
     """Base frame that fits joint positions [rad, m] to poses of the tip [m] at the same times.
 
     Raises:
-        CartsError: no row has both."""
+        CartsError: no row has both.
+    """
     known = np.isfinite(joints).all(1) & np.isfinite(Ts_reference_tip).all((1, 2))
     if not known.any():
         raise CartsError(
@@ -171,7 +172,8 @@ def check_instrument(
         joints: joint positions at the same times [rad, m].
 
     Raises:
-        CartsError: fewer than 20 rows have both."""
+        CartsError: fewer than 20 rows have both.
+    """
     rows = int((np.isfinite(joints).all(1) & np.isfinite(Ts_reference_tip).all((1, 2))).sum())
     if rows < _FEWEST_ROWS:
         raise CartsError(f"{rows} rows have both joints and a pose, at least {_FEWEST_ROWS} are needed. Record longer.")
@@ -434,7 +436,8 @@ def endoscope_motion(poses: Track | None, joints: Track | None, start: float, jo
     The tip of the ECM, by its poses or joints, counts as the camera, whose pose there `carts calibrate` estimates.
 
     Args:
-        start: time of the first image [s]."""
+        start: time of the first image [s].
+    """
     chosen = poses if poses is not None else joints
     if chosen is None or len(chosen.times) < 2:
         return None

@@ -324,7 +324,8 @@ def by_rows(
         times: of the frames [s], which become those of the rows, so that a delay can be estimated.
 
     Returns:
-        The arms, the ids that remain, and their positions in `ids`."""
+        The arms, the ids that remain, and their positions in `ids`.
+    """
     positions = {arm.name: np.asarray(arm.times, int) for arm in arms if arm.times is not None}
     keep = np.all([np.isin(np.arange(len(ids)), rows) for rows in positions.values()], axis=0) & np.ones(len(ids), bool)
     if not keep.any():

@@ -220,11 +220,7 @@ _HANDLE = "frame"
 
 
 def write_sequence(recording: FoundRecording, folder: Path, *, overwrite: bool = False) -> Path:
-    """Write FOLDER/sequence.toml with its tables, whole or not at all; images and videos are not copied.
-
-    Returns:
-        The sequence file.
-    """
+    """Write FOLDER/sequence.toml, whose path is returned, and tables, whole or not at all; images stay in place."""
     with TemporaryDirectory() as trial:
         _write(recording, Path(trial), Path(trial))
         try:

@@ -132,11 +132,7 @@ def _endovis_calibration(camera: FoundCamera, file: Path, job: Import) -> FoundC
 
 
 def jigsaws_trials(folder: Path) -> tuple[Path, ...]:
-    """Kinematics of the JIGSAWS trials in a folder, sorted by name.
-
-    Args:
-        folder: the root of the data set, one of its tasks, or a folder of a task.
-    """
+    """Kinematics of the JIGSAWS trials in the data set's root, a task or one of its folders, sorted by name."""
     levels = ("", "AllGestures", "kinematics/AllGestures", "*/kinematics/AllGestures", "*/*/kinematics/AllGestures")
     try:
         found = {file for level in levels for file in folder.glob(f"{level}/*.txt" if level else "*.txt")}
@@ -273,9 +269,8 @@ def _with_extrinsics(camera: FoundCamera, file: Path, job: Import) -> FoundCamer
     except (KeyError, TypeError, ValueError):
         job.warning(f"{file} has no R and T; the right camera is placed by right.yaml alone.")
         return camera
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = R, T * (1e-3 if np.linalg.norm(T) > 1.0 else 1.0)
-    return replace(camera, T_camera_world=pose)
+    T = T * (1e-3 if np.linalg.norm(T) > 1.0 else 1.0)
+    return replace(camera, T_camera_world=np.vstack([np.column_stack([R, T]), [0.0, 0.0, 0.0, 1.0]]))
 
 
 def _packed(path: Path, arm: str) -> dict[str, Any]:
