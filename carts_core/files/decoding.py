@@ -271,6 +271,10 @@ def _answer(request: bytes) -> bytes:
     folder, module, name, arguments, seconds, memory, written = _unpacked(request)
     try:
         os.chdir(folder)  # Paths may be relative, and the child may be older than the parent's folder.
+        for limit in (resource.RLIMIT_CPU, resource.RLIMIT_AS):
+            # Imports would count against the limits of the call before.
+            _, most = resource.getrlimit(limit)
+            resource.setrlimit(limit, (most, most))
         home = importlib.import_module(module)
         for library in getattr(home, "LIBRARIES", {}).get(name, ()):
             importlib.import_module(library)

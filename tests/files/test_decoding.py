@@ -1,5 +1,6 @@
 """Untrusted files are decoded in a child process within bounded memory and time, or by parsers that cannot grow."""
 
+import importlib
 import io
 import os
 import signal
@@ -69,6 +70,17 @@ def test_too_much_memory_or_time_and_a_crash_are_errors_and_the_next_call_works(
     with pytest.raises(ValueError, match=message):
         decoder.call(function, *arguments, limits=SMALL)
     assert decoder.call(abs, -1, limits=SMALL) == 1
+
+
+def test_what_a_call_imports_does_not_count_against_the_limits_of_the_call_before(
+    decoder: Decoder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    (tmp_path / "slow_to_import.py").write_text(
+        "import sys, time\nwhile sys.argv[0] == '-c' and time.process_time() < 5.0: pass\ndef answer(): return 42\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    assert decoder.call(abs, -1, limits=SMALL) == 1
+    assert decoder.call(importlib.import_module("slow_to_import").answer, limits=SMALL) == 42
 
 
 def test_a_child_that_has_ended_for_lack_of_work_is_replaced():

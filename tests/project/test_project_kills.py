@@ -46,7 +46,7 @@ def _survive_kills(path: Path, kills: int) -> None:
 
 
 def test_nothing_acknowledged_is_lost_when_the_process_is_killed(project_path: Path) -> None:
-    _survive_kills(project_path, 10)
+    _survive_kills(project_path, 5)
 
 
 @pytest.mark.slow
