@@ -61,7 +61,7 @@ class Listening:
         if isinstance(event, events.Theme) and client is not None:
             choose_theme(client.gui, light=event.light)
         elif isinstance(event, events.Hello) and tab is None:
-            self._worker.call(lambda: self._come(client_id, event))
+            self._worker.call(lambda: self._attach(client_id, event))
         elif tab is not None and (view := tab.view) is not None:
             self._act(client_id, tab, view, event)
 
@@ -83,7 +83,7 @@ class Listening:
                     view.display.drawn()
                 tab.put(event)
 
-    def _come(self, client_id: int, hello: events.Hello) -> None:
+    def _attach(self, client_id: int, hello: events.Hello) -> None:
         # A page repeats its greeting until it is answered, and may have closed by now.
         client = self._page.server.get_clients().get(client_id)
         if client is not None and self._tabs.of_client(client_id) is None:
@@ -99,7 +99,7 @@ class Listening:
             cameras = {camera.name: camera for camera in self._sequence.scene.cameras}
             stroke = read_stroke(painted, len(self._sequence), cameras, self._classes)
         except CartsError as error:
-            # The viewer's own page sends no such strokes.
+            # The viewer's own page never sends such strokes.
             _log.info("Refused: %s", error)
         else:
             tab.put(intents.Paint(client_id, stroke))
@@ -113,16 +113,16 @@ class ServerOptions(NetworkOptions, total=False):
     """Options of the networks and of the server."""
 
     host: str
-    """Address to listen on, 127.0.0.1 by default; one that other computers can reach makes the url carry a token."""
+    """Address to listen on, 127.0.0.1 by default; one that other computers can reach adds a token to the url."""
     port: int
-    """Port to listen on, 8080 by default; 0 picks a free port, a busy one moves up to the next free one."""
+    """Port to listen on, 8080 by default; 0 picks a free port; instead of a busy one the next free one is used."""
 
 
 class ViewerApp:
     """The viewer of one sequence, serving until it is closed.
 
     Attributes:
-        url: Where the page is.
+        url: Address of the page.
         page: The page, for tests and scripts.
         tabs: All tabs.
         sequence: The recording.
@@ -182,9 +182,9 @@ class ViewerApp:
 
         Args:
             path: The sequence file.
-            project: The project file, begun if it is not there; None for the default place.
+            project: The project file, created if missing; None for the default path.
             report: Called with a line for the user about long operations.
-            page: An empty page that is served already, and stays when the viewer is closed; None to serve a new one.
+            page: An empty page that is served already, and remains after the viewer is closed; None to serve a new one.
             folders: Folders that masks may be imported from, besides the sequence's own folder.
             options: See `ServerOptions`.
 
@@ -239,11 +239,11 @@ class ViewerApp:
 
     @property
     def incident(self) -> str | None:
-        """Why corrections are not in the project's file, and where they are; None if they are."""
+        """Why corrections are not in the project's file, and the file that has them; None if they are."""
         return self.project.incident
 
     def close(self) -> None:
-        """Save what is under way, stop the worker and the server; closing again does nothing.
+        """Save unfinished edits, stop the worker and the server; closing again does nothing.
 
         Raises:
             ProjectError: it could not be saved.
@@ -256,15 +256,15 @@ class ViewerApp:
             self.page.close()
         self._thumbnails.close()
         with ExitStack() as stack:
-            # From the last to the first, whatever fails.
+            # In reverse order, even if one of them fails.
             stack.callback(self._storage.close)
             stack.callback(self.tabs.close)
 
     def wait_until_shown(self, timeout: float = 30.0) -> ViewState:
-        """Wait until everything asked for so far has been done and sent to the page, for so long [s].
+        """Wait at most `timeout` [s] until all intents so far are carried out and sent to the page.
 
         Raises:
-            TimeoutError: it has not, in that time.
+            TimeoutError: they are not, in that time.
         """
         if not self._worker.settled(timeout):
             raise TimeoutError(f"The viewer was still busy after {timeout} s.")

@@ -1,4 +1,4 @@
-"""Choices of a user: compared pose, range of sliders, what a run is fitted to, and presets of the solver."""
+"""Choices of a user: compared pose, range of sliders, target of a run, and presets of the solver."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -31,11 +31,11 @@ class Compare:
     """The compared pose, and the share of the picture that shows it."""
 
     against: Against | None = None
-    """None: nothing, but for a key that is held."""
+    """None: no comparison, except while the key is held."""
     swipe: float = 0.5
     """Share of the picture's width, from its left side, that shows the other pose, 0..1."""
     peek: bool = False
-    """Whether the other pose is shown all over, as long as a key is held."""
+    """Whether the other pose fills the image, while the key is held."""
 
     @property
     def share(self) -> float:
@@ -66,7 +66,7 @@ class Reach(StrEnum):
 
     @property
     def width(self) -> float:
-        """To either side [deg] or [mm]."""
+        """Half width [deg] or [mm]."""
         return {Reach.NEAR: 5.0, Reach.FAR: 20.0, Reach.FULL: math.inf}[self]
 
 
@@ -78,7 +78,7 @@ class JointRange:
     joint: str
     revolute: bool
     lower: float
-    """[rad] or [m]; a joint without limits may turn once round either way."""
+    """[rad] or [m]; one turn to either side without limits."""
     upper: float
 
     @property
@@ -99,7 +99,7 @@ def joint_range(arm: Arm, joint: int) -> JointRange:
     """Range of the joint with this index."""
     lower, upper = (float(value) for value in arm.robot.joint_limits[joint])
     revolute = arm.robot.joint_types[joint] == "revolute"
-    # A joint without limits gets a slider with ends all the same: once round, or a metre, either way.
+    # A slider needs limits: without them, one turn or one metre to either side.
     room = math.pi if revolute else 1.0
     return JointRange(
         arm.name,
@@ -119,13 +119,13 @@ class Observed:
     """Choice of the target of a run.
 
     Raises:
-        SettingsError: a value is none of those that there are.
+        SettingsError: a value is not one of the choices.
     """
 
     what: Observe = "network"
     """As `--observe`."""
     masks: Masks = "recording"
-    """Which masks, where any are fitted; as `--masks`."""
+    """Source of the masks, if masks are fitted; as `--masks`."""
 
     def __post_init__(self) -> None:
         for value, allowed in ((self.what, get_args(Observe)), (self.masks, get_args(Masks))):
@@ -139,7 +139,7 @@ class Target:
 
     observed: Observed = Observed()
     given: GivenMasks | None = None
-    """The masks, where they are not those of the recording."""
+    """The masks, if they are not those of the recording."""
 
     @staticmethod
     def of(observed: Observed, project: ProjectState, recording: Recording) -> "Target":
@@ -170,14 +170,14 @@ class Preset:
     meaning: str
     """When to use it, as text for the user."""
     changes: Callable[[SurfaceSolver], dict[str, Any]]
-    """Changes to the default settings of a solver of surface maps; other solvers have the default alone."""
+    """Changes to the default settings of a solver of surface maps; other solvers have only the default."""
 
 
 PRESETS = {
-    "Default": Preset("As the solver ships.", lambda _: {}),
-    "Quick": Preset("Smaller images: sooner, and less exact.", lambda solver: {"stages": reduced(solver.stages, 0.75)}),
+    "Default": Preset("Default settings.", lambda _: {}),
+    "Quick": Preset("Smaller images: faster, less accurate.", lambda solver: {"stages": reduced(solver.stages, 0.75)}),
     "Far off": Preset("Measured joints that are wrong by more than 3 degrees.", lambda _: {"prior_deg": 6.0}),
     "Well calibrated": Preset("Measured joints that are right to about a degree.", lambda _: {"prior_deg": 1.0}),
-    "Smoke and haze": Preset("All haze is taken off before images are compared.", lambda _: {"dehaze": 1.0}),
+    "Smoke and haze": Preset("All haze is removed before images are compared.", lambda _: {"dehaze": 1.0}),
 }
-"""By their names, the default first."""
+"""Presets by name, the default first."""

@@ -57,7 +57,7 @@ class Background:
             CartsError: the intent cannot be carried out.
         """
         self._context.refresh()
-        # What takes long is queued; the rest is done at once.
+        # Long work is queued; the rest is done at once.
         if self._jobs.takes(intent):
             self._jobs.ask(intent, JobRequester(person, state))
         else:
@@ -65,7 +65,7 @@ class Background:
         self._jobs.settle()
 
     def wait_time(self) -> float | None:
-        """Time until work is due without a request [s]; None for ever."""
+        """Time until work is due without a request [s]; None if no work is due."""
         handlers = (self._propagating, self._exporting, self._jobs)
         return min((wait for handler in handlers if (wait := handler.wait_time()) is not None), default=None)
 
@@ -85,7 +85,7 @@ class Background:
 
     def fail(self, text: str) -> None:
         """Stop the running work after its error."""
-        # What is solved is not lost to an error of something else; its own errors have saved it already.
+        # An error of other work must not lose solved frames; the solver's own errors have saved them.
         with suppress(CartsError):
             self._propagating.finish()
         self._exporting.cancel()
@@ -119,7 +119,7 @@ WATCH_EVERY = 1.0
 
 
 class Controller(Handler):
-    """Holds the state and changes it: at once in `handle`, bit by bit in `advance`."""
+    """Holds the state and changes it: at once in `handle`, step by step in `advance`."""
 
     def __init__(
         self,
@@ -221,14 +221,14 @@ class Controller(Handler):
         self._deliver(intent.client_id, *shown_mask(self._context))
 
     def wait_time(self) -> float | None:
-        """Time until work is due without a request [s]; None for ever."""
+        """Time until work is due without a request [s]; None if no work is due."""
         handlers = (self._optimizing, self._browsing, self._live)
         return min((wait for handler in handlers if (wait := handler.wait_time()) is not None), default=None)
 
     def overdue_in(self) -> float | None:
         """Time until `advance` has to save an unfinished gesture, or check the file [s].
 
-        None: for ever.
+        None: it is not due.
         """
         if not self._editor.project.writable:
             return None
@@ -257,7 +257,7 @@ class Controller(Handler):
             self._context.change(error=self._incident)
 
     def fail(self, error: Exception, *, stop: bool) -> None:
-        """Show an error to the user; `stop` also what is going on, after an error of its own."""
+        """Show an error to the user; with `stop`, also stop the work that caused it."""
         text = str(error) if isinstance(error, CartsError) else f"{type(error).__name__}: {error}"
         self._context.change(error=text, busy=None)
         if stop:
@@ -279,7 +279,7 @@ class Controller(Handler):
         self._context.save()
 
     def say(self, text: str | None) -> None:
-        """Show what is being prepared; None for nothing."""
+        """Show a text on the present preparation; None removes it."""
         self._share()
         self._context.change(busy=text)
 
@@ -297,6 +297,6 @@ class Controller(Handler):
         if self._context.state.time_error is not None:
             # The value is final once the field is left.
             self._context.change(error=self._context.state.time_error, time_error=None)
-        # A run is no gesture, so releasing a control does not end it.
+        # A run is not a gesture, so releasing a control does not end it.
         if not self._optimizing.active:
             self._context.save()

@@ -1,6 +1,6 @@
-"""Edits by several users: drafts, steps of undo, and who owns a step.
+"""Edits by several users: drafts, steps of undo, and ownership of steps.
 
-A single tab goes back and forth in the history as it is. With several tabs, undo reverts the tab's own last step, or
+A single tab moves freely in the history. With several tabs, undo reverts the tab's own last step, or
 one from before the viewer started that belongs to no other user, by a new step that leaves the steps of others in
 place.
 """
@@ -13,7 +13,7 @@ from carts_core.errors import CartsError, ProjectError
 from carts_core.project import Change, Edits, Figures, Project, ProjectState, Step
 
 LONGEST_NAME = 30
-"""Characters of a person's name."""
+"""Longest name of a user [characters]."""
 
 
 @dataclass(eq=False)
@@ -27,9 +27,9 @@ class Person:
     present: bool = True
     """Whether their tab is open."""
     index: int = 0
-    """Index of the frame that they are on."""
+    """Index of the shown frame."""
     undone: list[int] = field(default_factory=list)
-    """Steps by which they took back others, which redo takes back in turn, the newest last."""
+    """Steps that reverted other steps, and that redo reverts in turn; the newest last."""
 
     @property
     def name(self) -> str:
@@ -42,7 +42,7 @@ class People:
 
     Attributes:
         project: the project.
-        persons: in the order in which they came.
+        persons: in order of arrival.
     """
 
     def __init__(self, project: Project) -> None:
@@ -51,7 +51,7 @@ class People:
         self._makers: dict[int, Person] = {}
         """Owner by number of step, since the viewer started."""
         self._reverted: set[int] = set()
-        """Steps that were taken back by a later one, and those later ones."""
+        """Steps reverted by a later step, and these later steps."""
 
     def join(self) -> Person:
         """Add a user."""
@@ -66,7 +66,7 @@ class People:
 
     @property
     def several(self) -> bool:
-        """Whether more than one is at work."""
+        """Whether several users are present."""
         return sum(person.present for person in self.persons) > 1
 
     def apply(
@@ -77,7 +77,7 @@ class People:
         return self._apply(person, name, edits, figures)
 
     def claim(self, person: Person) -> None:
-        """The newest step, which was saved in no other name, is this person's."""
+        """Assign the newest step, saved without an owner, to this user."""
         self._makers[self.project.state.position] = person
 
     def can_undo(self, person: Person) -> bool:
@@ -104,7 +104,7 @@ class People:
             edits, figures = self.project.reverting(own)
         except ProjectError as error:
             self._reverted.add(own)
-            raise CartsError(f"{error} Undo again to go on with your step before it.") from error
+            raise CartsError(f"{error} Undo again to revert your step before it.") from error
         change = self._revert(person, own, "Undo", edits, figures)
         person.undone.append(self.project.state.position)
         return change
@@ -115,13 +115,13 @@ class People:
             number = person.undone[-1]
             person.undone.pop()
             change = self._revert(person, number, "Redo", *self.project.reverting(number))
-            # What was done again can be taken back again.
+            # A redone step can be undone again.
             self._reverted.discard(self.project.state.position)
             return change
         return self.project.go_to(self.project.state.position + 1) if self._next_is_free(person) else None
 
     def go_to(self, person: Person, position: int) -> Change | None:
-        """Go to a place in the history.
+        """Go to a position in the history.
 
         Raises:
             CartsError: that would undo steps of another user at work.
@@ -136,8 +136,8 @@ class People:
         ]
         if others:
             raise CartsError(
-                f"Between here and there are steps of {', '.join(sorted(set(others)))}, who is at work now. Take back "
-                "your own with Undo, or wait until you are alone."
+                f"Steps of other present users are in between: {', '.join(sorted(set(others)))}. Revert your own steps "
+                "with Undo, or wait until the others have left."
             )
         person.undone.clear()
         return project.go_to(position)
@@ -179,7 +179,7 @@ class People:
         if change is not None and change.step is not None:
             number = change.step.number
             if max(self._makers, default=0) >= number:
-                # Steps that were undone are gone now.
+                # The undone steps no longer exist.
                 self._makers = {known: maker for known, maker in self._makers.items() if known < number}
                 self._reverted = {known for known in self._reverted if known < number}
             self._makers[number] = person
@@ -194,9 +194,9 @@ class Editor:
     """The project as one person edits it, and at most one draft: a gesture of theirs that is not finished.
 
     Attributes:
-        project: where finished gestures go.
+        project: receives finished gestures.
         people: users of the project.
-        person: who edits here.
+        person: the user.
     """
 
     def __init__(self, people: People, person: Person) -> None:
@@ -275,7 +275,7 @@ class Editor:
         return self.people.apply(self.person, name, edits, figures)
 
     def claim(self) -> None:
-        """The newest step of the project is this person's."""
+        """Assign the newest step of the project to this user."""
         self.people.claim(self.person)
 
     def overdue_in(self) -> float | None:
@@ -297,7 +297,7 @@ class Editor:
         return None if self._dropped() else self.people.redo(self.person)
 
     def go_to(self, position: int) -> Change | None:
-        """Undo or redo until so many steps are done; drafts as `undo`.
+        """Undo or redo until this number of steps is in effect; drafts as `undo`.
 
         Raises:
             CartsError: steps of another user at work are in between.

@@ -31,12 +31,12 @@ def serve(
     open_browser: bool = False,
     **options: Unpack[ServerOptions],
 ) -> None:
-    """Serve the viewer of a sequence until Ctrl-C, SIGTERM or SIGHUP, then save; prints where it is.
+    """Serve the viewer of a sequence until Ctrl-C, SIGTERM or SIGHUP, then save; prints the address.
 
     Args:
         sequence: The sequence file.
-        project: The project file, begun if it is not there; None for the default place.
-        folders: From where masks may be imported, besides the sequence's own folder.
+        project: The project file, created if missing; None for the default path.
+        folders: Folders for imports of masks, besides the sequence's own folder.
         open_browser: Open the page in the default browser.
         options: See `ServerOptions`.
 
@@ -55,10 +55,10 @@ def serve(
 def serve_site(
     folders: Sequence[Path], *, batch: Path | None = None, open_browser: bool = False, **options: Unpack[ServerOptions]
 ) -> None:
-    """Serve the start page, or a batch, until Ctrl-C, SIGTERM or SIGHUP, then save; prints where it is.
+    """Serve the start page, or a batch, until Ctrl-C, SIGTERM or SIGHUP, then save; prints the address.
 
     Args:
-        folders: What the page may look into, and nothing outside.
+        folders: Folders that the page may read.
         batch: Folder of the batch that is shown first; None for the start page.
         open_browser: Open the page in the default browser.
         options: See `ServerOptions`.
@@ -66,7 +66,7 @@ def serve_site(
     Raises:
         SystemExit: as `serve`.
     """
-    # A viewer of one sequence does without.
+    # Not needed by the viewer of one sequence.
     from carts_viewer.start.site import Site  # noqa: PLC0415
 
     _serve(
@@ -75,7 +75,7 @@ def serve_site(
 
 
 def _serve(opened: "Callable[[], ViewerApp | Site]", ready: Callable[[], str], *, open_browser: bool) -> None:
-    """Open, serve, save and close; `ready` gives what is said when it is open. Errors as `serve`."""
+    """Open, serve, save and close; `ready` returns the message after opening. Errors as `serve`."""
     log_to_stderr()
     with EndRequest() as end:
         try:
@@ -125,15 +125,15 @@ _SIGNALS = [signal.SIGINT, signal.SIGTERM, *([signal.SIGHUP] if hasattr(signal, 
 
 
 class EndRequest:
-    """While entered, these signals end `wait`; until `ready` they do as before, or raise `KeyboardInterrupt`.
+    """Graceful shutdown: these signals end `wait`; until `ready` they act as before, or raise `KeyboardInterrupt`.
 
-    After that they do nothing else, so what is being saved is saved. A signal that is ignored (`nohup`) stays so.
+    After `ready` they do nothing else, so that saving is not interrupted. Ignored signals (`nohup`) stay ignored.
     """
 
     def __init__(self) -> None:
         self._former: dict[int, Any] = {}
         self._ready = False
-        # A handler may run between any two instructions, where it must not wait for a lock; writing a byte it may.
+        # A handler may run between any two instructions and must not wait for a lock; writing a byte is safe.
         self._asked, self._ask = os.pipe()
         os.set_blocking(self._ask, False)
 
@@ -151,7 +151,7 @@ class EndRequest:
         os.close(self._ask)
 
     def ready(self) -> None:
-        """From now on a signal is no exception."""
+        """From now on signals raise no exception."""
         self._ready = True
 
     def wait(self) -> None:
@@ -168,7 +168,7 @@ class EndRequest:
         try:
             os.write(self._ask, b"x")
         except BlockingIOError:
-            return  # It was asked often enough.
+            return  # The pipe is full of earlier requests.
 
 
 _PAGE = '<!DOCTYPE html><meta charset="utf-8"><meta http-equiv="refresh" content="0; url={url}"><title>CaRTS</title>'
@@ -176,10 +176,10 @@ _PAGE = '<!DOCTYPE html><meta charset="utf-8"><meta http-equiv="refresh" content
 
 @contextmanager
 def opened_in_browser(url: str) -> Iterator[None]:
-    """Open a page; until the block ends, the file that leads there is kept.
+    """Open a page in the default browser; a file that redirects to it is kept until the block ends.
 
-    Every user of this computer can read the command line of a browser. So a url with a token is not put there but
-    into a file in a folder that this user alone may look into, and the browser is given that file.
+    Every user of this computer can read the command line of a browser. A url with a token is therefore passed in a
+    file in a private folder.
     """
     if "token=" not in url:
         webbrowser.open(url)

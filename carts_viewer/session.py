@@ -1,4 +1,4 @@
-"""An open recording: its frames, the poses that its project gives them, and the project's file."""
+"""An open recording: its frames, their poses in the project, and the project's file."""
 
 import tempfile
 from collections.abc import Iterable, Mapping
@@ -42,15 +42,15 @@ class Session:
 
     Attributes:
         scene: its arms and cameras.
-        editor: its project, and what is on the way there.
-        ranges: what each joint may be set to, by arm.
-        roots: folders that files may be brought in from: that of the sequence, and others that were allowed.
+        editor: its project with the unsaved draft.
+        ranges: allowed range of each joint, by arm.
+        roots: allowed folders of imports: that of the sequence, and others.
     """
 
     def __init__(
         self, sequence: Sequence, people: People, person: Person | None = None, folders: Iterable[Path] = ()
     ) -> None:
-        """`folders`, besides the sequence's own, are what files may be brought in from."""
+        """`folders` are allowed folders of imports, besides the sequence's own."""
         self._sequence = sequence
         self._own_offset = None if sequence.matching is None else sequence.matching.time_offset
         self.scene: Scene = sequence.scene
@@ -98,7 +98,7 @@ class Session:
             return self._reader.frame(index, domain, camera)
 
     def close(self) -> None:
-        """Stop reading frames in advance, and save what is under way.
+        """Stop reading frames in advance, and save unfinished edits.
 
         Raises:
             ProjectError: it could not be saved.
@@ -115,7 +115,7 @@ class Session:
     def ignored(
         self, index: int, cameras: Iterable[str], target: Target = NETWORK
     ) -> dict[str, Bool[np.ndarray, "height width"]]:
-        """Camera -> pixels of the frame that are left out where it is fitted, for the cameras that have some."""
+        """Camera -> pixels of the frame that a fit leaves out, for cameras with such pixels."""
         cameras = list(cameras)
         regions = {camera: self.editor.view.get(Key.ignore_region(index, camera)) for camera in cameras}
         ignored = {camera: region.region() for camera, region in regions.items() if region is not None}
@@ -142,10 +142,10 @@ class Session:
     ) -> dict[Key[Any], Any]:
         """Edits that give the frame this pose.
 
-        What is as it was saved keeps its provenance, and what is as measured needs no correction.
+        Unchanged values keep their provenance, and measured values need no correction.
 
         Args:
-            frame: which one.
+            frame: the frame.
             state: its pose.
             provenance: of the change.
             joint_std: arm -> standard deviations [rad, m], NaN where not known.
@@ -262,7 +262,7 @@ class Storage:
     reason: str | None
     """Why edits are not kept; None if they are."""
     scratch: tempfile.TemporaryDirectory | None = None
-    """The folder of a project that ends with the viewer."""
+    """The folder of a temporary project."""
     hint: str | None = None
     """Hint at rescued copies of the project."""
 
@@ -278,10 +278,10 @@ class Storage:
         return self.project.incident or self.reason or self.hint
 
     def close(self) -> None:
-        """Let others write.
+        """Close the project for other writers.
 
         Raises:
-            ProjectError: what was saved is nowhere on disk any more.
+            ProjectError: saved edits are no longer on disk.
         """
         try:
             self.project.close()
@@ -293,11 +293,11 @@ class Storage:
 def open_storage(sequence: Sequence, path: Path | None = None) -> Storage:
     """Open, or begin, a sequence's project for the viewer.
 
-    A project that may not be written to opens read-only. Where none can be begun, one is made that nothing keeps.
+    A project that cannot be written opens read-only. If none can be created, a temporary one is used.
 
     Args:
         sequence: the recording.
-        path: of the project; None for the default place.
+        path: of the project; None for the default path.
 
     Raises:
         ProjectError: the file is of another sequence, of a newer version or no project, or `path` cannot be made.
@@ -305,7 +305,7 @@ def open_storage(sequence: Sequence, path: Path | None = None) -> Storage:
     try:
         project = Project.open(sequence, path)
     except DamagedProject:
-        # It says what could be read of it, and where that is.
+        # The error names the file with the rescued content.
         raise
     except ProjectError as error:
         if (path or default_path(Path(sequence.path))).is_file():
@@ -326,6 +326,6 @@ def _rescued_hint(path: Path) -> str | None:
         return None
     newest, others = copies[0], f" (and {len(copies) - 1} earlier)" if len(copies) > 1 else ""
     return (
-        f"What was rescued when {path.name} was lost or damaged is in {newest}{others}. It may hold corrections that "
-        f"are not in {path.name}: open it with --project '{newest}', or remove it when nothing of it is needed."
+        f"A copy of {path.name}, rescued when it was lost or damaged, is {newest}{others}. It may hold corrections "
+        f"that are not in {path.name}: open it with --project '{newest}', or delete it if it is not needed."
     )

@@ -30,7 +30,7 @@ class ListedFrame:
     reason: str
     """Text for the user."""
     taken: bool
-    """Whether what was solved is in the project; otherwise the frame is unchanged."""
+    """Whether the solved pose is in the project; otherwise the frame is unchanged."""
 
 
 @dataclass(frozen=True)
@@ -38,20 +38,20 @@ class SolveState:
     """Progress or result of sequence mode."""
 
     frames: range
-    """From the first to the last one, kept frames included."""
+    """All frames of the solve, including kept ones."""
     done: int = 0
     """Frames that were visited."""
     compared: int = 0
-    """Frames that were compared with how they were, which comes after that."""
+    """Frames that were compared with their previous poses, after all visits."""
     running: bool = True
     text: str = ""
     """Progress, as text for the user."""
     listed: tuple[ListedFrame, ...] = ()
     """Frames whose fit became worse, or is doubtful."""
     base_frame_gain: float | None = None
-    """At the end, what free base frames would explain of what is left [1]; None where it is not known."""
+    """At the end, the share of the residual that free base frames would explain [1]; None if unknown."""
     calibration: Any = None
-    """The project's calibration that this is about."""
+    """Calibration of the project during the solve."""
 
     def suspicion(self, project: ProjectState) -> float | None:
         """`base_frame_gain`, as long as nothing runs and the project's calibration is the same."""
@@ -60,7 +60,7 @@ class SolveState:
 
     @property
     def progress(self) -> tuple[int, int]:
-        """Steps that are done, and all of them: every frame is visited, and then compared."""
+        """Completed and total steps; every frame is visited, then compared."""
         return self.done + self.compared, 2 * len(self.frames)
 
 
@@ -85,7 +85,7 @@ class Pose:
     source: Source
 
     def equals(self, other: "Pose") -> bool:
-        """Whether everything is at the same place, and from the same source."""
+        """Whether all values and the source are equal."""
         pairs = zip(_tensors(self.scene), _tensors(other.scene), strict=True)
         return self.source is other.source and all(torch.equal(own, others) for own, others in pairs)
 
@@ -112,15 +112,15 @@ class Curves:
 
     loss: tuple[float, ...] = ()
     stages: tuple[int, ...] = ()
-    """The stage of each iterate: losses compare within one."""
+    """The stage of each iterate; losses are comparable within a stage."""
     comparable: bool = False
-    """Whether losses compare over all stages, which they do once the run has ended."""
+    """Whether losses are comparable across stages, as after the end of the run."""
     scores: tuple[Scores, ...] = ()
     seconds: tuple[float, ...] = ()
     """Duration of each iteration [s]."""
     best: int = 0
-    """Index of the iterate that is kept so far. Losses of different observations of the image do not compare, so it
-    need not be the one of the lowest loss."""
+    """Index of the iterate that is kept so far. Losses of different observations of the image are not comparable,
+    so it need not be the one of the lowest loss."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,7 +131,7 @@ class Maps:
     cameras: tuple[str, ...]
     """The cameras that the iterate's maps belong to, in their order."""
     of_run: bool = True
-    """Whether a run has led there; otherwise the pose was only compared."""
+    """Whether a run produced the pose; otherwise it was only compared."""
 
 
 @dataclass(frozen=True)
@@ -165,7 +165,7 @@ class ExportState:
 
 @dataclass(frozen=True)
 class LiveState:
-    """A live stream that is shown in the place of the recording, or how the last one went."""
+    """A live stream, shown in place of the recording, or the result of the last one."""
 
     source: str
     """Text for the user."""
@@ -173,7 +173,7 @@ class LiveState:
     """Progress, as text for the user."""
     on: bool = True
     busy: bool = False
-    """Whether no frame has come yet."""
+    """Whether no frame has arrived yet."""
     verdict: str = "lost"
     """Verdict on the shown frame: good, doubtful or lost."""
     age: float = 0.0
@@ -182,7 +182,7 @@ class LiveState:
 
 @dataclass(frozen=True)
 class KeypointState:
-    """Keypoints, and where a person has found some of them in the shown frame."""
+    """Keypoints, and their clicked positions in the shown frame."""
 
     shown: bool = False
     """Whether they are marked in the picture."""
@@ -216,7 +216,7 @@ class ViewState:
     settings_error: str | None = None
     """Why the last change of a setting was not accepted."""
     settings_field: str | None = None
-    """Which setting that was."""
+    """Name of that setting."""
     time_error: str | None = None
     """Why the time offset that is being typed cannot be used."""
     observed: Observed = field(default_factory=Observed)
@@ -249,11 +249,11 @@ class ViewState:
     scores: Scores | None = None
     """Scores of the shown pose; None until computed, after its picture was sent."""
     networks: tuple[str, ...] = ()
-    """Networks that can be chosen: that of the beginning, and those that were adapted to the recording."""
+    """Networks to choose from: the initial one, and those adapted to the recording."""
     network: str = ""
-    """The one that runs."""
+    """The network in use."""
     asked_network: str = ""
-    """The one that was chosen, and is not used before its weights are accepted; empty if there is none."""
+    """The chosen network, if it is not used before its weights are accepted; otherwise empty."""
     problems: tuple[str, ...] = ()
     """Messages about damaged files beside the project."""
     unfamiliar: tuple[str, ...] = ()
@@ -274,19 +274,19 @@ class ViewState:
     live: LiveState | None = None
     error: str | None = None
     notice: str | None = None
-    """A message that is no error."""
+    """A message that is not an error."""
     imported: str = ""
     """Summary of the last import of masks, as text for the user."""
 
     @property
     def part(self) -> Frames:
-        """The frames that are worked on: those of the range, or the whole sequence."""
+        """Frames of the range, or of the whole sequence."""
         first, last = self.range or (0, len(self.project.identity.frame_ids) - 1)
         return range(first, last + 1)
 
     @property
     def run_outdated(self) -> bool:
-        """Whether the pose, or what the run saw, was changed since the last run."""
+        """Whether the pose, or an input of the run, was changed since the last run."""
         return bool(self.run.curves.loss) and (self.maps is None or not self.maps.of_run)
 
     @property

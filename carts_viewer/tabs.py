@@ -1,4 +1,4 @@
-"""Tabs: the queue of intents, the state and view of each tab, and what all tabs share."""
+"""Tabs: the queue of intents, the state and view of each tab, and the state that all tabs share."""
 
 import threading
 import time
@@ -58,10 +58,10 @@ class IntentQueue(Generic[T]):
             self._changed.notify()
 
     def take(self, timeout: float | None = None) -> list[Asked[T]]:
-        """Everything that waits, emptying the queue.
+        """Take all waiting intents.
 
         Args:
-            timeout: How long to wait for a first intent [s]; None waits for ever, 0 not at all.
+            timeout: How long to wait for a first intent [s]; None waits without limit, 0 not at all.
         """
         with self._changed:
             self._changed.wait_for(lambda: self._waiting or self._woken, timeout)
@@ -88,7 +88,7 @@ class IntentQueue(Generic[T]):
 
 
 AWAY = 20.0
-"""Time for a page to come back, as by reloading, before the run of its tab is ended [s]."""
+"""Time for a page to reconnect, as after a reload, before the run of its tab is ended [s]."""
 
 
 class View:
@@ -97,8 +97,8 @@ class View:
     Attributes:
         page: the tab's widgets and scene.
         layout: its panels.
-        scene: what is seen in 3D, frame and overlay included.
-        display: what puts states on the page.
+        scene: the 3D scene, frame and overlay included.
+        display: shows states on the page.
     """
 
     def __init__(
@@ -122,11 +122,11 @@ class Tab:
     """State of one browser tab: frame, camera, tools and run, and the page that shows it.
 
     Attributes:
-        key: what the tab calls itself; None until one has taken this place.
-        person: who works here.
-        session: the recording and its project, as they are used here.
+        key: identifier sent by the browser tab; None before one is attached.
+        person: the user.
+        session: the recording and its project, with the state of this tab.
         controller: holds the state and changes it.
-        view: what shows it; None while no page does.
+        view: widgets and scene of its page; None without a page.
     """
 
     def __init__(self, queue: IntentQueue["Tab"], session: Session, person: Person, controller: Controller) -> None:
@@ -139,9 +139,9 @@ class Tab:
         self._shown: ViewState | None = None
         self._pictured: ViewState | None = None
         self._left_at: float | None = None
-        """When the page left [s, monotonic]; None while there is one, and once its run is ended."""
+        """Time at which the page was closed [s, monotonic]; None while it is open, and once its run is ended."""
         self._gone = False
-        """Whether the page has left for good, so that nobody sees scores."""
+        """Whether the page was closed for good, so that scores are not needed."""
 
     def put(self, intent: Intent) -> None:
         """Queue an intent for the worker. Thread-safe."""
@@ -153,11 +153,11 @@ class Tab:
 
     @property
     def client_id(self) -> int | None:
-        """The connection of the page; None while there is none."""
+        """Client id of the page; None without a page."""
         return None if self.view is None else self.view.page.client.client_id
 
     def attach(self, client: viser.ClientHandle, renderer: OverlayRenderer, storage: Storage, *, light: bool) -> None:
-        """Show this place in a page, and no longer in an earlier one."""
+        """Show this tab in a page, and no longer in an earlier one."""
         choose_theme(client.gui, light=light)
         self.person.present = True
         self.view = View(client, self.session, renderer, storage, self.controller.state, self.put, self.waits)
@@ -205,7 +205,7 @@ class Tab:
                 attempt(lambda: display.show_picture(controller.state))
             # Scores come after the picture, which matters more during a drag.
             attempt(controller.score)
-            # Also after an error, which would otherwise be met again at once, and for ever.
+            # Also after an error, which would otherwise recur endlessly.
             self._pictured = controller.state
         self.show_panels()
 
@@ -217,7 +217,7 @@ class Tab:
                 self.view.display.show_panels(self._shown)
 
     def close(self) -> None:
-        """Save what is under way, and stop reading frames in advance.
+        """Save unfinished edits, and stop reading frames in advance.
 
         Raises:
             CartsError: it could not be saved.
@@ -233,7 +233,7 @@ _KEPT = 8
 
 
 class Tabs:
-    """All tabs, and what they share. Used on the worker's thread, but for `of_client` and `first`.
+    """All tabs, and their shared state. Used on the worker's thread, except for `of_client` and `first`.
 
     Attributes:
         background: long-running work.
@@ -265,14 +265,14 @@ class Tabs:
         return iter(self._tabs)
 
     def of_client(self, client_id: int) -> Tab | None:
-        """The place that this connection shows; any thread may ask."""
+        """The tab of a connection. Thread-safe."""
         return next((tab for tab in self._tabs if tab.client_id == client_id), None)
 
     def attach(self, client: viser.ClientHandle, hello: Hello) -> None:
         """Assign a tab to a page: its earlier one, an unused one, or a new one.
 
         Raises:
-            CartsError: a place could not be given up.
+            CartsError: a discarded tab could not be saved.
         """
         known = next((tab for tab in self._tabs if tab.key == hello.tab), None)
         tab = known or next((tab for tab in self._tabs if tab.key is None), None) or self._add()
@@ -291,7 +291,7 @@ class Tabs:
         if tab is not None:
             tab.detach()
             tab.controller.handle(intents.Play(False))
-            # The places of those who left last are kept longest.
+            # The most recently closed tabs are kept longest.
             self._tabs = (*(other for other in self._tabs if other is not tab), tab)
 
     def forget_images(self) -> None:

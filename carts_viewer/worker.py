@@ -23,9 +23,9 @@ _BEGINNING = (intents.Optimizing, intents.Propagating, intents.Exporting, intent
 
 
 class Worker:
-    """Drains the queue, newest wins; pictures go out as fast as each page draws them and the last one always does.
+    """Drains the queue; pictures are sent as fast as each page draws them, and the last one always.
 
-    Tabs take turns: whatever goes on in one of them holds up the others for a single step of it.
+    Tabs take turns: work of one tab delays the others by a single step.
     """
 
     def __init__(self, queue: IntentQueue[Tab], tabs: Tabs) -> None:
@@ -54,7 +54,7 @@ class Worker:
         self._thread.join(timeout=30.0)
 
     def call(self, work: Callable[[], None]) -> None:
-        """Do something on the worker's thread, before the intents that wait. Any thread may ask."""
+        """Call a function on the worker's thread, before waiting intents. Thread-safe."""
         self._calls.put(work)
         self._queue.wake()
 
@@ -68,7 +68,7 @@ class Worker:
         return True
 
     def report(self, text: str | None) -> None:
-        """Show at once in all tabs what is being prepared; called on the worker's thread."""
+        """Show at once in all tabs a text on the present preparation; called on the worker's thread."""
         for tab in self._tabs:
             tab.controller.say(text)
             tab.show_panels()
@@ -112,9 +112,9 @@ class Worker:
         self._publish()
 
     def _memory_wait(self, at_rest: bool) -> float | None:
-        """Return memory after some rest, and now and then during work, more rarely beside an open page.
+        """Return freed memory when idle, and regularly during work, less often while a page is open.
 
-        Gives how long to wait for it [s], None where it was done.
+        Returns the time until then [s]; None once it is done.
         """
         now, alone = time.monotonic(), not any(tab.view for tab in self._tabs)
         if not (at_rest or alone) and now - self._returned_at > MEMORY_KEPT_AT_WORK:
@@ -128,7 +128,7 @@ class Worker:
         self._worked_at = None if at_rest else now
         if alone and at_rest:
             self._attempt(self._tabs.forget_images)
-            # Widgets of a page that is gone refer to one another. Beside a page, this would hold up what moves there.
+            # Widgets of a closed page are reference cycles. While a page is open, collecting them would delay it.
             gc.collect()
         self._return_memory()
         return None
@@ -175,7 +175,7 @@ class Worker:
     def _fail(self, error: Exception, *tabs: Tab, stop: bool = False) -> str:
         if not isinstance(error, CartsError):
             # The terminal gets the traceback; the page shows the error.
-            _log.error("The viewer's worker met an unexpected error at %s", time.strftime("%H:%M:%S"), exc_info=error)
+            _log.error("Unexpected error of the viewer's worker at %s", time.strftime("%H:%M:%S"), exc_info=error)
         for tab in tabs:
             tab.controller.fail(error, stop=stop)
         return str(error) if isinstance(error, CartsError) else f"{type(error).__name__}: {error}"

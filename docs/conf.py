@@ -1,4 +1,4 @@
-"""How Sphinx builds this site: `make docs`. What is generated from the code is in `_ext/`."""
+"""Sphinx configuration of this site (`make docs`). Pages generated from the code are in `_ext/`."""
 
 import sys
 import tomllib
@@ -27,7 +27,7 @@ exclude_patterns = ["_build", "_ext", "requirements*"]
 
 myst_enable_extensions = ["colon_fence", "deflist", "dollarmath", "fieldlist"]
 myst_heading_anchors = 3
-# Pages of the guide link to sources and to the README, which are no pages of the site.
+# Pages of the guide link to sources and to the README, which are not pages of the site.
 myst_url_schemes = ["http", "https", "mailto"]
 
 # Docstrings are written with `code` in single backticks.

@@ -1,4 +1,4 @@
-"""Take the pictures of the examples: each example draws its own, and this script says where it goes.
+"""Write the pictures of the examples; each example draws its own.
 
 make pictures
 """
@@ -13,7 +13,7 @@ IMAGES = ROOT / "docs" / "images" / "examples"
 
 
 def main(names: list[str]) -> None:
-    """Run the examples whose file names begin like this, or all, and write docs/images/examples/NAME.jpg."""
+    """Run the examples whose file names begin with one of `names`, or all, and write docs/images/examples/NAME.jpg."""
     IMAGES.mkdir(parents=True, exist_ok=True)
     for path in sorted((ROOT / "examples").glob("[0-9]*.py")):
         if names and not path.name.startswith(tuple(names)):

@@ -1,9 +1,9 @@
-"""Take the pictures of the README and the tutorial: the shipped sample, as somebody works through the tutorial.
+"""Take the screenshots of the README and the tutorial, on the shipped sample, in the order of the tutorial.
 
     make pictures
 
-Needs the development tools and Chromium (`CARTS_CHROMIUM` or on the path). Nothing is drawn by hand: if the page
-changes, take them again.
+Needs the development tools and Chromium (`CARTS_CHROMIUM` or on the path). Run it again
+when the page changes.
 """
 
 import os
@@ -29,18 +29,18 @@ IMAGES = Path(__file__).parent / "images"
 WINDOW: ViewportSize = {"width": 1280, "height": 800}
 QUALITY = 82
 PATIENCE = 600.0
-"""How long anything may take [s]."""
+"""Timeout of each step [s]."""
 FLAGS = ["--no-sandbox", "--disable-quic", "--no-first-run", "--disable-background-networking", "--disable-sync"]
 
 
 class Photographer:
-    """Works with a viewer and takes pictures of its page."""
+    """Drives a viewer and takes screenshots of its page."""
 
     def __init__(self, app: ViewerApp, page: Page) -> None:
         self.app, self.page = app, page
         page.goto(app.url)
         page.wait_for_function("window.__viserMutable?.nodeRefFromName['/overlay'] && window.carts", timeout=60_000)
-        # The warning that this browser has no graphics card.
+        # Close the warning that this browser has no graphics card.
         page.locator(".mantine-Notification-closeButton").click(timeout=30_000)
 
     def do(self, *intents: intents.Intent) -> None:
@@ -63,7 +63,7 @@ class Photographer:
         self.page.get_by_text(name, exact=True).first.click()
 
     def choose(self, label: str, option: str) -> None:
-        """Choose from a list."""
+        """Choose an option of a list."""
         self.page.locator(f"[id='{self.app.page.element_id(self.app.view.page.find(label))}']").click()
         self.page.get_by_role("option", name=option, exact=True).click()
         self.page.wait_for_timeout(500)
@@ -76,7 +76,7 @@ class Photographer:
         self.page.screenshot(path=IMAGES / f"{name}.jpg", type="jpeg", quality=QUALITY)
 
     def click_keypoints(self, *names: str) -> None:
-        """Say of these keypoints where they truly are, which the sample knows."""
+        """Place these keypoints at their true positions, which the sample includes."""
         scene, state = self.app.scene, self.app.state
         points = labelled_keypoints(scene)
         truth = scene.state(state.frame.truth or {})
@@ -86,7 +86,7 @@ class Photographer:
         self.do(intents.ChooseKeypoint(None))
 
     def paint(self, target: Target, *points: tuple[float, float], polygon: bool = False) -> None:
-        """A stroke or polygon through these places of the image [px]."""
+        """Paint a stroke or polygon through these points of the image [px]."""
         state = self.app.state
         stroke = Stroke(0, state.index, state.camera, target, False, polygon, 24, np.array(points))
         self.do(intents.Paint(-1, stroke))

@@ -1,4 +1,4 @@
-"""Correct one frame: move its joints off on purpose, let the optimizer bring them back, and draw before and after.
+"""Correct one frame: perturb its joints, optimize them, and draw the arms before and after.
 
 python examples/01_optimize_a_frame.py [--sequence sequence.toml] [--picture overlay.png]
 """
@@ -27,7 +27,7 @@ def main(sequence: Path | None = None, picture: Path = Path("overlay.png")) -> N
     start = perturb(recording.scene, frame.measured, degrees=2.0, seed=1)
 
     extractor = FeatureExtractor.load()
-    # The scene without arms, so that what looks like one is not taken for one; {} goes without.
+    # Images of the scene without arms, to discount false detections; {} omits them.
     backgrounds = Backgrounds.of(recording, [camera], frame.domain)
     optimizer = FrameOptimizer(recording.scene, frame, backgrounds, extractor, start=start, cameras=[camera])
     for iterate in optimizer:

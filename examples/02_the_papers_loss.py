@@ -24,7 +24,7 @@ from carts_core.resources import sample_sequence
 
 
 def main(iterations: int = 20, picture: Path = Path("paper.png")) -> None:
-    """Optimize the first shipped frame with both."""
+    """Optimize the first shipped frame with both solvers."""
     sequence = Sequence.open(sample_sequence())
     frame = sequence.frame(0)
     camera = sequence.scene.cameras[0].name
@@ -46,7 +46,7 @@ def main(iterations: int = 20, picture: Path = Path("paper.png")) -> None:
         print(f"{name:8} {len(iterates)} iterates in {seconds:.1f} s, {1000 * seconds / len(iterates):.0f} ms each")
         pictures.append(outlined(frame.images[camera], mask))
     cv2.imwrite(str(picture), np.hstack(pictures)[..., ::-1])
-    print(f"wrote {picture}: the outline that each found, the paper's on the left")
+    print(f"wrote {picture}: the outlines of both results, the paper's on the left")
 
 
 if __name__ == "__main__":

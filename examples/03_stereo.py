@@ -1,4 +1,4 @@
-"""Two cameras in one optimization: what one image leaves open, above all depth, the second one narrows down.
+"""Optimize with two cameras: a second view reduces the uncertainty of one image, above all in depth.
 
 python examples/03_stereo.py [--sequence stereo/sequence.toml] [--picture stereo.png]
 
@@ -37,7 +37,7 @@ def synthesized(folder: Path) -> Path:
 
 
 def main(sequence: Path | None = None, picture: Path = Path("stereo.png")) -> None:
-    """Optimize the first frame with one camera, and with all."""
+    """Optimize the first frame with one camera, then with all."""
     with tempfile.TemporaryDirectory() as folder:
         recording = Sequence.open(sequence or synthesized(Path(folder) / "stereo"))
         frame = recording.frame(0)

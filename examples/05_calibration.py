@@ -1,8 +1,8 @@
-"""Find a wrong base frame: move one arm's base by a centimetre, and let several frames at once bring it back.
+"""Calibrate a wrong base frame: move one arm's base by a centimetre, and estimate it from several frames.
 
 python examples/05_calibration.py [--frames 4] [--picture calibration.png]
 
-Joints are held as they are: a turned base frame and a constant error of the first joint look the same.
+Joints are held: a rotated base frame and a constant error of the first joint are indistinguishable.
 """
 
 from dataclasses import replace
@@ -23,7 +23,7 @@ from carts_core.resources import sample_sequence
 
 
 def moved(scene: Scene, arm: str, metres: tuple[float, float, float]) -> Scene:
-    """The scene with the base frame of one arm somewhere else in the world."""
+    """The scene with the base frame of one arm translated."""
     T = scene.arm(arm).T_world_base.copy()
     T[:3, 3] += metres
     arms = tuple(replace(each, T_world_base=T) if each.name == arm else each for each in scene.arms)
@@ -31,7 +31,7 @@ def moved(scene: Scene, arm: str, metres: tuple[float, float, float]) -> Scene:
 
 
 def tip(scene: Scene, frame: Frame) -> np.ndarray:
-    """Where the point between the jaws of the first arm is, in the first camera [m]."""
+    """Position of the point between the jaws of the first arm in the first camera [m]."""
     state = scene.state(frame.measured)
     T_base_tip = scene.arms[0].robot.link_transform(state.joint_positions[0], "tool_tip_link")
     return (state.T_camera_world[0] @ state.T_world_base[0] @ T_base_tip)[:3, 3].numpy()

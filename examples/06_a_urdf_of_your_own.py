@@ -1,4 +1,4 @@
-"""Any URDF with meshes is an arm: write one, render it, and fit its joints to an image with plain PyTorch.
+"""Use any URDF with meshes as an arm: write one, render it, and fit its joints to an image with plain PyTorch.
 
 python examples/06_a_urdf_of_your_own.py [--steps 80] [--picture own_arm.png]
 
@@ -21,7 +21,7 @@ from carts_core.model.robot import Robot
 from carts_core.model.scene import Arm, Scene
 from carts_core.rendering import Renderer
 
-LENGTHS = {"upper": 0.05, "lower": 0.04, "hand": 0.02}  # of the rods, each along its own z [m]
+LENGTHS = {"upper": 0.05, "lower": 0.04, "hand": 0.02}  # lengths of the rods, each along its own z [m]
 
 
 def write_urdf(folder: Path) -> Path:
@@ -43,7 +43,7 @@ def write_urdf(folder: Path) -> Path:
 
 
 def blurred(silhouette: torch.Tensor) -> torch.Tensor:
-    """A silhouette [height, width] under a wide blur, so that it says from afar where it lies."""
+    """A silhouette [height, width] under a wide blur, for gradients over larger distances."""
     return gaussian_blur2d(silhouette[None, None], (25, 25), (6.0, 6.0))
 
 
@@ -51,7 +51,7 @@ def main(steps: int = 80, picture: Path = Path("own_arm.png")) -> None:
     """Fit the arm to an image of itself."""
     with tempfile.TemporaryDirectory() as folder:
         robot = Robot.load(write_urdf(Path(folder)))
-    # The camera looks along the world's y, from 20 cm away, so the arm moves in the image's plane.
+    # The camera looks along the world's y from 20 cm away, so the arm moves parallel to the image plane.
     T_camera_world = np.array([[1, 0, 0, 0], [0, 0, -1, 0.05], [0, 1, 0, 0.2], [0, 0, 0, 1]], float)
     camera = Camera("camera", 320, 240, (400.0, 400.0, 160.0, 120.0), T_camera_world)
     scene = Scene((Arm("rods", robot, np.eye(4)),), (camera,))

@@ -1,4 +1,4 @@
-"""Something lies over an instrument: mark it, and the optimizer leaves these pixels out.
+"""Mask an occluder in front of an instrument, so that the optimizer ignores its pixels.
 
 python examples/07_ignore_masks.py [--picture ignore.png]
 """
@@ -21,7 +21,7 @@ from carts_core.resources import sample_sequence
 
 
 def covered(image: np.ndarray, mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The image with a sheet of gauze over the jaws of the left instrument, and where the gauze is."""
+    """The image with a sheet of gauze over the jaws of the left instrument, and the mask of the gauze."""
     count, labels, _, centres = cv2.connectedComponentsWithStats(mask.astype(np.uint8))
     left = min(range(1, count), key=lambda number: centres[number][0])
     rows, columns = np.nonzero(labels == left)
@@ -32,7 +32,7 @@ def covered(image: np.ndarray, mask: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
 
 def main(picture: Path = Path("ignore.png")) -> None:
-    """Optimize the first shipped frame, covered, without and with the mask."""
+    """Optimize the first shipped frame with an occluder, without and with its mask."""
     sequence = Sequence.open(sample_sequence())
     scene, frame = sequence.scene, sequence.frame(0)
     camera = scene.cameras[0].name
@@ -47,7 +47,7 @@ def main(picture: Path = Path("ignore.png")) -> None:
         assert optimizer.best is not None
         _, mask = image_and_mask(renderer, optimizer.best.state)
         visible = dice(mask & ~gauze, truth & ~gauze)
-        print(f"gauze {name}: Dice {dice(mask, truth):.4f}, {visible:.4f} of what can be seen")
+        print(f"gauze {name}: Dice {dice(mask, truth):.4f}, {visible:.4f} in the visible part")
         views.append(outlined(frame.images[camera], mask))
     views[1] = outlined(views[1], gauze)
     cv2.imwrite(str(picture), np.hstack(views)[..., ::-1])

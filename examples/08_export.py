@@ -29,7 +29,7 @@ def corrected(sequence: Sequence, index: int, extractor: FeatureExtractor) -> Ex
 
 
 def main(frames: int = 2, output: Path = Path("exported"), picture: Path = Path("export.png")) -> None:
-    """Export the first frames of the shipped sequence, and draw what COCO's own reader makes of it."""
+    """Export the first frames of the shipped sequence, and draw the annotations as COCO's own reader returns them."""
     sequence, extractor = Sequence.open(sample_sequence()), FeatureExtractor.load()
     rows = tuple(corrected(sequence, index, extractor) for index in range(frames))
     dataset = Dataset(sequence, rows, sequence.scene, sequence.domains[0])

@@ -1,4 +1,4 @@
-"""Many recordings in one go: correct some frames of each sequence and condition, and write one table of scores.
+"""Process many recordings: correct some frames of each sequence and condition, and write one table of scores.
 
 python examples/09_batch.py [SEQUENCE.toml ...] [--frames 1] [--domains regular smoke] [--table scores.csv]
 """
@@ -27,7 +27,7 @@ def main(
     table: Path = Path("scores.csv"),
     picture: Path = Path("batch.png"),
 ) -> None:
-    """Evaluate every sequence; one that cannot be read is named and left out."""
+    """Evaluate every sequence; unreadable ones are reported and left out."""
     extractor = FeatureExtractor.load()
     scores: list[tuple[str, FrameScore]] = []
     for path in sequences or (sample_sequence(),):
@@ -56,7 +56,7 @@ def main(
     figure = Figure((6.4, 1.4 + 0.4 * len(scores)), layout="constrained")
     axes = figure.subplots()
     for row, (_, score) in enumerate(scores):
-        # There is none where a sequence has no masks.
+        # Sequences without masks have no Dice.
         before, after = score.dice_before or math.nan, score.dice_after or math.nan
         axes.plot([before, after], [row, row], color="lightgray", zorder=0)
         axes.scatter(before, row, color="tab:orange", label="" if row else "2 degrees off")

@@ -1,9 +1,9 @@
-"""Make a small recording with known truth, path-traced, under several conditions, and look at it.
+"""Synthesize a small path-traced recording with ground truth under several conditions, and draw it.
 
 python examples/10_synthesizing.py [OUTPUT] [--frames 1] [--seed 12] [--picture synthesized.png]
 
-Needs `pip install 'carts[synthesis]'`. The sizes here are small, so that it takes seconds; the defaults of
-`carts synthesize` are what the shipped sequence was made with.
+Needs `pip install 'carts[synthesis]'`. The sizes here are small, so that it takes seconds; the shipped
+sequence was made with the defaults of `carts synthesize`.
 """
 
 import tempfile
@@ -48,7 +48,7 @@ def main(
     print(f"{len(sequence)} frames in the domains {', '.join(sequence.domains)}")
     rows = [np.hstack(views[:2]), np.hstack(views[2:])]
     cv2.imwrite(str(picture), np.vstack(rows)[..., ::-1])
-    print(f"wrote {picture}: the outline is where the measured joints say that the arms are")
+    print(f"wrote {picture}: outlines of the arms at the measured joint positions")
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Masks that you have, with holes, in the place of the network: which joint positions fit them?
+"""Fit joint positions to given, incomplete masks instead of the network's predictions.
 
 python examples/11_masks_as_the_target.py [--picture masks.png]
 """
@@ -20,7 +20,7 @@ from carts_core.resources import sample_sequence
 
 
 def main(picture: Path = Path("masks.png")) -> None:
-    """Fit the first shipped frame to its mask, of which a fifth of all blocks is missing."""
+    """Fit the first shipped frame to its mask with a fifth of its blocks removed."""
     sequence = Sequence.open(sample_sequence())
     scene, frame = sequence.scene, sequence.frame(0)
     camera = scene.cameras[0].name

@@ -1,15 +1,15 @@
-// Runs before viser's client: takes the configuration of the page, and calls of the server in place of its scripts.
+// Runs before viser's client: reads the page's configuration, and replaces viser's scripts by calls of named functions.
 (() => {
   "use strict";
 
   window.cartsConfiguration = JSON.parse(document.currentScript.dataset.configuration);
 
-  // The token is not needed any more, and would be copied with the address.
+  // The token is no longer needed, and would be copied with the address.
   const address = new URL(location.href);
   address.searchParams.delete("token");
   history.replaceState(null, "", address);
 
-  /** An element with attributes and children; a text is a text, never HTML. */
+  /** An element with attributes and children; strings are inserted as text, never as HTML. */
   window.cartsElement = (tag, attributes = {}, ...children) => {
     const made = document.createElement(tag);
     for (const [name, value] of Object.entries(attributes)) made.setAttribute(name, value);

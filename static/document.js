@@ -1,4 +1,4 @@
-// A document over the page: HTML from the server, and the choices made in it. Also reports clicks in the picture.
+// A document over the page: HTML from the server, and the choices made in it. Also reports clicks in the image.
 (() => {
   "use strict";
 
@@ -19,7 +19,7 @@
         if (!field) return;
         say(field.dataset.do, field.type === "checkbox" ? (field.checked ? "1" : "0") : field.value);
       });
-      // What is typed here is no shortcut of the page behind.
+      // Keys typed here are not shortcuts of the page behind.
       for (const kind of ["keydown", "keyup", "pointerdown", "wheel", "dblclick"]) {
         box.addEventListener(kind, (event) => event.stopPropagation());
       }
@@ -40,7 +40,7 @@
     return button;
   }
 
-  // What documents are made of; anything else in their HTML is left out.
+  // Allowed elements of documents; others are removed.
   const TAGS = new Set(("b br button code details div figcaption figure h1 h2 h3 img input label li ol option p polyline progress " +
     "section select small span summary svg table tbody td th thead tr").split(" "));
   const ATTRIBUTES = /^(alt|checked|class|colspan|disabled|fill|max|open|placeholder|points|preserveAspectRatio|role|selected|spellcheck|src|stroke|stroke-width|style|title|type|value|viewBox|data-[a-z]+|aria-[a-z]+)$/;
@@ -65,7 +65,7 @@
     if (waiting) showDocument(...waiting);
   }
 
-  /** Put new content in place of the old one; focus, text being typed and scrolling stay where they are. */
+  /** Replace the content; focus, text being typed and scroll positions are kept. */
   function showDocument(content, place) {
     const target = element();
     waiting = held ? [content, place] : null;
@@ -97,7 +97,7 @@
     document.documentElement.classList.toggle("carts-covered", Boolean(content) && place === "page");
   }
 
-  // A click in the picture is a press that did not move.
+  // A click in the image is a press without motion.
   let pressed = null;
   const canvas = () => window.__viserMutable?.canvas;
   window.addEventListener("pointerdown", (event) => {

@@ -1,5 +1,5 @@
-// Ctrl (or Cmd) and the pointer drag a link of an arm: every message says where the link was taken and where the pointer
-// is now, so that one that is overtaken is no loss. Needs page.js.
+// Dragging a link of an arm with Ctrl (or Cmd). Every message holds the start and the present position of the pointer, so
+// that lost messages do not matter. Needs page.js.
 (() => {
   "use strict";
 
@@ -14,7 +14,7 @@
     window.carts.report("Dragged", { gesture, camera, start, end });
   }
 
-  setInterval(send, 2000); // a pointer that rests with its button down is still dragging
+  setInterval(send, 2000); // keep the gesture alive while the pointer rests with its button down
 
   function cursor(name) {
     const canvas = window.__viserMutable?.canvas;

@@ -1,11 +1,11 @@
-// The timeline's thumbnails and its curve. Only what is in view is asked for: pictures from the server one after the
-// other, the curve as lowest and highest value of every column. timeline.js says where to draw. Needs page.js.
+// The timeline's thumbnails and curve. Only the visible part is requested: thumbnails one after the other, the curve as
+// minimum and maximum of every column. timeline.js sets their positions. Needs page.js.
 (() => {
   "use strict";
 
   const KEPT = 800; // pictures
   const AT_ONCE = 2;
-  const WAIT = 90; // before a curve is requested anew during a zoom [ms]
+  const WAIT = 90; // delay before a curve is requested again during a zoom [ms]
   const COLOURS = ["#8b98a5", "#2dd4a7"]; // of a curve: as measured, and corrected
 
   // ---- Thumbnails -----------------------------------------------------------------------------------------------------
@@ -33,7 +33,7 @@
     }
   }
 
-  /** Pictures of some frames in view, so many frames apart that they do not overlap. */
+  /** Draw thumbnails of visible frames, spaced so that they do not overlap. */
   function drawThumbnails(context, { view, frames, xOf, top, height, light }, { camera, domain, aspect }) {
     const wide = Math.max(height * aspect, 8);
     const one = xOf(1) - xOf(0);
@@ -50,7 +50,7 @@
         if (picture === undefined && !loading.has(address)) missing.push(address);
       }
     }
-    // What was asked for and has gone out of view is not wanted any more.
+    // Drop requests for frames that are no longer visible.
     waiting = missing;
     load();
   }
@@ -62,7 +62,7 @@
   let asked = "";
   let timer = null;
 
-  /** Ask for the curve in view, unless that was done; the old one is drawn meanwhile. */
+  /** Request the visible part of the curve, unless requested already; the old one is drawn meanwhile. */
   function ask(view, columns) {
     const [first, last] = [Math.floor(view[0]), Math.ceil(view[1])];
     const key = `${chosen} ${first} ${last} ${columns}`;
@@ -86,7 +86,7 @@
     const ends = curve?.name === chosen ? limits() : null;
     if (!ends) {
       context.fillStyle = ink;
-      if (curve?.name === chosen) context.fillText(`${chosen}: nothing known of these frames`, 4, top + height / 2 + 3);
+      if (curve?.name === chosen) context.fillText(`${chosen}: no values in these frames`, 4, top + height / 2 + 3);
       return;
     }
     const yOf = (value) => top + height - ((value - ends[0]) / (ends[1] - ends[0])) * height;
@@ -111,7 +111,7 @@
     context.fillText(String(Number(ends[0].toPrecision(4))), 4, top + height - 2);
   }
 
-  /** The curve's value at a frame, in words; empty where it is not known. */
+  /** The curve's value at a frame as text; empty if unknown. */
   function valueAt(frame) {
     if (!curve || curve.name !== chosen) return "";
     const column = curve.edges.findIndex((edge, place) => edge <= frame && frame < curve.edges[place + 1]);
@@ -127,7 +127,7 @@
       onChange: (callback) => { drawAgain = callback; },
       chosen: () => chosen,
       choose(name) { chosen = name; localStorage.setItem("carts-curve", name); asked = ""; drawAgain(); },
-      /** Other values are known now. */
+      /** Invalidate the curve after a change of its values. */
       forget() { asked = ""; },
       loaded: () => [...pictures.keys()],
       curve: () => curve,

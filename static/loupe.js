@@ -1,13 +1,13 @@
-// The loupe: pixels around the pointer, large, with coordinates and colour. It reads the picture that the page has, so
-// nothing is asked of the server. Needs page.js.
+// The loupe: magnified pixels around the pointer with coordinates and colour. It reads the page's textures and sends no
+// requests to the server. Needs page.js.
 (() => {
   "use strict";
 
   const SIDE = 15; // pixels across, an odd number: the one in the middle is under the pointer
-  const SCALE = 10; // of a pixel [CSS px]
-  const AWAY = 26; // from the pointer [CSS px]
-  const HELD = 350; // a key that is down for longer is held: the loupe goes when it is let go of [ms]
-  const sources = new Map(); // name of a node -> { uuid, context } of what it shows
+  const SCALE = 10; // size of a magnified pixel [CSS px]
+  const AWAY = 26; // distance from the pointer [CSS px]
+  const HELD = 350; // a key pressed for longer is held, and its release hides the loupe [ms]
+  const sources = new Map(); // name of a node -> { uuid, context } of its texture
   let box = null;
   let pinned = false; // stays until the key or the button is pressed again
   let pressedAt = null;
@@ -56,7 +56,7 @@
     }
   }
 
-  /** Show what is under the pointer, or nothing outside of the pictures. */
+  /** Show the pixels under the pointer, or nothing outside of the images. */
   function draw() {
     const at = isOn() && pointer && window.carts.view.endoscope ? window.carts.imageAt(pointer) : null;
     if (!box && !at) return;
@@ -89,7 +89,7 @@
   }
 
   window.addEventListener("pointermove", (event) => {
-    // Over a panel or a bar nothing of the picture is pointed at.
+    // Over a panel or a bar the pointer is not in an image.
     const over = event.target instanceof Element && event.target.matches("canvas");
     pointer = over ? { clientX: event.clientX, clientY: event.clientY } : null;
   }, { capture: true });

@@ -1,10 +1,10 @@
-// What is drawn over the pictures and must not grow with the zoom: the cameras' names with their fit, a frame around the
-// chosen camera's image, keypoints with their names, and clicks. Needs page.js.
+// Marks over the images, of constant size at any zoom: the cameras' names and verdicts, a border around the active
+// camera's image, keypoints with their names, and clicks. Needs page.js.
 (() => {
   "use strict";
 
   const SVG = "http://www.w3.org/2000/svg";
-  const NEAR = 34; // from the pointer, where a mark fades so that it hides nothing [px]
+  const NEAR = 34; // distance to the pointer within which a mark fades [px]
   let layer = null;
   let page = { cameras: [], active: 0 };
   let pointer = [-1e4, -1e4];
@@ -27,7 +27,7 @@
     drawn = "";
   }
 
-  /** A keypoint: an open ring, so that what it is about stays visible, and its name. */
+  /** A keypoint: an open ring, which leaves the image below visible, and its name. */
   function drawPoint(group, label, x, y, line, chosen) {
     const near = Math.hypot(x - pointer[0], y - pointer[1]) < NEAR;
     const mark = element(group, "g", { class: `carts-point${chosen ? " chosen" : ""}${near ? " near" : ""}` });
@@ -53,12 +53,12 @@
         x: place.left, y: place.top, width: place.width, height: place.height,
         class: `carts-cell${active ? " active" : ""}`,
       });
-      // Of a picture that reaches out of the window, the part that is seen; its upper end lies below the tool bar.
+      // The visible part of an image that extends beyond the window; its upper end is below the tool bar.
       const left = Math.max(place.left, 0);
       const top = place.top < 0 ? Math.min(46, place.top + place.height - 28) : place.top;
       const label = element(group, "text", { x: left + 24, y: top + 19, class: "carts-cell-label" });
       const dice = camera.dice === null ? [] : [`Dice ${camera.dice.toFixed(3)}`];
-      // What a narrow picture has no room for; the circle's colour says the fit, too.
+      // Narrow images get shorter labels; the circle's colour shows the verdict, too.
       for (const texts of [[...(camera.fit ? [camera.fit] : []), ...dice], dice, []]) {
         label.textContent = [camera.name, ...texts].join(" · ");
         if (label.getComputedTextLength() < place.left + place.width - left - 30) break;
@@ -67,7 +67,7 @@
         cx: left + 13, cy: top + 14, r: 5, class: `carts-fit ${camera.fit ?? "unknown"}`,
       });
     }
-    let lowest = -1e4; // of the names so far, which must not lie over one another
+    let lowest = -1e4; // lowest label so far; labels must not overlap
     const at = ([, u, v]) => [place.left + u * place.width, place.top + v * place.height];
     const rings = camera.points.map(at);
     for (const point of [...camera.points].sort((one, other) => one[2] - other[2])) {

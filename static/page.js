@@ -1,26 +1,26 @@
-// What runs in the page besides viser's own client: the endoscope view and its tool bar.
+// The endoscope view and its tool bar, on top of viser's client.
 //
 // The frame is a textured plane '/frame' in front of the origin of viser's world, which is the endoscope's lens.
 // In the endoscope view this script replaces the virtual camera's symmetric frustum by the one that shows exactly the
-// plane (plus zoom and pan), so an off-centre principal point costs no space and registration holds at any window
-// shape. The 3D view is viser's own orbit camera. Each tab chooses for itself.
+// plane (plus zoom and pan), so an off-centre principal point wastes no space, and the registration is exact at any window
+// shape. The 3D view is viser's own orbit camera. Each tab chooses its view.
 (() => {
   "use strict";
 
   const FRAME = "/frame";
   const OVERLAY = "/overlay";
   const OTHERS = "/others"; // the other cameras' frames and overlays, beside the shown one's
-  const SCENE_ONLY = ["/world", "/lens", "/grid"]; // what the frame covers, or what would only clutter it
-  const GHOST = "/world/measured "; // the arms as measured, see-through, in the 3D view
+  const SCENE_ONLY = ["/world", "/lens", "/grid"]; // covered by the frame, or clutter in front of it
+  const GHOST = "/world/measured "; // semi-transparent arms as measured, in the 3D view
   const SCENE_LAYER = 7;
   const ENDOSCOPE_LAYER = 8;
   const SWITCHED = { grid: 9, ghost: 10 }; // layers of the 3D view that can be switched off
   const switchedOn = { grid: true, ghost: true };
   const MARGIN = 1.02;
-  const view = { endoscope: true, zoom: 1, x: 0.5, y: 0.5 }; // x, y: what is in the middle, as a share of the image
+  const view = { endoscope: true, zoom: 1, x: 0.5, y: 0.5 }; // x, y: the view's centre, as shares of the image
   const viser = () => window.__viserMutable;
 
-  let shown = { cameras: [], active: 0 }; // what the server says of the cameras, see setPage
+  let shown = { cameras: [], active: 0 }; // state of the cameras from the server, see setPage
 
   /** The cameras' images on the plane at distance 1 from the lens; `index` is that of the camera. */
   function cells() {
@@ -34,7 +34,7 @@
     return found;
   }
 
-  /** Put the other cameras' images where there is most room in this window: in one row, in one column, or in a grid. */
+  /** Arrange the cameras' images as large as this window allows: in one row, in one column, or in a grid. */
   function arrange() {
     const mutable = viser();
     const active = rectangleOf(FRAME);
@@ -94,10 +94,10 @@
     };
   }
 
-  // What lies over the lower part of a small screen.
+  // Elements over the lower part of a small screen.
   const CONTROLS = "body.carts-small.carts-controls .mantine-Paper-root[style*='position: fixed'], body.carts-small .carts-document-side";
 
-  /** Height of what lies over the lower end of the canvas [CSS px]. */
+  /** Height of the elements over the lower end of the canvas [CSS px]. */
   function bottomBars() {
     const controls = document.querySelector(CONTROLS);
     if (controls) return innerHeight - controls.getBoundingClientRect().top;
@@ -138,7 +138,7 @@
     };
   }
 
-  /** The camera under the pointer, and where in its image, as shares: [index, u, v]; null outside of all images. */
+  /** The camera under the pointer and the position in its image, as shares: [index, u, v]; null outside of all images. */
   function imageAt(event, index = null) {
     const box = viser().canvas.getBoundingClientRect();
     for (const cell of cells()) {
@@ -151,7 +151,7 @@
     return null;
   }
 
-  /** Keep the image in view: centred along a side that fits, without a gap along one that does not. */
+  /** Keep the image in view: centred along an axis on which it fits, without a gap along the other. */
   function clampPan(image, aspect) {
     const part = visibleRectangle(image, aspect);
     const [above, below] = covered();
@@ -161,7 +161,7 @@
     view.y = clamp(view.y, (part.height * (1 - above - below)) / image.height);
   }
 
-  /** Give the camera an off-axis frustum; called from inside its own updateProjectionMatrix. */
+  /** Set an off-axis frustum; called from the camera's own updateProjectionMatrix. */
   function aim(camera) {
     const image = view.endoscope ? imageRectangle() : null;
     if (!image) {
@@ -173,7 +173,7 @@
     const t = Math.tan((camera.fov * Math.PI) / 360) / camera.zoom;
     const a = t * camera.aspect;
     camera.near = 0.5 * image.depth;
-    // What lies behind the frame is hidden by it; leaving it out of the frustum saves drawing it.
+    // The frame hides everything behind it, so the frustum ends there.
     camera.far = 1.5 * image.depth;
     camera.view = {
       enabled: true, fullWidth: 1, fullHeight: 1,
@@ -210,7 +210,7 @@
       if (!box) return;
       for (const corner of [box.min, box.max]) {
         const at = corner.clone().applyMatrix4(child.matrixWorld).applyMatrix4(inverse).toArray();
-        // Shafts are long; what lies far behind the picture does not count.
+        // Shafts are long; corners far behind the image do not count.
         if (Math.hypot(...at) > 14 * depth) continue;
         at.forEach((value, axis) => {
           low[axis] = Math.min(low[axis], value);
@@ -229,7 +229,7 @@
     view.endoscope = false;
     mutable.cameraControl.enabled = true;
     Object.assign(mutable.camera, { near: 0.1 * image.depth, far: 2000 * image.depth });
-    // From above and beside, as far away as it takes to see the lens, its frame and what of the arms is near them.
+    // From above and beside, far enough to see the lens, its frame and the nearby parts of the arms.
     const root = mutable.nodeRefFromName[""];
     const place = (x, y, z) => mutable.camera.position.clone().set(x, y, z).applyMatrix4(root.matrixWorld);
     const { centre, radius } = sceneBounds(image.depth);
@@ -253,14 +253,14 @@
       <button data-do="scene" title="Orbit around the arms and the cameras (V)">3D view</button>
       <span class="carts-zoom">
         <button data-do="out" title="Zoom out" aria-label="Zoom out">−</button><output></output>
-        <button data-do="in" title="Zoom in (wheel over the picture)" aria-label="Zoom in">+</button>
+        <button data-do="in" title="Zoom in (wheel over the image)" aria-label="Zoom in">+</button>
       </span>
       <button data-do="loupe" title="Loupe: pixels, coordinates and colour (,)" aria-label="Loupe">⌕</button>
       <span class="carts-layers">
-        <button data-do="ghost" title="Show the arms as measured, see-through">Measured</button>
-        <button data-do="grid" title="Show the grid: 1 cm, and 5 cm between strong lines">Grid</button>
+        <button data-do="ghost" title="Show the measured arms, semi-transparent">Measured</button>
+        <button data-do="grid" title="Show the grid: 1 cm, with strong lines every 5 cm">Grid</button>
       </span>
-      <button data-do="fit" title="Show all of it (double click on the picture)">Fit</button>
+      <button data-do="fit" title="Show the whole image (double click)">Fit</button>
       <button data-do="theme" title="Light or dark" aria-label="Light or dark">◐</button>
       <button data-do="help" title="Keys (?)" aria-label="Keys">?</button>`;
     const actions = {
@@ -270,7 +270,7 @@
       in: () => zoomAt(1.25, 0.5, 0.5), out: () => zoomAt(0.8, 0.5, 0.5),
     };
     for (const button of bar.querySelectorAll("button")) {
-      // Not left focused, or the next press of the space bar would press it again.
+      // Unfocused, or the space bar would press it again.
       button.addEventListener("click", () => { actions[button.dataset.do](); button.blur(); });
     }
     for (const kind of ["pointerdown", "pointermove", "pointerup", "wheel", "dblclick"]) {
@@ -305,7 +305,7 @@
 
   // ---- Zoom and pan with the mouse ---------------------------------------------------------------------------------
 
-  /** Zoom by a factor, keeping what is at (u, v) of the canvas, as shares, where it is. */
+  /** Zoom by a factor about the point (u, v) of the canvas, as shares. */
   function zoomAt(factor, u, v) {
     const image = imageRectangle();
     const camera = viser()?.camera;
@@ -320,7 +320,7 @@
   }
 
   function listen() {
-    // paint.js lays its canvas over viser's; the wheel and the other buttons do there what they always do.
+    // paint.js lays its canvas over viser's; wheel and other buttons keep their function there.
     const painting = (event) => event.target instanceof Element && event.target.classList.contains("carts-paint");
     const inPicture = (event) =>
       view.endoscope && viser()?.canvas && (event.target === viser().canvas || painting(event));
@@ -329,13 +329,13 @@
       return [(event.clientX - box.left) / box.width, (event.clientY - box.top) / box.height];
     };
     let last = null;
-    let pointing = null; // index of the camera in whose image something is dragged
-    let place = null; // what is to be reported
-    let pressed = null; // where the picture was pressed, and nothing else began
-    let latest = null; // where something is dragged to
-    // A pointer that rests with its button down is still dragging; without reports its edit would be saved.
+    let pointing = null; // index of the camera in whose image a keypoint is dragged
+    let place = null; // position to report
+    let pressed = null; // position of a press that started no other gesture
+    let latest = null; // newest event of the drag
+    // Report a resting pointer with its button down, too, or its edit would be saved.
     setInterval(() => { if (pointing !== null && latest) point(latest); }, 2000);
-    /** Say where in the image the pointer is, at most 30 times a second, the last place always. */
+    /** Report the pointer's position in the image, at most 30 times a second, the last one always. */
     const point = (event) => {
       const found = imageAt(event, pointing);
       if (!found) return;
@@ -351,7 +351,7 @@
     }, { capture: true, passive: false });
     window.addEventListener("pointerdown", (event) => {
       if (!inPicture(event) || (painting(event) && event.button === 0)) return;
-      if (event.button === 0 && (event.ctrlKey || event.metaKey)) return; // drag.js takes hold of a link
+      if (event.button === 0 && (event.ctrlKey || event.metaKey)) return; // drag.js drags a link
       const at = imageAt(event);
       pointing = event.shiftKey && event.button === 0 ? (at?.[0] ?? shown.active) : null;
       pressed = pointing === null && event.button === 0 && at ? [at[0], event.clientX, event.clientY] : null;
@@ -385,12 +385,12 @@
     window.addEventListener("dblclick", (event) => { if (inPicture(event) && !painting(event)) showEndoscope(); }, { capture: true });
   }
 
-  // ---- Report to the server what has been drawn, and when a drag is over ------------------------------------------------
+  // ---- Reports to the server: drawn overlays, and the end of drags -------------------------------------------------
 
   const tab = Math.random().toString(36).slice(2);
   let reports = 0;
 
-  /** Choose the camera that edits are about. */
+  /** Choose the camera for edits. */
   function activate(index) {
     if (index !== shown.active) report("ShowCamera", { camera: shown.names[index] });
   }
@@ -404,11 +404,11 @@
     });
   }
 
-  const HELD_BACK = 150; // viser holds the last value of a slider back by up to 50 ms; the report must come after it
+  const HELD_BACK = 150; // viser delays the last value of a slider by up to 50 ms; the report must come after it
   const isControl = (event) => event.target instanceof Element && event.target.closest("[role=slider], input");
   let grabbed = false;
   let pressing = false; // whether a button of the mouse is down
-  // A field that a drag takes the focus from is let go of with the drag: the word would end the drag half way.
+  // A drag takes the focus from a field; its release is reported with the drag's, or it would end the drag early.
   const letGo = () => {
     if (!grabbed) return;
     grabbed = false;
@@ -421,7 +421,7 @@
   for (const kind of ["pointerup", "pointercancel"]) {
     window.addEventListener(kind, () => { pressing = false; letGo(); }, { capture: true });
   }
-  // With the keyboard, a slider is let go of with its key and a field with Enter.
+  // With the keyboard, a slider is released with its key and a field with Enter.
   window.addEventListener("keyup", (event) => {
     const slider = event.target instanceof Element && event.target.closest("[role=slider]");
     if (slider || (event.key === "Enter" && isControl(event))) { grabbed = true; letGo(); }
@@ -429,7 +429,7 @@
   window.addEventListener("focusout", (event) => { if (isControl(event)) { grabbed = true; letGo(); } });
   let drawnTexture = null;
 
-  /** WebGL drops a picture that a newer one overtakes while it is being decoded, so the server waits for this word. */
+  /** Acknowledge a drawn overlay; WebGL drops a texture that a newer one replaces during decoding, so the server waits. */
   function reportDrawn() {
     let texture = null;
     viser()?.nodeRefFromName[OVERLAY]?.traverse((child) => { texture ??= child.material?.map ?? null; });
@@ -439,18 +439,18 @@
     }
   }
 
-  // ---- Keys go to the page again after a list, a box or a button was used with the pointer ------------------------------
+  // ---- Return the keyboard to the page after a list, a box or a button was used with the pointer ------------------------
 
   let presses = 0;
   window.addEventListener("pointerdown", () => { presses += 1; }, { capture: true });
   window.addEventListener("click", (event) => {
     const used = event.target instanceof Element && event.target.closest("[role=option], button, input[type=checkbox]");
     if (!used || event.detail === 0 || used.closest("[role=dialog]")) return;
-    const list = used.matches("[role=option]"); // its field has the focus then, and is no longer about typing
-    const end = performance.now() + (list ? 500 : 60); // a list takes the focus back when it has closed, which may be late
+    const list = used.matches("[role=option]"); // its field keeps the focus, though typing has ended
+    const end = performance.now() + (list ? 500 : 60); // a list takes the focus back when it closes, possibly late
     const press = presses;
     const leave = () => {
-      if (press !== presses) return; // something else is in use by now
+      if (press !== presses) return; // another control is in use
       const focused = document.activeElement;
       if (focused?.matches(list ? "input[aria-haspopup=listbox]" : "button, input[type=checkbox]")) focused.blur();
       if (performance.now() < end) setTimeout(leave, 60);
@@ -458,7 +458,7 @@
     setTimeout(leave, 60);
   }, { capture: true });
 
-  // A field is left with Enter or Escape, too; what the field itself makes of the key comes first.
+  // Enter and Escape leave a field, after the field itself has handled the key.
   window.addEventListener("keydown", (event) => {
     const field = event.target instanceof Element ? event.target.closest("input:not([aria-haspopup=listbox])") : null;
     if (!field || !["Enter", "Escape"].includes(event.key) || event.isComposing || field.closest("[role=dialog]")) return;
@@ -471,7 +471,7 @@
   const connected = () => !/not connected/i.test(String(viser()?.sendMessage));
   setInterval(() => document.body.classList.toggle("carts-offline", Boolean(viser()?.canvas) && !connected()), 300);
 
-  // ---- Keep hold of the camera, which viser may replace ------------------------------------------------------------
+  // ---- Track the camera, which viser may replace --------------------------------------------------------------------
 
   let held = null;
   let shape = "";
@@ -486,7 +486,7 @@
     }
     if (!bar?.isConnected) buildBar(mutable.canvas);
     if (view.endoscope && mutable.cameraControl.enabled) mutable.cameraControl.enabled = false;
-    // viser sets `visible` itself in every frame, so what belongs to the 3D view alone is kept on a layer of its own.
+    // viser sets `visible` itself in every frame, so nodes of the 3D view have a layer of their own.
     for (const name of SCENE_ONLY) mutable.nodeRefFromName[name]?.traverse((child) => child.layers.set(SCENE_LAYER));
     mutable.nodeRefFromName["/grid"]?.traverse((child) => child.layers.set(SWITCHED.grid));
     for (const [name, node] of Object.entries(mutable.nodeRefFromName)) {
@@ -513,7 +513,7 @@
   window.carts = {
     view, imageAt, activate, connected,
     shown: () => shown,
-    /** What the server says of cameras, frame and marks; other scripts listen to it, too. */
+    /** Take the state of cameras, frame and marks from the server; other scripts listen to it, too. */
     setPage(message) {
       shown = message;
       document.dispatchEvent(new CustomEvent("carts-page", { detail: message }));

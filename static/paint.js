@@ -1,19 +1,19 @@
-// Brush, eraser and polygon. A stroke is drawn here at once and sent when it is finished; as soon as the server's
-// overlay shows it, it is drawn here no more. Needs page.js.
+// Brush, eraser and polygon. A stroke is drawn here at once, sent when it is finished, and removed as soon as the
+// server's overlay shows it. Needs page.js.
 (() => {
   "use strict";
 
-  const SPACING = 0.7; // between points that are kept [px of the image]
-  const LONGEST = 15000; // points, then another stroke begins; the server takes 20,000
-  const BOX = 6; // a pointer that has moved further draws a box [px of the screen]
-  const NEAR = 9; // of the first corner, where a click closes the polygon [px of the screen]
-  const SHOWN_BY_NOW = 250; // [ms] after the server's word, if no new overlay is noticed
-  const FORGOTTEN = 60000; // [ms] a stroke that the server has never answered
+  const SPACING = 0.7; // least distance of stored points [px of the image]
+  const LONGEST = 15000; // points; then another stroke begins, since the server accepts 20,000
+  const BOX = 6; // motion of the pointer from which it draws a box [px of the screen]
+  const NEAR = 9; // distance to the first corner within which a click closes the polygon [px of the screen]
+  const SHOWN_BY_NOW = 250; // [ms] after the server's acknowledgement, if no new overlay is detected
+  const FORGOTTEN = 60000; // [ms] after which an unacknowledged stroke is dropped
 
-  let brush = { tool: "off" }; // what the server says
+  let brush = { tool: "off" }; // state of the tool from the server
   let canvas = null;
-  let drawing = null; // the stroke under the pointer, or the polygon that is not closed yet
-  let pending = []; // sent, and not seen in an overlay yet
+  let drawing = null; // the current stroke, or the open polygon
+  let pending = []; // sent strokes that no overlay shows yet
   let count = 0;
   let pointer = null; // in the image [px]
   let shift = false;
@@ -33,7 +33,7 @@
     ];
   }
 
-  /** Distance of two places of the image on the screen [px]. */
+  /** Distance of two points of the image on the screen [px]. */
   function apart(a, b) {
     const image = place();
     return Math.hypot(((a[0] - b[0]) * image.width) / brush.width, ((a[1] - b[1]) * image.height) / brush.height);
@@ -64,7 +64,7 @@
     }
   }
 
-  /** Send what was drawn. */
+  /** Send the finished stroke. */
   function finish() {
     const stroke = drawing;
     drawing = null;
@@ -140,7 +140,7 @@
     } else if (!window.cartsConfiguration.keys.includes(key) || (key === "escape" && !active())) {
       return;
     } else if (key === "enter" && !(active() && brush.tool === "prompt")) {
-      return; // presses whatever button has the focus
+      return; // Enter presses the focused button
     } else {
       window.carts.report("Pressed", { key });
     }
@@ -199,7 +199,7 @@
     ring(context, u * scale, (v * image.height) / brush.height, 4);
   }
 
-  /** Where a prompt points: a dot, or a box. */
+  /** Draw a prompt: a dot, or a box. */
   function paintPrompt(context, stroke, image) {
     const [x, y] = [image.width / brush.width, image.height / brush.height];
     const [first, last] = [stroke.points[0], stroke.points[stroke.points.length - 1]];
@@ -258,7 +258,7 @@
     }
   }
 
-  /** With a tool in hand the pointer is ours, without one it moves the picture. */
+  /** With a tool selected, the canvas takes the pointer; without one, it pans the image. */
   function takePointer(on) {
     canvas.style.pointerEvents = on ? "auto" : "none";
     canvas.style.cursor = ["polygon", "prompt"].includes(brush.tool) ? "crosshair" : "none";
@@ -288,11 +288,11 @@
   window.addEventListener("keydown", onKey, { capture: true });
   window.addEventListener("keyup", onKey, { capture: true });
   Object.assign(window.carts, {
-    /** What is in hand, over which frame. */
+    /** Set the selected tool, and the frame under it. */
     setBrush(message) {
       const other = message.frame !== brush.frame || message.camera !== brush.camera;
       if (drawing && (other || message.tool !== brush.tool)) {
-        // A stroke belongs to the frame that it was begun on; a polygon without its last corners is nothing.
+        // A stroke belongs to the frame on which it was begun; an unfinished polygon is dropped.
         if (drawing.polygon) drop();
         else finish();
       }
@@ -300,7 +300,7 @@
       dirty = true;
       if (canvas) takePointer(active());
     },
-    /** The server has dealt with all strokes up to this one, and sent the overlay that shows them. */
+    /** The server has applied all strokes up to this one, and sent an overlay that shows them. */
     painted(number) {
       for (const stroke of pending) {
         if (stroke.number <= number) {

@@ -1,15 +1,15 @@
-// What belongs to one tab of the browser: its theme, where it is, the link that leads there, the sheet of keys,
-// and on a small screen the few buttons that reading and reviewing needs. Needs page.js.
+// State and controls of one browser tab: theme, address and link, the key sheet, and the review buttons of a small
+// screen. Needs page.js.
 (() => {
   "use strict";
 
   const make = window.cartsElement;
   const remembered = (key) => { try { return JSON.parse(sessionStorage.getItem(key)); } catch { return null; } };
-  const wanted = () => localStorage.getItem("carts-theme") ?? "dark"; // pictures are judged best before a dark wall
+  const wanted = () => localStorage.getItem("carts-theme") ?? "dark"; // images are best judged on a dark background
 
   // ---- Theme ------------------------------------------------------------------------------------------------------
 
-  // Documents over the page take their colours from this class, everything else from viser's theme.
+  // Documents over the page are coloured by this class, everything else by viser's theme.
   const dress = () => document.documentElement.classList.toggle("carts-light", wanted() === "light");
   dress();
 
@@ -22,17 +22,17 @@
     if (!documented) window.carts.report("Theme", { light: wanted() === "light" });
   }
 
-  // ---- Who this tab is, and where -----------------------------------------------------------------------------------
+  // ---- Identity and address of the tab -------------------------------------------------------------------------------
 
   const tabs = () => [...document.querySelectorAll("[role=tab][data-dock-tab]")];
 
-  // A tab that is duplicated takes the session's storage along, so what it calls itself lies there only while it loads.
+  // Duplicating a tab copies its session storage, so the tab's key is stored there only between unloading and loading.
   const key = sessionStorage.getItem("carts-key") ?? Math.random().toString(36).slice(2) + Date.now().toString(36);
   sessionStorage.removeItem("carts-key");
   window.addEventListener("pagehide", () => sessionStorage.setItem("carts-key", key));
   window.addEventListener("pageshow", () => sessionStorage.removeItem("carts-key"));
 
-  /** Where the address leads: project, frame (from 1), camera and domain, as far as it says so. */
+  /** Project, frame (from 1), camera and domain in the address, as far as given. */
   function linked() {
     const said = new URL(location.href).searchParams;
     const project = window.cartsConfiguration.project;
@@ -56,7 +56,7 @@
     return address.href;
   }
 
-  let welcome = false; // whether the server has given this connection its place
+  let welcome = false; // whether the server has assigned a tab to this connection
   let asked = 0;
   function sayHello() {
     if (welcome || !window.cartsConfiguration.project || !window.carts?.connected?.()) return;
@@ -70,7 +70,7 @@
   }
   setInterval(sayHello, 150);
 
-  /** A short note over the picture. */
+  /** Show a short note over the image. */
   function tell(text) {
     const note = document.createElement("div");
     note.className = "carts-note";
@@ -126,7 +126,7 @@
   window.addEventListener("click", (event) => {
     if (event.target instanceof Element && event.target.closest("[data-dock-tab]")) setTimeout(remember, 50);
   });
-  // viser builds its panels anew when the connection is back.
+  // viser rebuilds its panels after a reconnection.
   let away = false;
   setInterval(() => {
     const on = window.carts?.connected?.() ?? true;
@@ -135,7 +135,7 @@
     away = !on;
   }, 300);
 
-  // ---- The sheet of keys ----------------------------------------------------------------------------------------------
+  // ---- The key sheet ---- ----------------------------------------------------------------------------------------------
 
   let sheet = null;
 
@@ -148,7 +148,7 @@
       const row = ([key, text]) => make("tr", {}, make("td", {}, make("kbd", {}, key)), make("td", {}, text));
       const table = ([name, rows]) => make("section", {}, make("h3", {}, name), make("table", {}, ...rows.map(row)));
       sheet.append(
-        make("header", {}, make("b", {}, "Keys"), make("span", {}, "Press ? again, or Escape, to go on."),
+        make("header", {}, make("b", {}, "Keys"), make("span", {}, "Close with ? or Escape."),
           make("button", { "data-do": "tour" }, "Take the tour"), make("button", { "aria-label": "Close" }, "×")),
         make("div", { class: "carts-columns" }, ...groups.map(table)));
       sheet.querySelector("[aria-label=Close]").addEventListener("click", () => showSheet(false));
@@ -168,7 +168,7 @@
     event.stopPropagation();
   }, { capture: true });
 
-  // ---- What a control is about, when the pointer rests on it or on its label; over fields viser does that -----------------
+  // ---- Hints of buttons and labels; viser shows those of fields ------------------------------------------------------------
 
   let hints = {};
   let explained = 0;
@@ -187,7 +187,7 @@
     explain();
   });
 
-  // ---- The other pose, as long as a key is held --------------------------------------------------------------------------
+  // ---- Show the compared pose while a key is held --------------------------------------------------------------------------
 
   let peeking = false;
   const peek = (on) => { if (on !== peeking) { peeking = on; window.carts.report("Peek", { on }); } };
@@ -240,9 +240,9 @@
   Object.assign(window.carts, {
     copyLink, key,
     setHints(message) { hints = message; explain(); },
-    /** A server that was started since this page was loaded knows nothing of our widgets. */
+    /** Reload if the server was restarted after this page was loaded: it has none of its widgets. */
     meet(name) { if (name !== window.cartsConfiguration.server) location.reload(); },
-    /** Load the page anew, at no place of the recording that was shown. */
+    /** Reload the page without project, frame, camera and domain in its address. */
     reload() {
       const address = new URL(location.href);
       for (const name of ["project", "frame", "camera", "domain"]) address.searchParams.delete(name);

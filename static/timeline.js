@@ -1,5 +1,5 @@
-// The strip below the picture: all frames with review, fit and source, to be zoomed, dragged and clicked.
-// A line of the whole sequence lies below it. Needs page.js and lanes.js.
+// The strip below the image: all frames with review state, fit and source; it can be zoomed, dragged and clicked.
+// Its lowest line is the whole sequence. Needs page.js and lanes.js.
 (() => {
   "use strict";
 
@@ -10,31 +10,31 @@
   const VERDICTS = ["", "good", "doubtful", "failed"];
   const SOURCE = [null, "#facc15", "#60a5fa", "#e879f9"];
   const [TICKS, BARS, FITS, SOURCES, WHOLE] = [13, 24, 5, 4, 8]; // heights [px]
-  const [PICTURES, CURVE] = [38, 36]; // heights of what is left out in low windows [px]
-  const TALL = 560; // a window's height from which they are shown [px]
-  const LEAST = 8; // frames that are shown when zoomed in as far as it goes
-  const GRIP = 7; // how near to an end of the range it is taken hold of [px]
+  const [PICTURES, CURVE] = [38, 36]; // heights of the parts omitted in low windows [px]
+  const TALL = 560; // least height of a window that shows them [px]
+  const LEAST = 8; // visible frames at the largest zoom
+  const GRIP = 7; // distance within which an end of the range can be grabbed [px]
 
   let strip = null;
   let canvas = null;
   let readout = null;
-  let tip = null; // says of the frame under the pointer what the readout says of the shown one
+  let tip = null; // the readout for the frame under the pointer
   let picker = null;
   let frames = 0;
   let ids = null;
   let codes = new Uint32Array(0); // per frame: review + 8 fit + 32 source + 128 kept + 256 badness
-  // + 65536 (1 + joints that are not determined, 0 where that is not known)
+  // + 65536 (1 + undetermined joints, 0 if unknown)
   let here = 0;
   let solving = null;
   let fps = 0;
   let known = { domains: [], cameras: [], aspects: [] };
   let shown = { names: [], active: 0, domain: "", range: null };
-  let range = null; // first and last frame of what is played, solved and optimized
-  let view = [0, 1]; // first and last frame that is shown
+  let range = null; // first and last frame that are played, solved and optimized
+  let view = [0, 1]; // first and last visible frame
   let dragging = null; // "scrub", "whole" or "range"
-  let anchor = 0; // where a range was begun
+  let anchor = 0; // frame at which a range was begun
   let hover = null;
-  let pointer = 0; // where it is over the canvas [px]
+  let pointer = 0; // its column on the canvas [px]
   let dirty = true;
   let wanted = null;
   let open = localStorage.getItem("carts-lanes") !== "closed";
@@ -45,13 +45,13 @@
     strip = document.createElement("div");
     strip.className = "carts-strip";
     strip.innerHTML = `<div class="carts-strip-head">
-        <button data-do="first" title="Begin the range at this frame: what is played, solved, optimized and exported. Key: (">(&nbsp;Start</button>
+        <button data-do="first" title="Begin the range at this frame; it limits playing, solving, optimizing and exporting. Key: (">(&nbsp;Start</button>
         <button data-do="last" title="End the range at this frame. Key: )">End&nbsp;)</button>
-        <button data-do="whole" title="No range: the whole sequence">×</button>
+        <button data-do="whole" title="Remove the range">×</button>
         <span class="carts-range"></span>
         <select aria-label="Curve" title="Draw a curve over all frames: a joint, the loss, or the fit"></select>
         <button data-do="lanes" title="Show or hide thumbnails and curve" aria-label="Thumbnails and curve">▾</button>
-        <button data-do="legend" title="What the colours and marks mean" aria-expanded="false">Legend</button>
+        <button data-do="legend" title="Meaning of colours and marks" aria-expanded="false">Legend</button>
         <output></output>
       </div>
       <canvas role="slider" tabindex="-1" aria-label="Timeline: drag to scrub, wheel to zoom, Shift and drag for a range"></canvas>`;
@@ -87,7 +87,7 @@
     dirty = true;
   }
 
-  /** What is drawn of a frame, from top to bottom, with the colours. */
+  /** Meaning of the elements of a frame, from top to bottom, with their colours. */
   function legend() {
     const card = document.createElement("dl");
     card.className = "carts-strip-legend";
@@ -100,12 +100,12 @@
     const keys = (colours, names) => [...names.keys()].filter((number) => colours[number])
       .flatMap((number) => [" ", key(colours[number], names[number])]);
     const rows = [
-      ["White tick", "kept: an accepted frame, a keyframe, or one that was moved by hand; solving leaves it as it is"],
-      ["Bar", "the higher, the worse it fits; low and faint where the fit of the frame as it is is not known, none where nothing is known at all. Its colour is the review, or what made the joints:", ...keys(REVIEW, NAMES)],
+      ["White tick", "kept: an accepted frame, a keyframe, or one that was moved by hand; solving does not change it"],
+      ["Bar", "misfit: higher is worse; low and faint if the fit of the current pose is unknown, none if nothing is known. Its colour is the review state, or the source of the joints:", ...keys(REVIEW, NAMES)],
       ["Stripe below", "the verdict on the fit:", ...keys(FIT, VERDICTS)],
-      ["Stripe below that", "where the joints come from:", ...keys(SOURCE, ["", NAMES[5], NAMES[1], NAMES[6]])],
-      ["Line at the bottom", "the whole sequence, in the colours of the verdict, or of the review where there is none; the frame in it is what is shown above"],
-      ["Bands", "teal: the shown frame; pink: being solved; amber ends: the range, with what is outside dimmed"],
+      ["Stripe below that", "the source of the joints:", ...keys(SOURCE, ["", NAMES[5], NAMES[1], NAMES[6]])],
+      ["Line at the bottom", "the whole sequence, in the colours of the verdict or, without one, of the review; its box marks the part shown above"],
+      ["Bands", "teal: the shown frame; pink: being solved; amber: ends of the range, dimmed outside of it"],
     ];
     card.append(...rows.flatMap(([name, ...about]) => [make("dt", {}, name), make("dd", {}, ...about)]));
     return card;
@@ -131,7 +131,7 @@
   const xOf = (frame) => ((frame - view[0]) / (view[1] - view[0])) * width();
   const clamped = (frame) => Math.min(Math.max(Math.floor(frame), 0), frames - 1);
 
-  /** Show these frames, as many as they are, inside the sequence. */
+  /** Show these frames, clamped to the sequence. */
   function show(first, count) {
     const shown = Math.min(Math.max(count, Math.min(LEAST, frames)), frames);
     const start = Math.min(Math.max(first, 0), frames - shown);
@@ -145,7 +145,7 @@
     wanted = frame;
   }
 
-  /** The other end of the range, when the pointer is at one of its ends. */
+  /** The opposite end of the range if the pointer is at one of its ends. */
   function gripped(x) {
     if (!range) return null;
     if (Math.abs(x - xOf(range[0])) <= GRIP) return range[1];
@@ -166,7 +166,7 @@
     rangeTimer ??= setTimeout(tellRange, 40);
   }
 
-  /** Report a changed range: at once when it is let go of, or it would undo what comes next. */
+  /** Report a changed range: at once on release, so that it cannot override later changes. */
   function tellRange() {
     if (rangeTimer === null) return;
     clearTimeout(rangeTimer);
@@ -197,7 +197,7 @@
     show(frameAt(event.offsetX) - at * next + (event.deltaX / width()) * count, next);
   }
 
-  /** For every column of pixels the frame that fits worst, and whether any is kept. */
+  /** For every column of pixels the worst frame, and whether any frame is kept. */
   function columns(first, last, count) {
     const found = [];
     for (let column = 0; column < count; column += 1) {
@@ -219,7 +219,7 @@
     if (!code) return;
     const bad = ((code >> 8) & 255) / 255;
     const tallness = Math.max(3, bad * height);
-    context.globalAlpha = bad ? 1 : 0.4; // what is not known looks unlike what fits well
+    context.globalAlpha = bad ? 1 : 0.4; // unknown fits differ from good ones
     context.fillStyle = REVIEW[code & 7];
     context.fillRect(x, top + height - tallness, wide, tallness);
     context.globalAlpha = 1;
@@ -270,7 +270,7 @@
     });
   }
 
-  /** What is outside of the range is dimmed; its ends can be dragged in the upper part. */
+  /** Dim the frames outside of the range, and draw its ends, which can be dragged in the upper part. */
   function drawRange(context, light, w) {
     if (!range) return;
     const [left, right] = [xOf(range[0]), xOf(range[1] + 1)];
@@ -293,7 +293,7 @@
     context.globalAlpha = 1;
   }
 
-  /** What is known of a frame, in words; with its joints, which the status has no room for. */
+  /** Description of a frame; with its undetermined joints if `whole`. */
   function described(frame, whole = true) {
     const code = codes[frame] ?? 0;
     const said = NAMES[code & 7];
@@ -376,7 +376,7 @@
     if (dragging === null && (here < view[0] || here >= view[1])) show(here - count / 2, count);
   });
   Object.assign(window.carts, {
-    /** All that is known, or with `whole` unset what has changed: pairs of frame and code in one row. */
+    /** Set all codes, or only changed ones without `whole`: a flat list of pairs of frame and code. */
     setTimeline(message) {
       if (message.whole) {
         const other = frames !== message.frames;

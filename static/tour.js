@@ -1,35 +1,35 @@
-// A tour over the page: one thing after the other is framed and explained. It is offered once, can be left at any time
-// and begun again from the sheet of keys. Needs page.js and shell.js.
+// A guided tour of the page: each step frames and explains an element. It is offered once, can be left at any time, and
+// started again from the key sheet. Needs page.js and shell.js.
 (() => {
   "use strict";
 
   const SEEN = "carts-tour";
   const STEPS = [
-    ["canvas", "The picture", "The recorded image, with the arm over it where the joint positions say it is. Wheel: zoom; drag: move; " +
+    ["canvas", "The picture", "The recorded image with the arm rendered at its joint positions. Wheel: zoom; drag: pan; " +
       "a click chooses a camera."],
-    [".carts-verdict", "The verdict", "Whether the fit can be relied on: good, doubtful or failed, with the reason and what to try. " +
-      "It comes from the images, not from the solver, and is about the mask. The tab Values marks joints that the " +
+    [".carts-verdict", "The verdict", "The reliability of the fit: good, doubtful or failed, with a reason and a remedy. " +
+      "It is derived from the images, not from the solver, and refers to the mask. The tab Values marks joints that the " +
       "images hardly show."],
-    ["Run", "Run", "The optimizer moves the joints until the rendered arm and the images agree (key R). Curves below show how it goes."],
-    ["Joints", "Joints", "Or move a joint yourself. Shift+click on the picture says where a keypoint of the arm is."],
-    [".carts-strip", "The timeline", "All frames: high bars fit badly, and of frames without a bar nothing is known yet. Drag to scrub, wheel to zoom, Shift+drag for a range. " +
+    ["Run", "Run", "The optimizer moves the joints until the rendered arm and the images agree (key R). Curves below show its progress."],
+    ["Joints", "Joints", "Move joints by hand. Shift+click on the image places a keypoint of the arm."],
+    [".carts-strip", "The timeline", "All frames: high bars fit badly, and frames without a bar have no fit yet. Drag to scrub, wheel to zoom, Shift+drag for a range. " +
       "Legend explains colours and marks."],
-    ["Review", "Review", "Accept (G) goes on to the next unreviewed frame. Here are also keyframes, Solve between, " +
+    ["Review", "Review", "Accept (G) goes on to the next unreviewed frame. The tab also has keyframes, Solve between, " +
       "search and history."],
-    ["Jobs", "Jobs", "What takes long runs here while you go on: many frames, calibrations, exports."],
-    ["Export", "Export", "Masks, keypoints and kinematics for other tools. Everything is saved at once; Undo takes back anything."],
-    [".carts-review-bar", "Review", "The verdict, and what you say of the frame: accepting goes on to the next one."],
+    ["Jobs", "Jobs", "Long tasks run here while you continue: many frames, calibrations, exports."],
+    ["Export", "Export", "Masks, keypoints and kinematics for other tools. Every edit is saved at once and can be undone."],
+    [".carts-review-bar", "Review", "The verdict, and your review of the frame; accepting goes on to the next one."],
     [".carts-review-bar [data-do=controls]", "All controls", "Everything else is behind this button, in tabs: fit, review, values, jobs, export, help."],
-    [".carts-bar [data-do=help]", "More", "The sheet of keys is behind this button, or press the key ?. Every control says what it " +
-      "does when the pointer rests on it."],
+    [".carts-bar [data-do=help]", "More", "This button, or the key ?, opens the key sheet. Every control has a hint, shown when the pointer " +
+      "rests on it."],
   ];
-  let steps = []; // those that are about something in view, which is less on a small screen
+  let steps = []; // steps whose element is visible, fewer on a small screen
   let place = -1;
   let frame = null;
   let card = null;
-  const scrolled = new Map(); // what the tour has scrolled -> where it was before
+  const scrolled = new Map(); // element scrolled by the tour -> its previous position
 
-  /** What a step is about: by selector, or by the text of a button, tab or folder; null when it is not in view. */
+  /** Element of a step, by selector or by the text of a button, tab or folder; null if it is not visible. */
   function target(name) {
     const visible = (one) => one && one.getClientRects().length > 0;
     const direct = /^[A-Z]/.test(name) ? null : document.querySelector(name);
@@ -40,7 +40,7 @@
     return found?.closest("button, [role=tab]") ? found : found?.parentElement.closest(".mantine-Paper-root") ?? null;
   }
 
-  /** Scroll panels to what a step is about: one may have been scrolled past it. */
+  /** Scroll panels to the element of a step. */
   function reveal(about) {
     for (let around = about.parentElement; around; around = around.parentElement) {
       if (!scrolled.has(around) && around.scrollHeight > around.clientHeight) scrolled.set(around, around.scrollTop);
@@ -58,7 +58,7 @@
     document.body.append(frame, card);
   }
 
-  /** Frame what this step is about, and put the card beside it, inside the window. */
+  /** Frame the element of this step, and put the card beside it, inside the window. */
   function draw() {
     if (place < 0) return;
     const [name, title, text] = steps[place];
@@ -116,9 +116,9 @@
     document.body.classList.remove("carts-touring");
   }
 
-  /** Until it is answered, in every visit; when there is something to show. */
+  /** Offer the tour at every visit until it is answered, if there is something to show. */
   function offer() {
-    const answered = !["offered", null].includes(localStorage.getItem(SEEN)); // older versions have kept that it was offered
+    const answered = !["offered", null].includes(localStorage.getItem(SEEN)); // older versions stored "offered"
     if (answered || !document.querySelector(".carts-strip") || document.querySelector(".carts-offer")) return;
     const note = document.createElement("div");
     note.className = "carts-note carts-offer";

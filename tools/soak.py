@@ -44,7 +44,7 @@ KINDS = {
     "settings": (
         "Solver",
         "Fit to",
-        "Whose masks",
+        "Mask source",
         "Preset",
         "Iterations",
         "Working width [px]",

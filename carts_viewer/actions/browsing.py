@@ -86,7 +86,7 @@ class BrowsingHandler(Handler):
         except SequenceError as error:
             if sequence.matching is None:
                 raise
-            # Half-typed numbers are often far off, so there is no alarm before the field is left.
+            # Half-typed numbers are often far off, so no error is shown before the field is left.
             now = f"{sequence.matching.time_offset:g} s"
             text = f"With {seconds:g} s there are no joint positions near some frames in time, so it stays at {now}."
             _log.info("%s %s", text, error)
@@ -117,7 +117,7 @@ class BrowsingHandler(Handler):
     def _on_MarkRange(self, intent: intents.MarkRange) -> None:
         index, end = self._context.state.index, len(self._session.sequence) - 1
         first, last = self._context.state.range or (0, end)
-        # An end before the beginning begins anew there, with the rest of the sequence.
+        # A new end before the present beginning, or the reverse, resets the opposite end.
         if intent.end:
             self.handle(intents.SetRange((first if first <= index else 0, index)))
         else:

@@ -20,7 +20,7 @@ class OpenRun(Protocol):
     """The run of the optimizer on the shown frame."""
 
     def end(self, reason: str | None) -> None:
-        """End the run, if there is one, and save where it is; `reason` is text for the user."""
+        """End the run, if there is one, and save its pose; `reason` is text for the user."""
 
     def forget(self) -> None:
         """Forget the start of the run, since another frame is shown."""
@@ -56,7 +56,7 @@ class Context:
         self.state = replace(self.state, **changes)
 
     def end_run(self, reason: str | None) -> None:
-        """End the run on the shown frame, if there is one, and save where it is; `reason` is text for the user.
+        """End the run on the shown frame, if there is one, and save its pose; `reason` is text for the user.
 
         Raises:
             ProjectError: it could not be saved.
@@ -73,8 +73,8 @@ class Context:
             name: of the step in the history.
             scene: the pose.
             gesture: edits of the same gesture are one step, saved when it ends; None: this is the whole gesture.
-            source: who made it.
-            pins: whether the pose is what pins say; otherwise they are forgotten.
+            source: origin of the pose.
+            pins: whether the pose was fitted to pins; otherwise they are removed.
 
         Raises:
             ProjectError: it could not be saved.
@@ -157,7 +157,7 @@ class Context:
         return state.mask_correction, *others
 
     def score(self) -> None:
-        """Compare the pose with the truth, if that was not done yet; the project keeps the first figures it gets."""
+        """Compare the pose with the truth, unless that was done; the project keeps the first figures."""
         state = self.state
         if state.scores is not None:
             return
@@ -201,7 +201,7 @@ def finite(value: float) -> float:
 
 
 def clamped(value: float, low: float, high: float) -> float:
-    """The number, or the end of the range that it is beyond.
+    """The number clamped to a range.
 
     Raises:
         CartsError: it is not finite.
@@ -210,10 +210,10 @@ def clamped(value: float, low: float, high: float) -> float:
 
 
 def one_of(asked: str | None, now: str, known: Collection[str], what: str) -> str:
-    """The name that is asked for, by default the present one.
+    """The requested name, by default the present one.
 
     Raises:
-        CartsError: there is no such thing.
+        CartsError: the name is unknown.
     """
     if asked is None:
         return now
@@ -235,7 +235,7 @@ class Handler:
             CartsError: it cannot be carried out; the state stays valid.
         """
         if not self.takes(intent):
-            raise CartsError(f"The viewer does not know what to do with {type(intent).__name__}; this is a bug.")
+            raise CartsError(f"The viewer has no handler for {type(intent).__name__}; this is a bug.")
         getattr(self, f"_on_{type(intent).__name__}")(intent)
 
     def takes(self, intent: Intent) -> bool:

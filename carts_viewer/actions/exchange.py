@@ -69,7 +69,7 @@ class ExportingHandler(Handler):
         """Continue the export for `_BIT` seconds.
 
         Raises:
-            CartsError: it cannot be written; nothing of it is left.
+            CartsError: it cannot be written; its files are removed.
         """
         if self._job is None or self._intent is None:
             return
@@ -101,7 +101,7 @@ class ExportingHandler(Handler):
 
     def _on_Export(self, intent: intents.Export) -> None:
         if self._job is not None:
-            raise CartsError("Something is being exported already. Wait, or cancel that first.")
+            raise CartsError("An export is running already. Wait, or cancel it first.")
         if intent.format not in FORMATS or intent.frames not in FRAME_CHOICES or intent.parts not in PARTS_CHOICES:
             raise SettingsError(f"There is no export of {intent.frames!r} as {intent.format!r} by {intent.parts!r}.")
         self._context.end_run("Stopped: frames are exported")
@@ -165,7 +165,7 @@ def frames_within(project: ProjectState, frames: str, part: tuple[int, int] | No
 
 
 def shown_mask(context: Context) -> tuple[str, bytes]:
-    """The mask of the shown frame and camera as it was corrected: name and content of a PNG file."""
+    """The corrected mask of the shown frame and camera: name and content of a PNG file."""
     state, sequence = context.state, context.session.sequence
     name = file_name(f"{sequence.name}_{state.frame.frame_id}_{state.camera}") + ".png"
     mask = context.renderer.mask(state.pose.scene, state.camera, state.mask_correction)
@@ -191,14 +191,14 @@ _COMPRESSED = {".png", ".jpg", ".mp4", ".npz"}
 
 
 def zipped(path: Path) -> tuple[str, bytes]:
-    """Name and content of a download: a file as it is, a folder as a zip with the folder in it.
+    """Name and content of a download: a file unchanged, a folder as a zip archive.
 
     Raises:
         CartsError: it is gone, or too large for a browser.
     """
     files = [path] if path.is_file() else sorted(file for file in path.rglob("*") if file.is_file())
     if not files:
-        raise CartsError(f"{path} is not there any more. Export again.")
+        raise CartsError(f"{path} no longer exists. Export again.")
     size = sum(file.stat().st_size for file in files)
     if size > LARGEST:
         raise CartsError(
@@ -216,7 +216,7 @@ def zipped(path: Path) -> tuple[str, bytes]:
 
 
 _NAMED = 6
-"""Frames that are named."""
+"""Number of frames named in a warning."""
 
 
 def export_warnings(project: ProjectState, frames: Sequence[int], cameras: Collection[str]) -> list[str]:
@@ -260,10 +260,9 @@ T = TypeVar("T")
 
 
 class CooperativeThread(Generic[T]):
-    """A function that asks a `Monitor` whether to go on, between two of its steps.
+    """Runs a function that checks a `Monitor` between its steps.
 
-    It runs on a thread of its own, but only while `advance` waits for it. So nothing happens at the same time, and what
-    it uses needs no lock.
+    The function has a thread of its own, but runs only while `advance` waits for it, so shared data need no lock.
 
     Attributes:
         done: steps that are done.
@@ -281,7 +280,7 @@ class CooperativeThread(Generic[T]):
         self._thread = threading.Thread(target=self._work, name="carts-export", daemon=True)
 
     def advance(self, seconds: float) -> T | None:
-        """Continue for about so long [s]; returns the function's result once it has ended.
+        """Continue for about `seconds`; returns the function's result once it has ended.
 
         Raises:
             Exception: what the function raised.
@@ -296,7 +295,7 @@ class CooperativeThread(Generic[T]):
         return self._result
 
     def cancel(self) -> None:
-        """Have the function stop, and wait until it has cleaned up."""
+        """Stop the function, and wait until it has cleaned up."""
         self._cancelled = True
         if self._thread.is_alive():
             self._go.release()
@@ -331,8 +330,8 @@ class ImportingHandler(Handler):
         session = self._session
         place = intent.place.strip()[:_LONGEST]
         if not place:
-            raise CartsError("Type where the masks are: a COCO or CVAT file, or a folder of PNG masks.")
-        # As the folder is known by itself, whatever links lead to it.
+            raise CartsError("Type the path of the masks: a COCO or CVAT file, or a folder of PNG masks.")
+        # Resolved, so that links to the folder do not matter.
         path = session.roots.checked(session.sequence.path.parent.resolve() / Path(place))
         found = read_annotations(path, session.sequence, intent.camera, confined=True)
         self._context.end_run("Stopped: masks were imported")

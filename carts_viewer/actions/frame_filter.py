@@ -22,9 +22,9 @@ class FrameFilter:
     fit: str = ANY
     """A verdict, or `NOT_CHECKED`."""
     dice: float = 1.0
-    """Overlap with the truth below this; at 1 the truth does not matter [1]."""
+    """Upper bound of the Dice [1]; 1 disables the condition."""
     note: str = ""
-    """Part of the note, in any case."""
+    """Text contained in the note, ignoring case."""
     arm: str = ANY
     """An arm that was corrected."""
 

@@ -137,7 +137,7 @@ class SetSwipe(Latest):
 
 
 class Peek(Intent):
-    """Show the other pose all over, or no more."""
+    """Show the compared pose in the whole image, or stop."""
 
     on: bool
 
@@ -177,7 +177,7 @@ class Perturb(Intent):
 
 
 class Nudge(Intent):
-    """Move the chosen joint a little, either way."""
+    """Move the chosen joint by a small step."""
 
     by: float
     """[deg or mm]"""
@@ -188,7 +188,7 @@ class DragLink(Intent):
 
     keyed_by = ("gesture",)
     gesture: float
-    """The same as long as the pointer is down."""
+    """Identifier of the gesture; constant while the pointer is down."""
     camera: str
     start: tuple[float, float]
     """Start of the drag [px]."""
@@ -303,13 +303,13 @@ class SetPaintClass(Latest):
 
 
 class SetDiameter(Latest):
-    """Make the brush this thick [px]."""
+    """Set the diameter of the brush [px]."""
 
     diameter: float
 
 
 class ScaleBrush(Intent):
-    """Make the brush thicker or thinner by a factor, by a pixel at least."""
+    """Scale the diameter of the brush by a factor, by at least one pixel."""
 
     factor: float
 
@@ -322,7 +322,7 @@ class Paint(Intent):
 
 
 class NextObject(Intent):
-    """The next click with the prompt is about something else."""
+    """Begin a new object with the prompt."""
 
 
 class ClearLayer(Intent):
@@ -332,15 +332,15 @@ class ClearLayer(Intent):
 
 
 class Undo(Intent):
-    """Take back the last step, in whichever frame it was."""
+    """Undo the last step, in any frame."""
 
 
 class Redo(Intent):
-    """Do the step again that was taken back last."""
+    """Redo the last undone step."""
 
 
 class GoToStep(Intent):
-    """Undo or redo until so many steps are done."""
+    """Undo or redo until this number of steps is in effect."""
 
     position: int
 
@@ -372,11 +372,11 @@ class ShowWorse(Intent):
     """Show the next worst frame that is neither accepted nor rejected."""
 
     step: int = 1
-    """1 to the next one, which is less bad; -1 to one that is worse."""
+    """1 to the next better one, -1 to the next worse one."""
 
 
 class CopyCorrection(Intent):
-    """Correct the shown frame by as much as the previous (-1) or the next one (1) is."""
+    """Copy the correction of the previous (-1) or next (1) frame to the shown one."""
 
     step: int
 
@@ -395,7 +395,7 @@ class ChooseKeypoint(Intent):
 
 
 class PointAt(Latest):
-    """The chosen keypoint is there in the shown camera's image; many of these in a drag, then `Released`."""
+    """Place the chosen keypoint in an image; repeated during a drag, then `Released`."""
 
     u: float
     """Column [px]."""
@@ -471,7 +471,7 @@ class Adapt(Jobs):
     """Adapt the network to the recording."""
 
     minutes: int = 15
-    """At most."""
+    """Limit of processor time [min]."""
 
 
 class UseNetwork(Jobs):
@@ -514,7 +514,7 @@ class Exporting(Intent):
 
 
 class ExportMask(Intent):
-    """Send this frame's mask, as a PNG, to the tab that asked."""
+    """Send this frame's mask, as a PNG, to the requesting tab."""
 
     client_id: int
 
@@ -524,7 +524,7 @@ class Export(Exporting):
 
     format: FormatName
     frames: str
-    """Which ones, one of `exchange.FRAME_CHOICES`."""
+    """Frames to write, one of `exchange.FRAME_CHOICES`."""
     parts: Parts = "arms"
     """Granularity of the categories."""
     images: bool = False
@@ -577,11 +577,11 @@ class ReviewFound(Intent):
 
 
 class ClearFilter(Intent):
-    """Look for all frames again."""
+    """Clear all conditions of the filter."""
 
 
 class StartLive(Intent):
-    """Show a stream, with the arms followed through it."""
+    """Show a live stream with tracked arms."""
 
     source: str
     """As `carts live --source`: `replay`, `socket:PORT` or `camera:NUMBER`."""

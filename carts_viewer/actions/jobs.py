@@ -48,7 +48,7 @@ class JobRequester:
     state: ViewState
 
     def choose(self, context: Context) -> None:
-        """Have a job run with these choices, in this person's name."""
+        """Set the context of a job to these choices and this user."""
         context.session.editor.person = self.person
         context.change(**{name: getattr(self.state, name) for name in _CHOICES})
 
@@ -157,7 +157,7 @@ class JobsHandler(Handler):
     # ---- The queue -------------------------------------------------------------------------------------------------
 
     def advance(self) -> None:
-        """Begin the next job, or follow the one that runs.
+        """Begin the next job, or continue the running one.
 
         Raises:
             CartsError: the job failed and is marked so; the next one is begun later.
@@ -194,7 +194,7 @@ class JobsHandler(Handler):
         if self._requester is not None:
             self._asked[job.number] = self._requester
         if self._running() is None and not any(j.state is JobState.WAITING and j is not job for j in self._list.jobs):
-            # At once, so that an error of what was asked for is shown now.
+            # At once, so that errors of the request are shown immediately.
             self._begin(job)
         self._publish()
 
@@ -245,7 +245,7 @@ class JobsHandler(Handler):
         elif job.kind == "export":
             export = state.export
             if export is None:
-                self._end(job, JobState.CANCELLED, "Cancelled; nothing of it is left.")
+                self._end(job, JobState.CANCELLED, "Cancelled; its files are removed.")
             elif export.path is not None:
                 self._end(job, JobState.DONE, f"{export.frames} frames in {export.path}")
             else:

@@ -19,17 +19,17 @@ from carts_viewer.state import LiveState, Pose
 
 
 class LiveRun:
-    """A stream that is being followed.
+    """A tracked live stream.
 
     Args:
-        stream: where frames come from, and results go besides.
+        stream: source of frames, which also receives the results.
         tracker: of the arms.
         results: makes messages for the stream's clients.
-        recorder: keeps what is seen; None: nothing does.
+        recorder: records frames and corrections; None for no recording.
 
     Attributes:
-        statistics: how it goes.
-        error: what ended it; None if it goes on, or ended by itself.
+        statistics: throughput and latency.
+        error: the error that ended it; None while it runs, and after a normal end.
     """
 
     def __init__(self, stream: OpenStream, tracker: LiveTracker, results: Results, recorder: Recorder | None) -> None:
@@ -103,7 +103,7 @@ ALLOWED = (
     intents.DismissError,
     intents.CancelJob,
 )
-"""Intents that make sense while a stream is shown."""
+"""Intents that are allowed while a stream is shown."""
 
 
 class Show(Protocol):
@@ -134,7 +134,7 @@ class LiveHandler(Handler):
         """Whether an intent is dealt with here because a stream is shown.
 
         Raises:
-            CartsError: it cannot be done meanwhile.
+            CartsError: the intent is not allowed during a stream.
         """
         if not self.active or isinstance(intent, ALLOWED):
             return False
@@ -154,7 +154,7 @@ class LiveHandler(Handler):
         """Show the newest result, or stop after the end of the stream.
 
         Raises:
-            CartsError: what ended it.
+            CartsError: the error that ended the stream.
         """
         run = self._live
         if run is None:
@@ -196,7 +196,9 @@ class LiveHandler(Handler):
         context, session = self._context, self._session
         address = StreamAddress.parse(intent.source, intent.joints_port)
         if address.kind in (StreamKind.VIDEO, StreamKind.FOLDER):
-            raise CartsError(f"{address.kind} is followed by the command line: carts live SEQUENCE --source {address}")
+            raise CartsError(
+                f"{address.kind} is available on the command line only: carts live SEQUENCE --source {address}"
+            )
         self.stop("Stopped.")
         self._context.end_run("Stopped: a live stream was started")
         context.save()
@@ -227,7 +229,7 @@ class LiveHandler(Handler):
         """A new folder beside the project.
 
         Raises:
-            CartsError: the project ends with the viewer, and what is beside it would, too.
+            CartsError: the project is temporary, and files beside it would be lost.
         """
         project = self._session.editor.project
         if not project.writable:

@@ -19,10 +19,10 @@ from carts_viewer.state import Curves, Maps, Phase, RunState, Scores
 
 _REASONS = {
     "iterations": "Done: the best iteration is the result",
-    "not optimized": "Evaluated only, as the solver says",
+    "not optimized": "Evaluated only: this solver does not optimize",
     "converged": "Ended: no step lowers the loss any more",
-    "failed": "Ended: the image contradicts what was found",
-    "start kept": "The start is kept: what was found fits hardly better",
+    "failed": "Ended: the image contradicts the result",
+    "start kept": "The start is kept: the result fits hardly better",
     "cancelled": "Cancelled",
 }
 
@@ -88,7 +88,7 @@ class OptimizingHandler(Handler):
             run = self._make((state.camera,))
             iterate = run.optimizer.step()
         except CartsError:
-            # Without weights, say, there is nothing to show, and trying again with every picture would not help.
+            # Without weights, for example, there is no map, and trying again with every picture would not help.
             self._context.change(layer=Layer.MASK)
             raise
         self._context.change(maps=None if iterate is None else Maps(iterate, run.cameras, of_run=False), busy=None)
@@ -116,7 +116,7 @@ class OptimizingHandler(Handler):
 
     def _on_Reset(self, intent: intents.Reset) -> None:
         if self._run is not None:
-            # Nothing of the run was saved yet, so there is nothing to take back.
+            # Nothing of the run was saved yet, so there is nothing to undo.
             self._session.editor.drop()
         self.end(None)
         self._context.change(run=RunState())
@@ -132,7 +132,7 @@ class OptimizingHandler(Handler):
             else:
                 settings = changed(settings, {intent.name: intent.value}, "the solver")
         except SettingsError as error:
-            # Half-typed numbers are often out of range, so this is no occasion for an alarm; Run refuses later.
+            # Half-typed numbers are often out of range, so no error is shown yet; Run refuses them.
             self._context.change(settings_error=str(error), settings_field=intent.name)
             return
         self.end("Settings changed; Run starts anew from here")
@@ -165,7 +165,7 @@ class OptimizingHandler(Handler):
 
     def _on_SetObserved(self, intent: intents.SetObserved) -> None:
         observed = Observed(intent.what, intent.masks)  # type: ignore[arg-type]
-        self.end("What is fitted was changed; Run starts anew from here")
+        self.end("The target was changed; Run starts anew from here")
         self._context.change(observed=observed, maps=None)
 
     # ---- The run ---------------------------------------------------------------------------------------------------
@@ -191,7 +191,7 @@ class OptimizingHandler(Handler):
         if self._context.state.settings_error is not None:
             raise SettingsError(self._context.state.settings_error)
         if self._context.state.solving:
-            raise CartsError("Many frames are being solved. Wait, or stop that first.")
+            raise CartsError("Many frames are being solved. Wait, or stop solving first.")
         self._run = self._make(self._context.cameras)
         self._context.save()
         self._before = self._session.saved(self._context.state.index)
@@ -256,7 +256,7 @@ class OptimizingHandler(Handler):
         target = self._session.target(state.observed)
         found = self._check.fit(state.index, state.domain, state.pose, state.settings, target)
         if self._session.editor.project.writable:
-            # It says something about the frame and changes nothing, so there is nothing to undo.
+            # A verdict changes no value, so it is not a step of undo.
             self._context.save()
             self._session.editor.project.record_verdict(state.index, found.verdict)
             self._context.refresh()

@@ -151,17 +151,17 @@ class _Begun:
     """Frame, camera, target and class."""
     prompt: Prompt
     before: Layers
-    """The layers before it was there."""
+    """The layers before the object was added."""
     after: Layers
-    """The layers with it."""
+    """The layers with the object."""
 
 
 class Prompting:
     """Turns clicks and boxes into edits of painted layers.
 
-    A click adds what is there. As long as nothing else changes these layers, further clicks are about the same thing:
-    one more point on it, or with `erase` one beside it. Otherwise a click with `erase` takes away what is there. A box
-    replaces: what is in it and not segmented is taken away.
+    A click adds the object under it. As long as nothing else changes these layers, further clicks refine this object by
+    a point on it or, with `erase`, off it. Otherwise a click with `erase` removes the object under it. A box replaces
+    the layer inside it by the segmentation.
     """
 
     def __init__(self, segmenter: Callable[[], Segmenter]) -> None:
@@ -169,7 +169,7 @@ class Prompting:
         self._begun: _Begun | None = None
 
     def finish(self) -> None:
-        """The next click is about something else."""
+        """Begin a new object with the next click."""
         self._begun = None
 
     def edits(
@@ -185,12 +185,12 @@ class Prompting:
         Args:
             stroke: one point, or two corners of a box.
             image: of its frame and camera, RGB.
-            project: as it is.
+            project: its present state.
             keys: the layers that it may change.
-            changed: layers, pixels and whether they are erased -> these layers afterwards.
+            changed: maps layers, pixels and whether they are erased to the changed layers.
 
         Raises:
-            CartsError: there is nothing to segment, or it could not be done.
+            CartsError: segmentation failed or found nothing.
         """
         now = {key: project.get(key) for key in keys}
         place = (stroke.frame, stroke.camera, stroke.target, stroke.label)
@@ -214,14 +214,14 @@ class Prompting:
 
 
 def _boxed(box: tuple[float, float, float, float], found: Mask) -> Mask:
-    """The pixels whose middles are in a box."""
+    """The pixels whose centres are in a box."""
     rows, columns = np.ogrid[: found.shape[0], : found.shape[1]]
     left, top, right, low = box
     return (columns + 0.5 > left) & (columns + 0.5 < right) & (rows + 0.5 > top) & (rows + 0.5 < low)
 
 
 def asked(stroke: Stroke) -> Prompt:
-    """The prompt that a stroke is: one point, or two corners of a box in any order."""
+    """The prompt of a stroke: one point, or two corners of a box in any order."""
     low, high = stroke.points.min(0).tolist(), stroke.points.max(0).tolist()
     if len(stroke.points) == 1:
         return Prompt(inside=((low[0], low[1]),))

@@ -21,7 +21,7 @@ class PosingHandler(Handler):
         value = finite(intent.value)
         scene = self._session.with_joint(self._context.state.pose.scene, intent.arm, intent.joint, value)
         self._context.change(joint=(intent.arm, intent.joint))
-        # All events of one joint until it is let go of are one step of undo.
+        # All events of one joint until its release are one step of undo.
         gesture = (intents.SetJoint, intent.arm, intent.joint)
         self._set_pose(f"Move {self._joint_name()}", scene, gesture=gesture)
 
@@ -69,14 +69,14 @@ class PosingHandler(Handler):
 _REACH = 15.0
 """Largest distance from the arm at which a link can be grabbed [px]."""
 _LEAST = 0.5
-"""A pointer that has moved less was only pressed [px]."""
+"""Least motion of the pointer that counts as a drag [px]."""
 
 
 class DraggingHandler(Handler):
     """Handler of links that are dragged in the picture.
 
-    Every place of a gesture starts from the pose in which the link was taken, so that the way there does not matter and
-    dragging it back undoes it.
+    Each position of a gesture is solved from the pose at its beginning, so that the path does not matter and dragging
+    back restores the pose.
     """
 
     def __init__(self, context: Context) -> None:
@@ -89,7 +89,7 @@ class DraggingHandler(Handler):
 
     def _on_DragLink(self, intent: intents.DragLink) -> None:
         if not all(map(math.isfinite, (*intent.start, *intent.end))):
-            raise CartsError(f"{intent.start} to {intent.end} are no places in the image.")
+            raise CartsError(f"{intent.start} to {intent.end} are not positions in the image.")
         if intent.gesture != self._gesture:
             self._take(intent)
         moved = intent.end[0] - intent.start[0], intent.end[1] - intent.start[1]
@@ -102,7 +102,7 @@ class DraggingHandler(Handler):
             return
         scene, camera = context.session.scene, context.session.scene.camera(intent.camera)
         u, v = project_keypoints(scene, start, [point], camera.name)[0].tolist()
-        # Not the point but what the pointer has done to it, or a link that was taken beside its outline would jump.
+        # The pointer's displacement, not its position, or a link grabbed beside its outline would jump.
         pixel = _within(u + moved[0], camera.width), _within(v + moved[1], camera.height)
         fit = fit_keypoints(scene, start, [Pin(point, camera.name, pixel)])
         self._context.end_run("Stopped: the pose was changed by hand")
@@ -121,5 +121,5 @@ class DraggingHandler(Handler):
 
 
 def _within(value: float, size: int) -> float:
-    """A place at most one image beyond the image."""
+    """The point clamped to at most one image size beyond the image."""
     return min(max(value, -float(size)), 2.0 * size)

@@ -40,12 +40,12 @@ class AnnotatingHandler(Handler):
         self._pinned_from: SceneState | None = None
         """The pose before the first of the present pins."""
         self._fitted: SceneState | None = None
-        """The pose that the present pins have led to."""
+        """The pose fitted to the present pins."""
         self._worst: int | None = None
         """Frame last shown by `ShowWorse`; None after other navigation."""
 
     def released(self) -> None:
-        """The pointer was let go of."""
+        """Handle the release of the pointer."""
         self._held = None
 
     # ---- History ---------------------------------------------------------------------------------------------------
@@ -70,7 +70,7 @@ class AnnotatingHandler(Handler):
         self._context.forget_pins()
         frames = () if change is None else change.frames
         index = self._context.state.index
-        # What changes should be seen, wherever it is.
+        # Show the frame that changes.
         self._show(index=index if index in frames or not frames else frames[0], again=True)
 
     # ---- Review ----------------------------------------------------------------------------------------------------
@@ -112,7 +112,7 @@ class AnnotatingHandler(Handler):
         order = worst_first(project, open_ones)
         if len(order) == 1:
             raise CartsError("Every other frame is accepted or rejected.")
-        # Who comes from elsewhere begins with the worst one; who is there already, with the one after it.
+        # After other navigation begin with the worst frame, otherwise with the one after the shown frame.
         begins = self._worst != state.index and order[0] != state.index
         place = 0 if begins else (order.index(state.index) + (1 if intent.step > 0 else -1)) % len(order)
         self._go(order[place])
@@ -125,7 +125,7 @@ class AnnotatingHandler(Handler):
     def _mark(self, name: str, review: Review, *, gesture: object = None) -> None:
         """Set the review of the shown frame, which ends a run."""
         self._context.end_run("Stopped: the frame was reviewed")
-        # What says nothing is none, so that clearing what is clear is no step.
+        # An empty review is None, so that clearing it again is not a step.
         edits = {Key.review(self._context.state.index): None if review == Review() else review}
         self._context.edit(name, edits, gesture=gesture)
 
@@ -163,7 +163,7 @@ class AnnotatingHandler(Handler):
         state = self._context.state
         camera = self._session.scene.camera(intent.camera or state.camera)
         if not (math.isfinite(intent.u) and math.isfinite(intent.v)):
-            raise CartsError(f"({intent.u}, {intent.v}) is no place in the image.")
+            raise CartsError(f"({intent.u}, {intent.v}) is not a position in the image.")
         pixel = min(max(intent.u, 0.0), float(camera.width)), min(max(intent.v, 0.0), float(camera.height))
         self._held = self._held or state.keypoints.chosen or self._nearest(pixel, camera.name)
         pin = Pin(self._keypoints[self._held], camera.name, pixel)
@@ -179,7 +179,7 @@ class AnnotatingHandler(Handler):
         self._context.set_pose(f"Place {self._held}", fit.state, gesture=gesture, pins=True)
 
     def _moved_since(self, scene: SceneState) -> bool:
-        """Whether something else, a run, has moved the arms since they were fitted to pins."""
+        """Whether the arms were moved, such as by a run, since they were fitted to pins."""
         if self._fitted is None:
             return True
         pairs = zip(self._fitted.joint_positions, scene.joint_positions, strict=True)
@@ -194,7 +194,7 @@ class AnnotatingHandler(Handler):
 
 
 _LONGEST = 200
-"""Of a text that is looked for, in characters."""
+"""Longest text of a condition [characters]."""
 
 
 class FindingHandler(Handler):
@@ -206,7 +206,7 @@ class FindingHandler(Handler):
 
     def _on_SetFilter(self, intent: intents.SetFilter) -> None:
         if intent.name not in [field.name for field in fields(FrameFilter)]:
-            raise CartsError(f"Frames cannot be looked for by {intent.name!r}.")
+            raise CartsError(f"Frames cannot be filtered by {intent.name!r}.")
         value: Any = clamped(intent.value, 0.0, 1.0) if intent.name == "dice" else str(intent.value)[:_LONGEST]
         self._context.change(filter=replace(self._context.state.filter, **{intent.name: value}))
 
@@ -230,7 +230,7 @@ class FindingHandler(Handler):
         for index in frames:
             review = Review(intent.state, project.review(index).note)
             edits[Key.review(index)] = None if review == Review() else review
-        # All frames in a name would be a long one.
+        # A name with all frames would be too long.
         self._context.save()
         of = " of" if intent.state is ReviewState.UNTOUCHED else ""
         self._context.session.editor.apply(f"{_REVIEW_STEPS[intent.state]}{of} {len(frames)} frames", edits)
@@ -239,5 +239,5 @@ class FindingHandler(Handler):
     def _found(self) -> list[int]:
         frames = found(self._context.session.editor.view, self._context.state.filter)
         if not frames:
-            raise CartsError("No frame is like that. Loosen a condition, or clear them.")
+            raise CartsError("No frame meets the conditions. Loosen or clear them.")
         return frames

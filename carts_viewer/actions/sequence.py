@@ -41,7 +41,7 @@ class PropagatingHandler(Handler):
         """Solve the next frame, if any.
 
         Raises:
-            CartsError: a frame is not usable, or the frames could not be saved. What was solved is saved if it can be.
+            CartsError: a frame is not usable, or the frames could not be saved. Solved frames are saved if possible.
         """
         if self._run is not None:
             next(self._work, None)
@@ -62,13 +62,13 @@ class PropagatingHandler(Handler):
     # ---- Intents ---------------------------------------------------------------------------------------------------
 
     def solve(self, whole: bool, at: int, part: range | None = None) -> None:
-        """Begin to solve all frames, or those between the kept frames around the frame `at`; of a part, if given.
+        """Begin to solve all frames, or those between the kept frames around the frame `at`, within `part` if given.
 
         Raises:
             CartsError: there is nothing to solve, or it could not be saved.
         """
         if self._run is not None:
-            raise CartsError("Frames are being solved already. Wait, or stop that first.")
+            raise CartsError("Frames are being solved already. Wait, or stop solving first.")
         project = self._session.editor.project
         if not project.writable:
             raise ProjectError(f"Solved frames could not be saved: {project.read_only_reason}")
@@ -100,7 +100,7 @@ class PropagatingHandler(Handler):
         except Exception:
             self._context.change(solve=former)
             raise
-        self._work = self._bits(self._run)
+        self._work = self._steps(self._run)
         self._context.change(busy=None, solve=SolveState(frames, text="Estimating the first frame"))
 
     def _on_StopSolving(self, intent: intents.StopSolving) -> None:
@@ -133,7 +133,7 @@ class PropagatingHandler(Handler):
         provenance = self._optimizers.provenance(cameras, state.settings, free, target, Source.PROPAGATED, **more)
         return SequenceRun(optimizer, provenance)
 
-    def _bits(self, run: SequenceRun) -> Iterator[None]:
+    def _steps(self, run: SequenceRun) -> Iterator[None]:
         outcomes: dict[int, Outcome] = {}
         try:
             while run.optimizer.step() is not None:
@@ -148,7 +148,7 @@ class PropagatingHandler(Handler):
                     outcomes[index] = self._comparison.outcome(estimate, run, self._before, self._context.state)
                     self._context.change(busy=None)
                     self._check_calibration()
-                self._report(compared=number, text=f"Comparing with how it was, frame {number} of {visited}")
+                self._report(compared=number, text=f"Comparing with the previous pose, frame {number} of {visited}")
                 yield
             if outcomes and not run.cancelled:
                 self._report(text="Checking the calibration")
@@ -156,7 +156,7 @@ class PropagatingHandler(Handler):
                 gain = run.optimizer.base_frame_gain()
                 self._report(base_frame_gain=gain, calibration=self._before.records.get(WHOLE_PROJECT))
         finally:
-            # An image that is missing in the end does not cost what was solved before it.
+            # Frames solved before a missing image are kept.
             if self._run is run:
                 self._run = None
                 self._report(running=False, text="")
@@ -246,7 +246,7 @@ class MarkingHandler(Handler):
         state = self._context.state
         on = not state.project.is_keyframe(state.index) if intent.on is None else bool(intent.on)
         self._context.end_run("Stopped: the frame was marked")
-        name = "Make a keyframe" if on else "Make no keyframe"
+        name = "Make a keyframe" if on else "Unmark the keyframe"
         self._context.edit(name, {Key.keyframe(state.index): Keyframe(on)})
 
     def _on_SetDirection(self, intent: intents.SetDirection) -> None:

@@ -15,7 +15,7 @@ from carts_core.project.identity import data_dir
 
 _FILE = Kind("decision", 64)
 _LONGEST_CAUSE = 300
-"""Characters."""
+"""Longest quoted cause [characters]."""
 _ACCEPTED, _REFUSED = "accepted", "refused"
 
 

@@ -29,14 +29,14 @@ class Fit:
 
     verdict: FitVerdict
     loss: float
-    """Mean of the cameras that see an arm [1]."""
+    """Mean of the cameras with an arm in view [1]."""
     dice: float | None = None
     """Overlap with the true mask; None where there is none."""
 
     def worse_than(self, other: "Fit") -> str | None:
-        """Text on how this fit is worse than another one of the same frame; None where it is not."""
+        """Text on why this fit is worse than another one of the same frame; None otherwise."""
         if other.dice is not None and self.dice is not None:
-            # Where the truth is known, nothing else counts.
+            # If the truth is known, only Dice counts.
             return f"Dice {self.dice:.3f}, was {other.dice:.3f}" if self.dice < other.dice - _WORSE_DICE else None
         if VERDICTS.index(self.verdict.verdict) > VERDICTS.index(other.verdict.verdict):
             return f"{self.verdict.verdict}, was {other.verdict.verdict}"
@@ -66,7 +66,7 @@ class FitCheck:
             ignore = self._session.ignored(index, [name], target)
             task = FrameTask(sequence, index, domain, (name,), pose, settings, FreeParameters(), target, ignore)
             found[name] = self._optimizers.assess(task)
-        # Cameras that see no arm are left out, unless none sees any.
+        # Cameras without an arm in view are left out, unless all are.
         seeing = {name: one for name, one in found.items() if one[0].evidence.area >= _OUT_OF_VIEW} or found
         loss = sum(loss for _, loss in seeing.values()) / len(seeing)
         return Fit(of_cameras({name: assessment for name, (assessment, _) in seeing.items()}), loss)
@@ -108,7 +108,7 @@ class Comparison:
     def outcome(self, estimate: FrameEstimate, run: SequenceRun, before: ProjectState, state: ViewState) -> Outcome:
         """The best of the solved pose, a run on the frame alone, and the earlier pose.
 
-        The run alone is only made where what was solved is worse than before, or not good.
+        The run alone is made only if the solved pose is worse than the earlier one, or not good.
 
         Raises:
             CartsError: an image or the weights are not usable.
@@ -191,7 +191,7 @@ def solved_edits(estimate: FrameEstimate, run: SequenceRun) -> Edits:
     """Edits that apply the solved pose of a frame."""
     edits: dict[Key[Any], Any] = {}
     for arm, std in estimate.joint_std.items():
-        # An arm that was not free stays as it is.
+        # Arms that were not free are unchanged.
         if np.isfinite(std).any():
             edits[Key.joints(estimate.index, arm)] = joint_correction(
                 estimate.joint_positions[arm], run.provenance, std
@@ -202,4 +202,4 @@ def solved_edits(estimate: FrameEstimate, run: SequenceRun) -> Edits:
 def unchecked(estimate: FrameEstimate, run: SequenceRun) -> Outcome:
     """The result of a frame that was not compared, because solving was stopped."""
     edits = {**solved_edits(estimate, run), Key.verdict(estimate.index): None}
-    return Outcome(edits, Figures(estimate.loss), "not compared with how it was, because solving was stopped")
+    return Outcome(edits, Figures(estimate.loss), "not compared with the previous pose, because solving was stopped")

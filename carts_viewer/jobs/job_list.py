@@ -18,13 +18,13 @@ from carts_core.files.reading import Kind, parse_json, read_text, typed
 from carts_viewer.jobs.companions import Decisions, damage
 
 _KEPT = 50
-"""Jobs that are remembered when they have ended."""
+"""Number of ended jobs that are kept."""
 _LONGEST_LIST = 1000
-"""Jobs."""
+"""Most jobs in the file."""
 _LONGEST_LOG = 200
-"""Lines."""
+"""Most lines of a log."""
 _LONGEST_TEXT = 2000
-"""Characters of a title, a text or a line."""
+"""Longest title, text or line [characters]."""
 _FILE = Kind("list of jobs", 8 * 2**20)
 LARGEST_CALIBRATION = 500
 """Most frames of a calibration."""
@@ -177,7 +177,7 @@ class Job:
     title: str
     """Text for the user."""
     options: Options
-    """With the kind, all that is needed to do it again."""
+    """With the kind, all data to repeat the job."""
     state: JobState = JobState.WAITING
     done: Annotated[int, msgspec.Meta(ge=0)] = 0
     total: Annotated[int, msgspec.Meta(ge=0)] = 0
@@ -259,7 +259,7 @@ class JobList:
             self._write()
 
     def accept(self, number: int, options: Options) -> None:
-        """Have a job wait that another user has queued, with these options; from now on it is this user's."""
+        """Queue a job of another user, with these options, as this user's."""
         job = replace(self.find(number), state=JobState.WAITING, options=options)
         job = self._own(job)
         self.jobs = tuple(job if each.number == number else each for each in self.jobs)
@@ -309,7 +309,7 @@ class JobList:
             write_text(self._path, json.dumps([asdict(job) for job in self.jobs], indent=1))
 
     def _read(self) -> list[Job]:
-        """The jobs of the file; a damaged one is set aside and the list begun anew."""
+        """The jobs of the file; a damaged file is set aside and a new list started."""
         if self._path is None:
             return []
         try:
@@ -321,7 +321,9 @@ class JobList:
         except FileNotFoundError:
             return []
         except (OSError, ValueError) as error:
-            self.problem = damage(self._path.path, "list of jobs", error, "A new list was begun, and no job of it runs")
+            self.problem = damage(
+                self._path.path, "list of jobs", error, "A new list was started, and none of its jobs runs"
+            )
             return []
 
     def _job(self, row: _Row) -> Job:
@@ -334,12 +336,12 @@ class JobList:
         return Job(**{**vars(row), **texts, "options": options, "title": title})
 
     def _resumed(self, job: Job) -> Job:
-        """A job of a viewer that has ended: a waiting one waits or is asked for, one that ran has failed."""
+        """A job of an earlier viewer: a waiting one waits or needs confirmation, a running one has failed."""
         if job.state in (JobState.WAITING, JobState.ASKED):
             return replace(job, state=JobState.WAITING if self.is_own(job) else JobState.ASKED)
         if job.state is not JobState.RUNNING:
             return job
-        text = "The viewer ended while it ran. What it had saved is there; start it again for the rest."
+        text = "The viewer ended while it ran. Saved results are kept; start it again for the rest."
         return _changed(job, text, {"state": JobState.FAILED, "text": text, "ended": time.time()})
 
 

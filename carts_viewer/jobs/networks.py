@@ -18,7 +18,7 @@ _WEIGHTS_FILE = "surface.safetensors"
 _ADAPTED = "Adapted {}"
 _FILE = Kind("choice of a network", 2**12)
 _LONGEST_NAME = 40
-"""Characters."""
+"""Longest name of a network [characters]."""
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class _Choice:
 class Networks:
     """The surface network that all tabs use; the choice is kept in `PROJECT_network.json` beside the project.
 
-    Weights that this user has neither trained here nor accepted are not used before they are accepted, once a file.
+    Weights that this user has neither trained here nor accepted are not used before they are accepted, once per file.
 
     Attributes:
         names: labels of the networks to choose from.
@@ -87,7 +87,7 @@ class Networks:
         """Accept or refuse the weights that were asked for.
 
         Raises:
-            CartsError: none were, or they cannot be used.
+            CartsError: there is no question, or they cannot be used.
         """
         name, self.asked = self.asked, ""
         if not name:
@@ -102,9 +102,9 @@ class Networks:
             self._decisions.make(self._weights(_ADAPTED.format(number)), True)
 
     def _resume(self, name: str) -> None:
-        """Run the network that was chosen last, or ask for it."""
+        """Use the network that was chosen last, or ask for confirmation."""
         if name not in self.names:
-            raise CartsError("it is not there any more")
+            raise CartsError("it no longer exists")
         accepted = self._decisions.find(self._weights(name))
         if accepted:
             self._run(name)

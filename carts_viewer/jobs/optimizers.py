@@ -80,7 +80,7 @@ class FrameTask:
     domain: str
     cameras: tuple[str, ...]
     pose: Pose
-    """Where to start."""
+    """Initial state."""
     settings: SolverSettings
     free: FreeParameters
     target: Target
@@ -110,7 +110,7 @@ class ActiveRun:
     def pose(self, iterate: Iterate) -> Pose:
         """An iterate's state, which knows the run's cameras only, as a pose of the whole scene.
 
-        What was not free is exactly as it was: rounding must not count as a new calibration of all frames.
+        Parameters that were not free are copied exactly: rounding must not count as a new calibration of all frames.
         """
         state, start, free = iterate.state.to("cpu"), self.start.scene, self._free
         extrinsics, intrinsics = start.T_camera_world.clone(), start.intrinsics.clone()
@@ -140,9 +140,9 @@ class SequenceRun:
         """Progress, as text for the user."""
         done, total = self.optimizer.progress
         if done == 0:
-            return "Solving a few frames alone, for a first estimate of the error of all"
+            return "Solving single frames for a first estimate of the kinematic error"
         if done == total:
-            return f"All {total} frames estimated, revising those that disagree and judging the fit"
+            return f"All {total} frames estimated; revising inconsistent ones and assessing the fit"
         if done < 2 < total:
             return f"Frame {done} of {total}"  # The first takes longer than others.
         return f"Frame {done} of {total}, about {spoken_time(self.optimizer.seconds_left)} left"
@@ -286,7 +286,7 @@ class OptimizerFactory:
         if task.target.observed.what != "network" and not isinstance(task.settings, SurfaceSolver):
             raise SettingsError(
                 "The chosen solver compares features of images, so it cannot fit masks. Choose the solver Surface "
-                "maps, or fit what the network sees."
+                "maps, or fit the network's predictions."
             )
         return self._frame_optimizer(task, predictor)
 

@@ -52,7 +52,7 @@ class Progress:
 
 
 def optimize_frames(context: Context, comparison: Comparison, frames: Sequence[int], first: int) -> Generator[Progress]:
-    """Run on each of these frames alone, from the one at place `first` on; a result that fits worse is not taken.
+    """Run on each of these frames alone, beginning at position `first`; worse results are discarded.
 
     Every frame is a step of undo of its own, and is saved before the next one begins.
     """
@@ -173,19 +173,19 @@ OPTIONS: tuple[str, ...] = ()
 _POLL = 0.25
 """Interval between checks of the training [s]."""
 _LONGEST_END = 30.0
-"""Time that a stopped training has for its checkpoint [s]."""
+"""Time for a stopped training to save its checkpoint [s]."""
 
 
 def adapt(sequence: Path, folder: Path, minutes: float) -> Generator[Progress]:
     """Train in a process of its own and report progress; closing the iterator stops the training.
 
-    A training that was stopped goes on in its folder, for so many minutes.
+    A stopped training continues in its folder for the given minutes.
 
     Raises:
         CartsError: training failed.
     """
     training = _Training([str(folder), "--for", str(sequence), "--minutes", f"{minutes:g}", *OPTIONS])
-    total, text, lines = max(1, round(minutes)), "Making images to measure with", []
+    total, text, lines = max(1, round(minutes)), "Making validation images", []
     try:
         yield Progress(0, total, text, f"in {folder}")
         while training.running or training.unread:
@@ -204,11 +204,11 @@ def adapt(sequence: Path, folder: Path, minutes: float) -> Generator[Progress]:
 
 
 class _Training:
-    """A process that trains."""
+    """Child process of a training."""
 
     def __init__(self, arguments: list[str]) -> None:
         self._began = time.monotonic()
-        # Waiting threads that spin would take the processor from the page.
+        # Spinning threads would slow down the page.
         output = {"PYTHONUNBUFFERED": "1", "NO_COLOR": "1", "OMP_WAIT_POLICY": "PASSIVE"}
         environment = {**os.environ, **output, PARENT: str(os.getpid())}
         self._process = subprocess.Popen(

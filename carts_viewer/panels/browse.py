@@ -38,7 +38,7 @@ class BrowsePanel:
         self._count = len(sequence)
         stamps = sequence.timestamps
         self._began = 0.0 if stamps is None else float(stamps[0])
-        # Shown on while those of a newer pose are being computed, or the line would jump.
+        # Kept while those of a newer pose are computed, or the line would jump.
         self._scores = Scores()
         with gui.add_folder("Sequence"):
             # A slider needs two ends even for a sequence of a single frame.
@@ -58,7 +58,7 @@ class BrowsePanel:
                 offset or 0.0,
                 step=0.005,
                 visible=offset is not None,
-                hint="Clock of the kinematics minus clock of the images. Make it smaller when the overlay runs ahead.",
+                hint="Clock of the kinematics minus clock of the images. Reduce it if the overlay runs ahead.",
             )
             if sequence.remarks:
                 lines = "".join(f"<li>{escaped(remark)}</li>" for remark in sequence.remarks)
@@ -83,7 +83,7 @@ class BrowsePanel:
         self._error.visible = state.time_error is not None
         self._error.content = f'<p class="carts-error">{escaped(state.time_error or "")}</p>'
         offset = self._session.time_offset
-        # What could not be used stays in the field, where it is being typed.
+        # An invalid value stays in the field while it is typed.
         if offset is not None and state.time_error is None and not self._waits(intents.SetTimeOffset):
             write(self._offset, offset)
         write(self._domain, next(label for label, name in self._domains.items() if name == state.domain))
@@ -130,8 +130,8 @@ def _time(stamp: float, began: float) -> str:
 
 _NOTHING = "Nothing"
 _RAMPS = {
-    Layer.ATTENTION: '<span class="carts-ramp"></span> 0 (left out) to 1 (counts fully)',
-    Layer.SIMILARITY: '<span class="carts-ramp"></span> 0 (unlike) to 1 (alike)',
+    Layer.ATTENTION: '<span class="carts-ramp"></span> 0 (no weight) to 1 (full weight)',
+    Layer.SIMILARITY: '<span class="carts-ramp"></span> 0 (different) to 1 (similar)',
 }
 
 
@@ -183,7 +183,7 @@ class OverlayPanel:
         return _RAMPS.get(state.layer, "")
 
     def _explain_imported(self, state: ViewState) -> str:
-        """The labels of others; those of the shown frame."""
+        """Legend of the imported labels in the shown frame."""
         layer = state.project.get(Key.imported_mask(state.index, state.camera))
         points = state.project.get(Key.imported_keypoints(state.index, state.camera))
         known = state.project.get(Key.imported_labels())

@@ -16,10 +16,10 @@ _DVRK = ("dvrk", "dvrk-2.3", "dvrk-suj")
 _WITHOUT_PARTS = ("masks", "coco-keypoints", "bop", "csv", "npz", "json", *_DVRK, "video")
 """Formats that have no categories, or always both kinds."""
 _WRITTEN = (
-    "Masks, keypoints and poses are those of the rendered arms at their joint positions now; masks with what was "
-    "painted. The recording's own masks are not written."
+    "Masks, keypoints and poses are those of the arms rendered at the present joint positions; masks include "
+    "painted corrections. The recording's own masks are not written."
 )
-_NOT_KEPT = "This project ends with the viewer, and its exports with it: download them."
+_NOT_KEPT = "This project is temporary: download its exports before the viewer is closed."
 
 
 class ExportPanel:
@@ -119,12 +119,12 @@ class ImportPanel:
     def __init__(self, page: PanelPage, session: Session) -> None:
         gui = page.gui
         cameras = [camera.name for camera in session.scene.cameras]
-        with gui.add_folder("Masks of others", expand_by_default=False):
+        with gui.add_folder("Import", expand_by_default=False):
             self._place = gui.add_text("From", "", hint=_HINT)
             self._camera = gui.add_dropdown(
-                "Camera", [_BY_NAME, *cameras], visible=len(cameras) > 1, hint="Whose images the masks are of"
+                "Camera", [_BY_NAME, *cameras], visible=len(cameras) > 1, hint="Camera whose images were annotated"
             )
-            self._replace = gui.add_checkbox("Replace", False, hint="Replace what was imported before")
+            self._replace = gui.add_checkbox("Replace", False, hint="Replace earlier imports")
             self._import = page.button("Import masks", lambda _: self._intent(), icon=viser.Icon.FILE_IMPORT)
             self._text = gui.add_html("")
 
@@ -137,6 +137,6 @@ class ImportPanel:
         there = state.project.get(Key.imported_labels()) is not None
         content = "Nothing was imported yet."
         if there:
-            content = escaped(state.imported) or "What was imported is the layer <i>Imported masks</i>."
+            content = escaped(state.imported) or "The layer <i>Imported masks</i> shows the imports."
         if self._text.content != (wanted := f'<p class="carts-caption">{content}</p>'):
             self._text.content = wanted

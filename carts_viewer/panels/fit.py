@@ -16,7 +16,7 @@ _RATE = 30.0
 
 
 class LivePanel:
-    """Starts and stops a stream that is shown in the place of the recording."""
+    """Starts and stops a live stream, which is shown in place of the recording."""
 
     def __init__(self, page: PanelPage) -> None:
         gui = page.gui
@@ -28,7 +28,7 @@ class LivePanel:
             )
             self._device = gui.add_number("Device", 0, min=0, max=63, step=1, hint="Number of the camera, from 0")
             self._port = gui.add_number(
-                "Port", _PORT, min=1024, max=65535, step=1, hint="Of 127.0.0.1, where messages are sent to"
+                "Port", _PORT, min=1024, max=65535, step=1, hint="Port of 127.0.0.1 that receives messages"
             )
             self._repeat = gui.add_checkbox("Repeat", False, hint="Begin again when the recording ends")
             self._rate = gui.add_number(
@@ -83,13 +83,13 @@ def live_text(live: LiveState) -> str:
 
 
 _MEANING = (
-    "What the images say of the fit. Good: rely on the mask. Doubtful: look at it. Failed: do not use it. Joints "
-    "that the images leave open stay near their measured values; their deviations are under Values."
+    "Rating of the fit by the images. Good: the mask is reliable. Doubtful: inspect it. Failed: do not use it. "
+    "Undetermined joints stay near their measured values; their standard deviations are under Values."
 )
 
 
 class FitPanel:
-    """The verdict, always in view, and a button that asks the images for one."""
+    """The verdict, always visible, and a button that computes it."""
 
     def __init__(self, page: PanelPage, session: Session) -> None:
         gui = page.gui
@@ -100,7 +100,7 @@ class FitPanel:
             "Check the fit",
             intents.Assess(),
             icon=viser.Icon.STETHOSCOPE,
-            hint="Compare the arms as they are with the images of all cameras, and move nothing",
+            hint="Compare the arms in their present pose with the images of all cameras, without moving them",
         )
 
     def show(self, state: ViewState) -> None:
@@ -138,7 +138,7 @@ def fit_text(
         verdict: of the shown pose; None where it was not assessed.
         running: whether the pose is still moving.
         scores: Dice of the cameras with a true mask.
-        undetermined: joints that the images leave open; None where no deviation is known.
+        undetermined: joints that the images do not determine; None where no deviation is known.
         busy: what is being prepared.
     """
     cameras = dict(verdict.cameras) if verdict is not None else {}
@@ -169,7 +169,7 @@ def fit_text(
 
 
 def quality(failure: float) -> str:
-    """The verdict that a probability of failure calls for."""
+    """The verdict for a probability of failure."""
     return Verdict.of(failure).value
 
 

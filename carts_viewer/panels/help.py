@@ -28,7 +28,7 @@ _GROWTH = 1.25
 _BEGIN, _END = "<!-- keys: written by python -m carts_viewer.panels.help -->", "<!-- end of keys -->"
 
 Special = Literal["perturb", "view"]
-"""Shortcuts that are no intent: `perturb` depends on fields of the page, `view` happens in the tab alone."""
+"""Shortcuts without an intent: `perturb` depends on fields of the page, `view` is handled by the tab."""
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ def shortcuts() -> list[Shortcut]:
         Shortcut("R", "Run or pause the optimizer", intents.RunOrPause()),
         Shortcut("T", "One step of the optimizer", intents.Step()),
         Shortcut("X", "Reset to the start of the run", intents.Reset()),
-        Shortcut("K", "Make the frame a keyframe, or none", intents.HoldKeyframe()),
+        Shortcut("K", "Mark or unmark the frame as a keyframe", intents.HoldKeyframe()),
         Shortcut("K", "Solve between the keyframes", intents.Solve(), "shift"),
         Shortcut("G", "Accept, and go to the next unreviewed frame", intents.AcceptAndNext()),
         Shortcut("F", "Mark as needing work", intents.SetReview(ReviewState.NEEDS_WORK)),
@@ -85,15 +85,15 @@ def shortcuts() -> list[Shortcut]:
         Shortcut("M", "Back to measured joints", intents.BackToMeasured()),
         Shortcut("Z", "Undo", intents.Undo(), "cmd/ctrl"),
         Shortcut("Z", "Redo", intents.Redo(), "cmd/ctrl+shift"),
-        Shortcut("B", "Brush, or put it away", intents.ToggleTool(Tool.BRUSH), "shift"),
-        Shortcut("X", "Eraser, or put it away", intents.ToggleTool(Tool.ERASER), "shift"),
-        Shortcut("P", "Polygon, or put it away", intents.ToggleTool(Tool.POLYGON), "shift"),
-        Shortcut("T", "Prompt (click or box), or put it away", intents.ToggleTool(Tool.PROMPT), "shift"),
-        Shortcut("enter", "Prompt: go on with the next object", intents.NextObject()),
+        Shortcut("B", "Brush on or off", intents.ToggleTool(Tool.BRUSH), "shift"),
+        Shortcut("X", "Eraser on or off", intents.ToggleTool(Tool.ERASER), "shift"),
+        Shortcut("P", "Polygon on or off", intents.ToggleTool(Tool.POLYGON), "shift"),
+        Shortcut("T", "Prompt (click or box) on or off", intents.ToggleTool(Tool.PROMPT), "shift"),
+        Shortcut("enter", "Prompt: begin the next object", intents.NextObject()),
         Shortcut("M", "Paint on the mask or on the ignore region", intents.SetTarget(), "shift"),
         Shortcut("[", "Smaller brush", intents.ScaleBrush(1 / _GROWTH)),
         Shortcut("]", "Larger brush", intents.ScaleBrush(_GROWTH)),
-        Shortcut("escape", "Drop the polygon, or put the tool away", intents.SetTool(Tool.OFF)),
+        Shortcut("escape", "Drop the polygon, or deselect the tool", intents.SetTool(Tool.OFF)),
         Shortcut("V", "Endoscope view or 3D view", "view"),
         *(
             Shortcut(str(number), f"Overlay: {layer.lower()}", intents.ShowLayer(layer))
@@ -109,26 +109,26 @@ _GROUPS = {
     "Paint": ("Brush", "brush", "Eraser", "Polygon", "polygon", "Prompt", "Paint"),
     "View": ("",),
 }
-"""Names of groups, and words by which the keys of a group are known; the first group that fits has the key."""
+"""Names of groups, and words in the labels of their keys; a key belongs to the first group that matches."""
 _POINTER = (
     ("Ctrl+drag", "Drag a link of an arm; its joints follow"),
-    ("Shift+click", "Say where a keypoint of the arm is; Shift+drag takes it along"),
+    ("Shift+click", "Place a keypoint of the arm; Shift+drag moves it"),
 )
 """Actions of the pointer on the picture with a modifier key."""
 
 
 def key_groups() -> list[tuple[str, list[tuple[str, str]]]]:
-    """Shortcuts for the sheet of keys: name of each group, with pairs of key and meaning."""
+    """Shortcuts for the key sheet: name of each group, with pairs of key and meaning."""
     groups: dict[str, list[tuple[str, str]]] = {name: [] for name in _GROUPS}
     groups["On the picture"] = list(_POINTER)
     order = ["Review", "Optimize", "Paint", "Frames", "View"]
     for shortcut in shortcuts():
         name = next(name for name in order if any(word in shortcut.label for word in _GROUPS[name]))
         groups[name].append((shortcut.key, shortcut.label))
-    groups["View"].append((",", "Loupe: pixels, coordinates, colour; hold it, or press it to keep it"))
+    groups["View"].append((",", "Loupe: pixels, coordinates, colour; hold, or press to toggle"))
     groups["View"].append((".", "Hold: the measured pose, or the one compared with"))
     groups["View"].append(("?", "This sheet"))
-    groups["View"].append(("Ctrl+K", "Find anything by name"))
+    groups["View"].append(("Ctrl+K", "Find any action by name"))
     return list(groups.items())
 
 
@@ -137,7 +137,7 @@ def key_table() -> str:
     rows = [f"| **{shortcut.key}** | {shortcut.label} |" for shortcut in shortcuts()]
     rows += [
         *(f"| **{key}** | {text} |" for key, text in _POINTER),
-        "| **,** | Loupe: pixels, coordinates, colour; hold it, or press it to keep it |",
+        "| **,** | Loupe: pixels, coordinates, colour; hold, or press to toggle |",
         "| **.** (held) | The measured pose, or the one compared with |",
         "| **?** | All keys on one sheet |",
     ]
@@ -163,115 +163,115 @@ if __name__ == "__main__":
 
 
 HINTS = {
-    "Dismiss": "Take the message away; what it is about stays as it is",
-    "Fit to": "What the arms are fitted to: the network's predictions, or masks",
-    "Undo": "Take back your last step, in whatever frame it was (Ctrl+Z)",
-    "Redo": "Do again what was taken back last (Ctrl+Shift+Z)",
+    "Dismiss": "Hide the message",
+    "Fit to": "Target of a fit: the network's predictions, masks, or both",
+    "Undo": "Undo your last step, in any frame (Ctrl+Z)",
+    "Redo": "Redo the last undone step (Ctrl+Shift+Z)",
     # Sequence
     "Frame": "Number of the shown frame, from 1; N and B go to the next and the previous one",
-    "Play": "Play the sequence, or the range chosen in the timeline, round and round (space)",
-    "Frames/s": "How fast to play [frames/s]",
-    "Domain": "Which variant of the images is shown and optimized; joint positions are the same in all",
-    "Camera": "The camera that is painted on and exported alone; a click on its image chooses it, too",
+    "Play": "Play the sequence, or the range in the timeline, in a loop (space)",
+    "Frames/s": "Playback rate [frames/s]",
+    "Domain": "Variant of the images to show and optimize; joint positions are the same in all",
+    "Camera": "Active camera, for painting and for exports of one camera; a click on its image selects it, too",
     # Overlay
-    "Layer": "What is drawn over the image (the number keys)",
-    "Opacity %": "Of the overlay: 0 is invisible, 100 hides what is below it [%]",
-    "Swipe %": "Up to where the other pose is shown, from the left [% of the image's width]",
+    "Layer": "Layer over the image (number keys)",
+    "Opacity %": "Opacity of the overlay: 0 is invisible, 100 hides the image below [%]",
+    "Swipe %": "Share of the image that shows the other pose, from the left [% of the width]",
     # Paint
-    "Off": "No tool: drag moves the picture again (Esc)",
+    "Off": "No tool: dragging pans the image (Esc)",
     "Brush": "Paint with a round brush; Shift erases (Shift+B)",
     "Eraser": "Erase with a round brush; Shift paints (Shift+X)",
-    "Adapt the network to this recording": "Train the network further on images made for this recording; a job",
-    "Use the newest network": "Go on with the network that was adapted last",
-    "Prompt": "Segment what is at a click or in a box; Shift or Alt takes away (Shift+T)",
-    "Polygon": "Fill an area: click its corners, Enter or a double click ends it (Shift+P)",
-    "Mask": "Correct the mask: what is added or removed counts for Dice and exports",
+    "Adapt the network to this recording": "Train the network on synthetic images for this recording; a job",
+    "Use newest network": "Use the network that was adapted last",
+    "Prompt": "Segment the object at a click or in a box; Shift or Alt removes (Shift+T)",
+    "Polygon": "Fill a polygon: click its corners; Enter or a double click closes it (Shift+P)",
+    "Mask": "Correct the mask; Dice and exports use the corrected mask",
     "Ignore region": "Mark pixels that the optimizer leaves out",
     "Size [px]": "Diameter of the brush, in pixels of the image ([ and ])",
-    "Clear": "Remove all that was painted on this layer of this frame and camera",
+    "Clear": "Remove all paint of this layer in this frame and camera",
     # Joints
     "Perturb all joints": "Move every measured joint by the amount below, up or down at random (P)",
-    "By [°, mm]": "How far: degrees for joints that turn, millimetres for those that slide",
-    "Seed": "Which of the random directions; the same number gives the same ones",
+    "By [°, mm]": "Size of the offset: degrees for revolute joints, millimetres for prismatic ones",
+    "Seed": "Seed of the random signs; the same number gives the same signs",
     "Back to measured": "Forget all corrections of this frame's joints (M)",
     "All back to measured": "Forget all corrections of this frame's joints (M)",
     # Optimize
-    "Run": "Fit the arms to this frame's images from where they are; clicked keypoints do not pull on it (R)",
-    "Pause": "Hold the run; Continue goes on with it (R)",
+    "Run": "Fit the arms to this frame's images from their present pose; clicked keypoints do not constrain it (R)",
+    "Pause": "Pause the run; Continue resumes it (R)",
     "Step": "A single iteration (T)",
-    "Reset": "Back to where the run began (X)",
-    "Solver": "What compares the rendered arm with the image; the default is the most accurate",
-    "Cameras": "Which cameras' images count",
-    "Advanced settings": "Every number of the chosen solver, with its unit and meaning",
-    "Reset all to the preset": "Bring all settings back to those of the chosen preset",
+    "Reset": "Reset to the start of the run (X)",
+    "Solver": "Objective and optimizer; the default is the most accurate",
+    "Cameras": "Cameras whose images are fitted",
+    "Advanced settings": "All numbers of the chosen solver, with unit and meaning",
+    "Reset to preset": "Reset all settings to those of the chosen preset",
     "Close": "Close this window; settings stay",
-    "Base frames": "Let runs and calibrations move where the arms stand",
+    "Base frames": "Let runs and calibrations move the bases of the arms",
     "Camera pose": "Let runs and calibrations move the cameras",
     "Camera intrinsics": "Let runs and calibrations change focal length and principal point [px]",
     # Review
     "Accept + next": "Accept this frame, and go to the next unreviewed one (G)",
-    "Accept": "Accept this frame: solving leaves it as it is",
+    "Accept": "Accept this frame; solving does not change it",
     "Needs work": "Mark this frame for later (F)",
-    "Reject": "Mark this frame as unusable; exports leave it out if you say so (J)",
-    "Note": "Anything worth remembering about this frame; saved when you leave the field",
-    "Previous worst": "Go to the frame that fits next better than this one (Shift+L)",
-    "Next worst": "Go to the frame that fits worst of those that are neither accepted nor rejected; frames "
+    "Reject": "Mark this frame as unusable; exports can exclude it (J)",
+    "Note": "Remark on this frame; saved when you leave the field",
+    "Previous worst": "Go to the previous frame in the order from worst to best (Shift+L)",
+    "Next worst": "Go to the next frame, from worst to best, that is neither accepted nor rejected; frames "
     "without a verdict come last, in order (L)",
     "Next unreviewed": "Go to the next frame without a review (Y)",
     "Solve between": "Fit the frames between the kept ones around this frame together (Shift+K)",
-    "Solve all": "Fit all frames, or those in the timeline's range, together; kept frames stay as they are",
-    "Begin at": "From which end of the sequence solving goes on",
-    "Take it as solved": "Use what was solved for this frame, although it fits worse",
-    "Take all": "Use what was solved for all listed frames, although they fit worse",
-    "Leave them, close the list": "Keep the listed frames as they are",
+    "Solve all": "Fit all frames, or those in the timeline's range, together; kept frames do not change",
+    "Begin at": "End of the sequence at which solving begins",
+    "Take solved pose": "Use the solved pose of this frame, although it fits worse",
+    "Take all": "Use the solved poses of all listed frames, although they fit worse",
+    "Discard all": "Keep the previous poses of the listed frames, and close the list",
     "Stop and keep": "Stop solving, and keep the frames that are done",
-    "Keypoint": "Which point of the arm the next Shift+click is about",
+    "Keypoint": "Point of the arm that the next Shift+click places",
     "Show keypoints": "Mark the keypoints of the arms in the images, with their names (H)",
-    "Forget the clicks": "Remove the clicked points; the arm stays where it is",
+    "Clear clicks": "Remove the clicked points; the arm keeps its pose",
     "Import masks": "Read masks or keypoints into a layer of this project; one step of undo",
     # Find
     "Review": "Frames in this review state",
     "Corrected": "Frames in which this arm's joints were corrected",
-    "Note has": "Frames whose note contains this text",
-    "Previous": "The frame before this one that was found",
-    "Next": "The frame after this one that was found",
-    "Accept all": "Accept every frame that was found, as one step of undo",
-    "Reject all": "Reject every frame that was found, as one step of undo",
-    "Reset all": "Make every frame that was found unreviewed, as one step of undo",
+    "Note contains": "Frames whose note contains this text",
+    "Previous": "Previous frame found",
+    "Next": "Next frame found",
+    "Accept all": "Accept all frames found, as one step of undo",
+    "Reject all": "Reject all frames found, as one step of undo",
+    "Reset all": "Clear the review of all frames found, as one step of undo",
     # Jobs
     "Run jobs": "Run the jobs that another user, or another computer, has queued",
-    "Discard jobs": "Cancel these jobs; nothing of them runs",
+    "Discard jobs": "Cancel these jobs without running them",
     "Accept network": "Use these weights now, and whenever they are chosen again",
     "Refuse network": "Do not use these weights",
-    "Which frames": "What the job works on",
-    "Optimize each alone": "Run on each of these frames from where it is; what would fit worse is not taken",
+    "Which frames": "Frames of the job",
+    "Optimize each alone": "Run on each of these frames from its present pose; worse results are discarded",
     "Calibrate": "Fit base frames, or what is ticked under Free parameters, to these frames together. All masks "
     "move with it, so accepted frames become unreviewed; one step of undo",
-    "Job": "The job that the buttons and the log below are about",
-    "Cancel": "Stop this job, or take it out of the queue; what it has saved stays",
-    "Start again": "Queue this job once more; one on many frames goes on where it stopped",
-    "Clear ended": "Take all jobs that have ended off the list",
+    "Job": "Job for the buttons and the log below",
+    "Cancel": "Stop this job, or remove it from the queue; saved results are kept",
+    "Start again": "Queue this job again; a job on many frames continues where it stopped",
+    "Clear ended": "Remove ended jobs from the list",
     # Live
-    "Start": "Follow the source in the place of the recording",
-    "Stop": "Go back to the recording",
+    "Start": "Track the arms in the source, shown in place of the recording",
+    "Stop": "Return to the recording",
     # Export
-    "Format": "What other tools will read",
-    "Frames": "Which frames are written, by their review state",
-    "Only the range": "Of these, only frames in the timeline's range",
-    "Category per": "What gets a class of its own",
+    "Format": "File format",
+    "Frames": "Frames to write, by review state",
+    "Only the range": "Restrict them to the timeline's range",
+    "Category per": "Objects with a category of their own",
     "Copy images": "Copy the images beside their labels; otherwise labels name those of the recording",
     "Export": "Write into a new folder beside the project, as a job",
-    "Cancel export": "Stop; nothing of it is left",
-    "Download it": "Send what was written last to this browser",
+    "Cancel export": "Stop, and remove its files",
+    "Download it": "Send the last export to this browser",
     "Export mask": "Download this frame's mask of the shown camera as PNG",
 }
-"""By label."""
+"""Hints of controls by label."""
 
 
 def explain(page: PanelPage) -> list[str]:
     """Set the hints of all controls of a tab; returns the labels of those without one.
 
-    viser shows hints over fields alone, so the page's script shows those of buttons and over labels.
+    viser shows hints over fields only, so the page's script shows those of buttons and labels.
     """
     missing, shown = [], {}
     for handle in page.widgets():
@@ -288,14 +288,14 @@ def explain(page: PanelPage) -> list[str]:
 
 
 class HelpPanel:
-    """Registers the shortcuts and explains everything in a few words."""
+    """Registers the shortcuts and shows the help text."""
 
     def __init__(self, page: PanelPage, perturb: Callable[[], intents.Intent]) -> None:
         gui = page.gui
         own = {}
         for shortcut in shortcuts():
             hotkey = None if shortcut.hotkey in OWN_KEYS else shortcut.hotkey
-            # viser shows the keys that it listens to itself.
+            # viser lists the keys that it handles itself.
             described = shortcut.key if hotkey is None else None
             command = gui.add_command(shortcut.label, description=described, hotkey=hotkey, modifier=shortcut.modifier)  # type: ignore[arg-type]
             _listen(page, command, shortcut, perturb)

@@ -21,7 +21,7 @@ class Panel(Protocol):
 
 
 class PanelPage(TabPage):
-    """A tab's page, whose widgets ask for intents.
+    """A tab's page, whose widgets emit intents.
 
     Attributes:
         emit: hands an intent to the worker; never blocks.
@@ -39,7 +39,7 @@ class PanelPage(TabPage):
     ) -> viser.GuiButtonHandle:
         """Add a button of `viser.GuiApi.add_button` to the current container.
 
-        Pressed, it emits the intent, or what `intent` makes of the number of the tab.
+        When pressed, it emits the intent, or the result of `intent` for the client id.
         """
         handle = self.gui.add_button(label, color=color, **options)
 
@@ -52,11 +52,11 @@ class PanelPage(TabPage):
         return handle
 
     def on_input(self, handle: Any, intent: Callable[[Any], Intent]) -> None:
-        """When a person changes the widget, emit what `intent` makes of the new value.
+        """Emit `intent(value)` when the user changes the widget.
 
-        Our own writes, numbers that are not finite and choices that do not exist are not input.
+        Programmatic writes, non-finite numbers and unknown choices are not input.
         """
-        # What no page of ours would send is not acted upon, but every tab has seen it and must be set right.
+        # Invalid values are ignored, but the tabs show them and must be corrected.
         on_sent(handle, lambda value: self.emit(intent(value) if valid(handle, value) else Refresh()))
 
 
@@ -69,7 +69,7 @@ def valid(handle: Any, value: Any) -> bool:
 
 
 def write(handle: Any, value: Any) -> None:
-    """Set a widget's value if it is another one; a number that was not finite counts as another one."""
+    """Set a widget's value if it differs; a non-finite number counts as different."""
     if handle.value != value:
         handle.value = value
 

@@ -1,4 +1,4 @@
-"""The jobs: what waits, runs and has ended, with progress, time left, log, and buttons for the chosen one."""
+"""The list of jobs with progress, remaining time and log, and buttons for the chosen job."""
 
 import time
 
@@ -15,7 +15,7 @@ from carts_viewer.transport.document import escaped
 
 _NONE = "None"
 _LISTED = 5
-"""Jobs that a question names."""
+"""Number of jobs that a question lists."""
 _UNREVIEWED, _RANGE = "Unreviewed", "Range in the timeline"
 _FRAMES: dict[str, intents.Frames] = {
     _UNREVIEWED: "unreviewed",
@@ -26,7 +26,7 @@ _FRAMES: dict[str, intents.Frames] = {
 
 
 class JobsPanel:
-    """Queues jobs and shows how they go."""
+    """Queues jobs and shows their progress."""
 
     def __init__(self, page: PanelPage) -> None:
         gui = page.gui
@@ -67,7 +67,7 @@ class JobsPanel:
                 min=1,
                 max=LONGEST_TRAINING,
                 step=1,
-                hint="Processor time at most; it ends when it no longer gains",
+                hint="Limit of processor time; training ends earlier without further gain",
             )
             page.button(
                 "Adapt the network",
@@ -80,11 +80,11 @@ class JobsPanel:
                 "neighbouring frames together, see Review, <b>Solve</b>. <b>Calibrate</b> fits the poses of the "
                 "arms' bases (base frames), or what is ticked under Free parameters, to frames of the whole sequence. "
                 "All masks move with it: solve again afterwards; accepted frames have to be accepted again. Solving "
-                "and exports queue up here, too.</p>"
+                "and exports are queued here, too.</p>"
             )
         self._network = gui.add_dropdown("Network", [STARTED], visible=False, hint="Used in all tabs; saved")
         self._newest = page.button(
-            "Use the newest network",
+            "Use newest network",
             lambda _: intents.UseNetwork(self._network.options[-1]),
             icon=viser.Icon.CHECK,
             color="teal",
@@ -141,7 +141,7 @@ class JobsPanel:
             handle.visible = bool(question)
 
     def _follow_range(self, state: ViewState) -> None:
-        """A range that is chosen is chosen here, too, and one that is dropped is not."""
+        """Select the range when one is marked, and deselect it when it is removed."""
         ranged = state.range is not None
         before, now = (_UNREVIEWED, _RANGE) if ranged else (_RANGE, _UNREVIEWED)
         if ranged != self._ranged and self._frames.value == before:
@@ -185,10 +185,10 @@ def network_question(state: ViewState) -> str:
 def job_line(job: Job, now: float) -> str:
     """One job with its progress and the time that is left, as HTML."""
     left = job.seconds_left(now)
-    about = "at most" if job.kind == "calibrate" else "about"  # It stops when nothing is gained any more.
+    about = "at most" if job.kind == "calibrate" else "about"  # Training stops early without further gain.
     eta = "" if left is None else f", {about} {spoken_time(left)} left"
     running = job.state is JobState.RUNNING
-    # What a solve says itself has frames and time.
+    # The text of solving has frames and time already.
     steps = f" {job.done} of {job.total}{eta}" if running and job.total and job.kind != "solve" else ""
     share = 100.0 * job.done / job.total if job.total else 0.0
     bar = f'<progress max="100" value="{share:.0f}"></progress>' if running else ""

@@ -35,7 +35,7 @@ class JointsPanel:
             "Slider range",
             [str(reach) for reach in Reach],
             initial_value=str(state.reach),
-            hint="How far the sliders reach from the measured values [° or mm]",
+            hint="Range of the sliders around the measured values [° or mm]",
         )
         page.button("Perturb all joints", lambda _: self.perturb())
         self._degrees = gui.add_number("By [°, mm]", 2.0, min=0.0, max=LARGEST_PERTURBATION, step=0.5)
@@ -44,9 +44,9 @@ class JointsPanel:
         back = "All back to measured" if len(session.scene.arms) > 1 else "Back to measured"
         page.button(back, intents.BackToMeasured(), icon=viser.Icon.HISTORY)
         before = page.button(
-            "Copy previous", intents.CopyCorrection(-1), hint="Correct by as much as the previous frame is"
+            "Copy previous", intents.CopyCorrection(-1), hint="Copy the correction of the previous frame"
         )
-        after = page.button("Copy next", intents.CopyCorrection(1), hint="Correct by as much as the next frame is")
+        after = page.button("Copy next", intents.CopyCorrection(1), hint="Copy the correction of the next frame")
         page.row(before, after)
         self._names = {
             f"{limits.arm} {humanized(limits.joint)}": (limits.arm, number)
@@ -71,7 +71,7 @@ class JointsPanel:
         joints = self._session.joints(state.pose.scene)
         with self._page.atomic():
             for (arm, joint), (limits, slider) in self._sliders.items():
-                # A slider that a person is moving is ahead of the state; writing would pull it back under their hand.
+                # A slider being moved is ahead of the state; writing would pull it back.
                 if not self._waits((intents.SetJoint, arm, joint)):
                     measured, shown = (limits.to_shown(float(of[arm][joint])) for of in (state.frame.measured, joints))
                     self._place(slider, limits, state, measured, shown)
@@ -107,8 +107,8 @@ class JointsPanel:
     ) -> None:
         """Set a slider's ends around the measured value, within the joint's limits, and its value.
 
-        The ends reach as far as the shown value, and come back when it does; not during a drag, or what is under
-        the pointer would be another value.
+        The range extends to the shown value and shrinks with it, but not during a drag, which would change the value
+        under the pointer.
         """
         low, high = limits.to_shown(limits.lower), limits.to_shown(limits.upper)
         middle, width = max(low, min(measured, high)), state.reach.width
@@ -130,13 +130,13 @@ def _tidy(value: float) -> float:
 
 
 _UNSURE = 1.0
-"""Standard deviation from which a joint's value is a guess [deg] and [mm]: less than half of what arms are off by."""
+"""Standard deviation from which a joint's value is a guess [deg] and [mm]: under half the usual error of arms."""
 _EXPECTED = SurfaceSolver()
 _UNUSUAL = (
     2.0 * _EXPECTED.prior_deg,
     2e3 * math.radians(_EXPECTED.prior_deg) * _EXPECTED.length_scale,
 )
-"""Corrections that are rare, twice the deviation that the solver expects of measured joints [deg] and [mm]."""
+"""Corrections that count as rare: twice the deviation that the solver expects of measured joints [deg] and [mm]."""
 _EXPLAINED = (
     f"± is one standard deviation. <span class='carts-unsure'>Amber ±</span> (above {_UNSURE:g}° or mm): the images "
     "hardly show this joint. Its value is a guess; the mask hardly depends on it.<br>"
@@ -146,7 +146,7 @@ _EXPLAINED = (
 
 
 class ValuesPanel:
-    """By how much every joint of the shown frame was corrected."""
+    """Table of the corrections of all joints of the shown frame."""
 
     def __init__(self, gui: viser.GuiApi, session: Session) -> None:
         self._session = session
@@ -201,22 +201,22 @@ _NEAREST = "Nearest to the pointer"
 
 
 class KeypointsPanel:
-    """The keypoint to place by a click or a drag, and the residuals of those that were placed."""
+    """Choice of the keypoint to place, and residuals of the placed ones."""
 
     def __init__(self, page: PanelPage, session: Session) -> None:
         gui = page.gui
         self._labels = {point: label for label, point in labelled_keypoints(session.scene).items()}
         with gui.add_folder("Keypoints"):
             gui.add_html(
-                '<p class="carts-caption"><b>Shift+click</b> on the picture: the chosen keypoint is there. '
-                "<b>Shift+drag</b> takes it along. The arm follows at once; a run starts there, and the clicks do not "
-                "pull on it.</p>"
+                '<p class="carts-caption"><b>Shift+click</b> places the chosen keypoint in the image; <b>Shift+'
+                "drag</b> moves it. The arm follows at once. A run starts from this pose; clicks do not constrain "
+                "it.</p>"
             )
             options = [_NEAREST, *self._labels.values()]
             self._chosen = gui.add_dropdown("Keypoint", options)
             self._shown = gui.add_checkbox("Show keypoints", False)
             self._residuals = gui.add_html("")
-            self._forget = page.button("Forget the clicks", intents.ForgetPins(), icon=viser.Icon.X, visible=False)
+            self._forget = page.button("Clear clicks", intents.ForgetPins(), icon=viser.Icon.X, visible=False)
         page.on_input(self._chosen, lambda label: intents.ChooseKeypoint(None if label == _NEAREST else label))
         page.on_input(self._shown, lambda on: intents.ShowKeypoints(bool(on)))
 

@@ -24,7 +24,7 @@ from carts_viewer.transport.document import escaped
 
 SOLVER_LABELS = {
     SolverName.SURFACE: "Surface maps (default)",
-    SolverName.OCCLUDED: "Surface maps, past occluders",
+    SolverName.OCCLUDED: "Surface maps, with occluders",
     SolverName.ACS: "ACS, per attended area",
     SolverName.PAPER: "ACS as in the paper",
     SolverName.ACS_REFERENCE: "ACS as in the paper's code",
@@ -32,9 +32,9 @@ SOLVER_LABELS = {
     SolverName.NONE: "None: compare only",
 }
 """Labels of the solvers."""
-OBSERVED = {"What the network sees": "network", "Masks": "masks", "Masks, and parts by the network": "both"}
-"""Labels of what a run fits."""
-MASKS = {"Of the recording": "recording", "Imported": "imported", "Painted": "painted"}
+OBSERVED = {"Network predictions": "network", "Masks": "masks", "Masks and network": "both"}
+"""Labels of the targets of a run."""
+MASKS = {"Recording": "recording", "Imported": "imported", "Painted": "painted"}
 """Labels of the masks that a run fits."""
 UNDETERMINED = "Not determined by this image"
 """Label of unknowns that the image does not determine."""
@@ -42,14 +42,14 @@ _CONSEQUENCE = "The mask hardly depends on these, so it can be right although th
 _RUN = "Press Run to fit the arm to this frame."
 _BEFORE_RUN = {
     ReviewState.ACCEPTED: "This frame is accepted. Run would fit it again; if it moves, it has to be accepted again.",
-    ReviewState.REJECTED: "This frame is rejected. Run would fit it all the same.",
-    ReviewState.OPTIMIZED: "This frame has been fitted. Run goes on from where it is.",
+    ReviewState.REJECTED: "This frame is rejected. Run would still fit it.",
+    ReviewState.OPTIMIZED: "This frame has been fitted. Run continues from its pose.",
 }
 """Status before a run, by review state."""
 
 
 class OptimizePanel:
-    """The buttons that drive a run, and its state in words."""
+    """Buttons that control a run, and its status as text."""
 
     def __init__(self, page: PanelPage, session: Session, state: ViewState) -> None:
         gui = page.gui
@@ -70,10 +70,10 @@ class OptimizePanel:
         self._solver = gui.add_dropdown("Solver", list(self._solvers), initial_value=SOLVER_LABELS[state.solver])
         self._observed = gui.add_dropdown("Fit to", list(OBSERVED))
         self._masks = gui.add_dropdown(
-            "Whose masks",
+            "Mask source",
             list(MASKS),
             visible=False,
-            hint="Imported: by Review, Masks of others. Painted: rendered masks corrected with a brush.",
+            hint="Imported: under Review, Import. Painted: rendered masks corrected with a brush.",
         )
         cameras = [camera.name for camera in session.scene.cameras]
         self._cameras = gui.add_dropdown("Cameras", ["All cameras", "Shown camera"], visible=len(cameras) > 1)
@@ -104,7 +104,7 @@ class OptimizePanel:
 
 
 def status_line(state: ViewState) -> str:
-    """Iteration, time per iteration and why it stopped, as HTML."""
+    """Iteration, time per iteration and stop reason, as HTML."""
     curves, phase = state.run.curves, state.run.phase
     if state.busy is not None:
         return f'<span class="carts-spinner"></span>{escaped(state.busy)} …'
@@ -176,7 +176,7 @@ class SettingsPanel:
         self._window = gui.add_panel(visible=False)
         with self._window.add_tab("Solver settings"):
             reset = page.button(
-                "Reset all to the preset", lambda _: intents.ResetSettings(self._preset.value), icon=viser.Icon.HISTORY
+                "Reset to preset", lambda _: intents.ResetSettings(self._preset.value), icon=viser.Icon.HISTORY
             )
             close = gui.add_button("Close", icon=viser.Icon.X, color="gray")
             page.row(reset, close, weights=(2, 1))
@@ -271,7 +271,7 @@ def _widget(gui: Any, kind: type, name: str, value: Any) -> Any:
     unit = re.search(r"\[([^\]]*)\]", hint or "")
     # "[px of the working image]" is for the hint; the label has room for "px". [1] is no unit to show.
     short = unit.group(1).split()[0] if unit else "1"
-    # `prior_deg` in degrees needs its unit once only.
+    # `prior_deg` has its unit already.
     words = humanized(name.removesuffix(f"_{short}"))
     label = words if short == "1" else f"{words} [{short.replace('^2', '²')}]"
     if isinstance(value, str):
@@ -319,10 +319,10 @@ class CurvesPanel:
 def note(curves: Curves, outdated: bool) -> str:
     """Note on the curves."""
     if outdated:
-        return "Of the last run; the pose, the image or a setting was changed since."
+        return "Outdated: the pose, the image or a setting was changed since the run."
     if curves.comparable:
-        return "○ a stage of the solver begins · ● the result. At the end losses are drawn anew, so that all compare."
-    return "○ a stage of the solver begins; until the run has ended, losses only compare within a stage."
+        return "○ start of a stage · ● result. At the end all losses are recomputed and comparable."
+    return "○ start of a stage; during a run, losses are comparable within a stage only."
 
 
 class _Chart:

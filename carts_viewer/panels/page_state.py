@@ -91,7 +91,7 @@ def chosen(settings: Mapping[str, Any], state: ViewState) -> list[intents.Intent
     """Intents that restore the valid choices of `remembered`."""
     found: list[intents.Intent] = []
     layer, reach, beside = (settings.get(name) for name in ("layer", "reach", "beside"))
-    # What an imported mask, or a truth, shows is not there in every recording.
+    # Layers of imported masks or of the truth do not exist in every recording.
     if isinstance(layer, str) and layer in {Layer.SHADED, Layer.MASK, Layer.CONTOUR, Layer.NONE} - {state.layer}:
         found.append(intents.ShowLayer(Layer(layer)))
     if isinstance(reach, str) and reach in set(Reach) - {state.reach}:

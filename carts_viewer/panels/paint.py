@@ -19,17 +19,17 @@ _ICONS = {
     Tool.PROMPT: viser.Icon.WAND,
 }
 _HINTS = {
-    Tool.OFF: "Take a tool to correct the mask, or to hide occluders from the optimizer.",
+    Tool.OFF: "Select a tool to correct the mask, or to mark occluders for the optimizer to ignore.",
     Tool.BRUSH: "<b>Drag</b> to paint, with <b>Shift</b> to erase.",
     Tool.ERASER: "<b>Drag</b> to erase, with <b>Shift</b> to paint.",
     Tool.POLYGON: "<b>Click</b> corners; <b>double click</b> or <b>Enter</b> closes, with <b>Shift</b> to cut out. "
-    "<b>Backspace</b> takes back a corner.",
-    Tool.PROMPT: "<b>Click</b> a thing to add it, or drag a <b>box</b>, which replaces. Further clicks are about the "
-    "same thing: on it, or with <b>Shift</b> (or Alt) beside it; <b>Enter</b> begins the next. <b>Shift</b> on "
-    "something new takes it away.",
+    "<b>Backspace</b> removes the last corner.",
+    Tool.PROMPT: "<b>Click</b> an object to add it, or drag a <b>box</b> to replace the layer inside it. Further "
+    "clicks refine the object: on it, or with <b>Shift</b> (or Alt) off it; <b>Enter</b> begins the next. "
+    "<b>Shift</b> on a new object removes it.",
 }
 _ANY = "Any arm"
-_MOVING = "<b>Right-drag</b> moves the picture, <b>wheel</b> zooms."
+_MOVING = "<b>Right-drag</b> pans, <b>wheel</b> zooms."
 
 
 class PaintPanel:
@@ -54,8 +54,8 @@ class PaintPanel:
             self._class = gui.add_dropdown(
                 "Class",
                 list(self._classes),
-                hint="What the brush paints: a part of an arm (layer Parts), or any arm: such pixels belong to the arm "
-                "that is nearest to them in the overlay, also in an export with a category per arm",
+                hint="Painted class: a part of an arm (layer Parts), or any arm. Pixels of any arm belong to the arm "
+                "nearest to them in the overlay, also in an export with a category per arm",
             )
             self._size = gui.add_slider("Size [px]", *DIAMETERS, 1, state.brush.diameter)
             self._text = gui.add_html("")

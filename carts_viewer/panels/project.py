@@ -11,7 +11,7 @@ from carts_viewer.state import ViewState
 from carts_viewer.transport.document import escaped
 
 _LISTED = 60
-"""Steps in the list, around the present one."""
+"""Number of listed steps, around the present one."""
 
 
 class SavedPanel:
@@ -87,7 +87,7 @@ class PeoplePanel:
             self._name = gui.add_text(
                 "Your name",
                 state.name,
-                hint=f"Stands in the history before what you do, up to {LONGEST_NAME} characters",
+                hint=f"Precedes your steps in the history; up to {LONGEST_NAME} characters",
             )
             page.columns([self._name], 1, narrow_labels=True)
             self._others = gui.add_html("")
@@ -115,7 +115,7 @@ class PeoplePanel:
 
 
 class MessagePanel:
-    """The newest error, until it is dismissed or something else works."""
+    """The newest error, until it is dismissed or another action succeeds."""
 
     def __init__(self, page: PanelPage) -> None:
         self._page = page
@@ -135,6 +135,6 @@ class MessagePanel:
         self._text.content = f'<p class="carts-error" role="alert">{escaped(state.error or "")}</p>'
         if state.error is not None:
             note = self._page.client.add_notification(
-                "That did not work", state.error, color="red", auto_close_seconds=12.0
+                "Action failed", state.error, color="red", auto_close_seconds=12.0
             )
             self._notes = [note]

@@ -31,7 +31,7 @@ _COLORS = {
     ReviewState.ACCEPTED: "#2dd4a7",
     ReviewState.REJECTED: "#ef4444",
 }
-"""By what `review_name` says, in the order in which frames are counted; as in the timeline."""
+"""Colours by `review_name`, in the order of the counts; as in the timeline."""
 
 
 class ReviewPanel:
@@ -65,7 +65,7 @@ class ReviewPanel:
         keyframe = " · keyframe" if state.project.is_keyframe(state.index) else ""
         name = review_name(state.project, state.index)
         self._state.content = f'<p class="carts-caption">{_dot(name)}<b>{name}</b>{keyframe}</p>'
-        # Bright where the images say that there is something to accept.
+        # Highlighted if the verdict is good.
         good = (
             state.verdict is not None and state.verdict.verdict == "good" and review.state is not ReviewState.ACCEPTED
         )
@@ -90,7 +90,7 @@ class ReviewPanel:
 
 
 def _dot(name: str) -> str:
-    """The colour of what `review_name` says."""
+    """Swatch of a `review_name`."""
     return f'<span class="carts-swatch" style="background: {_COLORS[name]}"></span>'
 
 
@@ -112,7 +112,7 @@ class FindPanel:
                 "fit": gui.add_dropdown(
                     "Fit",
                     [ANY, *VERDICTS, NOT_CHECKED],
-                    hint="Frames with this verdict: what the images say of the fit",
+                    hint="Frames with this verdict on the fit",
                 ),
                 "arm": gui.add_dropdown("Corrected", [ANY, *(arm.name for arm in session.scene.arms)]),
                 "dice": gui.add_number(
@@ -123,14 +123,14 @@ class FindPanel:
                     step=0.01,
                     hint="Frames that overlap the true mask by less, 0 to 1; 1 shows all frames",
                 ),
-                "note": gui.add_text("Note has", ""),
+                "note": gui.add_text("Note contains", ""),
             }
             self._list = gui.add_html("")
             before = page.button("Previous", intents.ShowFound(-1), icon=viser.Icon.CHEVRON_LEFT)
             after = page.button("Next", intents.ShowFound(1), icon=viser.Icon.CHEVRON_RIGHT)
             page.row(before, after)
             self._bulk = [page.button(name, intents.ReviewFound(state)) for name, state in _BULK.items()]
-            clear = page.button("Clear", intents.ClearFilter(), hint="Forget these conditions")
+            clear = page.button("Clear", intents.ClearFilter(), hint="Clear these conditions")
             page.row(*self._bulk[:2])
             page.row(self._bulk[2], clear)
         for name, widget in self._widgets.items():
@@ -148,7 +148,7 @@ class FindPanel:
         for button in self._bulk:
             button.disabled = not frames
         if state.filter.empty:
-            self._list.content = '<p class="carts-caption">Choose what frames should be like.</p>'
+            self._list.content = '<p class="carts-caption">Choose conditions on frames.</p>'
             return
         links = " ".join(f'<a href="#" data-frame="{i}">{escaped(self._ids[i])}</a>' for i in frames[:_LISTED])
         more = " …" if len(frames) > _LISTED else ""

@@ -29,7 +29,7 @@ class CalibrationHint:
         self._watched: int | None = None
 
     def show(self, gain: float | None, state: ViewState) -> None:
-        """Update the widgets; `gain` is what free base frames would explain of the residual [1]."""
+        """Update the widgets; `gain` is the share of the residual that free base frames would explain [1]."""
         job = newest_calibration(state.jobs)
         if job is not None and not job.over:
             self._watched, line = job.number, ""
@@ -68,17 +68,17 @@ def calibration_line(gain: float | None) -> str:
     if gain is None or gain < BASE_FRAME_GAIN:
         return ""
     return (
-        '<p class="carts-caption">The calibration may be off: with other poses of the arms\' bases (base frames) or of '
-        f"the camera, the remaining residual would be {100 * gain:.0f} % smaller. A good mask can be accepted as it "
-        "is. Masks and joint values become better if you <b>calibrate</b> and then run or solve again, best before you "
-        "accept frames: a calibration moves all masks, so it takes their acceptance back.</p>"
+        '<p class="carts-caption">The calibration may be wrong: with other poses of the arms\' bases (base frames) or '
+        f"of the camera, the remaining residual would be {100 * gain:.0f} % smaller. A good mask can be accepted "
+        "nevertheless. For better masks and joint values, <b>calibrate</b> and then run or solve again, before you "
+        "accept frames: a calibration moves all masks, so accepted frames become unreviewed.</p>"
     )
 
 
 _LONGEST_LIST = 200
 _MEANING = (
     "Solving fits neighbouring frames together; <b>Run</b> fits one alone. Frames that you accepted, moved by hand or "
-    "marked as keyframes are kept as they are."
+    "marked as keyframes do not change."
 )
 _DIRECTIONS: dict[str, Direction] = {"First frame": "forward", "Last frame": "backward"}
 
@@ -94,7 +94,7 @@ class KeyframesPanel:
         self._index = 0
         with gui.add_folder("Keyframes"):
             self._held = gui.add_checkbox(
-                "Keyframe", False, hint="Solving leaves it as it is. Frames that you made or accepted are kept, too."
+                "Keyframe", False, hint="Solving does not change it. Frames that you moved or accepted are kept, too."
             )
             self._text = gui.add_html("")
             self._between = page.button(
@@ -106,12 +106,10 @@ class KeyframesPanel:
             self._calibration = CalibrationHint(page, session)
             self._progress = gui.add_progress_bar(0.0, visible=False)
             self._listed = gui.add_html("", visible=False)
-            self._take = page.button("Take it as solved", lambda _: intents.TakeSolved(self._index), visible=False)
+            self._take = page.button("Take solved pose", lambda _: intents.TakeSolved(self._index), visible=False)
             self._take_all = page.button("Take all", intents.TakeSolved(), visible=False)
             page.row(self._take, self._take_all, weights=(3, 2))
-            self._drop = page.button(
-                "Leave them, close the list", intents.DropSolved(), icon=viser.Icon.X, visible=False
-            )
+            self._drop = page.button("Discard all", intents.DropSolved(), icon=viser.Icon.X, visible=False)
             self._stop = page.button("Stop and keep", intents.StopSolving(), icon=viser.Icon.PLAYER_STOP, visible=False)
         page.on_input(self._held, lambda on: intents.HoldKeyframe(bool(on)))
         page.on_input(self._direction, lambda label: intents.SetDirection(_DIRECTIONS[label]))
@@ -126,7 +124,7 @@ class KeyframesPanel:
         self._plan_ahead(state)
         self._between.disabled = state.solving or not self._solvable
         self._all.disabled = state.solving or not self._open
-        # A range is chosen for solving all of it, more often than not.
+        # A range is usually chosen to solve all of it.
         bright = self._between if self._solvable and state.range is None else self._all
         for button in (self._between, self._all):
             button.color = "teal" if button is bright else "gray"

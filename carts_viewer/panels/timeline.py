@@ -58,7 +58,7 @@ class Traces:
         return [*_FIGURES, *self._joints]
 
     def measure(self, sequence: Sequence) -> bool:
-        """Take the measured joints of this recording; whether they are others than before."""
+        """Take the measured joints of this recording; returns whether they have changed."""
         other = sequence is not self._sequence
         self._sequence = sequence
         return other
@@ -82,9 +82,8 @@ class Traces:
         """A curve from frame `first` up to, and without, frame `last`; None where there is none.
 
         Returns:
-            `edges`: the frames at which columns begin, and where the last one ends; `curves`: for what was measured (or
-            found) and, of joints, what was corrected, the lowest and the highest value of each column, null where there
-            is none.
+            `edges`: first frame of each column, and the end of the last one; `curves`: for measured (or estimated)
+            values and, for joints, corrected ones, the minimum and maximum of each column, null where there is none.
         """
         first, last = max(first, 0), min(last, self._figures.shape[1])
         values = self._values(name)
@@ -119,7 +118,7 @@ _PATH = re.compile(r"(\d{1,4})/(\d{1,4})/(\d{1,9})\.jpg")
 
 
 class Thumbnails:
-    """Of one sequence."""
+    """Thumbnails of one sequence."""
 
     def __init__(self, sequence: Sequence) -> None:
         self._sequence = sequence
@@ -209,7 +208,7 @@ class TimelineData:
         self._records: Mapping[int, Record] = {}
         self._codes: dict[int, int] = {}
         self._draft: int | None = None
-        """The frame of which something was sent that is not saved yet."""
+        """Frame of which unsaved values were sent."""
         self._solving: list[int] | None = None
         self._traces = Traces(session)
         page.call("setTimeline", self._whole())
@@ -259,14 +258,14 @@ class TimelineData:
         return [state.index, number]
 
     def _changed(self, project: ProjectState) -> list[int]:
-        """Frame and code, one after the other, of the frames whose code is another one than before."""
+        """Alternating frame and code of all frames whose code has changed."""
         draft, self._draft = self._draft, None
         if project.records is self._records and draft is None:
             return []
         before, self._records = self._records, project.records
         touched = [i for i, record in project.records.items() if i >= 0 and before.get(i) is not record]
         whole = before.get(WHOLE_PROJECT) is not project.records.get(WHOLE_PROJECT)
-        # What the calibration changes makes figures and verdicts of all frames void.
+        # A changed calibration invalidates figures and verdicts of all frames.
         indices = {i for i in project.records if i >= 0} if whole else set(touched)
         indices |= {i for i in before if i >= 0 and i not in project.records}
         indices |= set() if draft is None else {draft}
@@ -281,8 +280,8 @@ class TimelineData:
 
 
 def code(project: ProjectState, frame: int, scene: Scene) -> int:
-    """Review, verdict, source, whether it is kept, how badly it fits (1 to 255, 0 unknown), and how many joints are not
-    determined (one more than there are, 0 unknown), in bits."""
+    """Bit field of review, verdict, source, kept, misfit (1 to 255, 0 unknown), and number of undetermined joints plus
+    one (0 unknown)."""
     record = project.records.get(frame)
     if record is None:
         return 0

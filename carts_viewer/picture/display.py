@@ -21,12 +21,12 @@ from carts_viewer.transport.tab_page import TabPage
 
 @cache
 def _threads() -> ThreadPoolExecutor:
-    """As many as cameras are shown beside one another; the renderer lets several run at once."""
+    """Threads for the cameras shown side by side; the renderer is thread-safe."""
     return ThreadPoolExecutor(4, thread_name_prefix="overlay")
 
 
 class PageDisplay:
-    """A tab as the worker sees it; used on the worker's thread."""
+    """Display of a tab; used on the worker's thread."""
 
     def __init__(
         self, page: TabPage, session: Session, renderer: OverlayRenderer, scene_view: SceneView, panels: Sequence[Panel]
@@ -41,7 +41,7 @@ class PageDisplay:
         self._shown: ViewState | None = None
 
     def drawn(self) -> None:
-        """The tab has drawn the newest picture; any thread may say so."""
+        """Record that the tab has drawn the newest picture. Thread-safe."""
         self._rate_limit.drawn()
 
     def ready_in(self) -> float:
@@ -108,7 +108,7 @@ class PageDisplay:
         return overlay
 
     def _imported(self, state: ViewState, camera: str) -> Rgba:
-        """Masks and keypoints of others."""
+        """Picture of imported masks and keypoints."""
         own = self._scene.camera(camera)
         layer = state.project.get(Key.imported_mask(state.index, camera))
         points = state.project.get(Key.imported_keypoints(state.index, camera))
@@ -160,22 +160,22 @@ def _draw_paint(
 
 
 LONGEST_WAIT = 0.08
-"""After this long the next picture is sent whether the last one was drawn or not [s]."""
+"""Time after which the next picture is sent without an acknowledgement [s]."""
 
 
 class RateLimit:
-    """When the next picture may be sent: once the tab has drawn the last one, or after `LONGEST_WAIT`."""
+    """Decides when the next picture may be sent: once the tab has drawn the last one, or after `LONGEST_WAIT`."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
         self._sent_at = self._drawn_at = float("-inf")
 
     def sent(self) -> None:
-        """A picture has been sent."""
+        """Record that a picture was sent."""
         self._sent_at = self._clock()
 
     def drawn(self) -> None:
-        """The tab has drawn the newest picture. Any thread may say so."""
+        """Record that the tab has drawn the newest picture. Thread-safe."""
         self._drawn_at = self._clock()
 
     def ready_in(self) -> float:

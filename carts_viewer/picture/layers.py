@@ -82,14 +82,14 @@ def mask(arm_ids: ArmIds, opacity: float) -> Rgba:
 
 def parts(classes: Int[np.ndarray, "height width"], opacity: float) -> Rgba:
     """Each class of parts in its colour (`label_color`); 0 is the background."""
-    # As in `_palette`, the background has a colour that cannot be seen.
+    # As in `_palette`, the background has an invisible colour.
     numbers = range(1, int(classes.max(initial=0)) + 1)
     rows = [(*ARM_COLORS[0], 0), *((*label_color(number), _byte(opacity)) for number in numbers)]
     return np.take(np.array(rows, np.uint8), classes, axis=0)
 
 
 def contour(arm_ids: ArmIds, opacity: float) -> Rgba:
-    """The rim of each arm's visible part in its colour, as wide as can be seen where the image is shown smaller."""
+    """The rim of each arm's visible part in its colour, wide enough to be visible in reduced images."""
     colors, count = _palette(arm_ids)
     colors[1:, 3] = _byte(opacity)
     width = max(2, round(max(arm_ids.shape) / 320))
@@ -118,7 +118,7 @@ def imported(
     size: tuple[int, int],
     opacity: float,
 ) -> Rgba:
-    """Labels of others in the arms' colours, in turn, and their keypoints as crosses; `size` is height and width."""
+    """Imported labels in the arms' colours, in turn, and their keypoints as crosses; `size` is height and width."""
     picture = nothing(*size)
     if labels is not None:
         colors = np.array([(*label_color(max(number, 1)), _byte(opacity)) for number in range(256)], np.uint8)
@@ -160,7 +160,7 @@ def paint_over(picture: Rgba, correction: MaskCorrection | None, ignored: Ignore
         _fill(picture, correction.removed(), (*REMOVED_COLOR, _byte(opacity)))
     if ignored is not None:
         region = ignored.region()
-        # What is below stays to be seen between the lines.
+        # The layers below stay visible between the lines.
         _fill(picture, region & _hatch(*region.shape), (*IGNORED_COLOR, _byte(opacity)))
         inside = cv2.erode(region.view(np.uint8), np.ones((3, 3), np.uint8)).view(bool)
         _fill(picture, region & ~inside, (*IGNORED_COLOR, 255))
@@ -182,7 +182,7 @@ def _hatch(height: int, width: int) -> Bool[np.ndarray, "height width"]:
 def _palette(arm_ids: ArmIds) -> tuple[UInt8[np.ndarray, "arms_and_1 4"], int]:
     """RGBA of background (index 0) and of each arm (its index + 1), and the number of arms seen."""
     count = int(arm_ids.max(initial=-1)) + 1
-    # The browser interpolates colour and opacity apart, so a black background would leave a dark seam.
+    # The browser interpolates colour and opacity separately, so a black background would leave a dark seam.
     rows = [(*ARM_COLORS[0], 0), *((*ARM_COLORS[arm % len(ARM_COLORS)], 255) for arm in range(count))]
     return np.array(rows, np.uint8), count
 

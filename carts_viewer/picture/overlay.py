@@ -33,7 +33,7 @@ class OverlayRenderer:
 
     def arm_ids(self, state: SceneState, camera: str) -> layers.ArmIds:
         """Index of the visible arm per pixel of the camera's own image, -1 for background."""
-        # Overlay and scores of one pose are asked for one after the other.
+        # Overlay and scores of one pose are requested one after the other.
         if camera not in self._last or self._last[camera][0] is not state:
             self._last[camera] = (state, self._renderer(camera).segment(state.to("cpu"))[0])
         return self._last[camera][1]
@@ -43,7 +43,7 @@ class OverlayRenderer:
     ) -> Int[np.ndarray, "height width"]:
         """Number of the class (`carts_core.model.parts.PartClass`) of every pixel, as it is exported; 0 for none.
 
-        What was added to the mask where nothing is rendered at all has no class.
+        Pixels added to the mask of an image without rendered arms have no class.
         """
         rendered = self._renderer(camera).segment_links(state.to("cpu"))[0]
         classes = np.append(link_classes(self._scene.arms), 0)
@@ -77,12 +77,12 @@ class OverlayRenderer:
 
         Args:
             state: The pose of the whole scene.
-            frame: Its true masks are used by the comparison; without one there is nothing to compare.
+            frame: The frame, with true masks for the comparison.
             camera: The camera's name.
             layer: What to draw.
             opacity: Opacity, 0..1.
-            maps: Where attention and similarity come from; without them these layers are empty.
-            correction: Of the mask that is compared with the truth.
+            maps: Source of attention and similarity; without them these layers are empty.
+            correction: Correction of the mask that is compared with the truth.
         """
         size = self._scene.camera(camera).height, self._scene.camera(camera).width
         if layer is Layer.SHADED:
@@ -102,7 +102,7 @@ class OverlayRenderer:
         return layers.nothing(*size)
 
     def pick(self, state: SceneState, camera: str, pixel: tuple[float, float], radius: float) -> Keypoint | None:
-        """The point of the arm that is seen at a pixel, or the nearest within `radius` [px]; None without one."""
+        """The visible point of an arm at a pixel, or the nearest within `radius` [px]; None without one."""
         return pick_point(self._scene, self._renderer(camera), state.to("cpu"), pixel, radius)
 
     def scores(self, state: SceneState, frame: Frame, camera: str, correction: MaskCorrection | None = None) -> Scores:
@@ -132,7 +132,7 @@ class OverlayRenderer:
 
 
 def with_imported(frame: Frame, scene: Scene, project: ProjectState) -> Frame:
-    """The frame with the masks of others for cameras that the recording has no mask of."""
+    """The frame with imported masks for cameras without a mask in the recording."""
     masks = dict(frame.masks or {})
     labels = project.get(Key.imported_labels())
     for camera in scene.cameras:

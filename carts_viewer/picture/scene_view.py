@@ -22,7 +22,7 @@ LENS = "/lens"
 FRAME = "/frame"
 OVERLAY = "/overlay"
 GRID = "/grid"
-"""Centimetres, in the 3D view."""
+"""Grid of centimetres in the 3D view."""
 OTHERS = "/others"
 """Frames and overlays of the other cameras, beside the shown one's; the page's script hides them in the 3D view."""
 WORLD = "/world"
@@ -30,26 +30,26 @@ WORLD = "/world"
 _LENS_COLOR = (45, 212, 167)
 _OTHER_COLOR = (150, 160, 165)
 _GHOST, _GHOST_OPACITY = (200, 205, 210), 0.28
-"""Of the arms as they are measured."""
+"""Colour and opacity of the measured arms."""
 _AXES = 0.012
 """Length of the axes of base and tip [m]."""
 _GRID_CELL = 0.01
-"""[m]"""
+"""Distance of grid lines [m]."""
 Colour = Callable[[Any], tuple[int, int, int]]
-"""A link's own colour -> the one that is shown."""
+"""Maps a link's own colour to the displayed one."""
 _JPEG_QUALITY = 88
 _DEPTH_SHARE = 0.25
 _LEAST_DEPTH = 0.005
 _OVERLAY_SHARE = 0.99
 _SPACING = 1.01
-"""From one image to the next, as a share of an image's size."""
+"""Distance of adjacent images, as a share of an image's size."""
 
 
 class SceneView:
     """3D scene of a tab."""
 
     def __init__(self, shown: viser.SceneApi, scene: Scene, state: SceneState, camera: str) -> None:
-        """`state` decides how far from the lens the frame is put."""
+        """`state` determines the distance of the frame from the lens."""
         self._shown = shown
         self._scene = scene
         self._depth = max(_DEPTH_SHARE * _distance_of_arms(scene, state, camera), _LEAST_DEPTH)
@@ -72,7 +72,7 @@ class SceneView:
         self._put(OVERLAY, picture, camera, _OVERLAY_SHARE * self._depth, "png")
 
     def show_beside(self, camera: Camera, active: Camera, image: np.ndarray | None, overlay: Rgba | None) -> None:
-        """Put another camera's image, or its overlay, beside that of the active camera; None: as it is.
+        """Put another camera's image, or its overlay, beside that of the active camera; None: unchanged.
 
         Images lie in a grid in the cameras' order, each as high as the active camera's, whose place is the true one.
         """
@@ -112,7 +112,7 @@ class SceneView:
         return image_file(self._planes[name][1])
 
     def show_pose(self, state: SceneState, camera: str) -> None:
-        """Move arms and cameras to where they are, seen from this camera."""
+        """Move arms and cameras to their poses in the frame of this camera."""
         extrinsics = {
             own.name: T.numpy().astype(float) for own, T in zip(self._scene.cameras, state.T_view_world, strict=True)
         }
@@ -124,7 +124,7 @@ class SceneView:
         self._place_arms(self._links, state)
 
     def show_measured(self, state: SceneState) -> None:
-        """Move the ghosts of the arms to where they are measured."""
+        """Move the ghosts of the arms to their measured poses."""
         self._place_arms(self._measured, state)
 
     def _place_arms(self, arms: list[list[viser.FrameHandle]], state: SceneState) -> None:
@@ -158,7 +158,7 @@ class SceneView:
         position: tuple[float, float, float],
         kind: str,
     ) -> bool:
-        """Show an image as a plane [m]; whether it is a new one, as with other cameras than before."""
+        """Show an image as a plane [m]; returns whether it is new, as after a change of cameras."""
         if name in self._planes and self._planes[name][0] == cameras:
             self._planes[name][1].image = image
             return False
@@ -217,7 +217,7 @@ class SceneView:
         return links
 
     def _add_grid(self) -> None:
-        """A grid of centimetres behind the arms, across the line of vision of the shown camera."""
+        """A grid of centimetres behind the arms, perpendicular to the optical axis of the shown camera."""
         self._shown.add_grid(
             GRID,
             width=20 * _GRID_CELL,

@@ -18,7 +18,7 @@ from carts_viewer.transport.events import Event
 DIAMETERS = (1, 300)
 """Thinnest and thickest brush [px]."""
 LONGEST_STROKE = 20_000
-"""Points; the page begins another stroke there."""
+"""Most points of a stroke; the page begins another stroke earlier."""
 _FRACTION_BITS = 4
 """OpenCV draws to 1/16 of a pixel."""
 
@@ -52,9 +52,9 @@ class Brush:
     label: int = 0
     """Number of the class that is painted on the mask (`carts_core.model.parts.PartClass`); 0: any arm."""
     diameter: int = 20
-    """[px]"""
+    """Diameter of the brush [px]."""
     painted: Mapping[int, int] = field(default_factory=dict)
-    """Number of each tab's last stroke that has been dealt with."""
+    """Number of each tab's last applied stroke."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,7 +70,7 @@ class Stroke:
     erase: bool
     polygon: bool
     diameter: int
-    """[px]; a polygon has none."""
+    """Diameter of the brush [px]; not used by polygons."""
     points: Float[np.ndarray, "points 2"]
     """(u, v) [px], at most one image size beyond the image."""
     label: int = 0
@@ -112,15 +112,15 @@ def read_stroke(painted: Painted, frames: int, cameras: Mapping[str, Camera], cl
     """A stroke over a frame of a recording, which has these cameras, by name, and classes.
 
     Raises:
-        SettingsError: it is no stroke over one of these frames and cameras. Points beyond the image and a brush that
+        SettingsError: it is not a stroke over one of these frames and cameras. Points beyond the image and a brush that
             is too thick are clamped instead.
     """
     camera, count = cameras.get(painted.camera), len(painted.points)
     shaped = count <= 2 if painted.prompt else count >= 3 or not painted.polygon
     if camera is None or painted.frame >= frames or painted.label > classes or not shaped:
         raise SettingsError(
-            f"what came is no stroke over one of {frames} frames of {', '.join(cameras)}. Draw it with the page of "
-            "this viewer."
+            f"the message is not a stroke over one of {frames} frames of {', '.join(cameras)}. Draw it with this "
+            "viewer's page."
         )
     size = np.array([camera.width, camera.height], float)
     return Stroke(
@@ -140,7 +140,7 @@ def read_stroke(painted: Painted, frames: int, cameras: Mapping[str, Camera], cl
 def corrected(old: MaskCorrection | None, stroke: Mask, rendered: Mask, *, erase: bool) -> MaskCorrection | None:
     """The correction after a stroke that adds pixels to the mask or takes them out; None if none is left.
 
-    What is rendered anyway needs no adding, and what is not rendered no removing.
+    Only pixels that are not rendered are added, and only rendered ones are removed.
     """
     nothing = np.zeros_like(stroke)
     added, removed = (nothing, nothing) if old is None else (old.added(), old.removed())
@@ -154,7 +154,7 @@ def corrected(old: MaskCorrection | None, stroke: Mask, rendered: Mask, *, erase
 def relabelled(old: PartLabels | None, stroke: Mask, label: int, *, erase: bool) -> PartLabels | None:
     """The painted classes after a stroke on the mask; None if none is left.
 
-    What is taken out of the mask has no class any more; what is added without a class keeps the one it has.
+    Removed pixels lose their class; pixels added without a class keep theirs.
     """
     if (not erase and not label) or (erase and old is None):
         return old

@@ -1,4 +1,4 @@
-"""A batch of `carts batch`: its jobs, failures first, its worst frames, and a way into any of them."""
+"""Page of a batch: its jobs, failures first, and its worst frames, with buttons that open them."""
 
 import threading
 from collections import Counter
@@ -20,7 +20,7 @@ _SECONDS = 5.0
 """Interval between updates while jobs run [s]."""
 _WORST = 12
 _SHOWN = 500
-"""Jobs that are listed."""
+"""Most listed jobs."""
 _SEPARATOR = "\n"
 """Separates job and frame in the value of a button; no name contains it."""
 
@@ -55,7 +55,7 @@ class BatchPage:
         )
         self._site.document.show(content)
         if counts["running"]:
-            self._look_again()
+            self._update()
 
     def choose(self, name: str, value: str) -> None:
         """Carry out a choice."""
@@ -77,7 +77,7 @@ class BatchPage:
         self.show()
 
     def close(self) -> None:
-        """Look no more."""
+        """Stop updating."""
         self._closed.set()
 
     def _review(self, name: str, frame_id: str) -> None:
@@ -92,13 +92,13 @@ class BatchPage:
         folder = self._batch / "jobs" / job.name
         path = self._site.roots.checked(sequence_file(folder, job))
         if not folder.path.is_dir():
-            raise CartsError(f"{name} was not begun yet, so there is nothing to look at.")
+            raise CartsError(f"{name} has not started yet, so it has no results.")
         project = review_project(folder, job)
         frames = list(Sequence.open(path).frame_ids) if frame_id else []
         self._site.open_sequence(path, project=project, frame=frames.index(frame_id) if frame_id in frames else None)
 
     def _worst(self, known: list[KnownJob]) -> list[tuple[float, KnownJob, FrameFinding, str]]:
-        """Frames with pictures that are most probably wrong: probability, job, frame, and address of its picture."""
+        """Frames with the highest probability of failure: probability, job, frame, and address of the picture."""
         found = [
             (frame.probability, entry, frame)
             for entry in known
@@ -117,7 +117,7 @@ class BatchPage:
             return ""
         return "" if image is None else self._site.page.media.publish(cv2.imencode(".jpg", image)[1].tobytes())
 
-    def _look_again(self) -> None:
+    def _update(self) -> None:
         def wait() -> None:
             if not self._closed.wait(_SECONDS):
                 self._site.post(lambda: None if self._closed.is_set() else self.show())

@@ -88,7 +88,7 @@ class FileBrowser:
         self.problem = ""
 
     def begin_in(self, folder: Path) -> None:
-        """List this folder, if it is one that may be looked into."""
+        """List this folder, if it is allowed."""
         self.browse(str(folder))
         if self.problem:
             self.folder, self.problem = self.roots.folders[0], ""
@@ -105,7 +105,7 @@ class FileBrowser:
             self.problem = str(error)
 
     def picked(self, text: str) -> Path | None:
-        """The path that a person has picked; None, with a `problem`, if it cannot be."""
+        """The picked path; None, with a `problem`, if it is not allowed."""
         self.problem = ""
         try:
             path = self.roots.checked(text)

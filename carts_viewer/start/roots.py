@@ -43,22 +43,22 @@ class Roots:
     def __init__(self, folders: Sequence[Path]) -> None:
         """
         Args:
-            folders: at least one, each a folder that is there.
+            folders: at least one existing folder.
 
         Raises:
-            SettingsError: one is not there.
+            SettingsError: a folder does not exist.
         """
         for folder in folders:
             if not folder.is_dir():
                 raise SettingsError(f"--root {folder} is no folder. Give folders that hold recordings.")
-        # The person may have named a link; below it none is followed.
+        # A named root may be a link; links below it are not followed.
         self.folders = tuple(dict.fromkeys(folder.resolve() for folder in folders))
 
     def checked(self, text: str | Path) -> Path:
-        """An absolute path below one of the folders, without links and hidden folders on its way.
+        """An absolute path below one of the folders, without links and hidden folders in it.
 
         Raises:
-            SettingsError: it is outside, is not there, or has a link or a hidden folder on its way.
+            SettingsError: it is outside, does not exist, or has a link or a hidden folder in its path.
         """
         path = Path(text)
         root = next((root for root in self.folders if path == root or path.is_relative_to(root)), None)
@@ -83,7 +83,7 @@ class Roots:
         """Folders, then files, each by name; without hidden ones and links.
 
         Raises:
-            SettingsError: it may not be looked into, or cannot be.
+            SettingsError: the folder is not allowed, or not readable.
         """
         found = []
         try:

@@ -31,16 +31,16 @@ _log = logging.getLogger(__name__)
 
 
 class Site:
-    """Serves one page, whatever it shows.
+    """Server of one page: start page, new recording, batch or viewer.
 
     Attributes:
         page: the page.
-        document: what lies over it.
+        document: the document over the page.
         roots: the allowed folders.
         shown: the shown page; None while a sequence is open.
         app: the viewer of the open sequence, if there is one.
-        url: where the page is.
-        incident: where corrections of a sequence that was left are kept instead, if they are not in its project.
+        url: address of the page.
+        incident: message on the file with the corrections of a closed sequence, if they are not in its project.
     """
 
     def __init__(
@@ -60,7 +60,7 @@ class Site:
             options: see `ServerOptions`.
 
         Raises:
-            SettingsError: a folder is not there, or the address is not usable.
+            SettingsError: a folder does not exist, or the address is not usable.
         """
         self.roots = Roots(folders)
         self.page = Page(host=options.get("host", "127.0.0.1"), port=options.get("port", 8080), title="CaRTS")
@@ -87,10 +87,10 @@ class Site:
         self._jobs.put(job)
 
     def wait(self, timeout: float = 60.0) -> None:
-        """Wait until everything asked for so far is done, for so long [s].
+        """Wait at most `timeout` [s] until all requests so far are done.
 
         Raises:
-            TimeoutError: it is not, in that time.
+            TimeoutError: they are not, in that time.
         """
         done = threading.Event()
         self.post(done.set)
@@ -190,7 +190,7 @@ class Site:
         except CartsError as error:
             page.fail(error)
         except Exception as error:
-            _log.exception("The page met an unexpected error")
+            _log.exception("Unexpected error of the page")
             page.fail(error)
 
     def _leave(self) -> None:
@@ -203,7 +203,7 @@ class Site:
                 app.close()
             finally:
                 self.incident = app.project.incident or self.incident
-                # What was under way is saved by now.
+                # Unfinished edits are saved by now.
                 with suppress(CartsError):
                     remember(app)
                 del app
@@ -215,6 +215,6 @@ class Site:
             try:
                 job()
             except Exception as error:
-                _log.exception("The page met an unexpected error")
+                _log.exception("Unexpected error of the page")
                 with suppress(Exception):
                     self.show_start(f"{type(error).__name__}: {error}")

@@ -95,7 +95,7 @@ def up_to_date(project: RecentProject) -> RecentProject:
     if not is_regular(path):
         return replace(project, reviewed=0, corrected=0)
     stamp = _changed(path), _changed(beside(path, LOG))
-    # A project that nothing has written to since it was left here is not read again.
+    # An unchanged project is not read again.
     if max(stamp) <= project.changed:
         return project
     reviewed, corrected = _read_numbers(path, stamp)
@@ -165,7 +165,7 @@ def _list() -> Path:
 
 
 class StartPage:
-    """Cards of recent recordings, half-made imports, the sample, and a file browser."""
+    """Cards of recent recordings, unfinished imports, the sample, and a file browser."""
 
     def __init__(self, site: Host, problem: str = "") -> None:
         self._site = site
@@ -209,7 +209,7 @@ class StartPage:
             case "open":
                 self._toggle("Choose a sequence file (.toml).", lambda entry: entry.path.suffix.lower() == ".toml")
             case "open-batch":
-                self._toggle("Choose the folder that carts batch has written to.", lambda _: False, folders=True)
+                self._toggle("Choose the output folder of carts batch.", lambda _: False, folders=True)
             case "browse" if browser is not None:
                 browser.browse(value)
             case "pick" if browser is not None and (path := browser.picked(value)) is not None:
@@ -232,7 +232,7 @@ class StartPage:
         """Nothing to close."""
 
     def _card(self, project: RecentProject) -> tuple[RecentProject, str, str]:
-        """A project as it is now, why that is not known, and the address of its picture."""
+        """The current entry of a project, the error that prevents it, and the address of its picture."""
         picture = self._published(thumbnail(project))
         try:
             return up_to_date(project), "", picture

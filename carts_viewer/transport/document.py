@@ -32,8 +32,8 @@ class Document:
         """Show HTML in all tabs and in those that join later.
 
         Args:
-            content: HTML in which everything foreign is escaped; "" takes the document away.
-            place: "page" covers the whole page, "side" its left side, and the picture stays to be seen.
+            content: HTML with escaped values; "" removes the document.
+            place: "page" covers the whole page, "side" its left side, beside the visible image.
         """
         self._shown = (content, place)
         for client in self.page.server.get_clients().values():
@@ -60,7 +60,7 @@ def render(template: str, **values: Any) -> str:
 
 @functools.cache
 def _templates() -> "jinja2.Environment":
-    # The viewer of one sequence does without.
+    # Not needed by the viewer of one sequence.
     import jinja2  # noqa: PLC0415
 
     loader = jinja2.FileSystemLoader(Path(__file__).parent.parent / "templates")

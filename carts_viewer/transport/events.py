@@ -12,11 +12,11 @@ _Point = tuple[float, float]
 
 @dataclass_transform(frozen_default=True)
 class Event(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_field="type", tag=True):
-    """An event of a tab, or what follows from one."""
+    """Base class of the events of a tab."""
 
 
 class Hello(Event):
-    """A page asks for its place: name of its tab and user, and the frame, camera and domain to show."""
+    """Request of a page for its tab: key of the tab, name of the user, and frame, camera and domain to show."""
 
     tab: _Key
     name: _Text = ""
@@ -36,7 +36,7 @@ class Theme(Event):
 
 
 class Trace(Event):
-    """A curve of the timeline is asked for."""
+    """A curve of the timeline is requested."""
 
     name: _Text
     first: int
@@ -62,7 +62,7 @@ class Dragged(Event):
     """A link is dragged."""
 
     gesture: float
-    """The same as long as the pointer is down."""
+    """Identifier of the gesture; constant while the pointer is down."""
     camera: int
     start: _Point
     end: _Point

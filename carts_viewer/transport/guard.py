@@ -24,7 +24,7 @@ from carts_core.errors import SettingsError
 PAGES = ("/", "/index.html")
 """Paths of the page."""
 _ELSEWHERE = "192.0.2.1"
-"""An address that is reserved for documentation, to ask the system which way it would send."""
+"""An address reserved for documentation, to find the outgoing network interface."""
 
 
 def check_address(host: str, port: int) -> None:
@@ -47,7 +47,7 @@ class Guard:
     """Decides which requests one server answers.
 
     Attributes:
-        token: What a first request must carry; None where only this computer can reach the server.
+        token: Token required in a first request; None if only this computer can reach the server.
     """
 
     def __init__(self, host: str) -> None:
@@ -64,10 +64,10 @@ class Guard:
         return f"http://{_bracketed(host)}:{port}/?token={self.token}"
 
     def refusal(self, target: str, headers: Headers) -> str | None:
-        """Why a request must not be answered; None when it may.
+        """Reason to refuse a request; None to answer it.
 
         Args:
-            target: What is asked for: path and query.
+            target: Requested path and query.
             headers: Of the request.
         """
         hosts = headers.get_all("Host")
@@ -92,12 +92,12 @@ class Guard:
         return f"{_cookie_name(headers)}={self._session}; Path=/; HttpOnly; SameSite=Strict"
 
     def _is_ours(self, name: str | None) -> bool:
-        """Whether a request may call this server so."""
+        """Whether a host name may refer to this server."""
         if name is not None and _is_loopback(name):
             return True
         if self.token is None or name is None:
             return False
-        # DNS rebinding makes any other name lead here, but neither an address nor this computer's own name.
+        # DNS rebinding can use any other name, but neither an address nor this computer's own name.
         own = socket.gethostname().lower().partition(".")[0]
         names = {self._host.lower(), socket.gethostname().lower(), own, f"{own}.local"}
         return _address(name) is not None or name in names
@@ -113,14 +113,14 @@ class Guard:
 
 
 def _any_equal(given: Iterable[str], secret: str) -> bool:
-    """Whether one of these is the secret; takes as long for a nearly right one as for a wrong one."""
+    """Whether one of these equals the secret, compared in constant time."""
     return any([secrets.compare_digest(value.encode("utf-8", "replace"), secret.encode()) for value in given])
 
 
 def _from_another_page(target: str, headers: Headers) -> bool:
-    """Whether a browser asks for a page of another origin; such a page may only link to ours, for the user to go to.
+    """Whether a request comes from a page of another origin, which may only link to our pages.
 
-    A websocket is judged by its `Origin`, which every browser sends with it.
+    Websockets are checked by their `Origin`, which every browser sends.
     """
     if headers.get("Upgrade") == "websocket" or set(headers.get_all("Sec-Fetch-Site")) <= {"same-origin", "none"}:
         return False
@@ -218,17 +218,17 @@ _DECODER = msgspec.msgpack.Decoder(GuiUpdateMessage | CommandTriggerMessage | Vi
 
 
 def refusal(data: object, value_of: Callable[[str], Any]) -> str | None:
-    """Why a message must not be acted upon; None when it may.
+    """Reason to refuse a message; None to accept it.
 
     Args:
-        data: What came over the websocket.
+        data: The message.
         value_of: The present value of the widget with this id; None when there is no such widget.
     """
     if not isinstance(data, bytes):
         return "it is text"
     try:
         message = _DECODER.decode(data)
-    # The latter two are what it raises for text that is no UTF-8 and for depth without end.
+    # The latter two are raised for invalid UTF-8 and for excessive nesting.
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         return str(error)
     if isinstance(message, GuiUpdateMessage):
@@ -241,7 +241,7 @@ def _value_refusal(value: bool | int | float | str, present: Any) -> str | None:
         if isinstance(value, bool | str):
             return f"{type(value).__name__} for a number"
         if not (math.isfinite(value) and abs(value) <= _LARGEST_NUMBER):
-            return "a number out of all range"
+            return "a number out of range"
     elif type(present) is not type(value) or not isinstance(present, bool | str):
         return f"{type(value).__name__} for {'no widget' if present is None else type(present).__name__}"
     return None
@@ -255,16 +255,16 @@ _SERVER_CONSTRUCTION = threading.Lock()
 def gated(
     respond: Callable[[Request], Response | Awaitable[Response] | None], refuse: Callable[[object], str | None]
 ) -> Iterator[None]:
-    """While active, a websocket server that is started gets a gate.
+    """While active, websocket servers that are started filter requests and messages.
 
     Args:
         respond: Answers a request; None leaves that to the server.
-        refuse: Says why a message must not reach the server; None when it may.
+        refuse: Returns the reason to drop a message; None to accept it.
     """
     original = websockets.asyncio.server.serve
 
     class Connection(ServerConnection):
-        """Swallows the messages that are refused."""
+        """A connection that drops refused messages."""
 
         async def recv(self, decode: bool | None = None) -> Data:  # pyright: ignore[reportIncompatibleMethodOverride]
             """The next message that is not refused."""
@@ -296,7 +296,7 @@ def gated(
 
 
 def response(status: http.HTTPStatus, kind: str, body: bytes, **more: str) -> Response:
-    """An answer that no browser guesses about, keeps, or shows inside another site; `more` are headers, `_` for `-`."""
+    """A response with headers against MIME sniffing, caching and framing; `more` are headers, `_` for `-`."""
     headers = Headers()
     headers["Content-Type"] = kind
     headers["Content-Length"] = str(len(body))

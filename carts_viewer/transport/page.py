@@ -92,7 +92,7 @@ class Media:
 
 
 OWN_KEYS = ("[", "]", "(", ")", "escape", "enter")
-"""Keys that viser's shortcuts do not know, or that our script must hear first."""
+"""Keys that viser's shortcuts do not support, or that the page's script must handle first."""
 
 _THUMBNAIL = "/thumbnail/"
 _SCRIPTS = ("page", "paint", "marks", "loupe", "drag", "lanes", "timeline", "tour", "shell", "document")
@@ -114,8 +114,8 @@ class Page:
         """Start serving.
 
         Args:
-            host: The address to listen on; one that other computers can reach makes the url carry a token.
-            port: The port to listen on; 0 picks a free one, a busy one moves up to the next free one.
+            host: The address to listen on; one that other computers can reach adds a token to the url.
+            port: The port to listen on; 0 picks a free one; instead of a busy one the next free one is used.
             title: The browser tab's title.
 
         Raises:
@@ -130,7 +130,7 @@ class Page:
         """Name of the recording that is shown; empty while none is."""
         self.media = Media()
         self.thumbnail: Callable[[str], Awaitable[Response]] | None = None
-        """Answers what is asked for below `/thumbnail/`; None while no recording is shown."""
+        """Answers requests below `/thumbnail/`; None while no recording is shown."""
         self._files = {path.name: path for path in static_dir().iterdir() if path.is_file()}
         queue_safely()
         list_icons_once()
@@ -148,7 +148,7 @@ class Page:
         self.server.on_client_disconnect(self._part)
 
     def on_disconnect(self, callback: Callable[[int], None]) -> None:
-        """Call `callback(client_id)` whenever a tab is gone, until the page is cleared."""
+        """Call `callback(client_id)` whenever a tab disconnects, until the page is cleared."""
         self._farewells.append(callback)
 
     def _part(self, client: viser.ClientHandle) -> None:
@@ -160,7 +160,7 @@ class Page:
         self._channel = self.server.gui.add_text("channel", "", visible=False)
 
     def clear(self, title: str) -> None:
-        """Take away all widgets, commands, nodes and callbacks; tabs must be reloaded when others are there."""
+        """Remove all widgets, commands, nodes and callbacks; tabs must be reloaded once new ones exist."""
         self._title = title
         self._farewells.clear()
         self.key_groups = []
@@ -234,18 +234,18 @@ class Page:
 
     def _page(self, request: Request) -> Response:
         nonce = secrets.token_urlsafe(16)
-        # viser's client connects to any server that `?websocket=` names, and does whatever that one says.
+        # viser's client connects to any server that `?websocket=` names, and executes its messages.
         policy = _POLICY.format(nonce=nonce, host=request.headers["Host"])
         cookie = self._guard.cookie(request.path, request.headers)
         more = {"Content_Security_Policy": policy} | ({} if cookie is None else {"Set_Cookie": cookie})
         return response(http.HTTPStatus.OK, "text/html; charset=utf-8", self._index(nonce), **more)
 
     def _value_of(self, element: str) -> Any:
-        # A tab may be there before the server's constructor has returned.
+        # A tab may connect before the server's constructor has returned.
         return value_of(self.server, element) if hasattr(self, "server") else None
 
     def _static(self, name: str) -> Response:
-        # Only names that a listing of the folder gave are served, so no path can leave it.
+        # Only names from a listing of the folder are served, so no path can leave it.
         file = self._files.get(name)
         if file is None:
             return response(http.HTTPStatus.NOT_FOUND, "text/plain; charset=utf-8", b"No such file.")

@@ -1,4 +1,4 @@
-"""One tab's own part of the page: its widgets and its scene, which no other tab sees, and calls into its script."""
+"""One tab's part of the page: its own widgets and scene, and calls of its script."""
 
 import json
 from collections.abc import Callable, Sequence
@@ -65,7 +65,7 @@ class TabPage:
         Args:
             handles: The widgets, in order.
             count: How many to a line.
-            narrow_labels: Give labels no more room than they need, and the fields the rest.
+            narrow_labels: Make labels as narrow as their text, and fields as wide as possible.
         """
         for first in range(0, len(handles), count):
             group = [element_id(handle) for handle in handles[first : first + count]]

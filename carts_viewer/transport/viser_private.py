@@ -1,6 +1,6 @@
 """Private parts of viser that the viewer uses.
 
-Nothing else reaches into them. viser is pinned to one minor version, tests/viewer/test_transport.py names every
+No other module uses them. viser is pinned to one minor version, tests/viewer/test_transport.py names every
 attribute that is used, and the browser tests drive them all.
 """
 
@@ -21,7 +21,7 @@ from viser.infra._async_message_buffer import AsyncMessageBuffer
 
 
 def list_icons_once() -> None:
-    """Have viser list its archive of icons once, and not again for every icon, which takes 0.5 s for a tab's page."""
+    """Make viser list its archive of icons once instead of once per icon, which takes 0.5 s per tab."""
     _gui_api.svg_from_icon = _gui_handles.svg_from_icon = _icon  # pyright: ignore[reportPrivateImportUsage]
 
 
@@ -92,7 +92,7 @@ class LoopEvent(asyncio.Event):
         self._own_loop = loop
 
     def set(self) -> None:
-        """Wake all who wait, if this runs on the event loop."""
+        """Wake all waiting tasks, if this runs on the event loop."""
         try:
             running = asyncio.get_running_loop()
         except RuntimeError:
@@ -111,6 +111,6 @@ class MessageBuffer(AsyncMessageBuffer):
 
 def queue_safely() -> None:
     """Use `MessageBuffer` in all servers that start later."""
-    # A tab that has just gone is normal, and what was on its way to it is no loss.
+    # Tabs disconnect at any time; messages to a closed tab are not needed.
     warnings.filterwarnings("ignore", message="Queued a .* on a closed connection", category=UserWarning)
     _infra.AsyncMessageBuffer = MessageBuffer  # pyright: ignore[reportAttributeAccessIssue, reportPrivateImportUsage]

@@ -44,7 +44,7 @@ class CalibrationProgress:
     share: float
     """Share of its stages, in [0, 1]."""
     scene: Scene | None = None
-    """With the calibration so far."""
+    """The scene with the calibration so far."""
     result: CalibrationResult | None = None
     """At its end."""
     error: str = ""
@@ -82,11 +82,11 @@ class CalibrationJob:
 
     @property
     def cancelled(self) -> bool:
-        """Whether it was stopped, be it as it ended."""
+        """Whether it was stopped, even at its end."""
         return self._cancelled.is_set()
 
     def join(self, timeout: float | None = None) -> None:
-        """Wait until it has ended, for so long [s]."""
+        """Wait at most `timeout` [s] until it has ended."""
         self._thread.join(timeout)
 
     def _run(self) -> None:
@@ -127,7 +127,7 @@ class CalibrationJob:
 
 
 def as_plain(scene: Scene) -> dict[str, Any]:
-    """A calibration as a draft keeps it."""
+    """A calibration as stored in a draft."""
     return {
         "arms": {arm.name: arm.T_world_base.tolist() for arm in scene.arms},
         "cameras": {camera.name: camera.T_camera_world.tolist() for camera in scene.cameras},
@@ -150,7 +150,7 @@ class PoseReport:
 
 @dataclass(frozen=True)
 class CalibrationReport:
-    """A calibration that has ended, as a draft keeps it."""
+    """Report of a finished calibration, as stored in a draft."""
 
     loss_before: float
     """Mean over the frames [1]."""
@@ -266,7 +266,7 @@ def calibrated_recording(
     """The recording with a calibration filled in.
 
     Args:
-        recording: as found, with stand-ins.
+        recording: as found, with placeholders.
         before: the scene that it describes.
         calibration: `as_plain`.
         text: origin of the calibration.

@@ -64,10 +64,10 @@ def curves(arm: FoundArm) -> list[Curve]:
 
 
 def opened(recording: FoundRecording) -> tuple[Sequence, TemporaryDirectory[str]]:
-    """The recording as a sequence, with the folder that its tables are in meanwhile.
+    """The recording as a sequence, with the temporary folder of its tables.
 
     Raises:
-        CartsError: what was found does not make a sequence.
+        CartsError: the files do not form a valid sequence.
     """
     folder = TemporaryDirectory(prefix="carts-import-")
     try:
@@ -143,7 +143,7 @@ def guess(draft: Draft) -> Guess:
     except CartsError as error:
         if not source.is_dir():
             return Guess("", None, {"recording": str(error)})
-        # Whatever is in a folder, a person may say what is what.
+        # In a folder, the user can assign the files by hand.
         kind = FOLDER
     options = replace(draft.options, source=kind)
     problems = _problems_of_parts(source, options) if kind == FOLDER else {}
@@ -172,7 +172,7 @@ def guess(draft: Draft) -> Guess:
 
 
 def _images_alone(source: Path, options: ImportOptions) -> FoundRecording | None:
-    """The cameras, to be seen while something is wrong with the kinematics."""
+    """The cameras, shown while the kinematics have errors."""
     plain = ImportOptions(source=options.source, images=options.images, kinematics=NO_TABLE)
     with suppress(CartsError):
         return find(source, plain)
@@ -198,7 +198,7 @@ def estimated_delay(recording: FoundRecording) -> TimeOffsetEstimate:
     """Time offset estimated from the motion in images and table.
 
     Raises:
-        CartsError: what was found does not make a sequence whose rows have times.
+        CartsError: the files do not form a valid sequence whose rows have times.
     """
     sequence, folder = opened(recording)
     with folder:
@@ -230,7 +230,7 @@ def check_form(
 
 
 def _for_page(text: str) -> str:
-    """A remark without the options of the command line, which are of no use here."""
+    """A remark without the options of the command line, which do not apply here."""
     before, found, _ = text.partition(" (change: --")
     text = before + "." if found else text
     sentences = re.split(r"(?<=[.:;]) ", text)

@@ -22,7 +22,7 @@ from carts_viewer.wizard.calibration import CalibrationReport
 
 _FORMAT = "carts-draft/1"
 _LONGEST_NAME = 200
-"""Characters."""
+"""Longest name of a sequence [characters]."""
 
 
 class Step(StrEnum):
@@ -51,7 +51,7 @@ class Draft:
     calibration: Mapping[str, Any] | None = None
     """Base frames, camera poses and intrinsics by arm or camera, as `carts calibrate` found them; None before."""
     offered: Mapping[str, Any] | None = None
-    """A calibration that clicked points speak against, until it is kept or discarded."""
+    """A calibration that contradicts the clicked points, until it is kept or discarded."""
     report: CalibrationReport | None = None
     """Figures of the calibration that is kept or offered."""
 
@@ -79,7 +79,7 @@ class Draft:
                 check_path(named)
             return draft
         except (ValueError, TypeError, KeyError, AttributeError) as error:
-            raise SettingsError(f"this import cannot be gone on with ({error}). Delete it and begin anew.") from error
+            raise SettingsError(f"this import cannot be continued ({error}). Delete it and begin anew.") from error
 
     def uncalibrated(self, **changes: Any) -> "Draft":
         """The draft with other fields, and without the calibration that does not hold for these."""
@@ -106,13 +106,13 @@ class DraftFile:
     def __init__(self, key: str | None = None) -> None:
         """
         Args:
-            key: of a draft that is there; None for a new one.
+            key: of an existing draft; None for a new one.
 
         Raises:
             SettingsError: there is no such draft.
         """
         if key is not None and key not in {draft.key for draft in drafts()}:
-            raise SettingsError("this import is not there any more. Begin a new one.")
+            raise SettingsError("this import no longer exists. Begin a new one.")
         self.key = key or secrets.token_hex(8)
 
     def read(self) -> Draft:
@@ -131,12 +131,12 @@ class DraftFile:
         return Draft.from_json(text)
 
     def write(self, draft: Draft) -> None:
-        """Keep a draft; one without a source is not worth it."""
+        """Save a draft, unless it has no source."""
         if draft.source:
             write_text(_path(self.key), draft.to_json())
 
     def delete(self) -> None:
-        """Forget it."""
+        """Delete the draft."""
         delete_draft(self.key)
 
 
@@ -154,7 +154,7 @@ def drafts() -> list[DraftSummary]:
 
 
 def delete_draft(key: str) -> None:
-    """Forget a draft, if it is there."""
+    """Delete a draft, if it exists."""
     if key in {draft.key for draft in drafts()}:
         remove_file(_path(key))
 
@@ -272,10 +272,10 @@ def _number(value: str) -> float | None:
         number = float(value.replace(",", "."))
     except ValueError as error:
         raise SettingsError(
-            f"{value!r} is no number. Type one, such as 0.12, or nothing to have it guessed."
+            f"{value!r} is not a number. Type one, such as 0.12, or nothing to have it guessed."
         ) from error
     if not math.isfinite(number):
-        raise SettingsError(f"{value!r} is no finite number.")
+        raise SettingsError(f"{value!r} is not a finite number.")
     return number
 
 

@@ -68,7 +68,7 @@ class FramePicture:
         Args:
             index: of the frame.
             camera: whose image.
-            scene: with a calibration that is worth showing; None without one.
+            scene: with a calibration to show; None without one.
             points: all that were clicked.
             wrong: which of these contradict the others.
         """
@@ -143,7 +143,7 @@ _WIDTH = 340.0
 """Width of the document at the side [px], as in `static/document.css`."""
 
 Calibrated = Callable[[Callable[[Draft], Draft]], None]
-"""Called on the site's thread with what a calibration makes of the draft."""
+"""Called on the site's thread with the draft after a calibration."""
 
 
 class HandEyeStep:
@@ -179,7 +179,7 @@ class HandEyeStep:
         self._picture = FramePicture(host.page, self._sequence)
 
     def close(self) -> None:
-        """Stop a calibration, and take the picture away."""
+        """Stop a calibration, and remove the picture."""
         if self._job is not None:
             self._job.cancel()
             self._job.join()
@@ -343,16 +343,16 @@ class HandEyeStep:
         if self._job is not None and self._job.cancelled:
             if not progress.ended:
                 return
-            # It may have ended before it saw that it was stopped, and still not be wanted.
+            # It may have ended before the stop took effect; its result is discarded all the same.
             progress = STOPPED if progress.result is not None else progress
         self._progress = progress
         self._report(lambda draft: draft if progress.result is None else self._calibrated(draft, progress.result))
 
     def _calibrated(self, draft: Draft, result: CalibrationResult) -> Draft:
-        """The draft with a calibration that the points agree with, or with the offer of one that they speak against."""
+        """The draft with a calibration that agrees with the points, or with the offer of one that contradicts them."""
         report = report_of(result, self._clicking, draft.points)
         if result.stop_reason in (StopReason.FAILED, StopReason.START_KEPT):
-            text = f"The calibration from your points is as it was, with a loss of {report.loss_before:.4f}."
+            text = f"The calibration from your points is unchanged, with a loss of {report.loss_before:.4f}."
             verdict = f" {report.verdict.capitalize()}: {report.reason}" if report.verdict else ""
             self._progress = CalibrationProgress("", 0.0, error=text + verdict, ended=True)
             return draft

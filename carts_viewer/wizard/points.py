@@ -12,9 +12,9 @@ from carts_core.optimization.hand_eye import HandEyeResult, HandEyeSettings, Ima
 from carts_core.recording import Sequence
 
 _FRAMES = 4
-"""In which the first camera is asked about."""
+"""Number of frames to click in the first camera."""
 _FURTHER_FRAMES = 2
-"""In which each other camera is asked about."""
+"""Number of frames to click in each other camera."""
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class Clicking:
     """The planned points, the next one to click, and the calibration computed from the clicked ones.
 
     Attributes:
-        sequence: the recording, with base frames that mean nothing.
+        sequence: the recording, with placeholder base frames.
         plan: all prompts, in order.
         result: calibration from the points; None while there are too few.
         problem: why there is no result; empty if there is.
@@ -111,14 +111,14 @@ def _plan(sequence: Sequence) -> tuple[ClickPrompt, ...]:
 
 
 def _asked(scene: Scene, arm: str) -> list[str]:
-    """The landmarks that are asked for: tip, end of the shaft, and an edge of it."""
+    """The prompted landmarks: tip, end of the shaft, and an edge of it."""
     known = landmarks(scene.arm(arm))
     joints = [name for name, mark in known.items() if mark.kind is LandmarkKind.POINT and name != TIP]
     return [name for name in (TIP, *joints[-1:], SHAFT_EDGE) if name in known]
 
 
 def spread_out(places: Rows[np.ndarray] | np.ndarray, count: int) -> list[int]:
-    """Rows whose places are far from each other, in order: the most typical one first, then the furthest from all."""
+    """Rows with positions far from each other, in order: the most typical one first, then the furthest from all."""
     points = np.asarray(places, float)
     chosen = [int(np.linalg.norm(points - np.median(points, axis=0), axis=1).argmin())]
     while len(chosen) < min(count, len(points)):

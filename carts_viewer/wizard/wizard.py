@@ -176,7 +176,7 @@ class RecordingWizard:
         self._host.show_start()
 
     def _browse(self, part: str) -> None:
-        """Look for a file or folder for a part of the recording."""
+        """Open the file browser for a part of the recording."""
         kind = part.partition(" ")[0]
         if kind not in _PURPOSES:
             raise SettingsError("this part of a recording is not known.")

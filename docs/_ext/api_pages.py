@@ -25,7 +25,7 @@ PUBLIC = (
     "resources",
     "lab.synthesis",
 )
-"""What others may import from `carts_core`, besides the settings, which have a page of their own."""
+"""Public modules of `carts_core`, besides the settings, which have a page of their own."""
 
 
 def api_pages() -> dict[str, str]:
@@ -39,7 +39,7 @@ def api_pages() -> dict[str, str]:
 
 
 def _public_names(module: ModuleType, package: bool) -> Iterator[str]:
-    """Classes and functions that are defined in a module, or that a package makes public, in their order."""
+    """Public classes and functions defined in a module, or exported by a package, in their order."""
     declared = getattr(module, "__all__", None) or vars(module)
     for name in declared:
         value = getattr(module, name)

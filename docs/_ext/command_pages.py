@@ -1,4 +1,4 @@
-"""A page for each subcommand of `carts`: what it says of itself with `--help`."""
+"""A page for each subcommand of `carts` with the output of `--help`."""
 
 import contextlib
 import io
@@ -23,7 +23,7 @@ def subcommands() -> dict[str, type]:
 
 
 def help_text(*arguments: str) -> str:
-    """What `carts ARGUMENTS --help` prints, without colours."""
+    """Output of `carts ARGUMENTS --help`, without colours."""
     printed = io.StringIO()
     before = dict(os.environ)
     os.environ.update(COLUMNS=str(WIDTH), NO_COLOR="1")

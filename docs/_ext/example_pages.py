@@ -33,7 +33,7 @@ def example_pages() -> dict[str, str]:
 
 def _gallery(cards: list[str], pages: list[str]) -> str:
     lead = (
-        "Each is one file of at most 80 lines in the folder `examples`. It runs on shipped or made data within "
+        "Each is one file of at most 80 lines in the folder `examples`. It runs on shipped or synthetic data within "
         "seconds, and a test runs it. Start one with `python examples/NAME.py`; `--help` lists its few options."
     )
     tree = "\n".join(page.removesuffix(".md") for page in pages)

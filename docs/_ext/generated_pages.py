@@ -15,7 +15,7 @@ FOLDER = "_generated"
 
 
 def write_pages(app: Sphinx) -> None:
-    """Bring every generated page up to date, and remove those whose subject is gone."""
+    """Update every generated page, and remove obsolete ones."""
     source = Path(app.srcdir)
     pages = {
         source / "reference" / FOLDER / name: text

@@ -1,4 +1,4 @@
-"""Equations as MathML, which browsers draw themselves: the site needs no script from another server."""
+"""Equations as MathML, which browsers render natively, without a script from another server."""
 
 from docutils import nodes
 from latex2mathml.converter import convert

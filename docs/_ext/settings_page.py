@@ -14,9 +14,9 @@ def settings_page() -> str:
     """The page, in Markdown."""
     parts = [
         "# Settings",
-        "What a run is set up with. Each class is a frozen dataclass of `carts_core.settings`, which checks its "
-        "ranges; options of the [commands](../cli.md) are made from the same fields. A value that is not allowed is "
-        "refused with a message that says what is.",
+        "Settings of runs and commands. Each class is a frozen dataclass of `carts_core.settings`, which checks its "
+        "ranges; options of the [commands](../cli.md) are made from the same fields. A value outside its range is "
+        "refused with a message that states the range.",
     ]
     for name, cls in vars(carts_core.settings).items():
         if inspect.isclass(cls) and dataclasses.is_dataclass(cls):

@@ -21,7 +21,7 @@ from std_msgs.msg import String  # pyright: ignore[reportMissingImports]
 
 
 class Bridge(Node):
-    """Sends what is published, and publishes what comes back."""
+    """Sends published images and joints to `carts live`, and publishes its results."""
 
     def __init__(self, arguments: argparse.Namespace) -> None:
         super().__init__("carts_live")

@@ -1,4 +1,4 @@
-"""Send a recording to `carts live --source socket:PORT`, as another program would, and print what comes back.
+"""Send a recording to `carts live --source socket:PORT`, and print the results.
 
 carts live sequence.toml --source socket:7000 --quiet
 python examples/live/sender.py 7000 sequence.toml
@@ -19,7 +19,7 @@ from carts_core.resources import sample_sequence
 
 
 def send(connection: socket.socket, message: dict) -> None:
-    """A message after its length."""
+    """Send a message, preceded by its length."""
     content = msgspec.msgpack.encode(message)
     connection.sendall(struct.pack(">I", len(content)) + content)
 
@@ -36,7 +36,7 @@ def show_results(connection: socket.socket) -> None:
 
 
 def main() -> None:
-    """Send frames at the rate that is asked for."""
+    """Send frames at the given rate."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("port", type=int)
     parser.add_argument("sequence", type=Path, nargs="?", default=sample_sequence())

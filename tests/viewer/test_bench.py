@@ -43,7 +43,7 @@ def test_a_short_soak_sees_what_it_is_there_for(open_viewer: OpenViewer, monkeyp
     monkeypatch.setattr(SceneView, "show_overlay", lambda own, *a: None if OVERLAY in own._planes else overlay(own, *a))
     assert Soaking(app, run=0.5).soak(0.01).stale
     monkeypatch.setattr(SceneView, "show_frame", lambda own, *a: 1 / 0 if FRAME in own._planes else frame(own, *a))
-    assert any("unexpected error" in line for line in Soaking(app, run=0.5).soak(0.01).exceptions)
+    assert any("Unexpected error" in line for line in Soaking(app, run=0.5).soak(0.01).exceptions)
 
 
 def _measured(sequence: Path, weights: Path) -> list[tuple[int, float]]:

@@ -220,7 +220,7 @@ class World:
         kept = list(place.glob("*.damaged-*"))
         asked = any(job.state is JobState.ASKED for job in state.jobs) or bool(state.asked_network)
         read = name in ("sequence_jobs.json", "sequence_network.json")
-        if read and not (state.problems and (kept or "not there" in state.problems[0])) and not asked:
+        if read and not (state.problems and (kept or "no longer exists" in state.problems[0])) and not asked:
             return "" if case.wrong in ("empty list", "a link to nothing") else f"nothing is said: {state.jobs}"
         return ""
 
@@ -256,7 +256,7 @@ class World:
             draft |= {"step": Step.HAND_EYE, "options": {}}
         plant(data_dir() / "drafts" / "0123.json", draft, case)
         self.do(self.site.show_start)
-        if "Not finished" not in self.site.document.content:
+        if "Unfinished imports" not in self.site.document.content:
             return "the draft is not listed"
         if problem := self.serves():
             return problem

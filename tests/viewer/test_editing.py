@@ -169,7 +169,7 @@ def test_pins_are_forgotten_when_the_pose_is_changed_otherwise(desk: Desk, inten
 
 
 def test_a_place_that_is_none_is_refused_and_one_outside_the_image_is_at_its_edge(desk: Desk) -> None:
-    with pytest.raises(CartsError, match="no place in the image"):
+    with pytest.raises(CartsError, match="not a position in the image"):
         desk.do(intents.PointAt(float("nan"), 3.0))
     with pytest.raises(CartsError, match="There is no keypoint"):
         desk.do(intents.ChooseKeypoint("elbow"))

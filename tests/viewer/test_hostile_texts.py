@@ -298,7 +298,7 @@ def test_names_of_files_columns_and_drafts_stay_texts_on_the_start_page_and_in_n
         rest_on_everything(page)
         check_settled(page, texts)
         main.get_by_role("button", name="All recordings").click()
-        main.get_by_role("heading", name="Not finished").wait_for()
+        main.get_by_role("heading", name="Unfinished imports").wait_for()
         check(page, texts)
         assert texts.reached > {"root", "folder", "images", "table", "column", "broken", "format"}
         assert texts.reached > {"file", "sequence"}, "the recent recording"

@@ -372,7 +372,7 @@ def test_an_adapted_network_is_offered_and_used_by_a_button(open_viewer: OpenVie
 
     app = open_viewer(plant, frames=2, networks={"weights": ()})
     with RawTab(app.url) as tab:
-        offered = widget(app, tab, "Use the newest network")
+        offered = widget(app, tab, "Use newest network")
         assert offered.visible
         tab.set(app.page.element_id(offered), True)
         eventually(lambda: app.state.asked_network or app.state.network != STARTED)

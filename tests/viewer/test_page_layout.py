@@ -13,7 +13,7 @@ from carts_viewer.panels.help import HINTS, explain
 pytestmark = pytest.mark.browser
 
 TABS = ("Optimize", "Review", "Values", "Jobs", "Live", "Export", "Help")
-FOLDERS = {"Optimize": ("Free parameters",), "Review": ("Find", "Masks of others")}
+FOLDERS = {"Optimize": ("Free parameters",), "Review": ("Find", "Import")}
 """What is folded at first, by the tab that it lies in."""
 PHONE = (390, 844)
 
@@ -265,7 +265,7 @@ def test_fields_lists_and_errors_leave_the_page_usable_and_no_other_host_is_aske
     app.sequence.forget_images()
     tab.put(intents.ShowDomain("regular"))
     tab.type_value(tab.find("Frame"), 12)
-    message, note = page.locator(".carts-error[role=alert]"), page.get_by_text("That did not work")
+    message, note = page.locator(".carts-error[role=alert]"), page.get_by_text("Action failed")
     expect(message).to_contain_text("012.png")
     expect(note).to_be_visible()
     tab.button("Dismiss")
@@ -278,7 +278,7 @@ def test_fields_lists_and_errors_leave_the_page_usable_and_no_other_host_is_aske
     expect(error).to_be_visible()
     above, below = box_of(field), box_of(error)
     assert 0 <= below["y"] - above["y"] - above["height"] < 40
-    tab.button("Reset all to the preset")
+    tab.button("Reset to preset")
     expect(error).to_be_hidden()
     tab.button("Close")
     assert asked and all(url.startswith((app.url, "data:", "blob:")) for url in asked)

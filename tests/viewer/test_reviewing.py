@@ -172,7 +172,7 @@ def test_all_found_frames_are_reviewed_in_one_step_and_notes_stay(known: Desk) -
     assert known.saved.review(2) == Review() and len(known.saved.steps) == steps + 2
     known.do(intents.Undo())
     assert known.saved.review(2).state is ReviewState.ACCEPTED
-    with pytest.raises(CartsError, match="No frame is like that"):
+    with pytest.raises(CartsError, match="No frame meets the conditions"):
         known.do(intents.SetFilter("note", "xyz"), intents.ShowFound())
     with pytest.raises(CartsError, match="cannot be looked for by 'colour'"):
         known.do(intents.SetFilter("colour", "red"))
@@ -236,9 +236,9 @@ def test_a_verdict_is_read_with_reason_remedy_and_cameras() -> None:
 
 
 def test_losses_are_only_said_to_compare_when_they_do() -> None:
-    assert "only compare within a stage" in note(Curves(loss=(1.0,)), False)
+    assert "comparable within a stage only" in note(Curves(loss=(1.0,)), False)
     ended = note(Curves(loss=(1.0,), comparable=True), False)
-    assert "● the result" in ended and "only compare" not in ended
+    assert "● result" in ended and "within a stage only" not in ended
     assert "changed since" in note(Curves(loss=(1.0,), comparable=True), True)
 
 

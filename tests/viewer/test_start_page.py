@@ -210,12 +210,12 @@ def test_drafts_are_listed_newest_first_and_damaged_ones_can_be_deleted(tmp_path
     assert DraftFile(second.key).read().name == "named"
     (data_dir() / "drafts" / "bad.json").write_text("{")
     assert "a damaged import" in {draft.name for draft in drafts()}
-    with pytest.raises(SettingsError, match="cannot be gone on with"):
+    with pytest.raises(SettingsError, match="cannot be continued"):
         DraftFile("bad").read()
     for key in ("bad", "../../x", first.key):
         delete_draft(key)
     assert [draft.name for draft in drafts()] == ["named"]
-    with pytest.raises(SettingsError, match="not there any more"):
+    with pytest.raises(SettingsError, match="no longer exists"):
         DraftFile("../../x")
 
 

@@ -27,7 +27,7 @@ def check_status(tab: Tab) -> None:
     expect(tip).to_be_hidden()
     expect(legend).to_be_hidden()
     page.get_by_role("button", name="Legend").click()
-    expect(legend).to_contain_text("solving leaves it as it is")
+    expect(legend).to_contain_text("solving does not change it")
     page.get_by_role("button", name="Legend").click()
 
 

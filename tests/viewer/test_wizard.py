@@ -304,7 +304,7 @@ def test_a_calibration_that_points_agree_with_is_kept_with_its_figures(site: Sit
         assert text in content
     assert Draft.from_json(draft.to_json()) == draft
     site.post(lambda: place.choose("undo", ""))
-    assert "Loss" not in ended(site, "Of the calibration from points").to_json()
+    assert "Loss" not in ended(site, "Calibration from points").to_json()
     assert place_of(site).draft.calibration is None and "± 8.2 mm" not in site.document.content
 
 
@@ -329,9 +329,9 @@ def test_a_calibration_that_moves_off_the_points_is_offered_and_not_kept(
     assert offer.report is not None and offer.report.objection
     assert "px allowed" in site.document.content and "<td>2.00°</td>" in site.document.content
     for choice, text, kept in (
-        ("keep", "Kept by choice", True),
+        ("keep", "Kept by the user", True),
         ("undo", "Calibration not kept", False),
-        ("discard", "Of the calibration from points", False),
+        ("discard", "Calibration from points", False),
         ("undo", "Calibration not kept", False),
     ):
         site.post(lambda choice=choice: place.choose(choice, ""))
