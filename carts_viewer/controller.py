@@ -70,7 +70,7 @@ class Background:
         return min((wait for handler in handlers if (wait := handler.wait_time()) is not None), default=None)
 
     def advance(self) -> None:
-        """Do one step of the work under way: a frame to solve or export, a step of a job.
+        """Do one step of the running work: a frame to solve or export, a step of a job.
 
         Raises:
             CartsError: it failed, and so did its job.
@@ -237,7 +237,7 @@ class Controller(Handler):
         return watch if draft is None else min(draft, watch)
 
     def advance(self) -> None:
-        """Do one step of the work under way: an iteration, or the next frame of playback."""
+        """Do one step of the running work: an iteration, or the next frame of playback."""
         self._optimizing.advance()
         self._browsing.advance()
         self._live.advance()
@@ -288,7 +288,7 @@ class Controller(Handler):
         self._context.score()
 
     def map(self) -> None:
-        """Compute what the chosen layer shows beyond the pose; errors as `handle`."""
+        """Compute the maps of the chosen layer; errors as `handle`."""
         if not self._live.active:
             self._optimizing.map()
 

@@ -124,7 +124,7 @@ class People:
         """Go to a position in the history.
 
         Raises:
-            CartsError: that would undo steps of another user at work.
+            CartsError: steps of another present user would be undone.
             ProjectError: it could not be saved.
         """
         project = self.project
@@ -156,7 +156,7 @@ class People:
         return next((one for one in self.persons if one.chosen and name.startswith(f"{one.chosen}: ")), None)
 
     def _next_is_free(self, person: Person) -> bool:
-        """Whether the step that was undone last belongs to no other user at work."""
+        """Whether the step that was undone last belongs to no other present user."""
         state = self.project.state
         if state.position == len(state.steps):
             return False
@@ -191,7 +191,7 @@ LONGEST_DRAFT = 5.0
 
 
 class Editor:
-    """The project as one person edits it, and at most one draft: a gesture of theirs that is not finished.
+    """Edits of one user: the project, and at most one draft, an unfinished gesture.
 
     Attributes:
         project: receives finished gestures.
@@ -245,8 +245,8 @@ class Editor:
 
         Args:
             name: of the step that it will be.
-            edits: what changes; added to what the same gesture changed before.
-            gesture: tells drafts apart; an earlier one that could not be saved becomes part of this one.
+            edits: the changes; merged with earlier ones of the same gesture.
+            gesture: identifies the draft; an earlier draft that could not be saved is merged into this one.
         """
         self._name, self._gesture = name, gesture
         self._edits = {**self._edits, **edits}
@@ -258,7 +258,7 @@ class Editor:
         self._gesture, self._edits, self._view = None, {}, None
 
     def save(self, figures: dict[int, Figures] | None = None) -> None:
-        """Save the draft as one step of undo. In a project that takes no edits it stays a draft.
+        """Save the draft as one step of undo. In a read-only project it remains a draft.
 
         Raises:
             ProjectError: it could not be saved; it is still there.
@@ -300,7 +300,7 @@ class Editor:
         """Undo or redo until this number of steps is in effect; drafts as `undo`.
 
         Raises:
-            CartsError: steps of another user at work are in between.
+            CartsError: steps of another present user are in between.
             ProjectError: it could not be saved, or the project is read-only.
         """
         if self._dropped():

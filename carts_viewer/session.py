@@ -84,9 +84,9 @@ class Session:
         return all(np.array_equal(values, measured[arm][frame.index]) for arm, values in frame.measured.items())
 
     def frame(self, index: int, domain: str, camera: str) -> Frame:
-        """The frame with the images of all cameras, or of that one alone where another one's cannot be used.
+        """The frame with the images of all cameras, or only that of `camera` if another one is not usable.
 
-        Those ahead of it are read in advance.
+        The following frames are read in advance.
 
         Raises:
             SequenceError: the image of that camera is not usable.

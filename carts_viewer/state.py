@@ -239,7 +239,7 @@ class ViewState:
     solve: SolveState | None = None
     """The present or the last solving of many frames."""
     direction: Direction = "forward"
-    """In which direction many frames are solved."""
+    """Direction of solving many frames."""
     joint: tuple[str, int] | None = None
     """The joint that keys nudge: arm, index of the joint; None: the first."""
     keypoints: KeypointState = field(default_factory=KeypointState)
@@ -267,9 +267,9 @@ class ViewState:
     name: str = ""
     """Name of this user."""
     others: tuple[tuple[str, int], ...] = ()
-    """Name and frame of the other users at work."""
+    """Names and frames of the other present users."""
     busy: str | None = None
-    """What the worker is preparing, as text for the user."""
+    """Present preparation of the worker, as text for the user."""
     export: ExportState | None = None
     live: LiveState | None = None
     error: str | None = None

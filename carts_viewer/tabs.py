@@ -52,7 +52,7 @@ class IntentQueue(Generic[T]):
         """Add an intent, in place of a waiting one of the same tab and key."""
         with self._changed:
             key = object() if intent.key is None else (tab, intent.key)
-            # Removed first, so that the newest version queues up behind what was asked for before it.
+            # Removed first, so that the newest version is queued behind earlier requests.
             self._waiting.pop(key, None)
             self._waiting[key] = Asked(tab, intent)
             self._changed.notify()
@@ -71,7 +71,7 @@ class IntentQueue(Generic[T]):
             return waiting
 
     def wake(self) -> None:
-        """End a `take` that waits, with nothing."""
+        """End a waiting `take` with an empty result."""
         with self._changed:
             self._woken = True
             self._changed.notify()
@@ -171,7 +171,7 @@ class Tab:
         self._left_at = time.monotonic()
 
     def away_in(self) -> float | None:
-        """Time until `leave` is due [s]; None where it is not."""
+        """Time until `leave` is due [s]; None if it is not."""
         return None if self._left_at is None else max(0.0, self._left_at + AWAY - time.monotonic())
 
     def leave(self) -> None:

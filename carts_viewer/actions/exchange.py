@@ -194,7 +194,7 @@ def zipped(path: Path) -> tuple[str, bytes]:
     """Name and content of a download: a file unchanged, a folder as a zip archive.
 
     Raises:
-        CartsError: it is gone, or too large for a browser.
+        CartsError: it no longer exists, or is too large for a browser.
     """
     files = [path] if path.is_file() else sorted(file for file in path.rglob("*") if file.is_file())
     if not files:
@@ -243,7 +243,7 @@ def _seen_by_all(project: ProjectState, frame: int, cameras: Collection[str]) ->
 
 @lru_cache(maxsize=256)
 def _cameras(settings: str | None) -> frozenset[str] | None:
-    """Cameras in the settings of an optimizer; None where they are not recorded."""
+    """Cameras in the settings of an optimizer; None if they are not recorded."""
     names = json.loads(settings).get("cameras") if settings else None
     return None if names is None else frozenset(map(str, names))
 
@@ -283,7 +283,7 @@ class CooperativeThread(Generic[T]):
         """Continue for about `seconds`; returns the function's result once it has ended.
 
         Raises:
-            Exception: what the function raised.
+            Exception: the exception of the function.
         """
         if self._thread.ident is None:
             self._thread.start()

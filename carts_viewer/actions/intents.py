@@ -1,7 +1,7 @@
 """Intents: requests of a user or of the page.
 
 A control that streams values, such as a slider that is being dragged, gives its intents a key: a newer intent
-replaces a waiting one of the same key, so that work never piles up and the last value counts.
+replaces a waiting one of the same key, so that the queue stays short and the last value is used.
 """
 
 from collections.abc import Hashable
@@ -482,13 +482,13 @@ class UseNetwork(Jobs):
 
 
 class AnswerNetwork(Jobs):
-    """Accept or refuse the weights that are asked for (`ViewState.asked_network`)."""
+    """Accept or refuse weights that need confirmation (`ViewState.asked_network`)."""
 
     accepted: bool
 
 
 class AnswerJobs(Jobs):
-    """Run or discard all jobs that are asked for (`JobState.ASKED`)."""
+    """Run or discard all jobs that need confirmation (`JobState.ASKED`)."""
 
     accepted: bool
 

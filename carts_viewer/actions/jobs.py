@@ -1,4 +1,4 @@
-"""The queue of jobs: one after the other is started, followed, stopped and recorded."""
+"""The queue of jobs, which run one after the other: start, progress, stop and record."""
 
 import time
 from collections.abc import Generator
@@ -139,7 +139,7 @@ class JobsHandler(Handler):
         if job.state is JobState.RUNNING:
             self._stop(job)
         if not job.over:
-            self._end(job, JobState.CANCELLED, "Cancelled; what was saved is kept.")
+            self._end(job, JobState.CANCELLED, "Cancelled; saved results are kept.")
 
     def _on_RepeatJob(self, intent: intents.RepeatJob) -> None:
         job = self._list.find(intent.number)
@@ -160,7 +160,7 @@ class JobsHandler(Handler):
         """Begin the next job, or continue the running one.
 
         Raises:
-            CartsError: the job failed and is marked so; the next one is begun later.
+            CartsError: the job failed and is marked as failed; the next one begins later.
         """
         job = self._running()
         if job is None:

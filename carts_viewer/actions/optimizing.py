@@ -56,7 +56,7 @@ class OptimizingHandler(Handler):
             self._iterate()
 
     def end(self, reason: str | None, *, save: bool = True) -> None:
-        """End the run and save its pose; its curves stay until the next run.
+        """End the run and save its pose; its curves are kept until the next run.
 
         Raises:
             ProjectError: it could not be saved.

@@ -211,7 +211,7 @@ class PropagatingHandler(Handler):
         taken = {i: outcome for i, outcome in self._held.items() if intent.index is None or i == intent.index}
         taken = {i: outcome for i, outcome in taken.items() if now.joints(i) == self._before.joints(i)}
         if not taken:
-            raise CartsError("There is nothing to take: the frame was changed meanwhile, or its list is gone.")
+            raise CartsError("There is nothing to take: the frame was changed meanwhile, or its list was closed.")
         self._context.end_run("Stopped: solved frames are taken")
         self._context.save()
         edits: dict[Key[Any], Any] = {}

@@ -316,7 +316,7 @@ class JobList:
             rows = typed(parse_json(read_text(self._path.path, _FILE)), list[_Row])
             numbers = [row.number for row in rows]
             if len(set(numbers)) < len(numbers) or len(numbers) > _LONGEST_LIST:
-                raise ValueError(f"it has more than {_LONGEST_LIST} jobs, or two of one number")
+                raise ValueError(f"it has more than {_LONGEST_LIST} jobs, or duplicate numbers")
             return [self._job(row) for row in rows]
         except FileNotFoundError:
             return []

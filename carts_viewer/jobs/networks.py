@@ -84,7 +84,7 @@ class Networks:
                 write_text(self._file, json.dumps(asdict(_Choice(name))))
 
     def answer(self, accepted: bool) -> None:
-        """Accept or refuse the weights that were asked for.
+        """Accept or refuse the weights that need confirmation.
 
         Raises:
             CartsError: there is no question, or they cannot be used.
@@ -128,7 +128,7 @@ class Networks:
         try:
             return read_bytes(path, WEIGHTS)
         except OSError as error:
-            raise CartsError(f"{path} cannot be read ({error}). Adapt the network anew.") from error
+            raise CartsError(f"{path} cannot be read ({error}). Adapt the network again.") from error
 
     def _numbers(self) -> list[int]:
         named = re.compile(re.escape(self._project.stem) + r"_adapted_([1-9]\d{0,5})")

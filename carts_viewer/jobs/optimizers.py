@@ -53,7 +53,7 @@ class Optimizer(Protocol):
 
     @property
     def assessment(self) -> Assessment | None:
-        """At the end, how far the result can be relied on; None before, and where it is not assessed."""
+        """At the end, the assessment of the result; None before, and if it is not assessed."""
 
     def step(self) -> Iterate | None:
         """The next iterate, the start itself at first; None when there are no more."""
@@ -98,7 +98,7 @@ class ActiveRun:
         self._rows = [names.index(name) for name in task.cameras]
 
     def verdict(self) -> FitVerdict | None:
-        """At the end, how far the result can be relied on; None where the solver does not assess it."""
+        """At the end, the verdict on the result; None if the solver does not assess it."""
         found = self.optimizer.assessment
         if found is None:
             return None
@@ -132,7 +132,7 @@ class SequenceRun:
         self.cancelled = False
 
     def cancel(self) -> None:
-        """Stop; what was reached stays in the optimizer's `estimates`."""
+        """Stop; the results so far remain in the optimizer's `estimates`."""
         self.cancelled = True
         self.optimizer.cancel()
 
@@ -191,10 +191,10 @@ class OptimizerFactory:
         """Use another surface network from now on; None: the one that the viewer was started with.
 
         Raises:
-            WeightsError: the weights cannot be read, or are no surface network's.
+            WeightsError: the weights cannot be read, or are not those of a surface network.
         """
         if surface is not None and read_weights(surface).network.kind != SurfaceNetwork.kind:
-            raise WeightsError(f"{surface} holds no surface network. Adapt the network anew.")
+            raise WeightsError(f"{surface} holds no surface network. Adapt the network again.")
         self._surface, self._extractor = surface, None
 
     def prepare(self) -> FeatureExtractor:

@@ -54,7 +54,7 @@ class Progress:
 def optimize_frames(context: Context, comparison: Comparison, frames: Sequence[int], first: int) -> Generator[Progress]:
     """Run on each of these frames alone, beginning at position `first`; worse results are discarded.
 
-    Every frame is a step of undo of its own, and is saved before the next one begins.
+    Every frame is a separate step of undo, and is saved before the next one begins.
     """
     taken = worse = 0
     cameras = [camera.name for camera in context.session.scene.cameras]
@@ -134,7 +134,7 @@ def calibrate(context: Context, optimizers: OptimizerFactory, count: int) -> Gen
     accepted, solved = (_count(session.editor.view, states) for states in ({_ACCEPTED}, {_ACCEPTED, _OPTIMIZED}))
     session.editor.apply(f"Calibrate on {len(indices)} frames", edits)
     context.refresh()
-    again = " All masks have moved: run or solve again what was fitted before." if solved else ""
+    again = " All masks have moved: run or solve fitted frames again." if solved else ""
     again += f" Unreviewed now, though accepted before: {accepted}." if accepted else ""
     done = f"Calibrated on {len(indices)} frames, one step of undo.{_moved(scene, result.scene)}"
     yield Progress(most, most, f"{done} {verdict}{again}")
@@ -177,7 +177,7 @@ _LONGEST_END = 30.0
 
 
 def adapt(sequence: Path, folder: Path, minutes: float) -> Generator[Progress]:
-    """Train in a process of its own and report progress; closing the iterator stops the training.
+    """Train in a child process and report progress; closing the iterator stops the training.
 
     A stopped training continues in its folder for the given minutes.
 

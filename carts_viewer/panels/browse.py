@@ -120,7 +120,7 @@ _CALENDAR = 1e8
 
 
 def _time(stamp: float, began: float) -> str:
-    """Time of a frame as text: since the first frame, and the date where it is known."""
+    """Time of a frame as text: since the first frame, and the date if known."""
     since = f"{stamp - began:.3f} s after the first"
     if stamp < _CALENDAR:
         return f"at {stamp:.3f} s"

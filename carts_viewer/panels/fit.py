@@ -139,7 +139,7 @@ def fit_text(
         running: whether the pose is still moving.
         scores: Dice of the cameras with a true mask.
         undetermined: joints that the images do not determine; None where no deviation is known.
-        busy: what is being prepared.
+        busy: text on the present preparation.
     """
     cameras = dict(verdict.cameras) if verdict is not None else {}
     chips = []

@@ -45,7 +45,7 @@ class PanelPage(TabPage):
 
         @handle.on_click
         async def _(event: viser.GuiEvent) -> None:
-            # A tab can send a click on a disabled button, so what a click may do is decided by the controller.
+            # A tab can send a click on a disabled button, so the controller checks every click.
             if event.client_id is not None:
                 self.emit(intent if isinstance(intent, Intent) else intent(event.client_id))
 

@@ -34,7 +34,7 @@ class Layout:
     Attributes:
         panels: in the order in which they are brought up to date.
         joints: the one with the joints' sliders.
-        timeline: what the strip below the picture shows.
+        timeline: data of the strip below the image.
     """
 
     def __init__(self, page: PanelPage, session: Session, storage: Storage, state: ViewState) -> None:

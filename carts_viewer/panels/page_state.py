@@ -26,7 +26,7 @@ class PageState:
         self._sent: dict[str, Any] = {}
 
     def show(self, state: ViewState) -> None:
-        """Send what has changed."""
+        """Send changes."""
         message = self._message(state)
         if message != self._sent:
             self._sent = message

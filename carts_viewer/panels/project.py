@@ -15,7 +15,7 @@ _LISTED = 60
 
 
 class SavedPanel:
-    """Whether everything is saved, a banner where it is not, undo and redo."""
+    """Save status, a banner if edits are not saved, undo and redo."""
 
     def __init__(self, page: PanelPage, storage: Storage) -> None:
         gui = page.gui

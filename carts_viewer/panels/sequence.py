@@ -24,7 +24,7 @@ class CalibrationHint:
             f"Calibrate on {frames} frames",
             intents.Calibrate(frames),
             visible=False,
-            hint="A job: the page stays usable. One step of undo. Jobs, Calibrate takes another number of frames.",
+            hint="A job, and one step of undo; the page remains usable. Jobs, Calibrate has other numbers of frames.",
         )
         self._watched: int | None = None
 
@@ -148,7 +148,7 @@ class KeyframesPanel:
         self._take.disabled = state.index not in held
         rows = "".join(
             f'<li><a href="#" data-frame="{frame.index}">{escaped(self._ids[frame.index])}</a> '
-            f"{escaped(frame.reason)}{'' if frame.taken else ' <b>kept as it was</b>'}</li>"
+            f"{escaped(frame.reason)}{'' if frame.taken else ' <b>not changed</b>'}</li>"
             for frame in listed[:_LONGEST_LIST]
         )
         more = f"<li>and {len(listed) - _LONGEST_LIST} more</li>" if len(listed) > _LONGEST_LIST else ""

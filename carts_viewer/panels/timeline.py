@@ -146,7 +146,7 @@ class Thumbnails:
         self._thread.shutdown(wait=True, cancel_futures=True)
 
     def _source(self, camera: int, domain: int) -> ImageSource:
-        """Images as recorded; a video gets a reader of its own."""
+        """Images as recorded; a video gets a separate reader."""
         if (camera, domain) not in self._sources:
             source = self._sequence.image_source(self._cameras[camera], self._sequence.domains[domain])
             self._sources[camera, domain] = source.another() if isinstance(source, Video) else source

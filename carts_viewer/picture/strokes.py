@@ -64,7 +64,7 @@ class Stroke:
     number: int
     """The tab's own count of its strokes."""
     frame: int
-    """Index of the frame that it was drawn over, whatever is shown now."""
+    """Index of the frame that it was drawn over, which may differ from the shown one."""
     camera: str
     target: Target
     erase: bool

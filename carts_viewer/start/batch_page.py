@@ -31,7 +31,7 @@ class BatchPage:
     def __init__(self, site: Host, folder: Path) -> None:
         """
         Raises:
-            SettingsError: the folder is no batch.
+            SettingsError: the folder is not a batch.
         """
         self._site = site
         self._batch = output_path(folder)
@@ -69,7 +69,7 @@ class BatchPage:
         self.show()
 
     def click(self, u: float, v: float) -> None:
-        """No image is shown."""
+        """Ignored, since no image is shown."""
 
     def fail(self, error: Exception) -> None:
         """Show an error."""

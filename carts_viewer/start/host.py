@@ -52,7 +52,7 @@ class Host(Protocol):
         """Go to the start page."""
 
     def show_recording(self, draft: str | None = None) -> None:
-        """Go to New recording: a new one, or a draft that is there."""
+        """Go to New recording: a new one, or an existing draft."""
 
     def show_batch(self, folder: Path) -> None:
         """Go to a batch; if it cannot be read, to the start page with the reason."""
@@ -99,7 +99,7 @@ class FileBrowser:
         try:
             folder = self.roots.checked(text) if text else None
             if folder is not None and not folder.is_dir():
-                raise SettingsError(f"{folder} is no folder.")
+                raise SettingsError(f"{folder} is not a folder.")
             self.folder = folder
         except SettingsError as error:
             self.problem = str(error)

@@ -50,7 +50,7 @@ class Roots:
         """
         for folder in folders:
             if not folder.is_dir():
-                raise SettingsError(f"--root {folder} is no folder. Give folders that hold recordings.")
+                raise SettingsError(f"--root {folder} is not a folder. Give folders that hold recordings.")
         # A named root may be a link; links below it are not followed.
         self.folders = tuple(dict.fromkeys(folder.resolve() for folder in folders))
 

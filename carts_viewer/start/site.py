@@ -120,7 +120,7 @@ class Site:
         self._go(lambda: StartPage(self, problem))
 
     def show_recording(self, draft: str | None = None) -> None:
-        """Go to New recording: a new one, or a draft that is there."""
+        """Go to New recording: a new one, or an existing draft."""
         self._go(lambda: RecordingWizard(self, draft))
 
     def open_sample(self) -> None:

@@ -69,7 +69,7 @@ def set_damaged_aside() -> str:
     try:
         _read()
     except (OSError, ValueError) as error:
-        return damage(_list(), "list of recent recordings", error, "A new list was begun")
+        return damage(_list(), "list of recent recordings", error, "A new list was started")
     return ""
 
 
@@ -86,7 +86,7 @@ def _read() -> list[RecentProject]:
 
 
 def up_to_date(project: RecentProject) -> RecentProject:
-    """The entry with the numbers of its project file as it is now; another program may have changed it.
+    """The entry with the current numbers of its project file, which another program may have changed.
 
     Raises:
         ProjectError: the project cannot be read.
@@ -221,7 +221,7 @@ class StartPage:
         self._browser = None if self._browser is not None else new
 
     def click(self, u: float, v: float) -> None:
-        """No image is shown."""
+        """Ignored, since no image is shown."""
 
     def fail(self, error: Exception) -> None:
         """Show an error."""
@@ -229,7 +229,7 @@ class StartPage:
         self.show()
 
     def close(self) -> None:
-        """Nothing to close."""
+        """Does nothing."""
 
     def _card(self, project: RecentProject) -> tuple[RecentProject, str, str]:
         """The current entry of a project, the error that prevents it, and the address of its picture."""

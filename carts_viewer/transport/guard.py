@@ -129,7 +129,7 @@ def _from_another_page(target: str, headers: Headers) -> bool:
 
 
 def _cookie_name(headers: Headers) -> str:
-    """One for each port, since cookies, unlike origins, do not tell the ports of a computer apart."""
+    """Name of the cookie; one per port, since all ports of a computer share their cookies."""
     return f"carts-{urlsplit('//' + headers['Host']).port or 80}"
 
 

@@ -119,13 +119,13 @@ class Page:
             title: The browser tab's title.
 
         Raises:
-            SettingsError: `host` is no address of this computer.
+            SettingsError: `host` is not an address of this computer.
         """
         check_address(host, port)
         self._guard = Guard(host)
         self._title = title
         self.key_groups: list[Any] = []
-        """Content of the sheet of keys: groups with pairs of key and meaning."""
+        """Content of the key sheet: groups with pairs of key and meaning."""
         self.project = ""
         """Name of the recording that is shown; empty while none is."""
         self.media = Media()
@@ -216,7 +216,7 @@ class Page:
         return element_id(handle)
 
     def _respond(self, request: Request) -> Response | Awaitable[Response] | None:
-        """Our own answer to a request, or None to let viser answer it."""
+        """The viewer's response to a request, or None for viser's."""
         reason = self._guard.refusal(request.path, request.headers)
         if reason is not None:
             return response(http.HTTPStatus.FORBIDDEN, "text/plain; charset=utf-8", reason.encode())

@@ -72,7 +72,7 @@ def on_sent(handle: Any, callback: Callable[[Any], None]) -> None:
     """Call `callback(value)` on the event loop whenever a tab sends a new value for a widget.
 
     By the time that viser's own `on_update` reads the widget, the worker may have written an older value into it, and
-    what the tab has sent would be lost.
+    the value from the tab would be lost.
     """
     impl = handle._impl
     update_other_tabs = impl.sync_cb

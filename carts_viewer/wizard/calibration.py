@@ -52,12 +52,12 @@ class CalibrationProgress:
     ended: bool = False
 
 
-STOPPED = CalibrationProgress("Stopped; the calibration from your points is as it was.", 0.0, ended=True)
+STOPPED = CalibrationProgress("Stopped; the calibration from your points is unchanged.", 0.0, ended=True)
 """End of a stopped calibration."""
 
 
 class CalibrationJob:
-    """One calibration on a thread of its own."""
+    """One calibration on a separate thread."""
 
     def __init__(
         self,
@@ -164,7 +164,7 @@ class CalibrationReport:
     """Residuals of the draft's points [px]; None for points that were not used."""
     after: tuple[float | None, ...]
     disagreeing: tuple[int, ...]
-    """Points whose residual has grown beyond what noise explains."""
+    """Points whose residual has grown beyond the noise of clicks."""
     objection: str
     """Why the points contradict the calibration; empty where they agree."""
 

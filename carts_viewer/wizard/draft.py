@@ -68,7 +68,7 @@ class Draft:
         """The draft of a text.
 
         Raises:
-            SettingsError: the text is no draft.
+            SettingsError: the text is not a draft.
         """
         try:
             plain = parse_json(text)
@@ -196,7 +196,7 @@ def changed(draft: Draft, name: str, value: str, guessed: Mapping[str, str]) -> 
     Args:
         draft: before.
         name: of the choice, as in `form`.
-        value: what was chosen; "" leaves it to the guess.
+        value: the chosen value; "" restores the guess.
         guessed: joint -> column, as guessed.
 
     Raises:
@@ -235,7 +235,7 @@ def picked(draft: Draft, part: str, path: Path, found: Mapping[str, Path]) -> Dr
     Args:
         draft: before.
         part: "source", "images", "images CAMERA", "calibration CAMERA", "kinematics" or "robot ARM".
-        path: what was picked.
+        path: the picked file or folder.
         found: camera -> where its images were found, which are kept when another camera is added.
     """
     kind, _, which = part.partition(" ")

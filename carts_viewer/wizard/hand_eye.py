@@ -150,13 +150,13 @@ class HandEyeStep:
     """Clicks in the images of a recording, and their calibration.
 
     Attributes:
-        problem: what went wrong last; empty without one.
+        problem: the last error; empty without one.
     """
 
     def __init__(self, host: Host, recording: FoundRecording, draft: Draft, report: Calibrated) -> None:
         """
         Args:
-            host: where it is shown.
+            host: the site that shows it.
             recording: as found.
             draft: with points from before, if there are some.
             report: called when a calibration ends.
@@ -294,7 +294,7 @@ class HandEyeStep:
         frames = range(len(self._sequence))
         free = [frame for frame in frames if (prompt.camera, frame) not in used]
         if not free:
-            raise SettingsError("there is no other frame. Use the list below, or leave out what is not visible.")
+            raise SettingsError("there is no other frame. Use the list below, or skip landmarks that are not visible.")
         other = min(free, key=lambda frame: abs(frame - prompt.frame))
         self._clicking.move_frame(prompt.camera, prompt.frame, other)
         self._wanted = None

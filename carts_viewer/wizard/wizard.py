@@ -1,4 +1,4 @@
-"""New recording: choose files, check what was guessed, click points, calibrate, save. Kept after each change."""
+"""New recording: choose files, check guesses, click points, calibrate, save. Drafts are saved after each change."""
 
 from collections.abc import Callable
 from contextlib import suppress
@@ -143,7 +143,7 @@ class RecordingWizard:
         self.show()
 
     def close(self) -> None:
-        """Stop what runs; the draft is kept already."""
+        """Stop running work; the draft is saved already."""
         self._leave_hand_eye()
 
     def _set(self, draft: Draft) -> None:

@@ -114,7 +114,7 @@ def test_two_folders_a_table_and_calibrations_become_a_sequence_with_its_arm_in_
     visitor.press("Calibrate")
     visitor.reads("Stage 1 of", 120)
     visitor.press("Stop")
-    visitor.reads("Stopped; the calibration from your points is as it was.", 120)
+    visitor.reads("Stopped; the calibration from your points is unchanged.", 120)
     visitor.press("Save and open")
     app = eventually(lambda: visitor.site.app, lambda now: now is not None, 120)
     assert app is not None

@@ -208,7 +208,7 @@ def test_frames_are_solved_while_the_page_stays_live_and_a_suspected_calibration
     tab.button("Solve all")
     expect(tab.page.get_by_text("The calibration may be wrong")).to_be_visible(timeout=120_000)
     tab.button("Calibrate on 4 frames")
-    said = tab.page.get_by_role("status").get_by_text("run or solve again what was fitted before")
+    said = tab.page.get_by_role("status").get_by_text("run or solve fitted frames again")
     expect(said.locator("visible=true")).to_have_count(1, timeout=120_000)
     expect(said.locator("visible=true")).to_contain_text("Moved: T_world_base of PSM1 by ")
     expect(tab.page.get_by_text("The calibration may be wrong")).to_have_count(0)

@@ -232,7 +232,7 @@ def test_a_calibration_that_had_ended_before_it_was_stopped_is_not_taken_either(
         place.choose(*STOP)
 
     site.post(stop_when_it_has_ended)
-    assert ended(site, "Stopped; the calibration from your points is as it was.").calibration is None
+    assert ended(site, "Stopped; the calibration from your points is unchanged.").calibration is None
     site.post(lambda: place.choose(*CALIBRATE))
     assert ended(site, "Calibrated").calibration is not None, "the next one is not stopped"
 
@@ -270,7 +270,7 @@ def test_a_calibration_is_stopped_at_any_moment(
         monkeypatch.setattr(calibration, "spread", spread)
     monkeypatch.setattr(calibration, "CalibrationOptimizer", Stopped)
     site.post(lambda: place.choose(*CALIBRATE))
-    assert ended(site, "Stopped; the calibration from your points is as it was.").calibration is None
+    assert ended(site, "Stopped; the calibration from your points is unchanged.").calibration is None
 
 
 def test_stop_is_answered_at_once(site: Site, jobs: list[CalibrationJob], monkeypatch: pytest.MonkeyPatch) -> None:
@@ -287,7 +287,7 @@ def test_stop_is_answered_at_once(site: Site, jobs: list[CalibrationJob], monkey
 
     monkeypatch.setattr(calibration, "CalibrationOptimizer", Slow)
     site.post(lambda: place.choose(*CALIBRATE))
-    assert ended(site, "Stopped; the calibration from your points is as it was.").calibration is None
+    assert ended(site, "Stopped; the calibration from your points is unchanged.").calibration is None
     (content,) = shown
     assert "Stopping …" in content
 
