@@ -44,12 +44,12 @@ class Compare:
 
 
 def other_pose(compare: Compare, measured: SceneState, before_run: SceneState | None) -> SceneState:
-    """The pose that is compared with; the measured one where there was no run."""
+    """The pose that is compared with; the measured one if there was no run."""
     return before_run if compare.against is Against.BEFORE_RUN and before_run is not None else measured
 
 
 def composed(own: Rgba, other: Rgba, share: float) -> Rgba:
-    """The other overlay up to a share of the width, the own one beyond it, and a line between them."""
+    """The other overlay up to a share of the width, the present one beyond it, and a line between them."""
     column = round(share * own.shape[1])
     both = np.concatenate([other[:, :column], own[:, column:]], axis=1)
     if 0 < column < own.shape[1]:

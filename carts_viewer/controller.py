@@ -169,11 +169,11 @@ class Controller(Handler):
         if self._live.replaces(intent):
             return
         if self._background.takes(intent):
-            self._hand_on(intent)
+            self._forward(intent)
             return
         next((handler for handler in self._handlers if handler.takes(intent)), super()).handle(intent)
 
-    def _hand_on(self, intent: intents.Intent) -> None:
+    def _forward(self, intent: intents.Intent) -> None:
         """Pass an intent to the background, after saving the edits of this tab."""
         if isinstance(intent, _BEGINNING):
             self._optimizing.end("Stopped: a job was started")

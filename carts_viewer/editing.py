@@ -271,7 +271,7 @@ class Editor:
         self.drop()
 
     def apply(self, name: str, edits: Edits, figures: Mapping[int, Figures] | None = None) -> Change | None:
-        """Save edits as one step of undo of this person's, without a draft; errors as `Project.apply`."""
+        """Save edits as one step of undo of this user, without a draft; errors as `Project.apply`."""
         return self.people.apply(self.person, name, edits, figures)
 
     def claim(self) -> None:
@@ -308,7 +308,7 @@ class Editor:
         return self.people.go_to(self.person, min(max(position, 0), len(self.project.state.steps)))
 
     def _dropped(self) -> bool:
-        """Drop a draft that cannot be saved; whether there was one."""
+        """Drop a draft that cannot be saved; returns whether there was one."""
         if self._view is None or self.project.writable:
             return False
         self.drop()

@@ -155,7 +155,7 @@ class EndRequest:
         self._ready = True
 
     def wait(self) -> None:
-        """Until one of the signals comes, or has come since `ready`."""
+        """Wait until one of the signals arrives, or has arrived since `ready`."""
         os.read(self._asked, 1)
 
     def _on_signal(self, number: int, frame: FrameType | None) -> None:

@@ -70,7 +70,7 @@ class Session:
 
     @property
     def sequence(self) -> Sequence:
-        """The recording, its joint positions matched with frames as `time_offset` says.
+        """The recording, with joint positions matched to frames by `time_offset`.
 
         Raises:
             SequenceError: with this offset, a frame has no joint positions.
@@ -79,7 +79,7 @@ class Session:
         return self._sequence
 
     def matched(self, frame: Frame) -> bool:
-        """Whether the frame has the joint positions that it has with the present time offset."""
+        """Whether the frame has the joint positions of the present time offset."""
         measured = self.sequence.measured
         return all(np.array_equal(values, measured[arm][frame.index]) for arm, values in frame.measured.items())
 
@@ -107,7 +107,7 @@ class Session:
         self.editor.save()
 
     def pose(self, frame: Frame, project: ProjectState | None = None) -> Pose:
-        """The frame's pose as a state of the project says, by default the present one with its draft."""
+        """The frame's pose in a state of the project, by default the present one with its draft."""
         project = self.editor.view if project is None else project
         state = corrected_state(self.scene, frame, project)
         return Pose(state, source_of(project, frame.index))
@@ -130,7 +130,7 @@ class Session:
         return Target.of(observed, self.editor.view if project is None else project, self.sequence)
 
     def measured(self, frame: Frame) -> SceneState:
-        """The state that the kinematics table gives, in the project's calibration."""
+        """The state of the kinematics table, with the project's calibration."""
         return calibrated_scene(self.scene, self.editor.view).state(frame.measured, mounts=frame.mounts)
 
     def edits(
@@ -181,7 +181,7 @@ class Session:
         return {**{key: saved.get(key) for key in keys}, Key.verdict(index): saved.verdict(index)}
 
     def copied(self, frame: Frame, source: Frame) -> SceneState:
-        """The frame's measured state, corrected by as much as the source frame is; joint limits hold.
+        """The frame's measured state with the correction of the source frame, clamped to the joint limits.
 
         Raises:
             CartsError: the source frame has no correction.

@@ -195,7 +195,7 @@ class KeypointState:
 
 @dataclass(frozen=True, eq=False)
 class ViewState:
-    """Everything the page shows."""
+    """Complete state of a page."""
 
     index: int
     frame: Frame
@@ -212,7 +212,7 @@ class ViewState:
     unsaved: bool = False
     """Whether the last step of `project` is a gesture that is not saved yet."""
     solver: SolverName = SolverName.SURFACE
-    """The solver that `settings` are of."""
+    """Name of the solver of `settings`."""
     settings_error: str | None = None
     """Why the last change of a setting was not accepted."""
     settings_field: str | None = None

@@ -37,9 +37,9 @@ class Worker:
         self._rest = threading.Condition()
         self._resting = False
         self._worked_at: float | None = 0.0
-        """When something was done last [s, monotonic]; None where its memory is returned."""
+        """Time of the last work [s, monotonic]; None once its memory is returned."""
         self._returned_at = 0.0
-        """When memory was returned last [s, monotonic]."""
+        """Time of the last return of memory [s, monotonic]."""
         self._thread = threading.Thread(target=self._work, name="carts-worker", daemon=True)
 
     def start(self, startup: Callable[[], None] | None = None) -> None:

@@ -190,7 +190,7 @@ class Context:
 
 
 def finite(value: float) -> float:
-    """The number.
+    """The number, if it is finite.
 
     Raises:
         CartsError: it is not finite.

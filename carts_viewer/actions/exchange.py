@@ -44,8 +44,8 @@ _STEMS = {
     "dvrk-suj": "suj",
 }
 """File names of formats whose own name is not descriptive."""
-_BIT = 0.05
-"""Time slice of an export [s]; a longer step is finished."""
+_TIME_SLICE = 0.05
+"""Time slice of an export [s]; longer steps are completed."""
 
 
 Deliver = Callable[[int, str, bytes], None]
@@ -66,7 +66,7 @@ class ExportingHandler(Handler):
         return None if self._job is None else 0.0
 
     def advance(self) -> None:
-        """Continue the export for `_BIT` seconds.
+        """Continue the export for `_TIME_SLICE` seconds.
 
         Raises:
             CartsError: it cannot be written; its files are removed.
@@ -75,7 +75,7 @@ class ExportingHandler(Handler):
             return
         job, intent = self._job, self._intent
         try:
-            path = job.advance(_BIT)
+            path = job.advance(_TIME_SLICE)
         except Exception as error:
             self.cancel()
             if not isinstance(error, ImportError):
@@ -159,7 +159,7 @@ class ExportingHandler(Handler):
 
 
 def frames_within(project: ProjectState, frames: str, part: tuple[int, int] | None) -> list[int]:
-    """Indices of the frames of one of `FRAME_CHOICES`, of a range with both its ends or of the whole sequence."""
+    """Indices of the frames of one of `FRAME_CHOICES`, of an inclusive range or of the whole sequence."""
     first, last = part or (0, len(project.identity.frame_ids) - 1)
     return [index for index in frames_in(project, FRAME_CHOICES[frames]) if first <= index <= last]
 

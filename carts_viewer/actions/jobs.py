@@ -79,7 +79,7 @@ class JobsHandler(Handler):
         self._requester: JobRequester | None = None
         """The user of the request that is carried out."""
         self._asked: dict[int, JobRequester] = {}
-        """By number of job; a job of an earlier viewer has none."""
+        """Requesters by job number; jobs of an earlier viewer have none."""
         self._work: Generator[Progress] | None = None
         self._wait = 0.0
         self._saved_at = 0.0

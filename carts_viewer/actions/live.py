@@ -131,7 +131,7 @@ class LiveHandler(Handler):
         self.stop("Stopped.")
 
     def replaces(self, intent: intents.Intent) -> bool:
-        """Whether an intent is dealt with here because a stream is shown.
+        """Whether an intent is handled here because a stream is shown.
 
         Raises:
             CartsError: the intent is not allowed during a stream.

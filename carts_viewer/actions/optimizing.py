@@ -196,9 +196,9 @@ class OptimizingHandler(Handler):
         self._context.save()
         self._before = self._session.saved(self._context.state.index)
         run = RunState(Phase.RUNNING, start=self._context.state.pose.scene)
-        self._context.change(run=run, playing=False, error=None, busy=None, unfamiliar=self._doubts())
+        self._context.change(run=run, playing=False, error=None, busy=None, unfamiliar=self._network_warnings())
 
-    def _doubts(self) -> tuple[str, ...]:
+    def _network_warnings(self) -> tuple[str, ...]:
         """Warnings about the network that the run relies on."""
         state = self._context.state
         if self._target.observed.what != "network" or not isinstance(state.settings, SurfaceSolver):
@@ -237,7 +237,7 @@ class OptimizingHandler(Handler):
         )
 
     def _verdict(self, run: ActiveRun, end: Iterate) -> FitVerdict | None:
-        """Verdict on the end of a run; of a scene with several cameras, from each of them alone."""
+        """Verdict at the end of a run; with several cameras, from each camera alone."""
         own = run.verdict()
         if own is not None and (len(self._session.scene.cameras) == 1 or own.verdict == "failed"):
             return own

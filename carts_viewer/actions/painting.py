@@ -144,7 +144,7 @@ Layers = Mapping[Key[Any], Any]
 
 
 @dataclass(frozen=True)
-class _Begun:
+class _PromptedObject:
     """A segmented object that further clicks refine."""
 
     place: tuple[int, str, Target, int]
@@ -166,7 +166,7 @@ class Prompting:
 
     def __init__(self, segmenter: Callable[[], Segmenter]) -> None:
         self._segmenter = segmenter
-        self._begun: _Begun | None = None
+        self._begun: _PromptedObject | None = None
 
     def finish(self) -> None:
         """Begin a new object with the next click."""
@@ -209,7 +209,7 @@ class Prompting:
         cleared = before if prompt.box is None or erase else changed(before, _boxed(prompt.box, found), True)
         edits = changed(cleared, found, erase)
         if not erase:
-            self._begun = _Begun(place, prompt, before, dict(edits))
+            self._begun = _PromptedObject(place, prompt, before, dict(edits))
         return edits
 
 

@@ -11,7 +11,7 @@ from carts_viewer.actions import intents
 from carts_viewer.actions.context import Context, Handler, clamped, finite
 
 LARGEST_PERTURBATION = 30.0
-"""[deg and mm]."""
+"""Largest perturbation [deg and mm]."""
 
 
 class PosingHandler(Handler):

@@ -29,7 +29,7 @@ class Fit:
 
     verdict: FitVerdict
     loss: float
-    """Mean of the cameras with an arm in view [1]."""
+    """Mean loss of the cameras with an arm in view [1]."""
     dice: float | None = None
     """Overlap with the true mask; None where there is none."""
 
@@ -160,7 +160,7 @@ class Comparison:
     def _alone(
         self, frame: Frame, start: Pose, state: ViewState, target: Target, of_many: Provenance
     ) -> tuple[Fit, Edits]:
-        """The fit of a run on this frame alone, and the edits that take it."""
+        """The fit of a run on this frame alone, and the edits that apply it."""
         settings = json.dumps({**json.loads(of_many.settings or "{}"), "alone": True})
         steps = self._steps(frame, start, state, target, replace(of_many, settings=settings))
         return next(outcome for outcome in steps if outcome is not None)

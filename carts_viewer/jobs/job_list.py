@@ -43,7 +43,7 @@ class SolveOptions:
 
     whole: bool = False
     at: int = 0
-    """Index of the frame between whose keyframes is solved."""
+    """Index of a frame; the frames between the keyframes around it are solved."""
     range: tuple[int, int] | None = None
     """First and last frame; None for the whole sequence."""
 
@@ -53,7 +53,7 @@ class OptimizeOptions:
     """Options of optimizing frames, each alone."""
 
     frames: tuple[int, ...]
-    """Indices."""
+    """Frame indices."""
     first: int = 0
     """Position in `frames` to begin at."""
 
@@ -99,7 +99,7 @@ _KINDS: dict[str, type[Options]] = {
 
 
 def read_options(kind: str, values: Mapping[str, Any], frames: int) -> Options:
-    """Options of a job with checked types, clamped to the ranges of the page, wherever they come from.
+    """Options of a job with checked types, clamped to the ranges of the page.
 
     Raises:
         ValueError: there is no such kind of job, or a value is missing or of another type.
@@ -175,21 +175,21 @@ class Job:
     number: Annotated[int, msgspec.Meta(ge=1)]
     kind: str
     title: str
-    """Text for the user."""
+    """Title, as text for the user."""
     options: Options
     """With the kind, all data to repeat the job."""
     state: JobState = JobState.WAITING
     done: Annotated[int, msgspec.Meta(ge=0)] = 0
     total: Annotated[int, msgspec.Meta(ge=0)] = 0
-    """Steps; 0 until it is known."""
+    """Number of steps; 0 while unknown."""
     began: float = 0.0
-    """[s since 1970]; 0 before."""
+    """Time of the start [s since 1970]; 0 before."""
     ended: float = 0.0
     text: str = ""
     """Progress or result, as text for the user."""
     log: tuple[str, ...] = ()
     token: str = ""
-    """Random; with kind, options and recording it tells this user's jobs from those that another user has queued."""
+    """Random token; with kind, options and recording it identifies the jobs that this user has queued."""
 
     @property
     def over(self) -> bool:
@@ -211,13 +211,13 @@ class Job:
 
 @dataclass(frozen=True)
 class _Row(Job):
-    """A job as the file has it."""
+    """A job in the format of the file."""
 
     options: dict[str, Any] = field(default_factory=dict)  # pyright: ignore[reportIncompatibleVariableOverride]
 
 
 class JobList:
-    """All jobs, oldest first; every change of a state is on disk before the next thing is done.
+    """All jobs, oldest first; every change of a state is saved before work continues.
 
     Attributes:
         jobs: the list.
@@ -227,7 +227,7 @@ class JobList:
     def __init__(
         self, project: Path, *, kept: bool, frame_ids: Sequence[str], recording: str = "", decisions: Decisions
     ) -> None:
-        """`recording` is its digest: jobs of this user in the list of another recording are not theirs."""
+        """`recording` is a digest; jobs in the list of another recording do not count as this user's."""
         self._path = output_path(project.parent, f"{project.stem}_jobs.json") if kept else None
         self._frame_ids, self._recording, self._decisions = frame_ids, recording, decisions
         self.problem = ""
@@ -290,7 +290,7 @@ class JobList:
         return job
 
     def _own(self, job: Job) -> Job:
-        """A job with a new token, which this user's decisions know."""
+        """A job with a new token, which is stored in this user's decisions."""
         job = replace(job, token=secrets.token_hex(16))
         self._decisions.make(self._identity(job), True)
         return job

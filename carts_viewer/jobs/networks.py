@@ -41,7 +41,7 @@ class Networks:
     """
 
     def __init__(self, project: Path, *, kept: bool, optimizers: OptimizerFactory, decisions: Decisions) -> None:
-        """`kept` says whether anything may be written beside the project."""
+        """`kept`: whether files may be written beside the project."""
         self._project, self._kept, self._optimizers, self._decisions = project, kept, optimizers, decisions
         self._file = output_path(project.parent, f"{project.stem}_network.json")
         self.names: tuple[str, ...] = ()

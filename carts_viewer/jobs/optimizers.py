@@ -108,7 +108,7 @@ class ActiveRun:
         return FitVerdict(found.verdict.value, f"{found.reason}{kept}", found.remedy, found.probability)
 
     def pose(self, iterate: Iterate) -> Pose:
-        """An iterate's state, which knows the run's cameras only, as a pose of the whole scene.
+        """Convert an iterate's state, which has the run's cameras only, to a pose of the whole scene.
 
         Parameters that were not free are copied exactly: rounding must not count as a new calibration of all frames.
         """
@@ -263,7 +263,7 @@ class OptimizerFactory:
         source: Source = Source.OPTIMIZER,
         **more: Any,
     ) -> Provenance:
-        """Provenance of a run with these settings, and `more` of them.
+        """Provenance of a run with these settings, and further ones in `more`.
 
         Raises:
             WeightsError: the networks cannot be loaded.

@@ -116,7 +116,7 @@ class BrowsePanel:
 
 
 _CALENDAR = 1e8
-"""Times from here on are counted from 1970, as ROS does, and read as dates [s]."""
+"""Times from this value on count from 1970, as in ROS, and are shown as dates [s]."""
 
 
 def _time(stamp: float, began: float) -> str:

@@ -73,7 +73,7 @@ def live_text(live: LiveState) -> str:
     if live.busy:
         return f'<div class="carts-verdict unknown" role="status"><b>Live</b> {escaped(live.text)}</div>'
     reason = {
-        "good": "The arms are followed.",
+        "good": "The arms are tracked.",
         "doubtful": "The image does not support the fit; the prediction from earlier frames is shown.",
         "lost": "The arms are not found; the measured joints with the last known correction are shown.",
     }[live.verdict]
@@ -104,7 +104,7 @@ class FitPanel:
         )
 
     def show(self, state: ViewState) -> None:
-        """Bring the verdict up to date."""
+        """Update the verdict."""
         if state.live is not None and state.live.on:
             self._check.visible = False
             self._text.content = live_text(state.live)

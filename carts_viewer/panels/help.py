@@ -48,7 +48,7 @@ class Shortcut:
 
 
 def shortcuts() -> list[Shortcut]:
-    """All of them, the same in every recording.
+    """All shortcuts; they are the same in every recording.
 
     Letters that viser uses to fly the camera (W A S D Q E) are left alone, and so are the arrow keys, which move a
     slider that has the focus.
@@ -145,7 +145,7 @@ def key_table() -> str:
 
 
 def with_keys(text: str) -> str:
-    """A text with the table of keys between its two marks.
+    """Insert the table of keys between the two marks of a text.
 
     Raises:
         ValueError: the text has no such marks.

@@ -107,7 +107,7 @@ class JobsPanel:
         page.on_input(self._chosen, lambda _: intents.Refresh())
 
     def show(self, state: ViewState) -> None:
-        """Bring the list up to date; the newest job is chosen when it comes."""
+        """Bring the list up to date; a new job is selected."""
         self._show_networks(state)
         self._show_question(self._asked, jobs_question(state), self._run, self._discard)
         self._show_question(self._asked_network, network_question(state), self._accept, self._refuse)
@@ -183,7 +183,7 @@ def network_question(state: ViewState) -> str:
 
 
 def job_line(job: Job, now: float) -> str:
-    """One job with its progress and the time that is left, as HTML."""
+    """One job with its progress and remaining time, as HTML."""
     left = job.seconds_left(now)
     about = "at most" if job.kind == "calibrate" else "about"  # Training stops early without further gain.
     eta = "" if left is None else f", {about} {spoken_time(left)} left"

@@ -24,7 +24,7 @@ _WIDTH = 312.0
 
 
 def choose_theme(gui: viser.GuiApi, *, light: bool) -> None:
-    """The colours of all tabs, or of the one that this is the interface of."""
+    """Set the theme of all tabs, or of the tab of this interface."""
     gui.configure_theme(dark_mode=not light, show_share_button=False, show_logo=False)
 
 

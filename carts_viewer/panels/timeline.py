@@ -79,7 +79,7 @@ class Traces:
                 rows[frame] = np.nan if known is None else known.joint_positions
 
     def between(self, name: str, first: int, last: int, columns: int) -> dict[str, Any] | None:
-        """A curve from frame `first` up to, and without, frame `last`; None where there is none.
+        """A curve from frame `first` up to but excluding `last`; None without values.
 
         Returns:
             `edges`: first frame of each column, and the end of the last one; `curves`: for measured (or estimated)
@@ -110,7 +110,7 @@ def _extremes(values: np.ndarray, edges: np.ndarray) -> list[list[float | None]]
 
 
 HEIGHT = 64
-"""[px]; shown smaller, for screens with more than one pixel per CSS pixel."""
+"""Height of thumbnails [px]; displayed smaller, for screens with several pixels per CSS pixel."""
 _MOST = 4000
 """Number of cached thumbnails of some 3 kB; the least recently used go first."""
 _QUALITY = 70
@@ -142,7 +142,7 @@ class Thumbnails:
         return response(http.HTTPStatus.OK, "image/jpeg", content)
 
     def close(self) -> None:
-        """Make no more pictures."""
+        """Stop making thumbnails."""
         self._thread.shutdown(wait=True, cancel_futures=True)
 
     def _source(self, camera: int, domain: int) -> ImageSource:

@@ -45,7 +45,7 @@ class PageDisplay:
         self._rate_limit.drawn()
 
     def ready_in(self) -> float:
-        """How long until the page can take another picture [s]; 0 when it can now."""
+        """Time until the page can take another picture [s]."""
         return self._rate_limit.ready_in()
 
     def show_picture(self, state: ViewState) -> None:
@@ -82,7 +82,7 @@ class PageDisplay:
         return [state.camera, *(name for name in others if state.beside and name in state.frame.images)]
 
     def _overlays(self, state: ViewState, cameras: list[str]) -> dict[str, Rgba]:
-        """By camera; those of several are rendered at the same time."""
+        """Overlays by camera; several are rendered in parallel."""
         if len(cameras) == 1:
             return {cameras[0]: self._overlay(state, cameras[0])}
         return dict(zip(cameras, _threads().map(lambda camera: self._overlay(state, camera), cameras), strict=True))
@@ -127,7 +127,7 @@ class PageDisplay:
                 self._scene_view.hide_beside(camera)
 
     def _acknowledge(self, old: Mapping[int, int], new: Mapping[int, int]) -> None:
-        """Acknowledge strokes that are in the overlay that was just sent: the tab need not draw them any more."""
+        """Acknowledge strokes that are in the sent overlay, so that the tab no longer draws them."""
         own = self._page.client.client_id
         if own in new and old.get(own) != new[own]:
             self._page.call("painted", new[own])
@@ -179,5 +179,5 @@ class RateLimit:
         self._drawn_at = self._clock()
 
     def ready_in(self) -> float:
-        """How long until the next picture may be sent [s], 0 when it may now."""
+        """Time until the next picture may be sent [s]."""
         return max(0.0, self._sent_at + LONGEST_WAIT - self._clock()) if self._drawn_at < self._sent_at else 0.0

@@ -27,7 +27,7 @@ class Layer(StrEnum):
 
 
 ARM_COLORS = ((45, 212, 167), (96, 165, 250), (250, 204, 21), (232, 121, 249))
-"""Colours of the arms in mask and contour, in the scene's order and then again from the start."""
+"""Colours of the arms in mask and contour, in the scene's order, repeated cyclically."""
 
 TRUTH_COLORS = {
     "true positive": (255, 255, 255),
@@ -134,7 +134,7 @@ def imported(
 
 
 def label_color(number: int) -> tuple[int, int, int]:
-    """Of label 1 and so on; after the arms' colours, others spread over the hues."""
+    """Colour of a label, from 1; after the arms' colours, others spread over the hues."""
     if number <= len(ARM_COLORS):
         return ARM_COLORS[number - 1]
     red, green, blue = colorsys.hsv_to_rgb(0.618 * number % 1.0, 0.65, 0.95)
@@ -180,7 +180,7 @@ def _hatch(height: int, width: int) -> Bool[np.ndarray, "height width"]:
 
 
 def _palette(arm_ids: ArmIds) -> tuple[UInt8[np.ndarray, "arms_and_1 4"], int]:
-    """RGBA of background (index 0) and of each arm (its index + 1), and the number of arms seen."""
+    """RGBA of background (index 0) and of each arm (its index + 1), and the number of visible arms."""
     count = int(arm_ids.max(initial=-1)) + 1
     # The browser interpolates colour and opacity separately, so a black background would leave a dark seam.
     rows = [(*ARM_COLORS[0], 0), *((*ARM_COLORS[arm % len(ARM_COLORS)], 255) for arm in range(count))]

@@ -59,7 +59,7 @@ class OverlayRenderer:
     def mask(
         self, state: SceneState, camera: str, correction: MaskCorrection | None = None
     ) -> Bool[np.ndarray, "height width"]:
-        """Where arms are visible in the camera's own image, as rendered and then as corrected."""
+        """Mask of the visible arms in the camera's own image, as rendered and then corrected."""
         rendered = self.arm_ids(state, camera) >= 0
         return rendered if correction is None else correction.applied_to(rendered)
 

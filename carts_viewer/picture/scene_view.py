@@ -108,7 +108,7 @@ class SceneView:
         return position, scale * camera.width, scale * camera.height
 
     def sent(self, name: str) -> bytes:
-        """The image file that `FRAME` or `OVERLAY` was last sent as."""
+        """The last sent image file of `FRAME` or `OVERLAY`."""
         return image_file(self._planes[name][1])
 
     def show_pose(self, state: SceneState, camera: str) -> None:
@@ -116,7 +116,7 @@ class SceneView:
         extrinsics = {
             own.name: T.numpy().astype(float) for own, T in zip(self._scene.cameras, state.T_view_world, strict=True)
         }
-        if not self._stays(WORLD, camera.encode() + b"".join(T.tobytes() for T in extrinsics.values())):
+        if not self._unmoved(WORLD, camera.encode() + b"".join(T.tobytes() for T in extrinsics.values())):
             _place(self._world, extrinsics[camera])
             for name, outline in self._outlines.items():
                 _place(outline, np.linalg.inv(extrinsics[name]))
@@ -130,13 +130,13 @@ class SceneView:
     def _place_arms(self, arms: list[list[viser.FrameHandle]], state: SceneState) -> None:
         bases = state.T_world_base.numpy().astype(float)
         for arm, nodes, T_world_base, joints in zip(self._scene.arms, arms, bases, state.joint_positions, strict=True):
-            if self._stays(nodes[0].name, T_world_base.tobytes() + joints.detach().numpy().tobytes()):
+            if self._unmoved(nodes[0].name, T_world_base.tobytes() + joints.detach().numpy().tobytes()):
                 continue
             Ts_base_link = arm.robot.forward_kinematics(joints).detach().numpy().astype(float)
             for node, T_base_link in zip(nodes, Ts_base_link, strict=True):
                 _place(node, T_world_base @ T_base_link)
 
-    def _stays(self, name: str, place: bytes) -> bool:
+    def _unmoved(self, name: str, place: bytes) -> bool:
         """Whether the node of this name has not moved since the last call."""
         before, self._places[name] = self._places.get(name), place
         return before == place
@@ -252,6 +252,6 @@ def _distance_of_arms(scene: Scene, state: SceneState, camera: str) -> float:
 
 
 def _mixed(color, accent: tuple[int, int, int]) -> tuple[int, int, int]:
-    """A link's own colour with a touch of the arm's, so that arms can be distinguished."""
+    """A link's own colour mixed with the arm's, so that arms can be distinguished."""
     own = np.asarray(color, float)[:3] * 255
     return tuple(int(value) for value in np.clip(0.75 * own + 0.25 * np.array(accent), 0, 255))  # type: ignore[return-value]

@@ -138,7 +138,7 @@ def read_stroke(painted: Painted, frames: int, cameras: Mapping[str, Camera], cl
 
 
 def corrected(old: MaskCorrection | None, stroke: Mask, rendered: Mask, *, erase: bool) -> MaskCorrection | None:
-    """The correction after a stroke that adds pixels to the mask or takes them out; None if none is left.
+    """The correction after a stroke that adds pixels to the mask or removes them; None if none is left.
 
     Only pixels that are not rendered are added, and only rendered ones are removed.
     """

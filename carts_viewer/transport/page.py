@@ -156,7 +156,7 @@ class Page:
             callback(client.client_id)
 
     def _add_channel(self) -> None:
-        """Invisible field whose value is the newest event of a tab, with the tab's own name and count of its events."""
+        """Invisible field whose value is the newest event of a tab, with the tab's key and its count of events."""
         self._channel = self.server.gui.add_text("channel", "", visible=False)
 
     def clear(self, title: str) -> None:

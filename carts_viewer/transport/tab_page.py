@@ -77,7 +77,7 @@ class TabPage:
                 self.gui.add_html(f"<style>{labels} {{ width: auto !important; white-space: nowrap }}</style>")
 
     def _side_by_side(self, ids: Sequence[str], shares: Sequence[float], box: str, total: float | None = None) -> None:
-        """Turn the boxes around these elements into parts of a line, by a style sheet that names their ids."""
+        """Lay out the boxes of these elements in a line, by a style sheet for their ids."""
         total = sum(shares) if total is None else total
         boxes = [box.format(name) for name in ids]
         rules = [

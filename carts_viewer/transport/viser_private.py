@@ -56,7 +56,7 @@ def value_of(server: viser.ViserServer, element: str) -> Any:
 
 
 def image_file(handle: viser.ImageHandle) -> bytes:
-    """The PNG or JPEG file that an image was last sent as."""
+    """The last sent PNG or JPEG file of an image."""
     return handle._data
 
 
@@ -85,7 +85,7 @@ def on_sent(handle: Any, callback: Callable[[Any], None]) -> None:
 
 
 class LoopEvent(asyncio.Event):
-    """An event of one event loop; calls from elsewhere are left to the one that follows on the loop."""
+    """An event that is set on its event loop only; calls from other threads are left to the next one on the loop."""
 
     def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
         super().__init__()

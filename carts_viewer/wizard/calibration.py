@@ -293,7 +293,7 @@ def calibrated_recording(
 
 
 def target_folder(roots: Roots, source: Path, name: str) -> Path:
-    """Folder for the sequence of a recording: beside it, or in it where it is an allowed folder itself.
+    """Folder for the sequence of a recording: beside it, or in it if it is an allowed folder itself.
 
     Raises:
         SettingsError: the name cannot be part of a path.

@@ -124,7 +124,7 @@ class Guess:
     def notes(
         self, *, about: str | None = None, kinds: tuple[str, ...] = ("warning", "missing", "guessed")
     ) -> list[Note]:
-        """Remarks about a camera or arm, or for None about none of them."""
+        """Remarks about a camera or arm, or for None those about neither."""
         if self.recording is None:
             return []
         names = [each.name for each in (*self.recording.cameras, *self.recording.arms)]

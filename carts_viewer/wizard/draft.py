@@ -82,7 +82,7 @@ class Draft:
             raise SettingsError(f"this import cannot be continued ({error}). Delete it and begin anew.") from error
 
     def uncalibrated(self, **changes: Any) -> "Draft":
-        """The draft with other fields, and without the calibration that does not hold for these."""
+        """The draft with other fields, and without the calibration, which is invalid for these."""
         return replace(self, **{"calibration": None, "offered": None, "report": None, **changes})
 
     def with_options(self, **changes: Any) -> "Draft":
@@ -116,7 +116,7 @@ class DraftFile:
         self.key = key or secrets.token_hex(8)
 
     def read(self) -> Draft:
-        """The draft; an empty one before anything was written.
+        """The draft; an empty one if none was saved.
 
         Raises:
             SettingsError: it is damaged.
@@ -191,7 +191,7 @@ _MEANINGS = (*JOINT_NAMES, "jaw", "time", "frame")
 
 
 def changed(draft: Draft, name: str, value: str, guessed: Mapping[str, str]) -> Draft | None:
-    """The draft after a choice; None if the choice is none of the form's.
+    """The draft after a choice; None if the form has no such choice.
 
     Args:
         draft: before.
@@ -280,7 +280,7 @@ def _number(value: str) -> float | None:
 
 
 def _new_name(images: Mapping[str, Any], path: Path) -> str:
-    """A name for one more camera: that of its folder, or with a number."""
+    """Name of a new camera: that of its folder, with a number if needed."""
     name, number = path.stem, 2
     while name in images:
         name, number = f"{path.stem} {number}", number + 1

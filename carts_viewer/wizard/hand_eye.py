@@ -106,7 +106,7 @@ def hand_eye_panel(
     folder: str,
     undoable: bool,
 ) -> str:
-    """HTML of the panel; `progress` is of a calibration that runs or has ended, `folder` where it would be saved."""
+    """HTML of the panel; `progress` of a running or ended calibration, `folder` of the saved sequence."""
     report, result = draft.report, clicking.result
     deviations = {} if result is None else result.deviations
     if report is not None:
@@ -198,7 +198,7 @@ class HandEyeStep:
         self._host.document.show(content, "side")
 
     def clicked(self, draft: Draft, u: float, v: float) -> Draft:
-        """The draft with the prompted point at this place; unchanged without a prompt."""
+        """The draft with the prompted point at this position; unchanged without a prompt."""
         prompt, self.problem = self.prompt(draft), ""
         if prompt is None or self._running() or not (0.0 <= u <= 1.0 and 0.0 <= v <= 1.0):
             return draft

@@ -83,7 +83,7 @@ class Clicking:
 
 
 def unknown_cameras(scene: Scene) -> tuple[str, ...]:
-    """Cameras with unknown pose: the same as that of the first camera."""
+    """Cameras with unknown pose, which is that of the first camera in the recording."""
     first = scene.cameras[0]
     return tuple(
         camera.name for camera in scene.cameras[1:] if np.array_equal(camera.T_camera_world, first.T_camera_world)

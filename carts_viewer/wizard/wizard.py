@@ -98,7 +98,7 @@ class RecordingWizard:
         self.show()
 
     def _browsed(self, name: str, value: str) -> bool:
-        """Carry out a choice about the file browser; whether it was one."""
+        """Carry out a choice in the file browser; returns whether it was one."""
         browser = self._browser
         match name:
             case "change":

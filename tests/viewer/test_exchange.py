@@ -161,7 +161,7 @@ def test_an_export_is_of_the_project_as_it_was_when_it_began(desk: Desk) -> None
 
 @pytest.mark.parametrize("written", [0, 1])
 def test_cancelling_leaves_nothing(desk: Desk, monkeypatch: pytest.MonkeyPatch, written: int) -> None:
-    monkeypatch.setattr(exporting, "_BIT", 0.0)  # So that it cannot be done already.
+    monkeypatch.setattr(exporting, "_TIME_SLICE", 0.0)  # So that it cannot be done already.
     desk.do(intents.Export("coco", "All"))
     desk.advance()
     while desk.state.export is not None and desk.state.export.done < written:
