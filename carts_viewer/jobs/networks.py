@@ -91,7 +91,7 @@ class Networks:
         """
         name, self.asked = self.asked, ""
         if not name:
-            raise CartsError("No network waits to be accepted any more.")
+            raise CartsError("No network needs to be accepted.")
         self._decisions.make(self._weights(name), accepted)
         if accepted:
             self.use(name)
