@@ -232,7 +232,7 @@ HINTS = {
     # Find
     "Review": "Frames in this review state",
     "Corrected": "Frames in which this arm's joints were corrected",
-    "Note contains": "Frames whose note contains this text",
+    "Note text": "Frames whose note contains this text",
     "Previous": "Previous frame found",
     "Next": "Next frame found",
     "Accept all": "Accept all frames found, as one step of undo",

@@ -123,7 +123,7 @@ class FindPanel:
                     step=0.01,
                     hint="Frames that overlap the true mask by less, 0 to 1; 1 shows all frames",
                 ),
-                "note": gui.add_text("Note contains", ""),
+                "note": gui.add_text("Note text", ""),
             }
             self._list = gui.add_html("")
             before = page.button("Previous", intents.ShowFound(-1), icon=viser.Icon.CHEVRON_LEFT)
