@@ -14,6 +14,7 @@ import torch
 from tiny import TinyScene, tiny_scene
 
 from carts_core.model.robot import Robot
+from carts_core.networks import FeatureExtractor
 from carts_core.process import tune_process
 from carts_core.rendering import Renderer
 from carts_core.resources import sample_sequence, shipped_robot
@@ -55,6 +56,31 @@ def _threads_as_before() -> Iterator[None]:
     threads = torch.get_num_threads()
     yield
     torch.set_num_threads(threads)
+
+
+_LOADED: dict[tuple[object, ...], FeatureExtractor] = {}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _networks_loaded_once(request: pytest.FixtureRequest) -> Iterator[None]:
+    """Networks from the same files are loaded once, but for tests of the networks themselves."""
+    if request.path.parent.name == "networks":
+        yield
+        return
+    load = FeatureExtractor.load
+
+    def load_once(*weights: Path | str, **options) -> FeatureExtractor:
+        files = [Path(path) for path in weights]
+        if not all(path.is_file() for path in files):
+            return load(*weights, **options)
+        key = (*((path, path.stat().st_mtime_ns) for path in files), *sorted(options.items()))
+        if key not in _LOADED:
+            _LOADED[key] = load(*weights, **options)
+        return _LOADED[key]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(FeatureExtractor, "load", load_once)
+        yield
 
 
 @pytest.fixture(scope="session")

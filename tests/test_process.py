@@ -7,49 +7,26 @@ import sys
 from pathlib import Path
 
 import pytest
+import torch
 
 from carts_core.model.mesh_cache import cache_dir, read
+from carts_core.process import tune_process
 from carts_core.project.identity import data_dir
 
-TUNED = "from carts_core.process import tune_process; tune_process()"
-
-FAULTS = """
-import resource
-import torch
-{tune}
-def images():
-    return [torch.zeros(4, 640, 480) + index for index in range(8)]
-for _ in range(10):
-    images()
-before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
-for _ in range(100):
-    images()
-print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
-"""
-
-
-def page_faults(tune: str, **malloc: str) -> int:
-    """How often the system had to hand out memory while images were made and dropped in a process of its own."""
-    environment = {name: value for name, value in os.environ.items() if not name.startswith("MALLOC_")} | malloc
-    ran = subprocess.run(
-        [sys.executable, "-c", FAULTS.format(tune=tune)], capture_output=True, text=True, check=True, env=environment
-    )
-    return int(ran.stdout)
-
-
-@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="only glibc's allocator can be told to keep memory")
-def test_memory_of_images_is_kept_and_not_asked_for_anew() -> None:
-    # Untuned, glibc asks for anything from none to all of it anew, as the heap happens to end; this has it ask for all.
-    anew = page_faults("", MALLOC_MMAP_THRESHOLD_="131072")
-    assert anew > 500_000
-    assert page_faults(TUNED) < 0.01 * anew
-
-
-KEPT = """
-import os, threading
+PAGE_FAULTS = """
+import os, resource, threading
 import numpy as np
-from carts_core.process import return_memory, tune_process
-tune_process()
+{tune}
+def faults(repetitions):
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+    for _ in range(repetitions):
+        [np.zeros((4, 640, 480), np.float32) + index for index in range(8)]
+    return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
+faults(10)
+print(faults(10))
+"""
+RETURNED = """
+from carts_core.process import return_memory
 def resident():
     return int(open("/proc/self/statm").read().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
 def work(done, end):
@@ -57,6 +34,7 @@ def work(done, end):
     del images
     done.release()
     end.wait()
+return_memory()
 start, done, end = resident(), threading.Semaphore(0), threading.Event()
 threads = [threading.Thread(target=work, args=(done, end)) for _ in range(8)]
 for thread in threads:
@@ -70,36 +48,53 @@ end.set()
 """
 
 
-@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="other allocators have no such heaps")
-def test_threads_share_heaps_and_freed_memory_is_returned_on_request() -> None:
-    environment = {name: value for name, value in os.environ.items() if not name.startswith("MALLOC_")}
-    ran = subprocess.run([sys.executable, "-c", KEPT], capture_output=True, text=True, check=True, env=environment)
-    kept, returned = map(float, ran.stdout.split())
-    # Each of the eight has used 40 MB, one after the other.
+def printed(code: str, **environment: str) -> list[float]:
+    """Numbers that a process prints whose environment tunes nothing else."""
+    kept = {name: value for name, value in os.environ.items() if not name.startswith(("MALLOC_", "OMP_"))}
+    ran = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, env=kept | environment
+    )
+    return [float(word) for word in ran.stdout.split()]
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="only glibc's allocator can be told to keep memory")
+def test_memory_of_images_is_kept_shared_by_threads_and_returned_on_request() -> None:
+    # Untuned, glibc asks for anything from none to all of it anew, as the heap happens to end; this has it ask for all.
+    (anew,) = printed(PAGE_FAULTS.format(tune=""), MALLOC_MMAP_THRESHOLD_="131072")
+    assert anew > 50_000
+    tune = "from carts_core.process import tune_process\ntune_process()"
+    again, kept, returned = printed(PAGE_FAULTS.format(tune=tune) + RETURNED, OMP_NUM_THREADS="1")
+    assert again < 0.02 * anew
+    # Each of the eight threads has used 40 MB, one after the other.
     assert kept < 160 and returned < 20
 
 
-@pytest.mark.parametrize(("given", "expected"), [({"OMP_NUM_THREADS": "2"}, 2), ({}, None)])
+@pytest.mark.parametrize(("given", "expected"), [("2", 2), (None, max(1, min((os.cpu_count() or 2) - 1, 4)))])
 def test_a_core_is_left_to_others_unless_the_environment_says_how_many(
-    given: dict[str, str], expected: int | None
+    given: str | None, expected: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    code = f"import torch; {TUNED}; print(torch.get_num_threads())"
-    environment = {name: value for name, value in os.environ.items() if not name.endswith("_NUM_THREADS")} | given
-    ran = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=environment)
-    assert int(ran.stdout) == (expected or max(1, min((os.cpu_count() or 2) - 1, 4)))
+    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
+    if given:
+        monkeypatch.setenv("OMP_NUM_THREADS", given)
+    torch.set_num_threads(2)
+    tune_process()
+    assert torch.get_num_threads() == expected
 
 
 UNWRITABLE = """
 import numba.core.caching as caching
 caching.CacheImpl._locator_classes = []  # As where neither the installation nor the home folder can be written to.
-import carts_core.rendering, carts_core.optimization.factors.edges
 from carts_core.compiled import compiled
 
 @compiled
 def twice(value):
     return 2 * value
 
-print(twice(21))
+@compiled
+def four_times(value):
+    return twice(twice(value))
+
+print(four_times(10) + 2)
 """
 
 

@@ -10,8 +10,6 @@ from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 
-import pytest
-
 import carts_core
 import carts_viewer
 from carts_core.resources import static_dir
@@ -116,7 +114,7 @@ def test_importing_the_whole_core_loads_no_web_toolkit() -> None:
     imports = "; ".join(f"import {_module(path)}" for path in CORE_SOURCES if path.name != "__main__.py")
     check = "import sys; loaded = {'viser', 'carts_viewer'} & set(sys.modules); assert not loaded, loaded"
     finished = subprocess.run(
-        [sys.executable, "-c", f"{imports}; {check}"], capture_output=True, text=True, check=False, timeout=240
+        [sys.executable, "-c", f"{imports}; {check}"], capture_output=True, text=True, check=False
     )
     assert finished.returncode == 0, finished.stderr
 
@@ -143,22 +141,6 @@ def test_no_file_runs_code_from_data_or_listens_on_every_interface() -> None:
     assert [f"{_named(path)}:{line} {what}" for path in SOURCES for line, what in _hazards(_tree(path))] == []
 
 
-@pytest.mark.parametrize(
-    "line",
-    [
-        "import pickle",
-        "from pickle import loads",
-        "torch.load(path)",
-        "eval(text)",
-        "np.load(path, allow_pickle=True)",
-        "subprocess.run(text, shell=True)",
-        "serve(host='0.0.0.0')",
-    ],
-)
-def test_the_safety_check_notices_what_it_is_there_for(line: str) -> None:
-    assert list(_hazards(ast.parse(line)))
-
-
 _MARKUP = re.compile(
     r"(?P<sink>\.(?:innerHTML|outerHTML|srcdoc)\s*\+?=(?!=)|insertAdjacentHTML|createContextualFragment|document\.write|"
     r"\beval\(|\bnew Function|[sS]etAttribute\(\s*[\"'`]on)\s*(?P<constant>(?:`[^`$]*`|\"[^\"]*\"|'[^']*');)?"
@@ -178,15 +160,3 @@ def test_no_script_makes_html_or_code_of_a_text() -> None:
         strings = [node.value for node in ast.walk(_tree(path)) if isinstance(node, ast.Constant)]
         scripts[_named(path)] = "\n".join(value for value in strings if isinstance(value, str))
     assert {name: found for name, source in scripts.items() if (found := _markup(source))} == {}
-
-
-@pytest.mark.parametrize(
-    "script",
-    [
-        *("a.innerHTML = text;", "a.innerHTML = `<b>${text}</b>`;", 'a.innerHTML = "<b>" + text;', "a.outerHTML=text"),
-        *("a.innerHTML += `<b>`;\na.innerHTML = x", "a.insertAdjacentHTML('beforeend', text)", "document.write(text)"),
-        *("new Function(text)()", "eval(text)", "a.setAttribute('onclick', text)", "frame.srcdoc = text"),
-    ],
-)
-def test_the_check_of_scripts_notices_what_it_is_there_for(script: str) -> None:
-    assert _markup(script)

@@ -118,7 +118,7 @@ def _kill_and_check(sequence: str, folder: Path, seconds: float) -> None:
         assert len(_coco(folder / "out").anns) == 6
 
 
-@pytest.mark.parametrize("count", [2, pytest.param(40, marks=[pytest.mark.slow, pytest.mark.timeout(900)])])
+@pytest.mark.parametrize("count", [1, pytest.param(40, marks=[pytest.mark.slow, pytest.mark.timeout(900)])])
 def test_kills_at_any_moment_leave_whole_exports(sequence: str, tmp_path: Path, count: int) -> None:
     folder = tmp_path / "exports"
     folder.mkdir()

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
+from carts_core.batch.engines import Pool
 from carts_core.cli.command_line import BAD_INPUT, main
 from carts_core.project import JointCorrection, Key, MaskCorrection, Project, Provenance, Review, ReviewState, Source
 from carts_core.recording import Sequence
@@ -111,8 +112,16 @@ def test_the_project_is_what_is_rendered(
     [("export", [], True), ("export", ["--project", "none"], False), ("calibrate export", [], False)],
 )
 def test_a_batch_exports_the_project_beside_a_recording_that_it_does_not_correct_itself(
-    corrected: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], steps: str, options: list[str], right: bool
+    corrected: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    steps: str,
+    options: list[str],
+    right: bool,
 ) -> None:
+    # In this process, which has imported what the jobs need.
+    monkeypatch.setattr(Pool, "run", lambda pool, jobs: map(pool._work, jobs))
     named = ", ".join(f'"{step}"' for step in steps.split())
     calibrate = '\ncalibrate = ["--settings", "iterations=1"]' if "calibrate" in steps else ""
     manifest = tmp_path / "manifest.toml"

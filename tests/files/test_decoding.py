@@ -4,7 +4,6 @@ import importlib
 import io
 import os
 import signal
-import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -12,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from processes import eventually
 
 from carts_core.decoders import tables
 from carts_core.files.decoding import Decoder, Limits, called, decoded
@@ -27,14 +27,6 @@ def decoder() -> Iterator[Decoder]:
     decoder = Decoder()
     yield decoder
     decoder.close()
-
-
-def wait_for_end(process: int) -> None:
-    """Wait until a process has ended, though it may not have been waited for by its parent."""
-    until = time.monotonic() + 30
-    while os.path.exists(f"/proc/{process}/exe"):
-        assert time.monotonic() < until
-        time.sleep(0.01)
 
 
 def test_values_arrays_and_errors_come_back_as_the_decoder_gave_them(decoder: Decoder, tmp_path: Path):
@@ -86,7 +78,8 @@ def test_what_a_call_imports_does_not_count_against_the_limits_of_the_call_befor
 def test_a_child_that_has_ended_for_lack_of_work_is_replaced():
     decoder = Decoder(idle=0.01)
     first = decoder.call(os.getpid, limits=SMALL)
-    wait_for_end(first)
+    # It may not have been waited for by its parent.
+    eventually(lambda: not os.path.exists(f"/proc/{first}/exe"))
     assert decoder.call(os.getpid, limits=SMALL) != first
     decoder.close()
 

@@ -14,7 +14,7 @@ def check(count: int, seed: int) -> None:
 
 
 def test_a_sample_of_wrong_inputs_is_read_or_refused_in_words():
-    check(150, seed=1)
+    check(3 * len(KINDS), seed=1)
 
 
 @pytest.mark.slow

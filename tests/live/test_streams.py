@@ -1,19 +1,22 @@
 """Frames come from anywhere, the newest counts, and what is wrong with a message is said to who sent it."""
 
 import json
+import select
 import socket
 import struct
 import threading
 import time
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import replace
-from itertools import pairwise
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import msgspec
 import numpy as np
 import pytest
+from processes import eventually
 
 from carts_core.errors import SettingsError
 from carts_core.live import (
@@ -38,6 +41,7 @@ from carts_core.live.messages import LARGEST, ErrorMessage, receive
 from carts_core.recording import Frame, Sequence
 from carts_core.settings.live import LiveSettings
 
+RESULT = ResultMessage("a", 0.0, 0.0, "good", "small", 0.0, {}, {})
 JOINTS = {"PSM1": {"yaw": 0.1, "insertion": 0.12}}
 
 
@@ -52,29 +56,40 @@ def assembler(sequence: Sequence) -> Assembler:
 
 
 class Repeater:
-    """In place of a tracker: says that every frame is as measured, after some time."""
+    """In place of a tracker: says that every frame is as measured, after as many seconds as it is told to say."""
 
     def __init__(self, sequence: Sequence, seconds: float = 0.0) -> None:
-        self.live, self._scene, self._seconds = LiveSettings(), sequence.scene, seconds
+        # No machine is so slow that a frame that is not stale by intention is as old as this.
+        self.live, self._scene, self._seconds = LiveSettings(oldest_seconds=30.0), sequence.scene, seconds
         self.frames: list[Frame] = []
+        self.held = threading.Event()
+        self.held.set()
 
     def track(self, frame: Frame, camera_poses: object = None) -> LiveEstimate:
         """An estimate."""
-        time.sleep(self._seconds)
         self.frames.append(frame)
+        assert self.held.wait(60)
         std = {name: np.full(len(values), np.nan) for name, values in frame.measured.items()}
         state = self._scene.state(frame.measured)
-        return LiveEstimate(
-            frame.frame_id,
-            frame.timestamp or 0.0,
-            LiveVerdict.GOOD,
-            Effort.SMALL,
-            0.01,
-            state,
-            frame.measured,
-            std,
-            self._seconds,
-        )
+        time = frame.timestamp or 0.0
+        good, small = LiveVerdict.GOOD, Effort.SMALL
+        return LiveEstimate(frame.frame_id, time, good, small, 0.01, state, frame.measured, std, self._seconds)
+
+
+class Given:
+    """A source of moments, each of which comes after a wait."""
+
+    def __init__(self, tracker: Repeater, *moments: tuple[Callable[[], object], Moment]) -> None:
+        self._tracker, self._moments = tracker, moments
+
+    def __iter__(self) -> Iterator[Moment]:
+        for wait, moment in self._moments:
+            wait()
+            yield moment
+        self._tracker.held.set()
+
+    def close(self) -> None:
+        """Nothing is open."""
 
 
 def picture(sequence: Sequence, encoding: str = "png") -> ImageMessage:
@@ -84,58 +99,53 @@ def picture(sequence: Sequence, encoding: str = "png") -> ImageMessage:
     return ImageMessage(cv2.imencode(f".{encoding}", image[..., ::-1])[1].tobytes(), encoding)  # pyright: ignore
 
 
-def test_a_replay_goes_at_the_speed_of_the_clock(sequence: Sequence) -> None:
-    began = time.monotonic()
-    moments = [(time.monotonic() - began, moment) for moment in Replay(sequence, ("left",), "regular", loops=2)]
-    assert [moment.frame.frame_id for _, moment in moments] == ["001", "002", "003"] * 2
-    times = [moment.frame.timestamp or 0.0 for _, moment in moments]
-    np.testing.assert_allclose(times, np.arange(6) / 10, atol=1e-9)
-    assert all(-1e-3 < passed - due < 2.0 for (passed, _), due in zip(moments, times, strict=True))
+def test_a_replay_goes_at_the_speed_of_the_clock_and_skips_what_is_late(
+    sequence: Sequence, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    replay, now = Replay(sequence, ("left",), "regular", loops=2), [5.0]
+
+    def wait(seconds: float) -> bool:
+        now[0] += seconds
+        return False
+
+    monkeypatch.setattr("carts_core.live.sources.time", SimpleNamespace(monotonic=lambda: now[0]))
+    monkeypatch.setattr(replay, "_closed", SimpleNamespace(wait=wait))
+    moments = iter(replay)
+    found = [next(moments) for _ in range(4)]
+    assert [moment.frame.frame_id for moment in found] == ["001", "002", "003", "001"]
+    np.testing.assert_allclose([moment.frame.timestamp or 0.0 for moment in found], np.arange(4) / 10, atol=1e-9)
+    assert now[0] == pytest.approx(5.3)
+    now[0] += 0.25
+    assert [moment.frame.frame_id for moment in moments] == ["003"]
 
 
 def test_a_slow_tracker_gets_the_newest_frame_and_the_others_are_dropped(sequence: Sequence) -> None:
-    tracker = Repeater(sequence, seconds=0.25)
-    statistics = follow(Replay(sequence, ("left",), "regular", rate=20.0, loops=8), tracker, [])  # pyright: ignore
-    assert statistics.tracked == len(tracker.frames) < 10 and statistics.dropped >= 8
-    assert statistics.tracked + statistics.dropped == statistics.arrived
-    times = [frame.timestamp or 0.0 for frame in tracker.frames]
-    assert all(after - before > 0.15 for before, after in pairwise(times[:-1]))
+    tracker = Repeater(sequence)
+    tracker.held.clear()
+    frames = [replace(sequence.frame(0), frame_id=str(number)) for number in range(5)]
+
+    def begun() -> None:
+        eventually(lambda: bool(tracker.frames))
+
+    source = Given(tracker, (lambda: None, Moment(frames[0])), *((begun, Moment(frame)) for frame in frames[1:]))
+    statistics = follow(source, tracker, [])  # pyright: ignore
+    assert [frame.frame_id for frame in tracker.frames] == ["0", "4"]
+    assert (statistics.arrived, statistics.tracked, statistics.dropped) == (5, 2, 3)
 
 
-def test_a_frame_that_has_waited_too_long_is_not_tracked(sequence: Sequence) -> None:
-    frame = sequence.frame(0)
-    stale = [Moment(frame, arrived=time.monotonic() - 1.0)]
+@pytest.mark.parametrize(("seconds", "waited"), [(0.0, 100.0), (20.0, 15.0)])
+def test_a_frame_whose_result_would_be_too_old_is_not_tracked(
+    sequence: Sequence, seconds: float, waited: float
+) -> None:
+    """Because it has waited for longer than it may, or for longer than the tracker usually leaves."""
+    tracker, frame = Repeater(sequence, seconds), sequence.frame(0)
+    late = Moment(replace(frame, frame_id="late"), arrived=time.monotonic() - waited)
 
-    class Stale:
-        def __iter__(self) -> Iterator[Moment]:
-            yield from stale
-            time.sleep(0.3)
-            yield Moment(frame)
+    def begun() -> None:
+        eventually(lambda: bool(tracker.frames))
 
-        def close(self) -> None:
-            """Nothing is open."""
-
-    statistics = follow(Stale(), Repeater(sequence), [])  # pyright: ignore
-    assert (statistics.arrived, statistics.dropped, statistics.tracked) == (2, 1, 1)
-
-
-def test_a_frame_whose_result_would_be_too_old_at_the_usual_time_is_not_tracked(sequence: Sequence) -> None:
-    frame = sequence.frame(0)
-
-    class Uneven:
-        def __iter__(self) -> Iterator[Moment]:
-            yield Moment(frame)
-            time.sleep(0.3)
-            # It has waited for less than it may, but not for so much less as the tracker takes.
-            yield Moment(replace(frame, frame_id="late"), arrived=time.monotonic() - 0.07)
-            time.sleep(0.3)
-            yield Moment(frame)
-
-        def close(self) -> None:
-            """Nothing is open."""
-
-    tracker = Repeater(sequence, seconds=0.05)
-    statistics = follow(Uneven(), tracker, [])  # pyright: ignore
+    moments = ((lambda: None, Moment(frame)), (begun, late), (lambda: time.sleep(0.3), Moment(frame)))
+    statistics = follow(Given(tracker, *moments), tracker, [])  # pyright: ignore
     assert (statistics.dropped, statistics.tracked) == (1, 2) and "late" not in {one.frame_id for one in tracker.frames}
 
 
@@ -192,6 +202,10 @@ def test_what_is_wrong_with_a_message_is_said(assembler: Assembler, values: dict
         assembler.moment(FrameMessage(0.0, **values))
 
 
+def connected(server: StreamServer) -> socket.socket:
+    return socket.create_connection(("127.0.0.1", server.port), timeout=60)
+
+
 def _answers(connection: socket.socket) -> Iterator[ResultMessage | ErrorMessage]:
     stream = connection.makefile("rb")
     while len(header := stream.read(4)) == 4:
@@ -208,8 +222,8 @@ def test_every_client_of_the_socket_gets_every_result(sequence: Sequence, assemb
         daemon=True,
     )
     thread.start()
-    sender, watcher = (socket.create_connection(("127.0.0.1", server.port), timeout=20) for _ in range(2))
-    time.sleep(0.3)
+    sender, watcher = (connected(server) for _ in range(2))
+    eventually(lambda: len(server._clients) == 2)
     for number in range(3):
         message = FrameMessage(float(number), JOINTS, {"left": picture(sequence)}, id=f"frame {number}")
         sender.sendall(packed(message))
@@ -241,12 +255,11 @@ def test_a_sender_of_nonsense_is_told_why_and_others_stay_connected(
 ) -> None:
     server = StreamServer(assembler, 0)
     try:
-        other = socket.create_connection(("127.0.0.1", server.port), timeout=20)
-        sender = socket.create_connection(("127.0.0.1", server.port), timeout=20)
+        other, sender = connected(server), connected(server)
         sender.sendall(content)
         (answer,) = _answers(sender)
         assert isinstance(answer, ErrorMessage) and message in answer.message
-        server.send(ResultMessage("a", 0.0, 0.0, "good", "small", 0.0, {}, {}))
+        server.send(RESULT)
         assert isinstance(next(_answers(other)), ResultMessage)
     finally:
         server.close()
@@ -255,24 +268,28 @@ def test_a_sender_of_nonsense_is_told_why_and_others_stay_connected(
 def test_a_client_that_never_reads_holds_nobody_up(assembler: Assembler) -> None:
     server = StreamServer(assembler, 0)
     try:
-        with socket.create_connection(("127.0.0.1", server.port), timeout=20):
-            time.sleep(0.2)
-            large, began = (
-                ResultMessage("a", 0.0, 0.0, "good", "small", 0.0, {}, {}, {"left": bytes(10**6)}),
-                time.time(),
-            )
-            for _ in range(60):
-                server.send(large)
-            assert time.time() - began < 10
+        with connected(server):
+            eventually(lambda: len(server._clients) == 1)
+            for _ in range(60):  # Beyond what a socket holds, it would wait here for ever.
+                server.send(msgspec.structs.replace(RESULT, masks={"left": bytes(10**6)}))
     finally:
         server.close()
 
 
 def _accepted(server: StreamServer) -> bool:
     """Whether one more client gets a result."""
-    with socket.create_connection(("127.0.0.1", server.port), timeout=20) as client:
-        time.sleep(0.1)
-        server.send(ResultMessage("a", 0.0, 0.0, "good", "small", 0.0, {}, {}))
+    with connected(server) as client:
+        address = client.getsockname()
+
+        def registered() -> bool:
+            for other in list(server._clients):
+                with suppress(OSError):  # It is gone.
+                    if other.getpeername() == address:
+                        return True
+            return False
+
+        eventually(lambda: registered() or bool(select.select([client], [], [], 0)[0]))
+        server.send(RESULT)
         return isinstance(next(_answers(client), None), ResultMessage)
 
 
@@ -280,9 +297,8 @@ def test_connections_that_were_closed_before_the_first_result_keep_no_places(ass
     server = StreamServer(assembler, 0)
     try:
         for _ in range(40):
-            socket.create_connection(("127.0.0.1", server.port), timeout=20).close()
-        time.sleep(0.3)
-        assert _accepted(server)
+            connected(server).close()
+        eventually(lambda: _accepted(server))
     finally:
         server.close()
 
@@ -291,16 +307,16 @@ def test_silent_clients_make_room_when_all_places_are_taken(
     assembler: Assembler, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     server = StreamServer(assembler, 0)
-    silent = [socket.create_connection(("127.0.0.1", server.port), timeout=20) for _ in range(16)]
+    monkeypatch.setattr("carts_core.live.sources._SILENCE", 1000.0)
+    silent = [connected(server) for _ in range(16)]
     try:
-        time.sleep(0.2)
-        with socket.create_connection(("127.0.0.1", server.port), timeout=20) as late:
+        eventually(lambda: len(server._clients) == 16)
+        with connected(server) as late:
             (answer,) = _answers(late)
             assert isinstance(answer, ErrorMessage) and "16 clients are connected" in answer.message
-        monkeypatch.setattr("carts_core.live.sources._SILENCE", 0.2)
-        time.sleep(0.3)
+        monkeypatch.setattr("carts_core.live.sources._SILENCE", 0.0)
         silent[0].sendall(packed(FrameMessage(0.1, JOINTS)))
-        time.sleep(0.1)
+        eventually(lambda: any(client.sends for client in list(server._clients.values())))
         assert _accepted(server)
         assert isinstance(next(_answers(silent[0])), ResultMessage)
         assert sum(next(_answers(each), None) is None for each in silent[1:]) == 1
@@ -310,15 +326,21 @@ def test_silent_clients_make_room_when_all_places_are_taken(
             each.close()
 
 
-def test_a_sender_that_has_ended_its_side_gets_the_result_of_its_last_frame(assembler: Assembler) -> None:
+def test_a_sender_that_has_ended_its_side_gets_the_result_of_its_last_frame(
+    assembler: Assembler, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("carts_core.live.sources._LINGER", 1000.0)
     server = StreamServer(assembler, 0)
     try:
-        with socket.create_connection(("127.0.0.1", server.port), timeout=20) as sender:
+        with connected(server) as sender:
             sender.sendall(packed(FrameMessage(0.0, JOINTS)))
             sender.shutdown(socket.SHUT_WR)
-            time.sleep(0.2)
-            server.send(ResultMessage("a", 0.0, 0.0, "good", "small", 0.0, {}, {}))
-            assert [type(answer) for answer in _answers(sender)] == [ResultMessage]
+            eventually(lambda: any(client.sends for client in list(server._clients.values())))
+            server.send(RESULT)
+            answers = _answers(sender)
+            assert isinstance(next(answers), ResultMessage)
+            server.close()
+            assert list(answers) == []
     finally:
         server.close()
 
@@ -331,51 +353,53 @@ def test_a_broken_connection_ends_without_an_error_for_others(assembler: Assembl
         receive(one)
 
 
+def put(folder: Path, name: str, content: str, image: np.ndarray | None = None) -> None:
+    """Write a frame into a folder, its JSON file last."""
+    if image is not None:
+        cv2.imwrite(str(folder / f"{name}.png"), image[..., ::-1])
+    (folder / "part").write_text(content)
+    (folder / "part").rename(folder / f"{name}.json")
+
+
 def test_a_folder_that_fills_is_followed_from_name_to_name(
     sequence: Sequence, assembler: Assembler, tmp_path: Path
 ) -> None:
-    folder, found = tmp_path / "stream", []
-    folder.mkdir()
-    source = Folder(assembler, ("left",), folder)
+    source, found = Folder(assembler, ("left",), tmp_path), list[Frame]()
 
     def fill() -> None:
         for number in range(3):
-            cv2.imwrite(str(folder / f"{number:03d}.png"), sequence.frame(number).images["left"][..., ::-1])
-            (folder / "part").write_text(json.dumps({"type": "frame", "time": number / 10, "joints": JOINTS}))
-            (folder / "part").rename(folder / f"{number:03d}.json")
-            time.sleep(0.3)
+            message = json.dumps({"type": "frame", "time": number / 10, "joints": JOINTS})
+            put(tmp_path, f"{number:03d}", message, sequence.frame(number).images["left"])
+            eventually(lambda number=number: len(found) > number)
         source.close()
 
     thread = threading.Thread(target=fill)
     thread.start()
-    found = [moment.frame for moment in source]
+    for moment in source:
+        found.append(moment.frame)
     thread.join()
-    assert [frame.frame_id for frame in found][-1] == "002" and len(found) >= 2
+    assert [frame.frame_id for frame in found] == ["000", "001", "002"]
     np.testing.assert_array_equal(found[-1].images["left"], sequence.frame(2).images["left"])
     with pytest.raises(SettingsError, match="is no folder"):
-        Folder(assembler, ("left",), folder / "003.json")
+        Folder(assembler, ("left",), tmp_path / "002.json")
 
 
 def test_what_cannot_be_used_in_a_folder_is_left_out(
     sequence: Sequence, assembler: Assembler, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    source, image = Folder(assembler, ("left",), tmp_path), sequence.frame(0).images["left"][..., ::-1]
+    source, image = Folder(assembler, ("left",), tmp_path), sequence.frame(0).images["left"]
     usable = json.dumps({"type": "frame", "time": 0.0, "joints": JOINTS})
 
     def fill() -> None:
-        (tmp_path / "000.json").write_text(usable)
+        put(tmp_path, "000", usable)
         for number, content in enumerate(["{", usable.replace("PSM1", "PSM9"), usable], 1):
-            time.sleep(0.2)
-            cv2.imwrite(str(tmp_path / f"{number:03d}.png"), image)
-            (tmp_path / f"{number:03d}.json").write_text(content)
-        time.sleep(0.2)
-        source.close()
+            eventually(lambda number=number: len(caplog.records) >= number)
+            put(tmp_path, f"{number:03d}", content, image)
 
     thread = threading.Thread(target=fill)
     thread.start()
-    found = [moment.frame.frame_id for moment in source]
+    assert next(iter(source)).frame.frame_id == "003"
     thread.join()
-    assert found == ["003"]
     said = [record.getMessage() for record in caplog.records]
     assert len(said) == 3 and all(text.startswith("A frame is left out: ") for text in said)
     assert "no image 000.left.png or 000.png" in said[0] and "PSM9" in said[2]

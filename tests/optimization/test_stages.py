@@ -189,4 +189,4 @@ def test_first_order_descent_imports_no_compiler() -> None:
         "FirstOrderDescent(DescentSolver(), zero, zero - 1, zero + 1).step(zero + 0.5)\n"
         "sys.exit('torch._dynamo' in sys.modules)\n"
     )
-    subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
+    subprocess.run([sys.executable, "-c", code], check=True)

@@ -2,13 +2,13 @@
 
 import os
 import sqlite3
-import subprocess
-import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from multiprocessing.context import ForkServerProcess
 from pathlib import Path
 
 import pytest
+from other_process import CONTEXT, hold
 from project_model import HAND, IDENTITY
 from sql_file import rows
 
@@ -21,22 +21,17 @@ ACCEPTED = Review(ReviewState.ACCEPTED, "clean")
 
 
 @contextmanager
-def _writer_process(path: Path) -> Iterator[subprocess.Popen]:
-    """Another process that has the project open for writing, until it is killed."""
-    program = (
-        "import sys, time; from pathlib import Path; from project_model import IDENTITY;"
-        "from carts_core.project import Project; project = Project(IDENTITY, Path(sys.argv[1]));"
-        "print(project.writable, flush=True); time.sleep(600)"
-    )
-    paths = os.pathsep.join([str(Path(__file__).parent), *sys.path])
-    environment = {**os.environ, "PYTHONPATH": paths}
-    command = [sys.executable, "-c", program, str(path)]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment) as process:
-        assert process.stdout is not None and process.stdout.readline() == "True\n"
-        try:
-            yield process
-        finally:
-            process.kill()
+def _other_process(path: Path, *, writable: bool) -> Iterator[ForkServerProcess]:
+    """Another process that has the project open, until it is killed."""
+    here, there = CONTEXT.Pipe(duplex=False)
+    process = CONTEXT.Process(target=hold, args=(path, there), daemon=True)
+    process.start()
+    assert here.recv() is writable
+    try:
+        yield process
+    finally:
+        process.kill()
+        process.join()
 
 
 def test_a_closed_project_is_one_file(project: Project, project_path: Path) -> None:
@@ -68,7 +63,7 @@ def test_the_file_can_be_read_with_plain_sql(project: Project, project_path: Pat
 def test_a_second_process_opens_read_only_and_says_so_until_the_first_is_killed(project_path: Path) -> None:
     with Project(IDENTITY, project_path) as project:
         project.apply("Accept", {Key.review(0): ACCEPTED})
-    with _writer_process(project_path) as writer:
+    with _other_process(project_path, writable=True) as writer:
         with Project(IDENTITY, project_path) as second:
             assert not second.writable
             assert second.read_only_reason is not None
@@ -77,7 +72,7 @@ def test_a_second_process_opens_read_only_and_says_so_until_the_first_is_killed(
             with pytest.raises(ProjectError, match=f"cannot be changed.*process {writer.pid}"):
                 second.apply("Reject", {Key.review(0): None})
         writer.kill()
-        writer.wait()
+        writer.join()
         with Project(IDENTITY, project_path) as third:
             assert third.writable and third.state.review(0) == ACCEPTED
 
@@ -150,14 +145,8 @@ def test_the_lock_outlives_another_descriptor_of_the_file_that_is_closed(project
     project_path.read_bytes()
     with Project(IDENTITY, project_path) as second:
         assert not second.writable and "open for writing elsewhere" in (second.read_only_reason or "")
-    program = (
-        "import sys; from pathlib import Path; from project_model import IDENTITY;"
-        "from carts_core.project import Project; print(Project(IDENTITY, Path(sys.argv[1])).writable)"
-    )
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(Path(__file__).parent), *sys.path])}
-    command = [sys.executable, "-c", program, str(project_path)]
-    finished = subprocess.run(command, capture_output=True, text=True, check=True, env=environment, timeout=60)
-    assert finished.stdout == "False\n"
+    with _other_process(project_path, writable=False):
+        pass
 
 
 def test_other_programs_that_use_sqlite_cannot_write_meanwhile(project: Project, project_path: Path) -> None:

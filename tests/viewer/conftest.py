@@ -13,7 +13,6 @@ from playwright.sync_api import Browser, expect, sync_playwright
 from viewer_desk import Desk
 from viewer_tab import OpenTab, OpenViewer, Tab, mark_frames, new_context
 
-from carts_core.networks import FeatureExtractor
 from carts_core.networks.network import FeatureNetwork
 from carts_core.networks.weights import save_weights
 from carts_core.settings import Architecture
@@ -28,28 +27,6 @@ FLAGS = (
 
 # Without a graphics card, and on a busy machine, a page may need long.
 expect.set_options(timeout=20_000)
-
-
-_LOADED: dict[tuple[object, ...], FeatureExtractor] = {}
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _networks_loaded_once() -> Iterator[None]:
-    """Networks from the same files are loaded once for all tests of this folder, and anew for those of others."""
-    load = FeatureExtractor.load
-
-    def load_once(*weights: Path | str, **options) -> FeatureExtractor:
-        files = [Path(path) for path in weights]
-        if not all(path.is_file() for path in files):
-            return load(*weights, **options)
-        key = (*((path, path.stat().st_mtime_ns) for path in files), *sorted(options.items()))
-        if key not in _LOADED:
-            _LOADED[key] = load(*weights, **options)
-        return _LOADED[key]
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(FeatureExtractor, "load", load_once)
-        yield
 
 
 @pytest.fixture(scope="session")
