@@ -260,7 +260,7 @@ class ViewerApp:
             stack.callback(self._storage.close)
             stack.callback(self.tabs.close)
 
-    def wait_until_shown(self, timeout: float = 30.0) -> ViewState:
+    def wait_until_shown(self, timeout: float = 120.0) -> ViewState:
         """Wait at most `timeout` [s] until all intents so far are carried out and sent to the page.
 
         Raises:

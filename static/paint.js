@@ -120,7 +120,10 @@
     dirty = true;
     if (!drawing || drawing.polygon) return;
     const moves = event.getCoalescedEvents?.() ?? [];
-    for (const one of moves.length ? moves : [event]) add(inImage(one));
+    for (const one of moves.length ? moves : [event]) {
+      const point = inImage(one);
+      if (point) add(point); // there is none while the picture is replaced
+    }
   }
 
   function release(event) {

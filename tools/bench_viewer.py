@@ -10,6 +10,7 @@ import argparse
 import dataclasses
 import tempfile
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -98,21 +99,35 @@ def frame_latency(app: ViewerApp, *, moves: int = 120, frames: int = 8, pause: f
     times: list[float] = []
     with RawTab(app.url, draws=True, key=_KEY) as tab:
         app.wait_until_shown()
-        forth, back = tab.find("Next frame"), tab.find("Previous frame (back)")
-        lap = [forth] * count + [back] * count
+        keys = {1: tab.find("Next frame"), -1: tab.find("Previous frame (back)")}
+        lap = [1] * count + [-1] * count
         for number in range(len(lap) + moves):
-            seen, pressed = len(tab.overlays), time.perf_counter()
-            tab.press(lap[number % len(lap)])
-            while len(tab.overlays) == seen:
-                if time.perf_counter() - pressed > 10.0:
-                    raise RuntimeError(f"no picture came within 10 s: {app.state.error}")
-                time.sleep(0.0005)
-            times.append(tab.overlays[-1][0] - pressed)
+            by, pressed = lap[number % len(lap)], time.perf_counter()
+            wanted = app.state.index + by
+            tab.press(keys[by])
+            _until(lambda wanted=wanted: app.state.index == wanted)
             app.wait_until_shown()
+            # Of the pictures that came since, the newest shows the frame; others may have been on their way before.
+            sent = app.view.scene.sent(OVERLAY)
+            _until(lambda sent=sent: bool(tab.overlays) and tab.overlays[-1][1] == sent)
+            times.append(tab.overlays[-1][0] - pressed)
             time.sleep(pause)
         stale = tab.overlays[-1][1] != app.view.scene.sent(OVERLAY)
     # The first lap has read the frames.
     return _latency(times[len(lap) :], stale)
+
+
+def _until(holds: Callable[[], bool], patience: float = 60.0) -> None:
+    """Wait for a condition.
+
+    Raises:
+        RuntimeError: it does not hold after so long [s].
+    """
+    end = time.perf_counter() + patience
+    while not holds():
+        if time.perf_counter() > end:
+            raise RuntimeError(f"The picture of a key did not come within {patience:g} s.")
+        time.sleep(0.0005)
 
 
 def _latency(times: list[float], stale: bool) -> Latency:

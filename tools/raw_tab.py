@@ -31,6 +31,8 @@ _CAMERA = {
 
 
 _NUMBERS = itertools.count(1)
+_PATIENCE = 120.0
+"""Longest wait for the server, on a busy machine [s]."""
 
 
 class RawTab:
@@ -78,17 +80,17 @@ class RawTab:
     def __enter__(self) -> "RawTab":
         self._thread.start()
         try:
-            asyncio.run_coroutine_threadsafe(self._open(), self._loop).result(20)
+            asyncio.run_coroutine_threadsafe(self._open(), self._loop).result(_PATIENCE)
             # Before that, it would take an old value for the present one.
-            if not self._joined.wait(20):
-                raise TimeoutError("The server did not bring the tab up to date within 20 s.")
+            if not self._joined.wait(_PATIENCE):
+                raise TimeoutError(f"The server did not bring the tab up to date within {_PATIENCE:g} s.")
         except BaseException:
             self._end()
             raise
         return self
 
     def __exit__(self, *exception: object) -> None:
-        asyncio.run_coroutine_threadsafe(self._close(), self._loop).result(20)
+        asyncio.run_coroutine_threadsafe(self._close(), self._loop).result(_PATIENCE)
         self._end()
 
     def set(self, element: str, value: Any) -> None:
@@ -114,14 +116,14 @@ class RawTab:
     def send(self, message: dict[str, Any] | bytes | str) -> None:
         """Send a message, or any bytes or text; errors as `set`."""
         data = msgspec.msgpack.encode(message) if isinstance(message, dict) else message
-        asyncio.run_coroutine_threadsafe(self._push(data), self._loop).result(20)
+        asyncio.run_coroutine_threadsafe(self._push(data), self._loop).result(_PATIENCE)
 
     @property
     def connected(self) -> bool:
         """Whether the server still talks to this tab."""
         return not self._reader.done()
 
-    def close_code(self, timeout: float = 20.0) -> int | None:
+    def close_code(self, timeout: float = _PATIENCE) -> int | None:
         """Wait until the server ends the connection, and give its code; None when it does not in that time [s]."""
         end = time.monotonic() + timeout
         while self.connected and time.monotonic() < end:
@@ -135,7 +137,12 @@ class RawTab:
     async def _open(self) -> None:
         protocol = Subprotocol(f"viser-v{viser.__version__}")
         self._connection = await connect(
-            self._url, subprotocols=[protocol], max_size=None, compression=None, origin=self._origin
+            self._url,
+            subprotocols=[protocol],
+            max_size=None,
+            compression=None,
+            origin=self._origin,
+            open_timeout=_PATIENCE,
         )
         # viser counts a tab as connected once it has said where its camera is.
         await self._push(msgspec.msgpack.encode(_CAMERA))

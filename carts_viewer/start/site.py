@@ -86,7 +86,7 @@ class Site:
         """Queue a function for the site's thread. Any thread may call this."""
         self._jobs.put(job)
 
-    def wait(self, timeout: float = 60.0) -> None:
+    def wait(self, timeout: float = 120.0) -> None:
         """Wait at most `timeout` [s] until all requests so far are done.
 
         Raises:

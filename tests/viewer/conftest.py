@@ -12,10 +12,12 @@ import torch
 from playwright.sync_api import Browser, expect, sync_playwright
 from viewer_desk import Desk
 from viewer_tab import OpenTab, OpenViewer, Tab, mark_frames, new_context
+from waiting import PATIENCE
 
 from carts_core.networks.network import FeatureNetwork
 from carts_core.networks.weights import save_weights
 from carts_core.settings import Architecture
+from carts_viewer import editing
 from carts_viewer.actions import intents
 from carts_viewer.app import ViewerApp
 from carts_viewer.jobs.optimizers import NetworkOptions
@@ -26,7 +28,7 @@ FLAGS = (
 ).split()
 
 # Without a graphics card, and on a busy machine, a page may need long.
-expect.set_options(timeout=20_000)
+expect.set_options(timeout=1000 * PATIENCE)
 
 
 @pytest.fixture(scope="session")
@@ -67,7 +69,7 @@ def open_viewer(tiny_sequence: Callable[..., Path], untrained_weights: Path) -> 
             app = stack.enter_context(ViewerApp.open(path, port=0, **chosen))
             if marked:
                 app.queue.put(intents.SetOpacity(1.0))
-            app.wait_until_shown(60)
+            app.wait_until_shown()
             return app
 
         yield make
@@ -77,7 +79,7 @@ def open_viewer(tiny_sequence: Callable[..., Path], untrained_weights: Path) -> 
 def shared_viewer(shared_sequence: Callable[..., Path], untrained_weights: Path) -> Iterator[ViewerApp]:
     """The viewer of a tiny sequence, for tests that leave it as it is."""
     with ViewerApp.open(shared_sequence(), port=0, weights=(untrained_weights,)) as app:
-        app.wait_until_shown(60)
+        app.wait_until_shown()
         yield app
 
 
@@ -101,12 +103,15 @@ def browser() -> Iterator[Browser]:
 
 
 @pytest.fixture
-def open_tab(browser: Browser, open_viewer: OpenViewer) -> Iterator[OpenTab]:
+def open_tab(browser: Browser, open_viewer: OpenViewer, monkeypatch: pytest.MonkeyPatch) -> Iterator[OpenTab]:
     """Opens a tab of a viewer, in a window of any size, when the first picture is there.
+
+    However slow a drag is, its edit is saved when it is let go of, and not before.
 
     Without a viewer one is opened, with the options of `open_viewer`. The browser has seen the page before, unless it
     is a `new` one. `asked` gets every address that the page asks for; `query` is appended to the page's address.
     """
+    monkeypatch.setattr(editing, "LONGEST_DRAFT", 1e6)
     with ExitStack() as stack:
 
         def make(

@@ -8,7 +8,6 @@ import signal
 import subprocess
 import sys
 import threading
-import time
 import weakref
 from collections.abc import Callable, Hashable
 from pathlib import Path
@@ -18,9 +17,9 @@ import cv2
 import numpy as np
 import pytest
 from viewer_tab import OpenViewer, decoded, place_of, run_without_end, view_of
-from waiting import eventually, get
+from waiting import PATIENCE, eventually, get
 
-from carts_core.errors import ProjectError, SequenceError, SettingsError
+from carts_core.errors import ProjectError
 from carts_core.optimization import Backgrounds
 from carts_core.project import Project
 from carts_core.recording import Sequence
@@ -89,7 +88,7 @@ def test_memory_is_returned_during_work_beside_a_page_and_without_one(
 def test_a_run_is_ended_and_its_pose_saved_once_its_tab_does_not_come_back(
     open_viewer: OpenViewer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(tabs, "AWAY", 1.0)
+    monkeypatch.setattr(tabs, "AWAY", 1e6)
     app = open_viewer()
     run_without_end(app)
     with RawTab(app.url, key="one") as raw:
@@ -98,8 +97,9 @@ def test_a_run_is_ended_and_its_pose_saved_once_its_tab_does_not_come_back(
         eventually(lambda: len(place.controller.state.run.curves.loss) > 1)
     with RawTab(app.url, key="one"):
         # It came back in time, so its run goes on for as long as it stays.
-        end = time.monotonic() + tabs.AWAY
-        eventually(lambda: time.monotonic() > end)
+        monkeypatch.setattr(tabs, "AWAY", 0.0)
+        done = len(place.controller.state.run.curves.loss)
+        eventually(lambda: len(place.controller.state.run.curves.loss) > done + 10)
         assert place.controller.state.run.phase is Phase.RUNNING
     eventually(lambda: place.controller.state.run.phase is Phase.IDLE)
     state = app.wait_until_shown()
@@ -118,7 +118,6 @@ def test_after_a_burst_of_slider_values_the_overlay_is_that_of_the_last(open_vie
         eventually(lambda: tab.overlays[-1][1] == app.view.scene.sent(OVERLAY))
         fresh = OverlayRenderer(app.sequence).arm_ids(state.pose.scene, "left")
         assert np.array_equal(_picture(tab.overlays[-1][1]), mask(fresh, state.opacity))
-        assert 1 <= len(tab.overlays) < 100
 
 
 def test_a_value_is_not_lost_to_a_panel_that_is_brought_up_to_date_at_that_moment(
@@ -150,7 +149,7 @@ def test_the_old_frame_stays_until_the_next_one_is_decoded(
     def slow(index: int, *arguments):
         if index == 5:
             asked.set()
-            assert decoded.wait(30)
+            assert decoded.wait(PATIENCE)
         return read(index, *arguments)
 
     monkeypatch.setattr(app.sequence, "frame", slow)
@@ -159,7 +158,7 @@ def test_the_old_frame_stays_until_the_next_one_is_decoded(
         before = app.state
         sent = app.view.scene.sent(FRAME)
         app.queue.put(intents.ShowFrame(5))
-        assert asked.wait(30)
+        assert asked.wait(PATIENCE)
         assert app.state.frame is before.frame and app.view.scene.sent(FRAME) == sent
         decoded.set()
         state = app.wait_until_shown()
@@ -212,7 +211,7 @@ def test_weights_that_are_missing_are_an_error_in_the_page_for_a_run_and_once_fo
 ) -> None:
     app = open_viewer(networks={"weights": (tmp_path / "none.safetensors",)})
     app.queue.put(intents.Run())
-    state = app.wait_until_shown(60)
+    state = app.wait_until_shown()
     assert "none.safetensors" in (state.error or "") and state.busy is None
     app.queue.put(intents.ShowLayer(Layer.ATTENTION))
     state = app.wait_until_shown()
@@ -239,16 +238,6 @@ def test_a_busy_port_moves_up_and_the_url_says_so(shared_viewer: ViewerApp, open
         assert second.url != shared_viewer.url and get(second.url, "/").status == 200
 
 
-def test_an_address_of_another_computer_is_refused_before_anything_is_opened() -> None:
-    with pytest.raises(SettingsError, match="cannot listen on"):
-        ViewerApp.open(Path("does not matter.toml"), host="192.0.2.7")
-
-
-def test_a_sequence_that_does_not_open_is_an_error_that_names_it() -> None:
-    with pytest.raises(SequenceError, match=r"nowhere\.toml"):
-        ViewerApp.open(Path("nowhere.toml"))
-
-
 def test_serve_ends_with_code_2_and_a_message_when_the_sequence_is_missing(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as ended:
         serve(Path("nowhere.toml"))
@@ -272,7 +261,7 @@ serve(Path(sys.argv[1]), port=0)
     lines = iter(process.stdout.readline, "")
     ready = next(line for line in lines if "Ready" in line)
     process.send_signal(signal.SIGINT)
-    _, errors = process.communicate(timeout=60)
+    _, errors = process.communicate(timeout=120)
     watchdog.cancel()
     assert "http://127.0.0.1:" in ready
     assert process.returncode == 0 and "Traceback" not in errors

@@ -48,7 +48,7 @@ def test_a_short_soak_sees_what_it_is_there_for(open_viewer: OpenViewer, monkeyp
 
 def _measured(sequence: Path, weights: Path) -> list[tuple[int, float]]:
     with ViewerApp.open(sequence, port=0, weights=(weights,)) as app:
-        app.wait_until_shown(60)
+        app.wait_until_shown()
         app.queue.put(intents.SetSetting("working_width", 96))
         return memory_while_optimizing(app, iterations=500)
 

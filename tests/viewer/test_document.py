@@ -23,7 +23,7 @@ def opened(browser: Browser) -> Iterator[tuple[Document, Tab]]:
         document, tab = Document(page), context.new_page()
         show(document, 1)
         tab.goto(page.url)
-        tab.get_by_text("step 1").wait_for(timeout=60_000)
+        tab.get_by_text("step 1").wait_for()
         yield document, tab
     finally:
         context.close()

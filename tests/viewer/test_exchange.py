@@ -10,7 +10,8 @@ import cv2
 import numpy as np
 import pytest
 from viewer_desk import Desk
-from viewer_tab import decoded
+from viewer_tab import OpenViewer, decoded, widget
+from waiting import eventually
 
 from carts_core.errors import CartsError, SettingsError
 from carts_core.evaluation import dice
@@ -39,6 +40,7 @@ from carts_viewer.editing import People
 from carts_viewer.picture.layers import Layer, imported, label_color
 from carts_viewer.picture.overlay import with_imported
 from carts_viewer.session import Session
+from tools.raw_tab import RawTab
 
 
 def exported(desk: Desk, intent: intents.Export) -> Path:
@@ -265,6 +267,21 @@ def test_an_import_is_one_step_shown_at_once_and_undone(plain: Desk) -> None:
     assert plain.reopened().saved.get(Key.imported_mask(1, "left")) is not None
 
 
+def test_masks_of_others_are_imported_and_chosen_in_the_panels(open_viewer: OpenViewer) -> None:
+    app = open_viewer(write_theirs, masks=False)
+    with RawTab(app.url) as tab:
+        source, fit = widget(app, tab, "Whose masks"), widget(app, tab, "Fit to")
+        assert not source.visible
+        tab.set(app.page.element_id(fit), "Masks")
+        eventually(lambda: source.visible)
+        tab.set(app.page.element_id(source), "Imported")
+        eventually(lambda: (app.state.observed.what, app.state.observed.masks) == ("masks", "imported"))
+        tab.set(app.page.element_id(widget(app, tab, "From")), "theirs.json")
+        tab.set(app.page.element_id(widget(app, tab, "Import masks")), True)
+        eventually(lambda: app.state.imported)
+        assert app.wait_until_shown().imported == ("Imported 2 masks and keypoints of 2 images from COCO (grasper).")
+
+
 def test_without_masks_of_its_own_a_recording_is_compared_with_the_imported_ones(plain: Desk) -> None:
     plain.controller.score()
     assert plain.state.scores is not None and plain.state.scores.dice is None
@@ -339,7 +356,7 @@ def test_masks_below_an_allowed_folder_are_imported(tiny_sequence: Callable[...,
     for allowed, said in ((), "outside of the allowed folders"), ((elsewhere,), "Imported 1 mask"):
         with ViewerApp.open(folder / path.name, port=0, folders=allowed) as app:
             app.queue.put(intents.ImportMasks(str(elsewhere)))
-            state = app.wait_until_shown(60)
+            state = app.wait_until_shown()
             assert said in (state.error or state.imported)
 
 

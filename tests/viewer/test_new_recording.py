@@ -98,7 +98,7 @@ def test_two_folders_a_table_and_calibrations_become_a_sequence_with_its_arm_in_
     points = place_of(visitor).draft.points
     visitor.press("Undo")
     eventually(lambda: place_of(visitor).draft.points, lambda now: now == points[:-1])
-    expect(visitor.page.locator("main").get_by_text("All planned points are clicked")).to_have_count(0, timeout=60_000)
+    expect(visitor.page.locator("main").get_by_text("All planned points are clicked")).to_have_count(0)
     visitor.press("All recordings")
     visitor.press("Continue day 3")
     visitor.reads("Click the shaft edge")

@@ -32,11 +32,78 @@ _LINKS_IN_3D = """() => {
 """Positions on the canvas [px] of the links near the image."""
 
 
+_COUNT = """() => {
+  const mutable = window.__viserMutable, send = mutable.sendMessage;
+  window.sent = [];
+  mutable.sendMessage = (message) => { window.sent.push(JSON.stringify(message)); send(message); };
+}"""
+
+
+_PRESS_SHORTLY = """() => { for (const kind of ['keydown', 'keyup']) {
+  document.body.dispatchEvent(new KeyboardEvent(kind, { key: ',', bubbles: true }));
+} }"""
+"""The key of the loupe, for a time that no machine makes long."""
+
+
+def _loupe(tab: Tab) -> dict[str, Any] | None:
+    return tab.page.evaluate("(() => { const b = document.querySelector('.carts-loupe');"
+                             " return b && !b.hidden ? { ...b.dataset } : null; })()")  # fmt: skip
+
+
+def check_loupe(tab: Tab) -> None:
+    """The loupe shows position and colour of the pixel under the pointer, and asks the server for nothing."""
+    tab.page.evaluate(_COUNT)
+    u, v = MARKERS[1][0] * 320, MARKERS[1][1] * 240
+    tab.page.mouse.move(*tab.place(u, v))
+    # While the key is held, it is shown; pressed shortly, it stays, and follows the pointer.
+    tab.page.keyboard.down(",")
+    eventually(lambda: _loupe(tab))
+    tab.page.evaluate("new Promise((done) => setTimeout(done, 450))")
+    tab.page.keyboard.up(",")
+    eventually(lambda: _loupe(tab), lambda loupe: loupe is None)
+    tab.page.evaluate(_PRESS_SHORTLY)
+    loupe = eventually(lambda: _loupe(tab))
+    assert loupe is not None and loupe["camera"] == "left"
+    assert (float(loupe["u"]), float(loupe["v"])) == pytest.approx((u, v), abs=0.5)
+    # The frame is sent as JPEG, so a colour is off by some levels.
+    assert np.abs(np.array(loupe["rgb"].split(), float) - (255, 0, 0)).max() < 30
+    shown = decoded(tab.page.locator(".carts-loupe canvas").screenshot())[..., 2::-1]
+    assert np.abs(shown[65, 65].astype(float) - (255, 0, 0)).max() < 40
+    tab.page.mouse.move(*tab.place(160, 12))
+    loupe = eventually(lambda: _loupe(tab), lambda loupe: loupe is not None and abs(float(loupe["v"]) - 12) < 0.5)
+    assert loupe is not None and max(map(float, loupe["rgb"].split())) < 30
+    tab.button("Loupe")
+    eventually(lambda: _loupe(tab), lambda loupe: loupe is None)
+    # But that a picture was drawn may be reported at any time.
+    assert not [text for text in tab.page.evaluate("window.sent") if "GuiUpdateMessage" in text and "Drawn" not in text]
+
+
+def check_slider(tab: Tab) -> None:
+    """A slider's drag ends with the overlay of its last value, and is one step."""
+    app, slider = tab.app, tab.slider("PSM1", 0)
+
+    def thumb() -> tuple[float, float]:
+        box = box_of(tab.page.locator(f"{tab.element(slider)} [role=slider]"))
+        return box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+
+    x, y = thumb()
+    tab.drag((x, y), *((x + 12 * math.sin(step / 5), y) for step in range(30)), (x - 10, y))
+    eventually(lambda: (app.state.undoable, app.state.unsaved), lambda now: now == (1, False))
+    tab.canvas.wait_until_registered()
+    final = math.degrees(float(app.state.pose.scene.joint_positions[0][0]))
+    assert final == pytest.approx(slider.value, abs=0.06) and final < slider.max - 5.5
+    x, y = thumb()
+    tab.drag((x, y), (x + 15, y), (x + 18, y))
+    eventually(lambda: (app.state.undoable, app.state.unsaved), lambda now: now == (2, False))
+
+
 def test_the_overlay_stays_on_the_frame_in_any_window_zoom_and_view(open_tab: OpenTab) -> None:
     tab = open_tab(window=(1700, 620), marked=True)
     canvas, mouse = tab.canvas, tab.page.mouse
     canvas.wait_until_registered()
+    check_loupe(tab)
     tab.page.set_viewport_size({"width": 1280, "height": 800})
+    wait_in(tab.page, "Math.abs(__viserMutable.canvas.getBoundingClientRect().bottom - innerHeight) < 2")
     canvas.wait_until_registered()
     # The wheel zooms about the pointer.
     before, box = canvas.where(), box_of(tab.page.locator("canvas"))
@@ -65,6 +132,7 @@ def test_the_3d_view_shows_the_whole_arms_with_grid_axes_and_the_measured_arms(o
     tab = open_tab(window=(1280, 800), width=160, height=120)
     tab.put(intents.Perturb(6.0, 0))
     tab.press("v")
+    wait_in(tab.page, "!carts.view.endoscope")
     strip, canvas = (box_of(tab.page.locator(name)) for name in (".carts-strip", "canvas"))
 
     def seen_whole() -> bool:
@@ -104,26 +172,11 @@ def test_the_3d_view_shows_the_whole_arms_with_grid_axes_and_the_measured_arms(o
     wait_in(tab.page, "carts.imageOnScreen() !== null")
 
 
-def test_a_dragged_slider_ends_with_the_overlay_of_its_last_value_and_is_one_step(open_tab: OpenTab) -> None:
-    tab = open_tab(marked=True)
-    app, slider = tab.app, tab.slider("PSM1", 0)
-    thumb = box_of(tab.page.locator(f"{tab.element(slider)} [role=slider]"))
-    x, y = thumb["x"] + thumb["width"] / 2, thumb["y"] + thumb["height"] / 2
-    tab.drag((x, y), *((x + 12 * math.sin(step / 5), y) for step in range(30)), (x - 10, y))
-    final = eventually(
-        lambda: float(app.state.pose.scene.joint_positions[0][0]),
-        lambda at: abs(at - math.radians(slider.value)) < 1e-3,
-    )
-    tab.canvas.wait_until_registered()
-    assert math.degrees(final) < slider.max - 5.5 and app.state.undoable == 1
-    eventually(lambda: app.state.unsaved, lambda unsaved: not unsaved)
-    tab.drag((x - 10, y), (x + 5, y), (x + 8, y))
-    eventually(lambda: app.state.undoable, lambda count: count == 2)
-
-
-def test_keypoints_are_placed_and_dragged_with_shift_and_links_with_ctrl_one_step_each(open_tab: OpenTab) -> None:
+def test_sliders_keypoints_and_links_are_dragged_and_each_drag_is_one_step(open_tab: OpenTab) -> None:
     tab = open_tab(marked=True)
     app, mouse, keyboard = tab.app, tab.page.mouse, tab.page.keyboard
+    check_slider(tab)
+    tab.put(intents.Undo(), intents.Undo())
     hand = Hand(tab)
     keyboard.down("Shift")
     mouse.click(*hand.at(150.0, 110.0))
@@ -172,43 +225,6 @@ def test_keypoints_are_placed_and_dragged_with_shift_and_links_with_ctrl_one_ste
     assert tab.canvas.where() == pytest.approx(hand.map, abs=0.5)
     tab.press("Control+z")
     eventually(seen, lambda at: at == pytest.approx(before, abs=0.05))
-
-
-_COUNT = """() => {
-  const mutable = window.__viserMutable, send = mutable.sendMessage;
-  window.sent = [];
-  mutable.sendMessage = (message) => { window.sent.push(message.type); send(message); };
-}"""
-
-
-def _loupe(tab: Tab) -> dict[str, Any] | None:
-    return tab.page.evaluate("(() => { const b = document.querySelector('.carts-loupe');"
-                             " return b && !b.hidden ? { ...b.dataset } : null; })()")  # fmt: skip
-
-
-def test_the_loupe_shows_position_and_colour_of_the_pixel_under_the_pointer_and_asks_nobody(open_tab: OpenTab) -> None:
-    tab = open_tab(marked=True)
-    tab.canvas.where()
-    tab.page.evaluate(_COUNT)
-    u, v = MARKERS[1][0] * 320, MARKERS[1][1] * 240
-    tab.page.mouse.move(*tab.place(u, v))
-    # While the key is held, it is shown; pressed shortly, it stays, and follows the pointer.
-    tab.page.keyboard.press(",", delay=450)
-    eventually(lambda: _loupe(tab), lambda loupe: loupe is None)
-    tab.press(",")
-    loupe = eventually(lambda: _loupe(tab))
-    assert loupe is not None and loupe["camera"] == "left"
-    assert (float(loupe["u"]), float(loupe["v"])) == pytest.approx((u, v), abs=0.5)
-    # The frame is sent as JPEG, so a colour is off by some levels.
-    assert np.abs(np.array(loupe["rgb"].split(), float) - (255, 0, 0)).max() < 30
-    shown = decoded(tab.page.locator(".carts-loupe canvas").screenshot())[..., 2::-1]
-    assert np.abs(shown[65, 65].astype(float) - (255, 0, 0)).max() < 40
-    tab.page.mouse.move(*tab.place(160, 12))
-    loupe = eventually(lambda: _loupe(tab), lambda loupe: loupe is not None and abs(float(loupe["v"]) - 12) < 0.5)
-    assert loupe is not None and max(map(float, loupe["rgb"].split())) < 30
-    tab.page.get_by_role("button", name="Loupe").click()
-    eventually(lambda: _loupe(tab), lambda loupe: loupe is None)
-    assert "GuiUpdateMessage" not in tab.page.evaluate("window.sent")
 
 
 def test_two_cameras_lie_beside_each_other_and_a_click_chooses_one(open_tab: OpenTab) -> None:

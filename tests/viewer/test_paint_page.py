@@ -14,13 +14,14 @@ from carts_viewer.actions import intents
 from carts_viewer.app import ViewerApp
 from carts_viewer.picture.layers import IGNORED_COLOR, Layer, label_color
 from carts_viewer.picture.overlay import OverlayRenderer
-from carts_viewer.picture.strokes import Tool
+from carts_viewer.picture.strokes import Target, Tool
 from tools.raw_tab import RawTab
 
 
 def _line(*points: tuple[float, float], width: int = 20) -> np.ndarray:
     canvas = np.zeros((240, 320), np.uint8)
-    cv2.polylines(canvas, [np.rint(np.array(points) - 0.5).astype(np.int32)], False, 1, width)
+    # To 1/16 of a pixel, from pixel centres.
+    cv2.polylines(canvas, [np.rint(16 * np.array(points) - 8).astype(np.int32)], False, 1, width, cv2.LINE_8, 4)
     return canvas.astype(bool)
 
 
@@ -54,9 +55,10 @@ def test_strokes_are_exact_at_any_zoom_seen_in_every_tab_and_taken_back(open_tab
     app = tab.app
     tab.open("Paint")
     tab.button("Ignore region")
+    eventually(lambda: tab.state.brush.target, lambda target: target is Target.IGNORE)
     tab.button("Brush")
     # Another tab has its own tool in hand, and shows what was painted.
-    other = open_tab(app, (1000, 900))
+    other = open_tab(app, (900, 640))
     expect(other.page.locator("canvas.carts-paint")).to_have_css("pointer-events", "none")
     other.put(intents.SetOpacity(1.0))
     hand = Hand(tab)
@@ -121,7 +123,7 @@ def test_polygon_eraser_shift_and_classes_change_the_mask_as_exported(open_tab: 
     tab.press("Enter")
     hand.steps(1)
     polygon = np.zeros((240, 320), np.uint8)
-    cv2.fillPoly(polygon, [np.rint(np.array(corners) - 0.5).astype(np.int32)], 1)
+    cv2.fillPoly(polygon, [np.rint(16 * np.array(corners) - 8).astype(np.int32)], 1, cv2.LINE_8, 4)
     wanted = rendered | polygon.astype(bool)
     assert _same(_mask(app), wanted)
     hand.take("Shift+X", Tool.ERASER)

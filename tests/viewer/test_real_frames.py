@@ -84,7 +84,7 @@ def test_thirty_real_frames_take_at_most_two_actions_each_and_are_exported(
     shared_dir: Path, tmp_path: Path, open_tab: OpenTab
 ) -> None:
     with ViewerApp.open(SEQUENCE, project=tmp_path / "real.carts", port=0) as app:
-        app.wait_until_shown(120)
+        app.wait_until_shown()
         tab, frames = open_tab(app), len(app.sequence)
         labeller = Labeller(tab)
         labeller.optimize_all()
@@ -98,7 +98,7 @@ def test_thirty_real_frames_take_at_most_two_actions_each_and_are_exported(
         tab.choose("Format", "COCO")
         tab.choose("Frames", "Accepted")
         tab.button("Export")
-        path = eventually(lambda: app.state.export and app.state.export.path, timeout=120)
+        path = eventually(lambda: app.state.export and app.state.export.path)
         assert path is not None
         found = _read_back(path, app, accepted)
     print(

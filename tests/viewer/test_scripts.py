@@ -110,6 +110,17 @@ def test_what_is_injected_into_the_page_neither_runs_nor_loads(
     assert tab.evaluate("ran") == [] and other_site.asked == []
 
 
+def test_a_worker_of_the_page_connects_to_no_other_server(attacked: Tab, other_site: OtherSite) -> None:
+    """viser's client, which is one, would connect to any server that a link names in `?websocket=`."""
+    connect = """(address) => new Promise((done) => {
+        const source = `addEventListener("securitypolicyviolation", (event) => postMessage(event.effectiveDirective));
+            new WebSocket(${JSON.stringify(address)});`;
+        new Worker(URL.createObjectURL(new Blob([source]))).onmessage = ({ data }) => done(data);
+    })"""
+    assert attacked.evaluate(connect, other_site.address.replace("http", "ws", 1)) == "connect-src"
+    assert other_site.asked == []
+
+
 def test_a_script_of_the_server_is_no_code_in_the_page(attacked: Tab) -> None:
     tab = attacked
     tab.evaluate("() => { ran.length = 0; }")

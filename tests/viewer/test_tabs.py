@@ -1,17 +1,16 @@
 """Several tabs in headless Chromium: each has its own frame and settings in one project; addresses and tokens."""
 
 import math
-import socket
-import time
 from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
 
 import pytest
-from playwright.sync_api import Browser, Route, expect
-from viewer_tab import OpenTab, Tab, box_of, new_context, place_of
+from playwright.sync_api import Browser, expect
+from viewer_tab import OpenTab, Tab, box_of, new_context, place_of, widget
 from waiting import eventually, wait_in
 
+from carts_viewer import editing
 from carts_viewer.actions import intents
 from carts_viewer.app import ViewerApp
 from tools.raw_tab import RawTab
@@ -45,7 +44,7 @@ def joint_of(tab: Tab) -> float:
 
 
 def test_tabs_have_frames_of_their_own_and_one_project_also_after_a_reload_and_a_close_in_mid_drag(
-    open_tab: OpenTab,
+    open_tab: OpenTab, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     first = open_tab(window=WINDOW, marked=True)
     app = first.app
@@ -65,6 +64,7 @@ def test_tabs_have_frames_of_their_own_and_one_project_also_after_a_reload_and_a
     assert first.state.index == 1 and "frame=2" in first.page.url
     shows_its_own(first)
     # One is closed in the middle of a drag, whose edit is saved when its time is over.
+    monkeypatch.setattr(editing, "LONGEST_DRAFT", 1e6)
     place, start = first.place_in_viewer, joint_of(first)
     thumb = box_of(first.page.locator(f"{first.element(first.slider('PSM1', 0))} [role=slider]"))
     x, y = thumb["x"] + thumb["width"] / 2, thumb["y"] + thumb["height"] / 2
@@ -73,6 +73,7 @@ def test_tabs_have_frames_of_their_own_and_one_project_also_after_a_reload_and_a
     first.page.mouse.move(x + 15, y, steps=15)
     eventually(lambda: abs(joint_of(first) - start), lambda moved: moved > 1.0)
     assert place.controller.state.unsaved
+    monkeypatch.setattr(editing, "LONGEST_DRAFT", 0.1)
     first.page.close()
     eventually(lambda: place.controller.state.unsaved, lambda unsaved: not unsaved)
     eventually(lambda: second.state.undoable, lambda steps: steps == 2)
@@ -82,7 +83,7 @@ def test_tabs_have_frames_of_their_own_and_one_project_also_after_a_reload_and_a
 def test_undo_and_redo_can_be_pressed_as_soon_as_the_other_tab_has_left(shared_viewer: ViewerApp) -> None:
     app = shared_viewer
     with RawTab(app.url) as raw:
-        undo, redo = (place_of(app, raw).view.page.find(name) for name in ("Undo", "Redo"))  # type: ignore[union-attr]
+        undo, redo = (widget(app, raw, name) for name in ("Undo", "Redo"))
         with RawTab(app.url) as other:
             place_of(app, other).put(intents.Nudge(1.0))
             app.wait_until_shown()
@@ -126,43 +127,3 @@ def test_the_token_of_the_address_is_used_up_by_the_page_and_reloading_works(
             eventually(lambda: app.state.index, lambda index: index == 1)
             answer = stranger.new_page().goto(plain)
             assert answer is not None and answer.status == 403
-
-
-def _call_of_a_link(app: ViewerApp, browser: Browser, timeout: float, *, policy: bool = True) -> float | None:
-    """Follow a link that names another server, and wait until the page calls it.
-
-    Args:
-        app: Whose page it is.
-        browser: Which follows the link.
-        timeout: How long to wait when the page is there [s].
-        policy: Whether the page comes with the header that restricts which servers it may call.
-
-    Returns:
-        The time from the click to the call [s]; None when there is none.
-    """
-    with closing(new_context(browser)) as context, closing(socket.create_server(("127.0.0.1", 0))) as listener:
-        listener.settimeout(timeout)
-        link = f"{app.url}/?websocket=ws://127.0.0.1:{listener.getsockname()[1]}"
-        page = context.new_page()
-        if not policy:
-            page.route(link, _without_policy)
-        clicked = time.monotonic()
-        page.goto(link)
-        try:
-            listener.accept()[0].close()
-        except TimeoutError:
-            return None
-        return time.monotonic() - clicked
-
-
-def _without_policy(route: Route) -> None:
-    answer = route.fetch()
-    headers = {name: value for name, value in answer.headers.items() if name != "content-security-policy"}
-    assert len(headers) < len(answer.headers)
-    route.fulfill(response=answer, headers=headers)
-
-
-def test_a_link_cannot_make_the_page_obey_another_server(shared_viewer: ViewerApp, browser: Browser) -> None:
-    delay = _call_of_a_link(shared_viewer, browser, 60.0, policy=False)
-    assert delay is not None, "the link does nothing anyway, so this shows nothing"
-    assert _call_of_a_link(shared_viewer, browser, 3.0 + 2.0 * delay) is None

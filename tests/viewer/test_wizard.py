@@ -13,7 +13,7 @@ from clicked_points import clicked
 from scipy.spatial.transform import Rotation
 from swaying import write_log, write_swaying
 from visitor import write_lab_files
-from waiting import eventually
+from waiting import PATIENCE, eventually
 
 from carts_core.imaging.working_image import Window
 from carts_core.model.camera import HALF_PIXEL
@@ -126,7 +126,7 @@ def test_a_delay_between_video_and_log_is_proposed_taken_and_undone(tmp_path: Pa
 
         def chosen(name: str) -> float | None:
             site.post(lambda: place.choose(name, ""))
-            site.wait(120)
+            site.wait()
             return place.draft.options.time_offset
 
         assert chosen("estimate-delay") is None and "Proposed." in site.document.content
@@ -137,9 +137,6 @@ def test_a_delay_between_video_and_log_is_proposed_taken_and_undone(tmp_path: Pa
 
 
 # ---- Calibrations; this part stands for any step of the optimizer ---------------------------------------------------
-
-
-CALIBRATE, STOP = ("calibrate", ""), ("cancel", "")
 
 
 CALIBRATE, STOP = ("calibrate", ""), ("cancel", "")
@@ -215,7 +212,7 @@ def place_of(site: Site) -> RecordingWizard:
     return site.shown
 
 
-def ended(site: Site, text: str, timeout: float = 30.0) -> Draft:
+def ended(site: Site, text: str, timeout: float = PATIENCE) -> Draft:
     """The draft once this is to be read."""
     eventually(lambda: site.document.content, lambda content: text in content, timeout)
     return place_of(site).draft
@@ -228,7 +225,7 @@ def test_a_calibration_that_had_ended_before_it_was_stopped_is_not_taken_either(
 
     def stop_when_it_has_ended() -> None:
         place.choose(*CALIBRATE)
-        jobs[-1].join(60)
+        jobs[-1].join(PATIENCE)
         place.choose(*STOP)
 
     site.post(stop_when_it_has_ended)

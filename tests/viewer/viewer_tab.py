@@ -7,8 +7,8 @@ from typing import Any
 
 import cv2
 import numpy as np
-from playwright.sync_api import Browser, BrowserContext, FloatRect, Locator, Page
-from waiting import eventually, wait_in
+from playwright.sync_api import Browser, BrowserContext, FloatRect, Locator, Page, expect
+from waiting import PATIENCE, eventually, wait_in
 
 from carts_viewer.actions import intents
 from carts_viewer.app import ViewerApp
@@ -24,8 +24,11 @@ MARKERS = ((0.30, 0.30), (0.70, 0.30), (0.30, 0.70), (0.70, 0.70))
 """Centres of the red discs in a marked frame, as shares of its width and height."""
 RADIUS = 0.03
 """Radius of a disc, as a share of the width."""
-READY = "window.carts && window.__viserMutable?.nodeRefFromName['/overlay']"
-"""True in a page that shows its first picture."""
+READY = (
+    "window.carts && window.__viserMutable?.nodeRefFromName['/overlay'] && "
+    "document.documentElement.style.getPropertyValue('--carts-strip')"
+)
+"""True in a page that shows its first picture, above a timeline that has its full height."""
 
 
 _SLOW_DISPLAY = """(() => {
@@ -43,7 +46,7 @@ def new_context(browser: Browser, window: tuple[int, int] = (1100, 720), **optio
         options: of Playwright's context.
     """
     context = browser.new_context(viewport={"width": window[0], "height": window[1]}, **options)
-    context.set_default_timeout(90_000)
+    context.set_default_timeout(1000 * PATIENCE)
     context.add_init_script(_SLOW_DISPLAY)
     return context
 
@@ -96,7 +99,16 @@ def widget(app: ViewerApp, raw: RawTab, label: str) -> Any:
 
 def dismiss_warning(page: Page) -> None:
     """Close viser's warning that this browser has no graphics card, without waiting for its animation."""
-    page.locator(".mantine-Notification-closeButton").first.dispatch_event("click", timeout=30_000)
+    page.locator(".mantine-Notification-closeButton").first.dispatch_event("click")
+
+
+def press(locator: Locator) -> None:
+    """Click an element once it is at rest, also where it moves before the button of a mouse would be let go.
+
+    The trial takes longer than the 50 ms within which viser sends only the newest press of a panel.
+    """
+    locator.click(trial=True)
+    locator.evaluate("one => one.dispatchEvent(new MouseEvent('click', {bubbles: true, cancelable: true, detail: 1}))")
 
 
 def box_of(locator: Locator) -> FloatRect:
@@ -144,7 +156,7 @@ class Tab:
         place = self.place_in_viewer
         for intent in asked:
             place.put(intent)
-        self.app.wait_until_shown(120)
+        self.app.wait_until_shown()
 
     def find(self, label: str) -> Any:
         """The widget with this label."""
@@ -166,23 +178,23 @@ class Tab:
         """Choose tabs of the panels, or open folders in them."""
         for name in names:
             tab = self.page.get_by_role("tab", name=name, exact=True)
-            (tab if tab.count() else self.page.get_by_text(name, exact=True).first).click()
+            if not tab.count():
+                press(self.page.get_by_text(name, exact=True).first)
+            elif tab.get_attribute("aria-selected") != "true":
+                tab.click()
+                expect(tab).to_have_attribute("aria-selected", "true")
 
     def button(self, name: str) -> None:
-        """Press a button, once its panel does not move any more.
-
-        The trial also takes longer than the 50 ms within which viser sends only the newest press of a panel.
-        """
-        button = self.page.get_by_role("button", name=name, exact=True)
-        button.click(trial=True)
-        button.click()
+        """Press a button."""
+        press(self.page.get_by_role("button", name=name, exact=True))
 
     def choose(self, label: str, option: str) -> None:
         """Choose from a list."""
         field = self.page.locator(self.element(self.find(label)))
-        field.click(trial=True)
-        field.click()
-        self.page.get_by_role("option", name=option, exact=True).click()
+        field.focus()
+        press(field)
+        press(self.page.get_by_role("option", name=option, exact=True))
+        expect(field).to_have_value(option)
 
     def type_value(self, handle: object, value: float, leave: str = "Tab") -> None:
         """Type into the number field beside a slider, and leave it with a key."""
@@ -266,10 +278,22 @@ class Canvas:
         return max(_outline_distance(shown, wanted), _outline_distance(wanted, shown))
 
     def where(self, good: Callable[[np.ndarray], bool] = lambda map_: True) -> np.ndarray:
-        """Wait until the frame is seen, at a good place, and give the map from image to canvas coordinates."""
-        map_ = eventually(
-            lambda: self.screen_from_image(self.screenshot()), lambda map_: map_ is not None and good(map_)
-        )
+        """The map from image to canvas coordinates by the page's script, once the frame is seen there, at a good place.
+
+        What is seen of the red discs alone is no measure of a pixel: the overlay may hide a part of them.
+        """
+
+        def at_rest() -> np.ndarray | None:
+            seen, place = self.screen_from_image(self.screenshot()), self._page.evaluate("carts.imageOnScreen()")
+            if seen is None or place is None:
+                return None
+            camera = self._tab.app.scene.camera(self._tab.state.camera)
+            across, down = place["width"] / camera.width, place["height"] / camera.height
+            map_ = np.array([[across, 0.0, place["left"]], [0.0, down, place["top"]]])
+            corners = [[0.0, camera.width], [0.0, camera.height], [1.0, 1.0]]
+            return map_ if np.abs((map_ - seen) @ corners).max() < 1.5 else None
+
+        map_ = eventually(at_rest, lambda map_: map_ is not None and good(map_))
         assert map_ is not None
         return map_
 

@@ -8,16 +8,18 @@ from typing import TypeVar
 from playwright.sync_api import Error, Page
 
 T = TypeVar("T")
+PATIENCE = 120.0
+"""Longest wait for a condition, on a busy machine [s]."""
 
 
 def get(url: str, path: str = "/", **headers: str) -> http.client.HTTPResponse:
     """The answer to a request, from the server that an address names."""
-    connection = http.client.HTTPConnection(url.removeprefix("http://").partition("/")[0], timeout=20)
+    connection = http.client.HTTPConnection(url.removeprefix("http://").partition("/")[0], timeout=PATIENCE)
     connection.request("GET", path, headers=headers)
     return connection.getresponse()
 
 
-def eventually(read: Callable[[], T], good: Callable[[T], object] = bool, timeout: float = 30.0) -> T:
+def eventually(read: Callable[[], T], good: Callable[[T], object] = bool, timeout: float = PATIENCE) -> T:
     """Read until the value is good; an error with the last value after `timeout` [s]."""
     end = time.monotonic() + timeout
     while not good(value := read()):
@@ -26,7 +28,7 @@ def eventually(read: Callable[[], T], good: Callable[[T], object] = bool, timeou
     return value
 
 
-def wait_in(page: Page, expression: str, timeout: float = 60.0) -> None:
+def wait_in(page: Page, expression: str, timeout: float = PATIENCE) -> None:
     """Return once an expression holds in a tab.
 
     Playwright's own `wait_for_function` evaluates a text in the page, which the page's policy forbids.
