@@ -8,12 +8,14 @@ import signal
 import subprocess
 import sys
 import threading
-import time
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from processes import command as of_process
+from processes import descendants, eventually
 
+from carts_core.batch.engines import Pool
 from carts_core.batch.folder import JOB_FILE, present_status
 from carts_core.batch.manifest import read_manifest
 from carts_core.batch.report import write_batch_report
@@ -63,7 +65,7 @@ def run(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
 
 
 def test_a_batch_writes_what_the_plain_commands_write_and_does_nothing_twice(
-    sequence: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    sequence: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     batch = tmp_path / "batch"
     command = ["batch", str(manifest(sequence)), "--output", str(batch), "--workers", "1"]
@@ -84,6 +86,7 @@ def test_a_batch_writes_what_the_plain_commands_write_and_does_nothing_twice(
         assert verdict["verdict"] in ("good", "doubtful", "failed") and (job / verdict["picture"]).stat().st_size
     before = {path: path.stat().st_mtime_ns for path in batch.rglob("*.png") if "report" not in path.parts}
     capsys.readouterr()
+    monkeypatch.setattr(Pool, "run", lambda pool, jobs: map(pool._work, jobs))
     main(command)
     assert "2 already there" in capsys.readouterr().out
     assert before and {path: path.stat().st_mtime_ns for path in before} == before
@@ -179,20 +182,6 @@ def test_a_wrong_manifest_is_reported_and_nothing_is_made(
     assert "matches nothing" in capsys.readouterr().err and not (tmp_path / "batch").exists()
 
 
-def _children(process: int) -> list[int]:
-    """Processes that a process has started, and those that these have."""
-    found = []
-    for path in Path("/proc").glob("[0-9]*/stat"):
-        try:
-            parent = int(path.read_text().rpartition(")")[2].split()[1])
-        except OSError:
-            continue
-        if parent == process:
-            child = int(path.parent.name)
-            found += [child, *_children(child)]
-    return found
-
-
 def _killed_now_and_then(command: list[str | Path], every: float, seed: int) -> int:
     """Run a batch while one of its workers is killed so often [s], and at least one job is done between two of these;
     how many were killed."""
@@ -209,7 +198,7 @@ def _killed_now_and_then(command: list[str | Path], every: float, seed: int) -> 
         done = 0
         while not ended.wait(every):
             now = len(list(jobs.glob("*/findings.json")))
-            workers = [child for child in _children(process.pid) if b"spawn_main" in _command_of(child)]
+            workers = [child for child in sorted(descendants(process.pid)) if "spawn_main" in of_process(child)]
             if workers and now > done:
                 chosen, done = chance.choice(workers), now
                 killed.append(chosen)
@@ -225,13 +214,6 @@ def _killed_now_and_then(command: list[str | Path], every: float, seed: int) -> 
         process.kill()
     assert process.returncode == 0, errors.decode()
     return len(killed)
-
-
-def _command_of(process: int) -> bytes:
-    try:
-        return Path(f"/proc/{process}/cmdline").read_bytes()
-    except OSError:
-        return b""
 
 
 @pytest.mark.slow
@@ -262,9 +244,7 @@ def test_a_stopped_batch_goes_on_and_comes_to_the_same_end(sequence: Path, tmp_p
     assert run(path, "--output", tmp_path / "whole", "--workers", "1").returncode == 0
     command = [sys.executable, "-m", "carts_core.cli", "batch", str(path), "--output", str(tmp_path / "stopped")]
     process = subprocess.Popen(command, env=ENVIRONMENT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    deadline = time.monotonic() + 120
-    while not list(tmp_path.glob("stopped/jobs/*/findings.json")) and time.monotonic() < deadline:
-        time.sleep(0.02)
+    eventually(lambda: bool(list(tmp_path.glob("stopped/jobs/*/findings.json"))))
     process.send_signal(signal.SIGTERM)
     _, errors = process.communicate(timeout=120)
     assert process.returncode in (0, 128 + signal.SIGTERM)

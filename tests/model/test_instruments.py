@@ -1,6 +1,7 @@
 """The built-in instruments: their files, their kinematics, their parts, and their likeness to real meshes."""
 
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ from carts_core.cli.command_line import main
 from carts_core.decoders.meshes import MOST_FACES
 from carts_core.errors import RobotError, SequenceError
 from carts_core.model.dvrk_model import dvrk_urdf
-from carts_core.model.instruments import INSTRUMENTS, builtin_urdf
+from carts_core.model.instruments import INSTRUMENTS, Instrument, builtin_urdf
 from carts_core.model.instruments.builtin import instrument_of
 from carts_core.model.keypoints import keypoints
 from carts_core.model.parts import PARTS, link_parts
@@ -37,9 +38,14 @@ def _own_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     builtin_urdf.cache_clear()
 
 
+@cache
+def loaded(name: str) -> Robot:
+    return Robot.load(f"builtin:{name}")
+
+
 @pytest.mark.parametrize("name", [*CLASSIC, "large_needle_driver_si", "mega_needle_driver_si", "cautery_hook_si"])
 def test_an_instrument_has_the_joints_and_the_kinematics_of_its_arm(name: str) -> None:
-    robot = Robot.load(f"builtin:{name}")
+    robot = loaded(name)
     instrument, geometry = instrument_of(name)
     assert robot.joint_names == JOINTS[: 7 if instrument.has_jaws else 6]
     low, high = robot.joint_limits.numpy().T
@@ -52,8 +58,10 @@ def test_an_instrument_has_the_joints_and_the_kinematics_of_its_arm(name: str) -
 
 
 @pytest.mark.parametrize("instrument", INSTRUMENTS, ids=lambda instrument: instrument.name)
-def test_meshes_are_closed_few_and_as_long_as_is_said(instrument) -> None:
-    robot = Robot.load(f"builtin:{instrument.name}")
+def test_meshes_are_closed_few_and_as_long_as_is_said_and_links_have_parts_and_keypoints(
+    instrument: Instrument,
+) -> None:
+    robot = loaded(instrument.name)
     assert all(mesh.closed for mesh in robot.meshes)
     assert 3_000 < sum(len(mesh.faces) for mesh in robot.meshes) < 12_000
     joints = torch.zeros(len(robot.joint_names), dtype=torch.float64)
@@ -62,11 +70,6 @@ def test_meshes_are_closed_few_and_as_long_as_is_said(instrument) -> None:
     end = max((mesh.vertices @ T_hinge_links[mesh.link, 1, :3] + T_hinge_links[mesh.link, 1, 3]).max()
               for mesh in robot.meshes)  # fmt: skip
     assert end == pytest.approx(instrument.length * 1e-3, abs=6e-4)
-
-
-@pytest.mark.parametrize("instrument", INSTRUMENTS, ids=lambda instrument: instrument.name)
-def test_links_are_shaft_wrist_and_jaws_and_have_keypoints(instrument) -> None:
-    robot = Robot.load(f"builtin:{instrument.name}")
     parts = {name: PARTS[part] for name, part in zip(robot.link_names, link_parts(robot), strict=True)}
     assert parts["roll_link"] == "shaft"
     assert parts["wrist_pitch_link"] == "wrist"
@@ -77,7 +80,7 @@ def test_links_are_shaft_wrist_and_jaws_and_have_keypoints(instrument) -> None:
 
 def test_jaws_open_to_their_own_side_and_do_not_reach_into_each_other_when_closed() -> None:
     for name in ("debakey_forceps", "maryland_bipolar_forceps", "prograsp_forceps", "clip_applier"):
-        robot = Robot.load(f"builtin:{name}")
+        robot = loaded(name)
         first, second = (
             np.concatenate([mesh.vertices for mesh in robot.meshes if robot.link_names[mesh.link] == link])
             for link in ("jaw_1_link", "jaw_2_link")
@@ -131,7 +134,7 @@ def test_the_command_lists_every_instrument(capsys: pytest.CaptureFixture[str]) 
 
 
 def test_a_portrait_shows_the_tip_whole_before_its_backdrop() -> None:
-    image = portrait(Robot.load("builtin:clip_applier"), 160, 120)
+    image = portrait(loaded("clip_applier"), 160, 120)
     backdrop = image == image[0, -1]
     assert 0.03 < (~backdrop.all(-1)).mean() < 0.5
     assert backdrop[:, -8:].all()
@@ -158,7 +161,7 @@ def test_silhouettes_are_like_those_of_the_real_meshes(name: str, number: str, t
     urdf = tmp_path / "real.urdf"
     urdf.write_text(dvrk_urdf(DVRK_MODEL, number, tmp_path))
     # Decimating a real one would take a minute.
-    ours, real = Robot.load(f"builtin:{name}"), Robot.load(urdf, max_faces=MOST_FACES)
+    ours, real = loaded(name), Robot.load(urdf, max_faces=MOST_FACES)
     rng = np.random.default_rng(1)
     overlaps = []
     for _ in range(8):

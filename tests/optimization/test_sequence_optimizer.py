@@ -21,6 +21,7 @@ from carts_core.optimization import (
 from carts_core.optimization.error_model import Gaussian
 from carts_core.optimization.measurement import FrameSolver, Measurement
 from carts_core.optimization.sequence import initial_correction
+from carts_core.optimization.sequence_estimate import FrameEstimate
 from carts_core.optimization.variables import Variables
 from carts_core.recording import Frame
 from carts_core.rendering import Renderer
@@ -55,9 +56,17 @@ def wrist_hidden(truths: Truths, hidden: set[int]) -> Callable[[int], dict[str, 
     return ignore
 
 
-def test_a_constant_error_is_recovered_in_every_frame(truths: Truths) -> None:
-    sequence = optimizer(truths, model=ALONE)
-    steps = list(sequence)
+@pytest.fixture(scope="module")
+def forward(made_truths: Truths) -> tuple[SequenceOptimizer, list[FrameEstimate]]:
+    """A finished optimization of the frames in their order, and its steps."""
+    sequence = optimizer(made_truths.fresh(), model=ALONE)
+    return sequence, list(sequence)
+
+
+def test_a_constant_error_is_recovered_in_every_frame(
+    truths: Truths, forward: tuple[SequenceOptimizer, list[FrameEstimate]]
+) -> None:
+    sequence, steps = forward
     assert [step.index for step in steps[:FRAMES]] == list(range(FRAMES))
     assert [step.start for step in steps[:FRAMES]] == ["cold"] + ["warm"] * (FRAMES - 1)
     assert sequence.stop_reason == "finished" and sequence.progress == (FRAMES, FRAMES)
@@ -211,15 +220,15 @@ def test_a_keyframe_counts_for_the_start_wherever_it_is(truths: Truths) -> None:
     assert np.array_equal(sequence.estimates[3].joint_positions[ARM], given[ARM])
 
 
-def test_backward_begins_at_the_last_frame_and_ends_alike(truths: Truths) -> None:
-    model = replace(ALONE, direction="backward")
-    backward, forward = optimizer(truths, model=model), optimizer(truths, model=ALONE)
+def test_backward_begins_at_the_last_frame_and_ends_alike(
+    truths: Truths, forward: tuple[SequenceOptimizer, list[FrameEstimate]]
+) -> None:
+    backward = optimizer(truths, model=replace(ALONE, direction="backward"))
     steps = list(backward)
-    list(forward)
     assert [step.index for step in steps[:FRAMES]] == list(reversed(range(FRAMES)))
     assert steps[0].start == "cold" and steps[1].start == "warm"
     for index in range(FRAMES):
-        there, back = (s.estimates[index].joint_positions[ARM] for s in (forward, backward))
+        there, back = (s.estimates[index].joint_positions[ARM] for s in (forward[0], backward))
         assert np.abs(there - back)[:2].max() < np.deg2rad(0.1)
 
 
