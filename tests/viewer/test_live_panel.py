@@ -53,9 +53,13 @@ def test_a_replay_is_followed_recorded_and_cannot_be_edited(app: ViewerApp, open
     # The next frame may take the scores away between two looks at them.
     scores = eventually(lambda: tab.state.scores)
     assert scores is not None and scores.dice is not None and scores.dice > 0.9
+    # However slow the machine is, more than two frames are recorded.
+    seen: set[str] = set()
+    eventually(lambda: seen.add(tab.state.frame.frame_id) or len(seen), lambda frames: frames > 3)
     tab.button("Stop")
-    expect(tab.page.get_by_text("Recorded: carts view")).to_be_visible(timeout=30_000)
-    assert not tab.state.streaming and tab.state.frame.frame_id == app.tabs.first.controller.state.frame.frame_id
+    expect(tab.page.get_by_text("Recorded: carts view")).to_be_visible()
+    assert not tab.state.streaming
+    assert tab.state.frame.frame_id == app.tabs.first.controller.state.frame.frame_id
     (recorded,) = app.project.path.parent.glob("*_live_*/sequence.toml")
     assert len(Sequence.open(recorded)) > 2
 
@@ -78,7 +82,8 @@ def test_another_program_sends_frames_and_gets_results(app: ViewerApp) -> None:
         eventually(lambda: app.state.frame.frame_id.startswith("sent"), timeout=SECONDS)
         live = eventually(lambda: app.state.live, lambda live: live is not None and not live.busy, SECONDS)
         assert live is not None and app.state.frame.frame_id.startswith("sent") and app.state.verdict is None
-        assert len(connection.recv(4)) == 4  # the result of a frame, for who sent it
+        connection.settimeout(SECONDS)
+        assert connection.recv(1)  # the result of a frame, for who sent it
     app.queue.put(intents.StopLive())
     eventually(lambda: app.state.streaming, lambda on: not on)
     assert app.state.frame.frame_id == sequence.frame_ids[0]

@@ -101,18 +101,18 @@ def test_a_sequence_is_opened_left_and_remembered_with_its_picture(
         assert isinstance(site.shown, StartPage) and recent_projects() == []
         path = tiny_sequence(frames=3)
         site.post(lambda: site.open_sequence(path))
-        site.wait(120)
+        site.wait()
         assert site.app is not None and site.shown is None
         assert [project.sequence for project in recent_projects()] == [str(path)]
         site.post(site.show_start)
-        site.wait(120)
+        site.wait()
         assert site.app is None and isinstance(site.shown, StartPage)
         project = recent_projects()[0]
         assert (project.name, project.frames, project.reviewed, project.corrected) == ("tiny", 3, 0, 0)
         assert (thumbnail(project) or b"")[:2] == b"\xff\xd8"
         # The same server opens it again, and the project is not held any more.
         site.post(lambda: site.open_sequence(path))
-        site.wait(120)
+        site.wait()
         assert site.app is not None and site.app.notice is None
     assert site.incident is None
     path.unlink()
@@ -124,13 +124,13 @@ def test_a_card_has_the_numbers_of_its_project_whatever_program_changed_it(
 ) -> None:
     def card() -> str:
         site.post(site.show_start)
-        site.wait(120)
+        site.wait()
         return site.document.content
 
     path, other = tiny_sequence(frames=3), tmp_path / "labs" / "other.carts"
     with site:
         site.post(lambda: site.open_sequence(path, project=other))
-        site.wait(120)
+        site.wait()
         assert site.app is not None
         # A note that is still under the hand is saved when the sequence is left.
         site.app.queue.put(intents.SetReview(ReviewState.ACCEPTED))
@@ -148,10 +148,10 @@ def test_a_card_has_the_numbers_of_its_project_whatever_program_changed_it(
         place = site.shown
         assert place is not None
         site.post(lambda: place.choose("recent", str(path)))
-        site.wait(120)
+        site.wait()
         assert site.app is not None and site.app.project.path == other
         site.post(site.show_start)
-        site.wait(120)
+        site.wait()
         other.write_bytes(b"not a project")
         assert "Progress unknown" in card()
         other.unlink()
@@ -162,7 +162,7 @@ def test_a_sequence_that_cannot_be_opened_leads_back_with_the_reason(site: Site,
     (tmp_path / "labs" / "bad.toml").write_text("format = 3")
     with site:
         site.post(lambda: site.open_sequence(tmp_path / "labs" / "bad.toml"))
-        site.wait(120)
+        site.wait()
         assert isinstance(site.shown, StartPage) and site.app is None
         assert "bad.toml" in site.document.content and 'role="alert"' in site.document.content
 
@@ -292,19 +292,17 @@ def test_failures_of_a_batch_come_first_and_a_frame_opens_with_what_was_found(ba
             expect(rows).to_have_count(2)
             expect(rows.first).to_contain_text("domain 'foggy' is not in")
             expect(page.locator(".card img").first).to_be_visible()
-            dark, light = "rgb(20, 24, 27)", "rgb(248, 250, 252)"
-            for colour in (dark, light, dark):
-                assert page.locator("main").evaluate("one => getComputedStyle(one).backgroundColor") == colour
-                assert hardly_legible(page, 4.5) == []
-                page.get_by_role("button", name="Light or dark").click()
-            page.get_by_role("button", name="Light or dark").click()
             # No text is shortened, and none is a column of single letters.
             cut = "one => one.scrollWidth > one.clientWidth + 1"
             assert not any(text.evaluate(cut) for text in page.locator(".card b, .card small, .jobs td").all())
             box = page.locator(".jobs td").first.bounding_box()
             assert box is not None and box["width"] > 150 and box["height"] < 150
+        for colour in ("rgb(20, 24, 27)", "rgb(248, 250, 252)"):
+            expect(page.locator("main")).to_have_css("background-color", colour)
+            assert hardly_legible(page, 4.5) == []
+            page.get_by_role("button", name="Light or dark").click()
         page.locator(".card", has_text="frame 002").get_by_role("button", name="Open").click()
-        app = eventually(lambda: site.app, timeout=60)
+        app = eventually(lambda: site.app)
         assert app is not None
         eventually(lambda: app.state.index, lambda index: index == 1, 60)
         assert app.state.verdict is not None and app.state.pose.source.value == "optimizer"
@@ -370,7 +368,7 @@ def test_another_recording_in_the_same_tab_is_not_taken_for_a_wrong_link(
         page.goto(site.url)  # and at once, before it is connected:
         for path, name in ((first, "tiny"), (second, "other")):
             site.post(lambda path=path: site.open_sequence(path))
-            expect(page.get_by_text(f"in {path.stem}.carts")).to_be_visible(timeout=60_000)
+            expect(page.get_by_text(f"in {path.stem}.carts")).to_be_visible()
             wait_in(page, f"location.href.includes('project={name}')")
         assert page.evaluate("localStorage.getItem('noted')") is None
         page.close()

@@ -199,9 +199,7 @@ class Tab:
     def type_value(self, handle: object, value: float, leave: str = "Tab") -> None:
         """Type into the number field beside a slider, and leave it with a key."""
         field = self.field(handle)
-        field.click()
-        field.press("Control+a")
-        field.press_sequentially(f"{value:g}", delay=60)
+        field.fill(f"{value:g}")
         field.press(leave)
 
     def place(self, u: float, v: float, camera: int = 0) -> tuple[float, float]:
