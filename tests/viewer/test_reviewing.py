@@ -174,7 +174,7 @@ def test_all_found_frames_are_reviewed_in_one_step_and_notes_stay(known: Desk) -
     assert known.saved.review(2).state is ReviewState.ACCEPTED
     with pytest.raises(CartsError, match="No frame meets the conditions"):
         known.do(intents.SetFilter("note", "xyz"), intents.ShowFound())
-    with pytest.raises(CartsError, match="cannot be looked for by 'colour'"):
+    with pytest.raises(CartsError, match="cannot be filtered by 'colour'"):
         known.do(intents.SetFilter("colour", "red"))
 
 

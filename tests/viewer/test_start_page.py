@@ -83,7 +83,7 @@ def test_nothing_outside_of_the_roots_can_be_reached(roots: Roots, path: str) ->
 
 
 def test_a_root_that_is_not_there_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(SettingsError, match=r"--root .*nothing is no folder"):
+    with pytest.raises(SettingsError, match=r"--root .*nothing is not a folder"):
         Roots([tmp_path / "nothing"])
 
 
