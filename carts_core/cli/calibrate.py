@@ -219,12 +219,7 @@ class Calibrate:
                 backgrounds=backgrounds,
                 known_base_frames=prior and prior.base_covariances,
             )
-            with Bar(console=console, transient=True) as bar:
-                task = bar.add_task("calibrating", total=None)
-                for iterate in optimizer:
-                    stage = f"stage {iterate.stage + 1} of {iterate.stages}, loss {iterate.loss:.4f}"
-                    bar.update(task, description=stage, total=iterate.stages, completed=iterate.stage)
-            result = optimizer.result()
+            result = _optimized(optimizer, console)
             text = beyond_prior(sequence.scene, result, prior.base_covariances) if prior else None
             if text is not None and not self.beyond_hand_eye:
                 raise SettingsError(
@@ -271,3 +266,12 @@ def frame_indices(frames: str | None, positions: str | None, sequence: "Sequence
     from ..recording import spread
 
     return spread(len(sequence), int(count))
+
+
+def _optimized(optimizer: "CalibrationOptimizer", console: Console) -> "CalibrationResult":
+    with Bar(console=console, transient=True) as bar:
+        task = bar.add_task("calibrating", total=None)
+        for iterate in optimizer:
+            text = f"stage {iterate.stage + 1} of {iterate.stages}, loss {iterate.loss:.4f}"
+            bar.update(task, description=text, total=iterate.stages, completed=iterate.stage)
+    return optimizer.result()

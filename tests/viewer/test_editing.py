@@ -348,7 +348,8 @@ def test_a_corrected_calibration_holds_in_every_frame(session: Session) -> None:
     assert {key.name for key in edits if key.kind in (Kind.EXTRINSICS, Kind.INTRINSICS)} == {"right", "left"}
     session.editor.project.apply("Calibrate", edits)
     other = _pose(session, 0).scene
-    assert torch.equal(other.T_camera_world, extrinsics) and torch.equal(other.T_world_base, bases)
+    torch.testing.assert_close(other.T_camera_world, extrinsics, rtol=0.0, atol=1e-7)
+    torch.testing.assert_close(other.T_world_base, bases, rtol=0.0, atol=1e-7)
     assert torch.equal(other.intrinsics, intrinsics)
 
 
