@@ -18,6 +18,7 @@ from .options import CalibrationOptions, Observing, Selection, SequencePath, out
 if TYPE_CHECKING:
     from collections.abc import Sequence as Points
 
+    from ..optimization import CalibrationOptimizer, CalibrationResult
     from ..optimization.hand_eye import HandEyeResult, ImagePoint
     from ..recording import Sequence
 
