@@ -1,12 +1,10 @@
-"""A small network and small training images, for tests that need one."""
+"""A small network, for tests that need one."""
 
 from pathlib import Path
 
 import pytest
 import torch
 
-from carts_core.lab.randomization import ImageSettings, PairGenerator, TrainingPair
-from carts_core.model.robot import Robot
 from carts_core.networks.network import FeatureNetwork
 from carts_core.networks.weights import save_weights
 from carts_core.settings import Architecture
@@ -33,10 +31,3 @@ def small_weights(small_network: FeatureNetwork, tmp_path: Path) -> Path:
     path = tmp_path / "small.safetensors"
     save_weights(small_network, path, {"step": 3}, (320, 240))
     return path
-
-
-@pytest.fixture(scope="session")
-def pairs(shipped_psm: Robot) -> list[TrainingPair]:
-    """Some training pairs of the shipped robot."""
-    generator = PairGenerator([shipped_psm], ImageSettings(), seed=5)
-    return [generator() for _ in range(24)]

@@ -12,11 +12,12 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
+from carts_core.console import Bar
 from carts_core.files import append_line, output_path, output_stream
 from carts_core.lab.baselines.networks import read_baseline
 from carts_core.lab.benchmark import TEST_SEED, Run
 from carts_core.lab.benchmark.counterfactual import Counterfactual
-from carts_core.lab.benchmark.runner import SourceBench
+from carts_core.lab.benchmark.frame import SourceBench
 from carts_core.lab.benchmark.scope import FULL, METHODS
 from carts_core.lab.benchmark.sources import Source
 from carts_core.networks.extractor import FeatureExtractor
@@ -52,23 +53,16 @@ def run(results: Path, path: Path, baselines: list[Path]) -> None:
         for domain, strengths in SEVERITIES.items():
             altered = Counterfactual(sequence, camera.name, nothing, TEST_SEED, strengths[level])
             source = Source("real", "", camera.name, frames, "", lambda progress, found=altered: found)
-            bench = SourceBench(source, None, networks)  # pyright: ignore[reportArgumentType]
-            bench.opened = altered, _renderer(sequence, camera.name)
+            bench = SourceBench(source, Bar(disable=True), FULL, extractor, networks)
             for frame in frames:
                 for method in (*METHODS_DRAWN, *networks):
                     if (domain, level, frame, method) in done:
                         continue
                     began = time.process_time()
-                    (found,) = bench.measure([Run("real", domain, frame, method)], FULL, extractor)
+                    (found,) = bench.measure([Run("real", domain, frame, method)])
                     entry = {"of": (domain, level, frame, method), "strength": asdict(strengths[level])}
                     entry |= {"dice": found.final.dice, "processor_seconds": time.process_time() - began}
                     append_line(output, json.dumps(entry).encode())
-
-
-def _renderer(sequence: Sequence, camera: str):
-    from carts_core.rendering import Renderer  # noqa: PLC0415
-
-    return Renderer(sequence.scene, cameras=[camera])
 
 
 def draw(results: Path, picture: Path) -> None:

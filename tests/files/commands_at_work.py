@@ -79,7 +79,7 @@ def _synthesize(work: Path) -> None:
 
 
 def _bench(work: Path) -> None:
-    def measured(bench: Any, runs: list[Run], scope: Any, extractor: Any) -> list[Measurement]:
+    def measured(bench: Any, runs: list[Run]) -> list[Measurement]:
         score = Score(0.5, 0.9, 0.9, 0.5, None, None, 1.0)
         return [Measurement(run, score, "converged", "a machine", (score,), (0,)) for run in runs]
 

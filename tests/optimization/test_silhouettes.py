@@ -8,7 +8,7 @@ import pytest
 import roma
 import torch
 
-from carts_core.lab.benchmark.hand_eye import looking_at, write_arm
+from carts_core.lab.benchmark.hand_eye import ARM, looking_at
 from carts_core.model.camera import Camera
 from carts_core.model.robot import Robot
 from carts_core.model.scene import Arm, Scene
@@ -63,7 +63,7 @@ def arm_before_camera(folder: Path) -> tuple[Scene, list[Frame]]:
     camera = Camera(
         name="left", width=SIZE[0], height=SIZE[1], intrinsics=(310.0, 310.0, 160.0, 120.0), T_camera_world=T
     )
-    scene = Scene((Arm("arm", Robot.load(write_arm(folder)), np.eye(4)),), (camera,))
+    scene = Scene((Arm("arm", Robot.load(ARM), np.eye(4)),), (camera,))
     renderer, rng = Renderer(scene), np.random.default_rng(0)
     frames = []
     for index in range(4):

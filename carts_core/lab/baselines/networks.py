@@ -92,16 +92,14 @@ class Baseline(nn.Module):
         elif settings.name == "colleoni":
             self.body = _TwoEncoders(settings)
         else:
-            models = segmentation_models()
-            self.body = _made(
-                settings,
-                lambda: models.Unet(
-                    f"tu-{settings.timm_encoder}",
-                    encoder_weights=None,
-                    decoder_channels=settings.decoder,
-                    **_swin_options(settings),
-                ),
-            )
+            models, options = segmentation_models(), dict[str, Any]()
+            if settings.name == "swin":
+                options["img_size"] = settings.size[::-1]
+                if settings.width is not None:
+                    heads = tuple((settings.width // 24 or 1) * factor for factor in _HEADS)
+                    options |= {"embed_dim": settings.width, "num_heads": heads}
+            options |= {"encoder_weights": None, "decoder_channels": settings.decoder}
+            self.body = _made(settings, lambda: models.Unet(f"tu-{settings.timm_encoder}", **options))
         self.register_buffer("mean", torch.tensor(_MEAN)[:, None, None], persistent=False)
         self.register_buffer("deviation", torch.tensor(_DEVIATION)[:, None, None], persistent=False)
 
@@ -146,17 +144,6 @@ class _TwoEncoders(nn.Module):
     def forward(self, images: Tensor, given: Tensor) -> Tensor:
         levels = zip(self.image(images), self.rendering(given), strict=True)
         return self.head(self.decoder([torch.cat(level, 1) for level in levels]))
-
-
-def _swin_options(settings: BaselineNetwork) -> dict[str, Any]:
-    if settings.name != "swin":
-        return {}
-    width, height = settings.size
-    options: dict[str, Any] = {"img_size": (height, width)}
-    if settings.width is not None:
-        heads = settings.width // 24 or 1
-        options |= {"embed_dim": settings.width, "num_heads": tuple(heads * factor for factor in _HEADS)}
-    return options
 
 
 def _made(settings: BaselineNetwork, make: Any) -> Any:
@@ -223,8 +210,14 @@ def read_baseline(path: Path) -> TrainedBaseline:
             metadata = file.metadata() or {}
             if (metadata.get("format"), metadata.get("version")) != (FORMAT, _VERSION):
                 raise ValueError(f"it says format {metadata.get('format')!r}; wanted is {FORMAT!r}")
-            settings, training = _described(metadata)
-            network = Baseline(settings)
+            values, training = parse_json(metadata["network"]), parse_json(metadata["training"], finite=False)
+            tables = isinstance(values, dict) and isinstance(training, dict)
+            if not tables or not isinstance(training["augmentation"], str):
+                raise TypeError("its description is no table")
+            unet = Architecture.from_json(values.pop("unet"))
+            width, height = values.pop("size")
+            decoder = tuple(int(n) for n in values.pop("decoder"))
+            network = Baseline(BaselineNetwork(**values, decoder=decoder, size=(int(width), int(height)), unet=unet))
             tensors = {name: file.get_tensor(name) for name in file.keys()}
             if not all(bool(torch.isfinite(value).all()) for value in tensors.values()):
                 raise ValueError("some of its values are not finite")
@@ -275,14 +268,3 @@ def start_from(network: Baseline, path: Path) -> int:
         )
     network.load_state_dict({**own, **fitting})
     return len(fitting)
-
-
-def _described(metadata: dict[str, str]) -> tuple[BaselineNetwork, dict[str, Any]]:
-    values = parse_json(metadata["network"])
-    training = parse_json(metadata["training"], finite=False)
-    if not isinstance(values, dict) or not isinstance(training, dict) or not isinstance(training["augmentation"], str):
-        raise TypeError("its description is no table")
-    unet = Architecture.from_json(values.pop("unet"))
-    width, height = values.pop("size")
-    decoder = tuple(int(n) for n in values.pop("decoder"))
-    return BaselineNetwork(**values, decoder=decoder, size=(int(width), int(height)), unet=unet), training

@@ -138,6 +138,7 @@ SIZE = (256, 192)
 """Width and height of a training frame [px]: a whole image, not a crop."""
 IMAGES = ImageSettings(width=SIZE[0], height=SIZE[1], field_width=SIZE[0], occluded=0.0, things=0.0, absent=0.0)
 """Regular images: no smoke, blood, low light, occluders, distractors or absent arms."""
+_SETTINGS = json.dumps(asdict(IMAGES))
 CHUNK = 250
 """Frames of a file."""
 
@@ -150,7 +151,18 @@ class TrainingFrames:
     """
 
     def __init__(self, folder: OutputPath, chunks: Iterable[int]) -> None:
-        parts = [_read(_file(folder, chunk).path) for chunk in chunks]
+        parts = []
+        for path in (_file(folder, chunk).path for chunk in chunks):
+            try:
+                check_regular(path, WEIGHTS)
+                with safe_open(path, framework="pt") as file:
+                    if (file.metadata() or {}).get("settings") != _SETTINGS:
+                        raise ValueError("its frames were made with other settings")
+                    parts.append([file.get_tensor(name) for name in ("images", "given", "masks")])
+            except (SafetensorError, OSError, ValueError) as error:
+                raise WeightsError(
+                    f"training frames {path} cannot be read ({error}). Delete the file to have them made again."
+                ) from error
         self._images, self._given, self._masks = (torch.cat(part) for part in zip(*parts, strict=True))
 
     def __len__(self) -> int:
@@ -161,21 +173,7 @@ class TrainingFrames:
     ) -> tuple[UInt8[Tensor, "batch 3 h w"], Float[Tensor, "batch 6 h w"], Float[Tensor, "batch 1 h w"]]:
         """Images, surface maps of the given kinematics, and masks, by their numbers."""
         chosen = list(numbers)
-        return (
-            self._images[chosen],
-            self._given[chosen].float() / SURFACE_UNIT,
-            self._masks[chosen].float()[:, None],
-        )
-
-
-def missing_chunks(folder: OutputPath, count: int) -> list[int]:
-    """Numbers of the missing files for a number of frames."""
-    return [chunk for chunk in range(chunks_of(count)) if not holds_file(_file(folder, chunk))]
-
-
-def chunks_of(count: int) -> int:
-    """Number of files for a number of frames."""
-    return -(-count // CHUNK)
+        return (self._images[chosen], self._given[chosen].float() / SURFACE_UNIT, self._masks[chosen].float()[:, None])
 
 
 def make_chunk(folder: OutputPath, chunk: int, seed: int) -> None:
@@ -194,29 +192,11 @@ def make_chunk(folder: OutputPath, chunk: int, seed: int) -> None:
         masks.append((2 * covered > SURFACE_UNIT).astype(np.uint8))
     arrays = {"images": images, "given": given, "masks": masks}
     tensors = {name: torch.from_numpy(np.stack(values)).contiguous() for name, values in arrays.items()}
-    write_bytes(_file(folder, chunk), tensor_bytes(tensors, {"settings": _settings(), "seed": str(seed)}))
+    write_bytes(_file(folder, chunk), tensor_bytes(tensors, {"settings": _SETTINGS, "seed": str(seed)}))
 
 
 def _file(folder: OutputPath, chunk: int) -> OutputPath:
     return folder / f"frames_{chunk:03d}.safetensors"
-
-
-def _settings() -> str:
-    return json.dumps(asdict(IMAGES))
-
-
-def _read(path: Path) -> tuple[Tensor, Tensor, Tensor]:
-    try:
-        check_regular(path, WEIGHTS)
-        with safe_open(path, framework="pt") as file:
-            if (file.metadata() or {}).get("settings") != _settings():
-                raise ValueError("its frames were made with other settings")
-            images, given, masks = (file.get_tensor(name) for name in ("images", "given", "masks"))
-    except (SafetensorError, OSError, ValueError) as error:
-        raise WeightsError(
-            f"training frames {path} cannot be read ({error}). Delete the file to have them made again."
-        ) from error
-    return images, given, masks
 
 
 WEIGHTS_FILE = "baseline.safetensors"
@@ -248,10 +228,12 @@ def prepare_frames(
         WeightsError: it holds other frames.
     """
     with locked_folder(folder.path):
-        for chunk in missing_chunks(folder, training.frames):
-            say(f"training frames: part {chunk + 1} of {chunks_of(training.frames)}")
-            make_chunk(folder, chunk, training.seed)
-    return TrainingFrames(folder, range(chunks_of(training.frames)))
+        chunks = range(-(-training.frames // CHUNK))
+        for chunk in chunks:
+            if not holds_file(_file(folder, chunk)):
+                say(f"training frames: part {chunk + 1} of {len(chunks)}")
+                make_chunk(folder, chunk, training.seed)
+    return TrainingFrames(folder, chunks)
 
 
 def train_baseline(

@@ -42,11 +42,7 @@ def occlude(
 ) -> Occluded:
     """Lay one to three pieces of one kind over the instruments, with folds, soft edges and a soft shadow.
 
-    Args:
-        image: without occluders.
-        instruments: visible pixels of the instruments.
-        rng: of places, shapes and kind.
-        share: exact share of these pixels that is covered.
+    `share` is the exact share of the visible pixels of the instruments that is covered.
     """
     if not instruments.any():
         return Occluded(image, np.zeros_like(instruments))

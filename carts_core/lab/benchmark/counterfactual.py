@@ -4,7 +4,7 @@ Surfaces are those that measured kinematics and the mask imply; other background
 """
 
 import dataclasses
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import cache
 
 import cv2
@@ -24,9 +24,10 @@ from ...recording.images import read_image
 from ...rendering import Renderer
 from ...rendering.points import link_transforms, visible_points
 from ...settings import DOMAINS, DomainConfig, EndoscopeConfig, SensorConfig, SynthesisConfig
-from ..synthesis.domains import Bleeding, Smoke, SmokeOverlay, expose, exposure_gain, linear
+from ..synthesis.domains import Conditions, View, expose, exposure_gain, linear
 from ..synthesis.path_tracer import PathTracer, Surface
 from ..synthesis.scene import KINDS, Tissue, grow_tissue, place_cameras
+from .rooms import AlteredSequence
 
 
 def backdrop(width: int, height: int, seed: int) -> UInt8[np.ndarray, "h w 3"]:
@@ -90,9 +91,7 @@ class RealSurface:
     def of(self, mask: Bool[np.ndarray, "h w"], measured: Mapping[str, np.ndarray] | None) -> Surface:
         """The surface of a frame: in the mask that of the nearest pixel of the measured arms, elsewhere the plane.
 
-        Args:
-            mask: the instruments' pixels.
-            measured: arm -> joint positions [rad, m]; None without arms.
+        `measured` maps arms to joint positions [rad, m]; None without arms.
         """
         depth = np.full(mask.shape, DISTANCE)
         normal = np.zeros((*mask.shape, 3))
@@ -136,7 +135,7 @@ _NOISY = dataclasses.replace(SensorConfig(), vignette=0.0, blur=0.0, sharpening=
 _MOMENTS = 5
 
 
-class Counterfactual:
+class Counterfactual(AlteredSequence):
     """A real sequence in all synthetic domains, with their code for blood, smoke and low light.
 
     Depth for blood and smoke is that of the measured arms, carried to the mask's pixels, before a plane behind the
@@ -151,24 +150,18 @@ class Counterfactual:
         seed: int,
         strengths: DomainConfig | None = None,
     ) -> None:
-        self.scene, self.timestamps = sequence.scene, sequence.timestamps
-        self.measured_joints = sequence.measured_joints
-        self._sequence, self._camera, self._backdrop = sequence, camera, backdrop
+        super().__init__(sequence)
+        self._camera, self._backdrop = camera, backdrop
         self._config = SynthesisConfig(seed=seed, domain=strengths or DomainConfig())
         self._surface = RealSurface(
             sequence.scene.with_cameras([camera]),
             [sequence.frame(i, cameras=()).measured for i in spread(len(sequence))],
         )
-        self._bleeding = Bleeding(_relief(seed), self._config.domain, self._config.rng("bleeding"))
-        self._smoke = Smoke(self._config.domain, self._config.rng("smoke"))
-        self._overlay = SmokeOverlay(self._config.domain.overlay_opacity, self._config.rng("overlay"))
+        self._conditions = Conditions(self._config, _relief(seed))
         self._clean = sequence.background(camera)
         brightness = float(np.median(linear(self._clean)))
         self._lamp = np.pi * DISTANCE**2 * brightness / _REFLECTANCE
         self._backgrounds: dict[str, np.ndarray] = {}
-
-    def __len__(self) -> int:
-        return len(self._sequence)
 
     def frame(self, index: int, domain: str | None = None, cameras: Iterable[str] | None = None) -> Frame:
         """A frame of the sequence with its image in a domain; only the regular one has other cameras, too."""
@@ -178,31 +171,22 @@ class Counterfactual:
         frame = self._sequence.frame(index, cameras=[self._camera])
         assert frame.masks is not None
         image, mask = frame.images[self._camera], frame.masks[self._camera]
-        altered = self._altered(domain, image, mask, frame.measured, self._time(index), index)
+        altered = self._altered(domain, image, mask, frame.measured, index)
         return dataclasses.replace(frame, domain=domain, images={self._camera: altered})
 
-    def background(self, camera: str, domain: str | None = None) -> UInt8[np.ndarray, "h w 3"]:
-        """The background under the domain's condition, averaged over some moments."""
-        domain = domain or DOMAINS[0]
+    def mean_background(self, camera: str, domain: str | None = None) -> MeanBackground:
+        """The mean background, averaged over some moments under the domain's condition."""
+        domain, regular = domain or DOMAINS[0], self._sequence.mean_background(camera)
         if domain == DOMAINS[0]:
-            return self._sequence.background(camera)
+            return regular
         if domain not in self._backgrounds:
             nothing = np.zeros(self._clean.shape[:2], bool)
             moments = [
-                self._altered(domain, self._clean, nothing, None, self._time(index), index).astype(np.float32)
-                for index in spread(len(self._sequence), _MOMENTS)
+                self._altered(domain, self._clean, nothing, None, index).astype(np.float32)
+                for index in spread(len(self), _MOMENTS)
             ]
             self._backgrounds[domain] = np.rint(np.mean(moments, axis=0)).astype(np.uint8)
-        return self._backgrounds[domain]
-
-    def mean_background(self, camera: str, domain: str | None = None) -> MeanBackground:
-        """The mean background and the pixels where it is known."""
-        regular = self._sequence.mean_background(camera)
-        return dataclasses.replace(regular, image=self.background(camera, domain))
-
-    def _time(self, index: int) -> float:
-        times = self._sequence.timestamps
-        return index * _FRAME_INTERVAL if times is None else float(times[index] - times[0])
+        return dataclasses.replace(regular, image=self._backgrounds[domain])
 
     def _altered(
         self,
@@ -210,31 +194,20 @@ class Counterfactual:
         image: UInt8[np.ndarray, "h w 3"],
         mask: Bool[np.ndarray, "h w"],
         measured: dict[str, np.ndarray] | None,
-        time: float,
         index: int,
     ) -> UInt8[np.ndarray, "h w 3"]:
-        rng = self._config.rng("noise", domain, index)
-
-        def lit(change: Callable[[Surface], Float[np.ndarray, "h w 3"]]) -> UInt8[np.ndarray, "h w 3"]:
-            return expose(change(self._surface.of(mask, measured)), _QUIET, rng)
-
-        match domain:
-            case "low_brightness":
-                return expose(linear(image) * self._config.domain.low_brightness, _NOISY, rng)
-            case "bleeding":
-                links = self._surface.Ts_world_link(measured)
-                return lit(lambda at: self._bleeding.stain(linear(image), at, links, self._surface.lens, self._lamp))
-            case "smoke":
-                return lit(
-                    lambda at: self._smoke.haze(linear(image), at.position, self._surface.lens, self._lamp, time)
-                )
-            case "background_change":
-                # A soft seam, as a lens makes it.
-                cover = cv2.GaussianBlur(mask.astype(np.float32), (0, 0), 0.7)[..., None]
-                return np.rint(cover * image + (1.0 - cover) * self._backdrop).astype(np.uint8)
-            case "simulated_smoke":
-                return self._overlay.over(image, time)
-        raise AssertionError(f"no such domain: {domain}")
+        times = self._sequence.timestamps
+        time = index * _FRAME_INTERVAL if times is None else float(times[index] - times[0])
+        if domain == "background_change":
+            # A soft seam, as a lens makes it.
+            cover = cv2.GaussianBlur(mask.astype(np.float32), (0, 0), 0.7)[..., None]
+            return np.rint(cover * image + (1.0 - cover) * self._backdrop).astype(np.uint8)
+        if domain == "simulated_smoke":
+            return self._conditions.overlay.over(image, time)
+        surface, links = self._surface.of(mask, measured), self._surface.Ts_world_link(measured)
+        view = View(index, time, 0, linear(image), self._lamp, None, surface, None, self._surface.lens, links)
+        sensor = _NOISY if domain == "low_brightness" else _QUIET
+        return expose(self._conditions.light(domain, view), sensor, self._config.rng("noise", domain, index))
 
 
 @cache

@@ -1,14 +1,18 @@
 """Single runs: a method on one frame or a sequence of frames, scored against the truth."""
 
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
 
 import cv2
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
+from rich.console import Console
 
+from ...console import Bar
 from ...evaluation import dice, joint_mae_deg, normalized_surface_distance
 from ...model.keypoints import keypoints
 from ...model.parts import COVERAGE
@@ -16,13 +20,13 @@ from ...model.perturbation import perturb
 from ...model.scene import Arm, Scene, SceneState
 from ...networks.extractor import FeatureExtractor
 from ...optimization import (
+    Assessment,
     Backgrounds,
     CalibrationOptimizer,
     FrameOptimizer,
     FreeParameters,
+    MaskPredictor,
     SequenceOptimizer,
-    SolverSettings,
-    SurfacePredictor,
     SurfaceSolver,
 )
 from ...optimization.observability import Uncertainty
@@ -30,10 +34,12 @@ from ...recording import Frame
 from ...recording.background import spread
 from ...rendering import Renderer
 from ...settings import DescentSolver
+from ...wording import counted
 from ..baselines.networks import TrainedBaseline
+from .conditions import CROSSING, OCCLUSION, OTHER_INSTRUMENT, WRONG, crossed, misled, occlude, with_other_instruments
 from .measurement import BEST_OF, TOLERANCE, WIDE_TOLERANCE, Measurement, Score, machine
-from .scope import METHODS, RENDERING, Run
-from .sources import Recording
+from .scope import METHODS, RENDERING, Run, Scope
+from .sources import Recording, Source
 
 _SEED = 0
 """Seed of the signs of initial offsets."""
@@ -60,10 +66,10 @@ class Truth:
     def score(
         self,
         state: SceneState,
-        known: Uncertainty | None,
-        loss: float | None,
         renderer: Renderer,
-        seconds: float,
+        seconds: float = 0.0,
+        known: Uncertainty | None = None,
+        loss: float | None = None,
         *,
         whole: bool = True,
     ) -> Score:
@@ -71,10 +77,10 @@ class Truth:
 
         Args:
             state: the estimate.
-            known: its uncertainty, if the optimizer reports it.
-            loss: of the optimizer.
             renderer: of the camera, at its size.
             seconds: until the estimate was known [s].
+            known: its uncertainty, if the optimizer reports it.
+            loss: of the optimizer.
             whole: whether to compute the depth of the tips and the second surface distance, the slowest figures.
         """
         state, scene = state.to("cpu"), renderer.scene
@@ -108,10 +114,7 @@ class Truth:
     ) -> tuple[int, int, int] | None:
         """Counts of measured joints with truth and deviation, and of errors within one and two of them; None without.
 
-        Args:
-            scene: with the arms.
-            found: arm -> joint positions [rad, m].
-            std: arm -> their standard deviations; NaN where not known.
+        `found` and `std` map arms to joint positions [rad, m] and their standard deviations, NaN where not known.
         """
         ratios = []
         for arm in scene.arms:
@@ -183,58 +186,6 @@ def start_of(scene: Scene, frame: Frame, run: Run, joints: Mapping[str, tuple[st
     return perturb(scene, origin, error, seed, joints)
 
 
-def optimize(
-    run: Run,
-    scene: Scene,
-    frame: Frame,
-    backgrounds: Backgrounds,
-    networks: FeatureExtractor | SurfacePredictor,
-    settings: SolverSettings,
-    free: FreeParameters,
-    truth: Truth,
-    renderer: Renderer,
-    ignore: dict[str, Bool[np.ndarray, "h w"]] | None = None,
-) -> Measurement:
-    """Run the optimizer on one frame, and score every iterate in one camera.
-
-    Args:
-        run: the run.
-        scene: with the cameras that take part.
-        frame: its images and kinematics.
-        backgrounds: of these cameras.
-        networks: the networks, or another predictor.
-        settings: of the method.
-        free: the unknowns.
-        truth: for the scores.
-        renderer: of the camera that is scored, at its size.
-        ignore: camera name -> pixels of an occluder.
-    """
-    start = start_of(scene, frame, run, truth.measured_joints)
-    began = time.perf_counter()
-    optimizer = FrameOptimizer(
-        scene, frame, backgrounds, networks, ignore=ignore, start=start, settings=settings, free=free, live=False
-    )
-    trace, best, seconds = _followed(optimizer, truth, renderer, time.perf_counter() - began)
-    assert optimizer.best is not None and optimizer.stop_reason is not None
-    end = optimizer.best
-    final = truth.score(end.state, end.uncertainty, end.loss, renderer, seconds)
-    assessment = optimizer.assessment
-    # With given masks, the first iterate can be the result of a search.
-    searched = METHODS[run.method].masks_given
-    return Measurement(
-        run,
-        final,
-        optimizer.stop_reason,
-        machine(networks.device),
-        tuple(trace),
-        tuple(best),
-        truth.score(scene.state(start), None, None, renderer, 0.0) if searched else None,
-        verdict=assessment and assessment.verdict.value,
-        probability=assessment and assessment.probability,
-        within=truth.within(scene, end.joint_positions(), end.joint_std()),
-    )
-
-
 def _followed(
     optimizer: FrameOptimizer, truth: Truth, renderer: Renderer, seconds: float
 ) -> tuple[list[Score], list[int], float]:
@@ -254,47 +205,15 @@ def _followed(
             complete()
             return trace, best, seconds
         best.append(len(trace) if optimizer.best is iterate else best[-1])
-        known, steps = iterate.uncertainty, len(trace)
+        steps = len(trace)
         loss = None if isinstance(optimizer.settings, SurfaceSolver) else iterate.loss
-        trace.append(truth.score(iterate.state, known, loss, renderer, seconds, whole=not steps))
+        trace.append(truth.score(iterate.state, renderer, seconds, iterate.uncertainty, loss, whole=not steps))
         if steps in BEST_OF:
             complete()
 
 
-def segment(
-    run: Run, scene: Scene, frame: Frame, truth: Truth, extractor: FeatureExtractor, trained: TrainedBaseline | None
-) -> Measurement:
-    """A network's own mask of one image, at the size that it was trained for.
-
-    Args:
-        run: which.
-        scene: with the camera that is scored.
-        frame: its image, and the measured joint positions, which are rendered for networks with that input.
-        truth: what the mask is compared with.
-        extractor: the feature and the surface network, and the device.
-        trained: a baseline in their place.
-    """
-    device, image, scene = extractor.device, frame.images[truth.camera], scene.with_cameras([truth.camera])
-    if trained is None:
-        network, size, kinematics = None, extractor.working_size, run.method == RENDERING
-    else:
-        network, settings = trained.network.to(device), trained.network.settings
-        size, kinematics = settings.size, settings.looks_at_kinematics
-    renderer = Renderer(scene, width=size[0], height=size[1]) if kinematics else None
-    began = time.perf_counter()
-    given = renderer and renderer.surface_maps(scene.state(frame.measured, mounts=frame.mounts)).to(device)
-    small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
-    tensor = torch.from_numpy(small).to(device).permute(2, 0, 1)[None].float() / 255.0
-    with torch.no_grad():
-        if network is not None:
-            probability = network(tensor, given).sigmoid()
-        elif given is not None:
-            probability = extractor.surface(tensor, given)[:, COVERAGE].sum(1, keepdim=True)
-        else:
-            probability = extractor.probability(tensor)
-    full = cv2.resize(probability[0, 0].cpu().numpy(), image.shape[1::-1], interpolation=cv2.INTER_LINEAR)
-    score = truth.score_mask(full >= 0.5, time.perf_counter() - began)
-    return Measurement(run, score, "not iterative", machine(device))
+def _judged(assessment: Assessment | None) -> dict[str, Any]:
+    return {} if assessment is None else {"verdict": assessment.verdict.value, "probability": assessment.probability}
 
 
 def calibrated_scene(recording: Recording, camera: str, frames: int, extractor: FeatureExtractor) -> Scene:
@@ -303,114 +222,230 @@ def calibrated_scene(recording: Recording, camera: str, frames: int, extractor: 
     Neither masks nor true joint positions are looked at.
     """
     chosen = [recording.frame(index, cameras=[camera]) for index in spread(len(recording), frames)]
-    optimizer = CalibrationOptimizer(
-        recording.scene,
-        chosen,
-        extractor,
-        cameras=[camera],
-        backgrounds=Backgrounds.of(recording, [camera], "regular"),
-    )
+    backgrounds = Backgrounds.of(recording, [camera], "regular")
+    optimizer = CalibrationOptimizer(recording.scene, chosen, extractor, cameras=[camera], backgrounds=backgrounds)
     for _ in optimizer:
         pass
     return optimizer.result().scene
 
 
-def correct_together(
-    runs: Iterable[Run],
-    recording: Recording,
-    extractor: FeatureExtractor,
-    truths: Mapping[int, Truth],
-    renderer: Renderer,
-) -> list[Measurement]:
-    """Correct frames in sequence mode, and score the final estimates.
-
-    Seconds are those spent on a frame over all visits, reading its image included.
-
-    Args:
-        runs: one per frame, of one domain and error at the start.
-        recording: of the frames.
-        extractor: the networks.
-        truths: position of the frame -> truth.
-        renderer: of the camera that takes part, at its size.
-    """
-    by_frame = {run.frame: run for run in runs}
-    (domain,) = {run.domain for run in by_frame.values()}
-    scene, cameras = renderer.scene, [camera.name for camera in renderer.scene.cameras]
-
-    def frame_at(index: int) -> Frame:
-        frame = recording.frame(index, domain, cameras)
-        return replace(frame, measured=start_of(scene, frame, by_frame[index], truths[index].measured_joints))
-
-    stamps = recording.timestamps
-    optimizer = SequenceOptimizer(
-        scene,
-        frame_at,
-        {index: None if stamps is None else float(stamps[index]) for index in by_frame},
-        extractor,
-        backgrounds=Backgrounds.of(recording, cameras, domain),
-    )
-    for _ in optimizer:
-        pass
-    found = []
-    for index, estimate in sorted(optimizer.estimates.items()):
-        truth, state = truths[index], scene.state(frame_at(index).measured, mounts=frame_at(index).mounts)
-        before = truth.score(state, None, None, renderer, 0.0)
-        after = truth.score(estimate.state, estimate.uncertainty, estimate.loss, renderer, estimate.seconds)
-        assessment = estimate.assessment
-        found.append(
-            Measurement(
-                by_frame[index],
-                after,
-                estimate.start,
-                machine(extractor.device),
-                before=before,
-                verdict=assessment and assessment.verdict.value,
-                probability=assessment and assessment.probability,
-                within=truth.within(scene, estimate.joint_positions, estimate.joint_std),
-            )
-        )
-    return found
-
-
 STEPS = 10
 """Steps of each frame but the first. TC-CaRTS (arXiv 2212.00072) claims to need far fewer than CaRTS's 30."""
+_OCCLUDERS_SEED = 20
 
 
-def correct_forwards(
-    runs: Iterable[Run],
-    recording: Recording,
-    extractor: FeatureExtractor,
-    truths: Mapping[int, Truth],
-    renderer: Renderer,
-    first: DescentSolver,
-) -> list[Measurement]:
-    """Correct frames in their order with ACS, each from its measured joints plus the previous frame's correction.
+def log(console: Console, line: str) -> None:
+    """Print progress to a file or a pipe."""
+    if not console.is_terminal:
+        console.print(line, soft_wrap=True, highlight=False, markup=False)
 
-    This is the first of the three modules that TC-CaRTS adds (arXiv 2212.00072). Its abstract, all that we have of it,
-    does not describe the others well enough: a network that corrects kinematics, and a regularization.
 
-    Args:
-        runs, recording, extractor, truths, renderer: as in `correct_together`.
-        first: settings of the first frame; the others take `STEPS` steps of the same schedule.
+class SourceBench:
+    """Measurements on a source, which is opened at its first run.
+
+    `baselines` maps names in `scope.BASELINES` to networks.
     """
-    scene, cameras = renderer.scene, [camera.name for camera in renderer.scene.cameras]
-    found: list[Measurement] = []
-    correction: dict[str, np.ndarray] = {}
-    for run in sorted(runs, key=lambda run: run.frame):
-        frame, truth = recording.frame(run.frame, run.domain, cameras), truths[run.frame]
-        backgrounds = Backgrounds.of(recording, cameras, run.domain, required=True)
-        measured = start_of(scene, frame, run, truth.measured_joints)
-        start = {arm: values + correction.get(arm, 0.0) for arm, values in measured.items()}
-        settings = DescentSolver.paper(STEPS) if found else first
+
+    def __init__(
+        self,
+        source: Source,
+        bar: Bar,
+        scope: Scope,
+        extractor: FeatureExtractor,
+        baselines: Mapping[str, TrainedBaseline] | None = None,
+    ) -> None:
+        self._source, self._bar, self._scope = source, bar, scope
+        self._extractor, self._baselines = extractor, baselines or {}
+        self._machine = machine(extractor.device)
+
+    def measure(self, runs: list[Run]) -> list[Measurement]:
+        """Measure a run, or all runs of one method that corrects frames together."""
+        method = METHODS[runs[0].method]
+        if not method.together:
+            return [self._measure_alone(runs[0])]
+        first = method.settings(self._scope.steps(runs[0])) if method.settings else None
+        return self._forwards(runs, first) if isinstance(first, DescentSolver) else self._together(runs)
+
+    def _measure_alone(self, run: Run) -> Measurement:
+        recording, method, camera = self._recording, METHODS[run.method], self._source.camera
+        cameras = self._source.cameras if method.every_camera else (camera,)
+        domain = "regular" if run.domain in (OCCLUSION, CROSSING, *WRONG) else run.domain
+        if run.domain in WRONG:
+            frame = misled(recording, run.domain, run.frame, camera)
+        elif run.domain == CROSSING:
+            frame = crossed(recording, run.frame, camera)
+        else:
+            frame = recording.frame(run.frame, None if run.domain == OCCLUSION else run.domain, cameras)
+        truth = self._truth(frame)
+        if run.domain == OCCLUSION:
+            found = occlude(frame.images[camera], truth.mask, np.random.default_rng((_OCCLUDERS_SEED, frame.index)))
+            frame, truth = replace(frame, images={camera: found.image}), replace(truth, hidden=found.hidden)
+        if method.settings is None:
+            return self._segment(run, frame, truth)
+        settings = method.settings(self._scope.steps(run))
+        networks, backgrounds = self._extractor, Backgrounds({})
+        if method.masks_given:
+            networks = MaskPredictor()
+        else:
+            backgrounds = Backgrounds.of(recording, cameras, domain, required=settings.needs_background)
+        scene, renderer = self._calibrated if method.calibrated else recording.scene, self._renderer
+        if run.domain == OTHER_INSTRUMENT:
+            scene = with_other_instruments(scene, run.frame)
+            renderer = Renderer(scene, cameras=[camera])
+        scene = scene.with_cameras(cameras)
+        start = start_of(scene, frame, run, truth.measured_joints)
         began = time.perf_counter()
-        optimizer = FrameOptimizer(scene, frame, backgrounds, extractor, start=start, settings=settings, live=False)
+        optimizer = FrameOptimizer(
+            scene,
+            frame,
+            backgrounds,
+            networks,
+            ignore={camera: truth.hidden} if method.occluders_given and truth.hidden is not None else None,
+            start=start,
+            settings=settings,
+            free=FreeParameters(extrinsics=method.poses, locked_cameras=(camera,)),
+            live=False,
+        )
+        trace, best, seconds = _followed(optimizer, truth, renderer, time.perf_counter() - began)
+        end = optimizer.best
+        assert end is not None and optimizer.stop_reason is not None
+        return Measurement(
+            run,
+            truth.score(end.state, renderer, seconds, end.uncertainty, end.loss),
+            optimizer.stop_reason,
+            machine(networks.device),
+            tuple(trace),
+            tuple(best),
+            # With given masks, the first iterate can be the result of a search.
+            truth.score(scene.state(start), renderer) if method.masks_given else None,
+            within=truth.within(scene, end.joint_positions(), end.joint_std()),
+            **_judged(optimizer.assessment),
+        )
+
+    def _segment(self, run: Run, frame: Frame, truth: Truth) -> Measurement:
+        """A network's own mask of one image, at the size that it was trained for.
+
+        Networks that look at kinematics get the rendering at the measured joint positions.
+        """
+        extractor, trained = self._extractor, self._baselines.get(run.method)
+        device, image = extractor.device, frame.images[truth.camera]
+        scene = self._recording.scene.with_cameras([truth.camera])
+        if trained is None:
+            network, size, kinematics = None, extractor.working_size, run.method == RENDERING
+        else:
+            network, settings = trained.network.to(device), trained.network.settings
+            size, kinematics = settings.size, settings.looks_at_kinematics
+        renderer = Renderer(scene, width=size[0], height=size[1]) if kinematics else None
+        began = time.perf_counter()
+        given = renderer and renderer.surface_maps(scene.state(frame.measured, mounts=frame.mounts)).to(device)
+        small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+        tensor = torch.from_numpy(small).to(device).permute(2, 0, 1)[None].float() / 255.0
+        with torch.no_grad():
+            if network is not None:
+                probability = network(tensor, given).sigmoid()
+            elif given is not None:
+                probability = extractor.surface(tensor, given)[:, COVERAGE].sum(1, keepdim=True)
+            else:
+                probability = extractor.probability(tensor)
+        full = cv2.resize(probability[0, 0].cpu().numpy(), image.shape[1::-1], interpolation=cv2.INTER_LINEAR)
+        score = truth.score_mask(full >= 0.5, time.perf_counter() - began)
+        return Measurement(run, score, "not iterative", self._machine)
+
+    def _together(self, runs: list[Run]) -> list[Measurement]:
+        """Correct frames of one domain and error at the start in sequence mode, and score the final estimates.
+
+        Seconds are those spent on a frame over all visits, reading its image included.
+        """
+        recording, renderer, domain = self._recording, self._renderer, runs[0].domain
+        scene, by_frame = renderer.scene, {run.frame: run for run in runs}
+        truths = {index: self._truth(recording.frame(index, cameras=[self._source.camera])) for index in by_frame}
+
+        def frame_at(index: int) -> Frame:
+            frame = recording.frame(index, domain, [self._source.camera])
+            return replace(frame, measured=start_of(scene, frame, by_frame[index], truths[index].measured_joints))
+
+        stamps = recording.timestamps
+        optimizer = SequenceOptimizer(
+            scene,
+            frame_at,
+            {index: None if stamps is None else float(stamps[index]) for index in by_frame},
+            self._extractor,
+            backgrounds=Backgrounds.of(recording, [self._source.camera], domain),
+        )
         for _ in optimizer:
             pass
-        seconds, best = time.perf_counter() - began, optimizer.best
-        assert best is not None and optimizer.stop_reason is not None
-        correction = {arm: values - measured[arm] for arm, values in best.joint_positions().items()}
-        before = truth.score(scene.state(measured), None, None, renderer, 0.0)
-        after = truth.score(best.state, best.uncertainty, best.loss, renderer, seconds)
-        how = "warm" if found else "cold"
-        found.append(Measurement(run, after, how, machine(extractor.device), before=before))
-    return found
+        return [
+            Measurement(
+                by_frame[index],
+                truth.score(found.state, renderer, found.seconds, found.uncertainty, found.loss),
+                found.start,
+                self._machine,
+                before=truth.score(scene.state(start.measured, mounts=start.mounts), renderer),
+                within=truth.within(scene, found.joint_positions, found.joint_std),
+                **_judged(found.assessment),
+            )
+            for index, found in sorted(optimizer.estimates.items())
+            for truth, start in [(truths[index], frame_at(index))]
+        ]
+
+    def _forwards(self, runs: list[Run], first: DescentSolver) -> list[Measurement]:
+        """Correct frames in their order with ACS, each from its measured joints plus the previous frame's correction.
+
+        This is the first of the three modules that TC-CaRTS adds (arXiv 2212.00072). Its abstract, all that we have of
+        it, does not describe the others well enough: a network that corrects kinematics, and a regularization. `first`
+        has the settings of the first frame; the others take `STEPS` steps of the same schedule.
+        """
+        renderer, cameras = self._renderer, [self._source.camera]
+        scene, found, correction = renderer.scene, list[Measurement](), dict[str, np.ndarray]()
+        for run in sorted(runs, key=lambda run: run.frame):
+            frame = self._recording.frame(run.frame, run.domain, cameras)
+            truth = self._truth(frame)
+            backgrounds = Backgrounds.of(self._recording, cameras, run.domain, required=True)
+            measured = start_of(scene, frame, run, truth.measured_joints)
+            start = {arm: values + correction.get(arm, 0.0) for arm, values in measured.items()}
+            settings = DescentSolver.paper(STEPS) if found else first
+            began = time.perf_counter()
+            optimizer = FrameOptimizer(
+                scene, frame, backgrounds, self._extractor, start=start, settings=settings, live=False
+            )
+            for _ in optimizer:
+                pass
+            seconds, best = time.perf_counter() - began, optimizer.best
+            assert best is not None
+            correction = {arm: values - measured[arm] for arm, values in best.joint_positions().items()}
+            before = truth.score(scene.state(measured), renderer)
+            after = truth.score(best.state, renderer, seconds, best.uncertainty, best.loss)
+            found.append(Measurement(run, after, "warm" if found else "cold", self._machine, before=before))
+        return found
+
+    def _truth(self, frame: Frame) -> Truth:
+        assert frame.masks is not None
+        camera = self._source.camera
+        return Truth(camera, frame.masks[camera], frame.truth or {}, self._recording.measured_joints)
+
+    @cached_property
+    def _recording(self) -> Recording:
+        task = self._bar.add_task("opening", total=None)
+
+        def report(what: str, done: int, total: int) -> None:
+            self._bar.update(task, description=what, completed=done, total=total)
+            log(self._bar.console, f"{self._source.name}: {what}, {done} of {total}")
+
+        recording = self._source.open(report)
+        self._bar.remove_task(task)
+        return recording
+
+    @cached_property
+    def _renderer(self) -> Renderer:
+        """Renderer of the scored camera, at its size."""
+        return Renderer(self._recording.scene, cameras=[self._source.camera])
+
+    @cached_property
+    def _calibrated(self) -> Scene:
+        frames = self._scope.calibration_frames
+        description = f"calibrating with {counted(frames, 'frame')}"
+        task = self._bar.add_task(description, total=None)
+        log(self._bar.console, f"{self._source.name}: {description}")
+        scene = calibrated_scene(self._recording, self._source.camera, frames, self._extractor)
+        self._bar.remove_task(task)
+        return scene

@@ -1,17 +1,15 @@
 """Hand-eye calibration of a seven-joint robot that no network was trained on: success rate and detected failures."""
 
 import json
-import tempfile
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
 import torch
 import trimesh
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Float, UInt8
 from roma import rotmat_to_rotvec, rotvec_to_rotmat
 
 from ...errors import CartsError
@@ -26,49 +24,18 @@ from ...recording import Frame
 from ...wording import counted
 from .measurement import code_fingerprint, stored
 from .rooms import made_rooms
-from .statistics import NOTHING
-from .targets import Goal, Reached, Target
+from .statistics import NOTHING, table_of
+from .targets import Target, target_of
 
-_SECTIONS = (0.16, 0.18, 0.22, 0.19, 0.2, 0.19, 0.08)
-"""Lengths of the links [m]."""
-
-_RADII = (0.075, 0.07, 0.065, 0.06, 0.055, 0.05, 0.04)
+ARM = Path(__file__).with_name("seven_joint_arm.urdf")
+"""The robot, of cylinders, spheres and boxes alone."""
 _COLOURS = ((0.85, 0.85, 0.83), (0.9, 0.45, 0.1))
-_LIMIT = 2.9
 _SIZE, _FOCAL = (640, 480), 620.0
 _SAMPLES = 3
 """Rays per pixel and axis; odd, so that thresholding coverage at a half does not bias the mask."""
 
 _HIDDEN = 0.25
 """Largest brightness of a side turned from the light [1]."""
-
-
-def write_arm(folder: Path) -> Path:
-    """Write the URDF, of cylinders, spheres and boxes alone; returns its path."""
-    lines = ['<robot name="seven_joint_arm">', '<link name="base">', _visual("cylinder", 0.09, 0.14, 0.07), "</link>"]
-    parent, height = "base", 0.14
-    for index, (length, radius) in enumerate(zip(_SECTIONS, _RADII, strict=True)):
-        axis = "0 0 1" if index % 2 == 0 else "0 1 0"
-        lines += [
-            f'<joint name="joint_{index + 1}" type="revolute"><parent link="{parent}"/>',
-            f'<child link="link_{index + 1}"/><origin xyz="0 0 {height}"/><axis xyz="{axis}"/>',
-            f'<limit lower="-{_LIMIT}" upper="{_LIMIT}" effort="1" velocity="1"/></joint>',
-            f'<link name="link_{index + 1}">',
-            _visual("sphere", 1.15 * radius, 0.0, 0.0),
-            _visual("cylinder", 0.85 * radius, length, length / 2),
-            "</link>",
-        ]
-        parent, height = f"link_{index + 1}", length
-    finger = '<visual><origin xyz="0 {y} 0.1"/><geometry><box size="0.03 0.02 0.09"/></geometry></visual>'
-    lines[-1] = finger.format(y=0.03) + finger.format(y=-0.03) + "</link>"
-    path = folder / "seven_joint_arm.urdf"
-    write_text(path, "\n".join([*lines, "</robot>"]))
-    return path
-
-
-def _visual(kind: str, radius: float, length: float, z: float) -> str:
-    size = f'radius="{radius}"' + (f' length="{length}"' if kind == "cylinder" else "")
-    return f'<visual><origin xyz="0 0 {z}"/><geometry><{kind} {size}/></geometry></visual>'
 
 
 def looking_at(eye: Float[np.ndarray, " 3"], target: Float[np.ndarray, " 3"]) -> Float[np.ndarray, "4 4"]:
@@ -80,20 +47,14 @@ def looking_at(eye: Float[np.ndarray, " 3"], target: Float[np.ndarray, " 3"]) ->
     return np.block([[rotation, -(rotation @ eye)[:, None]], [np.zeros((1, 3)), np.ones((1, 1))]])
 
 
-@dataclass(frozen=True)
-class ArmViews:
-    """Views of the arm from one camera that stands still, each in another pose."""
+def arm_views(count: int, seed: int, room: UInt8[np.ndarray, "h w 3"] | None = None) -> tuple[Scene, list[Frame]]:
+    """Render views of the arm from one camera, with random poses and noise, before a room of 640x480 px or grey.
 
-    scene: Scene
-    """Scene with the true base frame and camera."""
-    frames: tuple[Frame, ...]
-    """Frames with masks; measured joint positions are exact."""
-
-
-def arm_views(folder: Path, count: int, seed: int, room: UInt8[np.ndarray, "h w 3"] | None = None) -> ArmViews:
-    """Render views of the arm with random poses, camera and noise, before a room of 640x480 px (default: grey)."""
+    Returns:
+        The scene with the true base frame and camera, and frames with masks and exact joint positions.
+    """
     rng = np.random.default_rng(seed)
-    robot = Robot.load(write_arm(folder))
+    robot = Robot.load(ARM)
     angle, distance = rng.uniform(0, 2 * np.pi), rng.uniform(1.6, 2.2)
     eye = np.array([distance * np.cos(angle), distance * np.sin(angle), rng.uniform(0.5, 1.1)])
     T = looking_at(eye, np.array([0.0, 0.0, 0.5]) + rng.uniform(-0.05, 0.05, 3))
@@ -106,7 +67,6 @@ def arm_views(folder: Path, count: int, seed: int, room: UInt8[np.ndarray, "h w 
         joints = rng.uniform(-1.0, 1.0, len(robot.joint_names)) * np.array([1.5, 0.9, 1.5, 1.2, 1.5, 1.2, 1.5])
         coverage, shade = _rays(robot, joints, camera)
         picture = (1 - coverage[..., None]) * behind + 255 * shade + rng.normal(0, 2.0, (*coverage.shape, 3))
-        mask: Bool[np.ndarray, "h w"] = coverage >= 0.5
         frames.append(
             Frame(
                 index=index,
@@ -115,11 +75,11 @@ def arm_views(folder: Path, count: int, seed: int, room: UInt8[np.ndarray, "h w 
                 domain="regular",
                 images={"left": picture.clip(0, 255).astype(np.uint8)},
                 measured={"arm": joints},
-                masks={"left": mask},
+                masks={"left": coverage >= 0.5},
                 truth={"arm": joints},
             )
         )
-    return ArmViews(scene, tuple(frames))
+    return scene, frames
 
 
 def _rays(
@@ -155,7 +115,7 @@ _VIEWS = 10
 _STARTS = 10
 """Least number of starts of each condition for a verdict on its target."""
 _FREE = FreeParameters(joints=False, base_frames=True)
-_CODE = ("lab/benchmark/hand_eye.py", "lab/benchmark/rooms.py")
+_CODE = ("lab/benchmark/hand_eye.py", "lab/benchmark/seven_joint_arm.urdf", "lab/benchmark/rooms.py")
 
 
 @dataclass(frozen=True)
@@ -231,33 +191,27 @@ def hand_eye_table(runs: list[HandEyeRun]) -> Table | None:
                     "verdicts on others": ", ".join(f"{count} {verdict}" for verdict, count in others.items()),
                 }
             )
-    return Table.of(
-        "Hand-eye calibration of another robot",
-        f"A synthetic robot of seven joints, in no training data, in {_VIEWS} poses of 640 x 480 pixels; only its base "
-        "frame is free. Largest errors are those of the starts that ended near enough.",
-        rows,
-    )
+    return table_of("hand_eye", rows, views=_VIEWS)
 
 
 def hand_eye_targets(runs: list[HandEyeRun]) -> list[Target]:
     """Targets of hand-eye calibration."""
-    return [
-        Goal(
-            f"hand-eye from {condition.name}: within {condition.most_deg:g} degrees and "
-            f"{1e3 * condition.most_distance:g} mm" + ("" if condition.masks else ", or called failed"),
-            0.9 if condition.masks else 1.0,
-            partial(_reached, condition),
-            lambda value: f"{100 * value:.0f} %",
-        ).target(runs)
-        for condition in CONDITIONS
-    ]
-
-
-def _reached(condition: HandEyeCondition, runs: list[HandEyeRun]) -> Reached:
-    own = [run for run in runs if run.condition == condition.name]
-    right = [run for run in own if _near(run, condition) or (not condition.masks and run.verdict == "failed")]
-    share = len(right) / len(own) if own else None
-    return Reached(share, counted(len(own), "start"), complete=len(own) >= _STARTS)
+    targets = []
+    for condition in CONDITIONS:
+        own = [run for run in runs if run.condition == condition.name]
+        right = [run for run in own if _near(run, condition) or (not condition.masks and run.verdict == "failed")]
+        targets.append(
+            target_of(
+                f"hand_eye_{'masks' if condition.masks else 'network'}",
+                len(right) / len(own) if own else None,
+                counted(len(own), "start"),
+                complete=len(own) >= _STARTS,
+                condition=condition.name,
+                degrees=condition.most_deg,
+                mm=1e3 * condition.most_distance,
+            )
+        )
+    return targets
 
 
 def _near(run: HandEyeRun, condition: HandEyeCondition) -> bool:
@@ -272,12 +226,11 @@ def _run(condition: HandEyeCondition, seed: int, extractor: FeatureExtractor) ->
     off = np.eye(4)
     off[:3, :3] = rotvec_to_rotmat(torch.tensor(np.radians(condition.angle_deg) * axis)).numpy()
     off[:3, 3] = condition.distance * direction
-    with tempfile.TemporaryDirectory() as folder:
-        views = arm_views(Path(folder), _VIEWS, seed, room)
-    (arm,) = views.scene.arms
-    wrong = replace(views.scene, arms=(replace(arm, T_world_base=arm.T_world_base @ off),))
+    scene, frames = arm_views(_VIEWS, seed, room)
+    (arm,) = scene.arms
+    wrong = replace(scene, arms=(replace(arm, T_world_base=arm.T_world_base @ off),))
     networks = MaskPredictor() if condition.masks else extractor
-    optimizer = CalibrationOptimizer(wrong, views.frames, networks, free=_FREE)
+    optimizer = CalibrationOptimizer(wrong, frames, networks, free=_FREE)
     for _ in optimizer:
         pass
     assert optimizer.assessment is not None

@@ -11,6 +11,7 @@ from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 import torch
 
@@ -64,10 +65,7 @@ def run_fingerprint(
 ) -> str:
     """SHA-256 over all inputs of a run but the machine.
 
-    Args:
-        run, scope, extractor: of the benchmark.
-        source: fingerprint of the images and kinematics.
-        baseline: SHA-256 of the weights of a baseline.
+    `source` is the fingerprint of images and kinematics, `baseline` the SHA-256 of a baseline's weights.
     """
     method = METHODS[run.method]
     settings = to_plain(method.settings(scope.steps(run))) if method.settings else {}
@@ -160,19 +158,9 @@ class Measurement:
 
     def to_json(self) -> dict[str, Any]:
         """The measurement as JSON values; the trace is stored by column to keep the line short."""
-        names = [field.name for field in fields(Score)]
-        return {
-            "run": asdict(self.run),
-            "final": _rounded(asdict(self.final)),
-            "trace": {name: [_round(getattr(score, name)) for score in self.trace] for name in names},
-            "best": self.best,
-            "stopped": self.stopped,
-            "machine": self.machine,
-            "before": self.before and _rounded(asdict(self.before)),
-            "verdict": self.verdict,
-            "probability": _round(self.probability),
-            "within": self.within,
-        }
+        entry = _rounded(asdict(self))
+        columns = {field.name: [score[field.name] for score in entry["trace"]] for field in fields(Score)}
+        return entry | {"trace": columns}
 
     @staticmethod
     def from_json(line: Mapping[str, Any]) -> "Measurement":
@@ -181,31 +169,24 @@ class Measurement:
         Raises:
             KeyError, TypeError, ValueError: it is not one.
         """
-        names = [field.name for field in fields(Score)]
-        rows = list(zip(*(line["trace"][name] for name in names), strict=True))
-        best = tuple(line["best"])
-        if len(best) != len(rows) or not all(0 <= place <= index for index, place in enumerate(best)):
-            raise ValueError(f"best is {best}, but there are {len(rows)} iterates")
-        return Measurement(
-            run=Run(**line["run"]),
-            final=Score(**line["final"]),
-            trace=tuple(Score(**dict(zip(names, row, strict=True))) for row in rows),
-            best=best,
-            stopped=line["stopped"],
-            machine=line["machine"],
-            before=line["before"] and Score(**line["before"]),
-            verdict=line["verdict"],
-            probability=line["probability"],
-            within=line["within"] and tuple(line["within"]),
-        )
+        columns = dict(line["trace"])
+        rows = [dict(zip(columns, values, strict=True)) for values in zip(*columns.values(), strict=True)]
+        found = msgspec.convert({**line, "trace": rows}, Measurement)
+        if len(found.best) != len(rows) or not all(0 <= place <= index for index, place in enumerate(found.best)):
+            raise ValueError(f"best is {found.best}, but there are {len(rows)} iterates")
+        return found
 
 
-def _round(value: float | None) -> float | None:
-    return None if value is None else round(value, 6)
-
-
-def _rounded(values: dict[str, float | None]) -> dict[str, float | None]:
-    return {name: _round(value) for name, value in values.items()}
+def _rounded(value: Any) -> Any:
+    """Nested values with six digits."""
+    match value:
+        case float():
+            return round(value, 6)
+        case dict():
+            return {name: _rounded(part) for name, part in value.items()}
+        case list() | tuple():
+            return [_rounded(part) for part in value]
+    return value
 
 
 class ResultsFile:
@@ -375,6 +356,8 @@ def network_figures(scene: Scene, extractor: FeatureExtractor) -> dict[str, floa
     width, height = working_size(scene, settings.working_width, extractor.stride)
     wide, high = working_size(scene, round(settings.working_width * scale), extractor.stride)
     image = torch.rand(1, 3, height, width, device=extractor.device)
+    large = torch.rand(1, 3, high, wide, device=extractor.device)
+    given = torch.rand(1, 6, high, wide, device=extractor.device)
 
     def forward() -> None:
         with torch.no_grad():
@@ -382,9 +365,6 @@ def network_figures(scene: Scene, extractor: FeatureExtractor) -> dict[str, floa
 
     def both() -> None:
         extractor.features(image.requires_grad_()).sum().backward()
-
-    large = torch.rand(1, 3, high, wide, device=extractor.device)
-    given = torch.rand(1, 6, high, wide, device=extractor.device)
 
     return {
         f"surface network forward, {wide}x{high}": milliseconds(lambda: extractor.surface(large, given), _RUNS),

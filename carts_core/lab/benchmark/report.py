@@ -16,11 +16,10 @@ from matplotlib.ticker import NullFormatter
 from ...files import OutputPath, csv_cell, output_stream, write_text
 from ...html import Table, render_page
 from ...wording import counted
-from . import paper
 from .hand_eye import HandEyeRun, hand_eye_table, hand_eye_targets
 from .measurement import BEST_OF, TOLERANCE, Measurement
 from .scope import SYNTHETIC
-from .statistics import DICE, DOMAIN_LABELS, JOINT_MAE, SHORT_LABELS, Measurements, scores
+from .statistics import DICE, DOMAIN_LABELS, JOINT_MAE, PAPER, SHORT_LABELS, TEXTS, Measurements, scores
 from .tables import (
     ROWS,
     calibration_table,
@@ -47,35 +46,24 @@ matplotlib.use("Agg")
 matplotlib.rcParams["svg.hashsalt"] = "carts"
 
 COLORS = {"paper": "#b3541e", "ours": "#1f5fa8"}
+_PAPERS_TABLES = ("dice", "dice_by_iterations", "dice_by_error", "mae_by_error")
 _BARS = ("#9aa0a6", "#d0d3d6", "#c9a227", "#e0905c", "#b3541e", "#1f5fa8")
 
 
 def write_figures(data: Measurements, folder: OutputPath) -> dict[str, Path]:
     """Draw all plots for which there are measurements; returns caption -> file."""
     made: dict[str, Path] = {}
-    for name, caption, draw in (
-        ("domains", "Dice by method and domain, from the measured kinematics. Lines: standard deviation.", _domains),
-        (
-            "convergence",
-            "Convergence on the synthetic frames, from the measured kinematics: best iterate so far, mean and "
-            "quartiles over frames of all domains. A run that has ended keeps its value. Losses are of runs in which "
-            "they fell; ours compare within one observation only and are left out.",
-            _convergence,
-        ),
-        ("errors", "Dice and joint error after optimization, by the error at the start (regular domain).", _errors),
-        (
-            "scatter",
-            "Dice and joint error after optimization against the Dice at the start: one point per run, all errors at "
-            "the start. Below the dashed line a frame was made worse.",
-            _scatter,
-        ),
-    ):
-        figure = draw(data)
-        if figure is not None:
+    for name, draw in {
+        "domains": _domains,
+        "convergence": _convergence,
+        "errors": _errors,
+        "scatter": _scatter,
+    }.items():
+        if (figure := draw(data)) is not None:
             path = folder / f"{name}.svg"
             with output_stream(path) as stream:
                 figure.savefig(stream, format="svg", metadata={"Date": None})
-            made[caption] = path.path
+            made[TEXTS["figures"][name]] = path.path
     return made
 
 
@@ -163,8 +151,8 @@ def _errors(data: Measurements) -> Figure | None:
     figure = Figure(figsize=(9, 3.4), layout="constrained")
     dice_axes, mae_axes = figure.subplots(1, 2)
     for axes, figure_of, table, scale in (
-        (dice_axes, DICE, paper.DICE_BY_ERROR, 0.01),
-        (mae_axes, JOINT_MAE, paper.MAE_BY_ERROR, 1.0),
+        (dice_axes, DICE, "dice_by_error", 0.01),
+        (mae_axes, JOINT_MAE, "mae_by_error", 1.0),
     ):
         for method, color in COLORS.items():
             runs = data.of(source=SYNTHETIC, domain="regular", method=method)
@@ -172,7 +160,7 @@ def _errors(data: Measurements) -> Figure | None:
             found = {error: figure_of.values(m.final for m in runs if m.run.error_deg == error) for error in degrees}
             known = [(e, float(np.mean(values)), float(np.std(values))) for e, values in found.items() if values]
             _with_bars(axes, known, color, "o-", SHORT_LABELS[method])
-        points = [(error, scale * mean, scale * deviation) for error, (mean, deviation) in table["S-Reg"].items()]
+        points = [(float(error), scale * mean, scale * std) for error, (mean, std) in PAPER[table]["S-Reg"].items()]
         _with_bars(axes, points, "#777", "x--", "paper's own numbers (S-Reg)")
     dice_axes.set(title="Dice", xlabel="error of every joint at the start [deg]", ylabel="Dice")
     mae_axes.set(title="joint MAE", xlabel="error of every joint at the start [deg]", ylabel="MAE [deg]")
@@ -250,12 +238,8 @@ def write_report(
 ) -> Path:
     """Write `report.html`, `figures/`, `results.json` and `results.csv`; returns the page's path.
 
-    Args:
-        folder: of these files.
-        measurements: the runs.
-        facts: their provenance.
-        stages: stage of an iteration -> milliseconds; may be empty.
-        hand_eye: calibrations of another robot; may be empty.
+    `stages` maps stages of an iteration to milliseconds; these and `hand_eye`, calibrations of another robot, may be
+    empty.
 
     Raises:
         CartsError: the folder cannot be written to.
@@ -265,22 +249,21 @@ def write_report(
     sections = _sections(data, stages, hand_eye)
     figures = write_figures(data.compared(), folder / "figures")
     rows = [_row(measurement) for measurement in measurements]
+    machines = sorted({measurement.machine for measurement in measurements})
+    warnings = {
+        "Not everything has been measured yet; run the same command again to resume.": len(rows) < facts.planned,
+        "Runs come from more than one machine or number of threads, so seconds do not compare.": len(machines) > 1,
+    }
     document = {
         "format": "carts-benchmark/1",
         "facts": asdict(facts),
         "measured": len(measurements),
-        "machines": _machines(measurements),
+        "machines": machines,
         "targets": [asdict(target) for target in verdicts],
         "tables": [asdict(table) for tables in sections.values() for table in tables],
         "stages_ms": stages,
         "hand_eye": [asdict(run) for run in hand_eye],
-        "paper": {
-            "source": paper.SOURCE,
-            "dice": paper.DICE,
-            "dice_by_iterations": paper.DICE_BY_ITERATIONS,
-            "dice_by_error": paper.DICE_BY_ERROR,
-            "mae_by_error": paper.MAE_BY_ERROR,
-        },
+        "paper": {name: PAPER[name] for name in ("source", *_PAPERS_TABLES)},
         "runs": rows,
     }
     write_text(folder / "results.json", json.dumps(document, indent=1))
@@ -288,13 +271,19 @@ def write_report(
     page = render_page(
         "benchmark.html",
         title="CaRTS benchmark",
-        facts=_facts(facts, measurements),
-        warnings=_warnings(facts, measurements),
+        facts={
+            "runs": f"{len(measurements)} of {facts.planned} measured ({facts.scope})",
+            **{f"{name} frames": description for name, description in facts.sources.items()},
+            "machine": "; ".join(machines) or "-",
+            "carts": f"{facts.version}, measured code {facts.code[:12]}",
+            "weights": facts.weights[:12],
+        },
+        warnings=[text for text, holds in warnings.items() if holds],
         targets=verdicts,
         figures={caption: path.relative_to(folder.path).as_posix() for caption, path in figures.items()},
         sections=sections,
         tolerance=f"{TOLERANCE:g}",
-        source=paper.SOURCE,
+        source=PAPER["source"],
     )
     path = folder / "report.html"
     write_text(path, page)
@@ -356,26 +345,3 @@ def _csv(rows: list[dict[str, object]]) -> str:
             {name: csv_cell(cell) if isinstance(cell, str) else cell for name, cell in row.items()} for row in rows
         )
     return text.getvalue()
-
-
-def _machines(measurements: list[Measurement]) -> list[str]:
-    return sorted({measurement.machine for measurement in measurements})
-
-
-def _facts(facts: Facts, measurements: list[Measurement]) -> dict[str, str]:
-    return {
-        "runs": f"{len(measurements)} of {facts.planned} measured ({facts.scope})",
-        **{f"{name} frames": description for name, description in facts.sources.items()},
-        "machine": "; ".join(_machines(measurements)) or "-",
-        "carts": f"{facts.version}, measured code {facts.code[:12]}",
-        "weights": facts.weights[:12],
-    }
-
-
-def _warnings(facts: Facts, measurements: list[Measurement]) -> list[str]:
-    found = []
-    if len(measurements) < facts.planned:
-        found.append("Not everything has been measured yet; run the same command again to resume.")
-    if len(_machines(measurements)) > 1:
-        found.append("Runs come from more than one machine or number of threads, so seconds do not compare.")
-    return found

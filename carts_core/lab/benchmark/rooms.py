@@ -161,8 +161,7 @@ def _bench(rng: np.random.Generator, width: int, height: int) -> Picture:
             profile = _round(rng.uniform(-1, 1), rng.uniform(0, 0.8))
             _bar(picture, middle, angle, rng.uniform(80, 300), rng.uniform(6, 40), color, profile)
     for _ in range(40):
-        grey = rng.uniform(0.2, 0.9)
-        place = _somewhere(rng, width, height)
+        grey, place = rng.uniform(0.2, 0.9), _somewhere(rng, width, height)
         _disc(picture, place, int(rng.integers(2, 8)), grey)
     return picture
 
@@ -175,9 +174,8 @@ def _rods(rng: np.random.Generator, width: int, height: int) -> Picture:
         color = np.full(3, rng.choice([rng.uniform(0.05, 0.2), rng.uniform(0.4, 0.8)])) * rng.uniform(0.9, 1.1, 3)
         profile = _round(rng.uniform(-1, 1), rng.uniform(0, 0.6))
         length = rng.uniform(0.3, 1.4) * width
-        _bar(
-            picture, _somewhere(rng, width, height), rng.uniform(0, np.pi), length, rng.uniform(12, 60), color, profile
-        )
+        place, angle = _somewhere(rng, width, height), rng.uniform(0, np.pi)
+        _bar(picture, place, angle, length, rng.uniform(12, 60), color, profile)
     return picture
 
 
@@ -249,16 +247,8 @@ def _ceramic(rng: np.random.Generator, width: int, height: int) -> Picture:
         dish = np.asarray(color) * bowl[..., None] + gloss[..., None]
         cover = ((1.02 - inside) * radius / 2).clip(0, 1)[..., None]
         picture = (cover * dish + (1 - cover) * picture).astype(np.float32)
-    profile = _round(0.5, 0.7)
-    _bar(
-        picture,
-        _somewhere(rng, width, height),
-        rng.uniform(0, np.pi),
-        width,
-        rng.uniform(15, 45),
-        np.full(3, 0.9),
-        profile,
-    )
+    place, angle = _somewhere(rng, width, height), rng.uniform(0, np.pi)
+    _bar(picture, place, angle, width, rng.uniform(15, 45), np.full(3, 0.9), _round(0.5, 0.7))
     return picture
 
 
@@ -273,15 +263,12 @@ def _cables(rng: np.random.Generator, width: int, height: int) -> Picture:
     for _ in range(14):
         knots = np.array([(rng.uniform(-0.1, 1.1) * width, rng.uniform(-0.1, 1.1) * height) for _ in range(4)])
         t = np.linspace(0, 1, 80)[:, None]
-        curve = (
-            (1 - t) ** 3 * knots[0] + 3 * t * (1 - t) ** 2 * knots[1] + 3 * t**2 * (1 - t) * knots[2] + t**3 * knots[3]
-        )
+        s = 1 - t
+        curve = s**3 * knots[0] + 3 * t * s**2 * knots[1] + 3 * t**2 * s * knots[2] + t**3 * knots[3]
         color, thick = _color(rng, (0, 1), (0.05, 0.8)), float(rng.uniform(4, 26))
         for share, light in ((1.0, 0.5), (0.7, 0.9), (0.25, 1.4)):
-            line = [np.rint(curve).astype(np.int32)]
-            cv2.polylines(
-                picture, line, False, (color * light).clip(0, 1).tolist(), max(round(share * thick), 1), cv2.LINE_AA
-            )
+            line, shade = [np.rint(curve).astype(np.int32)], (color * light).clip(0, 1).tolist()
+            cv2.polylines(picture, line, False, shade, max(round(share * thick), 1), cv2.LINE_AA)
     return picture
 
 
@@ -305,7 +292,31 @@ _GAIN, _NOISE = 0.03, 1.5
 """Largest change of the light from frame to frame [1], and the sensor's noise [grey levels]."""
 
 
-class AnotherRoom:
+class AlteredSequence:
+    """Base class of a sequence in domains of its own, whose images are altered in memory."""
+
+    def __init__(self, sequence: Sequence) -> None:
+        self.scene, self.timestamps = sequence.scene, sequence.timestamps
+        self.measured_joints = sequence.measured_joints
+        self._sequence = sequence
+
+    def __len__(self) -> int:
+        return len(self._sequence)
+
+    def frame(self, index: int, domain: str | None = None, cameras: Iterable[str] | None = None) -> Frame:
+        """A frame with its images in a domain, the first one by default."""
+        raise NotImplementedError
+
+    def mean_background(self, camera: str, domain: str | None = None) -> MeanBackground:
+        """The mean background and the pixels where it is known."""
+        raise NotImplementedError
+
+    def background(self, camera: str, domain: str | None = None) -> UInt8[np.ndarray, "h w 3"]:
+        """The mean background in a domain."""
+        return self.mean_background(camera, domain).image.copy()
+
+
+class AnotherRoom(AlteredSequence):
     """A real sequence, with masks, in which each domain is a room of that name.
 
     The room stands still; light and noise vary from frame to frame, by the seed. The mean background is estimated as of
@@ -313,16 +324,10 @@ class AnotherRoom:
     """
 
     def __init__(self, sequence: Sequence, rooms: Items[Room], seed: int) -> None:
-        self.scene, self.timestamps = sequence.scene, sequence.timestamps
-        self.measured_joints = sequence.measured_joints
-        self.rooms = {room.domain: room for room in rooms}
-        self._sequence, self._seed = sequence, seed
+        super().__init__(sequence)
+        self.rooms, self._seed = {room.domain: room for room in rooms}, seed
         self._cameras = [camera.name for camera in sequence.scene.cameras]
-        self._picture = lru_cache(maxsize=8)(self._make_picture)
-        self._background = lru_cache(maxsize=8)(self._make_background)
-
-    def __len__(self) -> int:
-        return len(self._sequence)
+        self._picture, self._background = lru_cache(8)(self._make_picture), lru_cache(8)(self._make_background)
 
     def frame(self, index: int, domain: str | None = None, cameras: Iterable[str] | None = None) -> Frame:
         """A frame in a room; the first one by default."""
@@ -332,15 +337,15 @@ class AnotherRoom:
         images = {}
         for camera, image in frame.images.items():
             picture = pasted(image, frame.masks[camera], self._picture(room, camera))
-            images[camera] = self._photographed(picture, room, camera, index)
+            # The light and the noise of one moment.
+            rng = np.random.default_rng([self._seed, zlib.crc32(f"{self.rooms[room].name}/{camera}".encode()), index])
+            light = picture * rng.uniform(1 - _GAIN, 1 + _GAIN)
+            noisy = np.rint(light + rng.normal(0, _NOISE, picture.shape))
+            images[camera] = noisy.clip(0, 255).astype(np.uint8)
         return dataclasses.replace(frame, domain=room, images=images)
 
-    def background(self, camera: str, domain: str | None = None) -> UInt8[np.ndarray, "h w 3"]:
-        """The mean background, estimated from the recording in the room."""
-        return self.mean_background(camera, domain).image.copy()
-
     def mean_background(self, camera: str, domain: str | None = None) -> MeanBackground:
-        """The mean background and the pixels where it is known."""
+        """The mean background of the recording in the room, and the pixels where it is known."""
         return self._background(domain or next(iter(self.rooms)), camera)
 
     def _make_picture(self, room: str, camera: str) -> UInt8[np.ndarray, "h w 3"]:
@@ -355,14 +360,6 @@ class AnotherRoom:
         return background_of_recording(
             self.scene, camera, states, lambda place: self.frame(indices[place], room, [camera]).images[camera]
         )
-
-    def _photographed(
-        self, picture: UInt8[np.ndarray, "h w 3"], room: str, camera: str, index: int
-    ) -> UInt8[np.ndarray, "h w 3"]:
-        """The picture under the light and with the noise of one moment."""
-        rng = np.random.default_rng([self._seed, zlib.crc32(f"{self.rooms[room].name}/{camera}".encode()), index])
-        light = picture * rng.uniform(1 - _GAIN, 1 + _GAIN)
-        return np.rint(light + rng.normal(0, _NOISE, picture.shape)).clip(0, 255).astype(np.uint8)
 
 
 def pasted(

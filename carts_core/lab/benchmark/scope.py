@@ -37,48 +37,48 @@ class Run:
 
 @dataclass(frozen=True)
 class Scope:
-    """How much is measured."""
+    """How much is measured; defaults are those of the full form."""
 
-    frames: int
+    frames: int = 8
     """Frames of each sequence, evenly spread, on which all methods are evaluated."""
-    sequence_frames: int
+    sequence_frames: int = 24
     """Frames of the synthetic sequence that is made; all of them serve the estimate of the background."""
-    samples: int
+    samples: int = 8
     """Paths per pixel of the synthetic sequence."""
-    paper_iterations: int
+    paper_iterations: int = 100
     """Steps in the paper's setting from the measured joint positions, `PAPERS_STEPS` at most from others. Its schedule
     does not depend on their number, so one run holds all shorter ones."""
-    error_domains: tuple[str, ...]
+    error_domains: tuple[str, ...] = DOMAINS
     """Synthetic domains with errors at the start."""
-    errors_deg: tuple[float, ...]
+    errors_deg: tuple[float, ...] = (0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0)
     """Sizes of that error for the default solver [deg]."""
-    paper_errors_deg: tuple[float, ...]
+    paper_errors_deg: tuple[float, ...] = (0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0)
     """The same for the paper's setting, in the regular domain [deg]."""
-    further_errors_deg: tuple[float, ...]
+    further_errors_deg: tuple[float, ...] = (1.0, 2.0, 3.0, 5.0)
     """The same for the default solver on the other frames of the synthetic sequence [deg]."""
-    real_errors_deg: tuple[float, ...]
+    real_errors_deg: tuple[float, ...] = (1.0, 2.0, 3.0)
     """The same on real frames, both methods, in the regular domain, from the measured joint positions [deg]."""
-    hard_errors_deg: tuple[float, ...]
+    hard_errors_deg: tuple[float, ...] = (2.0,)
     """The same on synthetic frames with occluders, and with all cameras at once [deg]."""
-    crossing_errors_deg: tuple[float, ...]
+    crossing_errors_deg: tuple[float, ...] = (1.0, 2.0, 3.0)
     """The same on synthetic frames whose arms cross, for the default solver and ACS [deg]."""
-    consecutive: int
+    consecutive: int = 30
     """Largest number of first frames of each sequence that are corrected together."""
-    consecutive_domains: tuple[str, ...]
+    consecutive_domains: tuple[str, ...] = DOMAINS
     """Domains of these frames."""
-    consecutive_errors_deg: tuple[float, ...]
+    consecutive_errors_deg: tuple[float, ...] = (1.0, 2.0, 3.0)
     """Sizes of an error at the start that all synthetic frames share, in those domains [deg]."""
-    calibration_frames: int
+    calibration_frames: int = 20
     """Frames of a calibration of a real sequence, evenly spread."""
-    room_frames: int
+    room_frames: int = 2
     """Frames of a real sequence that are put before each of the other rooms, evenly spread."""
-    room_consecutive: int
+    room_consecutive: int = 8
     """The same for frames that are corrected together there."""
-    room_share: int
+    room_share: int = 1
     """Every n-th room is measured."""
-    family_frames: int
+    family_frames: int = 6
     """Frames of each instrument that is in no training data; may be 0."""
-    hand_eye_starts: int
+    hand_eye_starts: int = 10
     """Starts of each hand-eye calibration of another robot."""
 
     def steps(self, run: Run) -> int:
@@ -99,17 +99,16 @@ class Scope:
         return replace(self, frames=frames)
 
 
+FULL = Scope()
 QUICK = Scope(
     frames=2,
     sequence_frames=3,
     samples=4,
     paper_iterations=PAPERS_STEPS,
     error_domains=("regular",),
-    errors_deg=(0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0),
     paper_errors_deg=(2.0,),
     further_errors_deg=(),
     real_errors_deg=(),
-    hard_errors_deg=(2.0,),
     crossing_errors_deg=(2.0,),
     consecutive=6,
     consecutive_domains=("regular",),
@@ -120,28 +119,6 @@ QUICK = Scope(
     room_share=8,
     family_frames=1,
     hand_eye_starts=1,
-)
-FULL = Scope(
-    frames=8,
-    sequence_frames=24,
-    samples=8,
-    paper_iterations=100,
-    error_domains=DOMAINS,
-    errors_deg=QUICK.errors_deg,
-    paper_errors_deg=QUICK.errors_deg,
-    further_errors_deg=(1.0, 2.0, 3.0, 5.0),
-    real_errors_deg=(1.0, 2.0, 3.0),
-    hard_errors_deg=(2.0,),
-    crossing_errors_deg=(1.0, 2.0, 3.0),
-    consecutive=30,
-    consecutive_domains=DOMAINS,
-    consecutive_errors_deg=(1.0, 2.0, 3.0),
-    calibration_frames=20,
-    room_frames=2,
-    room_consecutive=8,
-    room_share=1,
-    family_frames=6,
-    hand_eye_starts=10,
 )
 
 
@@ -198,12 +175,7 @@ METHODS = {
     "temporal": Method("TC-CaRTS, its temporal pipeline", DescentSolver.paper, together=True),
     "masks": Method("ours, masks as target", _ours, masks_given=True),
 }
-_NETWORKS: dict[BaselineName, str] = {
-    "unet": "U-Net",
-    "hrnet": "HRNet",
-    "swin": "Swin",
-    "colleoni": "Colleoni's",
-}
+_NETWORKS: dict[BaselineName, str] = {"unet": "U-Net", "hrnet": "HRNet", "swin": "Swin", "colleoni": "Colleoni's"}
 _AUGMENTATIONS: dict[Augmentation, str] = {
     "none": "no augmentation",
     "smoke": "simulated smoke",

@@ -2,19 +2,16 @@
 
 import hashlib
 from collections.abc import Callable, Iterable
+from collections.abc import Sequence as Items
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Protocol
-
-import numpy as np
-from jaxtyping import Float, UInt8
+from typing import Any
 
 from ...errors import SettingsError
 from ...files import holds_file, output_path
 from ...files.reading import IMAGE, SEQUENCE, read_bytes
 from ...model.mesh_cache import cache_dir
-from ...model.scene import Scene
-from ...recording import Frame, MeanBackground, Sequence
+from ...recording import Sequence
 from ...recording.background import spread
 from ...settings import DOMAINS, EndoscopeConfig, MotionConfig, RenderConfig, SynthesisConfig
 from ...wording import counted
@@ -22,7 +19,7 @@ from ..synthesis.scene import place_cameras
 from ..synthesis.synthesize import Progress, synthesize
 from .counterfactual import Counterfactual, backdrop
 from .measurement import code_fingerprint
-from .rooms import AnotherRoom, made_rooms, photographs
+from .rooms import AlteredSequence, AnotherRoom, Room, made_rooms, photographs
 from .scope import FAMILY, REAL, ROOMS, SYNTHETIC, Scope
 
 TEST_SEED = 730_511
@@ -36,28 +33,7 @@ _ROOMS_CODE = ("lab/benchmark/rooms.py",)
 _ALTERING_CODE = ("lab/benchmark/counterfactual.py",)
 
 
-class Recording(Protocol):
-    """Interface of `Sequence`, `Counterfactual` and `AnotherRoom`."""
-
-    scene: Scene
-    measured_joints: dict[str, tuple[str, ...]]
-    timestamps: Float[np.ndarray, " frames"] | None
-
-    def __len__(self) -> int:
-        """Number of frames."""
-        ...
-
-    def frame(self, index: int, domain: str | None = None, cameras: Iterable[str] | None = None) -> Frame:
-        """One frame in a domain."""
-        ...
-
-    def background(self, camera: str, domain: str | None = None) -> UInt8[np.ndarray, "h w 3"]:
-        """The mean background in a domain."""
-        ...
-
-    def mean_background(self, camera: str, domain: str | None = None) -> MeanBackground:
-        """The mean background and the pixels where it is known."""
-        ...
+Recording = Sequence | AlteredSequence
 
 
 @dataclass(frozen=True)
@@ -104,14 +80,7 @@ def synthetic_source(scope: Scope, seed: int = TEST_SEED) -> Source:
             f"the default is {TEST_SEED}."
         )
     frames = scope.sequence_frames
-    config = SynthesisConfig(
-        seed=seed,
-        name=f"fresh {seed}",
-        endoscope=EndoscopeConfig(stereo=True),
-        motion=MotionConfig(frames=frames, frame_rate=frames / _MOTION_SECONDS),
-        render=RenderConfig(samples=scope.samples),
-    )
-    fingerprint, open_ = _made_once(config)
+    config = _config(scope, seed, f"fresh {seed}", frames, endoscope=EndoscopeConfig(stereo=True))
     evaluated = spread(frames, scope.frames)
     what = f"seed {seed}: two arms, {config.endoscope.width}x{config.endoscope.height}"
     taken = f"{len(evaluated)} of {counted(frames, 'frame')} by all methods, {counted(scope.samples, 'path')} per pixel"
@@ -120,8 +89,7 @@ def synthetic_source(scope: Scope, seed: int = TEST_SEED) -> Source:
         f"{what}, {taken}",
         "left",
         evaluated,
-        fingerprint,
-        open_,
+        *_made_once(config),
         cameras=tuple(camera.name for camera in place_cameras(config.endoscope)),
         consecutive=list(range(min(frames, scope.consecutive))),
         length=frames,
@@ -130,31 +98,27 @@ def synthetic_source(scope: Scope, seed: int = TEST_SEED) -> Source:
 
 def family_sources(scope: Scope, seed: int = TEST_SEED) -> list[Source]:
     """A synthetic sequence for each instrument in no training data."""
-    frames, sources = scope.family_frames, []
-    for robot in HELD_OUT if frames else ():
-        config = SynthesisConfig(
-            seed=seed,
-            name=f"{robot} {seed}",
-            robot=Path(f"builtin:{robot}"),
-            domains=_FAMILY_DOMAINS,
-            motion=MotionConfig(frames=frames, frame_rate=frames / _MOTION_SECONDS),
-            render=RenderConfig(samples=scope.samples),
+    frames, domains = scope.family_frames, _FAMILY_DOMAINS
+    return [
+        Source(
+            f"{FAMILY} {robot}",
+            f"seed {seed}: two arms, {counted(frames, 'frame')}, each in {counted(len(domains), 'domain')}",
+            "left",
+            list(range(frames)),
+            *_made_once(
+                _config(scope, seed, f"{robot} {seed}", frames, robot=Path(f"builtin:{robot}"), domains=domains)
+            ),
+            cameras=("left",),
+            domains=domains,
+            length=frames,
         )
-        fingerprint, open_ = _made_once(config)
-        sources.append(
-            Source(
-                f"{FAMILY} {robot}",
-                f"seed {seed}: two arms, {counted(frames, 'frame')}, each in {counted(len(config.domains), 'domain')}",
-                "left",
-                list(range(frames)),
-                fingerprint,
-                open_,
-                cameras=("left",),
-                domains=config.domains,
-                length=frames,
-            )
-        )
-    return sources
+        for robot in (HELD_OUT if frames else ())
+    ]
+
+
+def _config(scope: Scope, seed: int, name: str, frames: int, **settings: Any) -> SynthesisConfig:
+    motion = MotionConfig(frames=frames, frame_rate=frames / _MOTION_SECONDS)
+    return SynthesisConfig(seed=seed, name=name, motion=motion, render=RenderConfig(samples=scope.samples), **settings)
 
 
 def _made_once(config: SynthesisConfig) -> tuple[str, Callable[[Progress], Sequence]]:
@@ -171,6 +135,24 @@ def _made_once(config: SynthesisConfig) -> tuple[str, Callable[[Progress], Seque
     return fingerprint, open_
 
 
+def _masked(sequence: Sequence, camera: str) -> list[int]:
+    """Positions of the frames with a mask."""
+    return [index for index in range(len(sequence)) if camera in (sequence.frame(index).masks or {})]
+
+
+def _digest(*parts: object) -> "hashlib._Hash":
+    return hashlib.sha256(repr(parts).encode())
+
+
+def _add_frames(digest: "hashlib._Hash", sequence: Sequence, indices: Iterable[int], cameras: Items[str] | None) -> str:
+    """Add images and measured joint positions; returns the fingerprint."""
+    for index in sorted(set(indices)):
+        frame = sequence.frame(index, cameras=cameras)
+        for values in (*frame.images.values(), *frame.measured.values()):
+            digest.update(values.tobytes())
+    return digest.hexdigest()[:32]
+
+
 def real_source(path: Path, scope: Scope, seed: int = TEST_SEED) -> Source:
     """The frames of a real sequence that have a mask, in its first camera.
 
@@ -180,18 +162,13 @@ def real_source(path: Path, scope: Scope, seed: int = TEST_SEED) -> Source:
     """
     sequence = Sequence.open(path)
     camera = sequence.scene.cameras[0]
-    masked = [index for index in range(len(sequence)) if camera.name in (sequence.frame(index).masks or {})]
+    masked = _masked(sequence, camera.name)
     if not masked:
         raise SettingsError(f"{path} has no masks for camera {camera.name!r}, so nothing can be scored. Give `masks`.")
     frames = [masked[place] for place in spread(len(masked), scope.frames)]
-    code = code_fingerprint((*_SYNTHESIS, *_ALTERING_CODE))
-    fingerprint = hashlib.sha256(repr((read_bytes(path, SEQUENCE), seed, code)).encode())
     consecutive = masked[: scope.consecutive]
-    calibrating = spread(len(sequence), scope.calibration_frames)
-    for index in sorted({*frames, *consecutive, *calibrating}):
-        frame = sequence.frame(index)
-        fingerprint.update(b"".join(image.tobytes() for image in frame.images.values()))
-        fingerprint.update(b"".join(values.tobytes() for values in frame.measured.values()))
+    hashed = *frames, *consecutive, *spread(len(sequence), scope.calibration_frames)
+    code = code_fingerprint((*_SYNTHESIS, *_ALTERING_CODE))
 
     def open_(progress: Progress) -> Counterfactual:
         progress("backdrop of the real frames", 0, 1)
@@ -203,7 +180,7 @@ def real_source(path: Path, scope: Scope, seed: int = TEST_SEED) -> Source:
         f"{sequence.name}, camera {camera.name}, {taken}",
         camera.name,
         frames,
-        fingerprint.hexdigest()[:32],
+        _add_frames(_digest(read_bytes(path, SEQUENCE), seed, code), sequence, hashed, None),
         open_,
         cameras=tuple(camera.name for camera in sequence.scene.cameras),
         consecutive=consecutive,
@@ -211,14 +188,23 @@ def real_source(path: Path, scope: Scope, seed: int = TEST_SEED) -> Source:
     )
 
 
+def _rooms(folder: Path | None, scope: Scope, *parts: object) -> "tuple[list[Room], hashlib._Hash]":
+    """The rooms, and a hash over them and `parts`."""
+    rooms = (made_rooms() + (photographs(folder) if folder else []))[:: scope.room_share]
+    digest = _digest(*parts, code_fingerprint(_ROOMS_CODE))
+    for photograph in sorted(folder.glob("*")) if folder else []:
+        digest.update(photograph.name.encode() + read_bytes(photograph, IMAGE))
+    return rooms, digest
+
+
 def synthetic_room_source(sequence: Source, folder: Path | None, scope: Scope, seed: int = TEST_SEED) -> Source:
     """The instruments of the synthetic sequence before other rooms; arguments as for `room_sources`."""
-    rooms, fingerprint = _rooms(folder, scope, sequence.fingerprint, seed)
+    rooms, digest = _rooms(folder, scope, sequence.fingerprint, seed)
     frames = [sequence.frames[place] for place in spread(len(sequence.frames), scope.room_frames)]
 
     def open_(progress: Progress) -> AnotherRoom:
         recording = sequence.open(progress)
-        assert isinstance(recording, Sequence), "what is made is a sequence on disk"
+        assert isinstance(recording, Sequence)
         return AnotherRoom(recording, rooms, seed)
 
     return Source(
@@ -226,55 +212,37 @@ def synthetic_room_source(sequence: Source, folder: Path | None, scope: Scope, s
         f"{counted(len(frames), 'frame')} in {counted(len(rooms), 'room')}",
         sequence.camera,
         frames,
-        fingerprint.hexdigest()[:32],
+        digest.hexdigest()[:32],
         open_,
         consecutive=[sequence.consecutive[i] for i in spread(len(sequence.consecutive), scope.room_consecutive)],
         rooms=[room.domain for room in rooms],
     )
 
 
-def _rooms(folder: Path | None, scope: Scope, *parts: object):
-    """The rooms, and a hash over them and `parts`."""
-    rooms = (made_rooms() + (photographs(folder) if folder else []))[:: scope.room_share]
-    fingerprint = hashlib.sha256(repr((*parts, code_fingerprint(_ROOMS_CODE))).encode())
-    for photograph in sorted(folder.glob("*")) if folder else []:
-        fingerprint.update(photograph.name.encode() + read_bytes(photograph, IMAGE))
-    return rooms, fingerprint
-
-
 def room_sources(path: Path, folder: Path | None, scope: Scope, seed: int = TEST_SEED) -> list[Source]:
     """A source for each camera of a real sequence that has masks, with its instruments before other rooms.
 
-    Args:
-        path: of the sequence.
-        folder: of photographs, which are rooms beside the synthetic ones; may be None.
-        scope: of the benchmark.
-        seed: of light and noise.
+    Photographs in `folder` are rooms beside the synthetic ones; `seed` is that of light and noise.
 
     Raises:
         SequenceError: the sequence is not usable.
         SettingsError: the folder holds no photograph.
     """
     sequence = Sequence.open(path)
-    rooms, fingerprint = _rooms(folder, scope, read_bytes(path, SEQUENCE), seed)
+    rooms, digest = _rooms(folder, scope, read_bytes(path, SEQUENCE), seed)
     sources = []
     for camera in (known.name for known in sequence.scene.cameras):
-        masked = [index for index in range(len(sequence)) if camera in (sequence.frame(index).masks or {})]
-        if not masked:
+        if not (masked := _masked(sequence, camera)):
             continue
         frames = [masked[place] for place in spread(len(masked), scope.room_frames + 2)[1:-1]]
         together = [masked[place] for place in spread(len(masked), scope.room_consecutive)]
-        for index in sorted({*frames, *together}):
-            frame = sequence.frame(index, cameras=[camera])
-            fingerprint.update(frame.images[camera].tobytes())
-            fingerprint.update(b"".join(values.tobytes() for values in frame.measured.values()))
         sources.append(
             Source(
                 f"{ROOMS} {camera}",
                 f"{sequence.name}, camera {camera}, {counted(len(frames), 'frame')} in {counted(len(rooms), 'room')}",
                 camera,
                 frames,
-                fingerprint.hexdigest()[:32],
+                _add_frames(digest, sequence, (*frames, *together), [camera]),
                 lambda _: AnotherRoom(sequence, rooms, seed),
                 consecutive=together,
                 rooms=[room.domain for room in rooms],

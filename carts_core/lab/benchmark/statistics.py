@@ -1,17 +1,42 @@
 """Measurements of a benchmark: selection, means and deviations, pairs of methods, and texts of tables."""
 
-from collections.abc import Iterable
+import tomllib
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from ...html import Cell
+from ...html import Cell, Table
 from ...settings import DOMAINS
-from . import paper
 from .conditions import OCCLUSION
 from .measurement import TOLERANCE, WIDE_TOLERANCE, Measurement, Score
 from .rooms import Half
 from .scope import FAMILY, MAIN, PAPERS_STEPS, ROOMS
+
+
+def read_table(name: str) -> dict[str, Any]:
+    """A TOML file beside this module."""
+    return tomllib.loads(Path(__file__).with_name(name).read_text(encoding="utf-8"))
+
+
+PAPER = read_table("paper.toml")
+"""The paper's numbers; the file describes them."""
+TEXTS = read_table("tables.toml")
+"""Titles and captions of tables, and captions of figures."""
+
+
+def table_of(name: str, rows: Sequence[Mapping[str, str | Cell]], /, **values: object) -> Table | None:
+    """A table with the title and the caption of that name, into which values are put; None without rows."""
+    title, caption = (TEXTS[name][text].format(**values) for text in ("title", "caption"))
+    return Table.of(title, caption, rows)
+
+
+def paper_column(source: str, domain: str) -> str:
+    """Column of the paper for one of our sources and domains; empty without one."""
+    return PAPER["columns"].get(source, {}).get(domain, "")
+
 
 ANY = object()
 """Matches every error at the start."""
@@ -58,30 +83,15 @@ class Measurements:
         """The domains that occur in a source, in the order in which they were measured."""
         return list(dict.fromkeys(measurement.run.domain for measurement in self.of(source=source)))
 
-    def sources(self) -> list[str]:
-        """The sources that occur, without other rooms and other instruments."""
+    def sources(self, kind: str = "") -> list[str]:
+        """The sources that occur of a kind (`ROOMS` or `FAMILY`), or those of neither."""
         found = dict.fromkeys(measurement.run.source for measurement in self.all)
-        return [source for source in found if _usual(source)]
+        return [source for source in found if (source.startswith(kind) if kind else _usual(source))]
 
-    def families(self) -> list[str]:
-        """The sources that occur of instruments in no training data."""
-        found = dict.fromkeys(measurement.run.source for measurement in self.all)
-        return [source for source in found if source.startswith(FAMILY)]
-
-    def in_rooms(self, camera: str, half: Half, method: str) -> list[Measurement]:
-        """Measurements of a camera's frames in the rooms of one half."""
-        return [
-            measurement
-            for measurement in self.all
-            if measurement.run.source == f"{ROOMS} {camera}"
-            and measurement.run.domain.startswith(half)
-            and measurement.run.method == method
-        ]
-
-    def room_cameras(self) -> list[str]:
-        """The cameras with frames in other rooms."""
-        found = dict.fromkeys(m.run.source for m in self.all if m.run.source.startswith(ROOMS))
-        return [source.removeprefix(ROOMS).strip() for source in found]
+    def in_rooms(self, source: str, half: Half, method: str) -> list[Measurement]:
+        """Measurements of a source's frames in the rooms of one half."""
+        runs = ((measurement, measurement.run) for measurement in self.all)
+        return [m for m, run in runs if run.source == source and run.domain.startswith(half) and run.method == method]
 
 
 def _usual(source: str) -> bool:
@@ -94,15 +104,7 @@ def scores(measurements: Iterable[Measurement], iterations: int | None = None) -
     return [score for score in found if score is not None]
 
 
-DOMAIN_LABELS = {
-    "regular": "regular",
-    "low_brightness": "low brightness",
-    "bleeding": "bleeding",
-    "smoke": "smoke",
-    "background_change": "background change",
-    "simulated_smoke": "simulated smoke",
-    OCCLUSION: "occlusion",
-}
+DOMAIN_LABELS = {domain: domain.replace("_", " ") for domain in (*DOMAINS, OCCLUSION)}
 SHORT_LABELS = {"paper": "paper's setting", "ours": "ours"}
 """Labels of methods in tables by iterations and errors."""
 NOTHING = "–"
@@ -131,7 +133,7 @@ class Figure:
         mean = f"{self.scale * np.mean(values):.{self.digits}f}"
         return mean if len(values) == 1 else f"{mean} ± {self.scale * np.std(values):.{self.digits}f}"
 
-    def cell(self, scores: Iterable[Score | None], theirs: paper.Value | None = None, column: str = "") -> Cell:
+    def cell(self, scores: Iterable[Score | None], theirs: Sequence[float] | None = None, column: str = "") -> Cell:
         """The text, and the paper's number below it with the name of its column there."""
         note = "" if theirs is None else f"{column} {theirs[0]:.1f} ± {theirs[1]:.1f}"
         return Cell(self.text(scores), note)

@@ -8,11 +8,10 @@ from typing import get_args
 from ...html import Cell, Table
 from ...settings import DOMAINS
 from ...wording import counted
-from . import paper
 from .conditions import OCCLUSION, SHARE
 from .measurement import Measurement
 from .rooms import Half
-from .scope import BASELINES, FAMILY, METHODS, PAPERS_STEPS, RENDERING, SYNTHETIC
+from .scope import BASELINES, FAMILY, METHODS, PAPERS_STEPS, RENDERING, ROOMS, SYNTHETIC
 from .statistics import (
     DICE,
     DOMAIN_LABELS,
@@ -20,6 +19,7 @@ from .statistics import (
     JOINT_MAE,
     NOTHING,
     NSD,
+    PAPER,
     SHORT_LABELS,
     TIP_DEPTH,
     VISIBLE_MAE,
@@ -28,19 +28,11 @@ from .statistics import (
     Measurements,
     begun,
     pairs,
+    paper_column,
     scores,
+    table_of,
 )
-from .targets import (
-    NEAR_FINAL,
-    RIGHT,
-    area,
-    called_good,
-    image_alone,
-    judged,
-    steps_to_final,
-    within,
-    wrong,
-)
+from .targets import NEAR_FINAL, RIGHT, area, called_good, image_alone, judged, steps_to_final, within, wrong
 
 Row = dict[str, str | Cell]
 
@@ -66,35 +58,29 @@ def main_tables(data: Measurements) -> list[Table]:
             row: Row = {"method": label}
             for domain in data.domains(source):
                 chosen = scores(data.of(source=source, domain=domain, method=method, error_deg=None), steps)
-                column = paper.COLUMNS.get((source, domain), "") if figure is DICE and steps != 30 else ""
-                row[DOMAIN_LABELS[domain]] = figure.cell(chosen, paper.DICE.get(method, {}).get(column), column)
+                column = paper_column(source, domain) if figure is DICE and steps != 30 else ""
+                row[DOMAIN_LABELS[domain]] = figure.cell(chosen, PAPER["dice"].get(method, {}).get(column), column)
             rows.append(row)
-        caption = f"{figure.heading} in percent, mean ± standard deviation over frames, from the measured kinematics."
-        if figure is not DICE:
-            caption += " NSD: normalized surface distance, which the paper does not give."
-        tables.append(Table.of(f"{source.capitalize()} frames: {figure.heading}", caption, rows))
+        name = "main" if figure is DICE else "main_nsd"
+        tables.append(table_of(name, rows, source=source.capitalize(), figure=figure.heading))
     return [table for table in tables if table]
 
 
 def iteration_tables(data: Measurements) -> list[Table]:
     """Dice of the best iterate of the first so many steps."""
-    caption = (
-        "Best iterate (lowest loss) of the first so many steps of one run, in percent, from the measured kinematics. "
-        f"{NOTHING}: the setting ends before. A converged run keeps its value."
-    )
     tables = []
     for source in data.sources():
         rows = []
         for (method, label), domain in product(SHORT_LABELS.items(), data.domains(source)):
             chosen = data.of(source=source, domain=domain, method=method, error_deg=None)
-            column = paper.COLUMNS.get((source, domain), "") if method == "paper" else ""
-            theirs = paper.DICE_BY_ITERATIONS.get(column, (None,) * len(paper.ITERATIONS))
+            column = paper_column(source, domain) if method == "paper" else ""
+            theirs = PAPER["dice_by_iterations"].get(column, [None] * len(PAPER["iterations"]))
             cells = {
                 str(steps): DICE.cell(scores(chosen, steps), value, column)
-                for steps, value in zip(paper.ITERATIONS, theirs, strict=True)
+                for steps, value in zip(PAPER["iterations"], theirs, strict=True)
             }
             rows.append({"method": label, "domain": DOMAIN_LABELS[domain], **cells})
-        tables.append(Table.of(f"{source.capitalize()} frames: Dice by iterations", caption, rows))
+        tables.append(table_of("iterations", rows, source=source.capitalize()))
     return [table for table in tables if table]
 
 
@@ -104,15 +90,11 @@ def error_tables(data: Measurements) -> list[Table]:
     for source in data.sources():
         errors = sorted({run.run.error_deg for run in data.of(source=source) if run.run.error_deg is not None})
         origin = "the true" if source == SYNTHETIC else "the measured (the truth is not known)"
-        start = (
-            "mean ± standard deviation. Every joint starts that many degrees (insertion: millimetres) off "
-            f"{origin} joint positions, with a random sign."
-        )
         mae = "Mean absolute error of measured revolute joints [deg]"
         for figure, name, unit, theirs in (
-            (DICE, "Dice", "Dice in percent", paper.DICE_BY_ERROR),
-            (JOINT_MAE, "joint MAE", mae, paper.MAE_BY_ERROR),
-            (VISIBLE_MAE, "joint MAE, visible joints", mae, paper.MAE_BY_ERROR),
+            (DICE, "Dice", "Dice in percent", "dice_by_error"),
+            (JOINT_MAE, "joint MAE", mae, "mae_by_error"),
+            (VISIBLE_MAE, "joint MAE, visible joints", mae, "mae_by_error"),
         ):
             rows = []
             for (method, label), domain in product(SHORT_LABELS.items(), data.domains(source)):
@@ -120,16 +102,16 @@ def error_tables(data: Measurements) -> list[Table]:
                     error: scores(data.of(source=source, domain=domain, method=method, error_deg=error))
                     for error in errors
                 }
-                column = paper.COLUMNS.get((source, domain), "") if method == "paper" else ""
-                numbers = theirs.get(column, {})
+                column = paper_column(source, domain) if method == "paper" else ""
+                numbers = PAPER[theirs].get(column, {})
                 if any(figure.values(chosen) for chosen in found.values()):
                     cells = {
-                        f"{error:g}°": figure.cell(chosen, numbers.get(error), column)
+                        f"{error:g}°": figure.cell(chosen, numbers.get(f"{error:g}"), column)
                         for error, chosen in found.items()
                     }
                     rows.append({"method": label, "domain": DOMAIN_LABELS[domain], **cells})
-            title = f"{source.capitalize()} frames: {name} by the error at the start"
-            tables.append(Table.of(title, f"{unit}, {start}", rows))
+            texts = {"source": source.capitalize(), "name": name, "unit": unit, "origin": origin}
+            tables.append(table_of("errors", rows, **texts))
     return [table for table in tables if table]
 
 
@@ -156,13 +138,7 @@ def speed_table(data: Measurements) -> Table | None:
                 "made worse": f"{100 * mean(worse):.1f} %" if worse and method != "start" else NOTHING,
             }
         )
-    return Table.of(
-        "Seconds per frame, and frames made worse",
-        "Runs of each method on the frames that all methods have, each frame alone, from the image's arrival to the "
-        "result, without reading files. Made worse: Dice more than 0.01 below that of the start. The paper says that "
-        "30 to 50 iterations are far from video rate, and gives no seconds.",
-        rows,
-    )
+    return table_of("speed", rows)
 
 
 def pair_table(data: Measurements) -> Table | None:
@@ -184,13 +160,7 @@ def pair_table(data: Measurements) -> Table | None:
                 f"steps to within {NEAR_FINAL}": f"{median(steps):g}",
             }
         )
-    return Table.of(
-        "Against the paper's setting, to equal Dice",
-        f"Seconds until each has the Dice of the paper's setting at its end (its best of {PAPERS_STEPS}), median over "
-        f"pairs of runs in which that setting gained at least {GAINED} Dice. A run of ours that never has it "
-        "counts as 0 times faster. Steps: median over all runs of ours until they are that near their final Dice.",
-        rows,
-    )
+    return table_of("pairs", rows, steps=PAPERS_STEPS, gained=GAINED)
 
 
 def worse_table(data: Measurements) -> Table | None:
@@ -208,59 +178,33 @@ def worse_table(data: Measurements) -> Table | None:
         for m in data.default_solver()
         if m.made_worse
     ]
-    return Table.of("Frames made worse by the default solver", "All of them.", rows)
+    return table_of("worse", rows)
 
 
 def stage_table(stages: dict[str, float]) -> Table | None:
     """Milliseconds of each stage."""
-    return Table.of(
-        "Stages of one iteration",
-        "Medians on the first frame of the shipped sequence (two arms, 640x480).",
-        [{"stage": name, "ms": f"{value:.1f}"} for name, value in stages.items()],
-    )
+    return table_of("stages", [{"stage": name, "ms": f"{value:.1f}"} for name, value in stages.items()])
 
 
 def occlusion_table(data: Measurements) -> Table | None:
     """The default solver without knowledge of the occluders, with their pixels given, and with a proposal."""
-    return _table(
-        data,
-        "Occluders before the instruments",
-        f"Gauze, tissue or cloth over {100 * SHARE:.0f} % of the visible instruments. Dice of the rest, in percent: "
-        "pixels of occluders do not count, neither in the given mask nor in the estimate.",
-        OCCLUSION,
-        ("ours", "ours_given", "ours_proposed"),
-        (DICE, JOINT_MAE),
-    )
+    methods = "ours", "ours_given", "ours_proposed"
+    return _table(data, "occlusion", OCCLUSION, methods, (DICE, JOINT_MAE))
 
 
 def camera_table(data: Measurements) -> Table | None:
     """One camera against all of them in one objective."""
-    return _table(
-        data,
-        "All cameras in one objective",
-        "Dice of the first camera in percent. Depth: mean absolute error of the jaw tips along its axis. Posed: the "
-        "poses of the other cameras are unknown, too, with the calibration as prior.",
-        "regular",
-        ("ours", "stereo", "stereo_posed"),
-        (DICE, JOINT_MAE, VISIBLE_MAE, TIP_DEPTH),
-    )
+    methods = "ours", "stereo", "stereo_posed"
+    return _table(data, "cameras", "regular", methods, (DICE, JOINT_MAE, VISIBLE_MAE, TIP_DEPTH))
 
 
 def calibration_table(data: Measurements) -> Table | None:
     """One calibration of the whole recording, alone and before the default solver."""
-    return _table(
-        data,
-        "One calibration for all frames",
-        "Base frames from one calibration on images of the recording, joints as measured; then each frame is "
-        "corrected from there. Dice in percent.",
-        "regular",
-        ("ours", "calibrated", "calibrated_ours"),
-        (DICE,),
-    )
+    return _table(data, "calibration", "regular", ("ours", "calibrated", "calibrated_ours"), (DICE,))
 
 
 def _table(
-    data: Measurements, title: str, caption: str, domain: str, methods: tuple[str, ...], figures: tuple[Figure, ...]
+    data: Measurements, table: str, domain: str, methods: tuple[str, ...], figures: tuple[Figure, ...]
 ) -> Table | None:
     """A row per source, error at the start and method, over frames that all methods have."""
     rows = []
@@ -283,7 +227,7 @@ def _table(
                     "method": label,
                 }
                 rows.append(row | {figure.heading: figure.text(found) for figure in figures})
-    return Table.of(title, caption, rows)
+    return table_of(table, rows, share=100 * SHARE)
 
 
 _TOGETHER = {"sequence": "ours", "temporal": "paper"}
@@ -319,15 +263,7 @@ def sequence_table(data: Measurements) -> Table | None:
                 "Dice together": DICE.text(m.final for m in both),
             }
         )
-    return Table.of(
-        "Frames corrected together",
-        "The first frames of each sequence. An error at the start is the same in all of them; alone, each frame has "
-        "signs of its own. Seconds: median over frames that started at their neighbour's correction, reading the image "
-        "included. At the right: frames that were corrected alone, too. TC-CaRTS is the first of its three modules: "
-        "each frame starts at the previous correction and takes ten steps of ACS; the other two are not described well "
-        "enough. For it, alone means the paper's setting.",
-        rows,
-    )
+    return table_of("sequence", rows)
 
 
 def room_table(data: Measurements) -> Table | None:
@@ -337,12 +273,12 @@ def room_table(data: Measurements) -> Table | None:
         return Cell(DICE.text(scores(runs)), f"made worse: {sum(m.made_worse for m in runs)} of {len(runs)}")
 
     rows = []
-    for camera, half in product(data.room_cameras(), get_args(Half)):
-        alone, acs, together = (data.in_rooms(camera, half, method) for method in ("ours", "acs", "sequence"))
+    for source, half in product(data.sources(ROOMS), get_args(Half)):
+        alone, acs, together = (data.in_rooms(source, half, method) for method in ("ours", "acs", "sequence"))
         if alone:
             rows.append(
                 {
-                    "camera": camera,
+                    "camera": source.removeprefix(ROOMS).strip(),
                     "rooms": half,
                     "number": str(len({m.run.domain for m in alone})),
                     "Dice before": DICE.text(m.start for m in alone),
@@ -351,43 +287,33 @@ def room_table(data: Measurements) -> Table | None:
                     "ours, sequence mode": worse(together),
                 }
             )
-    return Table.of(
-        "Instruments in other rooms",
-        "Instruments, cut out by their masks and put before synthetic rooms and photographs, from the measured "
-        "kinematics; real ones by camera, and those of the synthetic frames. Held-out rooms served no tuning. Dice in "
-        "percent; made worse: by more than 1.",
-        rows,
-    )
+    return table_of("rooms", rows)
 
 
 def image_alone_table(data: Measurements) -> Table | None:
     """For each domain the best network that sees the image alone, and ours."""
     rows = []
     for source in data.sources():
-        ours, *others = image_alone(data, source)
+        dice, _ = image_alone(data, source)
+        ours = dice.pop("ours")
         for domain in DOMAINS:
-            known = [row for row in others if domain in row.dice]
-            if not known or domain not in ours.dice:
+            known = {method: found[domain] for method, found in dice.items() if domain in found}
+            if not known or domain not in ours:
                 continue
-            best = max(known, key=lambda row: row.dice[domain])
-            ahead, label = ours.dice[domain] - best.dice[domain], METHODS[best.method].label
+            best = max(known, key=lambda method: known[method])
+            ahead, label = ours[domain] - known[best], METHODS[best].label
             winner = "neither" if round(ahead, 1) == 0 else "ours" if ahead > 0 else label
             rows.append(
                 {
                     "frames": source,
                     "domain": DOMAIN_LABELS[domain],
                     "best network that sees the image alone": label,
-                    "its Dice": f"{best.dice[domain]:.1f}",
-                    "ours": f"{ours.dice[domain]:.1f}",
+                    "its Dice": f"{known[best]:.1f}",
+                    "ours": f"{ours[domain]:.1f}",
                     "who wins": f"{winner}, by {abs(ahead):.1f}",
                 }
             )
-    return Table.of(
-        "Networks that see the image alone",
-        "The best network without kinematics in each domain, and the default solver from the measured kinematics. Mean "
-        "Dice in percent over the same frames.",
-        rows,
-    )
+    return table_of("image_alone", rows)
 
 
 def family_table(data: Measurements) -> Table | None:
@@ -400,12 +326,11 @@ def family_table(data: Measurements) -> Table | None:
             "Dice before": f"{100 * mean(m.start.dice for m in runs if m.start):.1f}",
             "ours": f"{100 * mean(m.final.dice for m in runs):.1f}",
         }
-        for source in data.families()
+        for source in data.sources(FAMILY)
         for domain in data.domains(source)
         if (runs := data.of(source=source, domain=domain, method="ours"))
     ]
-    caption = "Synthetic frames, with the error at the start of other synthetic frames in every joint. Dice in percent."
-    return Table.of("Instruments that no training has", caption, rows)
+    return table_of("families", rows)
 
 
 def verdict_table(data: Measurements) -> Table | None:
@@ -425,13 +350,7 @@ def verdict_table(data: Measurements) -> Table | None:
                 "area under the ROC": NOTHING if known is None else f"{known:.3f}",
             }
         )
-    return Table.of(
-        "Verdicts",
-        "Verdicts use images and kinematics alone. A mask is wrong if its Dice is below "
-        f"{RIGHT}. Area: under the ROC of the probability of a wrong mask, 1 for perfect separation. Made worse: Dice "
-        "more than 0.01 below the start's.",
-        rows if groups else [],
-    )
+    return table_of("verdicts", rows if groups else [], right=RIGHT)
 
 
 def deviation_table(data: Measurements) -> Table | None:
@@ -446,5 +365,4 @@ def deviation_table(data: Measurements) -> Table | None:
         for name, runs in judged(data).items()
         if (known := within(runs)) is not None
     ]
-    caption = "Errors of measured joints over their reported deviation. Of a Gaussian, 68 and 95 % lie within 1 and 2."
-    return Table.of("Deviations", caption, rows)
+    return table_of("deviations", rows)

@@ -77,33 +77,26 @@ class RobotGeometry(Body):
         self.shaft_axis, self.shaft_end = self._shaft_line()
 
     def _shaft_line(self) -> tuple[np.ndarray, np.ndarray]:
+        """Direction of the shaft away from the tip, and its end there."""
         points = self.robot.meshes[self.shaft].vertices.astype(np.float64)
         centre = (points.min(0) + points.max(0)) / 2
         axis = np.zeros(3)
         axis[np.argmax(np.ptp(points, axis=0))] = 1.0
-        tip = self._tip_in_shaft_link(np.zeros(len(self.robot.joint_names)))
+        Ts, shaft_link = self.link_transforms(np.zeros(len(self.robot.joint_names))), self.part_link[self.shaft]
+        Ts_vertex, others = Ts[self._vertex_link], self._vertex_link != shaft_link
+        posed = np.einsum("vij,vj->vi", Ts_vertex[:, :3, :3], self.vertices) + Ts_vertex[:, :3, 3]
+        if others.any():
+            tip = posed[others].mean(0)
+        else:
+            tip = posed[np.argmax(((posed - posed[self._vertex_part == self.shaft].mean(0)) ** 2).sum(1))]
+        tip = np.linalg.inv(Ts[shaft_link])[:3] @ np.append(tip, 1.0)
         if axis @ (centre - tip) < 0:
             axis = -axis
         return axis, centre + axis * ((points - centre) @ axis).min()
 
-    def _tip_in_shaft_link(self, joint_positions: np.ndarray) -> np.ndarray:
-        Ts = self.link_transforms(joint_positions)
-        points = self._posed(Ts)
-        shaft_link = self.part_link[self.shaft]
-        centre = points[self._vertex_part == self.shaft].mean(0)
-        tip = points[np.argmax(((points - centre) ** 2).sum(1))]
-        others = self._vertex_link != shaft_link
-        if others.any():
-            tip = points[others].mean(0)
-        return np.linalg.inv(Ts[shaft_link])[:3] @ np.append(tip, 1.0)
-
     def link_transforms(self, joint_positions: np.ndarray) -> Float[np.ndarray, "links 4 4"]:
         """Ts_base_link [m] at these joint positions [dofs]."""
         return self.robot.forward_kinematics(torch.as_tensor(joint_positions, dtype=torch.float64)).numpy()
-
-    def _posed(self, Ts: np.ndarray) -> np.ndarray:
-        Ts = Ts[self._vertex_link]
-        return np.einsum("vij,vj->vi", Ts[:, :3, :3], self.vertices) + Ts[:, :3, 3]
 
     def posed(self, Ts_camera_link: Float[np.ndarray, "links 4 4"]) -> PosedRobot:
         """Vertices and normals in the camera's frame."""
@@ -144,10 +137,17 @@ def random_variant(rng: np.random.Generator, robots: Sequence[Robot], arms: int,
     chosen = [robots[int(rng.integers(len(robots)))] for _ in range(arms)]
     observed = [_vary(rng, robot) for robot in chosen]
     rendered = observed if rng.random() < PERFECT_MODEL else [_vary(rng, robot) for robot in chosen]
+    light = Light(
+        position=(float(rng.normal(0, 0.01)), float(rng.normal(0, 0.01)), float(rng.uniform(-0.04, 0.0))),
+        ambient=float(rng.uniform(0.15, 0.4)),
+        diffuse=float(rng.uniform(0.5, 0.85)),
+        specular=float(rng.uniform(0.1, 0.6)),
+        shininess=float(rng.uniform(8, 50)),
+    )
     scene = Scene(
         tuple(Arm(f"arm{index}", robot, np.eye(4)) for index, robot in enumerate(rendered)),
         (Camera("training", width, height, (float(width), float(width), width / 2, height / 2), np.eye(4)),),
-        _random_light(rng),
+        light,
     )
     geometries = tuple(RobotGeometry(robot) for robot in observed)
     known = geometries if rendered is observed else tuple(RobotGeometry(robot) for robot in rendered)
@@ -174,16 +174,6 @@ def _vary(rng: np.random.Generator, robot: Robot) -> Robot:
         meshes.append(replace(mesh, vertices=vertices, normals=normals.astype(np.float32), color=color))
     varied.meshes = tuple(meshes)
     return varied
-
-
-def _random_light(rng: np.random.Generator) -> Light:
-    return Light(
-        position=(float(rng.normal(0, 0.01)), float(rng.normal(0, 0.01)), float(rng.uniform(-0.04, 0.0))),
-        ambient=float(rng.uniform(0.15, 0.4)),
-        diffuse=float(rng.uniform(0.5, 0.85)),
-        specular=float(rng.uniform(0.1, 0.6)),
-        shininess=float(rng.uniform(8, 50)),
-    )
 
 
 Intrinsics = tuple[float, float, float, float]
@@ -315,11 +305,7 @@ class RecordedPlacements:
     ) -> tuple[Intrinsics, list[Placement]]:
         """A camera and a place for each robot, with a part of the first one in the image.
 
-        Args:
-            rng: random numbers.
-            geometries: robots of the recording.
-            size: width and height of the image [px], a part of the camera's image.
-            field: width of the camera's image [px].
+        `size` is width and height of the image [px], a part of the camera's image, which is `field` px wide.
 
         Raises:
             SettingsError: a robot is not in the recording.

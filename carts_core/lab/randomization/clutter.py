@@ -125,7 +125,8 @@ def _tool(rng: np.random.Generator) -> list[Part]:
         if rng.random() < 0.6:
             radius = rng.uniform(0.008, 0.016)
             ring, faces = _bent(_circle(radius), thickness / 2)
-            ring = ring @ _turn_about_x(np.pi / 2).T + (0, 0, joint - length / 2 - radius)
+            c, s = np.cos(np.pi / 2), np.sin(np.pi / 2)
+            ring = ring @ np.array([[1, 0, 0], [0, c, -s], [0, s, c]]).T + (0, 0, joint - length / 2 - radius)
             parts.append((ring @ R.T, faces))
     return parts
 
@@ -203,11 +204,6 @@ def _placed(rng: np.random.Generator, thing: Body, intrinsics: Intrinsics, width
     R = np.linalg.qr(rng.normal(size=(3, 3)))[0].astype(np.float32)
     vertices = thing.vertices @ R.T + centre
     return PosedRobot(vertices.astype(np.float32), thing.normals @ R.T)
-
-
-def _turn_about_x(angle: float) -> np.ndarray:
-    c, s = np.cos(angle), np.sin(angle)
-    return np.array([[1, 0, 0], [0, c, -s], [0, s, c]])
 
 
 def _turn_about_y(angle: float) -> np.ndarray:

@@ -90,8 +90,8 @@ class Observer:
         placements = claimed
         if rng.random() < settings.absent:
             placements = self._without_some(claimed)
-            view = look(variant.geometries, placements, intrinsics, *size)
-        fine = look(variant.geometries, placements, intrinsics, *size, SUPERSAMPLING)
+            view = look(variant.geometries, placements, intrinsics, size)
+        fine = look(variant.geometries, placements, intrinsics, size, SUPERSAMPLING)
         coverage = cv2.resize(fine.image(np.ones(len(fine.rows), np.float32)), size, interpolation=cv2.INTER_AREA)
         background = self._background(intrinsics, *size)
         camera_seed = int(rng.integers(2**63))
@@ -124,7 +124,7 @@ class Observer:
             else:
                 intrinsics = random_intrinsics(rng, *size, settings.field_width)
                 placements = [random_placement(rng, geometry, intrinsics, *size) for geometry in variant.geometries]
-            view = look(variant.geometries, placements, intrinsics, *size)
+            view = look(variant.geometries, placements, intrinsics, size)
             share = len(view.rows) / (settings.width * settings.height)
             tries += 1
             if settings.coverage[0] <= share <= settings.coverage[1] or tries == _TRIES:
@@ -170,21 +170,19 @@ class Observer:
 
 
 def look(
-    geometries: Sequence[RobotGeometry],
+    arms: Sequence[RobotGeometry],
     placements: Sequence[Placement],
     intrinsics: Intrinsics,
-    width: int,
-    height: int,
-    supersampling: int = 1,
+    size: tuple[int, int],
+    fine: int = 1,
 ) -> GBuffer:
-    """G-buffer of placed arms."""
+    """G-buffer of placed arms in an image of width and height `size`, `fine` times as fine."""
     posed = [
-        geometry.posed(placement.T_camera_base @ geometry.link_transforms(placement.joint_positions))
-        for geometry, placement in zip(geometries, placements, strict=True)
+        arm.posed(placement.T_camera_base @ arm.link_transforms(placement.joint_positions))
+        for arm, placement in zip(arms, placements, strict=True)
     ]
-    fx, fy, cx, cy = intrinsics
-    scaled = fx * supersampling, fy * supersampling, cx * supersampling, cy * supersampling
-    return render_gbuffer(geometries, posed, scaled, width * supersampling, height * supersampling)
+    fx, fy, cx, cy = (value * fine for value in intrinsics)
+    return render_gbuffer(arms, posed, (fx, fy, cx, cy), size[0] * fine, size[1] * fine)
 
 
 def to_uint8(image: np.ndarray) -> np.ndarray:
@@ -227,7 +225,7 @@ class PairGenerator:
             scale = float(rng.uniform(0.3, 2.0))
             pairs = zip(seen.variant.geometries, rendered, strict=True)
             rendered = [perturbed(rng, geometry, placement, scale) for geometry, placement in pairs]
-        hybrid_view = look(seen.variant.rendered, rendered, seen.intrinsics, settings.width, settings.height)
+        hybrid_view = look(seen.variant.rendered, rendered, seen.intrinsics, (settings.width, settings.height))
         mean_background = self._mean_background(seen.background, seen.camera_seed)
         hybrid_image = self._render_hybrid(seen.variant, rendered, seen.intrinsics, mean_background)
         return TrainingPair(
@@ -320,7 +318,7 @@ class SurfaceGenerator:
             perturbed(rng, geometry, placement, scale)
             for geometry, placement in zip(seen.variant.rendered, seen.claimed, strict=True)
         ]
-        wrong = _surface(seen.variant.rendered, look(seen.variant.rendered, given, seen.intrinsics, *size), size)
+        wrong = _surface(seen.variant.rendered, look(seen.variant.rendered, given, seen.intrinsics, size), size)
         if rng.random() < _UNKNOWN:
             wrong = np.zeros_like(wrong)
         return SurfaceSample(to_uint8(seen.image), wrong, _surface(seen.variant.geometries, seen.fine, size))

@@ -43,11 +43,7 @@ class GBuffer:
 
 
 def render_gbuffer(
-    geometries: Sequence[Body],
-    posed: Sequence[PosedRobot],
-    intrinsics: Intrinsics,
-    width: int,
-    height: int,
+    geometries: Sequence[Body], posed: Sequence[PosedRobot], intrinsics: Intrinsics, width: int, height: int
 ) -> GBuffer:
     """Rasterise the arms with the same visibility kernel as the renderer; nothing else is shared with it."""
     vertices = np.concatenate([arm.vertices for arm in posed])
@@ -97,18 +93,30 @@ Image = Float[np.ndarray, "h w 3"]
 
 def photograph(rng: np.random.Generator, image: Image, ranges: AppearanceRanges) -> Image:
     """Vignette, blur, exposure, colour, noise and JPEG artefacts, each drawn from `ranges`; result in [0, 1]."""
-    image = image * _vignette(rng, image.shape[1], image.shape[0], ranges)
+    height, width = image.shape[:2]
+    image = image * _vignette(rng, width, height, ranges)
     sigma = rng.uniform(*ranges.blur)
     if sigma > 0.2:
         image = cv2.GaussianBlur(image, (0, 0), sigma)
     if rng.random() < 0.25:  # cameras sharpen; that leaves bright seams along dark shafts
         image = image + rng.uniform(0.2, 1.0) * (image - cv2.GaussianBlur(image, (0, 0), rng.uniform(0.7, 1.5)))
     image = tone(rng, image, ranges)
-    image = np.clip(_noise(rng, image, ranges), 0, 1)
+    sigma = rng.uniform(*ranges.noise)
+    luminance = rng.standard_normal((height, width, 1), np.float32)
+    color = cv2.resize(rng.standard_normal((height // 2, width // 2, 3), np.float32), (width, height))
+    image = np.clip(image + sigma * (luminance + 0.7 * color) * (0.5 + image), 0, 1)
     if rng.random() < 0.7:
-        image = _jpeg(rng, image, ranges)
-    if rng.random() < 0.08:
-        image = image * _round_mask(rng, image.shape[1], image.shape[0])
+        options = [cv2.IMWRITE_JPEG_QUALITY, int(rng.uniform(*ranges.jpeg_quality))]
+        decoded = cv2.imdecode(
+            cv2.imencode(".jpg", (image[..., ::-1] * 255).astype(np.uint8), options)[1], cv2.IMREAD_COLOR
+        )
+        assert decoded is not None
+        image = decoded[..., ::-1].astype(np.float32) / 255
+    if rng.random() < 0.08:  # the black surround of a round endoscope image
+        y, x = np.mgrid[:height, :width].astype(np.float32)
+        radius = np.hypot(x - width * rng.uniform(0.4, 0.6), y - height * rng.uniform(0.4, 0.6))
+        edge = rng.uniform(0.55, 0.75) * width
+        image = image * np.clip((edge - radius) / rng.uniform(1, 6), 0, 1)[..., None]
     return image.astype(np.float32)
 
 
@@ -134,30 +142,6 @@ def _vignette(rng: np.random.Generator, width: int, height: int, ranges: Appeara
         # The mean brightness is kept, because low light is no part of the training data.
         light = light / light.mean()
     return np.clip(light, 0.35, 1.6)[..., None]
-
-
-def _noise(rng: np.random.Generator, image: np.ndarray, ranges: AppearanceRanges) -> np.ndarray:
-    height, width = image.shape[:2]
-    sigma = rng.uniform(*ranges.noise)
-    luminance = rng.standard_normal((height, width, 1), np.float32)
-    color = cv2.resize(rng.standard_normal((height // 2, width // 2, 3), np.float32), (width, height))
-    return image + sigma * (luminance + 0.7 * color) * (0.5 + image)
-
-
-def _jpeg(rng: np.random.Generator, image: np.ndarray, ranges: AppearanceRanges) -> np.ndarray:
-    quality = int(rng.uniform(*ranges.jpeg_quality))
-    coded = cv2.imencode(".jpg", (image[..., ::-1] * 255).astype(np.uint8), [cv2.IMWRITE_JPEG_QUALITY, quality])[1]
-    decoded = cv2.imdecode(coded, cv2.IMREAD_COLOR)
-    assert decoded is not None
-    return decoded[..., ::-1].astype(np.float32) / 255
-
-
-def _round_mask(rng: np.random.Generator, width: int, height: int) -> np.ndarray:
-    """The black surround of a round endoscope image."""
-    y, x = np.mgrid[:height, :width].astype(np.float32)
-    radius = np.hypot(x - width * rng.uniform(0.4, 0.6), y - height * rng.uniform(0.4, 0.6))
-    edge = rng.uniform(0.55, 0.75) * width
-    return np.clip((edge - radius) / rng.uniform(1, 6), 0, 1)[..., None]
 
 
 _ENVIRONMENT = (24, 48)

@@ -9,5 +9,4 @@ from ...settings import RenderConfig as RenderConfig
 from ...settings import SensorConfig as SensorConfig
 from ...settings import SynthesisConfig as SynthesisConfig
 from .synthesize import Progress as Progress
-from .synthesize import progress_bar as progress_bar
 from .synthesize import synthesize as synthesize

@@ -9,7 +9,7 @@ from jaxtyping import Float, UInt8
 from scipy.ndimage import map_coordinates
 
 from ...settings import DomainConfig, SensorConfig, SynthesisConfig
-from .path_tracer import INTENSITY, LIGHTS_CAMERA, Surface
+from .path_tracer import Surface
 from .scene import EXTENT, Tissue, sample, smooth_noise, smoothstep
 
 _ABSORPTION = np.array([620.0, 4200.0, 4600.0])
@@ -225,15 +225,21 @@ def expose(
     height, width = light.shape[:2]
     scale = width / 640.0
     image = np.minimum(light, 30.0).astype(np.float32)  # the brightest glints would otherwise bloom over the picture
-    image = image * _vignette(height, width, config.vignette)[..., None]
+    y, x = np.indices((height, width), dtype=np.float32) + 0.5
+    radius = np.hypot(x - width / 2, y - height / 2) / np.hypot(width / 2, height / 2)
+    image = image * (1.0 - config.vignette * radius**2.4)[..., None]
     if motion is not None:
         image = _motion_blur(image, motion)
     if config.blur > 0:
         image = cv2.GaussianBlur(image, (0, 0), max(config.blur * scale, 0.3))
-    image = _with_glow(image, scale)
+    # Light of the glints is scattered in the lens.
+    image = image + 0.06 * cv2.GaussianBlur(np.maximum(image - 1.0, 0.0), (0, 0), max(5.0 * scale, 0.5))
     image = _noisy(image, config, rng)
-    image = _soft_clip(image)
-    image = _srgb(image)
+    rest = 1.0 - _SHOULDER
+    bright = _SHOULDER + rest * (1.0 - np.exp(-np.maximum(image - _SHOULDER, 0.0) / rest))
+    image = np.where(image > _SHOULDER, bright, np.maximum(image, 0.0)).astype(np.float32)
+    image = np.clip(image, 0.0, 1.0)
+    image = np.where(image <= 0.0031308, 12.92 * image, 1.055 * image ** (1 / 2.4) - 0.055).astype(np.float32)
     if config.sharpening > 0:
         image = image + config.sharpening * (image - cv2.GaussianBlur(image, (0, 0), max(1.2 * scale, 0.5)))
     return np.clip(np.round(image * 255.0), 0, 255).astype(np.uint8)
@@ -243,17 +249,6 @@ def linear(image: UInt8[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w 3"]:
     """Linear RGB in [0, 1] of a picture: the inverse of the sRGB curve."""
     value = image.astype(np.float32) / 255.0
     return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4).astype(np.float32)
-
-
-def _srgb(value: np.ndarray) -> np.ndarray:
-    value = np.clip(value, 0.0, 1.0)
-    return np.where(value <= 0.0031308, 12.92 * value, 1.055 * value ** (1 / 2.4) - 0.055).astype(np.float32)
-
-
-def _vignette(height: int, width: int, loss: float) -> Float[np.ndarray, "h w"]:
-    y, x = np.indices((height, width), dtype=np.float32) + 0.5
-    radius = np.hypot(x - width / 2, y - height / 2) / np.hypot(width / 2, height / 2)
-    return 1.0 - loss * radius**2.4
 
 
 def _motion_blur(image: np.ndarray, motion: np.ndarray, taps: int = 5) -> np.ndarray:
@@ -281,12 +276,6 @@ def _motion_blur(image: np.ndarray, motion: np.ndarray, taps: int = 5) -> np.nda
     return total / taps
 
 
-def _with_glow(image: np.ndarray, scale: float) -> np.ndarray:
-    """Light of the glints scattered in the lens."""
-    excess = np.maximum(image - 1.0, 0.0)
-    return image + 0.06 * cv2.GaussianBlur(excess, (0, 0), max(5.0 * scale, 0.5))
-
-
 def _noisy(image: np.ndarray, config: SensorConfig, rng: np.random.Generator) -> np.ndarray:
     electrons = np.minimum(image, 2.0) * config.full_well
     deviation = np.sqrt(electrons + config.read_noise**2) / config.full_well
@@ -294,12 +283,6 @@ def _noisy(image: np.ndarray, config: SensorConfig, rng: np.random.Generator) ->
     # Colours are interpolated from the neighbours' on a real sensor, so noise has a grain of more than a pixel.
     noise = 0.55 * noise + 0.85 * cv2.GaussianBlur(noise, (0, 0), 0.8) * 1.6
     return image + deviation.astype(np.float32) * noise
-
-
-def _soft_clip(image: np.ndarray) -> np.ndarray:
-    rest = 1.0 - _SHOULDER
-    bright = _SHOULDER + rest * (1.0 - np.exp(-np.maximum(image - _SHOULDER, 0.0) / rest))
-    return np.where(image > _SHOULDER, bright, np.maximum(image, 0.0)).astype(np.float32)
 
 
 @dataclass(frozen=True)
@@ -313,12 +296,12 @@ class View:
     """Index of the camera."""
     light: Float[np.ndarray, "h w 3"]
     """Linear RGB over the regular background, 1 = white."""
-    gain: float
-    """From the renderer's radiance to `light`."""
+    lamp: float
+    """Radiant intensity of the light at the lens, in the unit of `light` times square metres."""
     other_light: Float[np.ndarray, "h w 3"] | None
-    """The same over the other background; None where that domain is not wanted."""
+    """Linear RGB over the other background; None where that domain is not wanted."""
     surface: Surface
-    motion: Float[np.ndarray, "h w 2"]
+    motion: Float[np.ndarray, "h w 2"] | None
     """[px] while the shutter is open."""
     lens: Float[np.ndarray, "3"]
     """The lens, in the world [m]."""
@@ -332,26 +315,26 @@ class Conditions:
         self._config = config
         self._bleeding = Bleeding(tissue, config.domain, config.rng("bleeding"))
         self._smoke = Smoke(config.domain, config.rng("smoke"))
-        self._overlay = SmokeOverlay(config.domain.overlay_opacity, config.rng("overlay"))
+        self.overlay = SmokeOverlay(config.domain.overlay_opacity, config.rng("overlay"))
 
     def image(self, domain: str, view: View) -> UInt8[np.ndarray, "h w 3"]:
         """The picture of one domain."""
         if domain == "simulated_smoke":
-            return self._overlay.over(self.image("regular", view), view.time)
+            return self.overlay.over(self.image("regular", view), view.time)
         rng = self._config.rng("noise", domain, view.frame, view.camera)
-        return expose(self._light(domain, view), self._config.sensor, rng, view.motion)
+        return expose(self.light(domain, view), self._config.sensor, rng, view.motion)
 
-    def _light(self, domain: str, view: View) -> Float[np.ndarray, "h w 3"]:
-        lamp = INTENSITY * len(LIGHTS_CAMERA) * view.gain
+    def light(self, domain: str, view: View) -> Float[np.ndarray, "h w 3"]:
+        """Linear RGB of one domain, without sensor and overlay."""
         match domain:
             case "regular":
                 return view.light
             case "low_brightness":
                 return view.light * self._config.domain.low_brightness
             case "bleeding":
-                return self._bleeding.stain(view.light, view.surface, view.Ts_world_link, view.lens, lamp)
+                return self._bleeding.stain(view.light, view.surface, view.Ts_world_link, view.lens, view.lamp)
             case "smoke":
-                return self._smoke.haze(view.light, view.surface.position, view.lens, lamp, view.time)
+                return self._smoke.haze(view.light, view.surface.position, view.lens, view.lamp, view.time)
             case "background_change" if view.other_light is not None:
                 return view.other_light
         raise AssertionError(f"no light for domain {domain}")

@@ -4,6 +4,7 @@ Tissue, light, smoke and blood are made for an endoscope 0.1 m away. For any oth
 that scale, with a miniature of the arm, and written enlarged, in metres: images do not determine scale.
 """
 
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import TypeVar
@@ -93,20 +94,18 @@ def plan_motion(
 def random_motion(draw: Callable[[np.random.Generator], Motion], config: SynthesisConfig) -> Motion:
     """The first of many random motions that is not rejected.
 
-    Args:
-        draw: makes one, or raises `Rejected`.
-        config: with the seed.
+    `draw` makes one, or raises `Rejected`.
 
     Raises:
-        SettingsError: all are.
+        SettingsError: all are rejected.
     """
-    reasons: dict[str, int] = {}
+    reasons = Counter[str]()
     for attempt in range(_ATTEMPTS):
         try:
             return draw(config.rng("motion", attempt))
         except Rejected as rejected:
-            reasons[str(rejected)] = reasons.get(str(rejected), 0) + 1
-    why = ", ".join(f"{reason} ({count})" for reason, count in sorted(reasons.items(), key=lambda item: -item[1]))
+            reasons[str(rejected)] += 1
+    why = ", ".join(f"{reason} ({count})" for reason, count in reasons.most_common())
     raise SettingsError(
         f"none of {_ATTEMPTS} random motions fits the settings: {why}. "
         "Make motion.reach or motion.wrist_range smaller, or take another seed."
@@ -116,6 +115,14 @@ def random_motion(draw: Callable[[np.random.Generator], Motion], config: Synthes
 def sample_times(config: SynthesisConfig) -> Float[np.ndarray, " frames"]:
     """Time of each frame [s]."""
     return np.arange(config.motion.frames) / config.motion.frame_rate
+
+
+def _spline(config: SynthesisConfig, rng: np.random.Generator, spread: np.ndarray) -> Float[np.ndarray, "frames n"]:
+    """Random smooth curves about 0, with knots within `spread`."""
+    times = sample_times(config)
+    controls = max(4, int(np.ceil(times[-1] / config.motion.control_interval)) + 1)
+    knots = np.linspace(0.0, max(times[-1], 1e-3), controls)
+    return CubicSpline(knots, rng.uniform(-1.0, 1.0, (controls, len(spread))) * spread, bc_type="clamped")(times)
 
 
 def reach_tip(
@@ -149,21 +156,14 @@ def _draw(
 ) -> Float[np.ndarray, "frames dofs"]:
     """One random motion of one arm, within its limits and in view."""
     motion = config.motion
-    times = sample_times(config)
-    controls = max(4, int(np.ceil(times[-1] / motion.control_interval)) + 1)
-    knots = np.linspace(0.0, max(times[-1], 1e-3), controls)
-
-    def spline(spread: np.ndarray) -> np.ndarray:
-        return CubicSpline(knots, rng.uniform(-1.0, 1.0, (controls, len(spread))) * spread, bc_type="clamped")(times)
-
-    targets = np.asarray(WORK_POINTS[number]) + spline(np.asarray(motion.reach))
+    targets = np.asarray(WORK_POINTS[number]) + _spline(config, rng, np.asarray(motion.reach))
     if not in_view(targets, camera):
         raise Rejected("a tip leaves the picture")
-    joints = np.zeros((len(times), len(arm.robot.joint_names)))
+    joints = np.zeros((motion.frames, len(arm.robot.joint_names)))
     joints[:, 2] = 0.14
-    joints[:, 3:6] = _wrist_middle(arm, number, config, rng) + spline(np.full(3, motion.wrist_range))
+    joints[:, 3:6] = _wrist_middle(arm, number, config, rng) + _spline(config, rng, np.full(3, motion.wrist_range))
     low, high = motion.jaw_range
-    joints[:, 6:] = np.clip((low + high) / 2 + spline(np.array([0.75 * (high - low)])), low, high)
+    joints[:, 6:] = np.clip((low + high) / 2 + _spline(config, rng, np.array([0.75 * (high - low)])), low, high)
     joints = reach_tip(arm, config.tip_link, targets, joints)
     lowest, highest = arm.robot.joint_limits.numpy()[:6].T
     margin = _LIMIT_MARGIN * (highest - lowest)
@@ -239,8 +239,8 @@ def clouds(arm: Arm, positions: np.ndarray, body: list[np.ndarray]) -> list[np.n
 
 ARM_NAME = "arm"
 
-_ENDOSCOPE = 0.3
-"""Cameras up to this distance look at the world as it is [m]."""
+INSTRUMENT_DISTANCE = 0.3
+"""Cameras up to this distance see the world at its own scale [m]."""
 
 _USUAL = 0.1
 """Distance for which the small world is made [m]."""
@@ -257,21 +257,7 @@ _TURN = 0.6
 
 def enlargement(config: EndoscopeConfig) -> float:
     """How many times larger the world is than the one that is traced [1]."""
-    return config.distance / _USUAL if config.distance > _ENDOSCOPE else 1.0
-
-
-def small_world(config: SynthesisConfig) -> SynthesisConfig:
-    """Settings with the camera at the scale of the traced scene."""
-    endoscope, scale = config.endoscope, enlargement(config.endoscope)
-    small = replace(endoscope, distance=endoscope.distance / scale, baseline=endoscope.baseline / scale)
-    return replace(config, endoscope=small)
-
-
-def enlarged(camera: Camera, scale: float) -> Camera:
-    """A camera of the small world in the large one."""
-    T_camera_world = camera.T_camera_world.copy()
-    T_camera_world[:3, 3] *= scale
-    return replace(camera, T_camera_world=T_camera_world)
+    return config.distance / _USUAL if config.distance > INSTRUMENT_DISTANCE else 1.0
 
 
 def measurement_error(robot: Robot, error: MeasurementError) -> MeasurementError:
@@ -300,11 +286,16 @@ def plan_arm(
         RobotError: `config.tip_link` names a link that the robot lacks.
     """
     body = surface_points(robot, config.rng("surface points"), spacing=0.0018 * scale)
+    tip_link = robot.link_names[-1] if config.tip_link == SynthesisConfig.tip_link else config.tip_link
 
     def draw(rng: np.random.Generator) -> tuple[Arm, np.ndarray]:
         joints = _draw_arm(robot, config, rng)
-        arm = _placed(robot, _tip_link(robot, config), joints, camera, rng, scale)
-        tips = robot.link_transform(torch.from_numpy(joints), _tip_link(robot, config))[:, :3, 3].numpy()
+        tips = _tips(robot, tip_link, torch.from_numpy(joints)).numpy()
+        # In the middle of the motion, the tip is at the work point.
+        tip = _tips(robot, tip_link, torch.from_numpy(joints[len(joints) // 2])).numpy()
+        if np.linalg.norm(tip) < 1e-9:
+            raise SettingsError(f"the tip {tip_link!r} of {robot.urdf} lies in its base. Name another --tip-link.")
+        arm = _placed(robot, tip, camera, rng, scale)
         if not in_view((tips @ arm.T_world_base[:3, :3].T + arm.T_world_base[:3, 3]) / scale, camera):
             raise Rejected("the tip leaves the picture")
         seen = [points / scale for points in clouds(arm, joints, body)]
@@ -314,53 +305,21 @@ def plan_arm(
     return random_motion(draw, config)
 
 
-def _tip_link(robot: Robot, config: SynthesisConfig) -> str:
-    return robot.link_names[-1] if config.tip_link == SynthesisConfig.tip_link else config.tip_link
-
-
 def _draw_arm(robot: Robot, config: SynthesisConfig, rng: np.random.Generator) -> Float[np.ndarray, "frames dofs"]:
     """A random motion about a random pose, within the joints' limits."""
-    times, motion = sample_times(config), config.motion
-    controls = max(4, int(np.ceil(times[-1] / motion.control_interval)) + 1)
-    knots = np.linspace(0.0, max(times[-1], 1e-3), controls)
     low, high = robot.joint_limits.numpy().T
     low, high = np.where(np.isfinite(low), low, -_FREE), np.where(np.isfinite(high), high, _FREE)
-    reach = np.minimum(motion.wrist_range, 0.25 * (high - low))
+    reach = np.minimum(config.motion.wrist_range, 0.25 * (high - low))
     middle = rng.uniform(low + 1.2 * reach, high - 1.2 * reach)
-    waves = CubicSpline(knots, rng.uniform(-1.0, 1.0, (controls, len(low))), bc_type="clamped")(times)
-    return np.clip(middle + waves * reach, low, high)
+    return np.clip(middle + _spline(config, rng, np.ones(len(low))) * reach, low, high)
 
 
-def _placed(
-    robot: Robot,
-    tip_link: str,
-    joints: Float[np.ndarray, "frames dofs"],
-    camera: Camera,
-    rng: np.random.Generator,
-    scale: float,
-) -> Arm:
-    """The arm with its tip, in the middle of the motion, at the work point; it comes in from beside the camera."""
-    tip = robot.link_transform(torch.from_numpy(joints[len(joints) // 2]), tip_link)[:3, 3].numpy()
-    if np.linalg.norm(tip) < 1e-9:
-        raise SettingsError(f"the tip {tip_link!r} of {robot.urdf} lies in its base. Name another --tip-link.")
+def _placed(robot: Robot, tip: Float[np.ndarray, "3"], camera: Camera, rng: np.random.Generator, scale: float) -> Arm:
+    """The arm with a tip [m], in its base frame, at the work point; it comes in from beside the camera."""
     right, down, forward = camera.T_camera_world[:3, :3]
     side = rng.choice((-1.0, 1.0))
     direction = -side * right - 0.5 * down + 0.35 * forward + rng.normal(0.0, _TURN / 3, 3)
-    rotation = rotation_between(tip, direction)
     T_world_base = np.eye(4)
-    T_world_base[:3, :3] = rotation
+    T_world_base[:3, :3] = rotation = rotation_between(tip, direction)
     T_world_base[:3, 3] = scale * np.asarray(WORK_POINTS[0]) * (0.0, 0.0, 1.0) - rotation @ tip
     return Arm(ARM_NAME, robot, T_world_base)
-
-
-def check_instrument_distance(config: EndoscopeConfig) -> None:
-    """Raise where a camera is too far off for instruments, whose scene cannot be enlarged.
-
-    Raises:
-        SettingsError: it is.
-    """
-    if enlargement(config) != 1.0:
-        raise SettingsError(
-            f"EndoscopeConfig.distance is {config.distance} m, but the robot is a surgical instrument. Give at most "
-            f"{_ENDOSCOPE} m for these; other robots may be further away."
-        )

@@ -45,18 +45,14 @@ def _mitsuba() -> ModuleType:
 class Part:
     """A piece of an instrument at its place in the world."""
 
-    arm: int
-    """Index of the arm."""
     link: int
     """Index of the link among all links of all arms, for `Surface.link`."""
     vertices: Float[np.ndarray, "v 3"]
     """In the world [m]."""
     normals: Float[np.ndarray, "v 3"]
     faces: Int[np.ndarray, "f 3"]
-    metal: bool
-    """Steel, or else the dark plastic of the shaft."""
-    paint: tuple[float, ...] | None = None
-    """RGB in [0, 1] of a painted part, which is neither."""
+    material: dict[str, Any]
+    """Mitsuba's description of it."""
 
 
 @dataclass(frozen=True)
@@ -102,8 +98,7 @@ class PathTracer:
     ) -> Float[np.ndarray, "h w 3"]:
         """Linear RGB radiance, in arbitrary units; `T_light_world` is the frame of the camera beside the lights."""
         T_world_light = np.linalg.inv(T_light_world)
-        scene = self._instruments(parts, _material)
-        scene |= self._tissue
+        scene = self._instruments(parts) | self._tissue
         integrator = {"type": "path", "max_depth": self._config.bounces, "rr_depth": 16}
         samples = -(-self._config.samples // len(LIGHTS_CAMERA))
         # One light at a time: choosing between them at random would be most of the picture's noise.
@@ -122,7 +117,7 @@ class PathTracer:
 
         The tissue and the space around it glow, the instruments are black: no side of a mesh can be missed.
         """
-        scene = self._instruments(parts, lambda part: _BLACK)
+        scene = self._instruments(parts, _BLACK)
         glow = {"type": "area", "radiance": {"type": "rgb", "value": 1.0}}
         vertices, _, faces, _ = self._tissue_mesh
         scene["tissue"] = self._mesh("tissue", vertices, faces, _BLACK, emitter=glow)
@@ -131,8 +126,7 @@ class PathTracer:
 
     def surface(self, parts: Sequence[Part], camera: Camera, seed: int) -> Surface:
         """What each pixel sees."""
-        scene = self._instruments(parts, lambda part: _BLACK)
-        scene |= self._tissue
+        scene = self._instruments(parts, _BLACK) | self._tissue
         integrator = {"type": "aov", "aovs": "position:position,normal:sh_normal,shape:shape_index"}
         layers = self._render(scene, integrator, camera, 1, seed)
         position, normal = layers[..., :3].astype(np.float64), layers[..., 3:6]
@@ -143,13 +137,15 @@ class PathTracer:
         depth = position @ T_camera_world[2, :3] + T_camera_world[2, 3]
         return Surface(position, normal, links[shape], depth)
 
-    def _instruments(self, parts: Sequence[Part], material: Any) -> dict[str, Any]:
-        scene: dict[str, Any] = {"type": "scene"}
-        for number, part in enumerate(parts):
-            scene[f"a_part_{number:03d}"] = self._mesh(
-                f"part{number}", part.vertices, part.faces, material(part), normals=part.normals
+    def _instruments(self, parts: Sequence[Part], material: dict[str, Any] | None = None) -> dict[str, Any]:
+        """A scene of parts, all of one material or each of its own."""
+        meshes = {
+            f"a_part_{number:03d}": self._mesh(
+                f"part{number}", part.vertices, part.faces, material or part.material, normals=part.normals
             )
-        return scene
+            for number, part in enumerate(parts)
+        }
+        return {"type": "scene", **meshes}
 
     def _texture(self, values: np.ndarray) -> dict[str, Any]:
         return {"type": "bitmap", "bitmap": self._mi.Bitmap(np.ascontiguousarray(values, np.float32)), "raw": True}
@@ -178,12 +174,10 @@ class PathTracer:
             has_vertex_texcoords=uv is not None,
         )
         parameters = self._mi.traverse(mesh)
-        parameters["vertex_positions"] = np.ascontiguousarray(vertices, np.float32).ravel()
         parameters["faces"] = np.ascontiguousarray(faces, np.uint32).ravel()
-        if normals is not None:
-            parameters["vertex_normals"] = np.ascontiguousarray(normals, np.float32).ravel()
-        if uv is not None:
-            parameters["vertex_texcoords"] = np.ascontiguousarray(uv, np.float32).ravel()
+        for part, values in (("positions", vertices), ("normals", normals), ("texcoords", uv)):
+            if values is not None:
+                parameters[f"vertex_{part}"] = np.ascontiguousarray(values, np.float32).ravel()
         parameters.update()
         return mesh
 
@@ -230,12 +224,6 @@ _PLASTIC: dict[str, Any] = {
 }
 _PAINT: dict[str, Any] = {"type": "roughplastic", "alpha": 0.25}
 _BLACK: dict[str, Any] = {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.0}}
-
-
-def _material(part: Part) -> dict[str, Any]:
-    if part.paint is not None:
-        return _PAINT | {"diffuse_reflectance": {"type": "rgb", "value": list(part.paint)}}
-    return _METAL if part.metal else _PLASTIC
 
 
 def _without_specks(image: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w 3"]:
@@ -290,19 +278,14 @@ class Stage:
             first_link = (mesh for mesh in arm.robot.meshes if mesh.link == 0)
             shaft = max(first_link, key=lambda mesh: np.ptp(mesh.vertices), default=None)
             for mesh in arm.robot.meshes:
-                T_world_link = transforms[first + mesh.link]
-                rotation, translation = T_world_link[:3, :3], T_world_link[:3, 3]
-                parts.append(
-                    Part(
-                        arm=index,
-                        link=first + mesh.link,
-                        vertices=mesh.vertices / self.scale @ rotation.T + translation,
-                        normals=mesh.normals @ rotation.T,
-                        faces=mesh.faces,
-                        metal=bool(mesh is not shaft and mesh.color.mean() > _DARK),
-                        paint=tuple(float(value) for value in mesh.color) if self.painted else None,
-                    )
-                )
+                link = first + mesh.link
+                rotation, translation = transforms[link][:3, :3], transforms[link][:3, 3]
+                vertices = mesh.vertices / self.scale @ rotation.T + translation
+                material = _METAL if mesh is not shaft and mesh.color.mean() > _DARK else _PLASTIC
+                if self.painted:
+                    color = [float(value) for value in mesh.color]
+                    material = _PAINT | {"diffuse_reflectance": {"type": "rgb", "value": color}}
+                parts.append(Part(link, vertices, mesh.normals @ rotation.T, mesh.faces, material))
         return parts
 
     def motion_in_image(

@@ -225,8 +225,12 @@ def grow_tissue(kind: str, resolution: int, texels: int, rng: np.random.Generato
     color *= 1.0 + 0.05 * paint.noise(0.0012, octaves=2)[..., None]
 
     roughness = look.roughness + 0.05 * paint.noise(0.012, octaves=2) + 0.10 * patch
+    # Walls around the middle, so that the tissue fills every picture.
+    unit = np.linspace(-EXTENT / 2, EXTENT / 2, resolution)
+    radius = np.hypot(*np.meshgrid(unit, unit))
+    cavity = (6.0 * np.maximum(radius - 0.050, 0.0) ** 2).astype(np.float32)
     return Tissue(
-        heights=_cavity(resolution) + cv2.resize(relief, (resolution, resolution), interpolation=cv2.INTER_AREA),
+        heights=cavity + cv2.resize(relief, (resolution, resolution), interpolation=cv2.INTER_AREA),
         albedo=np.clip(color, 0.01, 0.9).astype(np.float32),
         roughness=np.clip(roughness, 0.18, 0.7).astype(np.float32),
     )
@@ -282,13 +286,6 @@ def _jitter(rng: np.random.Generator) -> np.ndarray:
 
 def _mix(color: np.ndarray, other: np.ndarray, share: np.ndarray) -> np.ndarray:
     return color + (other - color) * share[..., None]
-
-
-def _cavity(resolution: int) -> np.ndarray:
-    """Walls around the middle, so that the tissue fills every picture."""
-    unit = np.linspace(-EXTENT / 2, EXTENT / 2, resolution)
-    radius = np.hypot(*np.meshgrid(unit, unit))
-    return (6.0 * np.maximum(radius - 0.050, 0.0) ** 2).astype(np.float32)
 
 
 def _pixel(point: np.ndarray) -> tuple[int, int]:

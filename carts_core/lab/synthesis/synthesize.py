@@ -4,16 +4,14 @@ import csv
 import hashlib
 import io
 import os
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
-from rich.progress import BarColumn, MofNCompleteColumn, TimeRemainingColumn
+from jaxtyping import Float
 
-from ...console import Bar, PlainColumn, Terminal
 from ...errors import CartsError, SettingsError
 from ...files import OutputPath, holds_file, published, write_bytes, write_text
 from ...html import render_page
@@ -23,50 +21,12 @@ from ...model.scene import Arm
 from ...resources import shipped_robot
 from ...settings import SynthesisConfig
 from .domains import Conditions, View, exposure_gain
-from .motion import (
-    check_instrument_distance,
-    enlarged,
-    enlargement,
-    measure,
-    measurement_error,
-    plan_arm,
-    plan_motion,
-    sample_times,
-    small_world,
-)
-from .path_tracer import PathTracer, Stage
+from .motion import INSTRUMENT_DISTANCE, enlargement, measure, measurement_error, plan_arm, plan_motion, sample_times
+from .path_tracer import INTENSITY, LIGHTS_CAMERA, PathTracer, Stage
 from .scene import KINDS, Tissue, grow_tissue, is_instrument, load_robot, place_arms, place_cameras
 
 Progress = Callable[[str, int, int], None]
 """Called with a description, the number of finished steps, and the total."""
-
-
-@contextmanager
-def progress_bar() -> Iterator[Progress]:
-    """Progress bar on standard error for `synthesize`."""
-    columns = (PlainColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Bar(*columns, console=Terminal(stderr=True)) as bar:
-        task = bar.add_task("starting", total=None)
-
-        def report(what: str, done: int, total: int) -> None:
-            bar.update(task, description=what, completed=done, total=total)
-
-        yield report
-
-
-def frame_name(frame: int) -> str:
-    """The id of a frame: 001 for the first."""
-    return f"{frame + 1:03d}"
-
-
-def write_image(path: OutputPath, image: UInt8[np.ndarray, "h w 3"], quality: int) -> None:
-    """A JPEG file of an RGB picture, whole or not at all."""
-    _write(path, ".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, quality])
-
-
-def write_mask(path: OutputPath, mask: Bool[np.ndarray, "h w"]) -> None:
-    """A PNG file of one bit per pixel, whole or not at all."""
-    _write(path, ".png", mask.astype(np.uint8) * 255, [cv2.IMWRITE_PNG_BILEVEL, 1, cv2.IMWRITE_PNG_COMPRESSION, 9])
 
 
 def write_table(
@@ -82,32 +42,8 @@ def write_table(
     table.writerow(["frame", "time", *columns])
     for frame, time in enumerate(times):
         values = np.concatenate([table_of_arm[frame] for table_of_arm in joints])
-        table.writerow([frame_name(frame), f"{time:.4f}", *(f"{value:.7f}" for value in values)])
+        table.writerow([_name(frame), f"{time:.4f}", *(f"{value:.7f}" for value in values)])
     write_text(path, text.getvalue())
-
-
-def write_sequence_file(
-    path: OutputPath, config: SynthesisConfig, output: Path, arms: Sequence[Arm], cameras: Sequence[Camera]
-) -> None:
-    """Write the sequence file; `output` is its final folder."""
-    robot = _robot_reference(config.robot, output)
-    page = render_page("synthetic_sequence.toml", config=config, robot=robot, arms=arms, cameras=cameras)
-    write_text(path, page)
-
-
-def _robot_reference(robot: Path, output: Path) -> str:
-    if str(robot).startswith(SCHEME):
-        return str(robot)
-    if robot.resolve() == shipped_robot().resolve():
-        return SCHEME + SHIPPED
-    return Path(os.path.relpath(robot.resolve(), output.resolve())).as_posix()
-
-
-def _write(path: OutputPath, suffix: str, pixels: np.ndarray, options: list[int]) -> None:
-    encoded, data = cv2.imencode(suffix, pixels, options)
-    if not encoded:
-        raise CartsError(f"{path} could not be encoded as {suffix}.")
-    write_bytes(path, data.tobytes())
 
 
 def synthesize(config: SynthesisConfig, output: OutputPath | Path | str, progress: Progress | None = None) -> Path:
@@ -142,12 +78,18 @@ def _write_sequence(config: SynthesisConfig, work: OutputPath, output: Path, rep
     """Write missing files into `work`; `output` is their final folder."""
     frames = config.motion.frames
     report("tissue, robots and motion", 0, frames)
-    tissue, other = _grow_tissues(config)
-    times, scale = sample_times(config), enlargement(config.endoscope)
-    cameras = place_cameras(small_world(config).endoscope)
+    endoscope, times, scale = config.endoscope, sample_times(config), enlargement(config.endoscope)
+    # Far cameras are placed in the small world.
+    near = replace(endoscope, distance=endoscope.distance / scale, baseline=endoscope.baseline / scale)
+    cameras = place_cameras(near)
     robot, error = load_robot(config), config.error
+    if is_instrument(robot) and scale != 1.0:
+        raise SettingsError(
+            f"EndoscopeConfig.distance is {endoscope.distance} m, but the robot is a surgical instrument. Give at "
+            f"most {INSTRUMENT_DISTANCE} m for these; other robots may be further away."
+        )
+    tissue, other = _grow_tissues(config)
     if is_instrument(robot):
-        check_instrument_distance(config.endoscope)
         arms = place_arms(robot, config.tip_link, cameras[0])
         joints = plan_motion(arms, [tissue, other], cameras[0], config)
     else:
@@ -157,7 +99,7 @@ def _write_sequence(config: SynthesisConfig, work: OutputPath, output: Path, rep
 
     tracing = _Tracing(config, stage, cameras, tissue, other)
     for frame in range(frames):
-        if not _is_done(work, frame, cameras):
+        if not all(holds_file(_mask_file(work, frame, camera)) for camera in cameras):
             tracing.trace(work, frame)
         report("frames", frame + 1, frames)
 
@@ -167,8 +109,24 @@ def _write_sequence(config: SynthesisConfig, work: OutputPath, output: Path, rep
     ]
     write_table(work / "kinematics.csv", arms, times, measured)
     write_table(work / "truth.csv", arms, times, joints)
-    seen_by = [enlarged(camera, scale) for camera in cameras]
-    write_sequence_file(work / "sequence.toml", config, output, arms, seen_by)
+    written = [replace(camera, T_camera_world=_enlarged(camera.T_camera_world, scale)) for camera in cameras]
+    robot_path = _robot_reference(config.robot, output)
+    page = render_page("synthetic_sequence.toml", config=config, robot=robot_path, arms=arms, cameras=written)
+    write_text(work / "sequence.toml", page)
+
+
+def _enlarged(T: Float[np.ndarray, "4 4"], scale: float) -> Float[np.ndarray, "4 4"]:
+    enlarged = T.copy()
+    enlarged[:3, 3] *= scale
+    return enlarged
+
+
+def _robot_reference(robot: Path, output: Path) -> str:
+    if str(robot).startswith(SCHEME):
+        return str(robot)
+    if robot.resolve() == shipped_robot().resolve():
+        return SCHEME + SHIPPED
+    return Path(os.path.relpath(robot.resolve(), output.resolve())).as_posix()
 
 
 class _Tracing:
@@ -191,10 +149,13 @@ class _Tracing:
             view, mask = self._view(frame, number)
             masks.append(mask)
             for domain in self._config.domains:
-                path = folder / "images" / domain / camera.name / f"{frame_name(frame)}.jpg"
-                write_image(path, self._conditions.image(domain, view), self._config.sensor.jpeg_quality)
+                image = cv2.cvtColor(self._conditions.image(domain, view), cv2.COLOR_RGB2BGR)
+                path = folder / "images" / domain / camera.name / f"{_name(frame)}.jpg"
+                _write(path, image, [cv2.IMWRITE_JPEG_QUALITY, self._config.sensor.jpeg_quality])
         for camera, mask in zip(self._cameras, masks, strict=True):
-            write_mask(_mask_file(folder, frame, camera), mask)
+            pixels = mask.astype(np.uint8) * 255
+            options = [cv2.IMWRITE_PNG_BILEVEL, 1, cv2.IMWRITE_PNG_COMPRESSION, 9]
+            _write(_mask_file(folder, frame, camera), pixels, options)
 
     def _view(self, frame: int, number: int) -> tuple[View, np.ndarray]:
         camera, stage = self._cameras[number], self._stage
@@ -214,7 +175,7 @@ class _Tracing:
             time=float(stage.times[frame]),
             camera=number,
             light=light[0],
-            gain=self._gains[0],
+            lamp=INTENSITY * len(LIGHTS_CAMERA) * self._gains[0],
             other_light=light[1] if len(light) > 1 else None,
             surface=surface,
             motion=stage.motion_in_image(frame, surface, camera, self._config.sensor.shutter),
@@ -237,9 +198,18 @@ def _grow_tissues(config: SynthesisConfig) -> tuple[Tissue, Tissue]:
     return regular, other
 
 
+def _name(frame: int) -> str:
+    """The id of a frame: 001 for the first."""
+    return f"{frame + 1:03d}"
+
+
 def _mask_file(folder: OutputPath, frame: int, camera: Camera) -> OutputPath:
-    return folder / "masks" / camera.name / f"{frame_name(frame)}.png"
+    return folder / "masks" / camera.name / f"{_name(frame)}.png"
 
 
-def _is_done(folder: OutputPath, frame: int, cameras: tuple[Camera, ...]) -> bool:
-    return all(holds_file(_mask_file(folder, frame, camera)) for camera in cameras)
+def _write(path: OutputPath, pixels: np.ndarray, options: list[int]) -> None:
+    """Write an image file, whole or not at all."""
+    encoded, data = cv2.imencode(path.path.suffix, pixels, options)
+    if not encoded:
+        raise CartsError(f"{path} could not be encoded.")
+    write_bytes(path, data.tobytes())

@@ -20,7 +20,7 @@ from ...model.perturbation import perturb
 from ...model.robot import Robot
 from ...model.scene import Arm, Scene, SceneState
 from ...networks.extractor import FeatureExtractor
-from ...optimization import FrameOptimizer, Verdict
+from ...optimization import Assessment, FrameOptimizer, Verdict
 from ...recording import Frame, Sequence, spread
 from ...rendering import Renderer
 from ...resources import shipped_weights
@@ -82,28 +82,19 @@ class Judgement:
     def worse(self) -> list[str]:
         """What is worse with the adapted weights; nothing if they may be offered."""
         was, now, moved = self.before, self.after, self.tips_moved
-        checks = [
-            (now.dice < was.dice - _DICE, f"masks of made images (Dice {was.dice:.3f} -> {now.dice:.3f})"),
-            (
-                now.made_parts < was.made_parts - _PARTS,
-                f"parts of made images ({was.made_parts:.3f} -> {now.made_parts:.3f} of the pixels)",
-            ),
-            (
-                now.made_tips > was.made_tips + _TIPS,
-                f"tips of made images ({was.made_tips:.1f} -> {now.made_tips:.1f} px)",
-            ),
-            (now.good < was.good, f"verdicts of the recording ({was.good} -> {now.good} good)"),
-            (
-                now.parts < was.parts - _PARTS,
-                f"parts of the recording ({was.parts:.3f} -> {now.parts:.3f} of the pixels)",
-            ),
-            (now.edges < _EDGES * was.edges, f"edges of the recording ({was.edges:.2f} -> {now.edges:.2f})"),
-            (
-                moved > _MOVED and _EDGES * was.edges <= now.edges <= was.edges,
-                f"tips of the recording (moved by {moved:.1f} px without stronger edges)",
-            ),
-        ]
-        return [text for worse, text in checks if worse]
+        pixels, steady = "of the pixels", _EDGES * was.edges <= now.edges <= was.edges
+        checks = {
+            f"masks of made images (Dice {was.dice:.3f} -> {now.dice:.3f})": now.dice < was.dice - _DICE,
+            f"parts of made images ({was.made_parts:.3f} -> {now.made_parts:.3f} {pixels})": now.made_parts
+            < was.made_parts - _PARTS,
+            f"tips of made images ({was.made_tips:.1f} -> {now.made_tips:.1f} px)": now.made_tips
+            > was.made_tips + _TIPS,
+            f"verdicts of the recording ({was.good} -> {now.good} good)": now.good < was.good,
+            f"parts of the recording ({was.parts:.3f} -> {now.parts:.3f} {pixels})": now.parts < was.parts - _PARTS,
+            f"edges of the recording ({was.edges:.2f} -> {now.edges:.2f})": now.edges < _EDGES * was.edges,
+            f"tips of the recording (moved by {moved:.1f} px without stronger edges)": moved > _MOVED and steady,
+        }
+        return [text for text, worse in checks.items() if worse]
 
     def lines(self) -> list[str]:
         """Summary of figures before and after."""
@@ -163,11 +154,8 @@ class MadeImage:
 
     def score(self, network: FeatureExtractor) -> tuple[float, float, float]:
         """Dice, share of right parts and mean distance of tips [px] of a fit."""
-        optimizer = FrameOptimizer(self.scene, self.frame, {}, network, live=False)
-        for _ in optimizer:
-            pass
-        assert optimizer.best is not None
-        found, truth = optimizer.best.state.to("cpu"), self.scene.state(self.frame.truth or {})
+        found, _ = _solved(self.scene, self.frame, network)
+        truth = self.scene.state(self.frame.truth or {})
         renderer = Renderer(self.scene, width=_SIZE[0], height=_SIZE[1])
         ours, theirs = _parts(self.scene, renderer, found), _parts(self.scene, renderer, truth)
         both, shown = int(((ours >= 0) & (theirs >= 0)).sum()), theirs >= 0
@@ -202,13 +190,17 @@ def made_images(config: TrainingConfig, number_of_images: int) -> Iterator[MadeI
         yield MadeImage(scene, frame)
 
 
-def _own_fit(recording: Sequence, frame: Frame, network: FeatureExtractor) -> tuple[bool, float, float, np.ndarray]:
-    """Whether a fit of a frame is good, its edges, its parts and its tips."""
-    optimizer = FrameOptimizer(recording.scene, frame, {}, network, live=False)
+def _solved(scene: Scene, frame: Frame, network: FeatureExtractor) -> tuple[SceneState, Assessment | None]:
+    optimizer = FrameOptimizer(scene, frame, {}, network, live=False)
     for _ in optimizer:
         pass
     assert optimizer.best is not None
-    state, found = optimizer.best.state.to("cpu"), optimizer.assessment
+    return optimizer.best.state.to("cpu"), optimizer.assessment
+
+
+def _own_fit(recording: Sequence, frame: Frame, network: FeatureExtractor) -> tuple[bool, float, float, np.ndarray]:
+    """Whether a fit of a frame is good, its edges, its parts and its tips."""
+    state, found = _solved(recording.scene, frame, network)
     edges = []
     for camera in recording.scene.cameras:
         renderer = Renderer(recording.scene, width=camera.width, height=camera.height, cameras=[camera.name])
@@ -347,10 +339,7 @@ def gain(before: dict[str, float], now: dict[str, float]) -> str:
 def offer(config: TrainingConfig, result: TrainingResult, progress: Progress, made: int, own: int) -> Offer:
     """Compare fits with the weights of the start and of a run; weights that are worse anywhere are put aside.
 
-    Args:
-        config: as from `adapted_to`.
-        result: of the run.
-        progress, made, own: as in `judge`.
+    `config` is that of `adapted_to`, `result` the run's; other arguments as in `judge`.
     """
     assert config.start is not None
     aside = output_path(result.weights.parent, REFUSED)

@@ -124,10 +124,6 @@ class TrainingLoop:
         may_change: names in `config_json` that may differ when the run is resumed.
         further: other modules whose state is stored, by name.
 
-    Attributes:
-        step: number of steps done.
-        history: losses, validations and times so far.
-
     Raises:
         SettingsError: the folder holds a run with other settings.
         WeightsError: its checkpoint cannot be read.
@@ -147,7 +143,9 @@ class TrainingLoop:
         self._optimizer = torch.optim.AdamW(
             network.parameters(), settings.learning_rate, weight_decay=settings.weight_decay
         )
-        self.step, self.history = 0, History()
+        self.step = 0
+        """Number of steps done."""
+        self.history = History()
         self._resume(may_change)
         self._saved = self.step
         self._clock, self._worked = time.perf_counter(), time.process_time()

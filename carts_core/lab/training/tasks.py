@@ -1,64 +1,23 @@
 """Training tasks: samples, loss and validation metrics of each network."""
 
 import math
-from collections.abc import Callable, Sequence
-from typing import Any, ClassVar, Protocol
+from collections.abc import Sequence
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
-from torch import Tensor, nn
+from torch import Tensor
 from torch.nn import functional
 
 from ...model.parts import COVERAGE, NORMALS, PARTS
 from ...model.robot import Robot
 from ...networks.network import FeatureNetwork, SurfaceNetwork
-from ...settings import NetworkName, ObjectiveWeights, TrainingConfig
+from ...settings import NetworkName, TrainingConfig
 from ..randomization import SURFACE_UNIT, PairGenerator, SurfaceGenerator, SurfaceSample, TrainingPair
 
 Batch = tuple[Tensor, ...]
 """Tensors of bytes, each with a leading dimension of samples."""
-
-
-class Task(Protocol):
-    """Network, samples, loss and validation of a training; stateless, so that workers can create their own."""
-
-    columns: ClassVar[dict[str, str]]
-    """Validation figures: name -> heading in the report."""
-    score: ClassVar[str]
-    """Name of the metric by which networks are compared; higher is better."""
-
-    def network(self, config: TrainingConfig) -> nn.Module:
-        """A network with random weights."""
-        ...
-
-    def generator(self, config: TrainingConfig, stream: Sequence[int]) -> Callable[[int], Any]:
-        """Returns a generator of samples by number, counted from 0; streams of a seed are independent."""
-        ...
-
-    def flipped(self, sample: Any, horizontally: bool, vertically: bool) -> Any:
-        """A sample mirrored; a mirrored instrument is still one."""
-        ...
-
-    def tensors(self, sample: Any) -> Batch:
-        """A sample as tensors of bytes."""
-        ...
-
-    def loss(self, config: TrainingConfig, network: Any, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
-        """The weighted loss, and each term before weighting."""
-        ...
-
-    def validate(self, network: Any, batch: Batch) -> dict[str, float]:
-        """Figures of a folded network, by the names in `columns`."""
-        ...
-
-    def worse(self, now: dict[str, float], first: dict[str, float]) -> bool:
-        """Whether a metric other than `score` is worse than at the start, so that weights are rejected."""
-        ...
-
-    def panels(self, network: Any, batch: Batch) -> list[list[tuple[str, np.ndarray]]]:
-        """Example predictions of a folded network: per sample, titled pictures."""
-        ...
 
 
 def flips(array: np.ndarray, horizontally: bool, vertically: bool) -> np.ndarray:
@@ -69,36 +28,6 @@ def flips(array: np.ndarray, horizontally: bool, vertically: bool) -> np.ndarray
 def byte_tensor(array: np.ndarray) -> Tensor:
     """An image [h, w, channels] as a tensor [channels, h, w]."""
     return torch.from_numpy(np.ascontiguousarray(array.transpose(2, 0, 1)))
-
-
-@torch.no_grad()
-def validate(
-    network: FeatureNetwork, images: Float[Tensor, "pairs 2 3 h w"], classes: Int[Tensor, "pairs 2 h w"], batch: int = 4
-) -> dict[str, float]:
-    """Run a folded network over a validation set: means of
-
-    - `dice_observed`, `dice_hybrid`: Dice of the predicted mask on observed and on hybrid images,
-    - `similarity_aligned`: cosine between features of observed and hybrid image where both show an instrument,
-    - `similarity_misaligned`: the same where only one of them does.
-    """
-    dices, aligned, misaligned = [], [], []
-    for start in range(0, len(images), batch):
-        chunk = images[start : start + batch].to(next(network.parameters()).device)
-        mask = (classes[start : start + batch] > 0).to(chunk.device)
-        features = network.features(chunk.flatten(0, 1).contiguous(memory_format=torch.channels_last))
-        predicted = (network.head(features)[:, 0] > 0).unflatten(0, chunk.shape[:2])
-        dices.append(dice(predicted, mask))
-        of_pair = features.unflatten(0, chunk.shape[:2])
-        similarity = functional.cosine_similarity(of_pair[:, 0], of_pair[:, 1], dim=1)
-        aligned.append(similarity[mask[:, 0] & mask[:, 1]])
-        misaligned.append(similarity[mask[:, 0] ^ mask[:, 1]])
-    mean = torch.cat(dices).mean(0)
-    return {
-        "dice_observed": float(mean[0]),
-        "dice_hybrid": float(mean[1]),
-        "similarity_aligned": float(torch.cat(aligned).mean()),
-        "similarity_misaligned": float(torch.cat(misaligned).mean()),
-    }
 
 
 def dice(predicted: Tensor, truth: Tensor) -> Tensor:
@@ -120,36 +49,12 @@ _TINY = 1e-8
 _OTHER_PART = 0.6
 
 
-def feature_loss(
-    network: FeatureNetwork,
-    images: Float[Tensor, "batch pair 3 h w"],
-    classes: Int[Tensor, "batch pair h w"],
-    weights: ObjectiveWeights,
-) -> tuple[Tensor, dict[str, Tensor]]:
-    """The weighted loss of a batch of pairs, and each term before weighting.
-
-    Args:
-        network: in training.
-        images: observed image and hybrid image of each pair, RGB in [0, 1].
-        classes: 0 background, 1 shaft, 2 head.
-        weights: of the terms.
-    """
-    features = network.features(images.flatten(0, 1).contiguous(memory_format=torch.channels_last))
-    logits = network.head(features)[:, 0]
-    target = (classes > 0).flatten(0, 1).to(logits.dtype)
-    of_pair = features.unflatten(0, images.shape[:2])
-    terms = {
-        "cross_entropy": functional.binary_cross_entropy_with_logits(logits, target),
-        "dice": soft_dice_loss(logits.sigmoid(), target),
-        "consistency": consistency_loss(of_pair[:, 0], of_pair[:, 1], classes[:, 0], classes[:, 1]),
-    }
-    return torch.stack([getattr(weights, name) * term for name, term in terms.items()]).sum(), terms
-
-
-def soft_dice_loss(probability: Float[Tensor, "batch h w"], target: Float[Tensor, "batch h w"]) -> Float[Tensor, ""]:
-    """One minus the Dice score of probabilities, averaged over images."""
-    overlap = (probability * target).sum((1, 2))
-    return 1 - ((2 * overlap + 1) / (probability.sum((1, 2)) + target.sum((1, 2)) + 1)).mean()
+def soft_dice_loss(
+    probability: Float[Tensor, "batch *parts h w"], target: Float[Tensor, "batch *parts h w"]
+) -> Float[Tensor, ""]:
+    """One minus the Dice score of probabilities, averaged over images and parts."""
+    overlap, total = (probability * target).sum((-2, -1)), probability.sum((-2, -1)) + target.sum((-2, -1))
+    return 1 - ((2 * overlap + 1) / (total + 1)).mean()
 
 
 def consistency_loss(
@@ -186,13 +91,21 @@ def dilated(mask: Float[Tensor, "batch h w"]) -> Float[Tensor, "batch h w"]:
     return functional.max_pool2d(rows, (1, _NEIGHBOURHOOD), 1, (0, _NEIGHBOURHOOD // 2))[:, 0]
 
 
+def _weighted(terms: dict[str, Tensor], weights: object) -> Tensor:
+    """Sum of terms, weighted by the fields of the same names."""
+    return torch.stack([getattr(weights, name) * term for name, term in terms.items()]).sum()
+
+
 def weighted_mean(values: Tensor, weights: Tensor) -> Tensor:
     """Mean under weights; about zero where all weights are."""
     return (values * weights).sum() / (weights.sum() + 1)
 
 
 class FeatureTask:
-    """See `Task`. A batch is images [batch, 2, 3, h, w] and classes [batch, 2, h, w] of observed and hybrid images."""
+    """Network, samples, loss and validation of the feature network; stateless, so that workers can create their own.
+
+    A batch is images [batch, 2, 3, h, w] and classes [batch, 2, h, w] of observed and hybrid images, in bytes.
+    """
 
     columns: ClassVar[dict[str, str]] = {
         "dice_observed": "Dice, observed",
@@ -200,43 +113,75 @@ class FeatureTask:
         "similarity_aligned": "cosine, aligned",
         "similarity_misaligned": "cosine, misaligned",
     }
+    """Validation figures: name -> heading in the report."""
     score: ClassVar[str] = "dice_observed"
+    """Name of the metric by which networks are compared; higher is better."""
 
     def network(self, config: TrainingConfig) -> FeatureNetwork:
         """A network with random weights."""
         return FeatureNetwork(config.architecture)
 
     def generator(self, config: TrainingConfig, stream: Sequence[int]) -> PairGenerator:
-        """An endless source of pairs."""
+        """Generator of pairs by number, counted from 0; streams of a seed are independent."""
         return PairGenerator([Robot.load(path) for path in config.robots], config.images, stream)
 
     def flipped(self, sample: TrainingPair, horizontally: bool, vertically: bool) -> TrainingPair:
-        """A pair mirrored."""
+        """A pair mirrored; a mirrored instrument is still one."""
         parts = sample.observed, sample.observed_classes, sample.hybrid, sample.hybrid_classes
         return TrainingPair(*(flips(part, horizontally, vertically) for part in parts))
 
-    def tensors(self, sample: TrainingPair) -> Batch:
+    def tensors(self, sample: Any) -> Batch:
         """A pair as tensors of bytes."""
         images = np.stack([sample.observed, sample.hybrid]).transpose(0, 3, 1, 2)
         classes = np.stack([sample.observed_classes, sample.hybrid_classes])
         return torch.from_numpy(np.ascontiguousarray(images)), torch.from_numpy(np.ascontiguousarray(classes))
 
-    def loss(self, config: TrainingConfig, network: FeatureNetwork, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
+    def loss(self, config: TrainingConfig, network: Any, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
         """The weighted loss, and each term before weighting."""
-        images, classes = batch
-        return feature_loss(network, images.float() / 255, classes, config.objective)
+        images, classes = batch[0].float() / 255, batch[1]
+        features = network.features(images.flatten(0, 1).contiguous(memory_format=torch.channels_last))
+        logits = network.head(features)[:, 0]
+        target = (classes > 0).flatten(0, 1).to(logits.dtype)
+        of_pair = features.unflatten(0, images.shape[:2])
+        terms = {
+            "cross_entropy": functional.binary_cross_entropy_with_logits(logits, target),
+            "dice": soft_dice_loss(logits.sigmoid(), target),
+            "consistency": consistency_loss(of_pair[:, 0], of_pair[:, 1], classes[:, 0], classes[:, 1]),
+        }
+        return _weighted(terms, config.objective), terms
 
-    def validate(self, network: FeatureNetwork, batch: Batch) -> dict[str, float]:
-        """Figures of a folded network."""
-        return validate(network, batch[0].float() / 255, batch[1])
+    @torch.no_grad()
+    def validate(self, network: Any, batch: Batch) -> dict[str, float]:
+        """Figures of a folded network, by the names in `columns`.
+
+        `dice_*`: Dice of the predicted mask. `similarity_aligned`: cosine between features of observed and hybrid image
+        where both show an instrument; `similarity_misaligned`: the same where only one of them does.
+        """
+        dices, aligned, misaligned = [], [], []
+        device = next(network.parameters()).device
+        for images, classes in zip(*(part.split(_PAIRS_AT_ONCE) for part in batch), strict=True):
+            chunk, mask = (images.float() / 255).to(device), (classes > 0).to(device)
+            features = network.features(chunk.flatten(0, 1).contiguous(memory_format=torch.channels_last))
+            dices.append(dice((network.head(features)[:, 0] > 0).unflatten(0, chunk.shape[:2]), mask))
+            of_pair = features.unflatten(0, chunk.shape[:2])
+            similarity = functional.cosine_similarity(of_pair[:, 0], of_pair[:, 1], dim=1)
+            aligned.append(similarity[mask[:, 0] & mask[:, 1]])
+            misaligned.append(similarity[mask[:, 0] ^ mask[:, 1]])
+        mean = torch.cat(dices).mean(0)
+        return {
+            "dice_observed": float(mean[0]),
+            "dice_hybrid": float(mean[1]),
+            "similarity_aligned": float(torch.cat(aligned).mean()),
+            "similarity_misaligned": float(torch.cat(misaligned).mean()),
+        }
 
     def worse(self, now: dict[str, float], first: dict[str, float]) -> bool:
-        """See `Task`; only the score counts."""
+        """Whether a metric other than `score` is worse than at the start, so that weights are rejected."""
         return False
 
     @torch.no_grad()
-    def panels(self, network: FeatureNetwork, batch: Batch) -> list[list[tuple[str, np.ndarray]]]:
-        """Example predictions of a folded network."""
+    def panels(self, network: Any, batch: Batch) -> list[list[tuple[str, np.ndarray]]]:
+        """Example predictions of a folded network: per sample, titled pictures."""
         rows = []
         for pair, truth in zip(batch[0].float() / 255, batch[1].cpu().numpy() > 0, strict=True):
             features = network.features(pair.to(next(network.parameters()).device))
@@ -269,11 +214,11 @@ _PART_WORSE, _TIP_WORSE = 0.005, 0.2
 _LOST = 20.0
 """Error of a tip that is not predicted, and the most that one counts [px]."""
 _SMOOTH = 0.2
-_AT_ONCE = 8
+_AT_ONCE, _PAIRS_AT_ONCE = 8, 4
 
 
 class SurfaceTask:
-    """See `Task`. A batch is images, given surface maps and true surface maps."""
+    """The same as `FeatureTask` for the surface network. A batch is images, given and true surface maps."""
 
     columns: ClassVar[dict[str, str]] = {
         "dice": "Dice of the arms",
@@ -290,7 +235,7 @@ class SurfaceTask:
         return SurfaceNetwork(config.architecture)
 
     def generator(self, config: TrainingConfig, stream: Sequence[int]) -> SurfaceGenerator:
-        """An endless source of samples."""
+        """Generator of samples by number."""
         return SurfaceGenerator([Robot.load(path) for path in config.robots], config.images, stream)
 
     def flipped(self, sample: SurfaceSample, horizontally: bool, vertically: bool) -> SurfaceSample:
@@ -303,11 +248,11 @@ class SurfaceTask:
         turn[NORMALS.start + 1] = -1 if vertically else 1
         return SurfaceSample(observed, given * turn, surface * turn)
 
-    def tensors(self, sample: SurfaceSample) -> Batch:
+    def tensors(self, sample: Any) -> Batch:
         """A sample as tensors of bytes."""
         return byte_tensor(sample.observed), byte_tensor(sample.given), byte_tensor(sample.surface)
 
-    def loss(self, config: TrainingConfig, network: SurfaceNetwork, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
+    def loss(self, config: TrainingConfig, network: Any, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
         """The weighted loss, and each term before weighting."""
         images, given, surface = _floats(batch)
         predicted = network(images, given)
@@ -319,14 +264,13 @@ class SurfaceTask:
         terms = {
             "everywhere": entropy.mean(),
             "near": weighted_mean(entropy, near),
-            "dice": _part_dice_loss(predicted.map()[:, COVERAGE], coverage),
+            "dice": soft_dice_loss(predicted.map()[:, COVERAGE], coverage),
             "normals": weighted_mean(difference.sum(1), near),
         }
-        weights = config.surface_objective
-        return torch.stack([getattr(weights, name) * term for name, term in terms.items()]).sum(), terms
+        return _weighted(terms, config.surface_objective), terms
 
     @torch.no_grad()
-    def validate(self, network: SurfaceNetwork, batch: Batch) -> dict[str, float]:
+    def validate(self, network: Any, batch: Batch) -> dict[str, float]:
         """Figures of a folded network."""
         images, given, surface = _floats(batch)
         seen = _seen(network, images, given)
@@ -353,7 +297,7 @@ class SurfaceTask:
         return parts or now["tip_error"] > first.get("tip_error", math.inf) + _TIP_WORSE
 
     @torch.no_grad()
-    def panels(self, network: SurfaceNetwork, batch: Batch) -> list[list[tuple[str, np.ndarray]]]:
+    def panels(self, network: Any, batch: Batch) -> list[list[tuple[str, np.ndarray]]]:
         """Example predictions of a folded network."""
         images, given, surface = _floats(batch)
         seen = _seen(network, images, given)
@@ -411,16 +355,11 @@ def _seen(network: SurfaceNetwork, images: Tensor, given: Tensor) -> Tensor:
     return torch.cat([network(image.to(device), known.to(device)).map().to(images.device) for image, known in parts])
 
 
-def _part_dice_loss(
-    predicted: Float[Tensor, "batch parts h w"], coverage: Float[Tensor, "batch parts h w"]
-) -> Float[Tensor, ""]:
-    assert predicted.shape[1] == len(PARTS)
-    overlap = (predicted * coverage).sum((2, 3))
-    return 1 - ((2 * overlap + 1) / (predicted.sum((2, 3)) + coverage.sum((2, 3)) + 1)).mean()
-
-
 def _colors(channels: Float[Tensor, "3 h w"]) -> np.ndarray:
     return channels.clamp(0, 1).permute(1, 2, 0).cpu().numpy()
+
+
+Task = FeatureTask | SurfaceTask
 
 
 def task_of(network: NetworkName) -> Task:

@@ -201,16 +201,7 @@ def _predictions(examples: Panels) -> Figure:
 
 _LOG_EVERY = 10
 _EXAMPLES = 6
-_MAY_CHANGE = (
-    "steps",
-    "minutes",
-    "workers",
-    "threads",
-    "device",
-    "validation_every",
-    "checkpoint_every",
-    "patience",
-)
+_MAY_CHANGE = ("steps", "minutes", "workers", "threads", "device", "validation_every", "checkpoint_every", "patience")
 
 
 def train(
@@ -273,10 +264,7 @@ class _Run:
         return TrainingResult(weights, report, validation, self.history.first, self.history.seconds)
 
     def _train(
-        self,
-        samples: Batch,
-        validation: dict[str, float] | None,
-        progress: Callable[[TrainingProgress], None],
+        self, samples: Batch, validation: dict[str, float] | None, progress: Callable[[TrainingProgress], None]
     ) -> dict[str, float] | None:
         """Train to the end; returns the newest validation, which is the given one if there was no other."""
 

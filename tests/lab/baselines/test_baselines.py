@@ -11,7 +11,7 @@ from safetensors.torch import save_file
 from carts_core.errors import SettingsError, WeightsError
 from carts_core.files import output_path
 from carts_core.lab.baselines.networks import Baseline, read_baseline, save_baseline, start_from
-from carts_core.lab.baselines.training import TrainingFrames, make_chunk, missing_chunks, train_baseline
+from carts_core.lab.baselines.training import TrainingFrames, make_chunk, prepare_frames, train_baseline
 from carts_core.settings import Architecture
 from carts_core.settings.training import BaselineName, BaselineNetwork, BaselineTraining
 
@@ -81,19 +81,21 @@ def test_a_u_net_finds_the_square_after_some_steps_and_a_stopped_run_goes_on(tmp
 
 def test_frames_are_made_once_and_are_the_same_each_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("carts_core.lab.baselines.training.CHUNK", 2)
-    folder, other = output_path(tmp_path / "a"), output_path(tmp_path / "b")
-    assert missing_chunks(folder, 3) == [0, 1]
-    make_chunk(folder, 0, seed=5)
-    make_chunk(other, 0, seed=5)
-    assert missing_chunks(folder, 3) == [1]
-    (file,) = (tmp_path / "a").iterdir()
-    assert file.read_bytes() == (tmp_path / "b" / file.name).read_bytes()
-    images, given, masks = TrainingFrames(folder, [0]).batch([0, 1])
+    folder, said = output_path(tmp_path / "a"), list[str]()
+    settings = BaselineTraining(augmentation="none", seed=5)
+    object.__setattr__(settings, "frames", 3)
+    frames = prepare_frames(folder, settings, said.append)
+    assert said == ["training frames: part 1 of 2", "training frames: part 2 of 2"]
+    make_chunk(output_path(tmp_path / "b"), 0, seed=5)
+    first = tmp_path / "a" / "frames_000.safetensors"
+    assert first.read_bytes() == (tmp_path / "b" / first.name).read_bytes()
+    images, given, masks = frames.batch([0, 1])
     assert images.shape == (2, 3, 192, 256) and given.shape == (2, 6, 192, 256) and masks.shape == (2, 1, 192, 256)
     assert 0 < masks.mean() < 0.6 and float(given.abs().max()) <= 1.01
-    file.write_bytes(file.read_bytes()[:1000])
+    first.write_bytes(first.read_bytes()[:1000])
     with pytest.raises(WeightsError, match=r"frames_000.safetensors cannot be read .* Delete the file"):
-        TrainingFrames(folder, [0])
+        prepare_frames(folder, settings, said.append)
+    assert len(said) == 2
 
 
 def test_weights_of_something_else_are_refused_in_words(tmp_path: Path) -> None:

@@ -7,34 +7,38 @@ from pathlib import Path
 import pytest
 
 from carts_core.files import output_path
-from carts_core.lab.benchmark import Benchmark, ResultsFile, Scope, Source, plan, runner
+from carts_core.lab.benchmark import QUICK, Benchmark, ResultsFile, Run, Source, plan, runner
 from carts_core.lab.benchmark.scope import METHODS
 from carts_core.networks import FeatureExtractor
 from carts_core.optimization import SolverSettings
 from carts_core.recording import Sequence
 
-TINY = Scope(
+TINY = replace(
+    QUICK,
     frames=1,
     sequence_frames=1,
     samples=1,
     paper_iterations=2,
-    error_domains=("regular",),
     errors_deg=(2.0,),
-    paper_errors_deg=(2.0,),
-    further_errors_deg=(),
-    real_errors_deg=(),
     crossing_errors_deg=(),
-    hard_errors_deg=(2.0,),
     consecutive=2,
-    consecutive_domains=("regular",),
-    consecutive_errors_deg=(2.0,),
     calibration_frames=2,
-    room_frames=1,
     room_consecutive=2,
     room_share=16,
     family_frames=0,
     hand_eye_starts=0,
 )
+
+
+@pytest.fixture
+def sequence(tiny_sequence: Callable[..., Path]) -> Sequence:
+    """Three frames with masks."""
+    return Sequence.open(tiny_sequence(frames=3, width=160, height=120))
+
+
+@pytest.fixture(scope="session")
+def extractor() -> FeatureExtractor:
+    return FeatureExtractor.load()
 
 
 @pytest.fixture
@@ -52,7 +56,11 @@ def few_steps(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def tiny_benchmark(
-    tiny_sequence: Callable[..., Path], tmp_path: Path, few_steps: None, monkeypatch: pytest.MonkeyPatch
+    tiny_sequence: Callable[..., Path],
+    tmp_path: Path,
+    few_steps: None,
+    monkeypatch: pytest.MonkeyPatch,
+    extractor: FeatureExtractor,
 ) -> Callable[..., Benchmark]:
     """Factory of the same benchmark over one frame of a tiny sequence in two domains, and two in sequence mode, on the
     same results file."""
@@ -60,7 +68,7 @@ def tiny_benchmark(
     monkeypatch.setattr(runner, "DOMAINS", domains)
     path = tiny_sequence(frames=2, domains=domains, cameras=("left", "right"), width=160, height=128)
 
-    def make(fingerprint: str = "tiny", name: str = "synthetic") -> Benchmark:
+    def make(fingerprint: str = "tiny", name: str = "synthetic", runs: list[Run] | None = None) -> Benchmark:
         source = Source(
             name,
             "tiny",
@@ -73,6 +81,6 @@ def tiny_benchmark(
             length=2,
         )
         results = ResultsFile(output_path(tmp_path, "bench", "measurements.jsonl"))
-        return Benchmark(TINY, [source], FeatureExtractor.load(), results, plan(TINY, [source]))
+        return Benchmark(TINY, [source], extractor, results, runs or plan(TINY, [source]))
 
     return make

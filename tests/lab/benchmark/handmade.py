@@ -1,6 +1,7 @@
 """Measurements made by hand."""
 
-from carts_core.lab.benchmark import Measurement, Run, Score
+from carts_core.lab.benchmark import Measurement, Run, Score, Target, targets
+from carts_core.lab.benchmark.statistics import Measurements
 
 
 def make_measurement(
@@ -29,3 +30,9 @@ def make_measurement(
     )
     best = tuple(max(range(place + 1), key=lambda i: dice[i]) for place in range(len(dice)))
     return Measurement(Run(source, domain, frame, method, error_deg), trace[-1], stopped, "a machine", trace, best)
+
+
+def target_of(start: str, *measurements: Measurement) -> Target:
+    """The one target of measurements whose label starts so."""
+    (found,) = [target for target in targets(Measurements(measurements)) if target.what.startswith(start)]
+    return found

@@ -16,11 +16,6 @@ SIZE = {"width": 160, "height": 120}
 GREEN = Room("green", "tuning", lambda width, height: np.full((height, width, 3), (40, 160, 90), np.uint8))
 
 
-@pytest.fixture
-def sequence(tiny_sequence: Callable[..., Path]) -> Sequence:
-    return Sequence.open(tiny_sequence(frames=3, **SIZE))
-
-
 def test_made_rooms_are_pictures_of_their_own_and_the_same_each_time() -> None:
     rooms = made_rooms()
     pictures = [room.draw(64, 48) for room in rooms]

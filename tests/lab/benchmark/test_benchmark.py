@@ -1,10 +1,6 @@
 """A whole small benchmark: runs, stops, goes on, and reports."""
 
-import os
-import signal
-import subprocess
-import sys
-import time
+import io
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -20,15 +16,13 @@ from carts_core.lab.benchmark import (
     Measurement,
     ResultsFile,
     Run,
+    frame,
     plan,
-    runner,
     synthetic_room_source,
     write_report,
 )
 from carts_core.lab.benchmark.conditions import NO_ARM, OTHER_INSTRUMENT, WRONG
-from carts_core.lab.benchmark.runner import SourceBench
-from carts_core.lab.benchmark.statistics import Measurements
-from carts_core.lab.benchmark.tables import sequence_table
+from carts_core.lab.benchmark.frame import SourceBench
 
 QUIET = Console(quiet=True)
 RUNS = 38
@@ -47,7 +41,7 @@ def count_runs(monkeypatch: pytest.MonkeyPatch) -> list[Measurement]:
         measured.extend(found)
         return found
 
-    monkeypatch.setattr(runner.SourceBench, "measure", counting)
+    monkeypatch.setattr(SourceBench, "measure", counting)
     return measured
 
 
@@ -57,19 +51,21 @@ def test_every_method_is_scored_in_every_domain_although_stopped_once_and_a_furt
     monkeypatch: pytest.MonkeyPatch,
     tmp_path: Path,
 ) -> None:
-    measure = SourceBench.measure
+    measure, log = SourceBench.measure, io.StringIO()
 
     def stop_at_five(self: SourceBench, *arguments) -> list[Measurement]:
+        assert log.getvalue().count("\n") == len(count_runs), "each measurement has its line at once"
         if len(count_runs) == 5:
             raise KeyboardInterrupt
         return measure(self, *arguments)
 
-    monkeypatch.setattr(runner.SourceBench, "measure", stop_at_five)
+    monkeypatch.setattr(SourceBench, "measure", stop_at_five)
     with pytest.raises(KeyboardInterrupt):
-        tiny_benchmark().run(QUIET)
+        tiny_benchmark().run(Console(file=log))
+    assert log.getvalue().startswith(f"1 of {RUNS}: synthetic, regular, frame 0: ")
     kept = tiny_benchmark().measurements()
     assert [entry.run for entry in kept] == [entry.run for entry in count_runs] and len(kept) == 5
-    monkeypatch.setattr(runner.SourceBench, "measure", measure)
+    monkeypatch.setattr(SourceBench, "measure", measure)
     benchmark = tiny_benchmark()
     benchmark.run(QUIET)
     measurements = benchmark.measurements()
@@ -87,6 +83,8 @@ def test_every_method_is_scored_in_every_domain_although_stopped_once_and_a_furt
         assert measurement.final.seconds > 0
         if measurement.run.error_deg and measurement.start:
             assert measurement.start.joint_mae_deg == pytest.approx(2.0, abs=1e-3)
+    temporal = [m.stopped for m in measurements if m.run.method == "temporal"]
+    assert temporal == 2 * ["cold", "warm"], "the second frame starts at the first's correction"
     judged = [m for m in measurements if m.run.method in ("ours", "masks", "sequence")]
     assert all(m.verdict in ("good", "doubtful", "failed") and m.probability is not None for m in judged)
     known, other = ([m for m in judged if (m.run.domain == OTHER_INSTRUMENT) is kind] for kind in (False, True))
@@ -98,7 +96,7 @@ def test_every_method_is_scored_in_every_domain_although_stopped_once_and_a_furt
     assert len(count_runs) == RUNS
     facts = Facts("quick", RUNS, {"synthetic": "tiny"}, "w", "c", "0")
     page = write_report(output_path(tmp_path, "bench"), measurements, facts, {}, [])
-    assert f"{RUNS} of {RUNS}" in page.read_text()
+    assert f"{RUNS} of {RUNS}" in page.read_text() and "TC-CaRTS" in page.read_text()
 
 
 def test_synthetic_instruments_are_measured_in_other_rooms_with_joints_and_verdicts(
@@ -117,48 +115,19 @@ def test_synthetic_instruments_are_measured_in_other_rooms_with_joints_and_verdi
     assert by_method["ours"].verdict is not None and by_method["ours"].within is not None
 
 
-def test_a_file_gets_a_line_for_what_was_measured_as_soon_as_it_was(
-    tiny_benchmark: Callable[..., Benchmark], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    log, measure = tmp_path / "log.txt", SourceBench.measure
-    seen: list[str] = []
-
-    def stop_at_three(self: SourceBench, *arguments) -> list[Measurement]:
-        seen.append(log.read_text())
-        if len(seen) == 3:
-            raise KeyboardInterrupt
-        return measure(self, *arguments)
-
-    monkeypatch.setattr(runner.SourceBench, "measure", stop_at_three)
-    with log.open("w") as file, pytest.raises(KeyboardInterrupt):
-        tiny_benchmark().run(Console(file=file))
-    assert [text.count("\n") for text in seen] == [0, 1, 2]
-    assert [line.split(":")[0] for line in seen[2].splitlines()] == [f"1 of {RUNS}", f"2 of {RUNS}"]
-    assert "synthetic, regular, frame 0: " in seen[2]
-
-
-def test_measurements_of_other_frames_are_not_used(tiny_benchmark: Callable[..., Benchmark]) -> None:
-    first = tiny_benchmark()
-    run = next(iter(first.runs))
-    first.results.append(_one(first), first.runs[run])
-    assert len(tiny_benchmark().measurements()) == 1
-    assert tiny_benchmark("other images").measurements() == []
-
-
 def test_a_calibration_is_found_once_and_holds_for_every_frame(
     tiny_benchmark: Callable[..., Benchmark], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     calls: list[int] = []
-    found = runner.calibrated_scene
+    found = frame.calibrated_scene
 
     def counting(recording, camera: str, frames: int, extractor):
         calls.append(frames)
         return found(recording, camera, frames, extractor)
 
-    monkeypatch.setattr(runner, "calibrated_scene", counting)
-    benchmark = tiny_benchmark(name="real")
+    monkeypatch.setattr(frame, "calibrated_scene", counting)
     runs = [Run("real", "regular", 0, method) for method in ("start", "calibrated", "calibrated_ours")]
-    benchmark = Benchmark(benchmark.scope, benchmark.sources.values(), benchmark.extractor, benchmark.results, runs)
+    benchmark = tiny_benchmark(name="real", runs=runs)
     benchmark.run(QUIET)
     plain, calibrated, corrected = benchmark.measurements()
     assert calls == [2]
@@ -169,78 +138,31 @@ def test_a_calibration_is_found_once_and_holds_for_every_frame(
 def test_frames_of_a_sequence_are_measured_together_also_where_some_are_known(
     tiny_benchmark: Callable[..., Benchmark], count_runs: list[Measurement]
 ) -> None:
-    benchmark = tiny_benchmark()
     runs = [Run("synthetic", "regular", frame, "sequence", 1.0) for frame in (0, 1)]
-    benchmark = Benchmark(benchmark.scope, benchmark.sources.values(), benchmark.extractor, benchmark.results, runs)
+    benchmark = tiny_benchmark(runs=runs)
     benchmark.run(QUIET)
     first = benchmark.measurements()
     assert [entry.stopped for entry in first] == ["cold", "warm"]
-    starts = [entry.start for entry in first]
-    assert all(start and start.joint_mae_deg == pytest.approx(1.0, abs=1e-3) for start in starts)
-    lines = benchmark.results.path.path.read_bytes().splitlines(keepends=True)
-    benchmark.results.path.path.write_bytes(lines[0])
-    results = ResultsFile(benchmark.results.path)
-    again = Benchmark(benchmark.scope, benchmark.sources.values(), benchmark.extractor, results, runs)
+    path = benchmark.results.path.path
+    path.write_bytes(path.read_bytes().splitlines(keepends=True)[0])
+    again = tiny_benchmark(runs=runs)
     again.run(QUIET)
     assert len(count_runs) == 4
     assert [entry.final.dice for entry in again.measurements()] == [entry.final.dice for entry in first]
 
 
-def _one(benchmark: Benchmark) -> Measurement:
-    run = next(iter(benchmark.runs))
-    bench = SourceBench(benchmark.sources[run.source], runner.Bar(console=QUIET))
-    return bench.measure([run], benchmark.scope, benchmark.extractor)[0]
-
-
-def test_measurements_of_other_settings_weights_or_code_are_not_used(
+def test_measurements_of_other_images_settings_weights_or_code_are_not_used(
     tiny_benchmark: Callable[..., Benchmark], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    reference = tiny_benchmark().runs
-    assert tiny_benchmark().runs == reference
-    other = tiny_benchmark()
-    other.extractor.sha256 = "0" * 64
-    changed = Benchmark(other.scope, other.sources.values(), other.extractor, other.results, other.runs)
-    assert not set(changed.runs.values()) & set(reference.values())
+    reference = tiny_benchmark()
+    keys = set(reference.runs.values())
+    assert set(tiny_benchmark().runs.values()) == keys
+    assert not keys & set(tiny_benchmark("other images").runs.values())
+    with monkeypatch.context() as patch:
+        patch.setattr(reference.extractor, "sha256", "0" * 64)
+        assert not keys & set(tiny_benchmark().runs.values())
     monkeypatch.setattr("carts_core.lab.benchmark.measurement.code_fingerprint", lambda: "edited")
-    assert not set(tiny_benchmark().runs.values()) & set(reference.values())
-
-
-@pytest.mark.slow
-def test_a_killed_benchmark_leaves_lines_that_are_all_valid(tmp_path: Path, tiny_sequence) -> None:
-    path = tiny_sequence(frames=1, domains=("regular",), width=160, height=128)
-    script = tmp_path / "bench.py"
-    script.write_text(
-        "import sys\n"
-        "from pathlib import Path\n"
-        "from rich.console import Console\n"
-        "from carts_core.lab.benchmark import Benchmark, QUICK, ResultsFile, Run, Source\n"
-        "from carts_core.recording import Sequence\n"
-        "from carts_core.networks import FeatureExtractor\n"
-        "from carts_core.files import output_path\n"
-        "source = Source('synthetic', 'tiny', 'left', [0], 'tiny', lambda progress: Sequence.open(sys.argv[1]))\n"
-        "runs = [Run('synthetic', 'regular', 0, 'start', float(error)) for error in range(int(sys.argv[3]))]\n"
-        "results = ResultsFile(output_path(Path(sys.argv[2])))\n"
-        "bench = Benchmark(QUICK, [source], FeatureExtractor.load(), results, runs)\n"
-        "print(len(bench.measurements()), results.unreadable)\n"
-        "bench.run(Console(quiet=True))\n"
-    )
-    lines = tmp_path / "lines.jsonl"
-    command = [sys.executable, str(script), str(path), str(lines)]
-    running = subprocess.Popen([*command, "5000"], stdout=subprocess.DEVNULL, env=os.environ)
-    try:
-        deadline = time.monotonic() + 120
-        while time.monotonic() < deadline and not (lines.exists() and lines.read_bytes().count(b"\n") >= 3):
-            assert running.poll() is None
-            time.sleep(0.02)
-    finally:
-        running.send_signal(signal.SIGKILL)
-        running.wait()
-    known = lines.read_bytes().count(b"\n")
-    assert known >= 3
-    again = subprocess.run([*command, str(known + 1)], capture_output=True, text=True, check=True, timeout=120)
-    found, torn = map(int, again.stdout.split())
-    assert found >= known and torn <= 1
-    assert len(lines.read_bytes().splitlines()) >= known + 1
+    assert not keys & set(tiny_benchmark().runs.values())
 
 
 def test_a_report_of_nothing_says_what_to_do(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -254,18 +176,3 @@ def test_the_shipped_sequences_seed_is_refused(capsys: pytest.CaptureFixture[str
     with pytest.raises(SystemExit) as stop:
         main(["bench", "--quick", "--seed", "7", "--report-only"])
     assert stop.value.code == BAD_INPUT and "--seed 7 is the shipped sequence's" in capsys.readouterr().err
-
-
-def test_the_temporal_pipeline_starts_each_frame_at_the_previous_correction(
-    tiny_benchmark: Callable[..., Benchmark],
-) -> None:
-    benchmark = tiny_benchmark()
-    runs = [Run("synthetic", "regular", frame, "temporal", 1.0) for frame in (0, 1)]
-    benchmark = Benchmark(benchmark.scope, benchmark.sources.values(), benchmark.extractor, benchmark.results, runs)
-    benchmark.run(QUIET)
-    first, second = benchmark.measurements()
-    assert [first.stopped, second.stopped] == ["cold", "warm"]
-    assert first.start and second.start, "both are put off by the same error"
-    assert first.start.joint_mae_deg == pytest.approx(1.0, abs=1e-3) == second.start.joint_mae_deg
-    table = sequence_table(Measurements(benchmark.measurements()))
-    assert table is not None and "TC-CaRTS" in table.rows[0][3].text

@@ -17,11 +17,6 @@ SIZE = {"width": 160, "height": 120}
 
 
 @pytest.fixture
-def sequence(tiny_sequence: Callable[..., Path]) -> Sequence:
-    return Sequence.open(tiny_sequence(frames=3, **SIZE))
-
-
-@pytest.fixture
 def counterfactual(sequence: Sequence) -> Counterfactual:
     other = np.full((SIZE["height"], SIZE["width"], 3), (40, 160, 90), np.uint8)
     return Counterfactual(sequence, "left", other, seed=1)

@@ -10,27 +10,23 @@ from carts_core.lab.benchmark.hand_eye import CONDITIONS, HandEyeRun, hand_eye_t
 from carts_core.networks.extractor import FeatureExtractor
 
 
-@pytest.fixture
-def networks() -> FeatureExtractor:
-    return FeatureExtractor.load()
-
-
 def runs(count: int, angle_deg: float, verdict: str, condition: int = 0) -> list[HandEyeRun]:
     return [HandEyeRun(CONDITIONS[condition].name, seed, angle_deg, 1e-3, verdict) for seed in range(count)]
 
 
 def test_one_start_is_measured_kept_and_not_measured_again(
-    tmp_path: Path, networks: FeatureExtractor, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, extractor: FeatureExtractor, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(hand_eye, "CONDITIONS", CONDITIONS[:1])
     monkeypatch.setattr(hand_eye, "_VIEWS", 3)
+    monkeypatch.setattr(hand_eye, "_SAMPLES", 1)
     file, said = output_path(tmp_path, "hand_eye.json"), list[str]()
-    (run,) = measure_hand_eye(file, networks, 1, said.append)
+    (run,) = measure_hand_eye(file, extractor, 1, said.append)
     assert run.verdict == "good" and run.angle_deg < 0.3 and run.distance < 3e-3
-    assert len(said) == 1 and known_hand_eye(file, networks) == [run]
-    assert measure_hand_eye(file, networks, 1, said.append) == [run] and len(said) == 1
-    file.path.write_text(file.path.read_text().replace(networks.fingerprint, "other weights"))
-    assert known_hand_eye(file, networks) == []
+    assert len(said) == 1 and known_hand_eye(file, extractor) == [run]
+    assert measure_hand_eye(file, extractor, 1, said.append) == [run] and len(said) == 1
+    file.path.write_text(file.path.read_text().replace(extractor.fingerprint, "other weights"))
+    assert known_hand_eye(file, extractor) == []
 
 
 def test_nine_of_ten_starts_meet_the_target_and_eight_do_not() -> None:

@@ -16,17 +16,17 @@ from carts_core.model.robot import Robot
 from carts_core.recording import Sequence
 
 
-def test_a_measurement_survives_its_json_line() -> None:
+def _read_back(measurement: Measurement) -> Measurement:
+    return Measurement.from_json(json.loads(json.dumps(measurement.to_json())))
+
+
+def test_a_measurement_survives_its_json_line_also_without_iterates() -> None:
     measurement = make_measurement((0.5, 0.7), error_deg=2.0)
-    assert Measurement.from_json(json.loads(json.dumps(measurement.to_json()))) == measurement
-
-
-def test_a_measurement_without_iterates_survives_too_and_has_no_start() -> None:
+    assert _read_back(measurement) == measurement
     score = Score(None, 0.9, 0.8, None, None, None, 0.1)
-    measurement = Measurement(Run("real", "smoke", 3, "unet"), score, "not iterative", "a machine")
-    again = Measurement.from_json(json.loads(json.dumps(measurement.to_json())))
-    assert again == measurement
-    assert again.start is None and again.best_of(30) is None and not again.made_worse and again.iterations == 0
+    alone = _read_back(Measurement(Run("real", "smoke", 3, "unet"), score, "not iterative", "a machine"))
+    assert alone.final == score
+    assert alone.start is None and alone.best_of(30) is None and not alone.made_worse and alone.iterations == 0
 
 
 def test_the_best_of_some_steps_has_the_time_of_all_of_them() -> None:

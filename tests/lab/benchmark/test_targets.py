@@ -2,16 +2,11 @@
 
 from dataclasses import replace
 
-from handmade import make_measurement
+from handmade import make_measurement, target_of
 
-from carts_core.lab.benchmark import Measurement, Target, targets
+from carts_core.lab.benchmark import Measurement, targets
 from carts_core.lab.benchmark.statistics import Measurements
 from carts_core.lab.synthesis import DOMAINS
-
-
-def _target(start: str, *measurements) -> Target:
-    (found,) = [target for target in targets(Measurements(measurements)) if target.what.startswith(start)]
-    return found
 
 
 def test_nothing_measured_gives_no_verdict_anywhere() -> None:
@@ -21,24 +16,24 @@ def test_nothing_measured_gives_no_verdict_anywhere() -> None:
 def test_the_speedup_compares_the_times_to_the_papers_dice() -> None:
     paper = make_measurement((0.5, 0.6, 0.7, 0.8), method="paper", seconds=10.0)
     fast = make_measurement((0.5, 0.9), seconds=2.0)
-    assert _target("times faster", paper, fast).reached == "10.0"
-    assert _target("times faster", paper, fast).met is True
+    assert target_of("times faster", paper, fast).reached == "10.0"
+    assert target_of("times faster", paper, fast).met is True
     slow = make_measurement((0.5, 0.9), seconds=6.0)
-    assert _target("times faster", paper, slow).met is False
+    assert target_of("times faster", paper, slow).met is False
     never = make_measurement((0.5, 0.75), seconds=0.1)
-    assert _target("times faster", paper, never).reached == "0.0"
+    assert target_of("times faster", paper, never).reached == "0.0"
 
 
 def test_the_worst_domain_decides_on_dice() -> None:
     good = [make_measurement((0.6, 0.99), domain=domain, error_deg=2.0) for domain in DOMAINS[1:]]
     fine = make_measurement((0.6, 0.981), domain="regular", error_deg=2.0)
     bad = make_measurement((0.6, 0.97), domain="regular", error_deg=2.0)
-    assert _target("synthetic, 2° off, each frame alone: mean Dice", fine, *good).met is True
-    part = _target("synthetic, 2° off, each frame alone: mean Dice", fine)
+    assert target_of("synthetic, 2° off, each frame alone: mean Dice", fine, *good).met is True
+    part = target_of("synthetic, 2° off, each frame alone: mean Dice", fine)
     assert part.met is None and part.reached == "0.981" and "domains measured: 1" in part.basis
-    missed = _target("synthetic, 2° off, each frame alone: mean Dice", bad)
+    missed = target_of("synthetic, 2° off, each frame alone: mean Dice", bad)
     assert missed.met is False
-    missed = _target("synthetic, 2° off, each frame alone: mean Dice", bad, *good)
+    missed = target_of("synthetic, 2° off, each frame alone: mean Dice", bad, *good)
     assert missed.met is False and missed.reached == "0.970" and "regular" in missed.basis
 
 
@@ -46,30 +41,30 @@ def test_real_frames_are_compared_with_their_clean_form() -> None:
     clean = make_measurement((0.87, 0.965), source="real")
     near = make_measurement((0.87, 0.958), source="real", domain="smoke")
     far = make_measurement((0.87, 0.9), source="real", domain="bleeding")
-    assert _target("real frames, each alone", clean).met is True
-    assert _target("real frames under", clean, near).met is None
+    assert target_of("real frames, each alone", clean).met is True
+    assert target_of("real frames under", clean, near).met is None
     others = [
         make_measurement((0.87, 0.965), source="real", domain=domain)
         for domain in ("low_brightness", "bleeding", "background_change")
     ]
-    assert _target("real frames under", clean, near, *others).met is True
-    same = _target("real frames under", clean, *others)
+    assert target_of("real frames under", clean, near, *others).met is True
+    same = target_of("real frames under", clean, *others)
     assert same.reached == "0.000"
-    lost = _target("real frames under", clean, near, far)
+    lost = target_of("real frames under", clean, near, far)
     assert lost.met is False and lost.reached == "0.065" and "bleeding" in lost.basis
 
 
 def test_pictures_with_occluders_count_for_occlusion_and_for_frames_made_worse_and_nowhere_else() -> None:
     covered = make_measurement((0.7, 0.6), domain="occlusion", error_deg=2.0)
-    assert _target("synthetic, 2° off, each frame alone: mean Dice", covered).met is None
-    assert _target("seconds per frame", covered).reached == "not measured"
-    assert _target("frames made worse", covered).reached == "100.0 %"
+    assert target_of("synthetic, 2° off, each frame alone: mean Dice", covered).met is None
+    assert target_of("seconds per frame", covered).reached == "not measured"
+    assert target_of("frames made worse", covered).reached == "100.0 %"
     plain = [make_measurement((0.9, dice), domain="occlusion", frame=i) for i, dice in enumerate((0.95, 0.97))]
     given = make_measurement((0.9, 0.99), domain="occlusion", method="ours_given")
-    reached = _target("30 % of the visible instrument", *plain, given)
+    reached = target_of("30 % of the visible instrument", *plain, given)
     assert reached.reached == "0.960" and reached.met is True and "occluder given 0.990" in reached.basis
     real = make_measurement((0.9, 0.94), domain="occlusion", source="real")
-    assert _target("30 % of the visible instrument", *plain, real).met is False
+    assert target_of("30 % of the visible instrument", *plain, real).met is False
 
 
 def test_sequence_mode_counts_warm_frames_on_cpu_and_gpu_apart() -> None:
@@ -77,6 +72,6 @@ def test_sequence_mode_counts_warm_frames_on_cpu_and_gpu_apart() -> None:
         return replace(make_measurement((0.97,), method="sequence", seconds=seconds, stopped=stopped), machine=machine)
 
     cold, warm, card = frame(3.0, "cold", "a CPU"), frame(0.25, "warm", "a CPU"), frame(0.02, "warm", "cuda: a card")
-    assert _target("sequence mode, seconds", cold, warm, card).reached == "0.25 s"
-    assert _target("sequence mode, frames per second", cold, warm).reached == "not measured"
-    assert _target("sequence mode, frames per second", cold, warm, card).reached == "50.0"
+    assert target_of("sequence mode, seconds", cold, warm, card).reached == "0.25 s"
+    assert target_of("sequence mode, frames per second", cold, warm).reached == "not measured"
+    assert target_of("sequence mode, frames per second", cold, warm, card).reached == "50.0"

@@ -4,9 +4,9 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from handmade import make_measurement
+from handmade import make_measurement, target_of
 
-from carts_core.lab.benchmark import FULL, QUICK, Measurement, family_sources, plan, synthetic_source, targets
+from carts_core.lab.benchmark import FULL, QUICK, Measurement, family_sources, plan, synthetic_source
 from carts_core.lab.benchmark.conditions import (
     NO_ARM,
     OTHER_CAMERA,
@@ -37,16 +37,11 @@ FRAMES = [
 ]
 
 
-def _target(start: str, *measurements: Measurement):
-    (found,) = [target for target in targets(Measurements(measurements)) if target.what.startswith(start)]
-    return found
-
-
 def test_the_area_under_the_roc_is_how_often_a_wrong_mask_is_held_for_less_likely() -> None:
     # Wrong at 0.99 and 0.05, right at 0.02 and 0.3: three of four pairs are in order.
-    assert _target("verdict against Dice", *FRAMES).reached == "0.750"
-    assert _target("verdict against Dice", *FRAMES[:3]).met is True
-    assert _target("verdict against Dice", FRAMES[0], FRAMES[3]).met is None, "nothing was wrong about any input"
+    assert target_of("verdict against Dice", *FRAMES).reached == "0.750"
+    assert target_of("verdict against Dice", *FRAMES[:3]).met is True
+    assert target_of("verdict against Dice", FRAMES[0], FRAMES[3]).met is None, "nothing was wrong about any input"
 
 
 def test_the_verdict_table_has_a_row_per_condition_and_one_of_all() -> None:
@@ -66,7 +61,7 @@ def test_other_instruments_have_a_table_and_targets_and_count_nowhere_else() -> 
     table = family_table(data)
     assert table is not None
     assert [cell.text for cell in table.rows[0]] == ["curved_scissors", "regular", "1", "85.0", "94.0"]
-    assert _target("curved_scissors", *data.all).met is False
+    assert target_of("curved_scissors", *data.all).met is False
 
 
 def test_rooms_and_other_instruments_are_planned_without_real_frames() -> None:

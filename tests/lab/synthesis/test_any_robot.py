@@ -8,7 +8,7 @@ import torch
 
 from carts_core.errors import RobotError, SettingsError
 from carts_core.evaluation import dice
-from carts_core.lab.benchmark.hand_eye import write_arm
+from carts_core.lab.benchmark.hand_eye import ARM
 from carts_core.lab.synthesis import EndoscopeConfig, MotionConfig, RenderConfig, SynthesisConfig, synthesize
 from carts_core.lab.synthesis.motion import measurement_error
 from carts_core.model.robot import Robot
@@ -24,9 +24,9 @@ def _config(robot: Path, **settings) -> SynthesisConfig:
         seed=4,
         robot=robot,
         domains=("regular", "smoke"),
-        endoscope=EndoscopeConfig(width=128, height=96, distance=DISTANCE),
+        endoscope=EndoscopeConfig(width=96, height=72, distance=DISTANCE),
         motion=MotionConfig(frames=2, frame_rate=2.0),
-        render=RenderConfig(samples=2, robot_faces=4000, tissue_resolution=64, texture_resolution=128),
+        render=RenderConfig(samples=1, robot_faces=4000, tissue_resolution=64, texture_resolution=128),
         **settings,
     )
 
@@ -34,7 +34,7 @@ def _config(robot: Path, **settings) -> SynthesisConfig:
 @pytest.fixture(scope="module")
 def sequence(tmp_path_factory: pytest.TempPathFactory) -> Sequence:
     folder = tmp_path_factory.mktemp("arm")
-    return Sequence.open(synthesize(_config(write_arm(folder)), folder / "sequence"))
+    return Sequence.open(synthesize(_config(ARM), folder / "sequence"))
 
 
 def test_one_arm_is_seen_from_so_far_and_its_masks_are_those_of_the_true_joints(sequence: Sequence) -> None:
@@ -58,7 +58,7 @@ def test_one_arm_is_seen_from_so_far_and_its_masks_are_those_of_the_true_joints(
 
 
 def test_joints_of_each_kind_have_errors_of_their_own(tmp_path: Path) -> None:
-    robot = Robot.load(write_arm(tmp_path))
+    robot = Robot.load(ARM)
     assert measurement_error(robot, MeasurementError()).bias == (0.02,) * 7
     chosen = MeasurementError(bias=(0.1,) * 7, drift=(0.0,) * 7, noise=(0.0,) * 7)
     assert measurement_error(robot, chosen) is chosen
@@ -71,4 +71,4 @@ def test_an_instrument_is_not_looked_at_from_a_metre_away(tmp_path: Path) -> Non
 
 def test_a_tip_that_the_robot_lacks_is_named(tmp_path: Path) -> None:
     with pytest.raises(RobotError, match="no_such_link"):
-        synthesize(_config(write_arm(tmp_path), tip_link="no_such_link"), tmp_path / "sequence")
+        synthesize(_config(ARM, tip_link="no_such_link"), tmp_path / "sequence")

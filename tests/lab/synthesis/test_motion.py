@@ -52,31 +52,20 @@ def test_inverse_kinematics_brings_the_tip_to_its_target(arms: Sequence[Arm]) ->
         np.testing.assert_array_equal(found[:, 3:], start[:, 3:])
 
 
-def test_joints_stay_well_inside_their_limits(arms: Sequence[Arm], joints: Sequence[np.ndarray]) -> None:
+def test_a_plan_keeps_within_limits_touches_nothing_and_stays_in_view(
+    arms: tuple[Arm, ...], joints: Sequence[np.ndarray], flat_tissue: Tissue, camera: Camera
+) -> None:
+    renderer = Renderer(Scene(arms, (camera,)), width=160, height=120)
     for arm, positions in zip(arms, joints, strict=True):
         low, high = arm.robot.joint_limits.numpy().T
-        assert (positions > low + 0.02).all()
-        assert (positions < high - 0.02).all()
-
-
-def test_instruments_touch_neither_each_other_nor_the_tissue(
-    arms: Sequence[Arm], joints: Sequence[np.ndarray], flat_tissue: Tissue
-) -> None:
+        assert (positions > low + 0.02).all() and (positions < high - 0.02).all()
     for frame in range(len(joints[0])):
         left, right = (_vertices(arm, positions[frame]) for arm, positions in zip(arms, joints, strict=True))
         assert KDTree(left).query(right)[0].min() > 0.0005
         assert min(left[:, 2].min(), right[:, 2].min()) > 0.0005
-
-
-def test_both_instruments_are_seen_in_every_frame(
-    arms: tuple[Arm, ...], joints: Sequence[np.ndarray], camera: Camera
-) -> None:
-    renderer = Renderer(Scene(arms, (camera,)), width=160, height=120)
-    for frame in range(len(joints[0])):
         state = renderer.scene.state({arm.name: positions[frame] for arm, positions in zip(arms, joints, strict=True)})
         ids = renderer.segment(state)[0]
-        for arm in range(2):
-            assert (ids == arm).mean() > 0.01
+        assert all((ids == arm).mean() > 0.01 for arm in range(2))
 
 
 def test_a_motion_that_cannot_be_done_says_why(arms: tuple[Arm, ...], camera: Camera, flat_tissue: Tissue) -> None:

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from carts_core.cli.command_line import BAD_INPUT, main
-from carts_core.errors import SequenceError, SettingsError
+from carts_core.errors import SettingsError
 from carts_core.lab.randomization.arms import RecordedPlacements, RobotGeometry
 from carts_core.lab.training.adaptation import (
     BACKGROUNDS,
@@ -92,7 +92,7 @@ def test_a_robot_that_is_not_of_the_recording_is_refused(far_away: Path):
         )
 
 
-def test_settings_come_from_the_recording_and_the_shipped_weights(tmp_path: Path):
+def test_settings_come_from_the_recording_and_the_shipped_weights_unless_they_are_given(tmp_path: Path):
     config = adapted_to(sample_sequence(), tmp_path, TrainingConfig())
     assert config.start == shipped_weights()[1]
     assert (config.steps, config.minutes) == (STEPS, None)
@@ -101,18 +101,18 @@ def test_settings_come_from_the_recording_and_the_shipped_weights(tmp_path: Path
     assert config.images.photographs == tmp_path / BACKGROUNDS
     cameras = len(Sequence.open(sample_sequence()).scene.cameras)
     assert len(list((tmp_path / BACKGROUNDS).glob("*.png"))) == cameras
-
-
-def test_a_recording_that_is_not_there_leaves_no_folder(tmp_path: Path):
-    with pytest.raises(SequenceError, match="nowhere"):
-        adapted_to(tmp_path / "nowhere.toml", tmp_path / "run", TrainingConfig())
-    assert not (tmp_path / "run").exists()
-
-
-def test_options_that_are_given_are_kept(tmp_path: Path):
     given = TrainingConfig(minutes=3.0, learning_rate=1e-4, start=Path("other.safetensors"))
     config = adapted_to(sample_sequence(), tmp_path, given)
     assert (config.minutes, config.learning_rate, config.start) == (3.0, 1e-4, Path("other.safetensors"))
+
+
+def test_a_recording_that_is_not_there_is_named_and_leaves_no_folder(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    with pytest.raises(SystemExit) as ended:
+        main(["train", str(tmp_path / "run"), "--for", str(tmp_path / "none.toml")])
+    assert ended.value.code == BAD_INPUT and not (tmp_path / "run").exists()
+    assert "none.toml is missing" in " ".join(capsys.readouterr().err.split())
 
 
 def test_a_run_ends_when_it_no_longer_gains_and_leaves_its_best_weights(
@@ -147,18 +147,18 @@ FIGURES |= dict.fromkeys(("dice_shaft", "dice_wrist", "dice_jaws"), 0.7)
 
 
 @pytest.mark.parametrize(
-    ("later", "kept"),
-    [
-        ({"dice": 0.9}, 1),
-        ({"dice": 0.9, "tip_error": 10.9}, 0),
-        ({"dice": 0.9, "dice_jaws": 0.6}, 0),
-        ({"dice": 0.9, "dice_wrist": 0.6}, 0),
-    ],
+    ("later", "worse"),
+    [({"dice": 0.9}, False), ({"tip_error": 10.9}, True), ({"dice_jaws": 0.6}, True), ({"dice_wrist": 0.6}, True)],
 )
-def test_weights_that_see_masks_better_and_parts_or_tips_worse_are_not_kept(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, later: dict[str, float], kept: int
+def test_weights_that_see_parts_or_tips_worse_are_rejected(later: dict[str, float], worse: bool):
+    assert SurfaceTask().worse({**FIGURES, **later}, FIGURES) is worse
+
+
+@pytest.mark.parametrize(("tip_error", "kept"), [(2.7, 1), (10.9, 0)])
+def test_weights_with_better_masks_and_worse_tips_are_not_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, tip_error: float, kept: int
 ):
-    figures = iter([FIGURES, {**FIGURES, **later}])
+    figures = iter([FIGURES, {**FIGURES, "dice": 0.9, "tip_error": tip_error}])
     monkeypatch.setattr(SurfaceTask, "validate", lambda *_: next(figures))
     config = adapted_to(sample_sequence(), tmp_path, TrainingConfig(workers=0, threads=1, batch_size=1, steps=1))
     result = train(replace(config, validation_samples=1), tmp_path)
@@ -247,10 +247,3 @@ def test_one_wrong_pixel_where_no_arm_is_hardly_changes_the_score():
     assert float(dice(predicted, truth).mean()) == pytest.approx(0.75) and pooled_dice(predicted, truth) > 0.999
     predicted[3] = True
     assert pooled_dice(predicted, truth) == pytest.approx(2 * 1200 / (1200 + 1200 + 2000))
-
-
-def test_a_missing_recording_is_said_in_words(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    with pytest.raises(SystemExit) as ended:
-        main(["train", str(tmp_path / "run"), "--for", str(tmp_path / "none.toml")])
-    assert ended.value.code == BAD_INPUT
-    assert "none.toml is missing" in " ".join(capsys.readouterr().err.split())

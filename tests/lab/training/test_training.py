@@ -63,24 +63,31 @@ from pathlib import Path
 sys.path.insert(0, sys.argv[2])
 from test_training import small_config
 from carts_core.lab.training.training import train
-train(small_config(steps=100_000), Path(sys.argv[1]))
+from carts_core.stopping import stopped_by_signals
+with stopped_by_signals():
+    train(small_config(steps=100_000, workers=int(sys.argv[3])), Path(sys.argv[1]))
 """
 
 
-def test_a_killed_run_goes_on_where_its_last_checkpoint_was(tmp_path: Path):
-    process = subprocess.Popen([sys.executable, "-c", _RUN, str(tmp_path), str(Path(__file__).parent)])
+@pytest.mark.parametrize(("sent", "workers"), [(signal.SIGKILL, 0), (signal.SIGTERM, 1)])
+def test_a_run_goes_on_where_its_last_checkpoint_was_after_a_signal_to_its_processes(
+    tmp_path: Path, sent: signal.Signals, workers: int
+):
+    arguments = [sys.executable, "-c", _RUN, str(tmp_path), str(Path(__file__).parent), str(workers)]
+    process = subprocess.Popen(arguments, start_new_session=True)
     try:
         deadline = time.monotonic() + 240
         while not (tmp_path / CHECKPOINT_FILE).is_file():
             assert process.poll() is None and time.monotonic() < deadline, "no checkpoint was written"
-            time.sleep(0.2)
-        time.sleep(1.0)
+            time.sleep(0.1)
+        os.killpg(process.pid, sent)
+        assert process.wait(120) != 0
     finally:
-        os.kill(process.pid, signal.SIGKILL)
+        process.kill()
         process.wait()
     before = load_checkpoint(tmp_path)
     assert before is not None and before.step >= 5
-    steps = before.step + 12
+    steps = before.step + 3
     result = train(small_config(steps=steps), tmp_path)
     after = load_checkpoint(tmp_path)
     assert after is not None and after.step == steps
@@ -94,12 +101,12 @@ def test_a_killed_run_goes_on_where_its_last_checkpoint_was(tmp_path: Path):
 
 def test_a_run_ends_in_time_with_its_learning_rate_down_and_is_not_gone_on_with(tmp_path: Path):
     events: list[TrainingProgress] = []
-    config = small_config(steps=100_000, minutes=0.05, validation_every=1_000)
+    config = small_config(steps=100_000, minutes=0.02, validation_every=1_000)
     result = train(config, tmp_path, events.append)
     steps = events[-1].step
     assert 1 < steps == events[-1].steps < 100_000
     # At the pace that it had, one more step would have been too late.
-    assert result.seconds * (steps + 1) / steps >= 60 * 0.05
+    assert result.seconds * (steps + 1) / steps >= 60 * 0.02
     checkpoint = load_checkpoint(tmp_path)
     assert checkpoint is not None and checkpoint.step == events[-1].step
     assert checkpoint.history.losses[-1]["step"] == checkpoint.step
@@ -232,7 +239,7 @@ def test_settings_out_of_range_are_refused(changes: dict):
 
 
 def test_a_surface_network_learns_and_reports(tmp_path: Path):
-    result = train(small_config(network="surface", steps=30), tmp_path)
+    result = train(small_config(network="surface", steps=20), tmp_path)
     assert result.weights.name == "surface.safetensors"
     parts = {"dice_shaft", "dice_wrist", "dice_jaws", "tip_error"}
     assert set(result.validation) == {"dice", "dice_given", "part_accuracy", "normal_error_deg", *parts}
