@@ -270,7 +270,7 @@ def test_an_import_is_one_step_shown_at_once_and_undone(plain: Desk) -> None:
 def test_masks_of_others_are_imported_and_chosen_in_the_panels(open_viewer: OpenViewer) -> None:
     app = open_viewer(write_theirs, masks=False)
     with RawTab(app.url) as tab:
-        source, fit = widget(app, tab, "Whose masks"), widget(app, tab, "Fit to")
+        source, fit = widget(app, tab, "Mask source"), widget(app, tab, "Fit to")
         assert not source.visible
         tab.set(app.page.element_id(fit), "Masks")
         eventually(lambda: source.visible)

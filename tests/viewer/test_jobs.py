@@ -90,7 +90,7 @@ def test_a_calibration_is_a_job_and_one_step_of_undo_and_says_what_it_does_to_ac
     (job,) = desk.state.jobs
     assert job.state is JobState.DONE
     assert desk.saved.review(0).state is ReviewState.UNTOUCHED
-    assert "accepted before: 1." in job.text and "solve again" in job.text
+    assert "accepted before: 1." in job.text and "solve fitted frames again" in job.text
     steps = [step.name for step in desk.saved.steps]
     assert steps[1:] == ["Calibrate on 2 frames"]
 
@@ -282,7 +282,7 @@ def test_weights_of_another_user_are_asked_for_once_a_file(
     assert (first.used, first.asked) == (STARTED, "Adapted 1")
     first.answer(True)
     assert (first.used, first.asked) == ("Adapted 1", "")
-    with pytest.raises(CartsError, match="No network waits"):
+    with pytest.raises(CartsError, match="No network needs"):
         first.answer(True)
     again = networks(planted, kept=kept)
     assert (again.used, again.asked) == ("Adapted 1", "")
