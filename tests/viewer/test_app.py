@@ -338,7 +338,7 @@ def test_a_copy_that_was_rescued_is_said_when_its_project_is_opened(open_viewer:
 
     app = open_viewer(frames=1, prepare=rescued)
     newest = app.project.path.with_name("sequence.rescued-20260102-120000-2.carts")
-    assert f"when sequence.carts was lost or damaged is in {newest} (and 1 earlier)" in (app.notice or "")
+    assert f"rescued when it was lost or damaged, is {newest} (and 1 earlier)" in (app.notice or "")
     assert f"--project '{newest}'" in (app.notice or "")
     app.queue.put(intents.SetJoint("PSM1", 0, 0.1))
     app.queue.put(intents.Released())
