@@ -27,9 +27,16 @@ def sequence_file(folder: OutputPath, job: Job) -> Path:
 
 
 def review_project(folder: OutputPath, job: Job) -> Path:
-    """Project for the review of a job, created if missing. New results get a new project; old ones are kept."""
+    """Project for the review of a job, created if missing. New results get a new project; old ones are kept.
+
+    Raises:
+        CartsError: a table of results cannot be read.
+    """
     tables = kinematics_tables(folder, job)
-    digest = fingerprint(*(read_bytes(table, TABLE) for table in tables))
+    try:
+        digest = fingerprint(*(read_bytes(table, TABLE) for table in tables))
+    except OSError as error:
+        raise CartsError(f"results of {job.name} cannot be read ({error}). Run the job again.") from error
     path = (folder / f"review-{digest[:12]}.carts").path
     if not path.exists():
         project = Project.open(sequence := Sequence.open(sequence_file(folder, job)), path)

@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from carts_core.errors import CartsError, SettingsError
 from carts_core.evaluation.calibration import beyond_prior
 from carts_core.files import name_fault
+from carts_core.model.camera import rigid_transform
 from carts_core.model.keypoints import link_transforms
 from carts_core.model.scene import Scene
 from carts_core.networks import FeatureExtractor
@@ -243,14 +244,17 @@ def calibrated_scene(scene: Scene, calibration: Mapping[str, Any]) -> Scene:
     """The scene with base frames, camera poses and intrinsics filled in.
 
     Raises:
-        SettingsError: the calibration is of other arms or cameras.
+        SettingsError: the calibration is of other arms or cameras, or not of rigid transforms.
     """
     try:
-        arms = tuple(replace(arm, T_world_base=np.array(calibration["arms"][arm.name])) for arm in scene.arms)
+        arms = tuple(
+            replace(arm, T_world_base=rigid_transform(calibration["arms"][arm.name], f"T_world_base of {arm.name}"))
+            for arm in scene.arms
+        )
         cameras = tuple(
             replace(
                 camera,
-                T_camera_world=np.array(calibration["cameras"][camera.name]),
+                T_camera_world=rigid_transform(calibration["cameras"][camera.name], f"T_camera_world of {camera.name}"),
                 intrinsics=tuple(float(value) for value in calibration["intrinsics"][camera.name]),
             )
             for camera in scene.cameras
@@ -272,20 +276,16 @@ def calibrated_recording(
         text: origin of the calibration.
 
     Raises:
-        SettingsError: the calibration is of other arms or cameras.
+        SettingsError: as `calibrated_scene`.
     """
-    names = {arm.name for arm in recording.arms}, {camera.name for camera in recording.cameras}
-    if (set(calibration["arms"]), set(calibration["cameras"])) != names:
-        raise SettingsError("the calibration is of other arms or cameras. Calibrate again.")
-    arms = tuple(
-        replace(arm, T_world_base=np.array(calibration["arms"][arm.name]), base_from=text) for arm in recording.arms
-    )
+    scene = calibrated_scene(before, calibration)
+    arms = tuple(replace(arm, T_world_base=scene.arm(arm.name).T_world_base, base_from=text) for arm in recording.arms)
     cameras = []
     for camera in recording.cameras:
-        found = tuple(float(value) for value in calibration["intrinsics"][camera.name])
-        placed = replace(camera, T_camera_world=np.array(calibration["cameras"][camera.name]))
-        if not np.allclose(found, before.camera(camera.name).intrinsics, rtol=1e-9, atol=0.0):
-            placed = replace(placed, intrinsics=found, pixel_center=0.5)
+        found = scene.camera(camera.name)
+        placed = replace(camera, T_camera_world=found.T_camera_world)
+        if not np.allclose(found.intrinsics, before.camera(camera.name).intrinsics, rtol=1e-9, atol=0.0):
+            placed = replace(placed, intrinsics=found.intrinsics, pixel_center=0.5)
         cameras.append(placed)
     stale = ("no base frame (hand-eye calibration)",)
     notes = [note for note in recording.notes if not any(words in note.text for words in stale)]

@@ -390,8 +390,10 @@ SEEN = (
     Case("jobs", (0, "options", "minutes"), "text"),
     Case("batch job.json", ("status",), "text"),
     Case("batch job.json", ("error",), "minus one"),
+    Case("draft hand-eye", ("calibration", "arms", "PSM1", 0), REMOVED),
+    Case("batch kinematics.csv", None, "a folder"),
 )
-"""With these, no tab got a page."""
+"""With these, no tab got a page, or the page met an unexpected error."""
 
 
 @pytest.fixture
