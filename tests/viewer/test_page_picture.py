@@ -143,8 +143,13 @@ def test_the_3d_view_shows_the_whole_arms_with_grid_axes_and_the_measured_arms(o
     eventually(seen_whole)
     # Fit brings them back from anywhere.
     x, y = canvas["x"], canvas["y"] + 300
-    tab.drag((x + 560, y), (x + 40, y), button="right", steps=6)
-    eventually(seen_whole, lambda whole: not whole)
+
+    def moved_away() -> bool:
+        # The camera may still be on its way, and would go on over a drag.
+        tab.drag((x + 560, y), (x + 40, y), button="right", steps=6)
+        return not seen_whole()
+
+    eventually(moved_away)
     tab.page.get_by_role("button", name="Fit", exact=True).click()
     eventually(seen_whole)
 
