@@ -1,4 +1,4 @@
-"""Altered frames: occluders before the instruments, crossing arms, and images that contradict their kinematics."""
+"""Altered frames: occluded instruments, crossing arms, and images that contradict their kinematics."""
 
 import dataclasses
 from dataclasses import dataclass, replace
@@ -19,7 +19,7 @@ from .sources import Recording
 OCCLUSION = "occlusion"
 """Name of the domain."""
 SHARE = 0.3
-"""Part of the visible instruments that is covered."""
+"""Covered share of the visible pixels of the instruments [1]."""
 _SENSOR = dataclasses.replace(SensorConfig(), vignette=0.0)
 _SURROUNDINGS = 0.3
 """Reflectance of the surroundings, from which the light is estimated."""
@@ -31,7 +31,7 @@ class Occluded:
 
     image: UInt8[np.ndarray, "h w 3"]
     hidden: Bool[np.ndarray, "h w"]
-    """The occluders' pixels."""
+    """Pixels of the occluders."""
 
 
 def occlude(
@@ -40,7 +40,7 @@ def occlude(
     rng: np.random.Generator,
     share: float = SHARE,
 ) -> Occluded:
-    """Lay one to three pieces of one kind over the instruments, with folds, soft edges and a soft shadow.
+    """Cover the instruments with one to three occluders of one kind, with folds, soft edges and a soft shadow.
 
     `share` is the exact share of the visible pixels of the instruments that is covered.
     """
@@ -64,7 +64,7 @@ def occlude(
 
 
 def _pieces(instruments: np.ndarray, scale: float, rng: np.random.Generator) -> Float[np.ndarray, "h w"]:
-    """A noisy field that falls with the distance from the pieces' centres, which lie on the instruments."""
+    """Noisy scalar field that decreases with the distance from the occluders' centres, which lie on the instruments."""
     rows, columns = np.indices(instruments.shape, dtype=np.float32)
     places = np.argwhere(instruments)
     level = np.full(instruments.shape, -np.inf, np.float32)
@@ -79,7 +79,7 @@ def _pieces(instruments: np.ndarray, scale: float, rng: np.random.Generator) -> 
 
 
 def _normals(level: np.ndarray, scale: float, rng: np.random.Generator) -> Float[np.ndarray, "h w 3"]:
-    """Unit normals of a body that bulges within its outline and has folds; z is towards the camera."""
+    """Unit normals of a bulging, folded body; z points towards the camera."""
     bulge = 22.0 * scale * np.sqrt(np.clip(level, 0.0, None) + 1e-3)
     folds = 3.0 * scale * smooth_noise(level.shape, 35.0 * scale, rng, octaves=3)
     dy, dx = np.gradient(cv2.GaussianBlur((bulge + folds).astype(np.float32), (0, 0), 1.2 * scale))
@@ -88,7 +88,7 @@ def _normals(level: np.ndarray, scale: float, rng: np.random.Generator) -> Float
 
 
 def _gauze(shape: tuple[int, int], scale: float, normal: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Off-white weave, with some blood in it."""
+    """Reflectance of an off-white, slightly bloody weave."""
     rows, columns = np.indices(shape, dtype=np.float32) / (rng.uniform(4.0, 7.0) * scale)
     warp = 1.2 * smooth_noise(shape, 90.0 * scale, rng)
     angle = rng.uniform(0.0, np.pi)
@@ -103,7 +103,7 @@ def _gauze(shape: tuple[int, int], scale: float, normal: np.ndarray, rng: np.ran
 
 
 def _tissue(shape: tuple[int, int], scale: float, normal: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Red to pink, with fat, and highlights where it faces the lamp."""
+    """Reflectance of red to pink tissue with fat, and with highlights where it faces the lamp."""
     fat = smoothstep(smooth_noise(shape, 70.0 * scale, rng, octaves=4), 0.2, 1.4)[..., None]
     red = np.array([0.50, 0.14, 0.11]) * rng.uniform(0.7, 1.3)
     flesh = red * (1.0 + 0.2 * smooth_noise(shape, 25.0 * scale, rng, octaves=4)[..., None])
@@ -112,7 +112,7 @@ def _tissue(shape: tuple[int, int], scale: float, normal: np.ndarray, rng: np.ra
 
 
 def _cloth(shape: tuple[int, int], scale: float, normal: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """A plain colour of drapes and gloves: blue, green or white."""
+    """Uniform reflectance of drapes and gloves: blue, green or white."""
     colors = ((0.10, 0.25, 0.50), (0.10, 0.38, 0.30), (0.65, 0.65, 0.62))
     shade = 1.0 + 0.06 * smooth_noise(shape, 12.0 * scale, rng, octaves=3)
     return shade[..., None] * np.array(colors[int(rng.integers(len(colors)))])
@@ -124,25 +124,25 @@ _KINDS = (_gauze, _tissue, _cloth)
 CROSSING = "crossing arms"
 """Name of the domain."""
 _HIDDEN = 0.15, 0.9
-"""Share of an arm that the other one hides [1]."""
+"""Range of the share of an arm that the other one hides [1]."""
 _SHOWN = 0.02, 0.25
-"""Share of the image that each arm covers [1]."""
+"""Range of the share of the image that each arm covers [1]."""
 _TURN, _REACH = 0.2, 0.008
-"""Deviation of the drawn yaw and pitch [rad], and of the insertion [m]."""
+"""Standard deviations of the random yaw and pitch [rad], and of the insertion [m]."""
 _DRAWS = 2000
 _COARSE = 160
-"""Width in which draws are compared [px]."""
+"""Image width at which random draws are checked [px]."""
 _BLUR, _NOISE = 0.65, 2.0
-"""Deviations of lens blur [px] and noise [grey levels]."""
+"""Standard deviations of lens blur [px] and noise [grey levels]."""
 
 
 def crossed(recording: Recording, index: int, camera: str, seed: int = 0) -> Frame:
     """A frame of the regular domain with its arms moved so that one crosses the other.
 
-    Measured joints keep the errors of that frame. Arms may intersect where they cross.
+    Measured joints keep the errors of the original frame. Arms may intersect where they cross.
 
     Raises:
-        SettingsError: no draw crosses, or the recording lacks two arms with known joints.
+        SettingsError: no random draw crosses, or the recording lacks two arms with known joints.
     """
     frame, scene = recording.frame(index, "regular", [camera]), recording.scene.with_cameras([camera])
     if len(scene.arms) != 2 or not frame.truth:
@@ -195,17 +195,17 @@ OTHER_CAMERA = "image of another camera"
 OTHER_INSTRUMENT = "another instrument"
 WRONG = (NO_ARM, OTHER_FRAME, OTHER_CAMERA, OTHER_INSTRUMENT)
 _STAND_INS = ("double_fenestrated_grasper", "clip_applier", "maryland_bipolar_forceps", "curved_scissors")
-"""Built-in instruments that are rendered in the place of the one in the image, one frame after the other."""
+"""Built-in instruments rendered instead of the one in the image, alternating between frames."""
 
 
 def wrong_inputs(frames: int, cameras: int, *, built_in: bool) -> tuple[str, ...]:
-    """Kinds of wrong inputs that a recording allows; `built_in` robots share base frames and joints with others."""
+    """Kinds of wrong inputs that a recording allows; `built_in` robots can be exchanged for other instruments."""
     possible = (True, frames > 1, cameras > 1, built_in)
     return tuple(kind for kind, needed in zip(WRONG, possible, strict=True) if needed)
 
 
 def with_other_instruments(scene: Scene, index: int) -> Scene:
-    """The scene of built-in instruments with another one in each arm, which depends on the frame's position."""
+    """Scene with the instruments exchanged for another built-in one, chosen by the frame index."""
     robot = Robot.load(f"builtin:{_STAND_INS[index % len(_STAND_INS)]}")
     return replace(scene, arms=tuple(replace(arm, robot=robot) for arm in scene.arms))
 
@@ -213,7 +213,7 @@ def with_other_instruments(scene: Scene, index: int) -> Scene:
 def misled(recording: Recording, kind: str, index: int, camera: str) -> Frame:
     """Frame of the regular domain whose image contradicts its kinematics in one of the ways of `WRONG`.
 
-    Its masks are those of the image that is shown.
+    The masks match the image of the returned frame.
     """
     frame = recording.frame(index, "regular", [camera])
     match kind:
@@ -229,6 +229,6 @@ def misled(recording: Recording, kind: str, index: int, camera: str) -> Frame:
             assert seen.masks is not None
             return replace(frame, images={camera: seen.images[other]}, masks={camera: seen.masks[other]})
         case "another instrument":
-            # Its joints cannot be compared with those of the one in the image.
+            # The joints of different instruments cannot be compared.
             return replace(frame, truth=None)
     raise AssertionError(f"no such wrong input: {kind}")

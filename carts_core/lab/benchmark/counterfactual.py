@@ -1,6 +1,6 @@
 """Real frames under the conditions of the synthetic domains, altered in memory.
 
-Surfaces are those that measured kinematics and the mask imply; other backgrounds are path-traced tissue.
+Surfaces are derived from measured kinematics and the mask; replaced backgrounds are path-traced tissue.
 """
 
 import dataclasses
@@ -31,7 +31,7 @@ from .rooms import AlteredSequence
 
 
 def backdrop(width: int, height: int, seed: int) -> UInt8[np.ndarray, "h w 3"]:
-    """A path-traced picture of tissue alone, kept in the cache.
+    """Path-traced image of tissue without instruments, stored in the cache.
 
     Raises:
         CartsError: Mitsuba is not installed.
@@ -52,18 +52,18 @@ def backdrop(width: int, height: int, seed: int) -> UInt8[np.ndarray, "h w 3"]:
 _CLEARANCE = 0.005
 """Distance between the deepest tip and the plane behind it [m]."""
 DISTANCE = EndoscopeConfig().distance
-"""Distance from the camera to the plane in the scaled world, for which blood and smoke are made [m]."""
+"""Distance from the camera to the plane in the scaled world, at which blood and smoke are simulated [m]."""
 
 
 class RealSurface:
-    """Instruments before a plane that is parallel to the image.
+    """Surface model of a real frame: instruments in front of a plane parallel to the image.
 
-    The world is like the synthetic one: the plane is z = 0, and the camera looks straight down at its origin. It is
-    scaled to the synthetic camera's distance, because smoke and the size of drops depend on it.
+    The world frame is as in synthesis: the plane is z = 0, and the camera looks straight down at the origin. The world
+    is scaled to the distance of the synthetic camera, on which smoke and the size of drops depend.
 
     Args:
-        scene: with one camera.
-        recording: measured joint positions of frames, arm -> [dofs], which place the plane.
+        scene: scene with one camera.
+        recording: measured joint positions of frames, arm -> [dofs], which determine the plane's distance.
     """
 
     def __init__(self, scene: Scene, recording: Sequence[Mapping[str, np.ndarray]]) -> None:
@@ -81,7 +81,7 @@ class RealSurface:
         self._rays = np.stack([(columns - cx) / fx, (rows - cy) / fy, np.ones_like(rows)], -1)
 
     def Ts_world_link(self, measured: Mapping[str, np.ndarray] | None) -> dict[int, Float[np.ndarray, "4 4"]]:
-        """The place of every link; none without joint positions. Links are scaled as the world is."""
+        """Link -> pose in the scaled world [m]; empty without joint positions."""
         if measured is None:
             return {}
         Ts_camera_link = link_transforms(self._scene, self._scene.state(measured))[0].double().numpy()
@@ -89,7 +89,7 @@ class RealSurface:
         return dict(enumerate(self._T_world_camera @ Ts_camera_link))
 
     def of(self, mask: Bool[np.ndarray, "h w"], measured: Mapping[str, np.ndarray] | None) -> Surface:
-        """The surface of a frame: in the mask that of the nearest pixel of the measured arms, elsewhere the plane.
+        """Surface of a frame: within the mask, that of the nearest pixel of the measured arms; elsewhere the plane.
 
         `measured` maps arms to joint positions [rad, m]; None without arms.
         """
@@ -111,7 +111,7 @@ class RealSurface:
             return self._renderer(self._scene.state(measured))
 
     def _arms(self, measured: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Scaled depth, normal in the world and link of the arms in the image; the link is -1 where there is none."""
+        """Per pixel: scaled depth, normal in the world, and link of the arms; the link is -1 on the background."""
         state, geometry = self._scene.state(measured), self._renderer.geometry
         rendering = self._rendered(measured)
         face = rendering.face_ids[0].long()
@@ -125,21 +125,21 @@ class RealSurface:
 
 
 _FRAME_INTERVAL = 0.25
-"""Between frames of a recording without timestamps [s]."""
+"""Assumed frame interval of a recording without timestamps [s]."""
 _REFLECTANCE = 0.3
-"""Assumed reflectance of the background, for the strength of the lamp."""
+"""Assumed reflectance of the background, from which the lamp's intensity is estimated."""
 _QUIET = SensorConfig(vignette=0.0, blur=0.0, sharpening=0.0, full_well=1e6, read_noise=0.0)
-"""For real frames, which contain lens effects and noise already."""
+"""Sensor without lens effects and noise, which real frames already contain."""
 _NOISY = dataclasses.replace(SensorConfig(), vignette=0.0, blur=0.0, sharpening=0.0)
-"""For low light, in which the sensor's noise dominates."""
+"""Sensor with noise but without lens effects, for low light."""
 _MOMENTS = 5
 
 
 class Counterfactual(AlteredSequence):
-    """A real sequence in all synthetic domains, with their code for blood, smoke and low light.
+    """Real sequence altered to all synthetic domains, with the synthesis code for blood, smoke and low light.
 
-    Depth for blood and smoke is that of the measured arms, carried to the mask's pixels, before a plane behind the
-    deepest tip. In `background_change`, the masked instrument is put before `backdrop`, of the camera's size.
+    Blood and smoke use the depth of the measured arms, extended to the mask's pixels, and of a plane behind the deepest
+    tip. In `background_change`, the masked instrument is composited over `backdrop` [camera height, width, 3].
     """
 
     def __init__(
@@ -164,7 +164,7 @@ class Counterfactual(AlteredSequence):
         self._backgrounds: dict[str, np.ndarray] = {}
 
     def frame(self, index: int, domain: str | None = None, cameras: Iterable[str] | None = None) -> Frame:
-        """A frame of the sequence with its image in a domain; only the regular one has other cameras, too."""
+        """Frame with its image altered to a domain; only the regular domain provides further cameras."""
         domain = domain or DOMAINS[0]
         if domain == DOMAINS[0]:
             return dataclasses.replace(self._sequence.frame(index, cameras=cameras or [self._camera]), domain=domain)
@@ -175,7 +175,7 @@ class Counterfactual(AlteredSequence):
         return dataclasses.replace(frame, domain=domain, images={self._camera: altered})
 
     def mean_background(self, camera: str, domain: str | None = None) -> MeanBackground:
-        """The mean background, averaged over some moments under the domain's condition."""
+        """Mean background, averaged over several times under the domain's condition."""
         domain, regular = domain or DOMAINS[0], self._sequence.mean_background(camera)
         if domain == DOMAINS[0]:
             return regular
@@ -199,7 +199,7 @@ class Counterfactual(AlteredSequence):
         times = self._sequence.timestamps
         time = index * _FRAME_INTERVAL if times is None else float(times[index] - times[0])
         if domain == "background_change":
-            # A soft seam, as a lens makes it.
+            # A soft edge, as produced by a lens.
             cover = cv2.GaussianBlur(mask.astype(np.float32), (0, 0), 0.7)[..., None]
             return np.rint(cover * image + (1.0 - cover) * self._backdrop).astype(np.uint8)
         if domain == "simulated_smoke":
@@ -212,5 +212,5 @@ class Counterfactual(AlteredSequence):
 
 @cache
 def _relief(seed: int) -> Tissue:
-    """Invisible relief; blood gathers in its hollows."""
+    """Invisible relief of the background, in whose hollows blood gathers."""
     return grow_tissue("muscle", 256, 1024, SynthesisConfig(seed=seed).rng("tissue"))

@@ -1,4 +1,4 @@
-"""Single runs: a method on one frame or a sequence of frames, scored against the truth."""
+"""Single runs: a method on one frame or a sequence of frames, scored against ground truth."""
 
 import time
 from collections.abc import Mapping
@@ -42,22 +42,22 @@ from .scope import METHODS, RENDERING, Run, Scope
 from .sources import Recording, Source
 
 _SEED = 0
-"""Seed of the signs of initial offsets."""
+"""Seed of the signs of initial joint offsets."""
 
 
 @dataclass(frozen=True)
 class Truth:
-    """Truth of a frame in one camera."""
+    """Ground truth of a frame in one camera."""
 
     camera: str
     mask: Bool[np.ndarray, "h w"]
     """Visible pixels of the instruments."""
     joint_positions: Mapping[str, np.ndarray]
-    """Arm -> true joint positions [rad, m]; empty if not known."""
+    """Arm -> true joint positions [rad, m]; empty if unknown."""
     measured_joints: Mapping[str, tuple[str, ...]]
-    """Arm -> joints that count."""
+    """Arm -> names of the joints whose errors are scored."""
     hidden: Bool[np.ndarray, "h w"] | None = None
-    """Pixels of an occluder, which are not compared."""
+    """Pixels of occluders, which are excluded from the comparison."""
 
     def score_mask(self, mask: Bool[np.ndarray, "h w"], seconds: float) -> Score:
         """Score of a mask without kinematics."""
@@ -73,15 +73,15 @@ class Truth:
         *,
         whole: bool = True,
     ) -> Score:
-        """The score of an estimate.
+        """Score an estimate.
 
         Args:
             state: the estimate.
-            renderer: of the camera, at its size.
-            seconds: until the estimate was known [s].
-            known: its uncertainty, if the optimizer reports it.
-            loss: of the optimizer.
-            whole: whether to compute the depth of the tips and the second surface distance, the slowest figures.
+            renderer: renderer at the camera's resolution.
+            seconds: computation time of the estimate [s].
+            known: uncertainty of the estimate, if the optimizer reports it.
+            loss: final loss of the optimizer.
+            whole: also compute the tip depth error and the second surface distance, the slowest metrics.
         """
         state, scene = state.to("cpu"), renderer.scene
         names = [arm.name for arm in scene.arms]
@@ -104,7 +104,7 @@ class Truth:
         return replace(score, tip_depth_mm=depth, nsd_wide=self._wide(mask))
 
     def with_wide(self, score: Score, state: SceneState, renderer: Renderer) -> Score:
-        """The score of an estimate, with the second surface distance."""
+        """Score of an estimate with the second surface distance added."""
         if score.nsd_wide is not None:
             return score
         return replace(score, nsd_wide=self._wide(renderer.segment(state.to("cpu"))[0] >= 0))
@@ -112,9 +112,10 @@ class Truth:
     def within(
         self, scene: Scene, found: Mapping[str, np.ndarray], std: Mapping[str, np.ndarray]
     ) -> tuple[int, int, int] | None:
-        """Counts of measured joints with truth and deviation, and of errors within one and two of them; None without.
+        """Number of joints with ground truth and standard deviation, and of errors within one and two sigma.
 
-        `found` and `std` map arms to joint positions [rad, m] and their standard deviations, NaN where not known.
+        `found` and `std` map arms to joint positions [rad, m] and their standard deviations, NaN where unknown. None if
+        there are no such joints.
         """
         ratios = []
         for arm in scene.arms:
@@ -157,7 +158,7 @@ def visible_joints(
 def tip_depth_error_mm(
     scene: Scene, estimate: Mapping[str, np.ndarray], truth: Mapping[str, np.ndarray]
 ) -> float | None:
-    """Mean absolute error [mm] of the jaw tips along the axis of the scene's camera; None without a truth."""
+    """Mean absolute depth error [mm] of the jaw tips in the scene's camera; None without ground truth."""
     errors = []
     for arm in scene.arms:
         if arm.name in truth:
@@ -174,9 +175,9 @@ def _tip_depths(scene: Scene, arm: Arm, joint_positions: Mapping[str, np.ndarray
 
 
 def start_of(scene: Scene, frame: Frame, run: Run, joints: Mapping[str, tuple[str, ...]]) -> dict[str, np.ndarray]:
-    """Joint positions that a run starts from; see `Run.error_deg`.
+    """Initial joint positions of a run; see `Run.error_deg`.
 
-    All methods and domains get the same error, and all frames that are corrected together.
+    The perturbation is identical for all methods and domains, and for all frames corrected together.
     """
     error = run.error_deg
     if error is None:
@@ -189,7 +190,7 @@ def start_of(scene: Scene, frame: Frame, run: Run, joints: Mapping[str, tuple[st
 def _followed(
     optimizer: FrameOptimizer, truth: Truth, renderer: Renderer, seconds: float
 ) -> tuple[list[Score], list[int], float]:
-    """Scores of all iterates, index of the best one at each iterate, and total seconds."""
+    """Step the optimizer to the end; returns scores of all iterates, best index so far at each, and total time [s]."""
     trace: list[Score] = []
     best: list[int] = []
 
@@ -217,9 +218,9 @@ def _judged(assessment: Assessment | None) -> dict[str, Any]:
 
 
 def calibrated_scene(recording: Recording, camera: str, frames: int, extractor: FeatureExtractor) -> Scene:
-    """The scene with base frames from so many frames of the recording, evenly spread, as one camera sees them.
+    """Scene with base frames calibrated from `frames` evenly spaced frames of one camera.
 
-    Neither masks nor true joint positions are looked at.
+    Neither masks nor true joint positions are used.
     """
     chosen = [recording.frame(index, cameras=[camera]) for index in spread(len(recording), frames)]
     backgrounds = Backgrounds.of(recording, [camera], "regular")
@@ -230,18 +231,18 @@ def calibrated_scene(recording: Recording, camera: str, frames: int, extractor: 
 
 
 STEPS = 10
-"""Steps of each frame but the first. TC-CaRTS (arXiv 2212.00072) claims to need far fewer than CaRTS's 30."""
+"""Steps for each frame after the first. TC-CaRTS (arXiv 2212.00072) reports needing far fewer than CaRTS's 30."""
 _OCCLUDERS_SEED = 20
 
 
 def log(console: Console, line: str) -> None:
-    """Print progress to a file or a pipe."""
+    """Print a progress line if the output is a file or a pipe."""
     if not console.is_terminal:
         console.print(line, soft_wrap=True, highlight=False, markup=False)
 
 
 class SourceBench:
-    """Measurements on a source, which is opened at its first run.
+    """Measures runs on a source, which is opened at the first run.
 
     `baselines` maps names in `scope.BASELINES` to networks.
     """
@@ -259,7 +260,7 @@ class SourceBench:
         self._machine = machine(extractor.device)
 
     def measure(self, runs: list[Run]) -> list[Measurement]:
-        """Measure a run, or all runs of one method that corrects frames together."""
+        """Measure one run, or all runs that a method corrects together."""
         method = METHODS[runs[0].method]
         if not method.together:
             return [self._measure_alone(runs[0])]
@@ -316,16 +317,16 @@ class SourceBench:
             machine(networks.device),
             tuple(trace),
             tuple(best),
-            # With given masks, the first iterate can be the result of a search.
+            # With given masks, the first iterate may be the result of a search.
             truth.score(scene.state(start), renderer) if method.masks_given else None,
             within=truth.within(scene, end.joint_positions(), end.joint_std()),
             **_judged(optimizer.assessment),
         )
 
     def _segment(self, run: Run, frame: Frame, truth: Truth) -> Measurement:
-        """A network's own mask of one image, at the size that it was trained for.
+        """Score a network's own mask of one image, predicted at the network's training resolution.
 
-        Networks that look at kinematics get the rendering at the measured joint positions.
+        Networks with kinematic input get the rendering at the measured joint positions.
         """
         extractor, trained = self._extractor, self._baselines.get(run.method)
         device, image = extractor.device, frame.images[truth.camera]
@@ -352,9 +353,9 @@ class SourceBench:
         return Measurement(run, score, "not iterative", self._machine)
 
     def _together(self, runs: list[Run]) -> list[Measurement]:
-        """Correct frames of one domain and error at the start in sequence mode, and score the final estimates.
+        """Correct the frames of one domain and initial error in sequence mode, and score the final estimates.
 
-        Seconds are those spent on a frame over all visits, reading its image included.
+        The time of a frame is the sum over all visits, including reading its image.
         """
         recording, renderer, domain = self._recording, self._renderer, runs[0].domain
         scene, by_frame = renderer.scene, {run.frame: run for run in runs}
@@ -389,11 +390,11 @@ class SourceBench:
         ]
 
     def _forwards(self, runs: list[Run], first: DescentSolver) -> list[Measurement]:
-        """Correct frames in their order with ACS, each from its measured joints plus the previous frame's correction.
+        """Correct frames in order with ACS, each from its measured joints plus the correction of the previous frame.
 
-        This is the first of the three modules that TC-CaRTS adds (arXiv 2212.00072). Its abstract, all that we have of
-        it, does not describe the others well enough: a network that corrects kinematics, and a regularization. `first`
-        has the settings of the first frame; the others take `STEPS` steps of the same schedule.
+        This is the first of the three modules that TC-CaRTS adds (arXiv 2212.00072). The other two, a network
+        that corrects kinematics and a regularization, are not reproduced: only the abstract was available. `first`
+        holds the settings of the first frame; later frames take `STEPS` steps of the same schedule.
         """
         renderer, cameras = self._renderer, [self._source.camera]
         scene, found, correction = renderer.scene, list[Measurement](), dict[str, np.ndarray]()
@@ -437,7 +438,7 @@ class SourceBench:
 
     @cached_property
     def _renderer(self) -> Renderer:
-        """Renderer of the scored camera, at its size."""
+        """Renderer of the scored camera at its full resolution."""
         return Renderer(self._recording.scene, cameras=[self._source.camera])
 
     @cached_property

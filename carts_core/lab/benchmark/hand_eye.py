@@ -28,18 +28,18 @@ from .statistics import NOTHING, table_of
 from .targets import Target, target_of
 
 ARM = Path(__file__).with_name("seven_joint_arm.urdf")
-"""The robot, of cylinders, spheres and boxes alone."""
+"""URDF of the robot, made of cylinders, spheres and boxes."""
 _COLOURS = ((0.85, 0.85, 0.83), (0.9, 0.45, 0.1))
 _SIZE, _FOCAL = (640, 480), 620.0
 _SAMPLES = 3
-"""Rays per pixel and axis; odd, so that thresholding coverage at a half does not bias the mask."""
+"""Rays per pixel and axis; odd, so that thresholding coverage at 0.5 does not bias the mask."""
 
 _HIDDEN = 0.25
-"""Largest brightness of a side turned from the light [1]."""
+"""Shading of surfaces seen edge-on, lit from the camera [1]."""
 
 
 def looking_at(eye: Float[np.ndarray, " 3"], target: Float[np.ndarray, " 3"]) -> Float[np.ndarray, "4 4"]:
-    """T_camera_world of a camera at `eye` whose z axis meets `target`, level with the floor (z up)."""
+    """T_camera_world of a camera at `eye` that looks at `target` without roll (world z is up)."""
     forward = (target - eye) / np.linalg.norm(target - eye)
     right = np.cross(forward, [0.0, 0.0, 1.0])
     right /= np.linalg.norm(right)
@@ -48,10 +48,10 @@ def looking_at(eye: Float[np.ndarray, " 3"], target: Float[np.ndarray, " 3"]) ->
 
 
 def arm_views(count: int, seed: int, room: UInt8[np.ndarray, "h w 3"] | None = None) -> tuple[Scene, list[Frame]]:
-    """Render views of the arm from one camera, with random poses and noise, before a room of 640x480 px or grey.
+    """Render views of the arm from one camera, with random poses and noise, over a 640x480 px background or grey.
 
     Returns:
-        The scene with the true base frame and camera, and frames with masks and exact joint positions.
+        Scene with the true base frame and camera, and frames with masks and exact joint positions.
     """
     rng = np.random.default_rng(seed)
     robot = Robot.load(ARM)
@@ -85,7 +85,7 @@ def arm_views(count: int, seed: int, room: UInt8[np.ndarray, "h w 3"] | None = N
 def _rays(
     robot: Robot, joints: Float[np.ndarray, " dofs"], camera: Camera
 ) -> tuple[Float[np.ndarray, "h w"], Float[np.ndarray, "h w 3"]]:
-    """Coverage of each pixel by the robot, and its colour times the coverage."""
+    """Robot's coverage of each pixel, and its colour premultiplied by coverage."""
     Ts = robot.forward_kinematics(torch.tensor(joints)).numpy()
     parts, colours = [], []
     for mesh in robot.meshes:
@@ -113,25 +113,25 @@ def _rays(
 
 _VIEWS = 10
 _STARTS = 10
-"""Least number of starts of each condition for a verdict on its target."""
+"""Minimum number of starts per condition for a verdict on its target."""
 _FREE = FreeParameters(joints=False, base_frames=True)
 _CODE = ("lab/benchmark/hand_eye.py", "lab/benchmark/seven_joint_arm.urdf", "lab/benchmark/rooms.py")
 
 
 @dataclass(frozen=True)
 class HandEyeCondition:
-    """Starts of one kind, with tolerances of the base frame."""
+    """Kind of start, with tolerances on the final base frame."""
 
     name: str
     angle_deg: float
-    """Rotation of the base frame at the start [deg]."""
+    """Initial rotation error of the base frame [deg]."""
     distance: float
-    """Translation of the base frame at the start [m]."""
+    """Initial translation error of the base frame [m]."""
     masks: bool
-    """Whether masks are fitted; otherwise predictions of the network."""
+    """Whether masks are fitted; otherwise, network predictions."""
     most_deg: float
     most_distance: float
-    """[m]"""
+    """Tolerance of the translation error [m]."""
 
 
 CONDITIONS = (
@@ -156,14 +156,14 @@ class HandEyeRun:
 
 
 def known_hand_eye(path: OutputPath, extractor: FeatureExtractor) -> list[HandEyeRun]:
-    """Stored runs of this code and these weights."""
+    """Stored runs with the current code and weights."""
     return [HandEyeRun(**run) for run in stored(path, "runs", _of(extractor)) or []]
 
 
 def measure_hand_eye(
     path: OutputPath, extractor: FeatureExtractor, starts: int, say: Callable[[str], None] = lambda line: None
 ) -> list[HandEyeRun]:
-    """Calibrate from the missing starts of each condition, and append each result to `path`."""
+    """Run the calibrations of each condition that are not stored yet, and write each result to `path`."""
     runs = known_hand_eye(path, extractor)
     done = {(run.condition, run.seed) for run in runs}
     for condition in CONDITIONS:

@@ -1,4 +1,4 @@
-"""Measurements of a run, the results file with one JSON line per run, and times of the solver's parts."""
+"""Measurements of runs, the results file with one JSON line per run, and timings of the solver's stages."""
 
 import hashlib
 import json
@@ -56,14 +56,14 @@ _MEASURED = (
 
 
 def code_fingerprint(patterns: tuple[str, ...] = _MEASURED) -> str:
-    """SHA-256 over modules of the package; by default those that influence estimates and scores."""
+    """SHA-256 over modules of the package; by default, those that affect estimates and scores."""
     return fingerprints.code_fingerprint(patterns)
 
 
 def run_fingerprint(
     run: Run, scope: Scope, extractor: FeatureExtractor, source: str, baseline: str | None = None
 ) -> str:
-    """SHA-256 over all inputs of a run but the machine.
+    """SHA-256 over all inputs of a run except the machine.
 
     `source` is the fingerprint of images and kinematics, `baseline` the SHA-256 of a baseline's weights.
     """
@@ -76,7 +76,7 @@ def run_fingerprint(
 
 
 BEST_OF = (30, 50)
-"""Numbers of steps whose best iterate is a row of the tables."""
+"""Step counts for which the tables have a row with the best iterate."""
 
 
 @dataclass(frozen=True)
@@ -84,22 +84,22 @@ class Score:
     """Scores of an estimate."""
 
     loss: float | None
-    """Loss; None for a method without one, and where losses of iterates are not comparable."""
+    """Loss; None if the method has none or losses of iterates are not comparable."""
     dice: float
     nsd: float
     """Normalized surface distance within `TOLERANCE`."""
     joint_mae_deg: float | None
     """Mean absolute error of measured revolute joints [deg]; None without true joint positions."""
     visible_joint_mae_deg: float | None
-    """The same over those that the image determines; None where the optimizer does not report which."""
+    """The same over the joints that the image determines; None if the optimizer does not report them."""
     tip_depth_mm: float | None
-    """Mean absolute error of the jaw tips along the camera's axis [mm]; None without true joint positions, and on the
-    way from start to end."""
+    """Mean absolute depth error of the jaw tips [mm]; None without true joint positions, and for intermediate
+    iterates."""
     seconds: float
-    """Wall time from the frame's arrival until this estimate was known [s]; scoring does not count."""
+    """Wall time from the arrival of the frame to this estimate [s], without scoring."""
     nsd_wide: float | None = None
-    """The same within `WIDE_TOLERANCE`; None for intermediate iterates, except the best ones at the end and after
-    the steps of `BEST_OF`."""
+    """Normalized surface distance within `WIDE_TOLERANCE`; None for intermediate iterates, except the best ones at the
+    end and after the step counts of `BEST_OF`."""
 
 
 @dataclass(frozen=True)
@@ -110,26 +110,26 @@ class Measurement:
     final: Score
     """Score of the method's result."""
     stopped: str
-    """Reason why the optimization ended."""
+    """Termination reason of the optimization."""
     machine: str
     """Description of the machine."""
     trace: tuple[Score, ...] = ()
-    """Scores of all iterates, the start first; empty for a method without iterates."""
+    """Scores of all iterates, beginning with the start; empty if the method does not iterate."""
     best: tuple[int, ...] = ()
-    """For each iterate, the index of the optimizer's best one so far. Losses of different stages do not compare, so it
-    does not follow from the losses."""
+    """For each iterate, the index of the optimizer's best one so far. It cannot be derived from the losses, because
+    losses of different stages are not comparable."""
     before: Score | None = None
-    """Score of the start, where the trace does not begin with it."""
+    """Score of the start, if the trace does not begin with it."""
     verdict: str | None = None
-    """`good`, `doubtful` or `failed`, where the method assesses its result."""
+    """`good`, `doubtful` or `failed`, if the method assesses its result."""
     probability: float | None = None
     """Probability that the mask is wrong [1]."""
     within: tuple[int, int, int] | None = None
-    """Joint positions with a truth and a deviation; those that err by at most one deviation; by at most two."""
+    """Number of joint positions with ground truth and standard deviation, and of errors within one and two of them."""
 
     @property
     def start(self) -> Score | None:
-        """The score before anything is corrected; None where the method has no start."""
+        """Score of the initial estimate; None if the method has none."""
         return self.before or (self.trace[0] if self.trace else None)
 
     @property
@@ -143,9 +143,9 @@ class Measurement:
         return self.start is not None and self.final.dice < self.start.dice - 0.01
 
     def best_of(self, iterations: int) -> Score | None:
-        """Best score within a number of steps; None where the run was cut before.
+        """Best score within a number of steps; None if the run was cut off earlier.
 
-        Its `seconds` are those of all these steps.
+        Its `seconds` cover all these steps.
         """
         if not self.trace or (iterations > self.iterations and self.stopped == "iterations"):
             return None
@@ -153,21 +153,21 @@ class Measurement:
         return replace(self.trace[self.best[last]], seconds=self.trace[last].seconds)
 
     def best_so_far(self) -> list[Score]:
-        """For each iterate, the score of the best until then."""
+        """For each iterate, the score of the best one so far."""
         return [self.trace[place] for place in self.best]
 
     def to_json(self) -> dict[str, Any]:
-        """The measurement as JSON values; the trace is stored by column to keep the line short."""
+        """Measurement as JSON values; the trace is stored by column to keep the line short."""
         entry = _rounded(asdict(self))
         columns = {field.name: [score[field.name] for score in entry["trace"]] for field in fields(Score)}
         return entry | {"trace": columns}
 
     @staticmethod
     def from_json(line: Mapping[str, Any]) -> "Measurement":
-        """The measurement that `to_json` wrote.
+        """Measurement from the output of `to_json`.
 
         Raises:
-            KeyError, TypeError, ValueError: it is not one.
+            KeyError, TypeError, ValueError: the line is not a measurement.
         """
         columns = dict(line["trace"])
         rows = [dict(zip(columns, values, strict=True)) for values in zip(*columns.values(), strict=True)]
@@ -178,7 +178,7 @@ class Measurement:
 
 
 def _rounded(value: Any) -> Any:
-    """Nested values with six digits."""
+    """Nested values, rounded to six digits."""
     match value:
         case float():
             return round(value, 6)
@@ -190,7 +190,7 @@ def _rounded(value: Any) -> Any:
 
 
 class ResultsFile:
-    """File of measurements, one JSON line each; a killed run loses at most the last line.
+    """File of measurements, one JSON line each; a killed process loses at most the last line.
 
     Raises:
         CartsError: the file cannot be read.
@@ -200,7 +200,7 @@ class ResultsFile:
         self.path = path
         self._known: dict[tuple[Run, str], Measurement] = {}
         self.unreadable = 0
-        """Lines that are not measurements: torn, or of another version."""
+        """Number of lines that are truncated or from another version."""
         try:
             lines = read_bytes(path.path, TABLE).splitlines() if path.path.exists() else []
         except OSError as error:
@@ -216,11 +216,11 @@ class ResultsFile:
                 self.unreadable += 1
 
     def find(self, run: Run, fingerprint: str) -> Measurement | None:
-        """Stored measurement of a run under the same settings, weights and code; None without one."""
+        """Stored measurement of a run with the same fingerprint, or None."""
         return self._known.get((run, fingerprint))
 
     def append(self, measurement: Measurement, fingerprint: str, **also: str) -> None:
-        """Append a measurement and its fingerprint, with further facts for readers of the file, and flush it to disk.
+        """Append a measurement, its fingerprint and informative fields, and flush them to disk.
 
         Raises:
             OutputError: the file cannot be written.
@@ -236,7 +236,7 @@ _CUDA = "cuda: "
 
 
 def machine(device: torch.device) -> str:
-    """Processor, cores, threads, and the graphics card that networks and solver run on, if they do."""
+    """Description of processor, cores, threads and, if used, the GPU."""
     model = platform.processor() or platform.machine()
     cpuinfo = Path("/proc/cpuinfo")
     if cpuinfo.is_file():
@@ -247,7 +247,7 @@ def machine(device: torch.device) -> str:
 
 
 def on_gpu(text: str) -> bool:
-    """Whether `machine` wrote that a graphics card was used."""
+    """Whether a description from `machine` contains a GPU."""
     return _CUDA in text
 
 
@@ -264,7 +264,7 @@ def milliseconds(work: Callable[[], object], runs: int) -> float:
 
 
 def render_figures(sequence: Sequence, runs: int) -> dict[str, float]:
-    """Times of the renderer at the camera's full size [ms]."""
+    """Timings of the renderer at the camera's full resolution [ms]."""
     camera = sequence.scene.cameras[0].name
     renderer = Renderer(sequence.scene, cameras=[camera])
     state = sequence.scene.with_cameras([camera]).state(sequence.frame(0, cameras=[camera]).measured)
@@ -294,7 +294,7 @@ def render_figures(sequence: Sequence, runs: int) -> dict[str, float]:
 
 
 def optimizer_figures(sequence: Sequence, iterations: int) -> dict[str, float]:
-    """Times of the optimizer on the first frame [ms]: the paper's loss, and the default solver from 2 degrees off."""
+    """Timings of the optimizer on the first frame [ms]: the paper's loss, and the default solver from 2 degrees off."""
     camera = sequence.scene.cameras[0].name
     frame = sequence.frame(0, cameras=[camera])
     backgrounds = {camera: sequence.background(camera)}
@@ -323,7 +323,7 @@ _RUNS = 10
 
 
 def stored(path: OutputPath, name: str, of: list[str]) -> Any:
-    """Value of a name in a file that was written for the same machine, weights and code; None without one."""
+    """Value `name` of a JSON file; None if it is missing or was written for other inputs `of`."""
     try:
         content = parse_json(read_bytes(path.path, VALUES))
         return content[name] if content["of"] == of else None
@@ -332,12 +332,12 @@ def stored(path: OutputPath, name: str, of: list[str]) -> Any:
 
 
 def known_stages(path: OutputPath, extractor: FeatureExtractor) -> dict[str, float]:
-    """Stored times of this machine and this code."""
+    """Stored stage timings for this machine, weights and code."""
     return stored(path, "ms", _of(extractor)) or {}
 
 
 def measure_stages(path: OutputPath, extractor: FeatureExtractor) -> None:
-    """Measure all stages, on the CPU, and write them to `path`, unless they are there."""
+    """Time all stages on the CPU and write them to `path`, unless they are stored."""
     if known_stages(path, extractor):
         return
     sequence = Sequence.open(sample_sequence())
@@ -350,7 +350,7 @@ def measure_stages(path: OutputPath, extractor: FeatureExtractor) -> None:
 
 
 def network_figures(scene: Scene, extractor: FeatureExtractor) -> dict[str, float]:
-    """Times of the networks on whole images of the sizes that the optimizer compares by default [ms]."""
+    """Timings of the networks on whole images at the optimizer's default resolutions [ms]."""
     settings = SurfaceSolver()
     scale = max(stage.scale for stage in settings.stages if isinstance(stage, Observe))
     width, height = working_size(scene, settings.working_width, extractor.stride)

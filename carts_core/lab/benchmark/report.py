@@ -1,4 +1,4 @@
-"""The report: one HTML page, plots as SVG, and the same numbers as JSON and CSV."""
+"""Benchmark report: one HTML page, plots as SVG, and the same numbers as JSON and CSV."""
 
 import csv
 import io
@@ -42,7 +42,7 @@ from .tables import (
 from .targets import targets
 
 matplotlib.use("Agg")
-# Same measurements, same bytes.
+# Makes the SVG files reproducible.
 matplotlib.rcParams["svg.hashsalt"] = "carts"
 
 COLORS = {"paper": "#b3541e", "ours": "#1f5fa8"}
@@ -51,7 +51,7 @@ _BARS = ("#9aa0a6", "#d0d3d6", "#c9a227", "#e0905c", "#b3541e", "#1f5fa8")
 
 
 def write_figures(data: Measurements, folder: OutputPath) -> dict[str, Path]:
-    """Draw all plots for which there are measurements; returns caption -> file."""
+    """Draw all plots that have measurements; returns caption -> file."""
     made: dict[str, Path] = {}
     for name, draw in {
         "domains": _domains,
@@ -123,19 +123,19 @@ def _convergence(data: Measurements) -> Figure | None:
 
 
 def _falls(measurement: Measurement) -> bool:
-    """Whether the losses of a run compare and one is below the first."""
+    """Whether the losses of a run are comparable and decrease."""
     best = measurement.best_so_far()
     return all(score.loss is not None for score in measurement.trace) and best[-1].loss != best[0].loss
 
 
 def _loss_to_go(measurement: Measurement) -> list[float]:
-    """The methods' losses are not in one unit, so each is scaled to fall from 1 to 0."""
+    """Losses scaled from 1 (first) to 0 (lowest), because the methods' losses differ in unit."""
     losses = [score.loss or 0.0 for score in measurement.best_so_far()]
     return [(loss - losses[-1]) / (losses[0] - losses[-1]) for loss in losses]
 
 
 def _padded(measurements: list[Measurement], steps: int, values: Callable[[Measurement], list[float]]) -> np.ndarray:
-    """[runs, steps + 1]; runs that ended earlier keep their last value."""
+    """Values as an array [runs, steps + 1]; runs that ended earlier keep their last value."""
     rows = [values(measurement) for measurement in measurements]
     return np.array([row + [row[-1]] * (steps + 1 - len(row)) for row in rows])
 
@@ -219,7 +219,7 @@ class Facts:
     scope: str
     """`quick` or `full`."""
     planned: int
-    """Number of runs of the plan, measured or not."""
+    """Number of planned runs, measured or not."""
     sources: dict[str, str]
     """Name -> description."""
     weights: str
@@ -238,7 +238,7 @@ def write_report(
 ) -> Path:
     """Write `report.html`, `figures/`, `results.json` and `results.csv`; returns the page's path.
 
-    `stages` maps stages of an iteration to milliseconds; these and `hand_eye`, calibrations of another robot, may be
+    `stages` maps stages of an iteration to milliseconds, `hand_eye` holds calibrations of another robot; both may be
     empty.
 
     Raises:
@@ -291,7 +291,7 @@ def write_report(
 
 
 def _sections(data: Measurements, stages: dict[str, float], hand_eye: list[HandEyeRun]) -> dict[str, list[Table]]:
-    """Title -> tables."""
+    """Sections of the report: title -> tables."""
     compared = data.compared()
     sections: dict[str, list[Table | None]] = {
         "Main table": [*main_tables(data), image_alone_table(compared)],
@@ -312,7 +312,7 @@ def _sections(data: Measurements, stages: dict[str, float], hand_eye: list[HandE
 
 
 def _row(measurement: Measurement) -> dict[str, object]:
-    """One run, flat."""
+    """CSV row of a run."""
     start, final = measurement.start, measurement.final
     bests = {steps: measurement.best_of(steps) for steps in BEST_OF}
     return {

@@ -23,24 +23,24 @@ Half = Literal["tuning", "held-out"]
 Picture = Float[np.ndarray, "h w 3"]
 
 _SEEDS = 2
-"""Made rooms of each kind."""
+"""Number of synthetic rooms of each kind."""
 
 _PHOTOGRAPHS = (".jpg", ".jpeg", ".png")
 
 
 @dataclass(frozen=True)
 class Room:
-    """Background of the instrument in place of the recorded one."""
+    """Background that replaces the recorded one."""
 
     name: str
     half: Half
-    """Whether it may serve tuning."""
+    """Whether the room may be used for tuning or is held out."""
     draw: Callable[[int, int], UInt8[np.ndarray, "h w 3"]]
-    """Its picture in a width and height [px]."""
+    """Draws the image of the room at a width and height [px]."""
 
     @property
     def domain(self) -> str:
-        """Domain of its runs."""
+        """Name of the domain in runs."""
         return f"{self.half}: {self.name}"
 
 
@@ -56,10 +56,10 @@ def made_rooms() -> list[Room]:
 
 
 def photographs(folder: Path) -> list[Room]:
-    """The photographs in a folder; of their names in order, every other one is held out.
+    """Rooms from the photographs in a folder; in order of name, every other one is held out.
 
     Raises:
-        SettingsError: it holds none.
+        SettingsError: the folder contains no photograph.
     """
     paths = sorted(path for path in folder.glob("*") if path.suffix.lower() in _PHOTOGRAPHS)
     if not paths:
@@ -69,7 +69,7 @@ def photographs(folder: Path) -> list[Room]:
 
 
 def _made(kind: str, draw: Callable[..., Picture], seed: int, width: int, height: int) -> UInt8[np.ndarray, "h w 3"]:
-    """Picture of a synthetic room."""
+    """Image of a synthetic room."""
     rng = np.random.default_rng([zlib.crc32(kind.encode()), seed])
     picture = draw(rng, width, height)
     picture *= 1.0 + 0.15 * _grain(rng, width, height, width / 3)[..., None]
@@ -78,7 +78,7 @@ def _made(kind: str, draw: Callable[..., Picture], seed: int, width: int, height
 
 
 def _photograph(path: Path, width: int, height: int) -> UInt8[np.ndarray, "h w 3"]:
-    """Central part of a photograph."""
+    """Central crop of a photograph, resized to `width` x `height` px."""
     whole = read_image(path)
     rows, columns, _ = whole.shape
     scale = max(width / columns, height / rows)
@@ -89,7 +89,7 @@ def _photograph(path: Path, width: int, height: int) -> UInt8[np.ndarray, "h w 3
 
 
 def _grain(rng: np.random.Generator, width: int, height: int, size: float) -> Float[np.ndarray, "h w"]:
-    """Smooth noise with bumps of about that size [px], in [-1, 1]."""
+    """Smooth noise in [-1, 1] with a wavelength of about `size` px."""
     cells = max(round(width / size), 2), max(round(height / size), 2)
     coarse = rng.uniform(-1, 1, cells[::-1]).astype(np.float32)
     return cv2.resize(coarse, (width, height), interpolation=cv2.INTER_CUBIC).clip(-1, 1)
@@ -113,7 +113,7 @@ def _bar(
     color: np.ndarray,
     profile: np.ndarray,
 ) -> None:
-    """Draw a straight bar, lit across as the profile says, and its shadow."""
+    """Draw a straight bar and its shadow; `profile` gives the brightness across the bar."""
     along = np.array([np.cos(angle), np.sin(angle)])
     across = np.array([-along[1], along[0]])
 
@@ -135,7 +135,7 @@ def _disc(picture: Picture, middle: tuple[float, float], radius: int, grey: floa
 
 
 def _round(light: float, gloss: float, steps: int = 15) -> np.ndarray:
-    """Light across a cylinder."""
+    """Brightness profile across a cylinder."""
     across = np.linspace(-0.98, 0.98, steps)
     normal = np.stack([across, np.sqrt(1 - across**2)])
     toward = normal.T @ np.array([np.sin(light), np.cos(light)])
@@ -167,7 +167,7 @@ def _bench(rng: np.random.Generator, width: int, height: int) -> Picture:
 
 
 def _rods(rng: np.random.Generator, width: int, height: int) -> Picture:
-    """Straight dark and bright cylinders, as thick as a shaft or nearly so."""
+    """Straight dark and bright cylinders, about as thick as an instrument shaft."""
     picture = _plain(_color(rng, (0.05, 0.5), (0.5, 0.9)), width, height)
     picture *= (1 + 0.1 * _grain(rng, width, height, 20))[..., None]
     for _ in range(7):
@@ -180,7 +180,7 @@ def _rods(rng: np.random.Generator, width: int, height: int) -> Picture:
 
 
 def _saturated(rng: np.random.Generator, width: int, height: int) -> Picture:
-    """Plain areas of strong colours."""
+    """Uniform areas of saturated colours."""
     picture = _plain(_color(rng, (0.7, 1), (0.5, 1)), width, height)
     for _ in range(5):
         corners = np.array([_somewhere(rng, width, height) for _ in range(4)])
@@ -190,7 +190,7 @@ def _saturated(rng: np.random.Generator, width: int, height: int) -> Picture:
 
 
 def _patterns(rng: np.random.Generator, width: int, height: int) -> Picture:
-    """Weaves, stripes and checks under a perspective."""
+    """Weaves, stripes and checks in perspective."""
     rows, columns = np.indices((height, width)).astype(np.float32)
     depth = 1 + rng.uniform(0.3, 1.2) * rows / height
     a, pitch = rng.uniform(0, np.pi), rng.uniform(14, 60)
@@ -205,7 +205,7 @@ def _patterns(rng: np.random.Generator, width: int, height: int) -> Picture:
 
 
 def _plates(rng: np.random.Generator, width: int, height: int) -> Picture:
-    """Sheets of metal with screws and holes."""
+    """Metal sheets with screws and holes."""
     picture = _plain(np.full(3, rng.uniform(0.1, 0.4)), width, height)
     for _ in range(6):
         middle, angle = _somewhere(rng, width, height), rng.uniform(-0.4, 0.4)
@@ -253,7 +253,7 @@ def _ceramic(rng: np.random.Generator, width: int, height: int) -> Picture:
 
 
 def _cables(rng: np.random.Generator, width: int, height: int) -> Picture:
-    """Cables, thick and thin, over a board with small parts."""
+    """Thick and thin cables over a board with small parts."""
     picture = _plain(_color(rng, (0.2, 0.9), (0.2, 0.6)), width, height)
     for _ in range(60):
         x, y = _somewhere(rng, width, height)
@@ -280,20 +280,20 @@ _PARALLAX = 24
 """Shift of the room between one camera and the next [px]."""
 
 _RIM = 2
-"""Width of the rim whose colours are taken from further inside, free of the old background [px]."""
+"""Width of the rim whose colours are replaced from further inside, to remove the old background [px]."""
 
 _SEAM = 0.8
-"""Deviation of the blur of the cut [px]."""
+"""Standard deviation of the blur of the mask's edge [px]."""
 
 _MATCH = (0.85, 1.15)
-"""Range of the factor that adapts the instrument's brightness to the room [1]."""
+"""Range of the gain that matches the instrument's brightness to the room [1]."""
 
 _GAIN, _NOISE = 0.03, 1.5
-"""Largest change of the light from frame to frame [1], and the sensor's noise [grey levels]."""
+"""Largest relative change of brightness between frames [1], and sensor noise [grey levels]."""
 
 
 class AlteredSequence:
-    """Base class of a sequence in domains of its own, whose images are altered in memory."""
+    """Base class of sequences whose images are altered in memory and that define their own domains."""
 
     def __init__(self, sequence: Sequence) -> None:
         self.scene, self.timestamps = sequence.scene, sequence.timestamps
@@ -304,23 +304,23 @@ class AlteredSequence:
         return len(self._sequence)
 
     def frame(self, index: int, domain: str | None = None, cameras: Iterable[str] | None = None) -> Frame:
-        """A frame with its images in a domain, the first one by default."""
+        """Frame with its images in a domain, by default the first one."""
         raise NotImplementedError
 
     def mean_background(self, camera: str, domain: str | None = None) -> MeanBackground:
-        """The mean background and the pixels where it is known."""
+        """Mean background and the pixels where it is known."""
         raise NotImplementedError
 
     def background(self, camera: str, domain: str | None = None) -> UInt8[np.ndarray, "h w 3"]:
-        """The mean background in a domain."""
+        """Mean background in a domain."""
         return self.mean_background(camera, domain).image.copy()
 
 
 class AnotherRoom(AlteredSequence):
-    """A real sequence, with masks, in which each domain is a room of that name.
+    """Real sequence with masks, composited over rooms; each domain is the room of that name.
 
-    The room stands still; light and noise vary from frame to frame, by the seed. The mean background is estimated as of
-    any recording: as the median over frames of what the measured arms do not cover.
+    The room is static; light and noise vary between frames, depending on the seed. The mean background is estimated as
+    for any recording: the median over frames, excluding pixels covered by the arms at their measured positions.
     """
 
     def __init__(self, sequence: Sequence, rooms: Items[Room], seed: int) -> None:
@@ -330,14 +330,14 @@ class AnotherRoom(AlteredSequence):
         self._picture, self._background = lru_cache(8)(self._make_picture), lru_cache(8)(self._make_background)
 
     def frame(self, index: int, domain: str | None = None, cameras: Iterable[str] | None = None) -> Frame:
-        """A frame in a room; the first one by default."""
+        """Frame composited over a room, by default the first one."""
         room = domain or next(iter(self.rooms))
         frame = self._sequence.frame(index, cameras=cameras or self._cameras)
         assert frame.masks is not None
         images = {}
         for camera, image in frame.images.items():
             picture = pasted(image, frame.masks[camera], self._picture(room, camera))
-            # The light and the noise of one moment.
+            # Brightness and noise are reproducible per room, camera and frame.
             rng = np.random.default_rng([self._seed, zlib.crc32(f"{self.rooms[room].name}/{camera}".encode()), index])
             light = picture * rng.uniform(1 - _GAIN, 1 + _GAIN)
             noisy = np.rint(light + rng.normal(0, _NOISE, picture.shape))
@@ -345,7 +345,7 @@ class AnotherRoom(AlteredSequence):
         return dataclasses.replace(frame, domain=room, images=images)
 
     def mean_background(self, camera: str, domain: str | None = None) -> MeanBackground:
-        """The mean background of the recording in the room, and the pixels where it is known."""
+        """Mean background of the recording in a room, and the pixels where it is known."""
         return self._background(domain or next(iter(self.rooms)), camera)
 
     def _make_picture(self, room: str, camera: str) -> UInt8[np.ndarray, "h w 3"]:
@@ -365,11 +365,11 @@ class AnotherRoom(AlteredSequence):
 def pasted(
     image: UInt8[np.ndarray, "h w 3"], mask: Bool[np.ndarray, "h w"], room: UInt8[np.ndarray, "h w 3"]
 ) -> Float[np.ndarray, "h w 3"]:
-    """The masked part of an image before a room, about as bright as the room, with a soft seam."""
+    """Composite the masked part of an image over a room, with matched brightness and a soft edge."""
     if not mask.any():
         return room.astype(np.float32)
     inside = np.asarray(binary_erosion(mask, iterations=_RIM), bool)
-    # The colour of each pixel near the rim is that of the nearest one well inside.
+    # Pixels near the rim take the colour of the nearest pixel well inside.
     nearest = distance_transform_edt(~(inside if inside.any() else mask), return_distances=False, return_indices=True)
     arm = image[tuple(np.asarray(nearest))].astype(np.float32)
     gain = np.clip(np.sqrt(max(float(np.median(room)), 1.0) / max(float(np.median(image)), 1.0)), *_MATCH)

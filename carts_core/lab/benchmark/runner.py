@@ -1,4 +1,4 @@
-"""Plan of a benchmark's runs, and the runner of those that are not measured yet."""
+"""Plan of a benchmark's runs, and the runner that measures the missing ones."""
 
 from collections.abc import Iterable, Mapping
 from collections.abc import Sequence as Items
@@ -23,10 +23,10 @@ _UNDER_OCCLUDERS = ("ours", "ours_given", "ours_proposed")
 
 
 def plan(scope: Scope, sources: Items[Source], baselines: Items[str] = ()) -> list[Run]:
-    """All runs, frame after frame, so that a stopped benchmark has some measurements of every kind.
+    """All runs, ordered by frame, so that a stopped benchmark has some measurements of every kind.
 
-    Frames on which not all methods are evaluated come after that, then frames that are corrected together, other rooms,
-    and instruments that no training has. `baselines` are names in `scope.BASELINES` whose weights are given.
+    Frames with a subset of the methods follow, then frames corrected together, other rooms, and instruments absent from
+    the training data. `baselines` are the names in `scope.BASELINES` whose weights are given.
     """
     rooms, families = ([s for s in sources if s.name.startswith(kind)] for kind in (ROOMS, FAMILY))
     sources = [source for source in sources if source not in (*rooms, *families)]
@@ -89,7 +89,7 @@ def _runs_of_frame(scope: Scope, source: Source, frame: int, baselines: Items[st
 
 def _runs_of_further_frame(scope: Scope, source: Source, frame: int) -> list[Run]:
     if source.name == REAL:
-        # One calibration serves the whole recording, and scoring it costs next to nothing.
+        # One calibration is shared by the whole recording, and scoring it is cheap.
         return [Run(source.name, "regular", frame, "calibrated")]
     return [
         Run(source.name, domain, frame, "ours", error)
@@ -99,9 +99,10 @@ def _runs_of_further_frame(scope: Scope, source: Source, frame: int) -> list[Run
 
 
 class Benchmark:
-    """The runs of a scope over some sources, and the file of their results.
+    """Runs of a scope over sources, and the file of their results.
 
-    Runs are measured in their order. `baselines` maps names in `scope.BASELINES` to networks; every one among the runs.
+    Runs are measured in the given order. `baselines` maps names in `scope.BASELINES` to networks and must contain those
+    that occur in the runs.
     """
 
     def __init__(
@@ -129,10 +130,10 @@ class Benchmark:
         return [measurement for measurement in found if measurement is not None]
 
     def run(self, console: Console) -> None:
-        """Measure the missing runs; a stopped benchmark keeps its measurements.
+        """Measure the missing runs; measurements are kept if the benchmark is stopped.
 
         Raises:
-            CartsError: a sequence cannot be made or read, or the results cannot be written.
+            CartsError: a sequence cannot be generated or read, or the results cannot be written.
         """
         todo = {run: key for run, key in self.runs.items() if self.results.find(run, key) is None}
         if not todo:
@@ -159,7 +160,7 @@ class Benchmark:
             bar.update(task, description="measured")
 
     def _group(self, run: Run) -> list[Run]:
-        """Runs that are measured together with this one."""
+        """Runs measured together with this one."""
         if not METHODS[run.method].together:
             return [run]
         return [other for other in self.runs if replace(other, frame=run.frame) == run]

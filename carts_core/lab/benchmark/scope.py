@@ -11,11 +11,11 @@ from ...settings.training import Augmentation, BaselineName, BaselineNetwork
 SYNTHETIC = "synthetic"
 REAL = "real"
 ROOMS = "rooms"
-"""Instruments in other rooms; a source of that name and the camera's, or `synthetic`."""
+"""Prefix of sources with instruments in other rooms, followed by the camera or `synthetic`."""
 FAMILY = "family"
-"""Instruments in no training data; a source of that name and the instrument's."""
+"""Prefix of sources with instruments absent from the training data, followed by the instrument."""
 PAPERS_STEPS = 50
-"""The paper's number of steps."""
+"""Number of steps in the paper."""
 
 
 @dataclass(frozen=True)
@@ -27,69 +27,69 @@ class Run:
     domain: str
     """One of the synthetic domains, `occlusion`, `crossing arms`, a room, or one of `conditions.WRONG`."""
     frame: int
-    """Position in the sequence."""
+    """Index in the sequence."""
     method: str
     """A name in `METHODS`."""
     error_deg: float | None = None
-    """Error of every joint at the start [deg; mm for prismatic joints], from the true joint positions if known; None
-    starts at the measured ones."""
+    """Initial error of every joint [deg; mm for prismatic joints] relative to the true joint positions if known, else
+    to the measured ones; None starts at the measured joint positions."""
 
 
 @dataclass(frozen=True)
 class Scope:
-    """How much is measured; defaults are those of the full form."""
+    """Extent of the benchmark; defaults are those of the full benchmark."""
 
     frames: int = 8
-    """Frames of each sequence, evenly spread, on which all methods are evaluated."""
+    """Number of evenly spaced frames per sequence on which all methods are evaluated."""
     sequence_frames: int = 24
-    """Frames of the synthetic sequence that is made; all of them serve the estimate of the background."""
+    """Length of the synthetic sequence; the background is estimated from all its frames."""
     samples: int = 8
-    """Paths per pixel of the synthetic sequence."""
+    """Samples per pixel in path tracing of the synthetic sequence."""
     paper_iterations: int = 100
-    """Steps in the paper's setting from the measured joint positions, `PAPERS_STEPS` at most from others. Its schedule
-    does not depend on their number, so one run holds all shorter ones."""
+    """Steps in the paper's setting from the measured joint positions; at most `PAPERS_STEPS` from other starts. The
+    schedule does not depend on the number of steps, so a run contains all shorter ones."""
     error_domains: tuple[str, ...] = DOMAINS
-    """Synthetic domains with errors at the start."""
+    """Synthetic domains with initial errors."""
     errors_deg: tuple[float, ...] = (0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0)
-    """Sizes of that error for the default solver [deg]."""
+    """Initial errors for the default solver [deg]."""
     paper_errors_deg: tuple[float, ...] = (0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0)
-    """The same for the paper's setting, in the regular domain [deg]."""
+    """Initial errors for the paper's setting, in the regular domain [deg]."""
     further_errors_deg: tuple[float, ...] = (1.0, 2.0, 3.0, 5.0)
-    """The same for the default solver on the other frames of the synthetic sequence [deg]."""
+    """Initial errors for the default solver on the other frames of the synthetic sequence [deg]."""
     real_errors_deg: tuple[float, ...] = (1.0, 2.0, 3.0)
-    """The same on real frames, both methods, in the regular domain, from the measured joint positions [deg]."""
+    """Initial errors on real frames in the regular domain, for both methods, relative to the measured joints [deg]."""
     hard_errors_deg: tuple[float, ...] = (2.0,)
-    """The same on synthetic frames with occluders, and with all cameras at once [deg]."""
+    """Initial errors on synthetic frames with occluders, and with all cameras at once [deg]."""
     crossing_errors_deg: tuple[float, ...] = (1.0, 2.0, 3.0)
-    """The same on synthetic frames whose arms cross, for the default solver and ACS [deg]."""
+    """Initial errors on synthetic frames whose arms cross, for the default solver and ACS [deg]."""
     consecutive: int = 30
-    """Largest number of first frames of each sequence that are corrected together."""
+    """Largest number of frames, from the first on, that are corrected together in each sequence."""
     consecutive_domains: tuple[str, ...] = DOMAINS
-    """Domains of these frames."""
+    """Domains of frames corrected together."""
     consecutive_errors_deg: tuple[float, ...] = (1.0, 2.0, 3.0)
-    """Sizes of an error at the start that all synthetic frames share, in those domains [deg]."""
+    """Initial errors shared by all synthetic frames in those domains [deg]."""
     calibration_frames: int = 20
-    """Frames of a calibration of a real sequence, evenly spread."""
+    """Number of evenly spaced frames for the calibration of a real sequence."""
     room_frames: int = 2
-    """Frames of a real sequence that are put before each of the other rooms, evenly spread."""
+    """Number of evenly spaced frames of a real sequence that are composited over each room."""
     room_consecutive: int = 8
-    """The same for frames that are corrected together there."""
+    """Number of frames corrected together in each room."""
     room_share: int = 1
     """Every n-th room is measured."""
     family_frames: int = 6
-    """Frames of each instrument that is in no training data; may be 0."""
+    """Number of frames of each instrument absent from the training data; may be 0."""
     hand_eye_starts: int = 10
-    """Starts of each hand-eye calibration of another robot."""
+    """Number of starts per condition of the hand-eye calibration of another robot."""
 
     def steps(self, run: Run) -> int:
-        """Steps in the paper's setting for a run."""
+        """Number of steps in the paper's setting for a run."""
         return self.paper_iterations if run.error_deg is None else min(self.paper_iterations, PAPERS_STEPS)
 
     def with_frames(self, frames: int) -> "Scope":
-        """The same with another number of evaluated frames.
+        """Copy with another number of evaluated frames.
 
         Raises:
-            SettingsError: it is less than one, or more than the synthetic sequence has.
+            SettingsError: the number is below one or exceeds the length of the synthetic sequence.
         """
         if not 1 <= frames <= self.sequence_frames:
             raise SettingsError(
@@ -124,29 +124,29 @@ QUICK = Scope(
 
 @dataclass(frozen=True)
 class Method:
-    """A method of the comparison, from images and measured kinematics to a mask."""
+    """Compared method, which predicts a mask from images and measured kinematics."""
 
     label: str
     """Label in tables."""
     settings: Callable[[int], SolverSettings] | None
-    """From the number of steps in the paper's setting to the optimizer's settings; None takes the network's own mask
-    and looks at no kinematics."""
+    """Optimizer settings as a function of the number of steps in the paper's setting; None evaluates the network's own
+    mask, without kinematics."""
     occluders_given: bool = False
-    """The pixels of occluders are given."""
+    """Whether the pixels of occluders are given."""
     every_camera: bool = False
-    """All cameras enter one objective."""
+    """Whether all cameras are optimized jointly."""
     poses: bool = False
-    """The poses of all cameras but the first are free, too."""
+    """Whether the poses of all cameras except the first are also optimized."""
     calibrated: bool = False
-    """Base frames are those of one calibration of the whole recording."""
+    """Whether base frames come from one calibration of the whole recording."""
     together: bool = False
-    """Frames are corrected together, as a sequence."""
+    """Whether frames are corrected together, as a sequence."""
     masks_given: bool = False
-    """Given masks are fitted, without a network."""
+    """Whether given masks are fitted, without a network."""
     baseline: bool = False
-    """A network from the literature, whose weights have to be given."""
+    """Whether it is a network from the literature, whose weights must be given."""
     image_alone: bool = False
-    """Its only input is the image."""
+    """Whether the image is the only input."""
 
 
 def _ours(_: int) -> SolverSettings:
@@ -194,7 +194,7 @@ BASELINES = {
 """Networks from the literature, by network and augmentation; measured if weights are given."""
 METHODS |= BASELINES
 MAIN = ("unet", "start", "l1", "paper", "ours")
-"""Methods of the main table: each frame alone, in one camera."""
+"""Methods of the main table, which treat each frame separately in one camera."""
 RENDERING = "surface"
 """The surface network's mask from an image and the rendering at the measured joint positions, the inputs of Colleoni et
 al."""

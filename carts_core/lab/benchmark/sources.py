@@ -1,4 +1,4 @@
-"""Sources of frames: a synthetic sequence that served no tuning, a real one if given, other rooms and instruments."""
+"""Sources of frames: a held-out synthetic sequence, a real one if given, other rooms and instruments."""
 
 import hashlib
 from collections.abc import Callable, Iterable
@@ -25,7 +25,7 @@ from .scope import FAMILY, REAL, ROOMS, SYNTHETIC, Scope
 TEST_SEED = 730_511
 """Seed of the synthetic sequence, reserved for the benchmark."""
 HELD_OUT = ("curved_scissors", "clip_applier")
-"""Built-in instruments in no training data."""
+"""Built-in instruments absent from the training data."""
 _FAMILY_DOMAINS = ("regular", "smoke")
 _MOTION_SECONDS = 6.0
 _SYNTHESIS = ("lab/synthesis/*.py", "settings/synthesis.py", "templates/synthetic_sequence.toml")
@@ -38,38 +38,38 @@ Recording = Sequence | AlteredSequence
 
 @dataclass(frozen=True)
 class Source:
-    """Frames to evaluate. Nothing is rendered before `open` is called."""
+    """Source of frames to evaluate, opened or rendered on demand by `open`."""
 
     name: str
     """`synthetic`, `real`, or `rooms` and a camera."""
     description: str
     """Description for the report."""
     camera: str
-    """The camera that is optimized and scored."""
+    """Camera that is optimized and scored."""
     frames: list[int]
-    """Positions of the frames on which all methods are evaluated."""
+    """Indices of the frames on which all methods are evaluated."""
     fingerprint: str
-    """Of images and kinematics."""
+    """Fingerprint of images and kinematics."""
     open: Callable[[Progress], Recording]
     cameras: tuple[str, ...] = ()
-    """All cameras that see the regular domain."""
+    """All cameras with images of the regular domain."""
     consecutive: list[int] = field(default_factory=list)
-    """Positions of frames that are corrected together."""
+    """Indices of frames that are corrected together."""
     rooms: list[str] = field(default_factory=list)
-    """Rooms of a source of frames in other rooms."""
+    """Names of the rooms, if the source has frames in other rooms."""
     domains: tuple[str, ...] = DOMAINS
-    """Its synthetic domains."""
+    """Synthetic domains of the source."""
     length: int = 1
-    """Frames of the whole recording."""
+    """Number of frames of the whole recording."""
 
     @property
     def further(self) -> list[int]:
-        """Positions of the frames that are corrected together, but not evaluated by all methods."""
+        """Indices of frames that are corrected together but not evaluated by all methods."""
         return [index for index in self.consecutive if index not in self.frames]
 
 
 def synthetic_source(scope: Scope, seed: int = TEST_SEED) -> Source:
-    """A synthetic sequence, rendered into the cache when it is first opened.
+    """Source with a synthetic sequence, rendered into the cache when it is first opened.
 
     Raises:
         SettingsError: the seed is that of the shipped sequence.
@@ -97,7 +97,7 @@ def synthetic_source(scope: Scope, seed: int = TEST_SEED) -> Source:
 
 
 def family_sources(scope: Scope, seed: int = TEST_SEED) -> list[Source]:
-    """A synthetic sequence for each instrument in no training data."""
+    """One source with a synthetic sequence per instrument absent from the training data."""
     frames, domains = scope.family_frames, _FAMILY_DOMAINS
     return [
         Source(
@@ -122,7 +122,7 @@ def _config(scope: Scope, seed: int, name: str, frames: int, **settings: Any) ->
 
 
 def _made_once(config: SynthesisConfig) -> tuple[str, Callable[[Progress], Sequence]]:
-    """The fingerprint of a synthetic sequence, and a function that opens it, rendered into the cache if missing."""
+    """Fingerprint of a synthetic sequence, and a function that opens it and renders it into the cache if missing."""
     fingerprint = hashlib.sha256(repr((config, code_fingerprint(_SYNTHESIS))).encode()).hexdigest()[:32]
     folder = output_path(cache_dir(), "benchmark", f"sequence_{config.seed}_{fingerprint[:8]}")
 
@@ -136,7 +136,7 @@ def _made_once(config: SynthesisConfig) -> tuple[str, Callable[[Progress], Seque
 
 
 def _masked(sequence: Sequence, camera: str) -> list[int]:
-    """Positions of the frames with a mask."""
+    """Indices of the frames with a mask."""
     return [index for index in range(len(sequence)) if camera in (sequence.frame(index).masks or {})]
 
 
@@ -145,7 +145,7 @@ def _digest(*parts: object) -> "hashlib._Hash":
 
 
 def _add_frames(digest: "hashlib._Hash", sequence: Sequence, indices: Iterable[int], cameras: Items[str] | None) -> str:
-    """Add images and measured joint positions; returns the fingerprint."""
+    """Add images and measured joint positions to a hash; returns the fingerprint."""
     for index in sorted(set(indices)):
         frame = sequence.frame(index, cameras=cameras)
         for values in (*frame.images.values(), *frame.measured.values()):
@@ -154,7 +154,7 @@ def _add_frames(digest: "hashlib._Hash", sequence: Sequence, indices: Iterable[i
 
 
 def real_source(path: Path, scope: Scope, seed: int = TEST_SEED) -> Source:
-    """The frames of a real sequence that have a mask, in its first camera.
+    """Source with the frames of a real sequence that have a mask in its first camera.
 
     Raises:
         SequenceError: the sequence is not usable.
@@ -189,7 +189,7 @@ def real_source(path: Path, scope: Scope, seed: int = TEST_SEED) -> Source:
 
 
 def _rooms(folder: Path | None, scope: Scope, *parts: object) -> "tuple[list[Room], hashlib._Hash]":
-    """The rooms, and a hash over them and `parts`."""
+    """Rooms, and a hash over them and `parts`."""
     rooms = (made_rooms() + (photographs(folder) if folder else []))[:: scope.room_share]
     digest = _digest(*parts, code_fingerprint(_ROOMS_CODE))
     for photograph in sorted(folder.glob("*")) if folder else []:
@@ -198,7 +198,7 @@ def _rooms(folder: Path | None, scope: Scope, *parts: object) -> "tuple[list[Roo
 
 
 def synthetic_room_source(sequence: Source, folder: Path | None, scope: Scope, seed: int = TEST_SEED) -> Source:
-    """The instruments of the synthetic sequence before other rooms; arguments as for `room_sources`."""
+    """Source with the instruments of the synthetic sequence in other rooms; arguments as for `room_sources`."""
     rooms, digest = _rooms(folder, scope, sequence.fingerprint, seed)
     frames = [sequence.frames[place] for place in spread(len(sequence.frames), scope.room_frames)]
 
@@ -220,13 +220,13 @@ def synthetic_room_source(sequence: Source, folder: Path | None, scope: Scope, s
 
 
 def room_sources(path: Path, folder: Path | None, scope: Scope, seed: int = TEST_SEED) -> list[Source]:
-    """A source for each camera of a real sequence that has masks, with its instruments before other rooms.
+    """One source per camera with masks of a real sequence, its instruments composited over other backgrounds.
 
-    Photographs in `folder` are rooms beside the synthetic ones; `seed` is that of light and noise.
+    Photographs in `folder` are used in addition to synthetic backgrounds; `seed` sets lighting and noise.
 
     Raises:
         SequenceError: the sequence is not usable.
-        SettingsError: the folder holds no photograph.
+        SettingsError: the folder contains no photograph.
     """
     sequence = Sequence.open(path)
     rooms, digest = _rooms(folder, scope, read_bytes(path, SEQUENCE), seed)

@@ -1,4 +1,4 @@
-"""Measurements of a benchmark: selection, means and deviations, pairs of methods, and texts of tables."""
+"""Statistics of a benchmark: selection, means, standard deviations, pairs of methods, and table texts."""
 
 import tomllib
 from collections.abc import Iterable, Mapping, Sequence
@@ -17,29 +17,29 @@ from .scope import FAMILY, MAIN, PAPERS_STEPS, ROOMS
 
 
 def read_table(name: str) -> dict[str, Any]:
-    """A TOML file beside this module."""
+    """Read a TOML file in the folder of this module."""
     return tomllib.loads(Path(__file__).with_name(name).read_text(encoding="utf-8"))
 
 
 PAPER = read_table("paper.toml")
-"""The paper's numbers; the file describes them."""
+"""Numbers from the paper, documented in the file."""
 TEXTS = read_table("tables.toml")
 """Titles and captions of tables, and captions of figures."""
 
 
 def table_of(name: str, rows: Sequence[Mapping[str, str | Cell]], /, **values: object) -> Table | None:
-    """A table with the title and the caption of that name, into which values are put; None without rows."""
+    """Table with the title and caption of that name, formatted with `values`; None if there are no rows."""
     title, caption = (TEXTS[name][text].format(**values) for text in ("title", "caption"))
     return Table.of(title, caption, rows)
 
 
 def paper_column(source: str, domain: str) -> str:
-    """Column of the paper for one of our sources and domains; empty without one."""
+    """Column of the paper's table that corresponds to a source and domain; empty if there is none."""
     return PAPER["columns"].get(source, {}).get(domain, "")
 
 
 ANY = object()
-"""Matches every error at the start."""
+"""Matches every initial error."""
 
 
 class Measurements:
@@ -56,10 +56,10 @@ class Measurements:
         method: str | None = None,
         error_deg: object = ANY,
     ) -> list[Measurement]:
-        """Measurements that match all given arguments; `error_deg=None` is the measured start.
+        """Measurements that match all given arguments; `error_deg=None` selects starts at the measured joints.
 
-        Frames with occluders or in other rooms, and instruments in no training data, match only if their domain or
-        source is given.
+        Frames with occluders or in other rooms, and instruments absent from the training data, match only if their
+        domain or source is given.
         """
         return [
             measurement
@@ -71,20 +71,20 @@ class Measurements:
         ]
 
     def compared(self) -> "Measurements":
-        """Measurements on frames on which all methods are evaluated."""
+        """Measurements on the frames on which all methods are evaluated."""
         frames = {(m.run.source, m.run.frame) for m in self.all if m.run.method in MAIN and m.run.error_deg is None}
         return Measurements(m for m in self.all if (m.run.source, m.run.frame) in frames)
 
     def default_solver(self) -> list[Measurement]:
-        """Runs of the default solver with one camera: each frame alone, with or without occluders, and in sequences."""
+        """Runs of the default solver with one camera: single frames, with or without occluders, and sequences."""
         return [*self.of(method="ours"), *self.of(method="ours", domain=OCCLUSION), *self.of(method="sequence")]
 
     def domains(self, source: str) -> list[str]:
-        """The domains that occur in a source, in the order in which they were measured."""
+        """Domains of a source, in order of measurement."""
         return list(dict.fromkeys(measurement.run.domain for measurement in self.of(source=source)))
 
     def sources(self, kind: str = "") -> list[str]:
-        """The sources that occur of a kind (`ROOMS` or `FAMILY`), or those of neither."""
+        """Sources of a kind (`ROOMS` or `FAMILY`), or by default those of neither."""
         found = dict.fromkeys(measurement.run.source for measurement in self.all)
         return [source for source in found if (source.startswith(kind) if kind else _usual(source))]
 
@@ -99,42 +99,42 @@ def _usual(source: str) -> bool:
 
 
 def scores(measurements: Iterable[Measurement], iterations: int | None = None) -> list[Score]:
-    """Final scores of measurements, or the best ones of a number of steps."""
+    """Final scores of measurements, or the best scores within a number of steps."""
     found = (entry.final if iterations is None else entry.best_of(iterations) for entry in measurements)
     return [score for score in found if score is not None]
 
 
 DOMAIN_LABELS = {domain: domain.replace("_", " ") for domain in (*DOMAINS, OCCLUSION)}
 SHORT_LABELS = {"paper": "paper's setting", "ours": "ours"}
-"""Labels of methods in tables by iterations and errors."""
+"""Short labels of methods, for tables by iterations and errors."""
 NOTHING = "–"
 """Placeholder for a missing number."""
 
 
 @dataclass(frozen=True)
 class Figure:
-    """A figure of scores and its form in tables."""
+    """Metric of scores and its format in tables."""
 
     heading: str
     name: str
-    """Field of `Score`."""
+    """Name of the field of `Score`."""
     scale: float = 1.0
     digits: int = 2
 
     def values(self, scores: Iterable[Score | None]) -> list[float]:
-        """The known values."""
+        """Values of the metric that are not None."""
         found = (getattr(score, self.name) for score in scores if score is not None)
         return [value for value in found if value is not None]
 
     def text(self, scores: Iterable[Score | None]) -> str:
-        """Mean ± standard deviation; a single value has no deviation."""
+        """Mean ± standard deviation; the mean alone for a single value."""
         if not (values := self.values(scores)):
             return NOTHING
         mean = f"{self.scale * np.mean(values):.{self.digits}f}"
         return mean if len(values) == 1 else f"{mean} ± {self.scale * np.std(values):.{self.digits}f}"
 
     def cell(self, scores: Iterable[Score | None], theirs: Sequence[float] | None = None, column: str = "") -> Cell:
-        """The text, and the paper's number below it with the name of its column there."""
+        """Table cell with the text and, below it, the paper's number and column."""
         note = "" if theirs is None else f"{column} {theirs[0]:.1f} ± {theirs[1]:.1f}"
         return Cell(self.text(scores), note)
 
@@ -148,12 +148,12 @@ TIP_DEPTH = Figure("depth of the tips [mm]", "tip_depth_mm")
 
 
 def begun(error_deg: float | None) -> str:
-    """Start of a run, for tables."""
+    """Label of the start of a run in tables."""
     return "as measured" if error_deg is None else f"{error_deg:g}°"
 
 
 GAINED = 0.01
-"""Least gain in Dice of the paper's setting for a comparison of speed."""
+"""Minimum gain in Dice of the paper's setting for a speed comparison."""
 
 
 @dataclass(frozen=True)
@@ -165,18 +165,18 @@ class Pair:
     gained: bool
     """Whether the paper's setting gained enough to compare."""
     papers: float
-    """Time until the best iterate of the paper's setting has the Dice of its best of `PAPERS_STEPS` [s]."""
+    """Time in which the paper's setting reaches the Dice of its best iterate within `PAPERS_STEPS` steps [s]."""
     ours: float | None
-    """The same of ours [s]; None if it never has."""
+    """Time in which the default solver reaches that Dice [s]; None if it never does."""
 
     @property
     def ratio(self) -> float:
-        """How many times faster ours is; 0 if it never gets there."""
+        """Speed-up of the default solver; 0 if it never reaches that Dice."""
         return self.papers / self.ours if self.ours else 0.0
 
 
 def pairs(data: Measurements) -> list[Pair]:
-    """All pairs of runs, also those in which the paper's setting gained nothing."""
+    """All pairs of runs from the same start, including those without gain in the paper's setting."""
     ours = {(m.run.source, m.run.domain, m.run.frame, m.run.error_deg): m for m in data.of(method="ours")}
     found = []
     for theirs in data.of(method="paper"):
@@ -192,6 +192,6 @@ def pairs(data: Measurements) -> list[Pair]:
 
 
 def _seconds_to(measurement: Measurement, dice: float) -> float | None:
-    """Time until the best iterate first had this Dice [s]; None if it never had."""
+    """Time until the best iterate reaches this Dice [s]; None if it never does."""
     reached = zip(measurement.trace, measurement.best_so_far(), strict=True)
     return next((now.seconds for now, best in reached if best.dice >= dice), None)

@@ -67,7 +67,7 @@ def main_tables(data: Measurements) -> list[Table]:
 
 
 def iteration_tables(data: Measurements) -> list[Table]:
-    """Dice of the best iterate of the first so many steps."""
+    """Dice of the best iterate by number of steps."""
     tables = []
     for source in data.sources():
         rows = []
@@ -85,7 +85,7 @@ def iteration_tables(data: Measurements) -> list[Table]:
 
 
 def error_tables(data: Measurements) -> list[Table]:
-    """Dice and joint MAE by the size of the error at the start."""
+    """Dice and joint MAE by initial error."""
     tables = []
     for source in data.sources():
         errors = sorted({run.run.error_deg for run in data.of(source=source) if run.run.error_deg is not None})
@@ -116,11 +116,11 @@ def error_tables(data: Measurements) -> list[Table]:
 
 
 def speed_table(data: Measurements) -> Table | None:
-    """Seconds per frame and how many frames each method made worse."""
+    """Seconds per frame, and number of frames that each method made worse."""
     rows = []
     for source, (method, entry) in product(data.sources(), METHODS.items()):
         chosen = data.of(source=source, method=method)
-        # Methods on many frames have other tables, because a frame's time is only a part of theirs.
+        # Methods that correct frames together have other tables, because their time is not spent frame by frame.
         if not chosen or entry.together or entry.calibrated:
             continue
         steps, seconds = (
@@ -142,7 +142,7 @@ def speed_table(data: Measurements) -> Table | None:
 
 
 def pair_table(data: Measurements) -> Table | None:
-    """The default solver against the paper's setting from the same starts."""
+    """Times of the default solver and of the paper's setting from the same starts."""
     rows, found = [], pairs(data)
     for source, error in dict.fromkeys((pair.source, pair.error_deg) for pair in found):
         chosen = [pair for pair in found if (pair.source, pair.error_deg) == (source, error) and pair.gained]
@@ -164,7 +164,7 @@ def pair_table(data: Measurements) -> Table | None:
 
 
 def worse_table(data: Measurements) -> Table | None:
-    """Runs of the default solver that ended below their start."""
+    """Runs of the default solver whose final Dice is lower than the initial one."""
     rows = [
         {
             "frames": m.run.source,
@@ -182,31 +182,31 @@ def worse_table(data: Measurements) -> Table | None:
 
 
 def stage_table(stages: dict[str, float]) -> Table | None:
-    """Milliseconds of each stage."""
+    """Time of each stage [ms]."""
     return table_of("stages", [{"stage": name, "ms": f"{value:.1f}"} for name, value in stages.items()])
 
 
 def occlusion_table(data: Measurements) -> Table | None:
-    """The default solver without knowledge of the occluders, with their pixels given, and with a proposal."""
+    """Scores of the default solver with unknown occluders, with given occluder pixels, and with a proposal."""
     methods = "ours", "ours_given", "ours_proposed"
     return _table(data, "occlusion", OCCLUSION, methods, (DICE, JOINT_MAE))
 
 
 def camera_table(data: Measurements) -> Table | None:
-    """One camera against all of them in one objective."""
+    """Scores with one camera and with all cameras optimized jointly."""
     methods = "ours", "stereo", "stereo_posed"
     return _table(data, "cameras", "regular", methods, (DICE, JOINT_MAE, VISIBLE_MAE, TIP_DEPTH))
 
 
 def calibration_table(data: Measurements) -> Table | None:
-    """One calibration of the whole recording, alone and before the default solver."""
+    """Scores of the default solver, of one calibration of the recording, and of the solver after that calibration."""
     return _table(data, "calibration", "regular", ("ours", "calibrated", "calibrated_ours"), (DICE,))
 
 
 def _table(
     data: Measurements, table: str, domain: str, methods: tuple[str, ...], figures: tuple[Figure, ...]
 ) -> Table | None:
-    """A row per source, error at the start and method, over frames that all methods have."""
+    """Table with one row per source, initial error and method, over frames measured with all methods."""
     rows = []
     for source in data.sources():
         errors = {m.run.error_deg for m in data.of(source=source, domain=domain, method=methods[-1])}
@@ -231,11 +231,11 @@ def _table(
 
 
 _TOGETHER = {"sequence": "ours", "temporal": "paper"}
-"""Methods that correct frames together -> their method for single frames."""
+"""Methods that correct frames together -> corresponding method for single frames."""
 
 
 def sequence_table(data: Measurements) -> Table | None:
-    """Frames corrected together, beside the same frames alone."""
+    """Scores of frames corrected together and of the same frames corrected separately."""
     found = [m for method in _TOGETHER for m in data.of(method=method)]
     rows = []
     keys = dict.fromkeys((m.run.source, m.run.domain, m.run.error_deg) for m in found)
@@ -267,7 +267,7 @@ def sequence_table(data: Measurements) -> Table | None:
 
 
 def room_table(data: Measurements) -> Table | None:
-    """Instruments in other rooms: the default solver, each frame alone and in a sequence, beside ACS."""
+    """Scores in other rooms: the default solver on single frames and on sequences, and ACS."""
 
     def worse(runs: Sequence[Measurement]) -> Cell:
         return Cell(DICE.text(scores(runs)), f"made worse: {sum(m.made_worse for m in runs)} of {len(runs)}")
@@ -291,7 +291,7 @@ def room_table(data: Measurements) -> Table | None:
 
 
 def image_alone_table(data: Measurements) -> Table | None:
-    """For each domain the best network that sees the image alone, and ours."""
+    """For each domain, the best network with only the image as input, and the default solver."""
     rows = []
     for source in data.sources():
         dice, _ = image_alone(data, source)
@@ -317,7 +317,7 @@ def image_alone_table(data: Measurements) -> Table | None:
 
 
 def family_table(data: Measurements) -> Table | None:
-    """Instruments of families that no training has."""
+    """Scores of instruments absent from the training data."""
     rows = [
         {
             "instrument": source.removeprefix(FAMILY).strip(),
@@ -334,7 +334,7 @@ def family_table(data: Measurements) -> Table | None:
 
 
 def verdict_table(data: Measurements) -> Table | None:
-    """Verdicts beside Dice, for each condition and over all of them."""
+    """Verdicts compared with Dice, for each condition and in total."""
     rows = []
     groups = judged(data)
     for name, runs in {**groups, "all": [run for found in groups.values() for run in found]}.items():
@@ -354,7 +354,7 @@ def verdict_table(data: Measurements) -> Table | None:
 
 
 def deviation_table(data: Measurements) -> Table | None:
-    """Share of joint errors within their reported deviations."""
+    """Share of joint errors within one and two reported standard deviations."""
     rows = [
         {
             "condition": name,

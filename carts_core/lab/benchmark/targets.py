@@ -1,4 +1,4 @@
-"""Targets of the default solver, and whether measurements reach them."""
+"""Performance targets of the default solver, and whether measurements meet them."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -16,44 +16,44 @@ from .scope import FAMILY, METHODS, PAPERS_STEPS, REAL, ROOMS, SYNTHETIC
 from .statistics import DOMAIN_LABELS, GAINED, JOINT_MAE, VISIBLE_MAE, Measurements, pairs, read_table
 
 RIGHT = 0.9
-"""Dice from which a mask counts as right."""
+"""Minimum Dice of a correct mask."""
 NEAR_FINAL = 0.005
-"""Distance to the final Dice that counts as converged."""
+"""Difference from the final Dice below which a run counts as converged."""
 _RECOVERED = 0.95
 _CONDITIONS = ("low_brightness", "bleeding", "smoke", "background_change")
-"""Of real frames."""
+"""Simulated conditions of real frames that have a target."""
 _MODES = {"ours": "each frame alone", "sequence": "in sequence mode"}
 _SHIFTED = tuple(domain for domain in DOMAINS if domain != "regular")
-"""Domains that differ from the training data of networks."""
+"""Domains that differ from the networks' training data."""
 _TARGETS = read_table("targets.toml")
 
 
 @dataclass(frozen=True)
 class Target:
-    """A target with its figure and verdict."""
+    """Target with its measured value and verdict."""
 
     what: str
     target: str
     reached: str
     met: bool | None
-    """None if open: nothing was measured, or only a part of the required runs, which meets it."""
+    """Whether the target is met; None if undecided: nothing was measured, or only part of the runs, which meets it."""
     reference: str
     basis: str
-    """Data that it was computed from."""
+    """Description of the data from which the value was computed."""
 
 
 def target_of(
     name: str, value: float | None, basis: str, *, reference: str = "", complete: bool = True, **names: object
 ) -> Target:
-    """The target of a name in `targets.toml`, reached or not.
+    """Create the target of a name in `targets.toml`, with its verdict.
 
     Args:
-        name: of its table.
-        value: None if nothing was measured.
-        basis: data that it was computed from.
-        reference: figure to compare with, if it depends on the data.
-        complete: whether everything was measured that the target asks for; otherwise it can be missed but not met.
-        names: texts and numbers of its label.
+        name: name of the table in `targets.toml`.
+        value: measured value; None if nothing was measured.
+        basis: description of the data from which the value was computed.
+        reference: value to compare with, if it depends on the data.
+        complete: whether all required runs were measured; otherwise the target can be missed but not met.
+        names: texts and numbers for the label.
     """
     entry = _TARGETS[name]
     scale, form, most = entry.get("scale", 1), entry.get("text", "{:.3f}"), "most" in entry
@@ -69,7 +69,7 @@ def target_of(
 
 
 def targets(data: Measurements) -> list[Target]:
-    """All targets, also those without measurements."""
+    """All targets, including those without measurements."""
     return [
         *_speed(data),
         *_synthetic(data),
@@ -100,7 +100,7 @@ def _mean_dice(data: Measurements, name: str, source: str, method: str) -> Targe
 
 
 def steps_to_final(measurement: Measurement) -> int:
-    """Steps until the best iterate first was near the final Dice."""
+    """Number of steps until the best iterate is near the final Dice."""
     bests = measurement.best_so_far()
     goal = min(measurement.final.dice, bests[-1].dice) - NEAR_FINAL
     return next(index for index, best in enumerate(bests) if best.dice >= goal)
@@ -132,7 +132,7 @@ def _speed(data: Measurements) -> Iterator[Target]:
 
 
 def _worst(means: dict[str, float]) -> tuple[str | None, str]:
-    """Domain of the lowest mean, and the text on it."""
+    """Domain with the lowest mean, and a description."""
     if not means:
         return None, "no runs"
     worst = min(means, key=lambda domain: means[domain])
@@ -178,7 +178,7 @@ def _real(data: Measurements) -> Iterator[Target]:
     }
     clean = means.pop("regular", None)
     worst, basis = _worst(means)
-    # A loss that is rounded to nothing is not written as -0.000.
+    # Avoid -0.000 for a loss that rounds to zero.
     lost = None if clean is None or worst is None else clean - means[worst]
     lost = 0.0 if lost is not None and -0.0005 < lost < 0 else lost
     yield target_of("real_robustness", lost, basis, complete=len(means) == len(_CONDITIONS))
@@ -228,8 +228,8 @@ def _rooms(data: Measurements, source: str) -> Iterator[Target]:
 def image_alone(data: Measurements, source: str) -> tuple[dict[str, dict[str, float]], int]:
     """Mean Dice in percent by method and domain, and the number of frames.
 
-    Methods are ours, which comes first, and the measured networks that see the image alone, on the frames that ours and
-    one of these have.
+    Methods are the default solver, which comes first, and the measured networks with only the image as input, on frames
+    measured with the default solver and at least one of these.
     """
     methods = ["ours", *(name for name, method in METHODS.items() if method.image_alone)]
     runs = {name: data.of(source=source, method=name, error_deg=None) for name in methods}
@@ -247,7 +247,7 @@ def image_alone(data: Measurements, source: str) -> tuple[dict[str, dict[str, fl
 
 
 def _ahead(data: Measurements, source: str) -> Target:
-    """Difference in the worst shifted domain of each."""
+    """Target for the lead of the default solver over the best network, each in its worst shifted domain."""
     dice, frames = image_alone(data, source)
     worst = {
         method: min(shifted, key=lambda domain: known[domain])
@@ -272,7 +272,7 @@ def _ahead(data: Measurements, source: str) -> Target:
 
 
 def judged(data: Measurements) -> dict[str, list[Measurement]]:
-    """Condition -> runs with a verdict."""
+    """Runs with a verdict, by condition."""
     labels = {"ours": "", "sequence": ", sequence mode", "masks": ", masks as target"}
     found: dict[str, list[Measurement]] = {}
     for measurement in data.all:
@@ -300,7 +300,7 @@ def called_good(runs: Iterable[Measurement]) -> list[Measurement]:
 
 
 def area(runs: Sequence[Measurement]) -> float | None:
-    """Area under the ROC of the probability of a wrong mask [1]; None without both right and wrong masks."""
+    """Area under the ROC curve of the probability of a wrong mask [1]; None without both right and wrong masks."""
     bad = np.array([run.final.dice < RIGHT for run in runs])
     if bad.all() or not bad.any():
         return None
@@ -309,7 +309,7 @@ def area(runs: Sequence[Measurement]) -> float | None:
 
 
 def within(runs: Iterable[Measurement]) -> tuple[int, float, float] | None:
-    """Number of joint positions with a deviation, and shares of errors within one and two of them [1]; None if none."""
+    """Number of joint positions with a standard deviation, and shares of errors within 1 and 2 sigma [1], or None."""
     known = np.array([run.within for run in runs if run.within])
     if not len(known):
         return None

@@ -1,4 +1,4 @@
-"""Adaptation of the shipped network to a recording, and the comparison of fits before and after."""
+"""Fine-tuning of the shipped network on a recording, and comparison of fits before and after."""
 
 import json
 from collections.abc import Callable, Iterator
@@ -29,16 +29,16 @@ from ..randomization.samples import Observer, to_uint8
 from .training import TrainingResult
 
 JUDGING_STREAM = 2
-"""Stream of random numbers of the made images; 0 and 1 are those of training and validation."""
+"""Random stream of the synthetic images for comparison; 0 and 1 are those of training and validation."""
 _SIZE = (320, 240)
-"""Of a made image [px]."""
+"""Width and height of a synthetic image [px]."""
 _OFF_DEG = 2.0
-"""Error of every joint of a synthetic image at the start [deg], of sliding ones [mm]."""
+"""Initial error of every joint in synthetic images [deg; mm for prismatic joints]."""
 _DICE, _PARTS, _TIPS, _EDGES = 0.002, 0.01, 0.2, 0.98
 """Thresholds of "worse": decrease of Dice and of the share of parts [1], increase of the tip error [px], and ratio of
 edge strengths [1]."""
 _MOVED = 3.0
-"""Distance of tips in the recording beyond which edges must become stronger [px]."""
+"""Tip displacement in the recording beyond which edge support must increase [px]."""
 
 Progress = Callable[[str, int, int], None]
 """Called with a description, the number of finished fits, and the total."""
@@ -46,41 +46,41 @@ Progress = Callable[[str, int, int], None]
 
 @dataclass(frozen=True)
 class Fits:
-    """Figures of fits of synthetic images with known joints, and of frames of the recording."""
+    """Metrics of fits to synthetic images with known joints, and to frames of the recording."""
 
     dice: float
     """Mean Dice of synthetic images [1]."""
     made_parts: float
-    """Mean share of the instrument's true pixels of synthetic images where the fit shows the same part [1]."""
+    """Mean share of true instrument pixels in synthetic images at which the fit shows the correct part [1]."""
     made_tips: float
-    """Mean distance of tips from the truth in synthetic images [px]."""
+    """Mean tip error in synthetic images [px]."""
     good: int
-    """Frames of the recording with a good verdict."""
+    """Number of frames of the recording with a good verdict."""
     edges: float
-    """Mean gradient of frames along the outlines of arms and parts, over that of the whole images [1]."""
+    """Mean image gradient along the outlines of arms and parts, relative to that of the whole images [1]."""
     parts: float
-    """Mean over frames: of rendered wrists and jaws, the smaller share that the network predicts as that part [1]."""
+    """Mean over frames of the share of rendered wrist or jaw pixels, the smaller one, predicted as that part [1]."""
     tips: tuple[Float[np.ndarray, "tips 2"], ...]
-    """Of each frame, the tips in the first camera [px]; NaN out of view."""
+    """Tips of each frame in the first camera [px]; NaN outside the image."""
 
 
 @dataclass(frozen=True)
 class Judgement:
-    """Fits with the weights of the start and with adapted ones, on the same images."""
+    """Comparison of fits with the initial and with the adapted weights, on the same images."""
 
     before: Fits
     after: Fits
 
     @property
     def tips_moved(self) -> float:
-        """Mean distance between the tips of both fits of the recording [px]."""
+        """Mean distance between corresponding tips of both fits in the recording [px]."""
         pairs = zip(self.before.tips, self.after.tips, strict=True)
         steps = np.concatenate([*(np.linalg.norm(after - before, axis=1) for before, after in pairs), np.empty(0)])
         known = steps[np.isfinite(steps)]
         return float(known.mean()) if len(known) else 0.0
 
     def worse(self) -> list[str]:
-        """What is worse with the adapted weights; nothing if they may be offered."""
+        """Metrics that are worse with the adapted weights; empty if the weights may be offered."""
         was, now, moved = self.before, self.after, self.tips_moved
         pixels, steady = "of the pixels", _EDGES * was.edges <= now.edges <= was.edges
         checks = {
@@ -97,7 +97,7 @@ class Judgement:
         return [text for text, worse in checks.items() if worse]
 
     def lines(self) -> list[str]:
-        """Summary of figures before and after."""
+        """Summary of the metrics before and after."""
         was, now = self.before, self.after
         return [
             f"fits of made images: Dice {was.dice:.3f} -> {now.dice:.3f}, parts {was.made_parts:.3f} -> "
@@ -110,12 +110,12 @@ class Judgement:
 def judge(
     config: TrainingConfig, before: Path, after: Path, *, made: int, own: int, progress: Progress = lambda *_: None
 ) -> Judgement:
-    """Solve synthetic images and frames of the recording with two weights files.
+    """Compare fits to synthetic images and to frames of the recording with two weights files.
 
     Args:
-        config: of the run that adapts, with its recording, robots and images.
-        before, after: weights of the surface network.
-        made, own: number of synthetic images, and of frames of the recording, spread over it.
+        config: settings of the adaptation run, with its recording, robots and images.
+        before, after: weights files of the surface network.
+        made, own: number of synthetic images, and of evenly spaced frames of the recording.
         progress: called before every fit.
 
     Raises:
@@ -150,10 +150,10 @@ class MadeImage:
 
     scene: Scene
     frame: Frame
-    """Measured joint positions are the true ones, moved."""
+    """Frame whose measured joint positions are the perturbed true ones."""
 
     def score(self, network: FeatureExtractor) -> tuple[float, float, float]:
-        """Dice, share of right parts and mean distance of tips [px] of a fit."""
+        """Fit the image; returns Dice, share of correct parts, and mean tip error [px]."""
         found, _ = _solved(self.scene, self.frame, network)
         truth = self.scene.state(self.frame.truth or {})
         renderer = Renderer(self.scene, width=_SIZE[0], height=_SIZE[1])
@@ -167,7 +167,7 @@ class MadeImage:
 
 
 def made_images(config: TrainingConfig, number_of_images: int) -> Iterator[MadeImage]:
-    """Images like those of training, whole and without occluders, that neither training nor validation sees."""
+    """Uncropped images without occluders from the training distribution, used in neither training nor validation."""
     width, height = _SIZE
     images = replace(
         config.images, width=width, height=height, field_width=width, occluded=0.0, absent=0.0, coverage=(0.02, 0.5)
@@ -175,7 +175,7 @@ def made_images(config: TrainingConfig, number_of_images: int) -> Iterator[MadeI
     observer = Observer([Robot.load(path) for path in config.robots], images, (config.seed, JUDGING_STREAM))
     for number in range(number_of_images):
         seen = observer(number)
-        # The varied arms, including their thickness, so that the truth is exact.
+        # The model has the same varied proportions as the image, so that the ground truth is exact.
         robots = [geometry.robot for geometry in seen.variant.geometries]
         names = [f"arm{place}" for place in range(len(robots))]
         arms = tuple(
@@ -199,7 +199,7 @@ def _solved(scene: Scene, frame: Frame, network: FeatureExtractor) -> tuple[Scen
 
 
 def _own_fit(recording: Sequence, frame: Frame, network: FeatureExtractor) -> tuple[bool, float, float, np.ndarray]:
-    """Whether a fit of a frame is good, its edges, its parts and its tips."""
+    """Fit a frame; returns whether its verdict is good, edge support, predicted share of parts, and visible tips."""
     state, found = _solved(recording.scene, frame, network)
     edges = []
     for camera in recording.scene.cameras:
@@ -211,7 +211,7 @@ def _own_fit(recording: Sequence, frame: Frame, network: FeatureExtractor) -> tu
 
 
 def edge_support(image: UInt8[np.ndarray, "h w 3"], parts: np.ndarray) -> float:
-    """Mean gradient of an image along the outlines of parts, over its mean everywhere [1]; 1 where there is none."""
+    """Mean image gradient along the outlines of parts, relative to the mean of the image [1]; 1 without outlines."""
     grey = cv2.GaussianBlur(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32), (0, 0), 1.0)
     gradient = np.hypot(cv2.Sobel(grey, cv2.CV_32F, 1, 0), cv2.Sobel(grey, cv2.CV_32F, 0, 1))
     outline = np.zeros(parts.shape, bool)
@@ -221,33 +221,33 @@ def edge_support(image: UInt8[np.ndarray, "h w 3"], parts: np.ndarray) -> float:
 
 
 def _parts(scene: Scene, renderer: Renderer, state: SceneState) -> np.ndarray:
-    """Part of every pixel, counted through all arms [h, w]; -1 for background."""
+    """Part index of every pixel, unique over all arms [h, w]; -1 for background."""
     links = renderer.segment_links(state)[0]
     classes = np.concatenate([link_parts(arm.robot) + 10 * place for place, arm in enumerate(scene.arms)])
     return np.where(links >= 0, classes[np.maximum(links, 0)], -1)
 
 
 def _tips(scene: Scene, state: SceneState) -> Float[np.ndarray, "tips 2"]:
-    """Tips of all arms in the first camera [px]; NaN behind it."""
+    """Image positions of all arms' tips in the first camera [px]; NaN behind the camera."""
     points = [point for arm in scene.arms for point in keypoints(arm) if point.name.endswith(" tip")]
     with torch.no_grad():
         return project_keypoints(scene, state, points, scene.cameras[0].name).double().numpy()
 
 
 def _tips_in_view(scene: Scene, state: SceneState) -> Float[np.ndarray, "tips 2"]:
-    """The same; NaN where they are not in the image."""
+    """Image positions of all arms' tips in the first camera [px]; NaN outside the image."""
     tips, size = _tips(scene, state), (scene.cameras[0].width, scene.cameras[0].height)
     inside = ((tips >= 0) & (tips < size)).all(1, keepdims=True)
     return np.where(inside, tips, np.nan)
 
 
 STEPS = 400
-"""Steps of a run without given steps or time."""
+"""Default number of steps, if neither steps nor time are given."""
 _VALIDATION_EVERY = 40
 BACKGROUNDS = "backgrounds"
-"""Folder of a run with the empty backgrounds of the recording."""
+"""Name of the run's folder with backgrounds of the recording, without arms."""
 _FROM_RECORDING = 0.5
-"""Share of backgrounds that are parts of these."""
+"""Share of training backgrounds that are crops of these."""
 _LEARNING_RATE = 6e-4
 _WARMUP = 15
 _AVERAGE = 0.97
@@ -256,35 +256,35 @@ _PATIENCE = 5
 
 
 REFUSED = "refused.safetensors"
-"""Weights of a run that are not offered."""
+"""File name of weights that are not offered, because a metric became worse."""
 
 
 @dataclass(frozen=True)
 class Offer:
-    """Adapted weights after the comparison."""
+    """Adapted weights with the result of the comparison."""
 
     weights: Path
-    """Weights file, renamed if something became worse."""
+    """Weights file, renamed if a metric became worse."""
     worse: list[str]
-    """What became worse; empty if the weights are offered."""
+    """Metrics that became worse; empty if the weights are offered."""
     lines: list[str]
-    """Summary of figures before and after."""
+    """Summary of the metrics before and after."""
 
 
 def adapted_to(recording: Path, output: Path, given: TrainingConfig) -> TrainingConfig:
-    """Settings that adapt the surface network to a recording; its backgrounds are written to `output`.
+    """Settings that adapt the surface network to a recording, whose backgrounds are written to `output`.
 
-    Robots, start, steps and time are those of `given` unless they are defaults.
+    Robots, initial weights, steps and time are taken from `given` unless they have default values there.
 
     Args:
-        recording: sequence file; of its images, only the empty background enters the training.
-        output: folder of the run, created once the recording could be read.
+        recording: sequence file; only the background without arms is used from its images.
+        output: folder of the run, created after the recording was read.
         given: settings for everything else.
 
     Raises:
         SequenceError: the recording cannot be read.
         OutputError: `output` cannot be written to.
-        BusyError: another run writes there.
+        BusyError: another run writes to `output`.
     """
     sequence = Sequence.open(recording)
     with locked_folder(output):
@@ -315,7 +315,7 @@ def adapted_to(recording: Path, output: Path, given: TrainingConfig) -> Training
 
 
 def _write_backgrounds(sequence: Sequence, output: Path) -> int:
-    """Write the empty backgrounds of a sequence's cameras; gives how many can be estimated."""
+    """Write the backgrounds without arms of a sequence's cameras; returns the number that could be estimated."""
     found = 0
     for camera in sequence.scene.cameras:
         background = sequence.mean_background(camera.name)
@@ -337,9 +337,9 @@ def gain(before: dict[str, float], now: dict[str, float]) -> str:
 
 
 def offer(config: TrainingConfig, result: TrainingResult, progress: Progress, made: int, own: int) -> Offer:
-    """Compare fits with the weights of the start and of a run; weights that are worse anywhere are put aside.
+    """Compare fits with the initial and with the adapted weights; adapted weights with a worse metric are set aside.
 
-    `config` is that of `adapted_to`, `result` the run's; other arguments as in `judge`.
+    `config` is the result of `adapted_to`, `result` that of the run; other arguments as in `judge`.
     """
     assert config.start is not None
     aside = output_path(result.weights.parent, REFUSED)
@@ -350,7 +350,7 @@ def offer(config: TrainingConfig, result: TrainingResult, progress: Progress, ma
     report = {"worse": worse, "figures": judgement.lines(), "made": made, "own": own}
     write_text(output_path(result.weights.parent, "report") / "fits.json", json.dumps(report, indent=1))
     if worse:
-        # The page and later commands look for weights under their usual name only.
+        # The page and later commands load weights only under the usual name.
         write_bytes(aside, read_bytes(result.weights, WEIGHTS))
         remove_file(output_path(result.weights.parent, result.weights.name))
     return Offer(aside.path if worse else result.weights, worse, judgement.lines())

@@ -1,4 +1,4 @@
-"""Training batches, made in worker processes while the network trains."""
+"""Training batches, generated in worker processes during training."""
 
 import multiprocessing
 import os
@@ -27,10 +27,10 @@ _MEMORY = 300
 
 
 class _Samples(Dataset):
-    """Training samples by number, so that a resumed run has the same samples as an uninterrupted one.
+    """Data set of training samples by number, so that a resumed run uses the same samples as an uninterrupted one.
 
-    With one worker, or none, `reuse` has every so manieth sample made, and the others chosen of the newest `_MEMORY`
-    made ones. With several, batches are dealt to them in turn, and each chooses of its own.
+    One of `reuse` samples is generated; the others are drawn from the newest `_MEMORY` generated ones and mirrored at
+    random. Batches are distributed over the workers in turn, and each worker draws from its own samples.
     """
 
     def __init__(self, config: TrainingConfig) -> None:
@@ -53,7 +53,7 @@ class _Samples(Dataset):
         return task.tensors(task.flipped(sample, bool(rng.integers(2)), bool(rng.integers(2))))
 
     def _sample(self, lane: int, number: int, newest: int) -> Any:
-        """A made sample; one from before a run was stopped is made again."""
+        """Generated sample; regenerated if it was made before the run was interrupted."""
         key = lane, number
         if key not in self._made:
             if lane not in self._generators:
@@ -69,7 +69,7 @@ class _Samples(Dataset):
     def _share_processor(self) -> None:
         if self._alone or get_worker_info() is None:
             return
-        # One thread per process: the processes themselves fill the cores. Training itself goes first.
+        # One thread per process, since the processes occupy all cores. Lower priority than the training process.
         torch.set_num_threads(1)
         cv2.setNumThreads(1)
         os.nice(_NICENESS)
@@ -77,7 +77,7 @@ class _Samples(Dataset):
 
 
 def _outlive_signals(closing: Event, parent: int, worker: int) -> None:
-    """Ignore signals of the process group: the parent ends its workers after saving."""
+    """Ignore signals to the process group, since the parent ends its workers after saving."""
     end_with_parent(parent, signal.SIGKILL)
 
     def end_if_closing(*_: object) -> None:
@@ -92,9 +92,9 @@ def _outlive_signals(closing: Event, parent: int, worker: int) -> None:
 
 @contextmanager
 def training_batches(config: TrainingConfig, first_step: int) -> Iterator[Iterator[Batch]]:
-    """Endless batches of the task's tensors, for as long as the context lasts; then the workers end.
+    """Context manager of an endless stream of the task's batches; its exit ends the workers.
 
-    A batch depends on the seed, the number of workers and its own number, wherever the stream starts.
+    A batch depends on the seed, the number of workers and its number only, not on the first step.
     """
     # A forked child hangs in OpenMP as soon as the parent has used threads.
     spawning = multiprocessing.get_context("spawn")
@@ -117,13 +117,13 @@ def training_batches(config: TrainingConfig, first_step: int) -> Iterator[Iterat
 
 
 def _stream(loader: DataLoader) -> Generator[Batch]:
-    """The loader's batches; closing it drops the loader's iterator, which ends its workers."""
+    """Batches of a loader; closing the generator drops the loader's iterator, which ends its workers."""
     for batch in loader:
         yield tuple(batch)
 
 
 def validation_set(config: TrainingConfig) -> Batch:
-    """Validation samples, from a fixed stream of random numbers that training does not use."""
+    """Batch of validation samples, from a fixed random stream that training does not use."""
     task = task_of(config.network)
     generator = task.generator(config, (config.seed, VALIDATION_STREAM))
     samples = [task.tensors(generator(number)) for number in range(config.validation_samples)]

@@ -31,13 +31,13 @@ class History:
     """Losses, validations and times of a run."""
 
     losses: list[dict[str, float]] = field(default_factory=list)
-    """Per logged step: `step`, `loss` and each term, averaged since the last entry."""
+    """One entry per logged step: `step`, `loss` and each term, averaged since the last entry."""
     validations: list[dict[str, float]] = field(default_factory=list)
-    """Per validation: `step` and the metrics of the task."""
+    """One entry per validation: `step` and the metrics of the task."""
     seconds: float = 0.0
     """Wall time spent in training steps [s]."""
     processor_seconds: float = 0.0
-    """Processor time of each thread of the training process there [s]."""
+    """CPU time of the training process in these steps, divided by its number of threads [s]."""
 
     @property
     def first(self) -> dict[str, float] | None:
@@ -53,7 +53,7 @@ def save_checkpoint(
     config_json: str,
     history: History,
 ) -> None:
-    """Write `checkpoint.safetensors` with the state of modules by name, optimizer and run, atomically."""
+    """Atomically write `checkpoint.safetensors` with the state of modules by name, optimizer and run."""
     tensors = {f"{name}/{key}": value for name, module in modules.items() for key, value in module.state_dict().items()}
     for index, state in optimizer.state_dict()["state"].items():
         tensors |= {f"optimizer/{index}/{key}": value for key, value in state.items()}
@@ -70,7 +70,7 @@ class Checkpoint:
     config_json: str
     history: History
     tensors: dict[str, Tensor]
-    """Of modules by name, and of the optimizer."""
+    """Tensors of the modules, by module name, and of the optimizer."""
 
     def restore(self, modules: dict[str, torch.nn.Module], optimizer: torch.optim.Optimizer) -> None:
         """Load the state into modules and optimizer."""
@@ -88,10 +88,10 @@ class Checkpoint:
 
 
 def load_checkpoint(folder: Path) -> Checkpoint | None:
-    """Checkpoint of a run; None before the first one.
+    """Read the checkpoint of a run; None if there is none yet.
 
     Raises:
-        WeightsError: the file is there and cannot be read.
+        WeightsError: the file exists but cannot be read.
     """
     path = folder / CHECKPOINT_FILE
     if not path.exists():
@@ -114,15 +114,15 @@ Batch = TypeVar("Batch")
 
 
 class TrainingLoop:
-    """Trains a network with AdamW, or resumes the run whose checkpoint lies in a folder.
+    """Trains a network with AdamW, or resumes the run whose checkpoint is in `output`.
 
     Args:
-        output: folder of the checkpoint.
+        output: folder for the checkpoint.
         network: the trained network, on its device.
         settings: steps, time limit and learning rate.
         config_json: settings of the run, stored in the checkpoint.
         may_change: names in `config_json` that may differ when the run is resumed.
-        further: other modules whose state is stored, by name.
+        further: further modules whose state is stored, by name.
 
     Raises:
         SettingsError: the folder holds a run with other settings.
@@ -144,7 +144,7 @@ class TrainingLoop:
             network.parameters(), settings.learning_rate, weight_decay=settings.weight_decay
         )
         self.step = 0
-        """Number of steps done."""
+        """Number of completed steps."""
         self.history = History()
         self._resume(may_change)
         self._saved = self.step
@@ -175,7 +175,7 @@ class TrainingLoop:
         updated: Callable[[], None] = lambda: None,
         ends: Callable[[bool], bool] = lambda last: last,
     ) -> None:
-        """Train until the planned steps are done or `ends` says so; a signal waits for the end of a step.
+        """Train until the planned steps are done or `ends` returns true; signals are handled at the end of a step.
 
         Args:
             batches: training batches.
@@ -221,7 +221,7 @@ class TrainingLoop:
 
     @property
     def planned(self) -> int:
-        """Steps of the whole run: those asked for, or fewer if the time limit allows no more at the pace so far."""
+        """Total number of steps: as set, or fewer if the time limit requires it at the present speed."""
         if self._settings.minutes is None or self.step == 0:
             return self._settings.steps
         seconds = self.history.processor_seconds + self._processor_seconds()
@@ -229,13 +229,13 @@ class TrainingLoop:
         return min(self._settings.steps, max(self.step, allowed))
 
     def save(self) -> None:
-        """Store the steps since the last checkpoint; for a run that is stopped between two steps."""
+        """Write a checkpoint if there are steps since the last one; used when a run is stopped between two steps."""
         if self.step > self._saved:
             self._take_time()
             self._checkpoint()
 
     def _processor_seconds(self) -> float:
-        """Processor time per thread since it was last added to the history [s]."""
+        """CPU time per thread that is not yet in the history [s]."""
         return (time.process_time() - self._worked) / self._settings.threads
 
     def _take_time(self) -> float:
@@ -252,7 +252,7 @@ class TrainingLoop:
 
 
 def schedule(step: int, warmup: int, steps: int) -> float:
-    """Factor on the learning rate: a linear rise, then a cosine down to a hundredth."""
+    """Learning-rate factor: linear warm-up, then cosine decay to 0.01."""
     rise = min(1.0, (step + 1) / max(warmup, 1))
     done = min(1.0, max(0.0, (step - warmup) / max(steps - warmup, 1)))
     return rise * (0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * done)))

@@ -17,29 +17,29 @@ from ...settings import NetworkName, TrainingConfig
 from ..randomization import SURFACE_UNIT, PairGenerator, SurfaceGenerator, SurfaceSample, TrainingPair
 
 Batch = tuple[Tensor, ...]
-"""Tensors of bytes, each with a leading dimension of samples."""
+"""Byte tensors, each with a leading batch dimension."""
 
 
 def flips(array: np.ndarray, horizontally: bool, vertically: bool) -> np.ndarray:
-    """An image [h, w, ...] mirrored."""
+    """Mirror an image [h, w, ...]."""
     return array[:: -1 if vertically else 1, :: -1 if horizontally else 1]
 
 
 def byte_tensor(array: np.ndarray) -> Tensor:
-    """An image [h, w, channels] as a tensor [channels, h, w]."""
+    """Convert an image [h, w, channels] to a tensor [channels, h, w]."""
     return torch.from_numpy(np.ascontiguousarray(array.transpose(2, 0, 1)))
 
 
 def dice(predicted: Tensor, truth: Tensor) -> Tensor:
-    """Dice of boolean masks [..., h, w]; 1 where both are empty."""
+    """Dice of boolean masks [..., h, w]; 1 if both are empty."""
     overlap = (predicted & truth).sum((-2, -1))
     return (2 * overlap + 1e-9) / (predicted.sum((-2, -1)) + truth.sum((-2, -1)) + 1e-9)
 
 
 def pooled_dice(predicted: Bool[Tensor, "n h w"], truth: Bool[Tensor, "n h w"]) -> float:
-    """Dice of the pixels of all images together; 1 where both are empty.
+    """Dice over the pixels of all images together; 1 if both masks are empty.
 
-    A mean over images would hang on those that show no arm: their own Dice is 1, or 0 as soon as one pixel is wrong.
+    A mean over images would be dominated by those without an arm: their Dice is 1, or 0 if a single pixel is wrong.
     """
     return float(dice(predicted.flatten(0, 1), truth.flatten(0, 1)))
 
@@ -63,11 +63,11 @@ def consistency_loss(
     classes_a: Int[Tensor, "batch h w"],
     classes_b: Int[Tensor, "batch h w"],
 ) -> Float[Tensor, ""]:
-    """Deviation of cosine similarities from their targets near the instruments, where ACS attends.
+    """Loss on the cosine similarity of features near the instruments, where ACS compares them.
 
-    Where both images show the same class the cosine should be 1; where one shows background and the other an
-    instrument, not above 0; where one shows the shaft and the other the head, not above 0.6. Each of these counts by
-    its own mean, since background would outweigh instruments otherwise.
+    Targets of the cosine: 1 where both images show the same class; at most 0 where one shows background and the other
+    an instrument; at most 0.6 where one shows the shaft and the other the head. The terms are averaged separately,
+    since background would otherwise outweigh instruments.
     """
     overlap = (features_a * features_b).sum(1)
     similarity = overlap * torch.rsqrt(features_a.square().sum(1) * features_b.square().sum(1) + _TINY)
@@ -85,26 +85,26 @@ def consistency_loss(
 
 
 def dilated(mask: Float[Tensor, "batch h w"]) -> Float[Tensor, "batch h w"]:
-    """The mask and its neighbourhood."""
-    # A square's maximum is the maximum along rows of the maxima along columns.
+    """Mask dilated by a square."""
+    # The square structuring element is separable.
     rows = functional.max_pool2d(mask[:, None], (_NEIGHBOURHOOD, 1), 1, (_NEIGHBOURHOOD // 2, 0))
     return functional.max_pool2d(rows, (1, _NEIGHBOURHOOD), 1, (0, _NEIGHBOURHOOD // 2))[:, 0]
 
 
 def _weighted(terms: dict[str, Tensor], weights: object) -> Tensor:
-    """Sum of terms, weighted by the fields of the same names."""
+    """Sum of terms, weighted by the fields of the same names in `weights`."""
     return torch.stack([getattr(weights, name) * term for name, term in terms.items()]).sum()
 
 
 def weighted_mean(values: Tensor, weights: Tensor) -> Tensor:
-    """Mean under weights; about zero where all weights are."""
+    """Weighted mean; about zero if all weights are zero."""
     return (values * weights).sum() / (weights.sum() + 1)
 
 
 class FeatureTask:
-    """Network, samples, loss and validation of the feature network; stateless, so that workers can create their own.
+    """Training task of the feature network; stateless, so that each worker can create its own.
 
-    A batch is images [batch, 2, 3, h, w] and classes [batch, 2, h, w] of observed and hybrid images, in bytes.
+    A batch consists of images [batch, 2, 3, h, w] and classes [batch, 2, h, w] of observed and hybrid images, as bytes.
     """
 
     columns: ClassVar[dict[str, str]] = {
@@ -113,31 +113,31 @@ class FeatureTask:
         "similarity_aligned": "cosine, aligned",
         "similarity_misaligned": "cosine, misaligned",
     }
-    """Validation figures: name -> heading in the report."""
+    """Validation metrics: name -> heading in the report."""
     score: ClassVar[str] = "dice_observed"
     """Name of the metric by which networks are compared; higher is better."""
 
     def network(self, config: TrainingConfig) -> FeatureNetwork:
-        """A network with random weights."""
+        """Network with random weights."""
         return FeatureNetwork(config.architecture)
 
     def generator(self, config: TrainingConfig, stream: Sequence[int]) -> PairGenerator:
-        """Generator of pairs by number, counted from 0; streams of a seed are independent."""
+        """Generator of pairs by number, from 0; different streams are independent."""
         return PairGenerator([Robot.load(path) for path in config.robots], config.images, stream)
 
     def flipped(self, sample: TrainingPair, horizontally: bool, vertically: bool) -> TrainingPair:
-        """A pair mirrored; a mirrored instrument is still one."""
+        """Mirror a pair; mirrored instruments remain valid samples."""
         parts = sample.observed, sample.observed_classes, sample.hybrid, sample.hybrid_classes
         return TrainingPair(*(flips(part, horizontally, vertically) for part in parts))
 
     def tensors(self, sample: Any) -> Batch:
-        """A pair as tensors of bytes."""
+        """Pair as byte tensors."""
         images = np.stack([sample.observed, sample.hybrid]).transpose(0, 3, 1, 2)
         classes = np.stack([sample.observed_classes, sample.hybrid_classes])
         return torch.from_numpy(np.ascontiguousarray(images)), torch.from_numpy(np.ascontiguousarray(classes))
 
     def loss(self, config: TrainingConfig, network: Any, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
-        """The weighted loss, and each term before weighting."""
+        """Weighted loss, and each term before weighting."""
         images, classes = batch[0].float() / 255, batch[1]
         features = network.features(images.flatten(0, 1).contiguous(memory_format=torch.channels_last))
         logits = network.head(features)[:, 0]
@@ -152,10 +152,10 @@ class FeatureTask:
 
     @torch.no_grad()
     def validate(self, network: Any, batch: Batch) -> dict[str, float]:
-        """Figures of a folded network, by the names in `columns`.
+        """Validation metrics of a folded network, by the names in `columns`.
 
-        `dice_*`: Dice of the predicted mask. `similarity_aligned`: cosine between features of observed and hybrid image
-        where both show an instrument; `similarity_misaligned`: the same where only one of them does.
+        `dice_*`: Dice of the predicted mask. `similarity_aligned`: cosine similarity of the features of observed and
+        hybrid image where both show an instrument; `similarity_misaligned`: where only one of them does.
         """
         dices, aligned, misaligned = [], [], []
         device = next(network.parameters()).device
@@ -176,12 +176,12 @@ class FeatureTask:
         }
 
     def worse(self, now: dict[str, float], first: dict[str, float]) -> bool:
-        """Whether a metric other than `score` is worse than at the start, so that weights are rejected."""
+        """Whether a metric other than `score` is worse than at the start; the weights are then rejected."""
         return False
 
     @torch.no_grad()
     def panels(self, network: Any, batch: Batch) -> list[list[tuple[str, np.ndarray]]]:
-        """Example predictions of a folded network: per sample, titled pictures."""
+        """Example predictions of a folded network: titled images per sample."""
         rows = []
         for pair, truth in zip(batch[0].float() / 255, batch[1].cpu().numpy() > 0, strict=True):
             features = network.features(pair.to(next(network.parameters()).device))
@@ -201,7 +201,7 @@ class FeatureTask:
 
 
 def _confusion(predicted: np.ndarray, truth: np.ndarray) -> np.ndarray:
-    """True positives white, true negatives black, false positives orange, false negatives red, as in the paper."""
+    """Confusion image: true positives white, true negatives black, false positives orange, false negatives red."""
     image = np.zeros((*truth.shape, 3))
     image[predicted & truth] = 1, 1, 1
     image[predicted & ~truth] = 1, 0.6, 0.1
@@ -212,13 +212,13 @@ def _confusion(predicted: np.ndarray, truth: np.ndarray) -> np.ndarray:
 _PART_WORSE, _TIP_WORSE = 0.005, 0.2
 """Thresholds of "worse": decrease of a part's Dice [1], increase of the tip error [px]."""
 _LOST = 20.0
-"""Error of a tip that is not predicted, and the most that one counts [px]."""
+"""Upper bound of a tip error, also used for tips that are not predicted [px]."""
 _SMOOTH = 0.2
 _AT_ONCE, _PAIRS_AT_ONCE = 8, 4
 
 
 class SurfaceTask:
-    """The same as `FeatureTask` for the surface network. A batch is images, given and true surface maps."""
+    """Training task of the surface network. A batch consists of images, prior surface maps and true surface maps."""
 
     columns: ClassVar[dict[str, str]] = {
         "dice": "Dice of the arms",
@@ -231,15 +231,15 @@ class SurfaceTask:
     score: ClassVar[str] = "dice"
 
     def network(self, config: TrainingConfig) -> SurfaceNetwork:
-        """A network with random weights."""
+        """Network with random weights."""
         return SurfaceNetwork(config.architecture)
 
     def generator(self, config: TrainingConfig, stream: Sequence[int]) -> SurfaceGenerator:
-        """Generator of samples by number."""
+        """Generator of samples by number, from 0."""
         return SurfaceGenerator([Robot.load(path) for path in config.robots], config.images, stream)
 
     def flipped(self, sample: SurfaceSample, horizontally: bool, vertically: bool) -> SurfaceSample:
-        """A sample mirrored; normals turn with it."""
+        """Mirror a sample, including its normals."""
         observed, given, surface = (
             flips(part, horizontally, vertically) for part in (sample.observed, sample.given, sample.surface)
         )
@@ -249,11 +249,11 @@ class SurfaceTask:
         return SurfaceSample(observed, given * turn, surface * turn)
 
     def tensors(self, sample: Any) -> Batch:
-        """A sample as tensors of bytes."""
+        """Sample as byte tensors."""
         return byte_tensor(sample.observed), byte_tensor(sample.given), byte_tensor(sample.surface)
 
     def loss(self, config: TrainingConfig, network: Any, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
-        """The weighted loss, and each term before weighting."""
+        """Weighted loss, and each term before weighting."""
         images, given, surface = _floats(batch)
         predicted = network(images, given)
         coverage = surface[:, COVERAGE]
@@ -271,7 +271,7 @@ class SurfaceTask:
 
     @torch.no_grad()
     def validate(self, network: Any, batch: Batch) -> dict[str, float]:
-        """Figures of a folded network."""
+        """Validation metrics of a folded network, by the names in `columns`."""
         images, given, surface = _floats(batch)
         seen = _seen(network, images, given)
         true, guess = (maps[:, COVERAGE].sum(1) > 0.5 for maps in (surface, seen))
@@ -291,14 +291,14 @@ class SurfaceTask:
 
     def worse(self, now: dict[str, float], first: dict[str, float]) -> bool:
         """Whether the Dice of a part or the tip error is worse than at the start."""
-        # Runs of earlier versions have no such figures.
+        # Runs of earlier versions lack these metrics.
         names = [name for name in (f"dice_{part}" for part in PARTS) if name in first]
         parts = any(now[name] < first[name] - _PART_WORSE for name in names)
         return parts or now["tip_error"] > first.get("tip_error", math.inf) + _TIP_WORSE
 
     @torch.no_grad()
     def panels(self, network: Any, batch: Batch) -> list[list[tuple[str, np.ndarray]]]:
-        """Example predictions of a folded network."""
+        """Example predictions of a folded network: titled images per sample."""
         images, given, surface = _floats(batch)
         seen = _seen(network, images, given)
         rows = []
@@ -317,9 +317,9 @@ class SurfaceTask:
 
 
 def tip_error(seen: Float[Tensor, "n channels h w"], surface: Float[Tensor, "n channels h w"]) -> float:
-    """Mean distance of predicted tips from true ones, over images that show the jaws [px].
+    """Mean distance between predicted and true tips, over images that show the jaws [px].
 
-    The tip is the pixel of the jaws that is farthest from the middle of the shaft, or of what is seen of the arm.
+    The tip is the jaw pixel farthest from the centre of the visible shaft or, without a shaft, of the visible arm.
     """
     errors = []
     for ours, theirs in zip(seen[:, COVERAGE] > 0.5, surface[:, COVERAGE] > 0.5, strict=True):
@@ -332,7 +332,7 @@ def tip_error(seen: Float[Tensor, "n channels h w"], surface: Float[Tensor, "n c
 
 
 def _middle(parts: Tensor) -> Tensor | None:
-    """Centre of the shaft, or of the arm where no shaft is visible; None without either."""
+    """Centre of the visible shaft or, without a shaft, of the visible arm; None if neither is visible."""
     pixels = (parts[0] if parts[0].any() else parts.any(0)).nonzero()
     return pixels.float().mean(0) if len(pixels) else None
 
@@ -349,7 +349,7 @@ def _floats(batch: Batch) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _seen(network: SurfaceNetwork, images: Tensor, given: Tensor) -> Tensor:
-    """Predicted surface maps of many images, on their device; the network may be on another one."""
+    """Predicted surface maps of many images, on the images' device; the network may be on another device."""
     device = next(network.parameters()).device
     parts = zip(images.split(_AT_ONCE), given.split(_AT_ONCE), strict=True)
     return torch.cat([network(image.to(device), known.to(device)).map().to(images.device) for image, known in parts])
@@ -363,5 +363,5 @@ Task = FeatureTask | SurfaceTask
 
 
 def task_of(network: NetworkName) -> Task:
-    """Task of a network."""
+    """Create the training task of a network."""
     return FeatureTask() if network == "feature" else SurfaceTask()

@@ -27,17 +27,17 @@ from .tasks import Batch, task_of
 
 
 def grow(larger: Network, trained: nn.Module) -> Network:
-    """Copy the weights of a trained network into a larger one of the same kind, with the same output.
+    """Copy the weights of a trained network into a larger one of the same kind, preserving its output.
 
-    New channels keep their random weights, but no trained channel reads them yet; new convolutions at the end of a
-    block pass trained channels on unchanged.
+    New channels keep their random weights, but trained channels ignore them; new convolutions at the end of a block are
+    the identity on trained channels.
 
     Args:
-        larger: a fresh network; changed in place and returned.
-        trained: a network with as many channels or fewer, and as many convolutions per block or fewer.
+        larger: newly created network; changed in place and returned.
+        trained: network with at most as many channels, and at most as many convolutions per block.
 
     Raises:
-        SettingsError: some layer of `trained` is larger than that of `larger`, or has no counterpart in it.
+        SettingsError: a layer of `trained` is larger than its counterpart in `larger`, or has none.
     """
     old_layers, new_layers = dict(trained.named_modules()), dict(larger.named_modules())
     for name in old_layers:
@@ -79,7 +79,7 @@ def _embed_convolution(name: str, layer: nn.Conv2d, old: nn.Conv2d | None, befor
 
 
 def _pass_through(layer: nn.BatchNorm2d, before: nn.BatchNorm2d) -> None:
-    """Invert the normalization for ReLU outputs of `before`, assuming normally distributed inputs."""
+    """Set a batch norm to the identity on ReLU outputs of `before`, whose inputs are assumed normally distributed."""
     kept = before.num_features
     shift, scale = before.bias, before.weight.abs().clamp(min=1e-6)
     ratio = shift / scale
@@ -105,20 +105,20 @@ def _put(name: str, own: Tensor, theirs: Tensor) -> None:
 
 @dataclass(frozen=True)
 class TrainingProgress:
-    """Progress of a run, once per logged step."""
+    """Progress of a run, reported once per logged step."""
 
     step: int
-    """Steps done."""
+    """Number of completed steps."""
     steps: int
-    """Steps in all; an estimate in a run of limited time."""
+    """Total number of steps; an estimate if the run has a time limit."""
     loss: float
-    """Loss, averaged over the last steps."""
+    """Mean loss of the last steps."""
     seconds_per_step: float
     """Wall time per step [s]."""
     validation: dict[str, float] | None
-    """Newest validation."""
+    """Metrics of the latest validation."""
     first: dict[str, float] | None
-    """First validation of the run, across interruptions."""
+    """Metrics of the first validation of the run, including resumed parts."""
 
 
 @dataclass(frozen=True)
@@ -128,11 +128,11 @@ class TrainingResult:
     weights: Path
     """Weights file, ready for `FeatureExtractor.load`."""
     report: Path
-    """The training report."""
+    """Page of the training report."""
     validation: dict[str, float]
-    """Figures of the saved weights."""
+    """Metrics of the saved weights."""
     first: dict[str, float] | None
-    """Figures of the run's first validation; None of a run that had none."""
+    """Metrics of the run's first validation; None without validation."""
     seconds: float
     """Wall time spent in training steps, over all resumed parts [s]."""
 
@@ -140,7 +140,7 @@ class TrainingResult:
 matplotlib.use("Agg")
 
 Panels = list[list[tuple[str, np.ndarray]]]
-"""Per sample, titled pictures; one without colours runs from -1 to 1."""
+"""Titled images per sample; images without colour channels have values from -1 to 1."""
 
 
 def write_report(folder: OutputPath, config: dict, history: History, columns: dict[str, str], examples: Panels) -> Path:
@@ -210,11 +210,11 @@ def train(
     """Train a network, or resume the run in `output`.
 
     The run writes `checkpoint.safetensors` periodically, the weights after every validation, and `report/` at the
-    end. After a kill the same call resumes from the last checkpoint.
+    end. If the process is killed, the same call resumes from the last checkpoint.
 
     Raises:
         SettingsError: `output` holds a run with other settings.
-        WeightsError: its checkpoint, or the weights to start from, cannot be read.
+        WeightsError: the checkpoint or the initial weights cannot be read.
         RobotError: a robot cannot be loaded.
         OutputError: `output` cannot be written to, or another process trains there.
     """
@@ -230,7 +230,7 @@ def train(
 
 
 class _Run:
-    """A training run: its loop, the exponential average of the weights, and the validations of that average."""
+    """Training run: training loop, exponential moving average of the weights, and validations of that average."""
 
     def __init__(self, config: TrainingConfig, output: Path) -> None:
         self.config, self.output, self.task = config, output, task_of(config.network)
@@ -243,11 +243,11 @@ class _Run:
         self.history = self.loop.history
 
     def finish(self, progress: Callable[[TrainingProgress], None]) -> TrainingResult:
-        """Do the steps that are left, validate, and write weights and report."""
+        """Do the remaining steps, validate, and write weights and report."""
         samples = validation_set(self.config)
         validation, loop = None, self.loop
         if self.config.patience is not None and not self.history.validations:
-            # The validation of the start is the baseline for `patience`.
+            # The initial validation is the baseline for `patience`.
             validation = self._validate(samples)
             progress(TrainingProgress(loop.step, loop.planned, math.nan, math.nan, validation, validation))
         if loop.step < loop.planned and not self._has_ended_gaining():
@@ -266,7 +266,7 @@ class _Run:
     def _train(
         self, samples: Batch, validation: dict[str, float] | None, progress: Callable[[TrainingProgress], None]
     ) -> dict[str, float] | None:
-        """Train to the end; returns the newest validation, which is the given one if there was no other."""
+        """Train to the end; returns the latest validation, or `validation` if there was none."""
 
         def loss(batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
             return self.task.loss(self.config, self.network, tuple(part.to(self.config.device) for part in batch))
@@ -294,7 +294,7 @@ class _Run:
         return validation
 
     def kept(self) -> str:
-        """What a stopped run leaves, for the terminal."""
+        """Terminal message on the files of a stopped run."""
         if self.loop.step == 0:
             return f"no step was made; weights in {self.output}, if there are any, are those of the start"
         return f"{self.output} holds {counted(self.loop.step, 'step')}; the same command goes on from there"
@@ -305,7 +305,7 @@ class _Run:
         return network
 
     def _score(self, entry: dict[str, float]) -> float:
-        """Score of a validation, higher is better; minus infinity where a metric is worse than at the start."""
+        """Score of a validation, higher is better; minus infinity if a metric is worse than at the start."""
         worse = self.history.first is not None and self.task.worse(entry, self.history.first)
         return -math.inf if worse else entry[self.task.score]
 
@@ -318,7 +318,7 @@ class _Run:
         return validation
 
     def _has_ended_gaining(self) -> bool:
-        """Whether none of the newest `patience` validations is better than the best one before them."""
+        """Whether none of the latest `patience` validations is better than the best one before them."""
         patience = self.config.patience
         scores = [self._score(entry) for entry in self.history.validations]
         if patience is None or len(scores) <= patience:
@@ -328,7 +328,7 @@ class _Run:
     def _save(self, validation: dict[str, float]) -> None:
         training = {"step": self.loop.step, "validation": validation, "config": json.loads(config_json(self.config))}
         field = self.config.images.field_width
-        # The camera's image is 4:3, as an endoscope's is; training images are crops of it.
+        # The camera's image is 4:3, as of an endoscope; training images are crops of it.
         save_weights(self._averaged(), weights_file(self.config, self.output), training, (field, field * 3 // 4))
 
 
@@ -357,19 +357,19 @@ def _first_network(config: TrainingConfig) -> UNet:
 
 
 def _as_large_as_start(config: TrainingConfig) -> TrainingConfig:
-    """The settings with the architecture of the weights to start from, if none was asked for."""
+    """Settings with the architecture of the initial weights, unless another one was set."""
     if config.start is None or config.architecture != Architecture():
         return config
     return replace(config, architecture=read_weights(config.start).network.architecture)
 
 
 def weights_file(config: TrainingConfig, output: Path) -> Path:
-    """Where a run leaves its weights."""
+    """Path of a run's weights file."""
     return output / f"{config.network}.safetensors"
 
 
 def config_json(config: TrainingConfig) -> str:
-    """The settings as JSON, with files by name only, so that a run can be moved."""
+    """Settings as JSON, with files by name only, so that a run's files can be moved."""
     settings = asdict(config)
     settings["start"] = config.start.name if config.start else None
     settings["robots"] = [path.name for path in config.robots]
