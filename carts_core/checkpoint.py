@@ -1,7 +1,7 @@
-"""Intermediate results on disk, with which a stopped run continues to the same result.
+"""Checkpoints of intermediate results, from which a stopped run resumes with an identical result.
 
-An entry is named by the content of everything that it was computed from, so the order does not matter and a changed
-input finds nothing. A line that a kill or a full disk has cut off is not used, and neither is an altered one.
+The key of an entry is a hash of all inputs of its computation, so entries do not depend on the order of computation,
+and a changed input invalidates them. Truncated or altered lines are ignored.
 """
 
 import json
@@ -25,11 +25,11 @@ class Checkpoint:
     """File of intermediate results.
 
     Args:
-        made_with: fingerprint of the common inputs; a file with another one is replaced.
-        classes: the frozen dataclasses that values consist of, beside numbers, lists and float64 arrays.
+        made_with: fingerprint of the common inputs; a file with a different fingerprint is replaced.
+        classes: the frozen dataclasses that values may contain, besides numbers, lists and float64 arrays.
 
     Attributes:
-        recalled: number of values that were looked up.
+        recalled: number of values read from the file.
     """
 
     def __init__(self, path: OutputPath, made_with: str, classes: Sequence[type]) -> None:
@@ -40,7 +40,7 @@ class Checkpoint:
         self.recalled = 0
 
     def value(self, key: str, compute: Callable[[], Value]) -> Value:
-        """The stored value of a key, or else the computed one, which is stored.
+        """Return the stored value of a key, or compute and store it.
 
         Raises:
             OutputError: the file cannot be written.

@@ -14,8 +14,8 @@ _SAID = "CARTS_COMPILED_UNCACHED"
 def compiled(function: Callable[..., Any]) -> Any:
     """`function` compiled by numba, with a cache on disk.
 
-    Where neither its folder nor the user's cache can be written to, it is compiled anew in each process, which takes
-    some seconds; a line on standard error announces it once.
+    If neither the module's folder nor the user's cache is writable, each process compiles it again, which takes some
+    seconds; a warning is printed once on standard error.
     """
     options: dict[str, Any] = {"nogil": True, "fastmath": False, "error_model": "numpy"}
     try:

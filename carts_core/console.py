@@ -1,7 +1,7 @@
-"""Console output in which foreign text is complete and harmless.
+"""Console output that escapes markup and control characters in untrusted text.
 
-Names, paths and errors come from files of others. Square brackets in them are no markup, and characters that would
-steer a terminal, or turn the order of what follows, are shown as escapes.
+Names, paths and error messages may come from untrusted files. Square brackets in them are not interpreted as markup;
+characters that control the terminal or reverse the text direction are shown as escapes.
 """
 
 import logging
@@ -29,12 +29,12 @@ from rich.text import Text
 T = TypeVar("T")
 
 _BETWEEN_LINES = 10.0
-"""Interval between lines of progress in a file or a pipe [s]."""
+"""Interval between progress lines written to a file or a pipe [s]."""
 _KEPT = "\n\t"
 _HIDDEN_CATEGORIES = ("Cc", "Cf", "Cs", "Zl", "Zp")
 """Control, format and surrogate characters, and separators of lines and paragraphs."""
 _MARKDOWN = re.compile(r"([\\`*{}\[\]#|!]|(?<![A-Za-z0-9])_|_(?![A-Za-z0-9]))")
-"""Characters with a meaning in Markdown; it ignores underscores inside a word."""
+"""Characters with a meaning in Markdown, except underscores inside a word."""
 
 
 def visible(text: str) -> str:
@@ -58,7 +58,7 @@ class Terminal(Console):
     """A console without markup, emoji codes or control characters."""
 
     def render_str(self, text: str, **options: Any) -> Text:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """As in rich, for every string that is printed."""
+        """Convert a string to text without markup; overrides rich's method."""
         return super().render_str(visible(text), **{**options, "markup": False, "emoji": False})
 
     def print_error(self, error: BaseException) -> None:
@@ -83,14 +83,14 @@ class Bar(Progress):
         self._printed = -math.inf
 
     def add_task(self, description: str, *args: Any, **fields: Any) -> TaskID:
-        """As in rich; in a file or a pipe, progress is printed as lines on standard error."""
+        """Add a task as in rich; without a terminal, progress is printed as lines on standard error."""
         task = super().add_task(description, *args, **fields)
         self._printed = -math.inf
         self._print(task)
         return task
 
     def update(self, task_id: TaskID, **changes: Any) -> None:
-        """As in rich; see `add_task`."""
+        """Update a task as in rich; see `add_task`."""
         super().update(task_id, **changes)
         self._print(task_id)
 
@@ -103,7 +103,7 @@ class Bar(Progress):
 
     @classmethod
     def get_default_columns(cls) -> tuple[ProgressColumn, ...]:
-        """Spinner, description, bar, share and time."""
+        """Default columns: spinner, description, bar, percentage and time."""
         time_left = TimeRemainingColumn()
         return SpinnerColumn(), PlainColumn("{task.description}"), BarColumn(), TaskProgressColumn(), time_left
 
@@ -111,7 +111,7 @@ class Bar(Progress):
 def track(
     items: Iterable[T], description: str, *, console: Console, total: float | None = None, disable: bool = False
 ) -> Iterator[T]:
-    """The items, with a progress bar while they are used."""
+    """Yield the items, showing a progress bar."""
     with Bar(console=console, disable=disable) as bar:
         yield from bar.track(items, total=total, description=description)
 
@@ -120,7 +120,7 @@ class VisibleFormatter(logging.Formatter):
     """Log formatter that escapes control characters."""
 
     def format(self, record: logging.LogRecord) -> str:
-        """The line of a record."""
+        """Format a log record, escaped."""
         return visible(super().format(record))
 
 

@@ -25,16 +25,16 @@ class SequenceError(CartsError):
 
 
 class WeightsError(CartsError):
-    """A weights file is missing, unreadable or of another network."""
+    """A weights file is missing, unreadable or belongs to another network."""
 
 
 class SettingsError(CartsError):
-    """A setting is out of its range or contradicts another one."""
+    """A setting is out of range or contradicts another one."""
 
 
 class ProjectError(CartsError):
-    """A project file cannot be opened or written to, or an edit does not fit the sequence."""
+    """A project file cannot be opened or written, or an edit does not match the sequence."""
 
 
 class OutputError(CartsError):
-    """A file or folder cannot be written, or a name cannot be part of its path."""
+    """A file or folder cannot be written, or a name is not allowed in its path."""

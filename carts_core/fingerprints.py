@@ -18,7 +18,7 @@ _PROBES = (0.0, 0.1, -0.2)
 
 
 def fingerprint(*parts: bytes | str | float | np.ndarray | Iterable) -> str:
-    """SHA-256 of numbers, texts, arrays (with type and shape), and tuples of these."""
+    """SHA-256 of numbers, strings, arrays (with dtype and shape), and tuples of these."""
     digest = hashlib.sha256()
     for part in parts:
         if isinstance(part, np.ndarray):
@@ -65,7 +65,7 @@ def calibration_fingerprint(scene: Scene, cameras: Iterable[Camera]) -> str:
     """Fingerprint of the poses of arms and cameras, and of the cameras' intrinsics.
 
     Args:
-        cameras: as their images were recorded, with distortion.
+        cameras: cameras of the recorded images, with distortion.
     """
     arms = [(arm.name, arm.robot.base_link, np.asarray(arm.T_world_base)) for arm in scene.arms]
     views = [

@@ -32,7 +32,7 @@ class Table:
 
     @staticmethod
     def of(title: str, caption: str, rows: Sequence[Mapping[str, str | Cell]]) -> "Table | None":
-        """A table of rows with the same keys, which are its headings; None without rows."""
+        """Table whose headings are the keys of its rows; None if there are no rows."""
         if not rows:
             return None
         cells = (tuple(cell if isinstance(cell, Cell) else Cell(cell) for cell in row.values()) for row in rows)
@@ -40,13 +40,13 @@ class Table:
 
 
 def render_page(template: str, **values: object) -> str:
-    """A page of a template by file name."""
+    """Render a template, given by its file name, to a page."""
     return _templates().get_template(template).render(values)
 
 
 @cache
 def _templates() -> "Environment":
-    # Imported late, because the page of `carts view` needs no reports.
+    # Imported late, because `carts view` does not need reports.
     from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape  # noqa: PLC0415
 
     templates = Environment(

@@ -9,16 +9,16 @@ MOST_THREADS = 4
 """Largest useful number of threads for images of this size."""
 
 _MMAP_THRESHOLD = 1 << 30
-"""Size below which allocations come from the heap, which keeps freed memory [bytes]."""
+"""Allocations below this size come from the heap, which keeps freed memory [bytes]."""
 
 _TRIM_THRESHOLD = 1 << 28
 """Free memory at the end of the heap beyond which it is returned to the system [bytes]."""
 
 _ARENAS = 2
-"""Number of malloc's heaps. By default each thread gets one of up to 8 per core, and each keeps its own peak size."""
+"""Number of malloc arenas. By default there are up to 8 per core, and each keeps its peak size."""
 
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD, _M_ARENA_MAX = -1, -3, -8
-"""Numbers of these parameters in glibc's malloc.h."""
+"""Parameter numbers from glibc's malloc.h."""
 
 
 @dataclass
@@ -35,32 +35,32 @@ _TUNED = _Tuned()
 
 
 def tune_process() -> None:
-    """Tune a program at its start; libraries do not call it.
+    """Tune threads and memory of the process; called at program start, not by libraries.
 
-    Freed memory is kept for the next image, which is faster; a server returns it with `return_memory`.
+    Freed memory is kept for the next image, which is faster; a server releases it with `return_memory`.
     """
     _leave_a_core_free()
     _keep_memory()
 
 
 def _leave_a_core_free() -> None:
-    """Limit torch to all cores but one, four at most, unless `OMP_NUM_THREADS` is set.
+    """Limit torch to one thread fewer than there are cores, four at most, unless `OMP_NUM_THREADS` is set.
 
-    Each parallel step waits for its slowest thread: with another process on one of the cores, an iteration of 0.1 s
-    took 2.6 s.
+    Each parallel step waits for its slowest thread: with another process on one core, an iteration took 2.6 s instead
+    of 0.1 s.
     """
     if "OMP_NUM_THREADS" not in os.environ:
-        import torch  # noqa: PLC0415  child processes that need no torch import this module, too
+        import torch  # noqa: PLC0415  child processes without torch import this module, too
 
         torch.set_num_threads(max(1, min((os.cpu_count() or 2) - 1, MOST_THREADS)))
         _TUNED.core_left_free = True
 
 
 def inference_threads() -> int:
-    """Number of threads for ONNX Runtime: torch's, or one per core, four at most, where a core was left free.
+    """Number of threads for ONNX Runtime: torch's, or one per core (four at most) if torch leaves a core free.
 
-    Its threads share work in small pieces: with another process on one or both of two cores, two threads took .73 and
-    .53 of the time of one.
+    ONNX Runtime distributes work in small pieces: with another process on one or both of two cores, two threads took
+    0.73 and 0.53 of the time of one.
     """
     if _TUNED.core_left_free:
         return min(os.cpu_count() or 1, MOST_THREADS)
@@ -72,7 +72,7 @@ def inference_threads() -> int:
 def _keep_memory() -> None:
     """Make glibc keep the memory of images instead of returning it to the system.
 
-    The system clears each page when it is first written to: a rendering of 640x480 px took 29 ms instead of 16 ms.
+    The system clears each new page on first access: with it, a rendering of 640x480 px took 29 ms instead of 16 ms.
     `MALLOC_...` variables of the environment take precedence.
     """
     mallopt = _of_malloc("mallopt")

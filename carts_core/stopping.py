@@ -15,10 +15,10 @@ _SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP
 
 
 class Stopped(KeyboardInterrupt):
-    """The program was stopped by the user or the system.
+    """Raised when the user or the system stops the program.
 
     Attributes:
-        number: of the signal.
+        number: signal number.
     """
 
     def __init__(self, number: int) -> None:
@@ -32,25 +32,26 @@ _NEVER_CUT = (
 )
 """Prefixes of modules in which no exception may be raised from a signal handler.
 
-Numba loads kernels through LLVM, and a project is opened through SQLite, which call back into Python: an exception
-there is lost, and LLVM ends the process with SIGSEGV. In finalizers it is lost, too. A half imported module is useless.
+Numba loads kernels through LLVM, and a project is opened through SQLite; both call back into Python, where an exception
+is lost, and LLVM ends the process with SIGSEGV. Exceptions in finalizers are lost, too. A partially imported module is
+unusable.
 """
 _OURS = ("carts_core", "carts_viewer")
 _INSTALLED = ("<frozen", *(sysconfig.get_path(name) for name in ("stdlib", "platstdlib", "purelib", "platlib")))
 _PATIENCE = 2.0
-"""Longest wait for a moment without library code on the stack [s]."""
+"""Longest wait for a stack without library code [s]."""
 _AGAIN = 0.02
-"""Interval after which a waiting signal is sent again [s]."""
+"""Interval after which a pending signal is sent again [s]."""
 PARENT = "CARTS_PARENT"
-"""Environment variable with the id of the process with which a command ends."""
+"""Environment variable with the id of the parent process; the command ends when the parent ends."""
 _PR_SET_PDEATHSIG = 1
-"""Constant of Linux's sys/prctl.h."""
+"""Constant from Linux's sys/prctl.h."""
 _POLL = 1.0
-"""Interval between checks for the parent, where the system has no signal for its end [s]."""
+"""Interval between checks for the parent on systems without a parent-death signal [s]."""
 
 
 def end_with_parent(parent: int, number: int = signal.SIGTERM) -> None:
-    """Send a signal to this process when its parent ends, by SIGKILL too; at once if it has already ended.
+    """Send a signal to this process when its parent exits, even through SIGKILL; immediately if it has already exited.
 
     Linux sends the signal (`prctl(PR_SET_PDEATHSIG)`) when the thread that started this process ends. Elsewhere, a
     thread checks once a second.
@@ -70,7 +71,7 @@ def _signal_at_end(parent: int, number: int) -> None:
 
 
 class _Unfinished:
-    """Number of blocks to be finished, and the signal that waits for them."""
+    """Number of active `finished_first` blocks, and the signal deferred until they end."""
 
     blocks = 0
     waiting: int | None = None
@@ -78,11 +79,11 @@ class _Unfinished:
 
 @contextmanager
 def stopped_by_signals() -> Iterator[None]:
-    """Make SIGTERM and SIGHUP raise `Stopped` in the main thread, as Ctrl-C does, in the block.
+    """In the block, make SIGTERM, SIGHUP and Ctrl-C raise `Stopped` in the main thread.
 
-    One that comes while a library is at work waits for its end, two seconds at most; one that comes while a module is
-    imported, a kernel is loaded or an object is finalized waits for that however long it takes. A signal that is
-    ignored stays so, as SIGHUP is under `nohup`. Child processes get the system's own handling.
+    A signal received in library code is deferred until that code returns, for two seconds at most; during an import,
+    the loading of a kernel or a finalizer it is deferred without limit. Ignored signals stay ignored, such as SIGHUP
+    under `nohup`. Child processes get the default handlers.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
@@ -90,14 +91,14 @@ def stopped_by_signals() -> Iterator[None]:
     before = {number: signal.getsignal(number) for number in _SIGNALS}
     taken = [number for number, handler in before.items() if handler is not signal.SIG_IGN]
     owner, repeated, since = os.getpid(), _Repeated(), None
-    # The context manager's frame, that of contextlib, and the one that runs the block.
+    # Frames of the context manager, of contextlib, and of the caller that runs the block.
     begin = sys._getframe(2)
 
     def stop(number: int, frame: FrameType | None) -> None:
         nonlocal since
         since = since or time.monotonic()
         if os.getpid() != owner:
-            # A forked child ends without the cleanup of its parent.
+            # A forked child exits without its parent's cleanup.
             signal.signal(number, signal.SIG_DFL)
             os.kill(os.getpid(), number)
         elif _Unfinished.blocks:
@@ -119,11 +120,11 @@ def stopped_by_signals() -> Iterator[None]:
 
 
 class _Repeated:
-    """Sends signals to this process again, until the end of their block."""
+    """Resends pending signals to this process until their block ends."""
 
     def __init__(self) -> None:
         self._lock, self._over = threading.Lock(), False
-        # A handler may run between any two instructions, where it must not wait for a lock; writing a byte it may.
+        # A handler may run between any two instructions, so it must not wait for a lock; writing a byte is safe.
         self._asked, self._ask = os.pipe()
         os.set_blocking(self._ask, False)
         threading.Thread(target=self._work, name="carts-signals", daemon=True).start()
@@ -147,7 +148,7 @@ class _Repeated:
 
 
 def _may_be_cut(frame: FrameType | None, begin: FrameType) -> bool:
-    """Whether an exception may be raised in a frame; callers of the frame `begin` are not considered."""
+    """Whether an exception may be raised in a stack frame; callers of `begin` are not considered."""
     while frame is not None and frame is not begin:
         module = frame.f_globals.get("__name__") or ""
         if frame.f_code.co_name == "__del__" or module.startswith(_NEVER_CUT):
@@ -157,7 +158,7 @@ def _may_be_cut(frame: FrameType | None, begin: FrameType) -> bool:
 
 
 def _is_ours(frame: FrameType | None) -> bool:
-    """Whether a frame runs code of this project or its caller, not of a library."""
+    """Whether a stack frame runs code of this project or its caller, not of a library."""
     if frame is None:
         return True
     package = str(frame.f_globals.get("__name__")).partition(".")[0]
@@ -166,7 +167,7 @@ def _is_ours(frame: FrameType | None) -> bool:
 
 @contextmanager
 def finished_first() -> Iterator[None]:
-    """Block that is not interrupted: `Stopped` is raised at its end. It should take no longer than a write."""
+    """Defer `Stopped` to the end of the block, which should take no longer than a write."""
     _Unfinished.blocks += 1
     try:
         yield
@@ -179,7 +180,7 @@ def finished_first() -> Iterator[None]:
 
 @contextmanager
 def when_stopped(what_is_kept: Callable[[], str] | str) -> Iterator[None]:
-    """Attach a note on the partial results to `Stopped`; the command prints it."""
+    """Attach a note on the partial results to `Stopped`, which the command prints."""
     try:
         yield
     except KeyboardInterrupt as stopped:

@@ -1,7 +1,7 @@
-"""Results that do not depend on torch's number of threads.
+"""Single-threaded operations, whose results do not depend on torch's number of threads.
 
 Sums over whole images, and kernels that torch, oneDNN and MKL select by the number of threads, differ in their last
-bits, which could trigger a restart of an optimization. These few operations run in one thread; convolutions use all.
+bits, which could trigger a restart of an optimization. Only these operations run in one thread.
 """
 
 from collections.abc import Iterator
@@ -27,5 +27,5 @@ def one_thread() -> Iterator[None]:
 
 @one_thread()
 def total(values: Tensor) -> float:
-    """The sum over all values."""
+    """Sum of all values, independent of the number of threads."""
     return float(values.sum())

@@ -5,12 +5,11 @@ from difflib import get_close_matches
 from itertools import islice
 
 _LONGEST_COMPARED, _MOST_COMPARED = 100, 200
-"""Largest length and number of names among which misspellings are looked for, since the cost is the product of
-lengths."""
+"""Largest length and number of names searched for misspellings, since the cost grows with the product of lengths."""
 
 
 def counted(number: int, what: str) -> str:
-    """A number with its noun, such as `1 run` and `2 runs`."""
+    """A number with its noun in singular or plural, such as `1 run` and `2 runs`."""
     return f"{number} {what}{'' if number == 1 else 's'}"
 
 
@@ -28,17 +27,17 @@ def listed(names: Iterable[str], most: int = 40) -> str:
 
 
 def shortened(text: str, length: int = 200) -> str:
-    """A text with its middle replaced if it is longer than `length`."""
+    """A text whose middle is replaced by an ellipsis if it is longer than `length`."""
     return text if len(text) <= length else f"{text[: length - 40]} ... {text[-35:]}"
 
 
 def shown(value: object, length: int = 200) -> str:
-    """A value quoted for an error: `repr`, shortened in its middle."""
+    """`repr` of a value for an error message, with its middle shortened."""
     return shortened(repr(value), length)
 
 
 def closest(name: str, known: Iterable[str]) -> str:
-    """` Did you mean 'X'?` when one of `known` resembles `name`, else nothing. A number resembles only itself."""
+    """Suggestion ` Did you mean 'X'?` if one of `known` resembles `name`, else empty. Numbers are not corrected."""
     known, number = list(known), name.lstrip("0")
     same = [one for one in known if one.casefold() == name.casefold()]
     same = same or [one for one in known if name.isdecimal() and one.lstrip("0") == number]

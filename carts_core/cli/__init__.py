@@ -1,3 +1,3 @@
-"""The `carts` command. Modules that take long to import are imported when a subcommand runs."""
+"""The `carts` command. Slow modules are imported when a subcommand runs."""
 
 from .command_line import main as main

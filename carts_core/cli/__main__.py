@@ -1,4 +1,4 @@
-"""`python -m carts_core.cli`."""
+"""Entry point of `python -m carts_core.cli`."""
 
 from .command_line import main
 

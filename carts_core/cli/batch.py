@@ -29,21 +29,21 @@ class Batch:
     manifest: Annotated[Path, tyro.conf.Positional]
     """Manifest of recordings, cameras, domains and steps (docs: batch)."""
     output: Path | None = None
-    """Folder to write to; by default `runs/batch/NAME`, after the manifest. In `jobs`, each has a folder of its own."""
+    """Folder to write to; by default `runs/batch/NAME`, after the manifest. Each job has its own folder in `jobs`."""
     workers: int = 0
     """Parallel jobs; by default the number of cores."""
     threads: int = 1
     """Threads of each job. One is most efficient with more jobs than cores."""
     shard: str = "1/1"
-    """Every N-th job from the I-th on, as `I/N`. Shards may run on any machine that shares the folder."""
+    """Run every N-th job, starting with the I-th, as `I/N`. Shards may run on all machines that share the folder."""
     scheduler: str | None = None
     """Give jobs to dask.distributed: address of its scheduler, or `local` for workers on this machine."""
     project: Literal["beside", "none"] = "beside"
-    """Corrections in jobs that only evaluate or export: those of the project beside the recording, or `none`."""
+    """Corrections for jobs that only evaluate or export: those in the project beside the recording, or `none`."""
     again: bool = False
-    """Repeat finished steps; each redoes what has changed since."""
+    """Repeat finished steps; each recomputes results whose inputs have changed."""
     report_only: bool = False
-    """Write the report on finished jobs without running any."""
+    """Write the report on finished jobs without running jobs."""
 
     def __post_init__(self) -> None:
         if self.workers < 0:
@@ -52,7 +52,7 @@ class Batch:
             raise SettingsError(f"--threads is {self.threads}; allowed is 1 or more.")
 
     def run(self) -> None:
-        """Run the jobs of the shard, and write the report on all; `CartsError` if jobs have failed."""
+        """Run the jobs of the shard, and write the report on all jobs; `CartsError` if a job failed."""
         from ..batch.folder import write_jobs
         from ..batch.manifest import read_manifest, shard
         from ..batch.report import write_batch_report
@@ -81,7 +81,7 @@ class Batch:
             )
 
     def _run(self, console: Terminal, jobs: "list[Job]", folder: "OutputPath") -> dict[str, str]:
-        """Run jobs; returns name and error of each failed one."""
+        """Run jobs; returns job name -> error of the failed jobs."""
         import os
 
         from ..batch.engines import Pool
@@ -115,7 +115,7 @@ class Batch:
 
 
 def _inference(folder: "OutputPath") -> "Engine":
-    """Inference engine of all jobs: the one that was faster where the batch was started."""
+    """Inference engine of all jobs: the faster one on the machine that started the batch."""
     from ..files import write_new
     from ..files.reading import SETTINGS, read_text
     from ..networks.extractor import FeatureExtractor

@@ -1,4 +1,4 @@
-"""Jobs of `carts batch`: subcommands that run one after the other into the job's folder."""
+"""Jobs of `carts batch`: subcommands run in sequence, with outputs in the job's folder."""
 
 import contextlib
 import io
@@ -54,9 +54,9 @@ class BatchWork:
     """Runs jobs in worker processes.
 
     Args:
-        folder: of the batch.
+        folder: folder of the batch.
         again: whether finished steps are repeated.
-        inference: engine of the surface network, equal on all machines, unless a step's options name one.
+        inference: inference engine of the surface network on all machines, unless a step's options select another.
         project: whether the project beside a recording is applied; see `with_project`.
     """
 
@@ -92,7 +92,7 @@ def with_project(job: Job) -> Path | None:
 
 
 def check_options(jobs: Sequence[Job]) -> None:
-    """Check the options of every step before anything runs; others than the command's are a `SettingsError`."""
+    """Check the options of all steps before the first run; `SettingsError` for options unknown to the command."""
     called: set[tuple[Step, tuple[str, ...]]] = set()
     for job in jobs:
         called |= {(step, job.options.get(step, ())) for step in job.steps}
@@ -136,7 +136,7 @@ def _steps(job: Job, folder: OutputPath, state: RunningJob, work: BatchWork) -> 
         known = state.state.steps.get(step)
         if work.again or known is None or known.key != key:
             began = time.perf_counter()
-            # They describe earlier results. After a kill they are made when the job resumes.
+            # They describe earlier results. If the process is killed, they are written when the job resumes.
             remove_file(folder / FINDINGS_FILE)
             with _logged(folder / f"{step}.log"):
                 _parsed(step, [*_arguments(job, step, sequence, folder), *options]).run()
@@ -170,7 +170,7 @@ _FOLDERS: dict[Step, str] = {"import": "recording", "calibrate": "calibration"}
 
 
 def _arguments(job: Job, step: Step, sequence: Path, folder: OutputPath) -> list[str]:
-    """Arguments of a step's command before its options."""
+    """Arguments of a step's command that precede its options."""
     chosen = ["--camera", job.camera, *(["--domain", job.domain] if job.domain else [])]
     output = str(folder / _FOLDERS.get(step, step))
     match step:
@@ -191,7 +191,8 @@ def _arguments(job: Job, step: Step, sequence: Path, folder: OutputPath) -> list
 
 
 def _table(job: Job, folder: OutputPath) -> Path | None:
-    """Kinematics table of an earlier step, None without optimization; `SettingsError` if each camera has its own."""
+    """Kinematics table of an earlier step; None without optimization. `SettingsError` if each camera has its own
+    table."""
     found = kinematics_tables(folder, job)
     if len(found) > 1:
         raise SettingsError(
@@ -202,7 +203,7 @@ def _table(job: Job, folder: OutputPath) -> Path | None:
 
 
 def _inputs(path: Path) -> list[str | int]:
-    """Path, size and modification time of a file; empty if there is none."""
+    """Path, size and modification time of a file; empty if it does not exist."""
     try:
         found = path.stat()
     except (OSError, ValueError):

@@ -25,13 +25,13 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class HandEye:
-    """Find base frames from landmarks that were clicked in 3 to 6 images; no initial pose is needed.
+    """Estimate base frames from landmarks clicked in 3 to 6 images; no initial pose is needed.
 
-    The points are in a table (docs/howto/own_recording.md); `carts view` (New recording) does the same by clicks.
+    The points are read from a table (docs/howto/own_recording.md); in `carts view` (New recording) they are clicked.
     """
 
     sequence: SequencePath
-    """Sequence file; its base frames are not used."""
+    """Sequence file. Its base frames are ignored."""
     points: Path
     """CSV file with the columns frame (its id), camera, arm, landmark (tip, wrist yaw joint, wrist pitch joint,
     shaft edge, shaft middle), u and v [px of the undistorted image, from its upper left corner]."""
@@ -40,14 +40,14 @@ class HandEye:
     overwrite: bool = False
     """Replace an earlier result there."""
     focal_length: bool = False
-    """Estimate the focal lengths, too. Needs points at several depths; their standard deviation is printed."""
+    """Estimate the focal lengths, too, and print their standard deviation. Requires points at several depths."""
     free_cameras: tuple[str, ...] = ()
-    """Cameras whose pose relative to the others is not known."""
+    """Cameras whose pose relative to the other cameras is unknown."""
     pixel_error: float = 2.0
     """Expected error of a point [px]."""
 
     def run(self) -> None:
-        """Solve, and write the result; an error leaves no files."""
+        """Solve, and write the result; no files are left after an error."""
         from ..files import MARKER, published, write_text
         from ..optimization.hand_eye import (
             RESULT_FILE,
@@ -99,13 +99,13 @@ def _print(console: Console, sequence: "Sequence", points: "Points[ImagePoint]",
 
 @dataclass(frozen=True)
 class TimeOffset:
-    """Estimate the delay between images and joint positions from their common motion, and propose a time_offset.
+    """Estimate the delay between images and joint positions by correlating their motion, and propose a time_offset.
 
-    It needs neither a hand-eye calibration nor a network, and does not change the sequence file.
+    Neither a hand-eye calibration nor a network is needed. The sequence file is not changed.
     """
 
     sequence: SequencePath
-    """Sequence file that matches rows with frames by time ([frames])."""
+    """Sequence file that matches table rows to frames by time ([frames])."""
     output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
     """Folder to create for a sequence file with the proposed time_offset; by default it is only printed."""
     overwrite: bool = False
@@ -115,7 +115,7 @@ class TimeOffset:
     domain: str | None = None
     """Domain of the images; by default the first one."""
     largest: float = 0.5
-    """Search range around the present time_offset [s]; extended up to 3 s where no delay explains the motion."""
+    """Search range around the current time_offset [s]; extended up to 3 s if no delay in it explains the motion."""
 
     def run(self) -> None:
         """Print the estimate, and write a sequence file if a folder is given."""
@@ -153,7 +153,7 @@ _SPREAD = "spread:"
 
 @dataclass(frozen=True)
 class Calibrate:
-    """Find base frames and cameras that fit many frames at once; write a sequence file with them, and a report."""
+    """Estimate base frames and cameras jointly from many frames; write a calibrated sequence file and a report."""
 
     sequence: SequencePath
     """Sequence file."""
@@ -162,26 +162,26 @@ class Calibrate:
     overwrite: bool = False
     """Replace an earlier calibration there."""
     frames: str | None = None
-    """Frames to calibrate with: `spread:20` (the default) for 20, spread evenly over the sequence, or by id as in
+    """Frames used for calibration: `spread:20` (the default) for 20 evenly spaced frames, or frame ids as in
     `carts evaluate`: `all`, `001-010,015`, `::3`."""
     positions: str | None = None
-    """Frames by position, counted from 1 as in the page, instead: `1-10,15`."""
+    """Frames by position in the sequence instead of id, counted from 1: `1-10,15`."""
     camera: tuple[str, ...] = Selection.camera
     """Cameras, by name; all are calibrated jointly."""
     domain: str | None = None
-    """Domain, by name; the sequence's first one if none is named."""
+    """Domain, by name; by default the first one of the sequence."""
     joint_prior_deg: float = 0.1
-    """With `--joints`: standard deviation of a joint's error in a frame [deg]. Written files keep the measured
-    joints."""
+    """With `--joints`: standard deviation of a joint's error in a frame [deg]. Output files contain the measured
+    joints.
+    """
     beyond_hand_eye: bool = False
-    """Write a calibration even if a base frame moves beyond the uncertainty of `carts hand-eye`, which wrote the
-    sequence file."""
+    """Write the calibration even if a base frame moves by more than the uncertainty estimated by `carts hand-eye`."""
     free: Annotated[FreeParameters, tyro.conf.arg(name="")] = CALIBRATION
     network: Annotated[Observing, tyro.conf.arg(name="")] = field(default_factory=Observing)
     solving: Annotated[CalibrationOptions, tyro.conf.arg(name="")] = field(default_factory=CalibrationOptions)
 
     def run(self) -> None:
-        """Calibrate; Ctrl-C or an error leaves no files."""
+        """Calibrate; no files are left after Ctrl-C or an error."""
         from ..evaluation import frame_residuals, mean_dice, remark, write_calibration
         from ..evaluation.calibration import beyond_prior
         from ..files import MARKER, published, write_text
@@ -255,7 +255,8 @@ class Calibrate:
 
 
 def frame_indices(frames: str | None, positions: str | None, sequence: "Sequence") -> list[int]:
-    """0-based indices that `--frames`, which may be `spread:COUNT`, or `--positions` chooses; errors as `Selection`."""
+    """0-based indices selected by `--frames`, which may be `spread:COUNT`, or `--positions`; errors as in
+    `Selection`."""
     frames = f"{_SPREAD}20" if frames is None and positions is None else frames
     if frames is None or not frames.startswith(_SPREAD):
         return Selection(frames, positions).frame_indices(sequence)

@@ -51,7 +51,7 @@ _DESCRIPTION = (
 )
 
 BAD_INPUT = 2
-"""Exit status for an unusable file or option."""
+"""Exit status for an invalid file or option."""
 
 COMMANDS: dict[str, type] = {
     "view": View,
@@ -73,14 +73,14 @@ COMMANDS: dict[str, type] = {
     "baseline": Baseline,
     "bench": Bench,
 }
-"""Subcommand -> its options and its work."""
+"""Subcommand -> dataclass with its options and `run` method."""
 
 Command: Any = reduce(or_, (Annotated[kind, tyro.conf.subcommand(name)] for name, kind in COMMANDS.items()))
 
 _AT_ONCE = (View, Live, RobotCommand, Robots)
-"""Commands without a message at the start."""
+"""Commands that print no message at the start."""
 _INVALID_CHOICE = re.compile(r"invalid choice '(?P<given>[^']*)' for .*?Expected one of \((?P<known>[^)]*)\)")
-"""Error message of tyro, without its frame."""
+"""Pattern of tyro's error message, without the surrounding box."""
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -109,7 +109,7 @@ def main(arguments: list[str] | None = None) -> None:
                 print(command.solving.printed())
                 return
         if not isinstance(command, _AT_ONCE):
-            # Imports take seconds on a busy machine.
+            # Imports may take seconds on a busy machine.
             Terminal(stderr=True).print(f"carts {arguments[0]}: starting", style="dim")
         with uncollected():
             from ..process import tune_process
@@ -127,7 +127,7 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 def _parsed(arguments: list[str]) -> Any:
-    """Parse a command line; help and errors of tyro end the program."""
+    """Parse a command line; tyro exits the program after help or an error."""
     name, *options = arguments or [""]
     if name and not name.startswith("-") and name not in COMMANDS:
         meant = closest(name, COMMANDS)
@@ -136,7 +136,7 @@ def _parsed(arguments: list[str]) -> Any:
     try:
         with contextlib.redirect_stderr(said):
             if name in COMMANDS:
-                # Suggestions for a misspelt option are those of this command.
+                # Suggest only options of this command for a misspelt option.
                 return tyro.cli(COMMANDS[name], prog=f"carts {name}", args=options)
             return tyro.cli(Command, prog="carts", description=_DESCRIPTION, args=arguments)  # pyright: ignore
     except SystemExit:
@@ -148,14 +148,14 @@ def _parsed(arguments: list[str]) -> Any:
 
 @contextmanager
 def _quiet_when_unread() -> Iterator[None]:
-    """Exit without a traceback when the reader of a pipe, such as `head`, has closed it."""
+    """Exit without a traceback if the reader of the output pipe, such as `head`, has closed it."""
     try:
         try:
             yield
         finally:
             print(end="", flush=True)
     except BrokenPipeError:
-        # Python flushes once more at the end.
+        # Python flushes again at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(1)
 

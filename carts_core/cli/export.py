@@ -20,14 +20,14 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Render:
-    """Render the arms over the frames or alone, with the corrections of the project beside the sequence."""
+    """Render the arms, alone or over the frames, with the corrections of the project beside the sequence."""
 
     sequence: SequencePath
     """Sequence file."""
     output: Path | None = None
     """Folder to write to; by default `runs/NAME/render`."""
     style: Literal["overlay", "image", "mask"] = "overlay"
-    """The rendering blended over the frame, alone, or its mask."""
+    """Rendering blended over the frame, rendering alone, or mask."""
     opacity: float = 0.6
     """Opacity of the rendering in an overlay, 0 to 1."""
     source: Annotated[FromProject, tyro.conf.arg(name="")] = field(default_factory=FromProject)
@@ -68,22 +68,22 @@ class Render:
 
 @dataclass(frozen=True)
 class Export:
-    """Write masks, kinematics, base frames or a video of frames; see docs/reference/exports.md for the formats.
+    """Export frames as masks, kinematics, base frames or a video; see docs/reference/exports.md for the formats.
 
-    The corrections of the project beside the sequence are applied; without one, frames are exported as measured.
+    The corrections of the project beside the sequence are applied; without a project, measured poses are exported.
     """
 
     sequence: SequencePath
     """Sequence file."""
     output: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="OUTPUT")]
-    """Folder to make, or file for csv, npz, json and dvrk."""
+    """Folder to create, or file for csv, npz, json and dvrk."""
     format: FormatName
-    """What to write."""
+    """Export format."""
     kinematics: Path | None = None
     """Kinematics table of `carts optimize` to export instead of a project's corrections."""
     source: Annotated[FromProject, tyro.conf.arg(name="")] = field(default_factory=FromProject)
     parts: Parts = "arms"
-    """Categories: one per arm, per part of it (shaft, wrist, jaws), or per link."""
+    """Categories: one per arm, per part (shaft, wrist, jaws), or per link."""
     images: Images = "named"
     """`named`: labels name the recording's own images, and formats that need images beside their labels (bop, voc,
     yolo) get copies; `copied`: copies for every format; `none`: no images. Copies have the same bytes."""
@@ -94,7 +94,7 @@ class Export:
     select: Annotated[Selection, tyro.conf.arg(name="")] = field(default_factory=Selection)
 
     def run(self) -> None:
-        """Write the export; Ctrl-C or an error leaves no files."""
+        """Write the export; no files are left after Ctrl-C or an error."""
         from ..export import FORMATS, Dataset, Monitor, export
         from ..recording import Sequence
 
@@ -128,7 +128,7 @@ class Export:
     def _frames(
         self, sequence: "Sequence", cameras: list[str], console: Terminal
     ) -> "tuple[Sequence, list[ExportFrame]]":
-        """Frames to export, and their recording."""
+        """The recording with corrections applied, and the frames to export."""
         from ..export import corrected_frames, measured_frames, project_frame, read_kinematics_csv
 
         indices = self.select.frame_indices(sequence)

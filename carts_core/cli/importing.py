@@ -1,4 +1,4 @@
-"""`carts import` makes a sequence file for a recording; `carts import-masks` adds masks to a project."""
+"""`carts import` writes a sequence file for a recording; `carts import-masks` adds masks to a project."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -22,12 +22,13 @@ _STYLES = {"found": "green", "guessed": "yellow", "missing": "magenta", "warning
 
 @dataclass(frozen=True)
 class Import:
-    """Write a sequence file for a recording, which is not copied; without SOURCE, list the supported formats."""
+    """Write a sequence file for a recording; without SOURCE, list the supported formats. The recording is not
+    copied."""
 
     source: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")] = None
     """File or folder of the recording."""
     output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
-    """Folder to make for sequence.toml and its tables; by default `NAME_sequence` here."""
+    """Folder to create for sequence.toml and its tables; by default `NAME_sequence` in the current folder."""
     overwrite: bool = False
     """Replace an earlier import."""
     options: Annotated[ImportOptions, tyro.conf.arg(name="")] = field(default_factory=ImportOptions)
@@ -37,7 +38,7 @@ class Import:
         from ..files.decoding import prepare
 
         if self.source is not None:
-            prepare()  # While torch is loaded.
+            prepare()  # Displayed while torch is loaded.
         from ..recording.importing.found import recording_name
         from ..recording.importing.importer import import_recording, known_kinds
 
@@ -73,7 +74,7 @@ def _rate(times: "np.ndarray") -> float:
 
 @dataclass(frozen=True)
 class ImportMasks:
-    """Import masks and keypoints into the project of a sequence, as layers beside painted ones.
+    """Import masks and keypoints into the project of a sequence, as layers separate from painted ones.
 
     Reads COCO (.json), CVAT for images (.xml), folders of PNG masks, EndoVis 2017 and 2018, and keypoints of SurgPose.
     The import is one undo step in `carts view`.
@@ -84,9 +85,9 @@ class ImportMasks:
     source: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")]
     """File or folder with the masks or keypoints."""
     project: Path | None = None
-    """Project file; by default that beside the sequence."""
+    """Project file; by default the one beside the sequence."""
     camera: str | None = None
-    """Camera of the images, where names of files and folders do not contain it."""
+    """Camera of the images, if file and folder names do not contain it."""
     replace: bool = False
     """Replace earlier imports. Painted layers are not changed."""
 

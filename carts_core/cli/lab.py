@@ -22,8 +22,9 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Synthesize:
-    """Make a sequence of two instruments, or of one arm of any other robot, over tissue, path-traced, with true and
-    measured kinematics, in all domains."""
+    """Path-trace a synthetic sequence of two instruments (or one arm of another robot) over tissue in all domains, with
+    true and measured kinematics.
+    """
 
     output: Annotated[Path, tyro.conf.Positional]
     """Folder to create; it must not exist."""
@@ -51,11 +52,14 @@ class Train:
     output: Annotated[Path, tyro.conf.Positional] = Path("runs/train")
     """Folder for checkpoints, weights and the training report."""
     for_: Annotated[Path | None, tyro.conf.arg(name="for", metavar="SEQUENCE")] = None
-    """Sequence file to adapt the shipped network to: its robots, cameras, distances, empty backgrounds. Training ends
-    without further improvement, or after 400 --steps or --minutes of processor time. Weights are kept if no fit is
-    worse."""
+    """Sequence file to adapt the shipped network to: its robots, cameras, distances and empty backgrounds. Training
+    stops when validation no longer improves, after 400 steps (`--steps`), or after `--minutes` of CPU time. The weights
+    are kept if no fit gets worse.
+    """
     fits: int = 8
-    """With `--for`: number of synthetic images to compare fits on; half as many frames of the recording are added."""
+    """With `--for`: number of synthetic images on which fits are compared; half as many frames of the recording are
+    added.
+    """
     training: Annotated[TrainingConfig, tyro.conf.arg(name="")] = field(default_factory=TrainingConfig)
 
     def __post_init__(self) -> None:
@@ -127,7 +131,7 @@ class Baseline:
     """Train HRNet, Swin, Colleoni's network or a U-Net for `carts bench --baselines`; rerun it to resume."""
 
     output: Annotated[Path, tyro.conf.Positional]
-    """Folder for checkpoint and weights."""
+    """Folder for checkpoints and weights."""
     frames: Path = Path("runs/baseline_frames")
     """Folder of training frames, which all baselines share; missing ones are created."""
     network: Annotated[BaselineNetwork, tyro.conf.arg(name="")] = field(default_factory=BaselineNetwork)
@@ -157,23 +161,23 @@ class Bench:
     output: Annotated[Path | None, tyro.conf.Positional] = None
     """Folder of the report; by default `runs/bench/quick` or `runs/bench/full`."""
     quick: bool = False
-    """Few frames and steps: some minutes instead of hours."""
+    """Use few frames and steps: minutes instead of hours."""
     real: Path | None = None
-    """Sequence file with real frames and masks, measured as recorded and with other backgrounds."""
+    """Sequence file with real frames and masks, evaluated as recorded and with other backgrounds."""
     rooms: Path | None = None
-    """Folder of photographs for further backgrounds."""
+    """Folder of photographs used as additional backgrounds."""
     report_only: bool = False
-    """Write the report from earlier measurements without new ones."""
+    """Write the report from earlier measurements only."""
     frames: int | None = None
     """Number of frames of each sequence; by default that of the scope."""
     seed: int | None = None
     """Seed of the synthetic sequence."""
     baselines: tuple[Path, ...] = ()
-    """Weights files of `carts baseline`; each is a row of the main table."""
+    """Weights files from `carts baseline`; each adds a row to the main table."""
     network: Annotated[Network, tyro.conf.arg(name="")] = field(default_factory=Network)
 
     def run(self) -> None:
-        """Do the missing measurements and write the report."""
+        """Run the missing measurements and write the report."""
         from importlib.metadata import version
 
         from ..lab.benchmark import FULL, QUICK, TEST_SEED, Benchmark, Facts, ResultsFile, plan, write_report
@@ -229,7 +233,7 @@ class Bench:
         console.print(f"wrote {page} ({len(measurements)} of {counted(len(runs), 'run')})")
 
     def _baselines(self) -> "dict[str, TrainedBaseline]":
-        """Row -> network."""
+        """Row name -> baseline network."""
         from ..lab.baselines.networks import read_baseline
 
         found: dict[str, TrainedBaseline] = {}

@@ -1,4 +1,4 @@
-"""`carts live`: tracking of the arms in a stream."""
+"""`carts live`: tracks the arms in a stream."""
 
 from collections.abc import Callable
 from contextlib import ExitStack, suppress
@@ -22,29 +22,30 @@ class Live:
     """Track the arms in a stream of images and joints; late frames are dropped. Ctrl-C ends it."""
 
     sequence: SequencePath
-    """Sequence file: its arms and cameras, and for a replay its images and joints."""
+    """Sequence file that defines arms and cameras and, for a replay, images and joints."""
     source: str = "replay"
     """Source of frames: `replay` (in real time), `camera:0`, `video:FILE`, `folder:PATH` (new files), or `socket:PORT`
-    of 127.0.0.1 (docs/reference/live.md)."""
+    on 127.0.0.1 (docs/reference/live.md)."""
     joints_port: int | None = None
-    """With `camera` and `video`: port of 127.0.0.1 for joints and results."""
+    """With `camera` and `video`: port on 127.0.0.1 for joints and results."""
     rate: float | None = None
-    """Replay: frames a second; by default those of the recording."""
+    """Replay: frame rate [1/s]; by default that of the recording."""
     loops: int = 1
     """Replay: number of repetitions."""
     output: Path | None = None
-    """File for results, one JSON object a line; by default the standard output. With a socket, all its clients receive
-    them, too."""
+    """File for results, one JSON object per line; by default the standard output. With a socket, results are also sent
+    to all clients.
+    """
     quiet: bool = False
-    """Print no results on the standard output."""
+    """Do not print results on the standard output."""
     masks: bool = False
     """Include masks in the results."""
     record: Path | None = None
-    """New folder to record the stream to, as a sequence with the corrections as its project."""
+    """New folder to record the stream to, as a sequence and a project with its corrections."""
     camera: tuple[str, ...] = Selection.camera
     """Cameras, by name."""
     domain: str | None = None
-    """Replay: domain, by name; the sequence's first one if none is named."""
+    """Replay: domain, by name; by default the first one of the sequence."""
     free: Annotated[FreeInFrames, tyro.conf.arg(name="")] = field(default_factory=FreeInFrames)
     network: Annotated[Network, tyro.conf.arg(name="")] = field(default_factory=Network)
 
@@ -95,7 +96,7 @@ class Live:
             sinks = [show, *([recorder] if recorder is not None else [])]
             statistics = LiveStatistics()
             try:
-                # Ctrl-C is the normal end; a closed pipe ends it, too.
+                # Ctrl-C is the normal way to stop; a closed output pipe also stops tracking.
                 with suppress(KeyboardInterrupt, BrokenPipeError):
                     follow(stream.source, tracker, sinks, statistics)
             finally:
@@ -106,7 +107,7 @@ class Live:
                     console.print(f"wrote {path}. Look at it: carts view {path}")
 
     def _lines(self) -> "list[Callable]":
-        """Functions that write a result as a line of JSON."""
+        """Functions that each write a result as a line of JSON."""
         import os
         import sys
 

@@ -1,4 +1,4 @@
-"""`carts optimize` corrects the kinematics of frames; `carts evaluate` compares such results with the truth."""
+"""`carts optimize` corrects the kinematics of frames; `carts evaluate` compares results with ground truth."""
 
 import json
 from dataclasses import dataclass, field
@@ -43,20 +43,21 @@ _WIDTH = 110
 
 @dataclass(frozen=True)
 class Evaluate:
-    """Optimize frames and compare masks and joints with the truth, before and after.
+    """Optimize frames and compare masks and joints with ground truth, before and after.
 
-    The start has the corrections of the project beside the sequence; without one, it is as measured.
+    The initial state has the corrections of the project beside the sequence; without a project, it is the measured one.
     """
 
     sequence: SequencePath
     """Sequence file."""
     json: Path | None = None
-    """Write the scores of all frames and their means to this file, whose folders are made; `-` for the standard output,
-    with everything else on the standard error."""
+    """Write the scores of all frames and their means to this file; missing folders are created. `-` writes them to the
+    standard output, and everything else to the standard error.
+    """
     mode: Mode = "frame"
     """Optimize each frame alone, or all frames jointly (docs: sequences)."""
     together: bool = False
-    """Optimize a frame with all chosen cameras at once (stereo); otherwise once per camera."""
+    """Optimize each frame jointly over all selected cameras (stereo); otherwise once per camera."""
     source: Annotated[FromProject, tyro.conf.arg(name="")] = field(default_factory=FromProject)
     start: Annotated[Perturbation, tyro.conf.arg(name="")] = field(default_factory=Perturbation)
     select: Annotated[Selection, tyro.conf.arg(name="")] = field(default_factory=Selection)
@@ -84,7 +85,7 @@ class Evaluate:
 
         console = Terminal(stderr=self.json == STANDARD_OUTPUT)
         if not console.is_terminal:
-            console.width = _WIDTH  # rich assumes 80 and would cut the table
+            console.width = _WIDTH  # rich assumes 80 columns and would truncate the table
         sequence = Sequence.open(self.sequence, progress=console.print)
         frames = self.select.frame_indices(sequence)
         cameras = self.select.camera_names(sequence.scene)

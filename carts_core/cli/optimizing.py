@@ -37,7 +37,7 @@ from .results_folder import FrameFolder, FrameInputs, FrameResult, InputHashes
 
 @dataclass(frozen=True)
 class _Part:
-    """Frames of a domain, seen by cameras that are optimized together."""
+    """Frames of one domain, seen by cameras that are optimized together."""
 
     domain: str
     cameras: tuple[str, ...]
@@ -45,12 +45,12 @@ class _Part:
 
     @property
     def name(self) -> str:
-        """Name for the terminal."""
+        """Name displayed in the terminal."""
         return f"{self.domain}, {', '.join(self.cameras)}"
 
 
 class Optimizing:
-    """Corrects the chosen frames and writes the results."""
+    """Corrects the selected frames and writes the results."""
 
     def __init__(self, asked: OptimizeOptions) -> None:
         self._asked, self._console, self._solver = asked, Terminal(), asked.solving.chosen
@@ -107,7 +107,7 @@ class Optimizing:
             # Every frame depends on all others, so a missing one requires solving all again.
             self._solve_sequence(part, now, common)
         else:
-            # Left behind by a kill after the last result.
+            # Left behind if the process was killed after the last result.
             remove_file(output.checkpoint)
         if todo:
             print_hints(self._console, constant_correction_hint(part.name, sequence, output.rows))
@@ -116,7 +116,7 @@ class Optimizing:
             )
 
     def _to_do(self, part: _Part, now: Mapping[int, InputHashes]) -> list[int]:
-        """Positions of the chosen frames without an up-to-date result; prints the reasons."""
+        """Indices of the selected frames without an up-to-date result; prints the reasons."""
         output, ids = part.output, self._sequence.frame_ids
         there = {row.frame_id for row in output.rows}
         faults = {index: output.fault(ids[index], origin) for index, origin in now.items() if ids[index] in there}
@@ -129,7 +129,7 @@ class Optimizing:
         return [index for index in now if index not in faults or faults[index]]
 
     def _report_others(self, part: _Part, common: InputHashes) -> None:
-        """Report outdated results of frames that were not chosen."""
+        """Report outdated results of frames that were not selected."""
         output, chosen = part.output, [self._sequence.frame_ids[index] for index in self._frames]
         if dropped := output.others_dropped(chosen):
             note = f"--overwrite starts over: results of {counted(dropped, 'other frame')} are removed"
@@ -155,7 +155,7 @@ class Optimizing:
         return FrameInputs(sequence, part.cameras, part.domain, self._observer, start, backgrounds.images, settings)
 
     def _kept(self, part: _Part) -> str:
-        """Message on what a stopped run has kept."""
+        """Message on the results kept by a stopped run."""
         there = f"{part.output.folder} holds {counted(len(part.output.rows), 'frame')}"
         if self._running is not None:
             done, total = self._running.progress
@@ -250,14 +250,14 @@ class Optimizing:
         )
 
     def _print_verdicts(self, part: _Part, frame_ids: list[str]) -> None:
-        """Print verdicts on masks, and how many joints are not determined."""
+        """Print verdicts on masks and the number of undetermined joints."""
         rows = [row for row in part.output.rows if row.frame_id in set(frame_ids)]
         joints = [row.undetermined(self._sequence.scene) for row in rows]
         if line := verdict_line(part.name, [row.verdict for row in rows], joints):
             self._console.print(line, soft_wrap=True)
 
     def _read_keyframes(self) -> dict[int, Mapping[str, np.ndarray]]:
-        """Position -> joint positions of the chosen keyframes."""
+        """Frame index -> joint positions of the selected keyframes."""
         if self._asked.keyframes is None:
             return {}
         ids = self._sequence.frame_ids
@@ -269,7 +269,7 @@ class Optimizing:
         return {index: rows[ids[index]] for index in self._frames if ids[index] in rows}
 
     def _settings(self) -> dict[str, Any]:
-        """Settings stored with the results; inputs have fingerprints (`FrameInputs`)."""
+        """Settings stored with the results; inputs are stored as fingerprints (`FrameInputs`)."""
         asked = self._asked
         settings = {
             "sequence": str(asked.sequence.resolve()),

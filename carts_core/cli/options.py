@@ -1,4 +1,4 @@
-"""Options that several commands share: frames, cameras, projects, networks, fitted masks, solver settings."""
+"""Options shared by several commands: frames, cameras, projects, networks, fitted masks, solver settings."""
 
 import json
 import os
@@ -46,27 +46,28 @@ class Selection:
     """Frames, cameras and domains of a sequence."""
 
     frames: str | None = None
-    """Frames by their ids, as the recording and the page name them: `all` (the default), `007`, `001-010` in the
-    recording's order, several with commas, or `::3` for every third."""
+    """Frame ids as in the recording and the page: `all` (the default), `007`, a range in the recording's order such as
+    `001-010`, several separated by commas, or `::3` for every third.
+    """
     positions: str | None = None
-    """Frames by position, counted from 1 as in the page, instead: `1-10,15`."""
+    """Frames by position in the sequence instead of id, counted from 1: `1-10,15`."""
     camera: tuple[str, ...] = (ALL,)
     """Cameras, by name."""
     domain: tuple[str, ...] = ()
-    """Domains, by name, or `all`; the sequence's first one if none is named."""
+    """Domains, by name, or `all`; by default the first one of the sequence."""
 
     def frame_indices(self, sequence: "Sequence") -> list[int]:
-        """Positions of the chosen frames; errors as `chosen_frames`."""
+        """Indices of the selected frames; errors as in `chosen_frames`."""
         return chosen_frames(self.frames, self.positions, sequence.frame_ids)
 
     def camera_names(self, scene: "Scene") -> list[str]:
-        """Names of the chosen cameras; `RobotError` for an unknown one."""
+        """Names of the selected cameras; `RobotError` for an unknown one."""
         if ALL in self.camera:
             return [camera.name for camera in scene.cameras]
         return [scene.camera(name).name for name in self.camera]
 
     def domain_names(self, sequence: "Sequence") -> list[str]:
-        """Names of the chosen domains; `SettingsError` for an unknown one."""
+        """Names of the selected domains; `SettingsError` for an unknown one."""
         if not self.domain:
             return [sequence.domains[0]]
         if ALL in self.domain:
@@ -79,10 +80,10 @@ class Selection:
 
 
 def chosen_frames(frames: str | None, positions: str | None, ids: Names[str]) -> list[int]:
-    """0-based indices that `--frames` (ids) or `--positions` (from 1) chooses; all where neither is given.
+    """0-based indices selected by `--frames` (ids) or `--positions` (from 1); all frames if neither is given.
 
     Raises:
-        SettingsError: both are given, or one is not readable or names a frame that the recording does not have.
+        SettingsError: both are given, or one is invalid or names a frame that is not in the recording.
     """
     if frames is not None and positions is not None:
         raise SettingsError("--frames and --positions are both given. Give one of them.")
@@ -101,7 +102,7 @@ def chosen_frames(frames: str | None, positions: str | None, ids: Names[str]) ->
 
 
 def _chosen(option: str, text: str, names: Names[str], known: str) -> list[int]:
-    """Indices of the names in a text of names, ranges and steps."""
+    """Indices of the names selected by a text of names, ranges and steps."""
     place = {name: index for index, name in enumerate(names)}
     known = f"{known} {names[0]} to {names[-1]}. Give `all`, `{names[0]}`, `{names[0]}-{names[-1]}` or `::3`."
     if text == ALL:
@@ -125,7 +126,7 @@ def _chosen(option: str, text: str, names: Names[str], known: str) -> list[int]:
 
 
 NO_PROJECT = "none"
-"""Value of `--project` for the recording as measured."""
+"""Value of `--project` that selects the measured recording."""
 
 
 @dataclass(frozen=True)
@@ -133,16 +134,17 @@ class FromProject:
     """Project whose corrections are applied."""
 
     project: str | None = None
-    """Project whose corrections (joints, calibration, time offset, masks) are used: by default that beside the
-    sequence, if there is one; `none` for the recording as measured, or a file."""
+    """Project file whose corrections (joints, calibration, time offset, masks) are used; by default the project beside
+    the sequence, if it exists; `none` for the measured recording.
+    """
 
     @property
     def named(self) -> bool:
-        """Whether a file was named."""
+        """Whether a project file was given."""
         return self.project not in (None, NO_PROJECT)
 
     def path(self, sequence_file: Path) -> Path | None:
-        """The project's file, None without one; `SettingsError` if the named one is missing."""
+        """The project file; None if there is none. `SettingsError` if the given file is missing."""
         if self.project == NO_PROJECT:
             return None
         from ..project import default_path
@@ -155,7 +157,8 @@ class FromProject:
         return path
 
     def read(self, sequence: "Sequence") -> "ProjectState | None":
-        """The project as it is now, None without one; `SettingsError` or `ProjectError` if it cannot be used."""
+        """Current state of the project; None if there is none. `SettingsError` or `ProjectError` if it cannot be
+        used."""
         path = self.path(sequence.path)
         if path is None:
             return None
@@ -168,7 +171,7 @@ class FromProject:
             raise ProjectError(f"{error} Or leave it out: --project {NO_PROJECT}.") from error
 
     def sentence(self, sequence: "Sequence", project: "ProjectState | None", frames: Names[int]) -> str | None:
-        """Which project is used, with the review states of the chosen frames; None without one."""
+        """Sentence on the project in use and the review states of the selected frames; None without a project."""
         if project is None:
             return None
         states = Counter(project.review(index).state.value for index in frames)
@@ -179,7 +182,9 @@ class FromProject:
         )
 
     def corrected(self, sequence: "Sequence", frames: Names[int], console: "Console") -> "Sequence":
-        """The sequence as its project corrects it, which is printed; the same without one. Errors as `read`."""
+        """Apply the project's corrections to the sequence and print a note; without a project, returns it unchanged.
+        Errors as in `read`.
+        """
         project = self.read(sequence)
         if project is None:
             return sequence
@@ -194,10 +199,11 @@ class Perturbation:
     """Offset of the initial joint positions, for experiments."""
 
     perturb_deg: float = 0.0
-    """Offset of every measured joint at the start [deg, mm]: from the true joint positions where the sequence has them,
-    else from the measured ones. 0 starts at the measured positions."""
+    """Offset of every initial joint position [deg, mm], from the true position if the sequence contains it, else from
+    the measured one. 0 starts at the measured positions.
+    """
     seed: int = 0
-    """Seed of the offset's signs, which are the same in all frames in sequence mode."""
+    """Random seed of the offset's signs, which are equal in all frames in sequence mode."""
 
     def __post_init__(self) -> None:
         if not 0 <= self.perturb_deg <= 180:
@@ -209,7 +215,7 @@ class Perturbation:
 
 
 _ENGINES: dict[str, Inference] = {"cpu:torch": "torch", "cpu:onnx": "onnx"}
-"""Names of the CPU with an inference engine of the surface network."""
+"""Device names that select the CPU and an inference engine of the surface network."""
 
 
 @dataclass(frozen=True)
@@ -217,11 +223,12 @@ class Network:
     """Weights of the networks, and the device that runs them."""
 
     weights: tuple[Path, ...] = ()
-    """Weights files; a network without one has the shipped weights."""
+    """Weights files; by default the shipped weights of each network."""
     device: str = "cpu"
-    """Device of the networks: `cpu`, or a CUDA device such as `cuda` or `cuda:1`. On a CPU the surface network runs in
-    torch or ONNX Runtime (equal to 1e-4), whichever is faster in a measurement that is made once; `cpu:torch` and
-    `cpu:onnx` select one."""
+    """Device of the networks: `cpu`, or a CUDA device such as `cuda` or `cuda:1`. On a CPU, the surface network runs in
+    torch or ONNX Runtime (results agree to 1e-4), whichever is faster in a benchmark that runs once; `cpu:torch` and
+    `cpu:onnx` select one.
+    """
 
     def __post_init__(self) -> None:
         if self.device not in _ENGINES:
@@ -229,7 +236,7 @@ class Network:
 
     @property
     def processor(self) -> str:
-        """Device of the networks, as torch names it."""
+        """PyTorch device string of the networks."""
         return "cpu" if self.device in _ENGINES else self.device
 
     @property
@@ -238,14 +245,14 @@ class Network:
         return _ENGINES.get(self.device, "auto")
 
     def load(self) -> "FeatureExtractor":
-        """The networks; `WeightsError` or `SettingsError` if weights, device or engine are not usable."""
+        """Load the networks; `WeightsError` or `SettingsError` if weights, device or engine cannot be used."""
         from ..networks.extractor import FeatureExtractor
 
         return FeatureExtractor.load(*self.weights, device=self.processor, inference=self.inference)
 
 
 def check_device(device: str) -> None:
-    """Check that a device exists; otherwise it is a `SettingsError`."""
+    """Check that a device exists; `SettingsError` otherwise."""
     if device == "cpu":
         return
     import torch
@@ -259,12 +266,12 @@ def check_device(device: str) -> None:
 
 
 def output_folder(named: Path | None, *default: str) -> OutputPath:
-    """Output folder of a command: the one given, else the one with these names in `runs`."""
+    """Output folder of a command: the given one, else the default path below `runs`."""
     return output_path(Path(), "runs", *default) if named is None else output_path(named)
 
 
 def check_writable(folder: Path) -> None:
-    """Check that a folder can be written to or created, before any work; otherwise it is a `SettingsError`."""
+    """Check in advance that a folder can be written to or created; `SettingsError` otherwise."""
     there = next(path for path in (folder, *folder.absolute().parents) if path.exists())
     if not (there.is_dir() and os.access(there, os.W_OK)):
         raise SettingsError(f"{folder} cannot be made or written to, because of {there}. Name another folder.")
@@ -276,7 +283,7 @@ SequencePath = Annotated[Path, tyro.conf.Positional]
 
 @dataclass(frozen=True)
 class FreeInFrames(FreeParameters):
-    """Free parameters of frames; rarely used ones are left to --settings."""
+    """Free parameters of frames; rarely used ones are set by --settings."""
 
     locked_cameras: tyro.conf.Suppress[tuple[str, ...]] = ()
 
@@ -286,14 +293,15 @@ class SolverOptions:
     """Solver and its settings."""
 
     solver: Annotated[SolverName, tyro.conf.EnumChoicesFromValues] = SolverName.SURFACE
-    """Solver: `surface` is the default; `occluded` runs again without occluded pixels; `acs`, `acs_reference`, `l1` and
-    `paper` compare image features as the paper does; `none` only compares the start."""
+    """Solver: `surface` is the default; `occluded` repeats the optimization without occluded pixels; `acs`,
+    `acs_reference`, `l1` and `paper` compare image features as the paper does; `none` only evaluates the initial state.
+    """
     settings: tuple[str, ...] = ()
-    """Settings that differ from the solver's: TOML files as --print-settings writes them, or single ones such as
+    """Settings that override the solver's: TOML files as written by --print-settings, or single settings such as
     `iterations=20`, `sequence.initial_frames=3` and `free.locked_cameras=["left"]`."""
 
     def __post_init__(self) -> None:
-        _ = self.chosen, self.sequence, self.freed(FreeParameters())  # A file that cannot be used is reported at once.
+        _ = self.chosen, self.sequence, self.freed(FreeParameters())  # Report an unusable file immediately.
 
     @property
     def chosen(self) -> SolverSettings:
@@ -310,7 +318,7 @@ class SolverOptions:
         return changed(free, _table(self.settings, "free"), "[free]")
 
     def check_surface(self, what: str) -> None:
-        """Check that the solver, for `what`, is `surface`, which estimates standard deviations."""
+        """Check that the solver is `surface`, which `what` requires because it estimates standard deviations."""
         if not isinstance(self.chosen, SurfaceSolver):
             raise SettingsError(f"{what} needs the solver surface; given is --solver {self.solver}. Leave it out.")
 
@@ -324,7 +332,7 @@ class CalibrationOptions:
     """Settings of a calibration."""
 
     settings: tuple[str, ...] = ()
-    """Settings that differ from the default ones: TOML files as --print-settings writes them, or single ones such as
+    """Settings that override the defaults: TOML files as written by --print-settings, or single settings such as
     `iterations=20`."""
 
     def __post_init__(self) -> None:
@@ -341,7 +349,7 @@ class CalibrationOptions:
 
 
 def _table(given: tuple[str, ...], name: str) -> dict[str, Any]:
-    """A table of what --settings names; later ones win."""
+    """Table `name` of all --settings merged; later values take precedence."""
     found: dict[str, Any] = {}
     for text in given:
         remedy = "Give a file as --print-settings writes, or `NAME=VALUE`."
@@ -363,7 +371,7 @@ def _table(given: tuple[str, ...], name: str) -> dict[str, Any]:
 
 
 def _of_solver(text: str) -> str:
-    """A single setting as TOML; one without a table is the solver's, and a bare word is a text."""
+    """Convert a single setting to TOML; without a table it belongs to the solver, and a bare word is a string."""
     key, _, value = (part.strip() for part in text.partition("="))
     key = key if "." in key else f"solver.{key}"
     try:
@@ -376,7 +384,7 @@ def _of_solver(text: str) -> str:
 RECORDING = "recording"
 """Masks of the sequence file."""
 LAYERS: dict[str, "MaskLayer"] = {"imported": "imported", "painted": "painted"}
-"""Masks of its project."""
+"""Masks of the sequence's project."""
 
 
 @dataclass(frozen=True)
@@ -385,27 +393,27 @@ class Observer:
 
     predictor: "FeatureExtractor | MaskPredictor"
     weights: str
-    """Fingerprint of the networks and their engine; empty without any."""
+    """Fingerprint of the networks and their engine; empty without networks."""
     masked: bool
     """Whether masks are fitted."""
     given: "GivenMasks | None" = None
-    """Fitted masks, unless they are those of the sequence file."""
+    """Fitted masks; None for those of the sequence file."""
     every: bool = False
     """Whether each frame needs a mask."""
 
     @property
     def ignore(self) -> "Ignore":
-        """Position of a frame -> camera name -> pixels that are not compared."""
+        """Frame index -> camera name -> pixels excluded from comparison."""
         return (lambda _: {}) if self.given is None else self.given.ignored
 
     def completed(self, frame: "Frame") -> "Frame":
-        """A copy of a frame, with given masks for cameras without a recorded one."""
+        """Copy of a frame in which cameras without a recorded mask get the given masks."""
         return frame if self.given is None else self.given.filled(frame)
 
     def mask_inputs(
         self, sequence: "Sequence", index: int, cameras: Iterable[str], domain: str | None
     ) -> tuple[object, ...]:
-        """The masks that the result of a frame depends on, for a fingerprint."""
+        """Masks that the result of a frame depends on, as inputs of a fingerprint."""
         if self.given is None:
             return tuple((camera, str(sequence.mask_fingerprint(index, camera, domain))) for camera in sorted(cameras))
         return tuple(sorted(masks(index).items()) for masks in (self.given.masks, self.given.ignored))
@@ -413,13 +421,13 @@ class Observer:
     def check(
         self, sequence: "Sequence", frames: Iterable[int], cameras: Iterable[str], domains: Iterable[str | None]
     ) -> None:
-        """Check that all frames have the masks to be fitted; otherwise it is a `SettingsError`."""
+        """Check that all frames have the masks to be fitted; `SettingsError` otherwise."""
         if not self.masked:
             return
         frames = list(frames)
         for camera, domain in product(cameras, domains):
             without = [index for index in frames if not self._has_mask(sequence, index, camera, domain)]
-            # With the network beside them, masks of others have to be of this recording, and its own may be missing.
+            # With the network, external masks must belong to this recording, and recorded masks may be missing.
             if without and (self.every or (self.given is not None and len(without) == len(frames))):
                 raise SettingsError(
                     f"{len(without)} of {counted(len(frames), 'frame')} have no {self._origin} of camera "
@@ -439,7 +447,8 @@ class Observer:
     def warnings(
         self, sequence: "Sequence", index: int, domain: str | None, cameras: tuple[str, ...], *, background: bool
     ) -> list[str]:
-        """Warnings from one frame: the network is not suited to these arms or images, or masks of cameras are missing.
+        """Warnings based on one frame: the network is not suited to these arms or images, or masks of cameras are
+        missing.
 
         Args:
             background: whether the solver knows the empty background.
@@ -465,12 +474,14 @@ class Observing(Network):
     """Observations that are fitted: predictions of the network, masks, or both."""
 
     observe: Literal["network", "masks", "both"] = "network"
-    """Fitted observations: predictions of the network, the sequence's masks (no network is loaded), or both: masks,
-    with parts and normals from the network, which alone serves frames without a mask."""
+    """Fitted observations: predictions of the network, the sequence's masks (no network is loaded), or both: masks for
+    coverage, and the network for parts, normals and frames without a mask.
+    """
     masks: str = RECORDING
-    """Which masks are fitted: `recording` for those of the sequence file, `imported` or `painted` for those of its
-    project (`carts import-masks`, `carts view`) or, as in `other.carts:painted`, of another one, or a file or folder of
-    masks (docs: masks)."""
+    """Masks to fit: `recording` for those of the sequence file, `imported` or `painted` for those of its project
+    (`carts import-masks`, `carts view`), a layer of another project such as `other.carts:painted`, or a file or folder
+    of masks (docs: masks).
+    """
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -486,10 +497,10 @@ class Observing(Network):
             )
 
     def observer(self, settings: SolverSettings, sequence: "Sequence") -> Observer:
-        """Observer of a sequence, for a solver.
+        """Create the observer of a sequence for a solver.
 
         Raises:
-            CartsError: the solver compares features of images, or weights or masks cannot be used.
+            CartsError: the solver compares image features, or weights or masks cannot be used.
         """
         if self.observe != "network" and not isinstance(settings, SurfaceSolver):
             raise SettingsError(
@@ -513,7 +524,9 @@ class Observing(Network):
 
     @property
     def _layer(self) -> "tuple[Path | None, MaskLayer | None]":
-        """Project (None for the one beside the sequence) and fitted layer; None for masks from elsewhere."""
+        """Project file (None for the default one) and fitted layer; the layer is None for masks that are not in a
+        project.
+        """
         from ..project.identity import SUFFIX
 
         project, _, name = self.masks.rpartition(":")
@@ -544,7 +557,7 @@ class Observing(Network):
 
     @property
     def caution(self) -> str | None:
-        """Remark on Dice scores that are measured against the fitted masks; None if there are none."""
+        """Remark that Dice scores refer to the fitted masks; None if no masks are fitted."""
         if self.observe == "network":
             return None
         against = "the masks that were fitted" if self.masks == RECORDING else "them where the recording has no masks"
@@ -558,15 +571,17 @@ class OptimizeOptions:
     sequence: SequencePath
     """Sequence file."""
     output: Path | None = None
-    """Folder to write to; by default `runs/NAME/DOMAIN/CAMERA`, with the names of all cameras under --together."""
+    """Folder to write to; by default `runs/NAME/DOMAIN/CAMERA`; with --together, CAMERA combines the names of all
+    cameras.
+    """
     overwrite: bool = False
     """Discard earlier results in the folder and start over."""
     mode: Mode = "frame"
     """Correct each frame alone, or all frames jointly (docs: sequences)."""
     together: bool = False
-    """Optimize a frame with all chosen cameras at once (stereo); otherwise once per camera."""
+    """Optimize each frame jointly over all selected cameras (stereo); otherwise once per camera."""
     keyframes: Path | None = None
-    """`sequence` mode: kinematics table; its rows with the source `edited` are keyframes."""
+    """In `sequence` mode: kinematics table whose rows with source `edited` are keyframes."""
     start: Annotated[Perturbation, tyro.conf.arg(name="")] = field(default_factory=Perturbation)
     select: Annotated[Selection, tyro.conf.arg(name="")] = field(default_factory=Selection)
     free: Annotated[FreeInFrames, tyro.conf.arg(name="")] = field(default_factory=FreeInFrames)

@@ -14,7 +14,7 @@ from ..optimization import BASE_FRAME_GAIN, Assessment, SequenceAssessment, Stop
 from ..wording import counted
 
 _NAMED = 5
-"""Frames that a hint names."""
+"""Number of frames named in a hint."""
 
 
 def print_hints(console: Console, *hints: str | None) -> None:
@@ -25,7 +25,7 @@ def print_hints(console: Console, *hints: str | None) -> None:
 
 
 def kept_start_hint(where: str, stopped: Sequence[str]) -> str | None:
-    """Hint where estimates are equal to their start; None if there are none."""
+    """Hint that estimates equal their initial values; None if there are no such estimates."""
     kept = sum(reason == "start kept" for reason in stopped)
     if not kept:
         return None
@@ -38,7 +38,9 @@ def kept_start_hint(where: str, stopped: Sequence[str]) -> str | None:
 def verdict_line(
     where: str, verdicts: Sequence[str | None], undetermined: Sequence[Sequence[str] | None]
 ) -> str | None:
-    """Verdicts on masks and numbers of undetermined joints (None: unknown) of runs; None where no run was assessed."""
+    """Line on the mask verdicts and numbers of undetermined joints (None: unknown) of runs; None if no run was
+    assessed.
+    """
     runs = [(verdict, joints) for verdict, joints in zip(verdicts, undetermined, strict=True) if verdict is not None]
     counts = Counter(
         fit_words(verdict, joints) for value in Verdict for verdict, joints in runs if verdict == value.value
@@ -48,7 +50,7 @@ def verdict_line(
 
 
 def verdict_hints(where: str, assessed: Mapping[str, Assessment | None]) -> list[str]:
-    """A line for each reason why results are doubtful or failed."""
+    """One line per reason why results are doubtful or failed."""
     frames: dict[tuple[str, str, str], list[str]] = {}
     for frame_id, found in assessed.items():
         if found is not None and found.verdict is not Verdict.GOOD:
@@ -77,7 +79,9 @@ def calibration_hint(found: Assessment | None, stopped: StopReason) -> str | Non
 
 
 def base_frame_hint(where: str, gains: Sequence[float | None]) -> str | None:
-    """Hint where base frames are probably wrong, by the mean share of the residual that free ones would explain."""
+    """Hint that base frames are probably wrong, from the mean share of the residual that free base frames would
+    explain; None if they are not.
+    """
     known = [gain for gain in gains if gain is not None]
     if not known or np.mean(known) < BASE_FRAME_GAIN:
         return None
@@ -89,15 +93,15 @@ def base_frame_hint(where: str, gains: Sequence[float | None]) -> str | None:
 
 
 _FRAMES = 4
-"""Least number of frames for this hint."""
+"""Minimum number of frames for this hint."""
 _LARGE = 5.0
-"""Threshold of constant corrections, twice the prior of the default solver [deg, mm]."""
+"""Threshold for constant corrections: twice the default solver's prior standard deviation [deg, mm]."""
 
 
 def constant_correction_hint(where: str, sequence: recording.Sequence, rows: Sequence[KinematicsRow]) -> str | None:
-    """Hint on large corrections of optimized rows that are nearly equal in all frames; None if there are none.
+    """Hint on large corrections that are nearly constant over the optimized frames; None if there are none.
 
-    Joints compensate for a wrong focal length or base frame: the image fits, and the joints are wrong.
+    A wrong focal length or base frame is compensated by the joints: the image fits, but the joints are wrong.
     """
     scene, position = sequence.scene, {frame_id: index for index, frame_id in enumerate(sequence.frame_ids)}
     rows = [row for row in rows if row.source == "optimized"]
@@ -110,7 +114,7 @@ def constant_correction_hint(where: str, sequence: recording.Sequence, rows: Seq
     prismatic = np.array([unit == "m" for unit in joint_units(scene)])
     shown = np.where(prismatic, 1e3 * off, np.degrees(off))
     typical = np.median(shown, axis=0)
-    # Four of five frames agree with the median to within half of it.
+    # 80 % of the frames agree with the median to within half of it.
     spread = np.quantile(np.abs(shown - typical), 0.8, axis=0)
     constant = np.flatnonzero((np.abs(typical) >= _LARGE) & (spread < np.abs(typical) / 2))
     if not constant.size:

@@ -26,7 +26,7 @@ from ..stopping import finished_first
 from .options import Observer, check_writable
 
 InputHashes = Mapping[str, str]
-"""Kind of input -> its fingerprint; the kinds are those of `_CHANGED`."""
+"""Kind of input -> its fingerprint; the kinds are the keys of `_CHANGED`."""
 
 _CHANGED = {
     "code": "another version of the program made them",
@@ -40,7 +40,7 @@ _CHANGED = {
     "background": "the background changed",
     "together": "they were solved together with other frames",
 }
-"""Message where the fingerprint of an input differs."""
+"""Kind of input -> message if its fingerprint differs."""
 
 _CODE = (
     "*.py",
@@ -57,11 +57,11 @@ _CODE = (
 
 
 class FrameInputs:
-    """Fingerprints of the inputs of frames, for some cameras in a domain. No image is decoded.
+    """Fingerprints of the inputs of frames, for given cameras and a domain. No image is decoded.
 
     Args:
-        start: position of a frame -> arm -> joint positions where the optimization starts [dofs] [rad, m].
-        backgrounds: camera name -> mean background that frames are compared with, where there is one.
+        start: frame index -> arm -> initial joint positions of the optimization [dofs] [rad, m].
+        backgrounds: camera name -> mean background, if the camera has one.
     """
 
     def __init__(
@@ -88,11 +88,11 @@ class FrameInputs:
 
     @property
     def common(self) -> InputHashes:
-        """Fingerprints of inputs that all frames share."""
+        """Fingerprints of the inputs shared by all frames."""
         return self._common
 
     def of(self, index: int) -> InputHashes:
-        """Fingerprints of a frame that is corrected alone; `SequenceError` if an image is missing."""
+        """Fingerprints of a frame corrected alone; `SequenceError` if an image is missing."""
         sequence, start = self._sequence, self._start(index)
         joints = [(name, start[name], sequence.measured[name][index]) for name in sorted(start)]
         joints += sorted(sequence.mounts(index).items())
@@ -119,16 +119,16 @@ class FrameInputs:
 
 
 def changes(before: InputHashes, now: InputHashes) -> str | None:
-    """Message on changed inputs; None if none of those in both has changed."""
+    """Description of the inputs that differ between two runs; None if the inputs recorded in both are equal."""
     different = [kind for kind in _CHANGED if kind in now and before.get(kind) != now[kind]]
     if "together" in different:
-        # Other frames imply other joints, images and masks.
+        # A change of frames implies changes of joints, images and masks.
         different = [kind for kind in different if kind not in ("joints", "images", "masks")]
     if "calibration" in different:
-        # Masks and backgrounds are compared without their distortion, which belongs to the calibration.
+        # Masks and backgrounds are compared undistorted; the distortion belongs to the calibration.
         different = [kind for kind in different if kind not in ("masks", "background")]
     if "joints" in different or "images" in different:
-        # A background is made from frames.
+        # A background is computed from frames.
         different = [kind for kind in different if kind != "background"]
     return " and ".join(_CHANGED[kind] for kind in different) or None
 
@@ -143,11 +143,11 @@ class Record:
     origin: Mapping[str, str]
     """Kind of input -> its fingerprint."""
     masks: Mapping[str, str]
-    """Camera -> fingerprint of the mask's file."""
+    """Camera -> fingerprint of its mask file."""
     row: str
     """Fingerprint of the row in the table."""
     threads: int
-    """Number of threads of torch; results do not depend on it."""
+    """Number of torch threads; results do not depend on it."""
     verdict: str = ""
     """`good`, `doubtful` or `failed`; empty without an assessment."""
     reason: str = ""
@@ -155,18 +155,18 @@ class Record:
     probability: float | None = None
     """Probability that the mask is wrong [1]."""
     not_determined: Several[str] | None = None
-    """`ARM.JOINT` of joints that the images do not determine; None without standard deviations."""
+    """`ARM.JOINT` of each joint not determined by the images; None without standard deviations."""
 
 
 def row_fingerprint(scene: Scene, row: KinematicsRow) -> str:
-    """Fingerprint of a row of the table, with the digits written there."""
+    """Fingerprint of a table row, with the digits written to the file."""
     values = np.concatenate([position_values(scene, row), std_values(scene, row)])
     verdict = [row.verdict] if row.verdict else []
     return fingerprint(row.frame_id, row.source, [f"{value:.9g}" for value in values], *verdict)
 
 
 def read_records(path: OutputPath) -> dict[str, Record]:
-    """Records by frame, empty if the file is missing or damaged; `SettingsError` for a newer version's."""
+    """Read records by frame; empty if the file is missing or damaged. `SettingsError` if a newer version wrote it."""
     if not holds_file(path):
         return {}
     try:
@@ -200,10 +200,10 @@ class FrameFolder:
     frame counts only if all its files were written. Nothing is created or changed before the first frame is written.
 
     Args:
-        settings: of the run; a folder with results of another `sequence` is not written to.
+        settings: settings of the run; a folder with results of another `sequence` is refused.
 
     Attributes:
-        rows: of the kinematics table.
+        rows: rows of the kinematics table.
         checkpoint: file with intermediate results of sequence mode.
 
     Raises:
@@ -234,7 +234,7 @@ class FrameFolder:
 
     @contextmanager
     def held(self) -> Iterator[None]:
-        """Lock the folder for other processes and read existing results; errors as of the class."""
+        """Lock the folder against other processes and read existing results; errors as in the class."""
         with locked_folder(self.folder):
             self._check_settings()
             self._goes_on = holds_file(self._table) and not self._overwrite
@@ -246,7 +246,9 @@ class FrameFolder:
             yield
 
     def fault(self, frame_id: str, origin: InputHashes) -> str | None:
-        """Reason why a frame's result is outdated, by those of its inputs whose fingerprints are given; else None."""
+        """Reason why a frame's result is outdated with respect to the given input fingerprints; None if it is up to
+        date.
+        """
         record = self._records.get(frame_id)
         row = self.rows[bisect_left(self.rows, self._order[frame_id], key=lambda row: self._order[row.frame_id])]
         if record is None:
@@ -262,13 +264,13 @@ class FrameFolder:
         return None
 
     def others_dropped(self, chosen: Several[str]) -> int:
-        """Number of other frames whose results are removed when the first result is written."""
+        """Number of unselected frames whose results are removed when the first result is written."""
         if not self._overwrite or not holds_file(self._table):
             return 0
         return len(set(self._written_before()) - set(chosen))
 
     def write(self, results: Several[FrameResult]) -> None:
-        """Write masks and rows of frames; signals are handled afterwards."""
+        """Write masks and rows of frames; signals are deferred to the end."""
         if not results:
             return
         with finished_first():
@@ -299,10 +301,10 @@ class FrameFolder:
             new = {result.row.frame_id: result.row for result in results}
             rows = {row.frame_id: row for row in self.rows} | new
             self.rows = sorted(rows.values(), key=lambda row: self._order[row.frame_id])
-            # A frame counts if all three files list it, so that a kill between them has it redone.
+            # A frame counts only if all three files list it, so that a frame interrupted by a kill is redone.
             write_text(self._table, kinematics_csv(self._scene, self.rows))
             known = {row.frame_id: self._records[row.frame_id] for row in self.rows if row.frame_id in self._records}
-            # One frame a line.
+            # One line per frame.
             lines = [f"{json.dumps(frame_id)}: {json.dumps(asdict(record))}" for frame_id, record in known.items()]
             content = f'{{"format": "{_FORMAT}", "frames": {{\n' + ",\n".join(lines) + "\n}}\n"
             write_text(self._records_file, content)
@@ -329,7 +331,7 @@ class FrameFolder:
             )
 
     def _settings_written(self) -> dict[str, Any]:
-        """Settings of the newest results in the folder; empty where the file is missing or damaged."""
+        """Settings of the newest results in the folder; empty if the file is missing or damaged."""
         if not holds_file(self._settings_file):
             return {}
         try:

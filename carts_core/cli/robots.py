@@ -1,4 +1,4 @@
-"""`carts robots` lists the built-in robots; `carts robot` makes a URDF from dVRK's own models."""
+"""`carts robots` lists the built-in robots; `carts robot` creates a URDF from dVRK models."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,7 +18,7 @@ class Robots:
     """List the built-in robots, for `robot = "builtin:NAME"` in a sequence file."""
 
     pictures: Path | None = None
-    """Folder for a picture of each, NAME.png."""
+    """Folder for a picture of each robot, NAME.png."""
 
     def run(self) -> None:
         """Print the list, and write pictures if a folder is given."""
@@ -60,16 +60,16 @@ class Robots:
 
 @dataclass(frozen=True)
 class RobotCommand:
-    """Make a URDF of an arm with an instrument of dvrk_model; without --instrument, list the instruments."""
+    """Create a URDF of an arm with an instrument from dvrk_model; without --instrument, list the instruments."""
 
     model: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="MODEL")]
-    """Checkout of https://github.com/jhu-dvrk/dvrk_model: the folder with `urdf` and `meshes`."""
+    """Checkout of https://github.com/jhu-dvrk/dvrk_model, the folder that contains `urdf` and `meshes`."""
     instrument: str | None = None
-    """Last six digits of its model number: 400... for the classic arm, 420... for Si."""
+    """Last six digits of the instrument's model number: 400... for the classic arm, 420... for Si."""
     output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
-    """URDF to write; by default `psm_NUMBER.urdf` here."""
+    """URDF to write; by default `psm_NUMBER.urdf` in the current folder."""
     overwrite: bool = False
-    """Replace a file that is there."""
+    """Replace an existing file."""
 
     def run(self) -> None:
         """Write the URDF after all its meshes have been read."""

@@ -14,17 +14,20 @@ from .options import Network
 
 @dataclass(frozen=True)
 class View:
-    """Open a sequence in the browser; without one, the start page to choose or create one."""
+    """Open a sequence in the browser; without a sequence, open the start page to choose or create one."""
 
     sequence: Annotated[Path | None, tyro.conf.Positional] = None
     """Sequence file, or the folder of a batch."""
     root: tuple[Path, ...] = ()
-    """Folders that the start page may read; by default the working folder. With a sequence: further folders that masks
-    may be imported from."""
+    """Folders that the start page may read; by default the working folder. With a sequence: additional folders from
+    which masks may be imported.
+    """
     project: Path | None = None
     """Project file with the corrections; by default beside the sequence, or in the user's data folder."""
     host: str = "127.0.0.1"
-    """Address to listen on; only this machine by default. Others need the token in the address that is printed."""
+    """Address to listen on; by default only reachable from this machine. Other machines need the token in the printed
+    address.
+    """
     port: int = 8080
     """Port to listen on; the next free one if it is taken."""
     open_browser: bool = False
@@ -39,7 +42,7 @@ class View:
             from carts_viewer.serving import serve, serve_site
 
             from ..batch.folder import is_batch
-        # Otherwise each garbage collection would search all modules and stop the page for 0.2 s.
+        # Otherwise each garbage collection would scan all modules and block the page for 0.2 s.
         gc.freeze()
         segmenter = None
         if self.segmenter is not None:

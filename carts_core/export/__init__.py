@@ -1,4 +1,4 @@
-"""Exports, with a function for each format."""
+"""Exports of frames, with one function per format."""
 
 from ..settings import FormatName as FormatName
 from ..settings import Images as Images

@@ -23,7 +23,7 @@ _KINDS: tuple[Parts, ...] = ("arms", "parts", "links")
 
 
 def write_masks(dataset: Dataset, folder: OutputPath, monitor: Monitor) -> None:
-    """Write PNG masks into `binary`, `arms`, `parts` and `links`; `labels.json` has the meaning of the values."""
+    """Write PNG masks into `binary`, `arms`, `parts` and `links`; `labels.json` maps pixel values to categories."""
     for view in dataset.views(monitor):
         if dataset.images == "copied":
             dataset.write_image_as(view, folder / "images", view.name)
@@ -40,7 +40,7 @@ Annotation = dict[str, Any]
 
 
 def write_coco(dataset: Dataset, folder: OutputPath, monitor: Monitor) -> None:
-    """Write the dataset in COCO's format, with lossless masks."""
+    """Write the dataset in COCO format, with lossless masks."""
 
     def annotations(view: View) -> Iterable[Annotation]:
         for category, mask in dataset.instances(view):
@@ -51,7 +51,7 @@ def write_coco(dataset: Dataset, folder: OutputPath, monitor: Monitor) -> None:
 
 
 def mask_annotation(view: View, category_id: int, mask: Bool[ndarray, "height width"]) -> Annotation:
-    """An object of a view, without its id; the box of an invisible one is empty."""
+    """Annotation of an object in a view, without its id; the box of an invisible object is empty."""
     return {
         "image_id": view.id,
         "category_id": category_id,
@@ -70,12 +70,12 @@ def write_annotations(
     categories: list[dict[str, Any]],
     annotate: Callable[[View], Iterable[Annotation]],
 ) -> None:
-    """Write images and an annotation file with the name that CVAT and Datumaro expect.
+    """Write images and a COCO annotation file with the name that CVAT and Datumaro expect.
 
     Args:
-        kind: `instances` or `person_keypoints`, as COCO names its files.
-        categories: as COCO has them.
-        annotate: the objects of a view, without their numbers.
+        kind: `instances` or `person_keypoints`, the prefix of COCO's file names.
+        categories: categories in COCO format.
+        annotate: returns the annotations of a view, without ids.
     """
     images, annotations = [], []
     for view in dataset.views(monitor):
@@ -108,7 +108,7 @@ _OUTSIDE, _HIDDEN, _VISIBLE = 0, 1, 2
 
 
 def write_coco_keypoints(dataset: Dataset, folder: OutputPath, monitor: Monitor) -> None:
-    """Write the keypoints, mask and box of every arm in COCO's format, with a category per arm."""
+    """Write keypoints, mask and box of every arm in COCO format, with one category per arm."""
     points = {arm.name: keypoints(arm) for arm in dataset.scene.arms}
 
     def annotations(view: View) -> Iterable[Annotation]:
@@ -116,7 +116,7 @@ def write_coco_keypoints(dataset: Dataset, folder: OutputPath, monitor: Monitor)
             yield from _annotations(dataset, view, category, points[category.arm])
 
     categories = [_category(category, points[category.arm]) for category in dataset.arms]
-    # CVAT and Datumaro expect "person" in the name, whatever the object is.
+    # CVAT and Datumaro expect "person" in the name for any kind of object.
     write_annotations(dataset, folder, monitor, "person_keypoints", categories, annotations)
 
 
@@ -138,7 +138,7 @@ def _category(category: Category, points: tuple[Keypoint, ...]) -> dict[str, Any
 def _annotations(
     dataset: Dataset, view: View, category: Category, points: tuple[Keypoint, ...]
 ) -> Iterable[Annotation]:
-    """The annotation of an arm in a view; none if no pixel and no keypoint of it is in the image."""
+    """Annotation of an arm in a view; empty if the image contains none of its pixels or keypoints."""
     mask = dataset.label_image(view, "arms") == category.id
     pixels = project_keypoints(dataset.scene, dataset.state(view.frame), points, view.camera.name).double().numpy()
     values: list[float] = []
@@ -154,7 +154,7 @@ def _annotations(
 
 
 def _element(tag: str, content: object) -> ElementTree.Element:
-    """An XML element with a text, or with a child for each entry of a mapping; a list stands for several children."""
+    """XML element with a text, or with one child per entry of a mapping and one per item of a list."""
     element = ElementTree.Element(tag)
     if isinstance(content, Mapping):
         for name, value in content.items():
@@ -165,13 +165,13 @@ def _element(tag: str, content: object) -> ElementTree.Element:
 
 
 def _xml(root: ElementTree.Element) -> bytes:
-    """Indented XML."""
+    """Serialize an element as indented XML."""
     ElementTree.indent(root, " ")
     return ElementTree.tostring(root, encoding="utf-8")
 
 
 def write_cvat(dataset: Dataset, folder: OutputPath, monitor: Monitor) -> None:
-    """Write the dataset in CVAT's format, with lossless masks."""
+    """Write the dataset in CVAT format, with lossless masks."""
     labels = [{"name": category.name, "type": "mask", "attributes": ""} for category in dataset.categories]
     task = {
         "name": dataset.sequence.name,
@@ -198,7 +198,7 @@ _IMAGE = 2
 
 
 def write_datumaro(dataset: Dataset, folder: OutputPath, monitor: Monitor) -> None:
-    """Write the dataset in Datumaro's format, with lossless masks."""
+    """Write the dataset in Datumaro format, with lossless masks."""
     items = []
     for view in dataset.views(monitor):
         file = dataset.write_image(view, folder / "images" / "default")
@@ -225,13 +225,13 @@ def write_datumaro(dataset: Dataset, folder: OutputPath, monitor: Monitor) -> No
 
 
 _LISTS = ("Main", "Segmentation")
-"""Folders in `ImageSets` with lists of the images; each lists all, since there is no split."""
+"""Folders in `ImageSets` with image lists; each contains all images, since there is no split."""
 _MOST_CATEGORIES = 254
 """Largest number of categories; 0 is the background and 255 is VOC's void."""
 
 
 def write_voc(dataset: Dataset, folder: OutputPath, monitor: Monitor) -> None:
-    """Write the dataset in Pascal VOC's format, with lossless label images; images are copied in their own format."""
+    """Write the dataset in Pascal VOC format, with lossless label images; images keep their file format."""
     if len(dataset.categories) > _MOST_CATEGORIES:
         raise CartsError(f"Pascal VOC holds {_MOST_CATEGORIES} categories, not {len(dataset.categories)}. Export COCO.")
     for view in dataset.views(monitor):
@@ -257,7 +257,7 @@ def write_voc(dataset: Dataset, folder: OutputPath, monitor: Monitor) -> None:
 
 
 def _object(category: Category, mask: np.ndarray) -> dict[str, Any]:
-    """An object; VOC counts pixels from 1."""
+    """VOC entry of an object; VOC counts pixels from 1."""
     left, top, width, height = bounding_box(mask)
     outlines = [
         {f"{'xy'[axis]}{number + 1}": value + 1 for (number, axis), value in np.ndenumerate(polygon)}
@@ -276,7 +276,8 @@ def _name(category: Category) -> str:
 
 
 def _palette() -> UInt8[np.ndarray, "256 3"]:
-    """VOC's colours: the bits of a label, from the lowest, fill red, green and blue in turn from their highest bit."""
+    """VOC's colour map: the bits of a label, from the lowest, set red, green and blue in turn, from their highest
+    bit."""
     labels = np.arange(256)[:, None]
     bits = (labels >> np.arange(8)) & 1
     return np.stack(
@@ -286,18 +287,19 @@ def _palette() -> UInt8[np.ndarray, "256 3"]:
 
 def _write_palette(path: OutputPath, labels: UInt8[np.ndarray, "height width"]) -> None:
     image = Image.fromarray(labels, mode="L")
-    image.putpalette(_palette().tobytes())  # turns grey values into numbers of colours
+    image.putpalette(_palette().tobytes())  # converts grey values to palette indices
     with output_stream(path) as stream:
         image.save(stream, format="PNG")
 
 
 _INTO_PIXEL = 0.25
-"""Added to a pixel's number [px], so that a reader finds that pixel whether it rounds (supervision) or cuts off the
-fraction (Ultralytics)."""
+"""Offset added to pixel indices [px], so that readers recover the pixel both by rounding (supervision) and by
+truncation (Ultralytics).
+"""
 
 
 def write_yolo(dataset: Dataset, folder: OutputPath, monitor: Monitor) -> None:
-    """Write the dataset in YOLO's format; every connected visible part of an arm is an object."""
+    """Write the dataset in YOLO format; each connected visible region of an arm is an object."""
     for view in dataset.views(monitor):
         stem = dataset.stems[view.id - 1]
         dataset.write_image_as(view, folder / "images", stem)
@@ -308,6 +310,6 @@ def write_yolo(dataset: Dataset, folder: OutputPath, monitor: Monitor) -> None:
                 numbers = " ".join(f"{value:.6f}" for value in ((polygon + _INTO_PIXEL) / size).ravel())
                 lines.append(f"{category.id - 1} {numbers}\n")
         write_text(folder / "labels" / f"{stem}.txt", "".join(lines))
-    names = json.dumps([category.name for category in dataset.categories], ensure_ascii=False)  # JSON is YAML
+    names = json.dumps([category.name for category in dataset.categories], ensure_ascii=False)  # JSON is valid YAML
     text = f"# Not split: both name all images.\ntrain: images\nval: images\nnames: {names}\n"
     write_text(folder / "data.yaml", text)

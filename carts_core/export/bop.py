@@ -1,7 +1,7 @@
 """BOP, the format of the benchmark for object pose estimation: 6D poses of all links, with masks and models.
 
-A scene per camera, `test/000001` and so on; an object is a link of an arm, since an object of BOP is rigid. Lengths are
-in millimetres.
+There is one scene per camera (`test/000001` etc.). Each link of an arm is an object, since BOP objects are rigid.
+Lengths are in millimetres.
 """
 
 import json
@@ -27,24 +27,24 @@ from .encodings import bounding_box, mask_png
 
 _MM = 1000.0
 _NOWHERE = [-1, -1, -1, -1]
-"""BOP's box of an object that is not in the image."""
+"""Bounding box that BOP assigns to objects outside the image."""
 
 
 @dataclass(frozen=True)
 class _Object:
-    """A link as an object of BOP."""
+    """A link as a BOP object."""
 
     id: int
-    """From 1."""
+    """Object id, from 1."""
     name: str
     link: int
-    """Index as in `View.link_ids`."""
+    """Link index as in `View.link_ids`."""
     mesh: trimesh.Trimesh
-    """In the link's frame [mm]."""
+    """Mesh in the link frame [mm]."""
 
 
 def write_bop(dataset: Dataset, folder: OutputPath, monitor: Monitor) -> None:
-    """Write the dataset in BOP's format: poses and masks of all links that the camera could see."""
+    """Write the dataset in BOP format: poses and masks of all links in the camera's field of view."""
     objects = list(_objects(dataset.scene.arms))
     _write_models(objects, folder / "models")
     scenes: dict[str, dict[str, dict[str, Any]]] = {camera.name: defaultdict(dict) for camera in dataset.scene.cameras}
@@ -63,7 +63,7 @@ def write_bop(dataset: Dataset, folder: OutputPath, monitor: Monitor) -> None:
 
 
 def _objects(arms: tuple[Arm, ...]) -> Iterator[_Object]:
-    """The links with meshes."""
+    """BOP objects of all links with meshes."""
     first, number = 0, 1
     for arm in arms:
         for link, name in enumerate(arm.robot.link_names):
@@ -100,7 +100,7 @@ def _camera(dataset: Dataset, view: View) -> dict[str, Any]:
     fx, fy, cx, cy = state.intrinsics[row].double().tolist()
     T_view_world = state.T_view_world[row].double().numpy()
     return {
-        # BOP's tools count pixels as OpenCV does, whose first pixel has its centre at 0.
+        # BOP tools follow OpenCV's convention: the centre of the first pixel is at 0.
         "cam_K": [fx, 0.0, cx - HALF_PIXEL, 0.0, fy, cy - HALF_PIXEL, 0.0, 0.0, 1.0],
         "depth_scale": 1.0,
         "cam_R_w2c": T_view_world[:3, :3].ravel().tolist(),
@@ -111,7 +111,7 @@ def _camera(dataset: Dataset, view: View) -> dict[str, Any]:
 def _links(
     dataset: Dataset, view: View, objects: list[_Object], folder: OutputPath
 ) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
-    """Poses and visibility of the links that are in the image or occluded there; their masks are written."""
+    """Write the masks of all links in the image, occluded ones included; returns their poses and visibility."""
     state, row = dataset.state(view.frame), _row(dataset, view)
     Ts = link_transforms(dataset.scene, state)[row]
     poses: list[dict[str, Any]] = []

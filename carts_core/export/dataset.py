@@ -1,4 +1,4 @@
-"""Images of an export with the labels of their pixels, one at a time, with progress and cancellation."""
+"""Dataset of an export: labelled images, generated one at a time, with progress and cancellation."""
 
 import os
 from collections.abc import Callable, Iterator
@@ -29,7 +29,7 @@ T = TypeVar("T")
 
 
 class ExportCancelled(CartsError):
-    """The export was cancelled; its output is removed."""
+    """Raised when an export is cancelled; its output is removed."""
 
 
 @dataclass(frozen=True)
@@ -37,12 +37,12 @@ class Monitor:
     """Progress and cancellation of an export."""
 
     progress: Callable[[int, int], None] | None = None
-    """Called after each step with the number of done and of all steps."""
+    """Called after each step with the number of finished steps and the total."""
     cancelled: Callable[[], bool] | None = None
-    """Called before each step, such as `threading.Event().is_set`."""
+    """Called before each step; True cancels the export. Example: `threading.Event().is_set`."""
 
     def track(self, steps: Items[T]) -> Iterator[T]:
-        """The steps one by one, with progress and cancellation (`ExportCancelled`)."""
+        """Yield the steps, reporting progress; raises `ExportCancelled` if cancelled."""
         for done, step in enumerate(steps):
             self._check()
             yield step
@@ -57,10 +57,10 @@ class Monitor:
 
 @dataclass(frozen=True)
 class Category:
-    """Category of pixels."""
+    """Pixel category."""
 
     id: int
-    """From 1; 0 is the background."""
+    """Category id, from 1; 0 is the background."""
     name: str
     """The arm's name, `ARM.PART` or `ARM.LINK`."""
     arm: str
@@ -68,20 +68,22 @@ class Category:
 
 @dataclass(frozen=True)
 class View:
-    """One frame through one camera."""
+    """One frame seen by one camera."""
 
     id: int
-    """From 1, through the whole export."""
+    """View id, from 1, unique in the export."""
     frame: ExportFrame
     camera: Camera
     name: str
-    """Unique in the export; the stem of every file of this view."""
+    """View name, unique in the export; the stem of all files of this view."""
     link_ids: Int[np.ndarray, "height width"]
-    """Index of the visible link through all arms, -1 for background."""
+    """Index of the visible link over all arms; -1 for background."""
 
     @property
     def painted(self) -> bool:
-        """Whether the view has painted masks or parts, so that not all pixels follow from the joint positions."""
+        """Whether the view has painted masks or parts, so that its labels are not determined by the joint positions
+        alone.
+        """
         return self.camera.name in self.frame.masks or self.camera.name in self.frame.part_labels
 
 
@@ -92,12 +94,14 @@ class Dataset:
     sequence: Sequence
     frames: tuple[ExportFrame, ...]
     scene: Scene
-    """Arms and cameras of the export, with the calibration that masks are rendered with."""
+    """Arms and cameras of the export, with the calibration used for rendering masks."""
     domain: str
     parts: Parts = "arms"
     """Granularity of the categories."""
     images: Images = "named"
-    """Labels refer to the recording's own images, to copies, or no image is written, where the format allows it."""
+    """Whether labels refer to the recording's images or to copies, or no images are written, where the format allows
+    it.
+    """
     frame_rate: float | None = None
     """Frame rate of a video [1/s]; as recorded if None."""
 
@@ -115,29 +119,29 @@ class Dataset:
 
     @cached_property
     def steps(self) -> list[tuple[str, ExportFrame, Camera]]:
-        """Name, frame and camera of every view, frame by frame; names are unique."""
+        """Unique name, frame and camera of each view, ordered by frame."""
         pairs = [(frame, camera) for frame in self.frames for camera in self.scene.cameras]
         names = unique_file_names([f"{camera.name}_{frame.frame_id}" for frame, camera in pairs])
         return [(name, *pair) for name, pair in zip(names, pairs, strict=True)]
 
     @cached_property
     def links(self) -> tuple[Category, ...]:
-        """A category for each link, in the order of `View.link_ids`."""
+        """One category per link, in the order of `View.link_ids`."""
         names = [(arm.name, link) for arm in self.scene.arms for link in arm.robot.link_names]
         return tuple(Category(id, f"{arm}.{link}", arm) for id, (arm, link) in enumerate(names, start=1))
 
     @cached_property
     def arms(self) -> tuple[Category, ...]:
-        """A category for each arm."""
+        """One category per arm."""
         return tuple(Category(id, arm.name, arm.name) for id, arm in enumerate(self.scene.arms, start=1))
 
     @property
     def categories(self) -> tuple[Category, ...]:
-        """The categories for `parts`."""
+        """Categories of the export, as selected by `parts`."""
         return self.categories_of(self.parts)
 
     def categories_of(self, parts: Parts) -> tuple[Category, ...]:
-        """A category for each arm, for each part of one, or for each link."""
+        """One category per arm, per part or per link."""
         if parts != "parts":
             return self.arms if parts == "arms" else self.links
         classes = part_classes(self.scene.arms)
@@ -145,12 +149,12 @@ class Dataset:
 
     @cached_property
     def link_classes(self) -> Int[np.ndarray, " links"]:
-        """Number of the class of every link, in the order of `View.link_ids`."""
+        """Part class number of each link, in the order of `View.link_ids`."""
         return link_classes(self.scene.arms)
 
     @cached_property
     def renderers(self) -> dict[str, Renderer]:
-        """Camera -> a renderer of that camera alone, at its full size."""
+        """Camera -> renderer of that camera only, at full resolution."""
         return {
             camera.name: Renderer(self.scene, width=camera.width, height=camera.height, cameras=[camera.name])
             for camera in self.scene.cameras
@@ -161,10 +165,10 @@ class Dataset:
         return self.scene.state(frame.joint_positions, mounts=self.sequence.mounts(frame.index))
 
     def views(self, monitor: Monitor) -> Iterator[View]:
-        """Labelled views of all frames and cameras; a step of `monitor` each.
+        """Yield the labelled views of all frames and cameras, one `monitor` step each.
 
         Raises:
-            CartsError: a mask is of another size than its camera, or of pixels that no arm is near.
+            CartsError: a mask does not have its camera's image size, or has pixels far from any arm.
         """
         for number, (name, frame, camera) in enumerate(monitor.track(self.steps), start=1):
             rendered = self.renderers[camera.name].segment_links(self.state(frame))[0]
@@ -177,7 +181,7 @@ class Dataset:
             yield View(number, frame, camera, name, link_ids)
 
     def label_image(self, view: View, parts: Parts | None = None) -> UInt[np.ndarray, "height width"]:
-        """Category of every pixel, 0 for background; 8 bits if that is enough for all categories, else 16."""
+        """Label image: category id per pixel, 0 for background; 8 bits if sufficient for all categories, else 16."""
         parts = parts or self.parts
         if parts == "links":
             ids = [link.id for link in self.links]
@@ -186,7 +190,7 @@ class Dataset:
             ids = [arms[link.arm] for link in self.links]
         else:
             numbers = [one.number for one in part_classes(self.scene.arms)]
-            # Links without a mesh may have no class.
+            # Links without a mesh may lack a class.
             ids = [numbers.index(number) + 1 if number in numbers else 0 for number in self.link_classes.tolist()]
         of_link = [0, *ids]
         return np.array(of_link, np.uint8 if max(of_link) <= 255 else np.uint16)[view.link_ids + 1]
@@ -200,25 +204,27 @@ class Dataset:
                 yield category, mask
 
     def image(self, view: View) -> UInt8[np.ndarray, "height width 3"]:
-        """The view's image, RGB, undistorted; `SequenceError` if it is missing or damaged."""
+        """Undistorted RGB image of the view; `SequenceError` if it is missing or damaged."""
         return self.sequence.frame(view.frame.index, self.domain, [view.camera.name]).images[view.camera.name]
 
     @cached_property
     def files(self) -> list[Path | None]:
-        """The recording's image of every view; None where that is undistorted, cropped, turned, or of a video
-        or a bag."""
+        """Recorded image file of each view; None if its images are undistorted, cropped or rotated, or come from a
+        video or bag.
+        """
         return [self._file(frame, camera) for _, frame, camera in self.steps]
 
     @property
     def remade_cameras(self) -> tuple[str, ...]:
-        """Cameras with images that are not files of the recording; see `files`."""
+        """Cameras whose images are not files of the recording; see `files`."""
         steps = zip(self.steps, self.files, strict=True)
         return tuple(dict.fromkeys(camera.name for (_, _, camera), file in steps if file is None))
 
     @cached_property
     def image_folder(self) -> Path:
-        """The folder that names of the recording's images are relative to: that of the sequence file, else the
-        innermost one that holds all of them."""
+        """Folder to which image names are relative: that of the sequence file, else the innermost common folder of all
+        recorded images.
+        """
         beside = self.sequence.path.parent
         cameras = self.sequence.scene.cameras
         files = [self._file(frame, camera) for frame in self.frames for camera in cameras]
@@ -228,13 +234,14 @@ class Dataset:
         return Path(os.path.commonpath(folders))
 
     def image_name(self, view: View) -> str:
-        """The path by which labels name a view's image: the recording's own, from `image_folder`, or `NAME.png`."""
+        """Image path used in labels: that of the recorded file relative to `image_folder`, or `NAME.png`."""
         return self._image_names[view.id - 1]
 
     def write_image(self, view: View, folder: OutputPath) -> str:
-        """Write the view's image into `folder` if copies are wanted or it is no recorded file; its `image_name`.
+        """Write the view's image into `folder` if copies are requested or it is not a recorded file; returns its
+        `image_name`.
 
-        Copies have the bytes of the recording's file; other images (see `remade_cameras`) are written as PNG.
+        Recorded files are copied byte for byte; other images (see `remade_cameras`) are written as PNG.
         """
         name = self.image_name(view)
         if self.images == "none":
@@ -248,7 +255,7 @@ class Dataset:
         return name
 
     def write_image_as(self, view: View, folder: OutputPath, stem: str) -> str:
-        """As `write_image`, for a format with a given file name; returns the name with its suffix."""
+        """Like `write_image`, for formats that prescribe the file name; returns the name with its suffix."""
         file = self.files[view.id - 1]
         name = f"{stem}{'.png' if file is None else file.suffix.lower()}"
         if self.images != "none":
@@ -264,15 +271,17 @@ class Dataset:
 
     @cached_property
     def stems(self) -> list[str]:
-        """Stem of the files of every view where folders are flat: the recorded image's own if all differ, else the
-        view's name."""
+        """File stem of each view in flat folders: that of the recorded image if all stems differ, else the view's
+        name."""
         own = [PurePath(name).stem for name in self._image_names]
         unique = len({stem.casefold() for stem in own}) == len(own) and not any(map(name_fault, own))
         return own if unique else [name for name, _, _ in self.steps]
 
     @cached_property
     def _image_names(self) -> list[str]:
-        """Of every view. Where two would have the same labels, or a name cannot be written, all are those of views."""
+        """Image name of each view; all are view names if two label files would collide or a recorded name cannot be
+        written.
+        """
         files = self.files
         paths = [PurePath(f"{name}.png") for name, _, _ in self.steps]
         paths = [
@@ -288,10 +297,10 @@ class Dataset:
 def labelled(
     mask: Bool[np.ndarray, "height width"], rendered: Int[np.ndarray, "height width"], where: str
 ) -> Int[np.ndarray, "height width"]:
-    """`rendered` labels (-1 for background) restricted to `mask`; additional pixels get the nearest rendered label.
+    """Restrict `rendered` labels (-1 for background) to `mask`; additional pixels get the nearest rendered label.
 
     Raises:
-        CartsError: the mask of the view `where` has another size, or nothing is rendered that could name its pixels.
+        CartsError: the mask of the view `where` has another size, or there is no rendered label for its pixels.
     """
     if mask.shape != rendered.shape or mask.dtype != bool:
         raise CartsError(
@@ -310,7 +319,7 @@ def labelled(
 
 
 def _nearest(pixels: Bool[np.ndarray, "height width"]) -> Int[np.ndarray, "2 height width"]:
-    """Row and column of the nearest True pixel, for every pixel."""
+    """For each pixel, row and column of the nearest True pixel."""
     return np.asarray(distance_transform_edt(~pixels, return_distances=False, return_indices=True))
 
 
@@ -321,14 +330,15 @@ def painted_links(
     classes: Int[np.ndarray, " links"],
     where: str,
 ) -> Int[np.ndarray, "height width"]:
-    """`link_ids` in which each pixel painted as a class (0 for none) has the nearest rendered link of that class.
+    """`link_ids` in which each pixel painted as a part class (0: not painted) gets the nearest rendered link of that
+    class.
 
     Args:
-        rendered: as `link_ids` (-1 for background), before a mask was applied.
-        classes: number of the class of every link.
+        rendered: like `link_ids` (-1 for background), before a mask was applied.
+        classes: part class number of each link.
 
     Raises:
-        CartsError: the labels of the view `where` have another size, or name a class that no link has.
+        CartsError: the labels of the view `where` have another size, or contain a class that no link has.
     """
     if painted.shape != link_ids.shape:
         raise CartsError(f"{where}: painted classes are {painted.shape}, the camera's images are {link_ids.shape}.")

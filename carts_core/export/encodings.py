@@ -1,4 +1,4 @@
-"""Encodings of masks and images: PNG, run lengths and polygons."""
+"""Encodings of masks and images: PNG, run-length encoding and polygons."""
 
 import cv2
 import numpy as np
@@ -10,12 +10,12 @@ from ..errors import CartsError
 
 
 def mask_png(mask: Bool[np.ndarray, "height width"]) -> bytes:
-    """A mask as a PNG file: 255 where an arm is, 0 elsewhere."""
+    """Encode a mask as PNG: 255 on arms, 0 elsewhere."""
     return label_png(mask.astype(np.uint8) * 255)
 
 
 def label_png(labels: UInt[np.ndarray, "height width *channels"]) -> bytes:
-    """Labels or grey values of 8 or 16 bits, or BGR(A), as a PNG file."""
+    """Encode labels or grey values of 8 or 16 bits, or BGR(A), as PNG."""
     ok, data = cv2.imencode(".png", labels)
     if not ok:
         raise CartsError(f"an image of shape {labels.shape} could not be written as PNG: OpenCV's encoder failed.")
@@ -23,20 +23,20 @@ def label_png(labels: UInt[np.ndarray, "height width *channels"]) -> bytes:
 
 
 def image_png(image: UInt8[np.ndarray, "height width channels"]) -> bytes:
-    """An RGB or RGBA picture as a PNG file."""
+    """Encode an RGB or RGBA image as PNG."""
     code = cv2.COLOR_RGBA2BGRA if image.shape[-1] == 4 else cv2.COLOR_RGB2BGR
     return label_png(cv2.cvtColor(image, code))
 
 
 def coco_rle(mask: Bool[np.ndarray, "height width"]) -> dict[str, object]:
-    """COCO's compressed run lengths (column by column): `size` as [height, width], and `counts` as text."""
+    """COCO's compressed run-length encoding (column-major): `size` as [height, width], and `counts` as text."""
     counts = coco_mask.encode(np.asfortranarray(mask, dtype=np.uint8))["counts"]
     assert isinstance(counts, bytes)
     return {"size": list(mask.shape), "counts": counts.decode("ascii")}
 
 
 def row_runs(mask: Bool[np.ndarray, "height width"]) -> list[int]:
-    """Lengths of runs row by row, in turn outside and inside the mask; the first is outside and may be 0."""
+    """Row-major run lengths, alternately outside and inside the mask; the first is outside and may be 0."""
     flat = mask.ravel()
     changes = np.flatnonzero(flat[1:] != flat[:-1]) + 1
     lengths = np.diff(changes, prepend=0, append=flat.size).tolist()
@@ -44,23 +44,23 @@ def row_runs(mask: Bool[np.ndarray, "height width"]) -> list[int]:
 
 
 def bounding_box(mask: Bool[np.ndarray, "height width"]) -> tuple[int, int, int, int]:
-    """Left, top, width and height [px] of a mask that is not empty."""
+    """Bounding box (left, top, width, height) [px] of a nonempty mask."""
     columns, rows = np.flatnonzero(mask.any(0)), np.flatnonzero(mask.any(1))
     return int(columns[0]), int(rows[0]), int(columns[-1] - columns[0] + 1), int(rows[-1] - rows[0] + 1)
 
 
 MIN_POINTS = 3
-"""Smallest number of points that readers accept as a polygon."""
+"""Minimum number of points that readers accept as a polygon."""
 
 
 def polygons(mask: Bool[np.ndarray, "height width"]) -> list[Int[np.ndarray, "points 2"]]:
-    """One closed polygon per connected part of a mask, through the centres of the pixels on its rim.
+    """One closed polygon per connected component of a mask, through the centres of its boundary pixels.
 
-    Filled with its edges, as by OpenCV, each gives exactly the pixels of its part. Holes are connected by a slit of
-    zero width, since a polygon has one rim only.
+    Filled including its edges, as in OpenCV, each polygon reproduces its component exactly. Holes are connected to the
+    outline by slits of zero width, since a polygon has a single boundary.
 
     Returns:
-        Points (column, row) [px], whole numbers; pixel (0, 0) is at (0, 0).
+        Integer points (column, row) [px]; the centre of pixel (0, 0) is at (0, 0).
     """
     contours, hierarchy = cv2.findContours(mask.astype(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
     if not contours:
@@ -75,8 +75,9 @@ def polygons(mask: Bool[np.ndarray, "height width"]) -> list[Int[np.ndarray, "po
 
 
 def _with_holes(rim: np.ndarray, holes: list[np.ndarray]) -> np.ndarray:
-    """One closed line along the rim and all holes. The shortest link is chosen first, so that it crosses no other
-    hole; the links of the other holes are then compared with those to the new points alone."""
+    """Closed polyline along the outline and all holes. The shortest link is added first, so that it crosses no other
+    hole; links of the remaining holes are then compared only with links to the new points.
+    """
     if not holes:
         return rim
     points, first = np.concatenate(holes), np.cumsum([0, *map(len, holes)])
@@ -87,7 +88,7 @@ def _with_holes(rim: np.ndarray, holes: list[np.ndarray]) -> np.ndarray:
         rim = np.concatenate([rim[: joint + 1], hole, hole[:1], rim[joint:]])
         at[at > joint] += len(hole) + 2
         new_length, new_at, new_start = _links(hole, points, first)
-        # Of links of one length, the first along the line.
+        # Among links of equal length, the first along the line.
         better = (new_length < length) | ((new_length == length) & (at > joint))
         better &= np.isfinite(length)
         length[better], at[better], start[better] = new_length[better], joint + 1 + new_at[better], new_start[better]
@@ -96,14 +97,14 @@ def _with_holes(rim: np.ndarray, holes: list[np.ndarray]) -> np.ndarray:
 
 
 _ROWS = 512
-"""Points whose distances are computed at a time."""
+"""Number of points whose distances are computed at a time."""
 
 
 def _links(line: np.ndarray, points: np.ndarray, first: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The shortest link from a line to each hole: squared length [px^2], index along the line, index along the hole.
+    """Shortest link from a line to each hole: squared length [px^2], index along the line, index along the hole.
 
     Args:
-        points: of all holes, those of hole n from `first[n]` to `first[n + 1]`.
+        points: points of all holes; hole n has those from `first[n]` to `first[n + 1]`.
     """
     length, at = np.full(len(points), np.inf), np.zeros(len(points), np.int64)
     for row in range(0, len(line), _ROWS):
@@ -120,7 +121,7 @@ def _links(line: np.ndarray, points: np.ndarray, first: np.ndarray) -> tuple[np.
 
 
 def _corners(line: np.ndarray) -> np.ndarray:
-    """The closed line without intermediate points of straight runs."""
+    """Closed line without the intermediate points of straight segments."""
     before, after = line - np.roll(line, 1, axis=0), np.roll(line, -1, axis=0) - line
     corners = line[(before != after).any(1)]
     return corners if len(corners) else line[:1]

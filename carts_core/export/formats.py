@@ -36,7 +36,7 @@ class ExportFormat:
     label: str
     """Label of the format."""
     write: Callable[[Dataset, OutputPath, Monitor], None]
-    """Writes the file or folder."""
+    """Function that writes the file or folder."""
     suffix: str = ""
     """Suffix of the file; empty for a folder."""
     images: bool = False
@@ -75,16 +75,16 @@ def export(
     Args:
         dataset: content of the export.
         name: one of `FORMATS`.
-        output: the folder, or the file, to make. A file's name gets the format's suffix if it has another one.
-        overwrite: replace a file, or a folder that an export made.
+        output: folder or file to create. A file gets the format's suffix if it has another one.
+        overwrite: replace a file, or a folder written by an export.
         monitor: progress and cancellation.
 
     Returns:
-        The path that was written.
+        Path of the output.
 
     Raises:
-        ExportCancelled: the monitor cancels it.
-        CartsError: the output exists, cannot be written, or what it needs is missing.
+        ExportCancelled: cancelled by the monitor.
+        CartsError: the output exists or cannot be written, or required data is missing.
     """
     chosen = FORMATS[name]
     if chosen.suffix:
@@ -100,7 +100,7 @@ def export(
 
 
 def _summary(dataset: Dataset, name: FormatName) -> str:
-    """Content of an exported folder, as JSON."""
+    """Description of an exported folder, as JSON."""
     views = [
         {
             "name": name,

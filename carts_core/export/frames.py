@@ -1,4 +1,5 @@
-"""Frames of an export: joint positions, verdicts, reviews and corrected masks, those of a project among them."""
+"""Frames of an export, from a recording, a table or a project: joint positions, verdicts, reviews and corrected
+masks."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
@@ -24,12 +25,13 @@ class ExportFrame(KinematicsRow):
     review: str | None = field(default=None, kw_only=True)
     """Review state, such as accepted; None without a project."""
     dice: float | None = field(default=None, kw_only=True)
-    """Dice with the masks of the recording, the lowest of the cameras [1]; None if not known."""
+    """Dice with the recorded masks, lowest over the cameras [1]; None if unknown."""
     masks: Mapping[str, Bool[ndarray, "height width"]] = field(default_factory=dict, kw_only=True)
     """Camera -> corrected mask at the camera's size; other cameras get the rendered mask."""
     part_labels: Mapping[str, UInt8[ndarray, "height width"]] = field(default_factory=dict, kw_only=True)
-    """Camera -> number of the class (`carts_core.model.parts.PartClass`) that a pixel was painted as, 0 for none. What
-    was painted belongs to that part whatever is rendered there, and to the mask."""
+    """Camera -> painted part class number (`carts_core.model.parts.PartClass`) per pixel, 0 for none. Painted classes
+    override the rendered ones, and painted pixels belong to the mask.
+    """
 
 
 def measured_frames(sequence: Sequence, indices: Iterable[int]) -> list[ExportFrame]:
@@ -46,10 +48,10 @@ def measured_frames(sequence: Sequence, indices: Iterable[int]) -> list[ExportFr
 
 
 def corrected_frames(sequence: Sequence, indices: Iterable[int], rows: Iterable[KinematicsRow]) -> list[ExportFrame]:
-    """Frames of `indices` that have a row, with its joint positions.
+    """Frames of `indices` that have a table row, with its joint positions.
 
     Raises:
-        SequenceError: a row is of a frame that the sequence does not have, or two are of the same.
+        SequenceError: a row refers to a frame that is not in the sequence, or two rows to the same frame.
     """
     known = set(sequence.frame_ids)
     by_id: dict[str, KinematicsRow] = {}
@@ -70,18 +72,18 @@ def corrected_frames(sequence: Sequence, indices: Iterable[int], rows: Iterable[
 
 
 RenderMask = Callable[[SceneState, str], Bool[np.ndarray, "height width"]]
-"""Pose of the scene and name of a camera -> rendered mask at the camera's size."""
+"""Function that renders the mask of a camera, given by name, at its full size for a scene state."""
 _SOURCES = {
     Source.MEASURED: "measured",
     Source.HAND: "edited",
     Source.OPTIMIZER: "optimized",
     Source.PROPAGATED: "propagated",
 }
-"""Sources as in the tables of `carts optimize`, so that `--keyframes` finds frames edited by hand."""
+"""Source names as in the tables of `carts optimize`, so that `--keyframes` finds manually edited frames."""
 
 
 class _CorrectedMasks(Mapping[str, Bool[np.ndarray, "height width"]]):
-    """Camera -> corrected mask of a frame, rendered on access."""
+    """Mapping camera -> corrected mask of a frame, rendered on access."""
 
     def __init__(self, render: RenderMask, pose: SceneState, corrections: Mapping[str, MaskCorrection]) -> None:
         self._render, self._pose, self._corrections = render, pose, corrections
@@ -99,11 +101,11 @@ class _CorrectedMasks(Mapping[str, Bool[np.ndarray, "height width"]]):
 def project_frame(
     recording: Sequence, project: ProjectState, index: int, cameras: Iterable[str], render: RenderMask
 ) -> ExportFrame:
-    """A frame with the corrections of a project, and the painted masks and parts of some cameras.
+    """Frame with the corrections of a project, and with painted masks and parts for the given cameras.
 
     Args:
-        recording: with the project's time offset; corrected or as measured.
-        render: called for cameras whose mask was corrected.
+        recording: recording with the project's time offset; other corrections may be applied.
+        render: renders masks; called for cameras whose mask was corrected.
     """
     frame = recording.frame(index, cameras=[])
     pose = corrected_state(recording.scene, frame, project)

@@ -1,7 +1,7 @@
-"""Corrected kinematics as CSV: a row per frame, a column `source`, and `ARM.JOINT` for every joint [rad, m].
+"""Corrected kinematics as CSV: one row per frame, with columns `source` and one `ARM.JOINT` per joint [rad, m].
 
-Where standard deviations are known, a column `ARM.JOINT.std` [rad, m] follows for every joint. Where a frame has a
-verdict, `verdict` (of the mask) and `not_determined` (the joints that the image leaves open) follow.
+If standard deviations are known, a column `ARM.JOINT.std` [rad, m] per joint follows. If a frame has a verdict,
+`verdict` (of the mask) and `not_determined` (joints not determined by the image) follow.
 """
 
 import csv
@@ -21,9 +21,9 @@ from ..optimization.observability import undetermined_joints
 from ..wording import shortened
 
 _TEXT_COLUMNS = ["verdict", "not_determined"]
-"""Text columns after the numbers."""
+"""Text columns after the numeric ones."""
 JOINED = "; "
-"""Separator of joint names in a text."""
+"""Separator of joint names in a text column."""
 
 
 @dataclass(frozen=True)
@@ -32,21 +32,21 @@ class KinematicsRow:
 
     frame_id: str
     source: str
-    """Source of the values: measured, edited, optimized."""
+    """Source of the values: measured, edited or optimized."""
     joint_positions: Mapping[str, np.ndarray]
     """Arm name -> [dofs], [rad, m]."""
     joint_std: Mapping[str, np.ndarray] | None = None
-    """Arm name -> standard deviation of the joint positions [dofs], [rad, m]; NaN, or no entry, if not known."""
+    """Arm name -> standard deviation of the joint positions [dofs], [rad, m]; NaN or no entry if unknown."""
     verdict: str | None = None
-    """Verdict on the mask: good, doubtful or failed; None where it was not assessed."""
+    """Verdict on the mask: good, doubtful or failed; None if it was not assessed."""
 
     def undetermined(self, scene: Scene) -> list[str] | None:
-        """`ARM.JOINT` of the joints that the images do not determine; None if no deviation is known."""
+        """`ARM.JOINT` of the joints not determined by the images; None if no standard deviation is known."""
         return undetermined_joints(scene, self.joint_std or {})
 
 
 def joint_columns(scene: Scene) -> list[str]:
-    """`ARM.JOINT` of every degree of freedom, in the scene's order."""
+    """`ARM.JOINT` of each degree of freedom, in the scene's order."""
     return [f"{arm.name}.{joint}" for arm in scene.arms for joint in arm.robot.joint_names]
 
 
@@ -61,14 +61,14 @@ def position_values(scene: Scene, row: KinematicsRow) -> np.ndarray:
 
 
 def std_values(scene: Scene, row: KinematicsRow) -> np.ndarray:
-    """Standard deviations of a row in the order of `joint_columns`, [columns] [rad, m], NaN if not known."""
+    """Standard deviations of a row in the order of `joint_columns`, [columns] [rad, m]; NaN if unknown."""
     known = row.joint_std or {}
     unknown = {arm.name: np.full(len(arm.robot.joint_names), math.nan) for arm in scene.arms}
     return np.concatenate([np.asarray(known.get(name, nothing), dtype=np.float64) for name, nothing in unknown.items()])
 
 
 def kinematics_csv(scene: Scene, rows: Iterable[KinematicsRow]) -> str:
-    """The table as text; with standard deviations if any row has them."""
+    """Kinematics table as CSV text; with standard deviations if any row has them."""
     rows = list(rows)
     with_std, with_verdict = any(row.joint_std is not None for row in rows), any(row.verdict for row in rows)
     text = io.StringIO()
@@ -83,7 +83,7 @@ def kinematics_csv(scene: Scene, rows: Iterable[KinematicsRow]) -> str:
 
 
 def read_kinematics_csv(path: Path, scene: Scene) -> list[KinematicsRow]:
-    """Rows of a table that `kinematics_csv` wrote; `SequenceError` for other arms or joints, or an unreadable file."""
+    """Read a table written by `kinematics_csv`; `SequenceError` if arms or joints differ or the file is unreadable."""
     try:
         return _read(path, scene)
     except (OSError, ValueError, csv.Error) as error:

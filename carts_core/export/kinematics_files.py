@@ -1,4 +1,4 @@
-"""Formats of kinematics: corrected joint positions as CSV, NPZ or JSON, and base frames as the dVRK reads them."""
+"""Kinematics formats: corrected joint positions as CSV, NPZ or JSON, and base frames in dVRK formats."""
 
 import json
 import math
@@ -18,7 +18,7 @@ from .kinematics import JOINED, joint_columns, joint_units, kinematics_csv, posi
 
 
 def _camera_poses(dataset: Dataset, frames: Sequence[ExportFrame]) -> dict[str, Float[np.ndarray, "frames 4 4"]]:
-    """Camera -> T_camera_world of every frame [m], of the cameras that move."""
+    """Moving camera -> T_camera_world of each frame [m]."""
     mounts = [dataset.sequence.mounts(frame.index) for frame in frames]
     return {
         camera.name: np.stack([camera.T_camera_world @ one[camera.name] for one in mounts])
@@ -28,18 +28,17 @@ def _camera_poses(dataset: Dataset, frames: Sequence[ExportFrame]) -> dict[str, 
 
 
 def write_kinematics_csv(dataset: Dataset, path: OutputPath, monitor: Monitor) -> None:
-    """Write the table that `read_kinematics_csv` and `carts export --kinematics` read."""
+    """Write a CSV table for `read_kinematics_csv` and `carts export --kinematics`."""
     write_text(path, kinematics_csv(dataset.scene, monitor.track(dataset.frames)))
 
 
 def write_kinematics_npz(dataset: Dataset, path: OutputPath, monitor: Monitor) -> None:
-    """Write an archive of NumPy without pickles.
+    """Write a NumPy archive (NPZ) without pickled objects.
 
-    Arrays: `frame_id`, `source`, `verdict` (of the mask, empty where it was not assessed), `not_determined` (joints
-    that the images leave open, with `; ` between them) and `index` [frames]; `column` (`ARM.JOINT`)
-    and `unit` [columns]; `joint_positions` and `joint_std` [frames, columns] in [rad] or [m], as `unit` says; a
-    `joint_std` that is not known is NaN. Where cameras move, `T_camera_world` [frames, cameras, 4, 4] [m] has their
-    poses, and `camera` their names.
+    Arrays: `frame_id`, `source`, `verdict` (of the mask, empty if not assessed), `not_determined` (joints not
+    determined by the images, separated by `; `) and `index` [frames]; `column` (`ARM.JOINT`) and `unit` [columns];
+    `joint_positions` and `joint_std` [frames, columns] in the unit given by `unit`; unknown `joint_std` is NaN. If
+    cameras move, `T_camera_world` [frames, cameras, 4, 4] [m] contains their poses, and `camera` their names.
     """
     frames = list(monitor.track(dataset.frames))
     moving, poses = _camera_poses(dataset, frames), {}
@@ -92,7 +91,7 @@ def write_kinematics_json(dataset: Dataset, path: OutputPath, monitor: Monitor) 
 def _write_base_frames(
     entry: Callable[[str, list[list[float]]], dict[str, Any]], dataset: Dataset, path: OutputPath, monitor: Monitor
 ) -> None:
-    """Write base frames of all arms in the frame of the first exported camera, with the dVRK's axes."""
+    """Write the base frames of all arms relative to the first exported camera, in dVRK axes."""
     camera = dataset.scene.cameras[0]
     if camera.name in dataset.sequence.moving_cameras:
         raise CartsError(
@@ -107,8 +106,8 @@ def _write_base_frames(
 
 
 write_dvrk = partial(_write_base_frames, lambda name, T: {"base_frame": {"reference_frame": name, "transform": T}})
-"""Writes base frames to be merged into a system's file (2.4)."""
+"""Writes base frames to be merged into a dVRK system file (version 2.4)."""
 write_dvrk_2_3 = partial(_write_base_frames, lambda name, T: {"base-frame": {"reference-frame": name, "transform": T}})
-"""Writes base frames for a console's file of 2.3 and earlier."""
+"""Writes base frames for a dVRK console file (version 2.3 and earlier)."""
 write_dvrk_suj = partial(_write_base_frames, lambda name, T: {"measured_cp": T})
-"""Writes base frames as a file of fixed set-up joints."""
+"""Writes base frames as a fixed set-up joint file of the dVRK."""

@@ -1,4 +1,4 @@
-"""Overlays of the rendered arms on the recorded images, as pictures and as a video per camera (H.264 in MP4)."""
+"""Overlays of the rendered arms on the recorded images, as images and as one video per camera (H.264 in MP4)."""
 
 from contextlib import ExitStack
 from fractions import Fraction
@@ -20,7 +20,7 @@ _CONTOUR = (80, 255, 120)
 def image_and_mask(
     renderer: Renderer, state: SceneState
 ) -> tuple[UInt8[np.ndarray, "height width 3"], Bool[np.ndarray, "height width"]]:
-    """Rendering of the first camera as RGB, and its mask."""
+    """RGB rendering of the first camera, and its mask."""
     with torch.no_grad():
         rendering = renderer(state)
     image = (rendering.image[0].movedim(0, -1) * 255.0).to(torch.uint8).numpy()
@@ -33,14 +33,14 @@ def overlay(
     mask: Bool[np.ndarray, "height width"],
     opacity: float,
 ) -> UInt8[np.ndarray, "height width 3"]:
-    """The rendering blended over the image inside the mask, RGB."""
+    """Blend the rendering over the image inside the mask, RGB."""
     return np.where(mask[..., None], cv2.addWeighted(frame, 1.0 - opacity, image, opacity, 0.0), frame)
 
 
 def outlined(
     frame: UInt8[np.ndarray, "height width 3"], mask: Bool[np.ndarray, "height width"]
 ) -> UInt8[np.ndarray, "height width 3"]:
-    """The image with a bright outline of the mask, RGB."""
+    """Draw a bright outline of the mask on an RGB image."""
     contours, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
     return cv2.drawContours(frame.copy(), contours, -1, _CONTOUR, 1)
 
@@ -74,7 +74,7 @@ def write_video(dataset: Dataset, folder: OutputPath, monitor: Monitor) -> None:
 
 
 def frame_rate(dataset: Dataset) -> float:
-    """Frames per second of a video: as set, else as the frames were recorded, else 25."""
+    """Frame rate of a video [1/s]: as set, else that of the recording, else 25."""
     times = dataset.sequence.timestamps
     if dataset.frame_rate is not None:
         return dataset.frame_rate

@@ -1,10 +1,11 @@
 """Decoding of untrusted files in a child process with limited memory and processor time.
 
-Decoders of libraries may need any amount of either for a small file: references that repeat, false sizes, compression.
-A decoder is a module-level function of this package that imports neither torch nor the rest of the application; it runs
-in a fresh interpreter, started with `decoded`, and its arguments and result are plain values, paths and arrays.
+Library decoders may need unlimited memory or time for a small file with repeated references, false sizes or
+compression. A decoder is a module-level function of this package that imports neither torch nor the rest of the
+application; it runs in a separate interpreter through `decoded`; its arguments and result are plain values, paths and
+arrays.
 
-The child ends with its parent.
+The child exits when its parent does.
 """
 
 import atexit
@@ -40,16 +41,16 @@ from .reading import GIB, MIB, RefusedFileError
 _SECONDS, _SECONDS_PER_MIB = 2.5, 0.2
 _MEMORY, _MEMORY_PER_BYTE = 320 * MIB, 8
 _COUNTED = 128 * MIB
-"""File size up to which the memory limit of a decoder grows [bytes]; larger files are read in parts."""
+"""File size up to which the memory limit of a decoder grows with the file [bytes]; larger files are read in parts."""
 _PATIENCE = 20
-"""Waiting time per second of processor time, for busy machines."""
+"""Wall-clock timeout as a multiple of the processor time limit, for busy machines."""
 _IDLE = 10.0
 _MOST_IDLE = 4
 _LARGEST_FILE = GIB
-"""Largest temporary file of a library [bytes], beyond a hundred times the size of the decoded file."""
+"""Largest temporary file of a library [bytes], in addition to a hundred times the size of the decoded file."""
 _ARRAY, _PATH = 1, 2
 _ENVIRONMENT = {
-    # Thread pools and arenas reserve address space that would count as memory.
+    # Thread pools and arenas reserve address space, which would count as memory.
     **dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"),
     "ARROW_DEFAULT_MEMORY_POOL": "system",
     "MALLOC_ARENA_MAX": "2",
@@ -58,7 +59,7 @@ _ENVIRONMENT = {
 
 @dataclass(frozen=True)
 class Limits:
-    """Resource limits of one call, beyond the use of the interpreter and imported libraries."""
+    """Resource limits of one call, in addition to the usage of the interpreter and imported libraries."""
 
     seconds: float = _SECONDS
     """Processor time [s]."""
@@ -80,20 +81,20 @@ class Limits:
 
 
 class DecodingLimitError(CartsError, ValueError):
-    """Decoding exceeds the limits of memory or time."""
+    """Decoding exceeds the memory or time limit."""
 
 
 def decoded(function: Callable[..., Any], path: Path, *arguments: Any) -> Any:
-    """The result of a decoder for a file, computed in a child process within `Limits.of` the file.
+    """Run a decoder on a file in a child process, within `Limits.of` the file; returns its result.
 
     Args:
-        function: decoder, at module level in this package. The table `LIBRARIES` of its module names, by function,
-            what is imported before memory is counted.
+        function: decoder, at module level in this package. The table `LIBRARIES` of its module maps function names to
+            libraries that are imported before memory is counted.
         path: first argument, a file or folder.
-        arguments: further ones.
+        arguments: further arguments.
 
     Raises:
-        OSError, CartsError: as the decoder raises them.
+        OSError, CartsError: as raised by the decoder.
         DecodingLimitError: it needs more memory or time than the limits.
         ValueError: any other error of the decoder.
     """
@@ -101,7 +102,7 @@ def decoded(function: Callable[..., Any], path: Path, *arguments: Any) -> Any:
 
 
 def called(function: Callable[..., Any], *arguments: Any, limits: Limits) -> Any:
-    """As `decoded`, within given limits."""
+    """Like `decoded`, within given limits."""
     decoder = acquire()
     try:
         return decoder.call(function, *arguments, limits=limits)
@@ -110,13 +111,13 @@ def called(function: Callable[..., Any], *arguments: Any, limits: Limits) -> Any
 
 
 def acquire() -> "Decoder":
-    """A decoder for several calls that share open files; an idle one if available."""
+    """Acquire a decoder for several calls that share open files; an idle one if available."""
     with _LOCK:
         return _IDLE_DECODERS.pop() if _IDLE_DECODERS else Decoder()
 
 
 def release(decoder: "Decoder") -> None:
-    """Return an acquired decoder to the pool, or end it if the pool is full."""
+    """Return an acquired decoder to the pool, or close it if the pool is full."""
     with _LOCK:
         if len(_IDLE_DECODERS) < _MOST_IDLE:
             _IDLE_DECODERS.append(decoder)
@@ -132,24 +133,24 @@ def prepare() -> None:
 
 
 class Decoder:
-    """Child process that runs decoders one after the other; it starts with the first call, and again after a failure.
+    """Child process that runs decoders sequentially; started on the first call, and restarted after a failure.
 
     Decoders may keep files open between calls. Not thread-safe.
     """
 
     def __init__(self, *, idle: float = _IDLE) -> None:
-        """`idle` is the time after which an idle child ends [s]."""
+        """`idle` is the time after which an idle child exits [s]."""
         self._idle = idle
         self._process: subprocess.Popen[bytes] | None = None
         self._pipe: Connection | None = None
         self._folder = ""
 
     def call(self, function: Callable[..., Any], *arguments: Any, limits: Limits) -> Any:
-        """Result of a function; errors as those of `decoded`."""
+        """Run a function in the child and return its result; errors as in `decoded`."""
         request = _packed([os.getcwd(), function.__module__, function.__qualname__, arguments, *vars(limits).values()])
         try:
             if (reply := self._reply(request, limits)) is None:
-                # The idle child ended as the request was sent.
+                # The idle child exited while the request was sent.
                 reply = self._reply(request, limits)
         except BaseException:
             self.close()
@@ -160,14 +161,14 @@ class Decoder:
         if kind == "result":
             return values[0]
         if kind == "system":
-            raise OSError(*values[:2], *map(str, values[2:]))  # Python chooses the subclass by the number.
+            raise OSError(*values[:2], *map(str, values[2:]))  # Python selects the subclass by errno.
         if kind == "memory":
             self.close()
             raise _needs_memory(limits)
         raise _ERRORS.get(kind, ValueError)(*values)
 
     def close(self) -> None:
-        """End the child and remove its temporary files."""
+        """Terminate the child and remove its temporary files."""
         process, pipe, folder = self._process, self._pipe, self._folder
         self._process, self._pipe = None, None
         if pipe is not None:
@@ -178,7 +179,7 @@ class Decoder:
             shutil.rmtree(folder, ignore_errors=True)
 
     def _reply(self, request: bytes, limits: Limits) -> Any:
-        """The child's reply; None if it ended before it received the request. Errors as `decoded`."""
+        """The child's reply; None if it exited before it received the request. Errors as in `decoded`."""
         self.start()
         assert self._process is not None and self._pipe is not None
         patience = limits.seconds * _PATIENCE
@@ -242,12 +243,12 @@ def _end() -> None:
 
 @cache
 def _spawner() -> ThreadPoolExecutor:
-    """Thread that starts children, since Linux ends a child with the thread that started it."""
+    """Thread that starts children, since Linux terminates a child when the thread that started it ends."""
     return ThreadPoolExecutor(1, "carts-decoding")
 
 
 def _forget() -> None:
-    """Drop thread and children of the parent after a fork."""
+    """After a fork, discard the parent's thread and children."""
     _IDLE_DECODERS.clear()
     _spawner.cache_clear()
 
@@ -257,7 +258,9 @@ if hasattr(os, "register_at_fork"):
 
 
 def serve() -> None:
-    """Entry point of the child; the command line has the parent's process id, a pipe and the longest idle time [s]."""
+    """Entry point of the child; command-line arguments are the parent's process id, a pipe and the longest idle time
+    [s].
+    """
     parent, descriptor, idle = sys.argv[1:4]
     end_with_parent(int(parent), signal.SIGKILL)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is handled by the parent.
@@ -270,9 +273,9 @@ def serve() -> None:
 def _answer(request: bytes) -> bytes:
     folder, module, name, arguments, seconds, memory, written = _unpacked(request)
     try:
-        os.chdir(folder)  # Paths may be relative, and the child may be older than the parent's folder.
+        os.chdir(folder)  # Relative paths refer to the parent's folder.
         for limit in (resource.RLIMIT_CPU, resource.RLIMIT_AS):
-            # Imports would count against the limits of the call before.
+            # Imports would count against the limits of the previous call.
             _, most = resource.getrlimit(limit)
             resource.setrlimit(limit, (most, most))
         home = importlib.import_module(module)
@@ -285,8 +288,8 @@ def _answer(request: bytes) -> bytes:
 
 
 def _described(error: Exception) -> list[Any]:
-    """Name and arguments of an error; errors of libraries become a `ValueError`."""
-    # Extension modules that cannot allocate may end without an exception, which is a `SystemError`.
+    """Class name and arguments of an error; errors of libraries become `ValueError`."""
+    # Extension modules that run out of memory may return without setting an exception, which causes a `SystemError`.
     if isinstance(error, MemoryError | SystemError) or (isinstance(error, OSError) and error.errno == errno.ENOMEM):
         return ["memory"]
     if isinstance(error, CartsError):
@@ -302,7 +305,7 @@ def _limit(seconds: float, memory: int, written: int) -> None:
     used = int(time.process_time() + 1)
     resource.setrlimit(resource.RLIMIT_CPU, (used + int(seconds), resource.RLIM_INFINITY))
     resource.setrlimit(resource.RLIMIT_FSIZE, (written, resource.RLIM_INFINITY))
-    with contextlib.suppress(OSError, ValueError):  # Only Linux has this file, and bounds address space.
+    with contextlib.suppress(OSError, ValueError):  # Only Linux has this file, and limits address space.
         pages = int(Path("/proc/self/statm").read_text().split()[0])
         resource.setrlimit(resource.RLIMIT_AS, (pages * resource.getpagesize() + memory, resource.RLIM_INFINITY))
 

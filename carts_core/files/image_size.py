@@ -15,7 +15,7 @@ LARGEST_IMAGE = 40_000_000
 _OTHERS = ("TIFF", "BMP", "WEBP", "PPM")
 _START_OF_SCAN = 0xDA
 _NO_FRAME_HEADER = (0xC4, 0xC8, 0xCC)
-"""Markers between 0xC0 and 0xCF that are no frame headers."""
+"""Markers between 0xC0 and 0xCF that are not frame headers."""
 _MOST_SCANS = 200
 """Largest number of scans of a progressive JPEG, each of which is decoded."""
 _TIFF_TILE = (322, 323)
@@ -35,14 +35,14 @@ class ImageTraits:
     orientation: int = 1
     """EXIF orientation, 1 to 8; 1 is upright."""
     turned_already: bool = False
-    """Whether decoders apply the orientation themselves, as for TIFF."""
+    """Whether decoders already apply the orientation, as for TIFF."""
     alpha: bool = False
     palette: bool = False
     lossy: bool = False
 
 
 def image_traits(content: bytes) -> ImageTraits:
-    """Traits of a PNG, JPEG or TIFF image; defaults for other kinds and damaged headers."""
+    """Traits of a PNG, JPEG or TIFF image; defaults for other formats and damaged headers."""
     if content.startswith(PNG):
         return _png_traits(content)
     if content.startswith(JPEG):
@@ -52,7 +52,7 @@ def image_traits(content: bytes) -> ImageTraits:
 
 
 def png_chunks(content: bytes) -> Iterator[tuple[bytes, int, int]]:
-    """Kind, and begin and end of the data, of each chunk of a PNG; the last one may be cut off."""
+    """Type, data start and data end of each PNG chunk; the last chunk may be truncated."""
     begin = len(PNG) + 8
     while begin + 4 <= len(content):
         end = begin + int.from_bytes(content[begin - 8 : begin - 4], "big")
@@ -83,7 +83,7 @@ def _jpeg_orientation(content: bytes) -> int:
 
 
 def _tiff_orientation(content: bytes) -> int:
-    """Orientation tag in the first directory of TIFF or EXIF data; 1 without it."""
+    """Orientation tag in the first directory of TIFF or EXIF data; 1 if absent."""
     order = TIFF.get(content[:4])
     if order is None:
         return 1
@@ -100,7 +100,7 @@ def _tiff_orientation(content: bytes) -> int:
 
 
 def size_problem(content: bytes) -> str | None:
-    """Reason to refuse an image, as a clause after the file's name; None if it can be decoded."""
+    """Reason to refuse an image, as a clause that follows the file name; None if it can be decoded."""
     size = _size(content)
     if size is None:
         return "cannot be decoded; it must be a JPEG, PNG, TIFF, BMP, WebP or PPM image"
@@ -135,7 +135,7 @@ def _jpeg_size(content: bytes) -> tuple[int, int] | None:
     position = 2
     while (position := content.find(b"\xff", position)) >= 0 and position + 9 <= len(content):
         marker = content[position + 1]
-        if marker in (0x00, 0x01, 0xFF) or 0xD0 <= marker <= 0xD8:  # Filling, or a marker without content.
+        if marker in (0x00, 0x01, 0xFF) or 0xD0 <= marker <= 0xD8:  # Fill byte, or a marker without payload.
             position += 1 if marker == 0xFF else 2
         elif marker == _START_OF_SCAN:
             return None
@@ -150,15 +150,15 @@ def _jpeg_size(content: bytes) -> tuple[int, int] | None:
 def _other_size(content: bytes) -> tuple[int, int] | None:
     from PIL import Image  # noqa: PLC0415 - most recordings never need it
 
-    # Pillow warns of sizes that are beyond our own limit anyway.
+    # Pillow's warning concerns sizes that exceed our own limit anyway.
     warnings.filterwarnings("ignore", category=Image.DecompressionBombWarning)
     try:
         image = Image.open(io.BytesIO(content), formats=_OTHERS)
         tags = getattr(image, "tag_v2", {})
         tile_width, tile_height = (int(tags.get(tag, 0)) for tag in _TIFF_TILE)
-    except Image.DecompressionBombError:  # Pillow does not give the number of pixels then.
+    except Image.DecompressionBombError:  # Pillow does not report the number of pixels in this case.
         return _FAR_TOO_LARGE
-    except Exception:  # Pillow raises whatever its format readers raise.
+    except Exception:  # Pillow propagates any exception of its format readers.
         return None
-    # Tiles are decoded whole, even those of small images.
+    # Tiles are decoded completely, even in small images.
     return max(image.width, tile_width), max(image.height, tile_height)

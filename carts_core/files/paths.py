@@ -1,4 +1,4 @@
-"""Names and paths of outputs, and folders that are opened name by name, so that no link is followed."""
+"""Names and paths of outputs, and opening of folders component by component without following links."""
 
 import errno
 import os
@@ -12,15 +12,15 @@ from pathlib import Path
 from ..errors import OutputError
 
 NAME_BYTES = 200
-"""What a name may have where it enters; the rest is for what it is combined with, such as `.png`."""
+"""Largest length of an untrusted name [bytes]; the remainder is reserved for additions such as `.png`."""
 _FILE_BYTES = 255
-"""What a file system takes as one component of a path."""
+"""Largest length of a path component in file systems [bytes]."""
 _REFUSED = re.compile(r"[/\\\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]")
-"""Separators of paths, control characters, ends of lines, and halves of characters, which no encoding has."""
+"""Path separators, control characters, line separators and surrogates."""
 
 
 def home() -> Path:
-    """The user's home folder; the root folder, which is not written to, of users that have none."""
+    """The user's home folder; the root folder, which is not written to, if the user has none."""
     try:
         return Path.home()
     except RuntimeError:
@@ -28,10 +28,10 @@ def home() -> Path:
 
 
 def name_fault(text: str, most_bytes: int = NAME_BYTES) -> str | None:
-    """Why a text cannot be the name of a file, in words that follow "is 'TEXT', "; None if it can.
+    """Reason why a text is not allowed as a file name, as a clause that follows "is 'TEXT', "; None if it is allowed.
 
-    Letters of any script, spaces and most punctuation are allowed. A path, a hidden name, a control character or a name
-    that is too long is not.
+    Letters of any script, spaces and most punctuation are allowed; paths, hidden names, control characters and overlong
+    names are not.
 
     Args:
         text: an untrusted name of a sequence, frame, camera, domain or arm.
@@ -50,7 +50,7 @@ def name_fault(text: str, most_bytes: int = NAME_BYTES) -> str | None:
 
 
 def allowed_names(most_bytes: int = NAME_BYTES) -> str:
-    """What `name_fault` allows, for errors."""
+    """Description of the names allowed by `name_fault`, for error messages."""
     return (
         f"A name is part of file names, so it has 1 to {most_bytes} bytes, no / or \\, no control characters, and no "
         "dot at its beginning. Rename it"
@@ -58,7 +58,7 @@ def allowed_names(most_bytes: int = NAME_BYTES) -> str:
 
 
 def check_name(text: str, what: str, most_bytes: int = NAME_BYTES) -> str:
-    """The name itself; `OutputError` unless it is one component of a path that leads nowhere else."""
+    """Return the name; `OutputError` unless it is a single safe path component."""
     if fault := name_fault(text, most_bytes):
         shown = text if len(text) <= _FILE_BYTES else f"{text[:60]}…"
         raise OutputError(f"the name of {what} is {shown!r}, {fault}. {allowed_names(most_bytes)}.")
@@ -67,15 +67,15 @@ def check_name(text: str, what: str, most_bytes: int = NAME_BYTES) -> str:
 
 @dataclass(frozen=True)
 class OutputPath(os.PathLike[str]):
-    """A file or folder to write. Made by `output_path` and `/`, which check every name.
+    """A file or folder to write. Created by `output_path` and `/`, which check every name.
 
-    Links are followed on the way to `folder`, which is named by the user, and not below it.
+    Links are followed on the path to `folder`, which is given by the user, but not below it.
     """
 
     folder: Path
-    """Folder named by the user; it need not exist."""
+    """Folder given by the user; it need not exist."""
     names: tuple[str, ...] = ()
-    """The way from there, each the name of one folder or file."""
+    """Path components below `folder`."""
     draft: bool = False
     """Whether it is in an unpublished folder, whose files are written once and synchronized together."""
 
@@ -91,7 +91,7 @@ class OutputPath(os.PathLike[str]):
 
     @property
     def path(self) -> Path:
-        """The path, for reading and for messages."""
+        """The path, for reading and messages."""
         return self.folder.joinpath(*self.names)
 
     @property
@@ -101,18 +101,18 @@ class OutputPath(os.PathLike[str]):
 
     @property
     def parent(self) -> "OutputPath":
-        """The folder that it lies in."""
+        """The parent folder."""
         if self.names:
             return replace(self, names=self.names[:-1])
         return replace(self, folder=self.folder.parent)
 
 
 def output_path(folder: Path, *names: str, draft: bool = False) -> OutputPath:
-    """The path of a file or folder to write: every such path is made here.
+    """Create the path of a file or folder to write; all such paths are created here.
 
     Args:
-        folder: named by the user, on the command line or in the environment; never by a recording.
-        names: components below it, which may be untrusted; others than single names are an `OutputError`.
+        folder: given by the user on the command line or in the environment; never by a recording.
+        names: components below it, which may be untrusted; `OutputError` unless each is a single name.
     """
     path = OutputPath(folder, draft=draft)
     for name in names:
@@ -121,7 +121,7 @@ def output_path(folder: Path, *names: str, draft: bool = False) -> OutputPath:
 
 
 def as_output(path: OutputPath | Path) -> OutputPath:
-    """An output path whose last component may not be a link."""
+    """Convert a path to an output path whose last component must not be a link."""
     if isinstance(path, OutputPath) and path.names:
         return path
     draft = isinstance(path, OutputPath) and path.draft
@@ -130,13 +130,13 @@ def as_output(path: OutputPath | Path) -> OutputPath:
 
 
 def file_name(text: str) -> str:
-    """A foreign text as the name of a file, whatever it is; letters of any script stay."""
+    """Convert an untrusted text to a valid file name; letters of any script are kept."""
     name = re.sub(r"[^\w.-]+", "_", text).lstrip(".")
     return name.encode(errors="ignore")[:NAME_BYTES].decode(errors="ignore") or "_"
 
 
 def unique_file_names(texts: list[str]) -> list[str]:
-    """`file_name` of each text, numbered where two would be the same file (also where case is ignored)."""
+    """`file_name` of each text, numbered where names would collide (also if case is ignored)."""
     names: list[str] = []
     taken: set[str] = set()
     for text in texts:
@@ -167,15 +167,15 @@ def explained(path: object) -> Iterator[None]:
 
 @contextmanager
 def opened_folder(path: OutputPath, *, make: bool = False) -> Iterator[int]:
-    """A descriptor of the folder at `path`.
+    """Open the folder at `path`; yields its descriptor.
 
     Args:
-        path: links are followed on the way to `path.folder` only.
-        make: make what is missing.
+        path: links are followed only on the path to `path.folder`.
+        make: create missing folders.
 
     Raises:
-        OutputError: something below `path.folder` is a link, or no folder.
-        OSError: it is not there, or may not be opened.
+        OutputError: a component below `path.folder` is a link or not a folder.
+        OSError: the folder does not exist or cannot be opened.
     """
     if make:
         _make(path.folder.absolute())
@@ -191,12 +191,14 @@ def opened_folder(path: OutputPath, *, make: bool = False) -> Iterator[int]:
 
 
 def open_below(folder: int, name: str) -> int:
-    """A descriptor of the folder `name` in an open one; `OSError` if it is missing, a link or no folder."""
+    """Open the subfolder `name` of an open folder and return its descriptor; `OSError` if it is missing, a link, or not
+    a folder.
+    """
     return os.open(name, _FOLDER | os.O_NOFOLLOW, dir_fd=folder)
 
 
 def status(folder: int, name: str) -> os.stat_result | None:
-    """What lies under `name` in an open folder, a link for itself; None if nothing does."""
+    """Status of the entry `name` in an open folder, without following links; None if it does not exist."""
     try:
         return os.stat(name, dir_fd=folder, follow_symlinks=False)
     except FileNotFoundError:
@@ -227,7 +229,7 @@ def _step(folder: int, name: str, path: Path, make: bool) -> int:
 
 
 def _make(folder: Path) -> None:
-    """Make a folder and missing ones above it, synchronized to disk."""
+    """Create a folder and its missing parents, synchronized to disk."""
     if folder.is_dir():
         return
     _make(folder.parent)

@@ -1,4 +1,4 @@
-"""Outputs that appear under their final name whole or not at all: they are written in a hidden folder beside it."""
+"""Atomic publication of outputs, which are written in a hidden staging folder and renamed when complete."""
 
 import ctypes
 import json
@@ -44,9 +44,9 @@ class Staging:
     mark: _Mark
 
     def remove(self) -> None:
-        """Remove the folder and its content; links are removed, not followed.
+        """Remove the folder and its contents; links are removed, not followed.
 
-        The mark is removed last, so that the rest is found again after a kill.
+        The mark file is removed last, so that leftovers are found after a kill.
         """
         found = status(self.parent, self.name)
         if found is None or found.st_ino != self.mark.inode:
@@ -65,11 +65,11 @@ class Staging:
 
 
 def make_staging(parent: int, output: str, key: str | None) -> Staging:
-    """A new staging folder in an open folder; `OSError` if it cannot be made."""
+    """Create a staging folder in an open folder; `OSError` if that fails."""
     while True:
         name = f".carts-{secrets.token_hex(16)}"
         os.mkdir(name, 0o700, dir_fd=parent)
-        # Another process may remove it while it is empty and not locked: then make another.
+        # Another process may remove it while it is empty and unlocked; then create another one.
         with suppress(FileNotFoundError):
             descriptor = open_below(parent, name)
             if try_lock(descriptor):
@@ -79,7 +79,7 @@ def make_staging(parent: int, output: str, key: str | None) -> Staging:
                     flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
                     with os.fdopen(os.open(_MARK, flags, 0o600, dir_fd=descriptor), "wb") as stream:
                         stream.write(json.dumps(asdict(mark)).encode())
-                except BaseException:  # Such as that of a full disk.
+                except BaseException:  # For example, if the disk is full.
                     staging.remove()
                     staging.close()
                     raise
@@ -88,7 +88,7 @@ def make_staging(parent: int, output: str, key: str | None) -> Staging:
 
 
 def leftovers(parent: int, output: str, besides: Staging) -> Iterator[Staging]:
-    """Locked staging folders for the same output whose processes have ended; `BusyError` if one is still running."""
+    """Staging folders for the same output whose processes have ended, locked; `BusyError` if one is still running."""
     for name in os.listdir(parent):
         if not _NAME.fullmatch(name) or name == besides.name:
             continue
@@ -98,7 +98,7 @@ def leftovers(parent: int, output: str, besides: Staging) -> Iterator[Staging]:
             continue
         mark = _read_mark(descriptor)
         if mark is None:
-            # Killed before it was marked. Only empty folders, or with an empty mark, are removed.
+            # The process was killed before marking it. Only empty folders, or those with an empty mark, are removed.
             with suppress(OSError):
                 if try_lock(descriptor):
                     found = status(descriptor, _MARK)
@@ -125,7 +125,7 @@ def _remove(folder: int, name: str) -> None:
 
 
 def _read_mark(folder: int) -> _Mark | None:
-    """The mark in an open folder; None without a valid one."""
+    """Read the mark in an open folder; None if there is no valid mark."""
     own = os.fstat(folder)
     try:
         descriptor = os.open(_MARK, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC, dir_fd=folder)
@@ -139,24 +139,24 @@ def _read_mark(folder: int) -> _Mark | None:
 MARKER = "export.json"
 """File that marks a folder as an export; other folders are never replaced."""
 _OLD = "carts-replaced"
-"""Name of the replaced output between two renames."""
+"""Temporary name of the replaced output between two renames."""
 
 
 @contextmanager
 def published(target: OutputPath | Path, *, overwrite: bool = False, key: str | None = None) -> Iterator[OutputPath]:
-    """Path for an output that becomes `target` when the block ends without an exception.
+    """Context manager for an output that replaces `target` when the block ends without an exception.
 
-    It is written in a hidden folder of a random name beside `target`. When the block fails or is interrupted that
-    folder is removed; when the process is killed it stays, and the next call for the same target removes it.
+    The output is written in a hidden folder with a random name beside `target`. If the block fails or is interrupted,
+    that folder is removed; if the process is killed, the next call for the same target removes it.
 
     Args:
-        target: file or folder to make; no link itself. An empty folder counts as absent.
-        overwrite: replace what is there: a file, or a folder that is an export itself.
-        key: of what the output is made from. With one, what an earlier call with the same key has left is kept, also
-            when the block fails, and the block can go on with it.
+        target: file or folder to create; it must not be a link. An empty folder counts as absent.
+        overwrite: replace an existing file, or a folder written by an export.
+        key: fingerprint of the inputs. If given, partial output is kept if the block fails, and a later call with the
+            same key resumes from it.
 
     Yields:
-        A path with the target's name, for a file or a folder; without `key` it is not there yet.
+        Path with the target's name, for a file or a folder; without `key` it does not exist yet.
 
     Raises:
         OutputError: the target exists and may not be replaced, another process writes it, or it cannot be written.
@@ -180,7 +180,7 @@ def published(target: OutputPath | Path, *, overwrite: bool = False, key: str | 
 
 @contextmanager
 def published_file(target: OutputPath | Path, *, overwrite: bool = False) -> Iterator[OutputPath]:
-    """Path for a single file, to be written by `write_bytes` or `output_stream`; errors as `published`."""
+    """Like `published`, for a single file that is written by `write_bytes` or `output_stream`."""
     output = as_output(target)
     with explained(output), opened_folder(output.parent, make=True) as folder:
         _check_free(folder, output, overwrite)
@@ -188,12 +188,12 @@ def published_file(target: OutputPath | Path, *, overwrite: bool = False) -> Ite
 
 
 def _take_staging(folder: int, output: OutputPath, key: str | None) -> Staging:
-    """A new staging folder, or a leftover one of the same work. Leftovers of other work are removed."""
+    """New staging folder, or one left over with the same key. Other leftovers are removed."""
     taken = make_staging(folder, output.name, key)
     try:
         for left in leftovers(folder, output.name, taken):
             if status(left.descriptor, _OLD) is not None and status(folder, output.name) is None:
-                # A kill between the two renames of `_move` left the earlier output here.
+                # If the process was killed between the two renames of `_move`, the earlier output is here.
                 os.rename(_OLD, output.name, src_dir_fd=left.descriptor, dst_dir_fd=folder)
             reused = key is not None and left.mark.key == key
             needless, taken = (taken, left) if reused else (left, taken)
@@ -241,7 +241,7 @@ def _below(folder: int, name: str) -> Iterator[int]:
 
 
 def _sync(folder: int, name: str) -> None:
-    """Synchronize an output in an open folder, with all its content, to disk."""
+    """Synchronize an output in an open folder, including its contents, to disk."""
     found = status(folder, name)
     if found is not None and not stat.S_ISDIR(found.st_mode):
         _sync_file(folder, name)

@@ -1,7 +1,7 @@
 """Reading of untrusted files: regular files of limited size, and limited nesting.
 
 Recordings, robots and weights are untrusted, and all are read through this module. Links are followed,
-since data are often linked; devices, pipes and sockets are refused, and no file is read beyond its kind's limit.
+since data are often linked; devices, pipes and sockets are refused, as are files above the size limit of their kind.
 """
 
 import configparser
@@ -31,7 +31,7 @@ GIB = 2**30
 LARGEST_DEPTH = 32
 """Largest nesting depth of TOML, JSON and YAML."""
 MOST_YAML_EVENTS = 500_000
-"""Largest number of YAML events: values, and beginnings and ends of lists and tables."""
+"""Largest number of YAML events: values, and starts and ends of lists and mappings."""
 MOST_JSON_PARTS = 3_000_000
 """Largest number of lists and objects in JSON."""
 MOST_INI_LINES = 10_000
@@ -44,11 +44,11 @@ LARGEST_WHOLE_NUMBER = 2**63 - 1
 
 @dataclass(frozen=True)
 class Kind:
-    """A kind of file with its largest size."""
+    """File kind with its size limit."""
 
     name: str
     limit: int
-    """[bytes]"""
+    """Size limit [bytes]."""
 
 
 SEQUENCE = Kind("sequence file", MIB)
@@ -61,7 +61,7 @@ ROBOT = Kind("URDF", 16 * MIB)
 MESH = Kind("mesh", 128 * MIB)
 WEIGHTS = Kind("weights file", 512 * MIB)
 _POINTER = b"version https://git-lfs"
-"""Beginning of a Git LFS pointer, which stands for a file that was not fetched."""
+"""First bytes of a Git LFS pointer, the placeholder of a file that was not fetched."""
 _LARGEST_POINTER = 1024
 """Largest size of a pointer [bytes]."""
 _POINTER_TEXT = "it is a Git LFS pointer, and its content was not fetched; run `git lfs pull` in its repository"
@@ -71,18 +71,18 @@ CACHED = Kind("cached mesh", 256 * MIB)
 
 
 class RefusedFileError(CartsError, OSError):
-    """A file exists but is refused: it is special, too large, or nested too deeply.
+    """Raised for a file that exists but is special, too large, or nested too deeply.
 
-    It is an OSError too, so that callers handle it like a missing file and name the file.
+    It is also an `OSError`, so that callers handle it like a missing file.
     """
 
 
 class LfsPointerError(RefusedFileError):
-    """A file is a Git LFS pointer whose content was not fetched."""
+    """Raised for a Git LFS pointer whose content was not fetched."""
 
 
 def is_regular(path: Path) -> bool:
-    """Whether the path is a regular file, directly or by links; False for impossible names."""
+    """Whether the path is a regular file, directly or through links; False for invalid names."""
     try:
         return stat.S_ISREG(os.stat(path).st_mode)
     except (OSError, ValueError):
@@ -90,15 +90,15 @@ def is_regular(path: Path) -> bool:
 
 
 def open_regular(path: Path, kind: Kind) -> BufferedReader:
-    """Open a regular file for reading; pipes and devices neither block nor take effect.
+    """Open a regular file for reading; opening pipes and devices neither blocks nor has side effects.
 
     Raises:
         FileNotFoundError, IsADirectoryError, OSError: as raised by the system.
-        RefusedFileError: it is no regular file, is too large, or has a name that no file can have.
+        RefusedFileError: it is not a regular file, is too large, or has an invalid name.
     """
     try:
         descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC | os.O_NOCTTY)
-    except ValueError as error:  # A name with a null character.
+    except ValueError as error:  # The name contains a null character.
         raise RefusedFileError(f"no file can have this name ({error})") from error
     try:
         status = os.fstat(descriptor)
@@ -117,12 +117,12 @@ def open_regular(path: Path, kind: Kind) -> BufferedReader:
 
 
 def check_regular(path: Path, kind: Kind) -> None:
-    """As `open_regular`, for a library that opens the file by its path."""
+    """Check a file like `open_regular`, for a library that opens it by its path."""
     open_regular(path, kind).close()
 
 
 def read_bytes(path: Path, kind: Kind) -> bytes:
-    """The content of a file; errors as `open_regular`."""
+    """Content of a file; errors as in `open_regular`."""
     with open_regular(path, kind) as file:
         size = os.fstat(file.fileno()).st_size
         content = file.read(size + 1)  # Reading allocates the requested size.
@@ -134,7 +134,7 @@ def read_bytes(path: Path, kind: Kind) -> bytes:
 
 
 def read_text(path: Path, kind: Kind) -> str:
-    """The content of a UTF-8 file without byte order mark; line ends are `\n`.
+    """Content of a UTF-8 file without byte order mark; line ends are `\n`.
 
     Raises:
         FileNotFoundError, IsADirectoryError, OSError, RefusedFileError: as `open_regular`.
@@ -144,8 +144,8 @@ def read_text(path: Path, kind: Kind) -> str:
 
 
 def parse_toml(text: str) -> dict[str, Any]:
-    """TOML as dictionaries and lists; `ValueError` for other texts, and beyond the limits of this module."""
-    # The parser's time and memory grow with the square of a key's parts, so long keys never reach it.
+    """Parse TOML to dictionaries and lists; `ValueError` if it is invalid or exceeds the limits of this module."""
+    # The parser's time and memory grow quadratically with the parts of a key, so long keys are refused first.
     if _LONG_KEY.search(text):
         raise ValueError(f"a key has more than {LARGEST_DEPTH} parts")
     try:
@@ -157,14 +157,14 @@ def parse_toml(text: str) -> dict[str, Any]:
 
 
 def parse_json(text: str | bytes, *, finite: bool = True) -> Any:
-    """JSON as dictionaries and lists.
+    """Parse JSON to dictionaries and lists.
 
     Args:
-        text: of the file.
+        text: content of the file.
         finite: refuse `NaN` and `Infinity`.
 
     Raises:
-        ValueError: it is not JSON, or is beyond the limits of this module.
+        ValueError: it is not JSON, or exceeds the limits of this module.
     """
     parts = text.count("[") + text.count("{") if isinstance(text, str) else text.count(b"[") + text.count(b"{")
     if parts > MOST_JSON_PARTS:
@@ -181,11 +181,11 @@ def parse_json(text: str | bytes, *, finite: bool = True) -> Any:
 
 
 def parse_yaml(text: str) -> Any:
-    """YAML as dictionaries, lists, numbers and texts; dates and sexagesimal numbers stay texts.
+    """Parse YAML to dictionaries, lists, numbers and strings; dates and sexagesimal numbers stay strings.
 
     Raises:
-        ValueError: it is not YAML, has aliases or merge keys, or is beyond the limits of this module.
-        CartsError: the package that reads it is not installed.
+        ValueError: it is not YAML, has aliases or merge keys, or exceeds the limits of this module.
+        CartsError: the YAML package is not installed.
     """
     needs_extra("yaml", "import")
     import yaml  # noqa: PLC0415
@@ -206,7 +206,7 @@ def parse_yaml(text: str) -> Any:
         values = yaml.load(text, Loader=_plain_yaml(parser))
     except ValueError:
         raise
-    except Exception as error:  # constructors of values raise many kinds
+    except Exception as error:  # value constructors raise many kinds of exceptions
         raise ValueError(shortened(" ".join(str(error).split()))) from error
     _check_values(values)
     return values
@@ -214,11 +214,11 @@ def parse_yaml(text: str) -> Any:
 
 @cache
 def _plain_yaml(parser: Any) -> Any:
-    """A loader without merge keys, whose numbers are parsed in linear time."""
+    """Create a loader without merge keys that parses numbers in linear time."""
 
     class PlainLoader(parser):
         def flatten_mapping(self, node: Any) -> None:
-            """Keep merge keys, for which there is no constructor."""
+            """Keep merge keys, which then fail for lack of a constructor."""
 
     def whole(loader: Any, node: Any) -> int | str:
         text = loader.construct_scalar(node).replace("_", "")
@@ -236,7 +236,7 @@ def _plain_yaml(parser: Any) -> Any:
 
 
 def parse_xml(text: str) -> ElementTree.Element:
-    """Root of an XML document; `ValueError` if it is none, or declares a document type or entities."""
+    """Parse XML and return the root; `ValueError` if it is invalid, or declares a document type or entities."""
     if "<!DOCTYPE" in text or "<!ENTITY" in text:
         raise ValueError("it declares a document type or entities")
     try:
@@ -246,12 +246,12 @@ def parse_xml(text: str) -> ElementTree.Element:
 
 
 def parse_ini(text: str) -> configparser.ConfigParser:
-    """INI with unchanged values, without interpolation; `ValueError` for other texts and more than `MOST_INI_LINES`."""
+    """Parse INI without interpolation; `ValueError` if it is invalid or has more than `MOST_INI_LINES` lines."""
     if text.count("\n") > MOST_INI_LINES:
         raise ValueError(f"it has more than {MOST_INI_LINES:,} lines")
     parser = configparser.ConfigParser(inline_comment_prefixes=(";", "#"), interpolation=None)
     try:
-        # The time of the parser grows with the square of a run of blanks.
+        # The parser's time grows quadratically with the length of a run of blanks.
         parser.read_string(re.sub(r"[^\S\n]+", " ", text))
     except configparser.Error as error:
         raise ValueError(shortened(" ".join(error.message.split()))) from error
@@ -259,7 +259,9 @@ def parse_ini(text: str) -> configparser.ConfigParser:
 
 
 def typed(value: Any, kind: type[T]) -> T:
-    """A value of `parse_json` or `parse_toml` as a dataclass or another type; `ValueError` names a wrong field."""
+    """Convert a value from `parse_json` or `parse_toml` to a dataclass or another type; `ValueError` names the wrong
+    field.
+    """
     try:
         return msgspec.convert(value, kind, dec_hook=_path)
     except (msgspec.ValidationError, OverflowError) as error:
@@ -282,7 +284,7 @@ def all_finite(root: Any) -> bool:
 
 
 def check_path(path: str | Path) -> None:
-    """Check the lengths of a path and of the names in it; too long ones are a `ValueError`."""
+    """Check the lengths of a path and of its components; `ValueError` if too long."""
     text = str(path)
     if len(text) <= LARGEST_NAME and text.isascii():
         return
@@ -297,7 +299,7 @@ _LONG_KEY = re.compile(rf"(?<![\w-]){_KEY_PART}(?:[ \t]*+\.[ \t]*+{_KEY_PART}){{
 
 
 def _check_values(root: Any) -> None:
-    """Check depth, whole numbers and texts, level by level without recursion."""
+    """Check nesting depth, integers and strings, level by level without recursion."""
     level = [root]
     for _ in range(LARGEST_DEPTH + 1):
         deeper: list[Any] = []

@@ -1,4 +1,4 @@
-"""Atomic writing of files, whole on disk or not at all and never through a link, and file locks."""
+"""Atomic writing of files, never through a link, and file locks."""
 
 import fcntl
 import itertools
@@ -19,16 +19,16 @@ _FORMULA = ("=", "+", "-", "@", "\t", "\r")
 
 
 def csv_cell(text: str) -> str:
-    """A text as a table cell that spreadsheets do not interpret as a formula: an apostrophe precedes risky ones.
+    """Escape a text for a table cell: an apostrophe keeps spreadsheets from interpreting it as a formula.
 
-    Numbers stay as they are. `text_of_cell` gives the text back.
+    Numbers are not changed. `text_of_cell` is the inverse.
     """
     risky = text.startswith(_FORMULA) and not _is_number(text)
     return f"'{text}" if risky or text.startswith("'") else text
 
 
 def text_of_cell(cell: str) -> str:
-    """The text of a cell from `csv_cell`."""
+    """Text of a cell written by `csv_cell`."""
     return cell.removeprefix("'")
 
 
@@ -44,24 +44,25 @@ _NEW = os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
 _MODE = 0o666
 _OWN_DESCRIPTORS = Path("/proc/self/fd")
 _NAMELESS = getattr(os, "O_TMPFILE", 0) if _OWN_DESCRIPTORS.is_dir() else 0
-"""Flag for files that get their name when they are complete, so that a kill leaves nothing; 0 if not supported."""
+"""Flag for unnamed temporary files, which are linked when complete, so that a kill leaves no file; 0 if not supported.
+"""
 
 
 def write_bytes(path: OutputPath | Path, content: bytes) -> None:
     """Write a file atomically; missing folders are created.
 
-    Readers see the old file or the new one, whole, even if the process or the machine stops. A link under the
-    file's name is replaced itself; what it points at stays as it is.
+    Readers see either the complete old file or the complete new one, even after a crash of the process or machine. If
+    the path is a link, the link is replaced and its target is unchanged.
 
     Raises:
-        OutputError: it cannot be written; nothing is changed then.
+        OutputError: the file cannot be written; nothing is changed then.
     """
     with output_stream(path) as stream:
         stream.write(content)
 
 
 def write_text(path: OutputPath | Path, text: str) -> None:
-    """`write_bytes` of a text in UTF-8; line ends stay as they are."""
+    """Write a text in UTF-8 with `write_bytes`; line ends are kept."""
     write_bytes(path, text.encode())
 
 
@@ -96,7 +97,7 @@ def write_new(path: OutputPath | Path, content: bytes) -> bool:
 
 @contextmanager
 def output_stream(path: OutputPath | Path) -> Iterator[BinaryIO]:
-    """A seekable and readable stream that becomes the file when the block succeeds; errors as `write_bytes`."""
+    """Open a seekable, readable stream that becomes the file if the block succeeds; errors as in `write_bytes`."""
     output = as_output(path)
     with explained(output), opened_folder(output.parent, make=True) as folder:
         if output.draft:
@@ -126,12 +127,12 @@ def output_stream(path: OutputPath | Path) -> Iterator[BinaryIO]:
 
 
 def append_line(path: OutputPath | Path, line: bytes, *, sync: bool = True) -> None:
-    """Append a line to a file, created if missing, and synchronize it to disk; optional with `sync`.
+    """Append a line to a file, created if missing, and if `sync` is set synchronize it to disk.
 
-    An incomplete last line, left by a kill, is ended first.
+    An incomplete last line, left by a killed process, is terminated first.
 
     Raises:
-        OutputError: it cannot be written, or is a link, has a second name, or is no regular file.
+        OutputError: it cannot be written, is a link, has a second hard link, or is not a regular file.
     """
     output = as_output(path)
     flags = os.O_RDWR | os.O_APPEND | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
@@ -149,7 +150,7 @@ def append_line(path: OutputPath | Path, line: bytes, *, sync: bool = True) -> N
 
 
 def remove_file(path: OutputPath | Path) -> None:
-    """Remove a regular file, if it exists; `OutputError` if it is a link or no file, or may not be removed."""
+    """Remove a regular file if it exists; `OutputError` if it is a link, not a file, or cannot be removed."""
     output = as_output(path)
     with explained(output):
         try:
@@ -165,7 +166,7 @@ def set_aside(path: OutputPath | Path) -> Path:
     """Rename a damaged file to `NAME.damaged-1`, or the next free number, so that it is not overwritten.
 
     Returns:
-        Its new path.
+        New path of the file.
 
     Raises:
         OutputError: it cannot be renamed.
@@ -191,7 +192,7 @@ def holds_file(path: OutputPath | Path) -> bool:
 
 
 def check_own(folder: int, output: OutputPath) -> None:
-    """Check that writing to or removing an entry changes no other file; otherwise it is an `OutputError`."""
+    """Check that writing or removing an entry changes no other file; `OutputError` otherwise."""
     found = status(folder, output.name)
     if found is None or (stat.S_ISREG(found.st_mode) and found.st_nlink == 1):
         return
@@ -200,9 +201,9 @@ def check_own(folder: int, output: OutputPath) -> None:
 
 
 def _new_file(folder: int) -> tuple[int, str | None]:
-    """A new empty file in an open folder, and its name; None if it can do without."""
+    """Create an empty file in an open folder; returns its descriptor, and its name or None for an unnamed file."""
     if _NAMELESS:
-        # On file systems without support, the attempt with a name succeeds or reports the error.
+        # On file systems without support, the attempt with a name below succeeds or reports the error.
         with suppress(OSError):
             return os.open(".", _NAMELESS | os.O_RDWR | os.O_CLOEXEC, _MODE, dir_fd=folder), None
     name = _random_name()
@@ -210,7 +211,7 @@ def _new_file(folder: int) -> tuple[int, str | None]:
 
 
 def _link(descriptor: int, folder: int, name: str) -> None:
-    """Give a file without name one in an open folder."""
+    """Link an unnamed file into an open folder."""
     os.link(_OWN_DESCRIPTORS / str(descriptor), name, dst_dir_fd=folder, follow_symlinks=True)
 
 
@@ -223,22 +224,22 @@ _PAUSE = 0.1
 
 
 class BusyError(OutputError):
-    """Another process is writing to the output."""
+    """Raised if another process is writing to the output."""
 
 
 @contextmanager
 def locked_folder(path: OutputPath | Path, *, wait: bool = False) -> Iterator[None]:
-    """Lock a folder, created if missing, against other processes of carts.
+    """Lock a folder, created if missing, against other CaRTS processes.
 
-    The lock is on the folder itself: no file is made for it, and none can be deleted.
+    The lock is on the folder itself, so there is no lock file that could be deleted.
 
     Args:
         path: the folder.
-        wait: until all other holders have released it.
+        wait: wait until other processes have released the lock.
 
     Raises:
         BusyError: another process holds it.
-        OutputError: the folder cannot be made, or its file system has no locks.
+        OutputError: the folder cannot be created, or its file system does not support locks.
     """
     output = path if isinstance(path, OutputPath) else OutputPath(path)
     with explained(output), opened_folder(output, make=True) as folder:
@@ -251,7 +252,9 @@ def locked_folder(path: OutputPath | Path, *, wait: bool = False) -> Iterator[No
 
 
 def try_lock(descriptor: int) -> bool:
-    """Lock an open file or folder until it is closed; False if it is locked. `OSError` without locks."""
+    """Lock an open file or folder until it is closed; False if it is already locked. `OSError` if locks are not
+    supported.
+    """
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:

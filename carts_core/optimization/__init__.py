@@ -1,4 +1,4 @@
-"""Solvers: unknowns, factors, stages, and the objects that can be stepped."""
+"""Solvers: unknowns, factors, stages and step-wise optimizers."""
 
 from ..settings import CALIBRATION as CALIBRATION
 from ..settings import CALIBRATION_SETTINGS as CALIBRATION_SETTINGS

@@ -1,8 +1,8 @@
 """False positives of the network in the background, found by running it once on the mean background.
 
-The paper compares an image with BG_m + rendering, so whatever resembles an arm in the background is in both. The
-surface network has one image at a time. It is run once on the mean background, and what it predicts there is
-subtracted from its predictions in an image, as far as the image still shows that background.
+The paper compares an image with BG_m + rendering, so background structures that resemble an arm occur in both. The
+surface network gets a single image. It is therefore run once on the mean background, and its predictions there are
+subtracted from those in an image where the image still shows that background.
 """
 
 from collections.abc import Iterable, Mapping
@@ -27,60 +27,63 @@ _PATCH = 3
 """Side of the patches over which differences are averaged [px of the working image]."""
 
 _NOISE = 3.0, 6.0
-"""A difference counts from so many deviations of the noise beyond its median on, and in full so many later [1]."""
+"""Noise standard deviations above the median at which a difference starts to count, and the further number after which
+it counts fully [1].
+"""
 
 _CONTRAST = 0.04, 0.10
-"""The same at least, for images without noise [1]."""
+"""Lower bounds of these two thresholds, for images without noise [1]."""
 
 _FOREIGN = 0.06
-"""Median difference from which a background is not that of the image [1]."""
+"""Median difference above which a background does not belong to the image [1]."""
 
 _UNTELLING = 0.15
-"""Difference above which arms need not be visible as a change, as in moving smoke [1]."""
+"""Difference above which arms may be indistinguishable from other changes, such as moving smoke [1]."""
 
 DECEPTIVE = 0.08
-"""Share of a background with false positives from which the network gets images without that background [1]."""
+"""Share of a background with false positives above which the background is removed from the network's input [1]."""
 
 _SMOOTH = 12.0
-"""Deviation of the blur that replaces such a background [px of the working image]."""
+"""Standard deviation of the blur that replaces such a background [px of the working image]."""
 
 _FITS, _SAMPLES = 4, 4
-"""Rounds of the robust fit of light, and the step between the pixels that it looks at [px]."""
+"""Iterations of the robust illumination fit, and its pixel sampling step [px]."""
 
 
 _KEPT = 4
-"""Sizes, treatments of haze and predictors for which the backgrounds of a domain are kept."""
+"""Number of combinations of size, dehazing and predictor for which the backgrounds of a domain are cached."""
 
 
 @dataclass(frozen=True)
 class Change:
-    """Difference of images and the empty background."""
+    """Difference between images and the empty background."""
 
     surely: Float[Tensor, "cameras 1 h w"]
-    """Confidence that a pixel differs, in [0, 1]; 1 where the background is not known."""
+    """Confidence that a pixel differs, in [0, 1]; 1 where the background is unknown."""
     telling: Float[Tensor, "cameras 1 h w"]
-    """How far a pixel that does not differ shows no arm, in [0, 1]: 0 where the background is not known, in images of
-    another scene, and where smoke differs as much as an arm would."""
+    """Confidence that an unchanged pixel shows no arm, in [0, 1]: 0 where the background is unknown, in images of
+    another scene, and where smoke differs as much as an arm would.
+    """
 
 
 @dataclass(frozen=True)
 class Background:
-    """Images of the cameras without arms, in the size of the compared images."""
+    """Background images of the cameras, at the size of the compared images."""
 
     images: Float[Tensor, "cameras 3 h w"]
     """RGB in [0, 1]."""
     known: Float[Tensor, "cameras 1 h w"]
-    """Confidence that they show no arm, in [0, 1]."""
+    """Confidence that a pixel shows no arm, in [0, 1]."""
     seen: Float[Tensor, "cameras 1 h w"]
-    """Predicted coverage where they are known: false positives."""
+    """Coverage predicted in the known background: false positives."""
 
     def compared(self, images: Float[Tensor, "cameras 3 h w"], scale: float) -> "Change":
-        """Images, RGB in [0, 1], beside the background under their light.
+        """Compare images (RGB in [0, 1]) with the background under the images' illumination.
 
-        What is not known to be background counts as different.
+        Pixels with unknown background count as different.
 
         Args:
-            scale: times the working size [1].
+            scale: image size relative to the working size [1].
         """
         found = [
             self._compared(background, image, scale) for background, image in zip(self.images, images, strict=True)
@@ -90,8 +93,9 @@ class Background:
         return Change(1.0 - self.known * (1.0 - surely), self.known * telling)
 
     def _compared(self, background: Tensor, image: Tensor, scale: float) -> tuple[Float[Tensor, "1 h w"], bool]:
-        """How surely each pixel differs from the background under the image's light, in [0, 1], and whether an arm
-        would."""
+        """Confidence that each pixel differs from the background under the image's illumination, in [0, 1], and whether
+        an arm would differ.
+        """
         difference = (image - _lit_as(background, image)).abs().amax(0, keepdim=True)
         difference = box_mean(difference, 2 * round(_PATCH * scale / 2) + 1)
         usual = float(difference.median())
@@ -104,7 +108,7 @@ class Background:
 
 
 def _lit_as(background: Float[Tensor, "3 h w"], image: Float[Tensor, "3 h w"]) -> Float[Tensor, "3 h w"]:
-    """The background under the gain and the haze of the image: a line per colour, fitted robustly."""
+    """Apply the gain and haze of the image to the background: a robustly fitted line per colour channel."""
     x, y = (values[:, ::_SAMPLES, ::_SAMPLES].flatten(1) for values in (background, image))
     weight = torch.ones_like(x)
     gain, offset = torch.ones(len(x), 1, device=x.device), torch.zeros(len(x), 1, device=x.device)
@@ -113,7 +117,7 @@ def _lit_as(background: Float[Tensor, "3 h w"], image: Float[Tensor, "3 h w"]) -
         x_mean, y_mean = (weight * x).sum(1, keepdim=True) / total, (weight * y).sum(1, keepdim=True) / total
         variance = (weight * (x - x_mean).square()).sum(1, keepdim=True) / total
         covariance = (weight * (x - x_mean) * (y - y_mean)).sum(1, keepdim=True) / total
-        # A background of one colour says nothing of the gain; then it stays 1.
+        # A uniform background does not determine the gain, which then stays 1.
         gain = ((covariance + 1e-4) / (variance + 1e-4)).clamp(0.3, 3.0)
         offset = y_mean - gain * x_mean
         error = (y - gain * x - offset).abs()
@@ -125,14 +129,14 @@ def _lit_as(background: Float[Tensor, "3 h w"], image: Float[Tensor, "3 h w"]) -
 def without_background(
     images: Float[Tensor, "cameras 3 h w"], changed: Float[Tensor, "cameras 1 h w"], scale: float
 ) -> Float[Tensor, "cameras 3 h w"]:
-    """Changed pixels of images, before a blurred background.
+    """Composite the changed pixels of images over a blurred background.
 
-    The blurred background goes on smoothly where it is not known, so that what is there has no outline.
+    The blur extends smoothly into unknown regions, so that these have no outline.
 
     Args:
         images: RGB in [0, 1].
-        changed: how surely each pixel differs from the background, in [0, 1].
-        scale: times the working size [1].
+        changed: confidence that each pixel differs from the background, in [0, 1].
+        scale: image size relative to the working size [1].
     """
     same = 1.0 - changed
     mixed = smoothed(torch.cat([images * same, same], 1), _SMOOTH * scale)
@@ -143,15 +147,15 @@ class Recording(Protocol):
     """Source of mean backgrounds."""
 
     def mean_background(self, camera: str, domain: str | None = None) -> MeanBackground:
-        """Of a camera, in a domain."""
+        """Mean background of a camera in a domain."""
         ...
 
 
 class Backgrounds:
-    """The mean backgrounds of cameras, and the network's false positives in them; one object serves all frames.
+    """Mean backgrounds of cameras and the network's false positives in them; shared by all frames.
 
     Args:
-        known: camera name -> where it certainly shows no arm; everywhere by default.
+        known: camera name -> pixels that certainly show no arm; all pixels by default.
     """
 
     def __init__(
@@ -165,13 +169,13 @@ class Backgrounds:
 
     @staticmethod
     def of(recording: Recording, cameras: Iterable[str], domain: str, *, required: bool = False) -> "Backgrounds":
-        """Those of a recording's cameras in a domain that say what is there without arms; made once, then kept.
+        """Usable mean backgrounds of a recording's cameras in a domain; cached.
 
         Args:
-            required: whether a loss needs them all, whatever they can say.
+            required: whether a loss needs the backgrounds of all cameras, informative or not.
 
         Raises:
-            SequenceError: they are required, and one cannot be estimated, or an image is not usable.
+            SequenceError: a required background cannot be estimated, or an image cannot be used.
         """
         kept, key = _MADE.setdefault(recording, {}), (tuple(cameras), domain, required)
         if key not in kept:
@@ -199,11 +203,13 @@ class Backgrounds:
         _MADE.pop(recording, None)
 
     def covers(self, scene: Scene) -> bool:
-        """Whether the background of each camera of a scene is there."""
+        """Whether there is a background for each camera of a scene."""
         return all(camera.name in self.images for camera in scene.cameras)
 
     def at(self, scene: Scene, size: tuple[int, int], dehaze: float, predictor: FramePredictor) -> Background:
-        """Backgrounds of a scene's cameras in a width and height [px]; `SettingsError` if one is missing or misfits."""
+        """Backgrounds of a scene's cameras at a given width and height [px]; `SettingsError` if one is missing or does
+        not fit.
+        """
         key = tuple(camera.name for camera in scene.cameras), size, dehaze, predictor
         if key not in self._found:
             stacked = stacked_images(scene, self.images, size, "background").to(predictor.device)
@@ -217,7 +223,7 @@ class Backgrounds:
             while len(self._found) > _KEPT:
                 del self._found[next(iter(self._found))]
         else:
-            # The one that was used least lately comes first.
+            # The least recently used entry comes first.
             self._found[key] = self._found.pop(key)
         return self._found[key]
 

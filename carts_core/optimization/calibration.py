@@ -1,4 +1,4 @@
-"""Calibration: base frames and cameras from many frames at once."""
+"""Joint calibration of base frames and cameras from many frames."""
 
 import time
 from collections.abc import Iterator, Mapping, Sequence
@@ -38,12 +38,12 @@ from .verdict import Assessment, Verdict, assess_calibration, check_domain, with
 
 
 def calibrated_scene(whole: Scene, part: Scene, variables: Variables, offsets: torch.Tensor) -> Scene:
-    """Scene with the calibration of a part of its cameras; unmoved values stay exact.
+    """Scene with calibrated values for a subset of its cameras; unchanged values stay bit-identical.
 
     Args:
-        part: the same arms with the cameras that take part.
+        part: the same arms with the calibrated cameras only.
         variables: the unknowns of `part`.
-        offsets: of the unknowns from their start.
+        offsets: offsets of the unknowns from their initial values.
     """
     start, state = variables.start, variables.state(offsets)
     arms = tuple(
@@ -64,7 +64,7 @@ def _moved(given: np.ndarray, start: SceneState, state: SceneState, name: str, i
     before, after = getattr(start, name)[index], getattr(state, name)[index]
     if torch.equal(before, after):
         return given
-    import roma  # noqa: PLC0415 -- it loads the compiler of torch, which takes a second
+    import roma  # noqa: PLC0415 -- it loads torch's compiler, which takes a second
 
     result = after.cpu().double()
     result[:3, :3] = roma.special_procrustes(result[:3, :3])
@@ -75,15 +75,16 @@ _TRIED = 4
 """Largest number of frames for the domain check."""
 
 _HELD_INTRINSICS = 0.01
-"""Expected error of focal lengths and principal points that are held, as a share of the focal length [1]. It widens
-deviations and moves nothing: they are consider parameters (Schmidt, Application of state-space methods to navigation
-problems, 1966)."""
+"""Expected error of fixed focal lengths and principal points, as a share of the focal length [1]. It increases standard
+deviations and changes no estimate: they are consider parameters (Schmidt, Application of state-space methods to
+navigation problems, 1966).
+"""
 
 _TOO_FAR = 3.0
-"""Number of known standard deviations beyond which a base frame has moved too far [1]."""
+"""Largest motion of a base frame, in its known standard deviations [1]."""
 
 _CORRELATED = SequenceSettings.measurement_noise / SurfaceSolver.noise
-"""Ratio of a standard deviation to that of independent pixels, as in sequence mode [1]."""
+"""Ratio of a standard deviation to that for independent pixels, as in sequence mode [1]."""
 
 
 @dataclass(frozen=True)
@@ -91,15 +92,15 @@ class CalibrationIterate:
     """One iterate of a calibration; an immutable copy."""
 
     index: int
-    """Number of steps before it; 0 is the start."""
+    """Iteration number; 0 is the start."""
     stage: int
     stages: int
     loss: float
-    """Weighted mean over the frames, comparable within one observation of the images, under one blur."""
+    """Weighted mean loss over the frames, comparable within one observation and blur."""
     offsets: Float[torch.Tensor, " n"]
-    """From the start, in radian-like units."""
+    """Offsets from the start, in radian-like units."""
     scene: Scene
-    """With this calibration."""
+    """Scene with this calibration."""
     frame_losses: Float[np.ndarray, " frames"]
     seconds: float
     """Duration of this iteration [s]."""
@@ -111,11 +112,12 @@ class UnknownChange:
 
     name: str
     unit: str
-    """deg, mm, px or %, of all the other values."""
+    """Unit of all other fields: deg, mm, px or %."""
     change: float
     standard_deviation: float
-    """Standard deviation for all modelled errors: those of the frames, a shared error of outlines, fixed intrinsics,
-    and an early end of the optimization."""
+    """Total standard deviation from all modelled errors: frame errors, a common outline error, fixed intrinsics, and
+    early termination of the optimization.
+    """
     deviation: float
     """Standard deviation from the curvature alone, for independent pixels."""
     deviation_between_frames: float | None
@@ -129,43 +131,44 @@ class CalibrationResult:
     """Result of a calibration."""
 
     scene: Scene
-    """As given, with the new calibration."""
+    """The given scene with the new calibration."""
     unknowns: tuple[UnknownChange, ...]
     frame_losses_before: Float[np.ndarray, " frames"]
-    """With joints as measured, like `frame_losses_after`, and under the last observation."""
+    """Initial loss of each frame with measured joints, like `frame_losses_after`, under the last observation."""
     frame_losses_after: Float[np.ndarray, " frames"]
     frame_weights: Float[np.ndarray, " frames"]
     """Weights of the frames, in [0, 1]."""
     stop_reason: StopReason
     assessment: Assessment | None
-    """Verdict; None if the run was stopped before its end."""
+    """Verdict; None if the run was cancelled."""
     beyond: tuple[str, ...] = ()
     """Arms whose base frame has moved farther than its known covariance allows."""
     deviations: Mapping[tuple[str, str], PoseDeviation] = field(default_factory=dict)
-    """(arm, camera) -> standard deviations of the arm's pose before that camera, at the mean of its tips."""
+    """(arm, camera) -> standard deviations of the arm's pose relative to that camera, at the mean tip position."""
 
 
 class CalibrationOptimizer:
-    """Calibration over many frames, one iterate at a time; the counterpart of `FrameOptimizer`.
+    """Step-wise calibration over many frames; the counterpart of `FrameOptimizer`.
 
-    Where cameras and the base frames of all arms are free and no camera moves, only their product can be seen. Then the
-    first camera keeps its extrinsics, and the base frames move.
+    If cameras and the base frames of all arms are free and no camera moves, only their product is observable; the first
+    camera's extrinsics are then held fixed.
 
     Args:
         frames: observed images and measured joint positions.
         networks: the networks, or another predictor of surface maps.
-        settings: the solver; `frame_prior_deg` and `intrinsics_prior` are its own.
+        settings: the solver, with its `frame_prior_deg` and `intrinsics_prior`.
         free: unknowns. Joints are free in each frame separately.
         joint_prior_deg: expected error of free joints [deg].
         ignore: per frame, camera name -> pixels that show an occluder.
-        cameras: names of the cameras that take part, all by default.
-        backgrounds: of these cameras, where they are known, as of `FrameOptimizer`.
-        known_base_frames: arm -> covariance of its base frame's turn and shift in its own axes [rad, m], as of
-            `HandEyeResult`, where it is known better than the prior of the settings.
+        cameras: names of the cameras to use, all by default.
+        backgrounds: known mean backgrounds of these cameras, as in `FrameOptimizer`.
+        known_base_frames: arm -> covariance of the base frame's rotation and translation in its own axes [rad, m], as
+            in `HandEyeResult`, if it is more accurate than the prior of the settings.
 
     Raises:
-        SettingsError: no frame, nothing of the calibration is free, another solver, or an image does not fit.
-        RobotError: there is no such camera or arm.
+        SettingsError: there are no frames, no calibration parameter is free, the settings belong to another solver, or
+            an image has the wrong size.
+        RobotError: a camera or arm does not exist.
     """
 
     def __init__(
@@ -211,15 +214,16 @@ class CalibrationOptimizer:
         self.best: CalibrationIterate | None = None
         self.stop_reason: StopReason | None = None
         self.assessment: Assessment | None = None
-        """Verdict at the end. A calibration that failed, or fits worse than the start by any measure, is replaced by
-        the start. A doubtful one has failed if the network does not know the robot."""
+        """Final verdict. A calibration that failed, or fits worse than the start by any measure, is replaced by the
+        start. A doubtful one counts as failed if the network is not suited to the robot.
+        """
 
     def cancel(self) -> None:
         """Stop; `best` and `history` are kept."""
         self.stop_reason = self.stop_reason or StopReason.CANCELLED
 
     def step(self) -> CalibrationIterate | None:
-        """The next iterate; None once the optimization has stopped. The first one is iterate 0, the start."""
+        """Compute the next iterate; None once the optimization has stopped. Iterate 0 is the start."""
         if self.stop_reason is not None:
             return None
         began = time.perf_counter()
@@ -245,7 +249,7 @@ class CalibrationOptimizer:
         return iterate
 
     def _judged(self, points: Iterator[Point]) -> Iterator[Point]:
-        """Points of the stages, followed by the start if the images contradict the result."""
+        """Yield the points of the stages, and finally the start if the images contradict the result."""
         yield from points
         last, problem = self._best_point, self._problem
         if last is None or problem.present is None:
@@ -265,7 +269,7 @@ class CalibrationOptimizer:
         yield replace(self._fit.evaluate(problem.present), objective_key=(*last.objective_key, "start"))
 
     def _with_knowledge(self, found: Assessment) -> Assessment:
-        """Verdict that accounts for a network that does not know the arms; masks need no network."""
+        """Verdict that accounts for a network not suited to the arms; given masks need no network."""
         if found.verdict is not Verdict.DOUBTFUL or self._problem.some_masked:
             return found
         tried = [self._frames[index] for index in spread(len(self._frames), _TRIED)]
@@ -277,7 +281,7 @@ class CalibrationOptimizer:
         return iter(self.step, None)
 
     def result(self) -> CalibrationResult:
-        """Result of the best iterate under the finest descent reached; `SettingsError` before the first step."""
+        """Result at the best iterate of the finest descent reached; `SettingsError` before the first step."""
         if self.best is None or self._problem.present is None:
             raise SettingsError("no step was made yet. Call `step` first.")
         offsets = self.best.offsets
@@ -299,7 +303,7 @@ class CalibrationOptimizer:
         )
 
     def _moved_too_far(self, arm: str, offsets: torch.Tensor) -> bool:
-        """Whether a base frame has turned or shifted by more than `_TOO_FAR` of its known deviations."""
+        """Whether a base frame has rotated or moved by more than `_TOO_FAR` known standard deviations."""
         rows = [index for index, name in enumerate(self.variables.names) if name.startswith(f"{arm}/base/")]
         moved = offsets[rows].double().cpu().numpy()
         known = with_joint_errors(self._known[arm], self.settings.length_scale)
@@ -315,7 +319,7 @@ class CalibrationOptimizer:
         alone: Float[torch.Tensor, "n n"],
         between: Float[torch.Tensor, "n n"] | None,
     ) -> Float[torch.Tensor, "n n"]:
-        """Covariance of the unknowns for all modelled errors."""
+        """Covariance of the unknowns from all modelled errors."""
         assert evaluation.outline is not None
         shifts = [alone @ evaluation.outline[:, None], alone @ evaluation.gradient.double().cpu()[:, None]]
         if not self.free.intrinsics:
@@ -325,7 +329,7 @@ class CalibrationOptimizer:
         if self._known:
             # The jackknife does not show the error of known base frames.
             shared = shared + alone @ self._problem.prior.precision.double().cpu() @ alone
-        # With one frame the correlation of pixels comes from the settings.
+        # With a single frame, the correlation of pixels is taken from the settings.
         frames = _CORRELATED**2 * alone if between is None else between
         total = frames + shared
         wider = _widened(frames.diagonal(), shared.diagonal(), len(self._frames)) / total.diagonal().sqrt()
@@ -353,7 +357,7 @@ class CalibrationOptimizer:
     def _pose_deviations(
         self, offsets: torch.Tensor, covariance: Float[np.ndarray, "n n"]
     ) -> dict[tuple[str, str], PoseDeviation]:
-        """Standard deviations of each arm's pose before each camera, by central differences."""
+        """Standard deviations of each arm's pose relative to each camera, by central differences."""
         around = self.variables.around(offsets)
         found = {}
         for number, arm in enumerate(self._scene.arms):
@@ -369,9 +373,9 @@ class CalibrationOptimizer:
 
 
 def _between_frames(evaluation: CalibrationEvaluation) -> Float[torch.Tensor, "n n"] | None:
-    """Covariance from leaving out each frame in turn, by the quadratic model; None with one frame.
+    """Covariance by the leave-one-frame-out jackknife on the quadratic model; None with a single frame.
 
-    The jackknife over clusters, here frames, whose pixels share their errors (CR3: MacKinnon, Nielsen and Webb, Fast
+    The clusters are frames, whose pixels have correlated errors (CR3: MacKinnon, Nielsen and Webb, Fast
     and reliable jackknife and bootstrap methods for cluster-robust inference, 2023).
     """
     gradients, curvatures = evaluation.frame_gradients, evaluation.frame_curvatures
@@ -386,11 +390,11 @@ def _between_frames(evaluation: CalibrationEvaluation) -> Float[torch.Tensor, "n
 def _widened(
     frames: Float[torch.Tensor, " n"], shared: Float[torch.Tensor, " n"], count: int
 ) -> Float[torch.Tensor, " n"]:
-    """Standard deviations, as much wider as Student's t is wider than a Gaussian.
+    """Standard deviations, enlarged by the ratio of Student's t to Gaussian quantiles.
 
     Args:
-        frames: variances from a number of frames, with one degree of freedom less than that.
-        shared: variances that are known, of errors that all frames share.
+        frames: variances estimated from `count` frames, with `count - 1` degrees of freedom.
+        shared: known variances of errors common to all frames.
     """
     variance = frames + shared
     if count < 2:
@@ -403,8 +407,9 @@ def _widened(
 
 
 def with_fixed_gauge(scene: Scene, free: FreeParameters) -> FreeParameters:
-    """`free` with the first camera locked if all cameras and base frames are free: their common motion is
-    unobservable."""
+    """Lock the first camera in `free` if all cameras and base frames are free, since their common motion is
+    unobservable.
+    """
     every_base = free.base_frames and (not free.arms or {arm.name for arm in scene.arms} <= set(free.arms))
     names = [camera.name for camera in scene.cameras]
     if not (every_base and free.extrinsics) or set(names) & set(free.locked_cameras):

@@ -1,4 +1,4 @@
-"""Many frames as one optimization problem in the calibration that they share."""
+"""Optimization problem of many frames in their shared calibration."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -26,8 +26,9 @@ from .variables import Variables
 
 @dataclass(frozen=True)
 class Eliminated:
-    """Quadratic model of the shared unknowns after elimination of a frame's own ones (Schur complement). On the CPU, in
-    double precision."""
+    """Quadratic model of the shared unknowns after elimination of a frame's own unknowns (Schur complement), in double
+    precision on the CPU.
+    """
 
     gradient: Float[Tensor, " shared"]
     curvature: Float[Tensor, "shared shared"]
@@ -41,10 +42,10 @@ class Eliminated:
 
 
 def eliminate(gradient: Float[Tensor, " n"], curvature: Float[Tensor, "n n"], own: int) -> Eliminated:
-    """Eliminate the first `own` unknowns of a model; 0 leaves it as it is.
+    """Eliminate the first `own` unknowns of a quadratic model; none if 0.
 
     Args:
-        gradient, curvature: of the model; the block of the own unknowns is positive definite.
+        gradient, curvature: quadratic model; the block of the own unknowns must be positive definite.
     """
     gradient, curvature = gradient.double().cpu(), curvature.double().cpu()
     across = curvature[:own, own:]
@@ -67,21 +68,23 @@ _ASSESSED, _COMPARED = 12, 4
 
 @dataclass(frozen=True)
 class CalibrationEvaluation(Evaluation):
-    """All frames at one calibration; the maps are those of the first frame."""
+    """Evaluation of all frames at one calibration; the maps are those of the first frame."""
 
     frame_losses: Float[Tensor, " frames"]
     frame_weights: Float[Tensor, " frames"]
     """Weight of each frame, in [0, 1]."""
     frame_gradients: Float[Tensor, "frames n"] | None
-    """Each frame's part of the gradient, without the prior."""
+    """Each frame's contribution to the gradient, without the prior."""
     frame_curvatures: Float[Tensor, "frames n n"] | None
-    """Each frame's part of the curvature, without the prior."""
+    """Each frame's contribution to the curvature, without the prior."""
     outline: Float[Tensor, " n"] | None
-    """Change of the gradient for one standard deviation of an error that all outlines share."""
+    """Change of the gradient for one standard deviation of an error common to all outlines."""
 
 
 class _FramePart:
-    """Problem of one frame in its own unknowns (joint offsets) and the shared ones, with the value of its own ones."""
+    """Problem of one frame in its own unknowns (joint offsets) and the shared ones; stores the values of its own
+    unknowns.
+    """
 
     def __init__(self, problem: FrameProblem, own: int) -> None:
         self.problem = problem
@@ -89,18 +92,18 @@ class _FramePart:
         self._anchor: tuple[Tensor, Tensor, Eliminated] | None = None
 
     def at(self, shared: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch m"]:
-        """All unknowns of the frame at one or a batch of calibrations, with measured joints."""
+        """All unknowns of the frame, with measured joints, at one calibration or a batch."""
         return torch.cat([shared.new_zeros(*shared.shape[:-1], len(self.own)), shared], -1)
 
     def follow(self, shared: Float[Tensor, " n"]) -> None:
-        """Update the own unknowns for a calibration, by the anchored model."""
+        """Update the own unknowns for a calibration, using the anchored model."""
         if self._anchor is not None and len(self.own):
             at, own, model = self._anchor
             moved = own + model.own_step(shared - at).to(own)
             self.own = self.problem.variables.clamp(torch.cat([moved, shared]))[: len(own)]
 
     def anchor(self, shared: Float[Tensor, " n"], model: Eliminated) -> None:
-        """Anchor a model at the present own unknowns."""
+        """Anchor a model at the current own unknowns."""
         self._anchor = (shared, self.own, model)
 
     def observe(self, stage: Observe, shared: Float[Tensor, " n"]) -> None:
@@ -114,7 +117,7 @@ class _FramePart:
     def curvature_with_intrinsics(
         self, shared: Float[Tensor, " n"], stage: Descend, free: FreeParameters
     ) -> Float[Tensor, "n k"]:
-        """Mixed second derivatives of the shared unknowns and of the intrinsics of all cameras, which are held."""
+        """Mixed second derivatives with respect to the shared unknowns and the fixed intrinsics of all cameras."""
         problem, own = self.problem, len(self.own)
         known = problem.variables
         every = Variables(problem.scene, known.start, replace(free, intrinsics=True), problem.settings.length_scale)
@@ -134,18 +137,19 @@ class CalibrationProblem:
 
     Args:
         free: unknowns; joints are free in each frame separately.
-        joint_prior_deg: expected error of free joints [deg]; `settings.length_scale` turns it into metres.
-        backgrounds: of the cameras, where they are known; see `FrameProblem`.
-        known_base_frames: arm -> covariance of its base frame's turn and shift in its own axes [rad, m], where it is
-            known better than the prior of `settings`.
+        joint_prior_deg: expected error of free joints [deg]; `settings.length_scale` converts it to metres.
+        backgrounds: known mean backgrounds of the cameras; see `FrameProblem`.
+        known_base_frames: arm -> covariance of the base frame's rotation and translation in its own axes [rad, m], if
+            it is more accurate than the prior of `settings`.
 
     Attributes:
         variables: unknowns of the calibration.
-        stage: index of the present descent.
-        present: the present descent.
+        stage: index of the current descent.
+        present: the current descent.
 
     Raises:
-        SettingsError: an image is missing or of another size than its camera, or nothing of the calibration is free.
+        SettingsError: an image is missing or its size differs from that of its camera, or no calibration parameter is
+            free.
     """
 
     def __init__(
@@ -191,7 +195,7 @@ class CalibrationProblem:
         self._lowest, self._begun = math.inf, False
 
     def objective_key(self, blur: float) -> tuple[int, float]:
-        """Key of the objective: the observation and the blur. Losses compare within one key."""
+        """Key of the objective: the observation and the blur. Losses are comparable within one key."""
         return self._parts[0].problem.objective_key(blur)
 
     def observe(self, stage: Observe, offsets: Float[Tensor, " n"]) -> None:
@@ -203,7 +207,7 @@ class CalibrationProblem:
         self._begun = False
 
     def evaluate(self, offsets: Float[Tensor, " n"], stage: Descend, *, gradient: bool = True) -> CalibrationEvaluation:
-        """Evaluate a calibration; free joints follow it."""
+        """Evaluate a calibration; free joints are updated for it."""
         if stage is not self.present or not self._begun:
             self.present, self._lowest, self._begun = stage, math.inf, True
             self.stage += 1
@@ -218,7 +222,7 @@ class CalibrationProblem:
                 outlines.append(eliminate(evaluation.common, evaluation.hessian, own).gradient)
         combined = self._combined(offsets, evaluations, models, outlines)
         self._losses = combined.frame_losses
-        # The solver steps from the lowest point so far, and so do the frames' own unknowns.
+        # The solver, and with it the frames' own unknowns, steps from the best point so far.
         if models and combined.value < self._lowest:
             self._lowest = combined.value
             for part, model in zip(self._parts, models, strict=True):
@@ -226,7 +230,7 @@ class CalibrationProblem:
         return combined
 
     def frame_losses(self, offsets: Float[Tensor, " n"]) -> Float[np.ndarray, " frames"]:
-        """Loss of each frame at a calibration with measured joints, under the present descent."""
+        """Loss of each frame at a calibration with measured joints, under the current descent."""
         assert self.present is not None
         at_measured = [
             part.evaluate(offsets, torch.zeros_like(part.own), self.present, gradient=False) for part in self._parts
@@ -240,17 +244,18 @@ class CalibrationProblem:
 
     @property
     def some_masked(self) -> bool:
-        """Whether given masks are the target in some frames at least."""
+        """Whether given masks are the target in at least one frame."""
         return any(part.problem.masked for part in self._parts)
 
     def silhouette_overlap(self, offsets: Float[Tensor, " n"], scale: float) -> float:
-        """Mean overlap of silhouettes and masks (Dice), with measured joints."""
+        """Mean Dice of silhouettes and masks, with measured joints."""
         parts = self._some(_COMPARED)
         return float(np.mean([part.problem.silhouette_overlap(part.at(offsets), scale) for part in parts]))
 
     def search_silhouettes(self, stage: SilhouetteSearch) -> Float[Tensor, " n"]:
-        """Offsets whose silhouettes in some frames are nearest to the masks; the prior is replaced by the search
-        range."""
+        """Offsets whose silhouettes are nearest to the masks in a subset of frames; the prior is replaced by the search
+        range.
+        """
         parts = self._some(_COMPARED)
         compared = [(part, part.problem.silhouettes(stage.scale)) for part in parts]
         distance = float(np.mean([part.problem.distance for part in parts]))
@@ -269,17 +274,17 @@ class CalibrationProblem:
         return found
 
     def _some(self, count: int) -> list[_FramePart]:
-        """Evenly spread frames."""
+        """A subset of evenly spaced frames."""
         return [self._parts[index] for index in spread(len(self._parts), count)]
 
     def evidence(self, offsets: Float[Tensor, " n"]) -> list[Evidence]:
-        """Evidence of some evenly spread frames on a calibration, with measured joints."""
+        """Evidence for and against a calibration from evenly spaced frames, with measured joints."""
         losses = [float(loss) for loss in self.frame_losses(offsets)[spread(len(self._parts), _ASSESSED)]]
         parts = zip(self._some(_ASSESSED), losses, strict=True)
         return [part.problem.evidence(part.at(offsets), loss) for part, loss in parts]
 
     def curvature_with_intrinsics(self, offsets: Float[Tensor, " n"]) -> Float[Tensor, "n k"]:
-        """Mixed second derivatives of the calibration and of intrinsics that are held, as of the present stage."""
+        """Mixed second derivatives with respect to the calibration and fixed intrinsics, at the current stage."""
         assert self.present is not None
         found = [part.curvature_with_intrinsics(offsets, self.present, self._free) for part in self._parts]
         return torch.einsum("f,fnk->nk", self._weights, torch.stack(found))
@@ -313,8 +318,9 @@ class CalibrationProblem:
 
 
 def with_joint_errors(covariance: Float[np.ndarray, "6 6"], length_scale: float) -> Float[np.ndarray, "6 6"]:
-    """Covariance of a base frame [rad, m] in radian-like units, widened for constant joint errors, which points cannot
-    distinguish from an error of the base frame."""
+    """Convert the covariance of a base frame [rad, m] to radian-like units, increased by constant joint errors, which
+    points cannot distinguish from a base frame error.
+    """
     scales = np.repeat([1.0, length_scale], 3)
     return covariance / np.outer(scales, scales) + np.radians(SurfaceSolver.frame_prior_deg) ** 2 * np.eye(6)
 
@@ -335,8 +341,9 @@ def _with_base_frames(
 
 
 def frame_weights(losses: Float[Tensor, " frames"]) -> Float[Tensor, " frames"]:
-    """Robust weights of frames, in [0, 1]: 1 up to a multiple of the median loss, and decreasing beyond it, so that
-    outliers (bad kinematics, smoke) have little influence."""
+    """Robust frame weights in [0, 1]: 1 up to a multiple of the median loss, decreasing beyond, so that outliers (bad
+    kinematics, smoke) have little influence.
+    """
     shown = losses[losses > 0]
     if not len(shown):
         return torch.ones_like(losses)

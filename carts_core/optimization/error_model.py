@@ -13,7 +13,7 @@ from ..settings import SequenceSettings
 
 @dataclass(frozen=True)
 class Gaussian:
-    """Mean [rad] and covariance [rad^2] of corrections, or of their parts."""
+    """Mean [rad] and covariance [rad^2] of corrections or their components."""
 
     mean: Float[np.ndarray, " n"]
     covariance: Float[np.ndarray, "n n"]
@@ -21,16 +21,16 @@ class Gaussian:
 
 @dataclass(frozen=True)
 class Information:
-    """Measurement of a frame's correction x, with the log likelihood -x.precision.x / 2 + vector.x."""
+    """Measurement of a frame's correction x in information form, with log likelihood -x.precision.x / 2 + vector.x."""
 
     precision: Float[np.ndarray, "n n"]
     """[1/rad^2]; singular in directions that the image does not determine."""
     vector: Float[np.ndarray, " n"]
-    """[1/rad]"""
+    """Information vector [1/rad]."""
 
     @staticmethod
     def nothing(n: int) -> "Information":
-        """No information, of a frame whose image is left out."""
+        """No information, for a frame whose image is ignored."""
         return Information(np.zeros((n, n)), np.zeros(n))
 
     @staticmethod
@@ -48,7 +48,7 @@ class Information:
         return Information(self.precision + other.precision, self.vector + other.vector)
 
     def mahalanobis(self, expected: Gaussian) -> float:
-        """Squared Mahalanobis distance from the prediction, mean over the measured directions [1].
+        """Squared Mahalanobis distance from the prediction, averaged over the measured directions [1].
 
         It is the normalized innovation squared of a filter (Bar-Shalom, Li and Kirubarajan, Estimation with
         Applications to Tracking and Navigation, 2001, 5.4), whose degrees of freedom are the rank of the precision:
@@ -66,26 +66,26 @@ class Information:
         return float(difference @ np.linalg.solve(spread, difference)) / measured.shape[1]
 
     def contradicts(self, expected: Gaussian) -> bool:
-        """Whether the correction is three standard deviations from the prediction, on average."""
+        """Whether the correction deviates from the prediction by three standard deviations or more, on average."""
         return self.mahalanobis(expected) > _CONTRADICTS
 
 
 _CONTRADICTS = 9.0
-"""Mean squared Mahalanobis distance from which a measurement contradicts its prediction [1]."""
+"""Mean squared Mahalanobis distance at which a measurement contradicts its prediction [1]."""
 
 _MEASURED = 10.0
-"""Least precision of a measured direction [1/rad^2], a standard deviation of 18 degrees."""
+"""Minimum precision of a measured direction [1/rad^2]: a standard deviation of 18 degrees."""
 
 _EXACT = 1e14
 """Precision of exactly known values [1/rad^2]."""
 
 
 class ErrorModel:
-    """Kalman model of n corrections with the state [3 n]: constants, drifts, noises.
+    """Kalman model of n corrections with the state [3 n]: constant, drift and noise components.
 
     Args:
-        settings: of joints; other unknowns have as much less drift and noise as they have a smaller constant.
-        constant: deviation of each unknown's constant [rad].
+        settings: standard deviations for joints; drift and noise of other unknowns scale with their constant.
+        constant: standard deviation of each unknown's constant component [rad].
     """
 
     def __init__(self, settings: SequenceSettings, constant: Float[np.ndarray, " n"]) -> None:
@@ -100,7 +100,7 @@ class ErrorModel:
         return Gaussian(np.zeros(3 * self._n), np.diag(self._variance))
 
     def predicted(self, state: Gaussian, seconds: float) -> Gaussian:
-        """Predicted state after a time [s]; the prior after an infinite one."""
+        """Predicted state after a time [s]; the prior for infinite time."""
         kept = self._kept(seconds)
         noise = np.diag(self._variance * (1.0 - kept**2))
         return Gaussian(kept * state.mean, kept[:, None] * state.covariance * kept + noise)
@@ -110,7 +110,7 @@ class ErrorModel:
         return np.repeat([constant, math.exp(-seconds / self._drift_seconds), 0.0], self._n)
 
     def correction(self, state: Gaussian) -> Gaussian:
-        """The sum of the parts."""
+        """Corrections as the sum of the state's components."""
         return Gaussian(self._sum @ state.mean, self._sum @ state.covariance @ self._sum.T)
 
     def updated(self, state: Gaussian, information: Information) -> Gaussian:
@@ -118,7 +118,7 @@ class ErrorModel:
         return combined(state, information, self._sum)
 
     def smoothed(self, filtered: Sequence[Gaussian], seconds: Sequence[float]) -> list[Gaussian]:
-        """Corrections of all frames, `seconds` apart, each given all others (Rauch, Tung and Striebel, 1965)."""
+        """Corrections of all frames, `seconds` apart, given all measurements (Rauch, Tung and Striebel, 1965)."""
         if not filtered:
             return []
         result = [filtered[-1]]
@@ -143,15 +143,15 @@ def combined(state: Gaussian, information: Information, C: Float[np.ndarray, "m 
 
 
 def information_shares(gaps: Sequence[float], memory: float) -> list[float]:
-    """Share of each frame's information that counts for the others, since image errors are correlated in time [1].
+    """Share of each frame's information used for other frames, since image errors are correlated in time [1].
 
-    The model is an autoregressive process of first order: n values that are a gap apart have the information of
-    n (1 - r) / (1 + r) independent ones, with r = exp(-gap / memory). The share of a frame is the mean for the gaps on
-    either side.
+    The model is a first-order autoregressive process: n values spaced by a gap have the information of n (1 - r) / (1 +
+    r) independent ones, with r = exp(-gap / memory). The share of a frame is the mean over the gaps before and after
+    it.
 
     Args:
-        gaps: from the frame before to each frame [s]; that of the first one does not matter.
-        memory: time after which the correlation has fallen to 1/e [s].
+        gaps: time from the previous frame to each frame [s]; the first one is not used.
+        memory: time constant of the correlation (decay to 1/e) [s].
     """
     shares = [math.tanh(0.5 * gap / memory) for gap in gaps[1:]]
     if not shares:
@@ -163,21 +163,21 @@ def remove_measurement(smoothed: Gaussian, own: Information) -> Gaussian:
     """Smoothed correction of a frame without its own measurement."""
     precision = np.linalg.inv(smoothed.covariance)
     values, vectors = np.linalg.eigh(precision - own.precision)
-    # Rounding must not make a precision negative.
+    # Rounding errors must not make a precision negative.
     covariance = vectors @ np.diag(1.0 / np.maximum(values, 1.0)) @ vectors.T
     return Gaussian(covariance @ (precision @ smoothed.mean - own.vector), covariance)
 
 
 class Smoother:
-    """Filters measurements in the order of visits, and smooths them backwards.
+    """Forward filter over frames in visiting order, with a backward smoother.
 
-    Image errors of neighbouring frames are correlated, so that only a share of a frame's information is used for the
-    others; all of it is used for the frame itself.
+    Image errors of neighbouring frames are correlated, so only a share of a frame's information is used for other
+    frames; all of it is used for the frame itself.
 
     Args:
-        gaps: position -> seconds from the frame visited before it, in the order of the visits.
+        gaps: frame index -> time from the previously visited frame [s], in visiting order.
         correlation_seconds: time constant of the autocorrelation of image errors [s].
-        exact: positions of frames that are known and therefore count whole.
+        exact: indices of frames that are known and therefore have full weight.
     """
 
     def __init__(
@@ -189,7 +189,7 @@ class Smoother:
         self._order: list[int] = []
         self._measured: dict[int, Information] = {}
         self._filtered: list[Gaussian] = []
-        """States after the first frames of the order; completed when they are needed."""
+        """Filtered states of the first frames in visiting order; extended on demand."""
 
     def expected(self, index: int) -> Gaussian:
         """Predicted correction of the next frame."""
@@ -208,14 +208,14 @@ class Smoother:
         del self._filtered[self._order.index(index) :]
 
     def restart(self, index: int) -> None:
-        """Start again from the prior at the next frame."""
+        """Restart from the prior at the next frame."""
         self._gaps[index] = inf
         self._shares = self._information_shares()
         # The previous frame loses a neighbour, so its share grows.
         del self._filtered[max(len(self._order) - 1, 0) :]
 
     def smoothed(self) -> dict[int, Gaussian]:
-        """Position -> smoothed correction of each measured frame."""
+        """Frame index -> smoothed correction of each measured frame."""
         self._filter(len(self._order))
         states = self._errors.smoothed(self._filtered, [self._gaps[index] for index in self._order])
         own = {index: self._measured[index].scaled(1.0 - self._shares[index]) for index in self._order}
@@ -228,7 +228,7 @@ class Smoother:
         return other
 
     def _predicted(self, place: int, index: int) -> Gaussian:
-        """Predicted state of the frame at a place in the order."""
+        """Predicted state of the frame at index `place` of the visiting order."""
         if place == 0:
             return self._errors.initial()
         self._filter(place)
@@ -242,6 +242,6 @@ class Smoother:
             self._filtered.append(self._errors.updated(self._predicted(place, index), shared))
 
     def _information_shares(self) -> dict[int, float]:
-        """Position -> share of a frame's information that counts for the others [1]."""
+        """Frame index -> share of the frame's information used for other frames [1]."""
         shares = information_shares(list(self._gaps.values()), self._correlation_seconds)
         return {index: 1.0 if index in self._exact else share for index, share in zip(self._gaps, shares, strict=True)}

@@ -1,4 +1,4 @@
-"""Evidence of images for and against a fit, and the log odds of failure that follow."""
+"""Image evidence for and against a fit, and the resulting log odds of failure."""
 
 from dataclasses import asdict, dataclass
 
@@ -17,30 +17,33 @@ from .predictor import FramePredictor
 
 @dataclass(frozen=True)
 class ArmEvidence:
-    """Evidence on one arm of a fit from the pixels near it, of all cameras together."""
+    """Evidence for and against the fit of one arm, from the pixels near it in all cameras."""
 
     residual: float
-    """Squared difference of the rendered and the predicted coverage, the latter conditioned on the fit, relative to
-    their mean area [1]."""
+    """Squared difference of the rendered coverage and the coverage predicted with the fit as condition, relative to
+    their mean area [1].
+    """
     agreement: float
-    """Overlap (soft Dice) of both [1]."""
+    """Overlap (soft Dice) of rendered and predicted coverage [1]."""
     unconditioned: float
-    """The same, the network conditioned on nothing [1]."""
+    """Overlap (soft Dice) with the unconditioned prediction [1]."""
     overlap_with_change: float | None
-    """Overlap (soft Dice) of the rendering and the change against the mean background [1]; None where not known."""
+    """Overlap (soft Dice) of the rendering with the change relative to the mean background [1]; None if unknown."""
 
 
 _WITHOUT_CHANGE = (0.13, 23.8, 1.5, -3.25, -0.44)
 _WITH_CHANGE = (0.99, 27.9, 0.81, -1.84, -0.42, -2.85)
-"""Bias, and weights of loss, residual, agreement, unconditioned (and overlap with change) in the log odds of a failure:
-logistic regressions over 503 frames of known truth, see docs/explanation/decisions.md; none of them is held out."""
+"""Bias, and weights of loss, residual, agreement, unconditioned (and overlap with change) in the log odds of failure:
+logistic regressions on 503 frames with ground truth, none held out; see docs/explanation/decisions.md.
+"""
 
 _LEAST_CHANGE, _CHANGE_SLOPE = 0.6, 40.0
-"""Least overlap with change of all correct fits, and slope of the log odds below it."""
+"""Lowest overlap with change among correct fits, and slope of the log odds below it."""
 
 _MASK_MIDDLE, _MASK_SLOPE = 0.8, 22.0
-"""Overlap with a given mask at log odds of 0, and their slope: a fit is good from 0.9 on and doubtful below, since a
-mask may have holes."""
+"""Overlap with a given mask at log odds 0, and slope of the log odds: a fit is good from 0.9 and doubtful below, since
+a mask may have holes.
+"""
 
 
 def log_odds_of_failure(loss: float, arm: ArmEvidence, masked: bool) -> float:
@@ -65,11 +68,12 @@ _MARGIN, _NEAR = 16, 8
 image]."""
 
 _SHOWN, _TELLING = 2e-3, 0.3
-"""Least area of an arm that is assessed alone, as a share of the images, and least share of an arm with informative
-change [1]."""
+"""Minimum area of an arm that is assessed separately, as a share of the images, and minimum share of an arm with
+informative change [1].
+"""
 
 _PART_SHOWN = 60.0
-"""Least area of a part that is assessed alone [px of the working image]."""
+"""Minimum area of a part that is assessed separately [px of the working image]."""
 
 OUT_OF_VIEW = 5e-4
 """Share of the images below which no arm is in view [1]."""
@@ -77,36 +81,39 @@ OUT_OF_VIEW = 5e-4
 
 @dataclass(frozen=True)
 class Evidence(ArmEvidence):
-    """Evidence on a fit without ground truth: of all arms, and of the arm with the worst fit."""
+    """Evidence for and against a fit, without ground truth: for all arms, and for the arm with the worst fit."""
 
     area: float
     """Area of the rendered arms, as a share of the images [1]."""
     start_area: float
-    """The same at the start [1]."""
+    """Area of the rendered arms at the start, as a share of the images [1]."""
     loss: float
     """Cost of the surface factor per pixel of the arms, without the prior [1]; see `Evaluation.loss`."""
     predicted: float
-    """Share of the rendered arms that the network predicts, conditioned on nothing [1]."""
+    """Share of the rendered arms in the network's unconditioned prediction [1]."""
     changed: float | None
-    """Share of the rendered arms that differs from the mean background; None where that is not known [1]."""
+    """Share of the rendered arms that differs from the mean background [1]; None if that is unknown."""
     still_in_view: float = 1.0
-    """Smallest ratio of an arm's area to its area at the start, over the arms in view then [1]; parts behind another
-    arm count as in view."""
+    """Smallest ratio of an arm's area to its area at the start, over the arms initially in view [1]; parts occluded by
+    another arm count as in view.
+    """
     elsewhere: float = 0.0
-    """If an arm is out of view: coverage predicted far from the others that differs from the mean background, as a
-    share of the images [1]."""
+    """If an arm is out of view: predicted coverage far from the other arms that differs from the mean background, as a
+    share of the images [1].
+    """
     parts_predicted: float = 1.0
-    """Share of the rendered wrists or jaws that is predicted as that part, the smaller one of both [1]; 1 where hardly
-    any of them is in view, and with given masks."""
+    """Minimum over wrists and jaws of the share of the rendered part that is predicted as that part [1]; 1 if hardly
+    visible, and with given masks.
+    """
     masked: bool = False
-    """Whether the predictions are given masks, which count in the whole image."""
+    """Whether the predictions are given masks, which are compared in the whole image."""
 
 
 @torch.no_grad()
 def evidence(
     images: FrameImages, start: SceneState, end: SceneState, predictor: FramePredictor, loss: float
 ) -> Evidence:
-    """Evidence of images for and against a fit; runs the predictor twice."""
+    """Collect image evidence for and against a fit; runs the predictor twice."""
     before, maps = (images.renderer.surface_maps(state) for state in (start, end))
     covered, was = (part[:, COVERAGE].sum(1, keepdim=True) for part in (maps, before))
     margin = max(images.size) if predictor.masked else round(_MARGIN * images.scale)
@@ -173,7 +180,7 @@ def _places(
     *,
     whole: bool,
 ) -> list[Float[Tensor, "cameras 1 h w"]]:
-    """Weights of the pixels at and around each arm that is in view, as the only arm there; all pixels if `whole`."""
+    """Pixel weights at and around each visible arm, excluding other arms; all pixels if `whole`."""
     labels = window.of(torch.from_numpy(arm_ids).to(weight.device))[:, None]
     arms = [labels == arm for arm in range(count)]
     shown = [arm for arm in arms if float(arm.sum()) >= _SHOWN * arm_ids.size]
@@ -191,10 +198,10 @@ def _around(silhouette: Float[Tensor, "cameras 1 h w"], scale: float) -> Float[T
 def _of_arm(
     here: Tensor, rendered: Tensor, conditioned: Tensor, alone: Tensor, change: tuple[Tensor, Tensor] | None
 ) -> ArmEvidence:
-    """Evidence from maps under pixel weights.
+    """Evidence on one arm from coverage maps under pixel weights.
 
     Args:
-        rendered, conditioned, alone: coverage, as rendered and as predicted with and without a condition.
+        rendered, conditioned, alone: coverage: rendered, predicted with condition, and predicted without.
     """
     rendered, conditioned, alone = rendered * here, conditioned * here, alone * here
     overlap = None
@@ -209,10 +216,10 @@ def _of_arm(
 
 
 def _overlap(one: Float[Tensor, "cameras 1 h w"], other: Float[Tensor, "cameras 1 h w"]) -> float:
-    """Soft Dice of two maps in [0, 1]; 0 where both are empty."""
+    """Soft Dice of two maps in [0, 1]; 0 if both are empty."""
     return 2.0 * total(torch.minimum(one, other)) / max(total(one) + total(other), 1e-6)
 
 
 def _share(part: Float[Tensor, "cameras 1 h w"], whole: Float[Tensor, "cameras 1 h w"]) -> float:
-    """Share of `whole` that `part` covers, both in [0, 1]; 0 of an empty map."""
+    """Share of `whole` covered by `part`, both in [0, 1]; 0 if `whole` is empty."""
     return total(part * whole) / max(total(whole), 1e-6)

@@ -24,7 +24,7 @@ _EMPTY = 1e-6
 def cosine_similarity(
     observed: Float[Tensor, "*batch channels h w"], rendered: Float[Tensor, "*batch channels h w"]
 ) -> Float[Tensor, "*batch h w"]:
-    """sim_cos of the paper, along the channels; two empty features count as equal."""
+    """Cosine similarity along the channels (sim_cos of the paper); two zero features count as equal."""
     dot = (observed * rendered).sum(-3)
     norms = (observed.square().sum(-3) + _EMPTY).sqrt() * (rendered.square().sum(-3) + _EMPTY).sqrt()
     return (dot + _EMPTY) / norms
@@ -37,12 +37,12 @@ def attentional_loss(
     loss: Loss,
     pixels: int | None = None,
 ) -> Float[Tensor, "*batch"]:
-    """ACS loss of the paper (its equation for L) in one of its forms, per image.
+    """ACS loss of the paper (equation for L) in one of its variants, per image.
 
     Args:
-        similarity: of features, at most 1; for `l1` the negated difference of predictions.
+        similarity: similarity of features, at most 1; for `l1`, the negated difference of predictions.
         weight: attention map, in [0, 1].
-        pixels: w x h of the whole image, where the maps are a window of it that holds all attention.
+        pixels: number of pixels w x h of the whole image, if the maps are a window that contains all attention.
     """
     pixels = pixels or similarity.shape[-2] * similarity.shape[-1]
     if loss == "acs_paper":
@@ -67,10 +67,10 @@ class FeatureProblem:
     """Compares a frame's observed features with rendered ones (f_L of the paper).
 
     Args:
-        backgrounds: camera name -> mean background BG_m, of the same size.
+        backgrounds: camera name -> mean background BG_m, at the camera's image size.
 
     Raises:
-        SettingsError: an image or a background is missing, or of another size than its camera.
+        SettingsError: an image or background is missing, or its size differs from that of its camera.
     """
 
     def __init__(
@@ -94,27 +94,27 @@ class FeatureProblem:
         self._observed = self._images
 
     def _represent(self, images: Tensor) -> Tensor:
-        """Features for ACS, predictions for L1."""
+        """Network features for ACS, predictions for L1."""
         if self.settings.loss is Loss.L1:
             return self._extractor.probability(images)[:, 0]
         return self._extractor.features(images)
 
     def observe(self, stage: Observe, offsets: Float[Tensor, " n"]) -> None:
-        """Observed features are computed when a window is compared first."""
+        """No-op: observed features are computed on the first comparison of a window."""
 
     def objective_key(self, blur: float) -> tuple[int, float]:
-        """All losses compare: each is of the final attention."""
+        """Key of the objective; constant, since all losses use the final attention and are comparable."""
         return 0, 0.0
 
     @property
     def final(self) -> FirstOrder:
-        """The last stage: losses of all stages are of its attention, and so compare."""
+        """The last stage, whose attention is used for the losses of all stages, so that they are comparable."""
         stage = self.settings.stages[-1]
         assert isinstance(stage, FirstOrder)
         return stage
 
     def evaluate(self, offsets: Float[Tensor, " n"], stage: Stage, *, gradient: bool = True) -> Evaluation:
-        """Evaluate a point in a stage's attention."""
+        """Evaluate a point under the attention of a stage."""
         assert isinstance(stage, FirstOrder)
         settings, final = self.settings, self.final
         wide = stage.attention > final.attention
@@ -153,9 +153,9 @@ class FeatureProblem:
         )
 
     def _observed_around(self, silhouette: Float[Tensor, "cameras h w"], radius: int) -> Window:
-        """The window that is compared: all that the attention covers, with some surroundings for the network.
+        """Compared window: the area of the attention, with a margin for the network.
 
-        It stays where it is as long as it holds the attention, so that observed features are computed once.
+        It is kept as long as it contains the attention, so that observed features are computed once.
         """
         size = (self.renderer.width, self.renderer.height)
         if self.settings.loss is Loss.L1:

@@ -1,4 +1,4 @@
-"""Factors: terms of an objective with a quadratic model each, and the Gaussian prior."""
+"""Interface of factors, the terms of an objective, and the Gaussian prior."""
 
 from dataclasses import dataclass
 from typing import Protocol
@@ -13,21 +13,23 @@ class Linearization:
     """A quadratic model of a factor, or of a sum of factors, around a point."""
 
     cost: float
-    """At the point, in units of the noise [1]: a negative log likelihood up to a constant."""
+    """Cost at the point, in units of the noise [1]: a negative log likelihood up to a constant."""
     gradient: Float[Tensor, " n"]
-    """Of the cost [1/rad]."""
+    """Gradient of the cost [1/rad]."""
     hessian: Float[Tensor, "n n"]
-    """Gauss-Newton's approximation of the second derivative [1/rad^2]."""
+    """Gauss-Newton approximation of the Hessian [1/rad^2]."""
 
     def __add__(self, other: "Linearization") -> "Linearization":
         return Linearization(self.cost + other.cost, self.gradient + other.gradient, self.hessian + other.hessian)
 
 
 class Factor(Protocol):
-    """A summand of an objective. `FrameOptimizer(factors=...)` adds one to a frame's; `Prior` is a short example."""
+    """A term of an objective. `FrameOptimizer(factors=...)` adds one to a frame's objective; `Prior` is a short
+    example.
+    """
 
     def costs(self, offsets: Float[Tensor, "batch n"]) -> Float[Tensor, " batch"]:
-        """Cost of each of a batch of points [1]."""
+        """Costs of a batch of points [1]."""
         ...
 
     def linearize(self, offsets: Float[Tensor, " n"]) -> Linearization:
@@ -37,16 +39,16 @@ class Factor(Protocol):
 
 @dataclass(frozen=True)
 class Prior:
-    """A Gaussian over the unknowns, which may be correlated. Implements `Factor`."""
+    """Gaussian prior over the unknowns, which may be correlated. Implements `Factor`."""
 
     mean: Float[Tensor, " n"]
-    """[rad]"""
+    """Mean [rad]."""
     precision: Float[Tensor, "n n"]
     """Inverse of the covariance [1/rad^2]."""
 
     @staticmethod
     def around_start(precision: Float[Tensor, " n"]) -> "Prior":
-        """Independent errors around 0, of the given inverse variances [1/rad^2]."""
+        """Prior of independent errors around 0 with the given inverse variances [1/rad^2]."""
         return Prior(torch.zeros_like(precision), torch.diag(precision))
 
     def costs(self, offsets: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch"]:
@@ -55,11 +57,11 @@ class Prior:
         return 0.5 * (away @ self.precision * away).sum(-1)
 
     def gradient(self, offsets: Float[Tensor, " n"]) -> Float[Tensor, " n"]:
-        """Of the cost [1/rad]."""
+        """Gradient of the cost [1/rad]."""
         return self.precision @ (offsets - self.mean)
 
     def linearize(self, offsets: Float[Tensor, " n"]) -> Linearization:
-        """Exact: the cost is quadratic."""
+        """Quadratic model around a point; exact, since the cost is quadratic."""
         return Linearization(float(self.costs(offsets)), self.gradient(offsets), self.precision)
 
     @property

@@ -34,7 +34,7 @@ def _nearest(gradient, camera, position, normal, samples, expected, sampling, di
         best = 0
         for s in range(len(samples)):
             x, y = position[0, k] + nx * samples[s], position[1, k] + ny * samples[s]
-            # Beyond the image there is no change of colour.
+            # Outside the image the gradient is 0.
             if not (x >= 0.0 and y >= 0.0 and x <= width - 1.0 and y <= height - 1.0):
                 strength[s] = 0.0
             else:
@@ -58,7 +58,7 @@ def _nearest(gradient, camera, position, normal, samples, expected, sampling, di
         before, peak, after = strength[middle - 1], strength[middle], strength[middle + 1]
         finer = np.float32(0.5) * (after - before) / max(np.float32(2.0) * peak - before - after, np.float32(1e-12))
         distance[k] = samples[middle] + sampling * min(max(finer, np.float32(-0.5)), np.float32(0.5))
-        # The strongest one at either end is the flank of an edge further away.
+        # A maximum at either end is the flank of a more distant edge.
         found[k] = 1.0 if 0 < best < last else 0.0
 
 
@@ -70,13 +70,13 @@ def nearest_edges(
     samples: Float[np.ndarray, " samples"],
     expected: Float[np.ndarray, " samples"],
 ) -> tuple[Float[np.ndarray, " K"], Float[np.ndarray, " K"]]:
-    """Distance to the strongest edge along the outward normal [px], and 1 where there is one, 0 elsewhere.
+    """Distance to the strongest edge along the outward normal [px], and 1 if there is one, else 0.
 
     Args:
-        gradient: of the images' three colours, to the right and then down [1/px].
-        position: where the outline is [px].
-        samples: distances at which edges are looked for, evenly spaced, at least three [px].
-        expected: what each of them counts [1].
+        gradient: image gradients of the three colour channels, in x and then in y [1/px].
+        position: outline points [px].
+        samples: evenly spaced search distances along the normal, at least three [px].
+        expected: weight of each sample [1].
     """
     distance, found = (np.empty(len(camera), np.float32) for _ in range(2))
     sampling = samples[1] - samples[0]
@@ -85,28 +85,28 @@ def nearest_edges(
 
 
 _SCALE = 2.0
-"""Size of the image for edge detection relative to the working image, up to the camera's image [1]."""
+"""Size of the image for edge detection relative to the working image, limited to the camera's resolution [1]."""
 
 _REACH, _SAMPLING = 4.0, 0.5
-"""Search range along the normal of an outline, and distance of samples [px]."""
+"""Search range along the normal of an outline, and sample spacing [px]."""
 
 _LIKELY = 3.0
-"""Deviation of how far from the outline the right edge is expected [px]."""
+"""Standard deviation of the expected distance between outline and true edge [px]."""
 
 _NEAR = 8
 """Largest distance of an outline from predicted coverage [px]."""
 
 _ROBUST = 1.5
-"""Distance at which an edge has lost three quarters of its weight [px]."""
+"""Distance at which the weight of an edge is reduced to a quarter [px]."""
 
 _BLUR = 1.0
-"""Deviation of the blur under which edges are looked for [px]."""
+"""Standard deviation of the blur for edge detection [px]."""
 
 _SHARE = (0.3, 1.0, 1.0)
-"""Weight of an outline pixel per part; along a straight shaft the errors of many pixels are correlated [1]."""
+"""Weight of an outline pixel per part [1]; errors along a straight shaft are correlated over many pixels."""
 
 _RENDERED_ANEW = 1.0
-"""Outlines that have moved by more than this are rendered again; up to there they move by their Jacobian [px]."""
+"""Motion beyond which outlines are rendered again; below, they are moved by their Jacobian [px]."""
 
 
 class EdgeFactor:
@@ -116,7 +116,7 @@ class EdgeFactor:
         ignore: camera name -> pixels that show an occluder.
 
     Raises:
-        SettingsError: an image is missing, or an image or a mask is of another size than its camera.
+        SettingsError: an image is missing, or the size of an image or mask differs from that of its camera.
     """
 
     def __init__(
@@ -136,7 +136,7 @@ class EdgeFactor:
         down, right = torch.gradient(smoothed(clear, _BLUR), dim=(-2, -1))
         # The compiled kernel reads all colours of a pixel at once.
         self._gradient = torch.cat([right, down], 1).contiguous(memory_format=torch.channels_last)
-        # An outline beside an occluder would find the occluder's edge.
+        # An outline next to an occluder would be matched to the occluder's edge.
         hidden = 1.0 - pixel_weights(scene, ignore, size).to(device)
         self._shown = (1.0 - attention(hidden, math.ceil(_REACH))) * certainty(through)
         self.renderer = Renderer(scene, width=size[0], height=size[1], device=device)
@@ -147,17 +147,17 @@ class EdgeFactor:
     def near(
         self, offsets: Float[Tensor, " n"], coverage: Float[Tensor, "cameras rows columns"], weight: float
     ) -> "LocalEdgeFactor":
-        """The factor in the neighbourhood of a point.
+        """Local edge factor in the neighbourhood of a point.
 
         Args:
-            coverage: of the arms as they were observed, of the whole image at any size; other edges do not count.
-            weight: of a squared distance, per pixel of the outline [1/px^2].
+            coverage: observed coverage of the arms in the whole image, at any resolution; edges elsewhere are ignored.
+            weight: weight of a squared distance per outline pixel [1/px^2].
         """
         near = functional.interpolate(coverage[:, None], self._shown.shape[2:], mode="bilinear").clamp(0.0, 1.0)
         return LocalEdgeFactor(self, offsets, attention(near, _NEAR) * self._shown, weight)
 
     def equations(self, outline: Outline, counts: Float[Tensor, "cameras 1 h w"], edge_weight: float) -> Linearization:
-        """Quadratic model of given outlines, with weights of the image's pixels."""
+        """Quadratic model for given outlines and pixel weights."""
         distance, weight = self._nearest(outline)
         column, row = outline.position.round().long()
         weight = weight * counts[outline.camera, 0, row, column] * self._share[outline.parts]
@@ -167,9 +167,9 @@ class EdgeFactor:
         return Linearization(cost, -weighted @ distance, weighted @ outline.motion.T)
 
     def cost(self, outline: Outline, counts: Float[Tensor, "cameras 1 h w"]) -> float:
-        """Distance of outlines from edges: sum of robust squared distances [px^2].
+        """Edge cost of outlines: sum of robust squared distances [px^2].
 
-        A pixel without an edge costs as much as one far away, so that poses compare.
+        A pixel without an edge costs as much as one with a distant edge, so that costs of poses are comparable.
         """
         distance, found = self._nearest(outline)
         column, row = outline.position.round().long()
@@ -178,7 +178,7 @@ class EdgeFactor:
         return total(weight * (found * squared + (1.0 - found) * _ROBUST**2))
 
     def _nearest(self, outline: Outline) -> tuple[Float[Tensor, " K"], Float[Tensor, " K"]]:
-        """Distance to the edge along the outward normal [px], and 1 where there is one, 0 elsewhere."""
+        """Distance to the edge along the outward normal [px], and 1 if there is one, else 0."""
         values = outline.camera, outline.position, outline.normal, self._samples, self._expected
         near = nearest_edges(as_array(self._gradient.permute(0, 2, 3, 1)), *map(as_array, values))
         distance, found = (torch.from_numpy(each).to(self._gradient.device) for each in near)
@@ -186,9 +186,9 @@ class EdgeFactor:
 
 
 class LocalEdgeFactor:
-    """Edges near a point. Implements `Factor.linearize`.
+    """Edge factor near a point. Implements `Factor.linearize`.
 
-    Outlines that move little are moved by their Jacobian; rendering them again is what costs time.
+    Small motions of outlines are computed from their Jacobian, since rendering is slow.
     """
 
     def __init__(self, factor: EdgeFactor, offsets: Float[Tensor, " n"], counts: Tensor, weight: float) -> None:
@@ -207,16 +207,16 @@ class LocalEdgeFactor:
         return self._factor.equations(self._outline.at(offsets - self._rendered_at), self._counts, self._weight)
 
     def cost(self) -> float:
-        """Distance of the last rendered outlines from edges; see `EdgeFactor.cost`."""
+        """Edge cost of the last rendered outlines; see `EdgeFactor.cost`."""
         return self._factor.cost(self._outline, self._counts)
 
     def moved_by(self, step: Float[Tensor, " n"]) -> float:
-        """Largest motion of outlines for a step [px]."""
+        """Largest motion of the outlines for a step [px]."""
         return self._outline.moved_by(step)
 
 
 _STILL = 0.03
-"""Outlines that move by no more than this have arrived [px]."""
+"""Outline motion below which the alignment has converged [px]."""
 
 
 @torch.no_grad()
@@ -230,11 +230,11 @@ def align_edges(
     """Minimize the sum of the edge factor and of a fixed quadratic model.
 
     Args:
-        known: the quadratic model there of all other factors.
-        coverage: of the arms as observed, see `EdgeFactor.near`.
+        known: quadratic model of all other factors at `offsets`.
+        coverage: observed coverage of the arms; see `EdgeFactor.near`.
 
     Returns:
-        The minimum, and the quadratic model of the edges alone around it.
+        The minimum, and the quadratic model of the edge factor around it.
     """
     factor, variables, origin = edges.near(offsets, coverage, stage.weight), edges.variables, offsets
     step = torch.zeros_like(offsets)

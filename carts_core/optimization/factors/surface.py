@@ -1,8 +1,8 @@
-"""The surface factor: surface maps of a state against predicted ones, under one blur.
+"""Surface factor: differences between rendered and predicted surface maps, under one blur.
 
-What the network predicts (parts and normals, see `carts_core.model.parts`) the renderer knows exactly for every
-state, so no background, no shading and no network enter a step, and residuals have a Jacobian. A robust weight per
-pixel keeps what cannot be explained (an occluder, a false detection) from pulling.
+The renderer computes the quantities predicted by the network (parts and normals, see `carts_core.model.parts`) exactly
+for any state, so steps need no background, shading or network, and residuals have a Jacobian. A robust weight per pixel
+limits the influence of outliers (an occluder, a false detection).
 """
 
 import math
@@ -29,7 +29,7 @@ _REDUCTIONS = (1, 2, 4, 8)
 """Allowed reductions of the observed images in a factor [1]."""
 
 _PIXELS_AT_ONCE = 1 << 20
-"""Most pixels of all states together that are rendered at once."""
+"""Largest number of pixels, over all states, that are rendered at once."""
 
 _SMALLEST_BLUR = 1.2
 """Smallest blur after reduction of the images [px of the reduced image]."""
@@ -39,14 +39,14 @@ class SurfaceFactor:
     """Half the sum of robust squared differences of surface maps, in units of the noise. Implements `Factor`.
 
     Args:
-        stage: blur, and difference beyond which a pixel loses its weight.
+        stage: blur, and scale of the robust weights.
 
     Attributes:
-        noise: deviation of what is observed, per pixel [1].
-        area: of a pixel [px of the working image].
+        noise: standard deviation of the observation, per pixel [1].
+        area: area of a pixel [px of the working image].
         size: width and height of the compared images [px].
-        window: the part of them that is compared [px].
-        certainty: information of a pixel, as a share of what it would have in a clear image [1].
+        window: the compared part of the images [px].
+        certainty: information of a pixel, relative to a clear image [1].
     """
 
     def __init__(
@@ -77,13 +77,13 @@ class SurfaceFactor:
         self._channels = torch.ones(SURFACE_CHANNELS, 1, 1, device=device)
         self._channels[1 : COVERAGE.stop] = settings.parts_weight
         self._channels[NORMALS] = settings.normals_weight
-        # Parts and normals are predicted by the network even where a given mask says what the arm covers.
+        # Parts and normals are predicted by the network even where coverage comes from a given mask.
         self._channels[1:] *= (self.noise / settings.noise) ** 2
         if self._total_only:
             self._channels = self._channels[: COVERAGE.start + 1]
 
     def costs(self, offsets: Float[Tensor, "batch n"]) -> Float[Tensor, " batch"]:
-        """Cost of each of a batch of points, as many at once as memory allows."""
+        """Costs of a batch of points, in chunks that fit in memory."""
         states = self._variables.state(offsets)
         pixels = self.window.area * states.intrinsics.shape[-2]
         at_once = max(_PIXELS_AT_ONCE // pixels, 1)
@@ -97,7 +97,7 @@ class SurfaceFactor:
         return torch.cat(found) / self.noise**2
 
     def compare(self, offsets: Float[Tensor, " n"]) -> "Comparison":
-        """Compare the state at a point."""
+        """Compare the state at a point with the observation."""
         rendering = self.renderer.surface(self._variables.state(offsets), None, 1)
         _, squared, ratio = self._difference(rendering.maps)
         return self._comparison(rendering, squared, ratio)
@@ -111,7 +111,7 @@ class SurfaceFactor:
         residual = self._observed - model
         weight = ratio.square() * self._channels * self._precision * self.certainty
         grown = torch.zeros_like(residual)
-        # Increase of coverage if outlines move outwards by a pixel.
+        # Increase of coverage if outlines move outwards by one pixel.
         down, right = torch.gradient(model[:, COVERAGE.start], dim=(-2, -1))
         grown[:, COVERAGE.start] = torch.hypot(down, right) / math.sqrt(self.area)
         gradient, hessian, outline = self._normal_equations(
@@ -131,22 +131,22 @@ class SurfaceFactor:
         """Blurred maps, squared residuals of pixels, and robust weights in (0, 1]."""
         model = self._blurred(maps * self._weight)
         squared = ((self._observed - model).square() * self._channels).sum(-3, keepdim=True)
-        # Geman-McClure: a residual far beyond the scale costs no more, and no longer pulls.
+        # Geman-McClure: the cost of residuals far beyond the scale saturates, and their gradient vanishes.
         return model, squared, 1.0 / (1.0 + squared / self._robust**2)
 
     def _blurred(self, maps: Float[Tensor, "*batch 6 h w"]) -> Float[Tensor, "*batch channels h w"]:
-        """Compared channels of surface maps: all, or the total coverage if no parts are known."""
+        """Blurred channels to compare: all, or only the total coverage if the parts are unknown."""
         if self._total_only:
             return smoothed(maps[..., COVERAGE, :, :].sum(-3, keepdim=True), self._blur)
         blurred = smoothed(maps, self._blur)
-        # The coverage of all parts is compared in place of the first part's.
+        # The total coverage is compared in place of the first part's coverage.
         blurred[..., COVERAGE.start, :, :] = blurred[..., COVERAGE, :, :].sum(-3)
         return blurred
 
     def _normal_equations(
         self, jacobian: tuple[JacobianBlock, ...], residual: Tensor, grown: Tensor, weight: Tensor, unknowns: int
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """-J^T W r, J^T W J and J^T W g, under the blur."""
+        """Normal equations -J^T W r, J^T W J and J^T W g, under the blur."""
         gradient, curvature = residual.new_zeros(unknowns), residual.new_zeros(unknowns, unknowns)
         outline = torch.zeros_like(gradient)
         windows, blocks = [], []
@@ -185,8 +185,8 @@ class Comparison:
 
 @dataclass(frozen=True)
 class SurfaceLinearization(Linearization):
-    """The quadratic model, and the comparison that gave it."""
+    """Quadratic model, and the comparison from which it was computed."""
 
     comparison: Comparison
     outline: Float[Tensor, " n"]
-    """Decrease of the gradient if all observed outlines move outwards by a pixel of the working image [1/px]."""
+    """Decrease of the gradient if all observed outlines move outwards by one pixel of the working image [1/px]."""
