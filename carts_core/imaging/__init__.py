@@ -1,1 +1,1 @@
-"""Images in the working size: resizing, filters, windows and dehazing."""
+"""Images at the working size: resizing, filters, windows and dehazing."""

@@ -1,8 +1,8 @@
 """Removal of smoke and haze from images before they are compared.
 
-Haze adds a grey that varies slowly over the image and takes contrast in the same measure. Tissue reflects little
-in at least one colour, so the darkest colour of the darkest pixel nearby tells how much has been added: the dark
-channel prior of He, Sun and Tang, "Single Image Haze Removal Using Dark Channel Prior" (CVPR 2009).
+Haze adds a grey that varies slowly over the image, and reduces contrast in proportion. Tissue reflects little in at
+least one colour, so the minimum over colours and nearby pixels estimates the added grey: the dark channel prior of He,
+Sun and Tang, "Single Image Haze Removal Using Dark Channel Prior" (CVPR 2009).
 """
 
 import torch
@@ -16,21 +16,21 @@ _REACH = 1 / 32
 """Radius of the dark channel, and standard deviation of the smoothing of haze [image widths]."""
 
 _COARSER = 4
-"""Downscaling for the estimate of haze [1]."""
+"""Downscaling factor for the estimate of haze [1]."""
 
 _AIRLIGHT = 0.75
 """Value of opaque haze, in each colour [1]."""
 
 _LEAST = 0.25
-"""Smallest transmission; noise grows by its inverse [1]."""
+"""Smallest transmission [1]; dehazing amplifies noise by its inverse."""
 
 
 def transmission(images: Float[Tensor, "n 3 h w"], share: float) -> Float[Tensor, "n 1 h w"]:
-    """Transmission of haze at each pixel; `_LEAST` to 1.
+    """Estimate the transmission of haze at each pixel, from `_LEAST` to 1.
 
     Args:
         images: RGB in [0, 1].
-        share: of the estimated haze that is removed [1]; 0 for none.
+        share: share of the estimated haze to remove [1]; 0 for none.
     """
     if share == 0:
         return torch.ones_like(images[:, :1])
@@ -42,12 +42,12 @@ def transmission(images: Float[Tensor, "n 3 h w"], share: float) -> Float[Tensor
 
 
 def dehazed(images: Float[Tensor, "n 3 h w"], through: Float[Tensor, "n 1 h w"]) -> Float[Tensor, "n 3 h w"]:
-    """Images, RGB in [0, 1], without haze of a transmission."""
+    """Remove haze of a given transmission from images, RGB in [0, 1]."""
     return ((images - _AIRLIGHT) / through + _AIRLIGHT).clamp(0.0, 1.0)
 
 
 def certainty(through: Float[Tensor, "n 1 h w"]) -> Float[Tensor, "n 1 h w"]:
-    """Information of a pixel of a dehazed image, as a share of what it would have without haze [1].
+    """Information of each pixel of a dehazed image, relative to that without haze [1].
 
     Dehazing amplifies noise by the inverse of the transmission, and information is the inverse of its square.
     """

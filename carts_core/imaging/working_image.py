@@ -1,4 +1,4 @@
-"""Images in the working size: checks, stacking, filters, and the window that is compared."""
+"""Images at the working size: checks, stacking, filters, and the compared window."""
 
 import math
 from collections.abc import Mapping
@@ -32,7 +32,8 @@ class Window:
 
     @staticmethod
     def around(silhouette: Float[Tensor, "cameras h w"], margin: int, multiple: int, size: tuple[int, int]) -> "Window":
-        """Bounding box of all silhouettes with a margin, in multiples of a size; the whole image if they are empty."""
+        """Bounding box of all silhouettes with a margin, aligned to multiples of a size; the whole image if they are
+        empty."""
         covered = silhouette.amax(0) > 0
         columns, rows = covered.any(0).nonzero()[:, 0], covered.any(1).nonzero()[:, 0]
         if not len(columns):
@@ -65,7 +66,7 @@ class Window:
         return Window(self.left - outer.left, self.top - outer.top, self.width, self.height)
 
     def reduced(self, factor: int) -> "Window":
-        """This window in an image that is smaller by a factor."""
+        """This window in an image downscaled by a factor."""
         return Window(self.left // factor, self.top // factor, self.width // factor, self.height // factor)
 
     def of(self, image: Float[Tensor, "*batch h w"]) -> Float[Tensor, "*batch {self.height} {self.width}"]:
@@ -81,10 +82,10 @@ class Window:
 def stacked_images(
     scene: Scene, images: Mapping[str, UInt8[np.ndarray, "h w 3"]], size: tuple[int, int], what: str
 ) -> Float[Tensor, "cameras 3 height width"]:
-    """Images of the scene's cameras, reduced to a size (width, height) [px], RGB in [0, 1].
+    """Images of the scene's cameras, downscaled to a size (width, height) [px], RGB in [0, 1].
 
     Raises:
-        SettingsError: one is missing, or of another size than its camera.
+        SettingsError: an image is missing, or its size differs from that of its camera.
     """
     resized = []
     for camera in scene.cameras:
@@ -104,10 +105,10 @@ def _check_shape(image: np.ndarray, shape: tuple[int, ...], what: str) -> None:
 def pixel_weights(
     scene: Scene, ignore: Mapping[str, Bool[np.ndarray, "h w"]], size: tuple[int, int]
 ) -> Float[Tensor, "cameras 1 h w"]:
-    """Weights of pixels at a size (width, height) [px]: 0 at known occluders, 1 elsewhere.
+    """Pixel weights at a size (width, height) [px]: 0 at known occluders, 1 elsewhere.
 
     Raises:
-        SettingsError: a mask is of another size than its camera.
+        SettingsError: the size of a mask differs from that of its camera.
     """
     weight = np.ones((len(scene.cameras), 1, size[1], size[0]), np.float32)
     for index, camera in enumerate(scene.cameras):
@@ -127,7 +128,7 @@ def working_size(scene: Scene, width: int, stride: int) -> tuple[int, int]:
 
 
 def blurred(images: Float[Tensor, "n channels h w"], deviation: float) -> Float[Tensor, "n channels h w"]:
-    """Images under a Gaussian blur of a standard deviation [px]; unchanged for 0."""
+    """Blur images by a Gaussian of a standard deviation [px]; unchanged for 0."""
     if deviation == 0:
         return images
     from kornia.filters import filter2d_separable  # noqa: PLC0415 - as below
@@ -144,7 +145,7 @@ def _kernel(deviation: float, device: torch.device) -> Float[Tensor, "1 n"]:
 
 
 def smoothed(images: Float[Tensor, "*batch h w"], deviation: float) -> Float[Tensor, "*batch h w"]:
-    """As `blurred`, without autograd, for any number of channels, and much faster on a CPU."""
+    """Like `blurred`, but without autograd, for any number of channels, and much faster on a CPU."""
     flat = images.reshape(-1, *images.shape[-2:])
     if deviation == 0 or images.device.type != "cpu":
         return blurred(flat[None], deviation).view(images.shape)
@@ -157,7 +158,7 @@ def smoothed(images: Float[Tensor, "*batch h w"], deviation: float) -> Float[Ten
 
 
 def box_mean(image: Float[Tensor, "1 h w"], side: int) -> Float[Tensor, "1 h w"]:
-    """Mean over the part of a square of odd side [px] around each pixel that lies in the image."""
+    """Mean over a square of odd side [px] around each pixel, clipped to the image."""
     if image.device.type != "cpu":
         return functional.avg_pool2d(image, side, stride=1, padding=side // 2, count_include_pad=False)
     sums, counts = (
@@ -177,7 +178,7 @@ def attention(silhouette: Float[Tensor, "*batch h w"], radius: int) -> Float[Ten
     flat = silhouette.detach().reshape(-1, *silhouette.shape[-2:])
     size = 2 * radius + 1
     if flat.device.type == "cpu":
-        # Its time does not depend on the radius.
+        # The run time does not depend on the radius.
         square = np.ones((size, size), np.uint8)
         flat = torch.from_numpy(np.stack([cv2.dilate(image, square) for image in flat.contiguous().numpy()]))
     else:

@@ -13,11 +13,11 @@ from .messages import LatestFrame, Moment, ResultMessage, Source, encoded_masks
 from .tracker import LiveEstimate, LiveTracker, LiveVerdict
 
 _RECENT = 20
-"""Number of recent frames for the predicted time of the next one."""
+"""Number of recent frames from which the processing time of the next one is predicted."""
 _USUAL = 75
-"""Percentile of recent times that is the predicted time."""
+"""Percentile of recent processing times that is the predicted one."""
 _FRESH = 0.01
-"""Least patience for a waiting frame [s]."""
+"""Lower bound of the `patience` with which a frame is taken [s]."""
 
 
 @dataclass(frozen=True)
@@ -27,11 +27,11 @@ class Tracked:
     moment: Moment
     estimate: LiveEstimate
     age: float
-    """Time since its arrival [s]."""
+    """Time since the arrival of the frame [s]."""
 
 
 Sink = Callable[[Tracked], None]
-"""Receives each result on the tracker's thread."""
+"""Callback for each result, called on the tracker's thread."""
 
 
 @dataclass
@@ -42,7 +42,7 @@ class LiveStatistics:
     dropped: int = 0
     verdicts: dict[str, int] = field(default_factory=lambda: dict.fromkeys(LiveVerdict, 0))
     ages: list[float] = field(default_factory=list)
-    """Ages of the last results that were not lost [s]."""
+    """Ages of the last results with a verdict other than `lost` [s]."""
     began: float = field(default_factory=time.monotonic)
     ended: float = 0.0
 
@@ -75,13 +75,13 @@ class LiveStatistics:
 def follow(
     source: Source, tracker: LiveTracker, sinks: Sequence[Sink], statistics: LiveStatistics | None = None
 ) -> LiveStatistics:
-    """Track a stream until it ends; the source is closed then, also where the caller is interrupted.
+    """Track a stream until it ends, and close the source, even if the caller is interrupted.
 
     Args:
-        source: of frames.
-        tracker: of the arms.
-        sinks: of results.
-        statistics: of an earlier part of the stream, to be continued.
+        source: source of frames.
+        tracker: tracker of the arms.
+        sinks: callbacks that receive the results.
+        statistics: statistics of an earlier part of the stream, to be continued.
 
     Raises:
         CartsError: the stream failed, or a frame does not fit the scene.
@@ -110,11 +110,11 @@ def follow(
 
 
 class Results:
-    """Makes messages of results.
+    """Converts results to messages.
 
     Args:
-        scene: with the cameras that take part.
-        masks: whether messages have masks; rendering them takes about 10 ms a camera.
+        scene: scene with the tracked cameras.
+        masks: whether messages have masks; rendering them takes about 10 ms per camera.
     """
 
     def __init__(self, scene: Scene, *, masks: bool = False) -> None:
@@ -122,7 +122,7 @@ class Results:
         self._renderers = {camera.name: Renderer(scene, cameras=[camera.name]) for camera in scene.cameras if masks}
 
     def message(self, tracked: Tracked) -> ResultMessage:
-        """The message of a result."""
+        """Convert a result to a message."""
         estimate, joints, frames = tracked.estimate, {}, {}
         T_world_base, T_camera_world = (
             values.double().cpu().numpy() for values in (estimate.state.T_world_base, estimate.state.T_view_world)

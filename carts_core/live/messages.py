@@ -1,4 +1,4 @@
-"""Messages of a stream, and the moments (images with joint positions) that are matched from them."""
+"""Messages of a stream, and the frames (`Moment`) that are assembled from them."""
 
 import math
 import socket
@@ -26,17 +26,17 @@ _LENGTH = struct.Struct(">I")
 
 
 class StreamError(CartsError):
-    """A message of a live stream is not usable."""
+    """Invalid message of a live stream."""
 
 
 class ImageMessage(msgspec.Struct, forbid_unknown_fields=True):
-    """An image as the camera recorded it."""
+    """Image as recorded by the camera."""
 
     data: bytes
     encoding: Literal["jpeg", "png", "rgb8"] = "jpeg"
-    """`rgb8` is three bytes a pixel, row after row."""
+    """Encoding of the image; `rgb8` has three bytes per pixel, row by row."""
     width: int = 0
-    """Of `rgb8` [px]."""
+    """Width of an `rgb8` image [px]."""
     height: int = 0
 
 
@@ -50,9 +50,9 @@ class FrameMessage(msgspec.Struct, tag="frame", forbid_unknown_fields=True):
     images: dict[str, ImageMessage] = {}
     """Camera -> image; a message without images only changes joints."""
     camera_poses: dict[str, list[list[float]]] = {}
-    """Camera -> T_camera_world [4 x 4, m], of a camera that moves; it stays until the next one."""
+    """Camera -> T_camera_world [4 x 4, m] of moving cameras; a pose is valid until the next one."""
     id: str = ""
-    """Returned with the result."""
+    """Identifier that is returned with the result."""
 
 
 class ResultMessage(msgspec.Struct, tag="result"):
@@ -72,7 +72,7 @@ class ResultMessage(msgspec.Struct, tag="result"):
     base_frames: dict[str, dict[str, list[list[float]]]]
     """Arm -> camera -> T_camera_base [4 x 4, m]."""
     masks: dict[str, bytes] = {}
-    """Camera -> PNG, 255 where an arm is; base64 in JSON lines."""
+    """Camera -> PNG mask, 255 for arms; base64 in JSON lines."""
 
 
 class ErrorMessage(msgspec.Struct, tag="error"):
@@ -91,10 +91,10 @@ def packed(message: msgspec.Struct) -> bytes:
 
 
 def receive(connection: socket.socket) -> FrameMessage | None:
-    """The next message of a sender; None at the end.
+    """Receive the next message; None at the end of the stream.
 
     Raises:
-        StreamError: it is too long or not valid.
+        StreamError: the message is too long or invalid.
         OSError: the connection is broken.
     """
     header = _exactly(connection, _LENGTH.size)
@@ -108,12 +108,12 @@ def receive(connection: socket.socket) -> FrameMessage | None:
         raise StreamError("the connection ended within a message.")
     try:
         return _decoder.decode(content)
-    except (msgspec.MsgspecError, ValueError, RecursionError) as error:  # a ValueError: no UTF-8
+    except (msgspec.MsgspecError, ValueError, RecursionError) as error:  # ValueError: not UTF-8
         raise StreamError(f"a message cannot be read: {error}. docs/reference/live.md describes them.") from error
 
 
 def _exactly(connection: socket.socket, count: int) -> bytes | None:
-    """Exactly `count` bytes; None if the connection ends before."""
+    """Receive exactly `count` bytes; None if the connection ends before."""
     parts, missing = [], count
     while missing:
         part = connection.recv(min(missing, 1 << 20))
@@ -125,10 +125,10 @@ def _exactly(connection: socket.socket, count: int) -> bytes | None:
 
 
 def decoded(camera: str, image: ImageMessage) -> UInt8[np.ndarray, "height width 3"]:
-    """An image as RGB.
+    """Decode an image to RGB.
 
     Raises:
-        StreamError: it cannot be decoded, or is too large.
+        StreamError: the image cannot be decoded, or is too large.
     """
     if image.encoding == "rgb8":
         if image.width < 1 or image.height < 1 or len(image.data) != 3 * image.width * image.height:
@@ -145,17 +145,17 @@ def decoded(camera: str, image: ImageMessage) -> UInt8[np.ndarray, "height width
 
 
 def encoded_masks(masks: Mapping[str, np.ndarray]) -> dict[str, bytes]:
-    """Masks as PNG."""
+    """Encode masks as PNG."""
     return {name: cv2.imencode(".png", np.uint8(255) * mask)[1].tobytes() for name, mask in masks.items()}
 
 
 @dataclass(frozen=True)
 class Moment:
-    """A frame of a stream."""
+    """Frame of a stream: images with joint positions."""
 
     frame: Frame
     camera_poses: Mapping[str, np.ndarray] = field(default_factory=dict)
-    """Camera -> T_camera_world [4 x 4, m], for cameras that are not at their pose in the scene."""
+    """Camera -> T_camera_world [4 x 4, m], for cameras whose pose differs from that in the scene."""
     arrived: float = field(default_factory=time.monotonic)
     """Time of arrival on the monotonic clock [s]."""
 
@@ -167,7 +167,7 @@ class Source(Protocol):
         """Iterate over frames as they arrive, until the stream ends or `close` is called.
 
         Raises:
-            CartsError: the stream is not usable.
+            CartsError: the stream failed.
         """
         ...
 
@@ -179,7 +179,7 @@ class Source(Protocol):
 def mounts_of(
     scene: Scene, frame: Frame, camera_poses: Mapping[str, Float[np.ndarray, "4 4"]]
 ) -> dict[str, Float[np.ndarray, "4 4"]]:
-    """Camera -> T_mount_world [m] of the cameras that move; poses that were sent override the frame's."""
+    """Camera -> T_mount_world [m] of moving cameras; received poses override those of the frame."""
     sent = {
         camera.name: np.linalg.inv(camera.T_camera_world) @ camera_poses[camera.name]
         for camera in scene.cameras
@@ -192,8 +192,8 @@ class Assembler:
     """Assembles frames from messages; joints and camera poses persist until replaced.
 
     Args:
-        sequence: with the arms and cameras.
-        cameras: of which each frame needs an image.
+        sequence: sequence with the arms and cameras.
+        cameras: cameras that need an image in each frame.
     """
 
     def __init__(self, sequence: Sequence, cameras: tuple[str, ...]) -> None:
@@ -205,10 +205,11 @@ class Assembler:
         self._changing = threading.Lock()
 
     def moment(self, message: FrameMessage) -> Moment | None:
-        """Frame completed by a message; None for one without images, or before all joints are known.
+        """Frame completed by a message; None if the message has no images, or not all joints are known yet.
 
         Raises:
-            StreamError: it has an unknown arm, joint or camera, lacks an image, or one or the time is not usable.
+            StreamError: the message has an unknown arm, joint or camera, lacks an image, or has an invalid image or
+                time.
         """
         if not math.isfinite(message.time):
             raise StreamError(f"a message has the time {message.time}; give seconds.")
@@ -262,10 +263,10 @@ class Assembler:
         return self.undistorted(name, decoded(name, message.images[name]))
 
     def undistorted(self, name: str, image: np.ndarray) -> np.ndarray:
-        """An image as the scene's camera sees it.
+        """Undistort an image for the scene's camera.
 
         Raises:
-            StreamError: it is of another size than the camera's images.
+            StreamError: the size of the image differs from that of the camera.
         """
         camera = self._sequence.recorded_camera(name)
         if image.shape[:2] != (camera.height, camera.width):
@@ -280,10 +281,10 @@ class LatestFrame:
     """Buffer that keeps only the latest frame of a source, which is read on its own thread.
 
     Args:
-        source: is closed with the buffer.
+        source: source that is read, and closed with the buffer.
 
     Attributes:
-        arrived, dropped: numbers of frames.
+        arrived, dropped: numbers of frames that arrived and were dropped.
     """
 
     def __init__(self, source: Source) -> None:

@@ -1,4 +1,4 @@
-"""Recorder of a stream as a sequence, with the corrections as its project."""
+"""Recording of a stream as a sequence, with the corrections as its project."""
 
 import queue
 import threading
@@ -41,25 +41,25 @@ _VERDICTS = {
         "failed", "The arms were lost during live tracking, so joints are as measured.", _AGAIN, 1.0
     ),
 }
-"""Recorded verdicts; the probabilities are not calibrated, and sort the worst frames first."""
+"""Recorded verdicts; the probabilities are not calibrated, and serve only to sort the worst frames first."""
 
 
 class Recorder:
-    """Writes results on its own thread.
+    """Records results to disk on its own thread.
 
     The folder gets `images/CAMERA/FRAME.png`, `kinematics.csv` with the measured joints, `corrected.csv` with the
     corrected ones, `camera_CAMERA.csv` with the pose of each camera's mount, `sequence.toml`, and at the end the
-    project `sequence.carts`. Each frame is on disk with its row. Where the arms were lost, joints are as measured and
-    the verdict is *failed*.
+    project `sequence.carts`. Each frame is written with its row. Where the arms were lost, the measured joints are
+    written, and the verdict is *failed*.
 
     Args:
-        sequence: with the arms and cameras.
-        cameras: that are tracked.
-        folder: new or empty.
-        provenance: of the corrections.
+        sequence: sequence with the arms and cameras.
+        cameras: names of the tracked cameras.
+        folder: new or empty folder.
+        provenance: provenance of the corrections.
 
     Attributes:
-        missed: number of frames that were not recorded, since the disk was too slow.
+        missed: number of frames that were not recorded because the disk was too slow.
 
     Raises:
         OutputError: the folder is not empty, or cannot be written.
@@ -91,14 +91,14 @@ class Recorder:
         """Finish writing; returns the sequence file, or None without frames.
 
         Raises:
-            CartsError: something could not be written.
+            CartsError: a file could not be written.
         """
         self._waiting.put(None)
         self._thread.join()
         if self._error is not None:
             raise self._error
         if not self._edits:
-            # Without frames the folder stays empty, so that the same command works again.
+            # Without frames the folder stays empty, so that the same command can be repeated.
             remove_file(self._output / "sequence.toml")
             return None
         path = (self._output / "sequence.toml").path

@@ -37,9 +37,9 @@ _WAITING = 8
 """Largest number of results waiting for a slow client; older ones are dropped."""
 _CLIENTS = 16
 _SILENCE = 10.0
-"""Idle time after which a client is disconnected in favour of a new one, if all places are taken [s]."""
+"""Idle time after which a client is disconnected in favour of a new one, if no more connections are allowed [s]."""
 _LINGER = 1.0
-"""Time for which a sender still gets results after it has closed its side [s]."""
+"""Time for which a client still receives results after it has closed its side [s]."""
 
 
 class _Client:
@@ -55,14 +55,14 @@ class StreamServer:
     """Server on 127.0.0.1: a source of frames that returns results.
 
     Args:
-        assembler: of messages.
-        port: 0 chooses a free one.
+        assembler: assembler of messages.
+        port: port number; 0 chooses a free one.
 
     Attributes:
-        port: of the server.
+        port: port number of the server.
 
     Raises:
-        SettingsError: the port is taken.
+        SettingsError: the port is in use.
     """
 
     def __init__(self, assembler: Assembler, port: int) -> None:
@@ -83,7 +83,7 @@ class StreamServer:
             yield moment
 
     def send(self, result: ResultMessage) -> None:
-        """Send a result to all clients; slow ones miss some."""
+        """Send a result to all clients; slow clients miss some."""
         content = packed(result)
         with self._changing:
             for client in self._clients.values():
@@ -121,7 +121,7 @@ class StreamServer:
             threading.Thread(target=self._write, args=(connection, client), daemon=True).start()
 
     def _has_room(self) -> bool:
-        """Whether there is a place for a client; disconnects the one that has been idle for longest if necessary."""
+        """Whether another client may connect; disconnects the longest idle client if necessary."""
         if len(self._clients) < _CLIENTS:
             return True
         connection, longest = min(self._clients.items(), key=lambda each: each[1].heard)
@@ -195,10 +195,10 @@ class Replay(_Closable):
 
     Args:
         sequence: the recording.
-        cameras: to replay.
-        domain: to replay.
-        rate: frames per second; that of the recording if None.
-        loops: number of repetitions, with continuing time.
+        cameras: cameras to replay.
+        domain: domain to replay.
+        rate: frame rate [1/s]; as recorded if None.
+        loops: number of repetitions, with time stamps that continue to increase.
 
     Raises:
         SettingsError: the recording has no times, and no rate is given.
@@ -227,7 +227,7 @@ class Replay(_Closable):
                 due = loop * self._length + float(offset)
                 following = loop * self._length + float(np.append(self._times, self._length)[index + 1])
                 if time.monotonic() - began > following:
-                    continue  # Too late for it.
+                    continue  # The frame is late.
                 frame = self._sequence.frame(index, self._domain, self._cameras)
                 if self._closed.wait(max(0.0, due - (time.monotonic() - began))):
                     return
@@ -235,15 +235,15 @@ class Replay(_Closable):
 
 
 class Camera(_Closable):
-    """Camera device or video file, by OpenCV; joints come from another source.
+    """Camera device or video file read with OpenCV; joints come from another source.
 
     Args:
-        assembler: with the joints.
+        assembler: assembler that has the joints.
         camera: name of the camera in the scene.
-        device: number of a device, or a file.
+        device: number of a device, or path of a video file.
 
     Raises:
-        SettingsError: it cannot be opened.
+        SettingsError: the device or file cannot be opened.
     """
 
     def __init__(self, assembler: Assembler, camera: str, device: int | str) -> None:
@@ -279,16 +279,16 @@ class Camera(_Closable):
 class Folder(_Closable):
     """Watched folder with `NAME.json` and `NAME.png`, or `NAME.CAMERA.png` for each of several cameras.
 
-    The JSON file is a frame message without images, and is written last. Of several new names only the last is read.
-    Unusable frames are skipped with a warning.
+    The JSON file is a frame message without images, and is written last. If several frames are new, only the last is
+    read. Unusable frames are skipped with a warning.
 
     Args:
-        assembler: of the messages.
-        cameras: to read.
-        folder: the folder.
+        assembler: assembler of the messages.
+        cameras: cameras to read.
+        folder: folder to watch.
 
     Raises:
-        SettingsError: it is no folder.
+        SettingsError: `folder` is not a folder.
     """
 
     def __init__(self, assembler: Assembler, cameras: tuple[str, ...], folder: Path) -> None:
@@ -351,11 +351,11 @@ class OpenStream:
 
     @property
     def clients(self) -> list[Callable[[ResultMessage], None]]:
-        """Sinks of results over the network."""
+        """Sinks that send results to network clients."""
         return [] if self.server is None else [self.server.send]
 
     def close(self) -> None:
-        """Close both; can be called more than once."""
+        """Close source and server; can be called more than once."""
         self.source.close()
         if self.server is not None:
             self.server.close()
@@ -373,12 +373,12 @@ def open_stream(
     """Open a stream of a sequence's arms and cameras.
 
     Args:
-        address: of the source.
-        sequence: with the arms and cameras.
-        cameras: of which each frame needs an image; a device provides the first one.
-        domain: of a replay.
-        rate: of a replay [1/s]; as recorded if None.
-        loops: repetitions of a replay.
+        address: address of the source.
+        sequence: sequence with the arms and cameras.
+        cameras: cameras that need an image in each frame; a device provides the first one.
+        domain: domain of a replay.
+        rate: frame rate of a replay [1/s]; as recorded if None.
+        loops: number of repetitions of a replay.
 
     Raises:
         SettingsError: a device, a folder or a port cannot be used, or a replay has no times.

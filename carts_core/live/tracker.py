@@ -50,7 +50,7 @@ class Effort(StrEnum):
 
 @dataclass(frozen=True)
 class LiveEstimate:
-    """Estimate of one frame, given those before it."""
+    """Estimate for one frame, given the previous frames."""
 
     frame_id: str
     time: float
@@ -58,7 +58,7 @@ class LiveEstimate:
     verdict: LiveVerdict
     effort: Effort
     loss: float
-    """Of the surface factor [1]."""
+    """Loss of the surface factor [1]."""
     state: SceneState
     joint_positions: Mapping[str, Float[np.ndarray, " dofs"]]
     """Arm name -> [rad, m]."""
@@ -69,7 +69,7 @@ class LiveEstimate:
 
 
 CHANGED = 0.5
-"""Change of thumbnails from which they show another scene, a correlation below one half [1]."""
+"""Change of thumbnails above which they show different scenes; equivalent to a correlation of one half [1]."""
 _SIZE = (32, 24)
 """Width and height of thumbnails [px]."""
 
@@ -77,7 +77,7 @@ Picture = Float[np.ndarray, "cameras pixels"]
 
 
 def small_picture(frame: Frame) -> Picture:
-    """Gray thumbnails of the images, each without its mean."""
+    """Zero-mean grey thumbnails of the images."""
     small = [cv2.resize(image, _SIZE, interpolation=cv2.INTER_AREA) for image in frame.images.values()]
     pixels = np.stack([image.reshape(_SIZE[0] * _SIZE[1], -1).mean(axis=1) for image in small]).astype(float)
     return pixels - pixels.mean(axis=1, keepdims=True)
@@ -90,7 +90,7 @@ def change(before: Picture, now: Picture) -> float:
 
 
 _REMEMBERED = 60
-"""Number of good fits whose median loss is the usual one."""
+"""Number of recent good fits whose median loss is the reference."""
 _LOOKED = 1.0
 """Interval of checks for an arm elsewhere in the image [s]."""
 
@@ -132,13 +132,13 @@ class LiveTracker:
         model: of the measurement error.
         live: stages, and thresholds of bad fits.
         free: unknowns.
-        backgrounds: of the cameras, in which detections are false.
+        backgrounds: backgrounds of the cameras; detections in them are false positives.
         cameras: names of the cameras that take part, all by default.
         concurrent: whether recovery runs on its own thread, while later frames are doubtful or lost; otherwise it
             delays the result. `close` ends the thread.
 
     Attributes:
-        verdict: of the last frame; lost before the first one.
+        verdict: verdict of the last frame; lost before the first one.
     """
 
     def __init__(
@@ -178,7 +178,7 @@ class LiveTracker:
         """Whether the last search was cancelled."""
 
     def close(self) -> None:
-        """End the thread after its present frame."""
+        """Stop the recovery thread after its current frame."""
         if self._pool is not None:
             self._pool.shutdown(wait=False, cancel_futures=True)
 
@@ -187,11 +187,11 @@ class LiveTracker:
 
         Args:
             frame: images, measured joint positions and time stamp.
-            camera_poses: camera name -> T_camera_world [m], for cameras that are not at their pose in the scene.
-                Backgrounds are not used then, since moving cameras have none.
+            camera_poses: camera name -> T_camera_world [m], for cameras whose pose differs from that in the scene.
+                Backgrounds are then not used, since moving cameras have none.
 
         Raises:
-            SettingsError: an image is missing or of another size than its camera.
+            SettingsError: an image is missing, or its size differs from that of its camera.
         """
         began = time.perf_counter()
         variables = self._variables(frame, camera_poses or {})
@@ -236,7 +236,7 @@ class LiveTracker:
         return self._elsewhere
 
     def _known(self, errors: ErrorModel, now: float, effort: Effort = Effort.SMALL) -> _Attempt:
-        """Prediction for a frame; the prior for a search."""
+        """Predicted state for a frame; the prior for a search."""
         state, gap = errors.initial(), math.inf
         if self._filtered is not None and effort is not Effort.SEARCH:
             gap = max(now - self._seen, 1e-3)
@@ -246,7 +246,7 @@ class LiveTracker:
     def _measured(
         self, frame: Frame, variables: Variables, errors: ErrorModel, now: float
     ) -> tuple[_Attempt, Measurement]:
-        """Measure with the least effort that fits, and start a recovery if it does not."""
+        """Measure with the smallest effort that fits, and start a recovery if none fits."""
         small, full = (self._solvers[effort, self._moving] for effort in (Effort.SMALL, Effort.FULL))
         found = None
         self._drop_outdated(frame)
@@ -273,7 +273,7 @@ class LiveTracker:
         return found
 
     def _drop_outdated(self, frame: Frame) -> None:
-        """Cancel a search in a frame that the present one no longer resembles."""
+        """Cancel a search in a frame that no longer resembles the current one."""
         running = self._recovery
         # The search after a cancelled one runs to its end, so that fast motion cannot cancel all of them.
         if running is None or running.attempt.effort is not Effort.SEARCH or self._gave_up:
@@ -305,7 +305,7 @@ class LiveTracker:
     def _fits(self, attempt: _Attempt, measurement: Measurement) -> bool:
         """Whether a measurement is reliable; without a filtered state only a search can be."""
         if attempt.effort is Effort.SEARCH:
-            # A search starts far away, and ends less close than tracking.
+            # A search starts farther from the solution than tracking, and converges less closely.
             return measurement.loss <= self.live.bad_loss
         usual = statistics.median(self._losses) if self._losses else math.inf
         worst = max(self.live.bad_factor * usual, 0.5 * self.live.bad_loss)
@@ -314,7 +314,7 @@ class LiveTracker:
         return self._filtered is not None and not measurement.information.contradicts(attempt.expected)
 
     def _take(self, errors: ErrorModel, attempt: _Attempt, measurement: Measurement) -> None:
-        """Update the filter by a good frame, weighted for the correlation with the one before."""
+        """Update the filter with a good frame, weighted for its correlation with the previous one."""
         share = math.tanh(0.5 * attempt.gap / self._model.correlation_seconds)
         self._filtered = errors.updated(attempt.state, measurement.information.scaled(share))
         self._seen = attempt.time

@@ -12,7 +12,7 @@ from ..errors import SettingsError
 from ..files.image_size import pixels_problem
 
 HALF_PIXEL = 0.5
-"""Offset of pixel centres: +0.5 here and 0 in OpenCV, so OpenCV's principal point is smaller by this [px]."""
+"""Offset of pixel centres: +0.5 here and 0 in OpenCV, so OpenCV's principal point is smaller by this offset [px]."""
 
 DISTORTION_LENGTHS = (0, 4, 5, 8, 12, 14)
 """Numbers of coefficients of OpenCV's distortion models."""
@@ -20,32 +20,32 @@ DISTORTION_LENGTHS = (0, 4, 5, 8, 12, 14)
 RIGID_TOLERANCE = 1e-3
 """Largest deviation of R^T R from the identity, per element [1]."""
 EXACT = 1e-9
-"""Rotations that deviate less than this from rigid ones are not changed; others are projected onto SO(3)."""
+"""Deviation of R^T R from the identity [1] below which rotations are unchanged; others are projected onto SO(3)."""
 LAST_ROW_TOLERANCE = 1e-6
 """Largest deviation of the last row from 0, 0, 0, 1, for matrices in single precision [1]."""
 
 T_DVRK_OPENCV = np.diag([-1.0, -1.0, 1.0, 1.0])
-"""From OpenCV's camera frame (x right, y down) to the dVRK's (x left, y up); its own inverse."""
+"""Transform from OpenCV's camera frame (x right, y down) to the dVRK's (x left, y up); its own inverse."""
 
 FOCAL_RANGE = 0.3, 20.0
-"""Focal lengths of cameras, in the image's longer side [1]: from a view of 118 degrees to one of 3 degrees."""
+"""Plausible focal lengths, relative to the image's longer side [1]: fields of view from 118 to 3 degrees."""
 CENTRE_RANGE = 0.25, 0.75
-"""Principal points of cameras, in width and height of the image [1]."""
+"""Plausible principal points, relative to the width and height of the image [1]."""
 SQUARE_RANGE = 0.9, 1.1
-"""Ratios fx / fy of cameras with nearly square pixels [1]."""
+"""Plausible ratios fx / fy [1]; pixels are nearly square."""
 
 FARTHEST = 1e6
-"""Largest coordinate of a transform [m], of a focal length and of a principal point [px]."""
+"""Largest coordinate of a transform [m], focal length and principal point [px]."""
 
 
 def rigid_transform(value: ArrayLike, what: str) -> Float[np.ndarray, "4 4"]:
-    """`value` as a rigid transform in double precision; the noise of single precision and of rounding is taken out.
+    """Convert `value` to a rigid transform in double precision; rounding noise is removed.
 
     Args:
-        value: 4x4 numbers, translation in [m].
+        value: 4x4 matrix, translation in [m].
 
     Raises:
-        SettingsError: not 4x4, not finite, or not a rotation with a translation.
+        SettingsError: `value` is not 4x4, not finite, or not a rotation with a translation.
     """
     try:
         matrix = np.array(value, dtype=np.float64)
@@ -72,7 +72,7 @@ def rigid_transform(value: ArrayLike, what: str) -> Float[np.ndarray, "4 4"]:
         raise SettingsError(f"the translation of {what} is {matrix[:3, 3].tolist()}. Give it in metres.")
     matrix[3] = (0, 0, 0, 1)
     if deviation > EXACT:
-        # The nearest rotation, by singular values.
+        # The nearest rotation, by singular value decomposition.
         left, _, right = np.linalg.svd(rotation)
         matrix[:3, :3] = left @ right
     return matrix
@@ -81,7 +81,7 @@ def rigid_transform(value: ArrayLike, what: str) -> Float[np.ndarray, "4 4"]:
 def implausible_intrinsics(
     width: int, height: int, intrinsics: tuple[float, float, float, float], distortion: tuple[float, ...] = ()
 ) -> str | None:
-    """What is unusual about a calibration for images of a size, in words that follow "it has"; None if nothing.
+    """Description of implausible intrinsics as a phrase that follows "it has"; None if they are plausible.
 
     Args:
         width, height: of the images [px].
@@ -121,26 +121,26 @@ def _folds(
     return bool((np.diff(distorted) <= 0).any())
 
 
-# Identity is equality here: comparing arrays element by element would not give one truth value.
+# Compared by identity, since element-wise comparison of arrays gives no single truth value.
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """An OpenCV pinhole (x right, y down, z forward) whose images are, or have been, undistorted.
+    """OpenCV pinhole camera (x right, y down, z forward) for undistorted images.
 
     Raises:
-        SettingsError: a size, focal length, transform or the number of distortion coefficients is impossible.
+        SettingsError: a size, focal length, transform or the number of distortion coefficients is invalid.
     """
 
     name: str
     width: int
-    """[px]"""
+    """Width of the image [px]."""
     height: int
-    """[px]"""
+    """Height of the image [px]."""
     intrinsics: tuple[float, float, float, float]
     """fx, fy, cx, cy [px] of the undistorted image, pixel centres at +0.5."""
     T_camera_world: Float[np.ndarray, "4 4"]
     """Extrinsics [m] (C of the paper)."""
     distortion: tuple[float, ...] = ()
-    """OpenCV's coefficients k1 k2 p1 p2 [k3 ...] of the image as recorded; empty when it has none."""
+    """OpenCV's distortion coefficients k1 k2 p1 p2 [k3 ...] of the recorded image; empty for none."""
 
     def __post_init__(self) -> None:
         if self.width < 1 or self.height < 1:
@@ -170,13 +170,13 @@ class Camera:
         return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
 
     def undistort(self, image: np.ndarray, interpolation: int = cv2.INTER_LINEAR) -> np.ndarray:
-        """`image` [height, width, ...] as a pinhole without distortion sees it; unchanged when there is none.
+        """Undistort `image` [height, width, ...]; unchanged if the camera has no distortion.
 
         Args:
-            image: an image as recorded, `uint8` or floating point, or a `bool` mask (nearest neighbour then).
+            image: recorded image, `uint8` or floating point, or a `bool` mask (nearest-neighbour interpolation).
 
         Raises:
-            SettingsError: the image has another size than the camera.
+            SettingsError: the size of the image differs from the camera's.
         """
         if image.shape[:2] != (self.height, self.width):
             raise SettingsError(
@@ -191,10 +191,10 @@ class Camera:
         return cv2.remap(image, *maps, interpolation)
 
     def resized(self, width: int, height: int) -> "Camera":
-        """The camera of the same view at another number of pixels; its images count as undistorted."""
+        """The camera at another image resolution, without distortion."""
         x, y = width / self.width, height / self.height
         fx, fy, cx, cy = self.intrinsics
-        # With pixel centres at +0.5 the image spans [0, width], so the principal point scales like everything else.
+        # With pixel centres at +0.5 the image spans [0, width], so the principal point scales like the focal length.
         return replace(self, width=width, height=height, intrinsics=(fx * x, fy * y, cx * x, cy * y), distortion=())
 
 

@@ -1,7 +1,7 @@
 """Mesh decimation with a bound on the surface distance.
 
-It runs in a child process with bounded processor time: the library that does it neither looks at signals nor ends in
-good time on every mesh. 300,000 triangles at random take it longer than ten minutes.
+Runs in a child process with limited CPU time, since the library ignores signals and takes very long for some meshes:
+more than ten minutes for 300,000 random triangles.
 """
 
 import numpy as np
@@ -11,40 +11,41 @@ from ..files.decoding import DecodingLimitError, Limits, called
 from ..files.reading import GIB
 
 LIBRARIES = {"fewest": ("fast_simplification", "scipy.spatial")}
-"""Imported before the memory of a child process is counted."""
+"""Modules that a child process imports before its memory is measured."""
 _SECONDS = 12.0
-"""Of computing, not of waiting for a processor."""
+"""Constant part of the CPU time limit [s]."""
 _SECONDS_PER_FACE = 1e-4
-"""About five times the need of instrument meshes."""
+"""CPU time limit per triangle [s]; about five times what instrument meshes need."""
 _MEMORY = 2 * GIB
 _FEWER = 0.6
-"""Triangles of a trial, relative to those of the one before."""
+"""Number of triangles of a trial, relative to the previous trial [1]."""
 _FEWEST = 8
 _CARE = 2
-"""How carefully the library chooses edges, 0 to 10: at 7, its default, surfaces move ten times as far."""
+"""Aggressiveness of the library, 0 to 10; at 7, its default, surfaces deviate ten times as much."""
 _SAMPLES = 20_000
-"""Points on a surface whose distance to the other is measured."""
+"""Number of points on a surface at which the distance to the other is measured."""
 _NEIGHBOURS = (6, 60)
-"""Samples of the other surface whose triangles are tried, for each point and for the worst ones."""
+"""Number of nearest samples of the other surface whose triangles are tested: for each point, and for the worst
+points."""
 _WORST, _AT_ONCE = 2_000, 16
 _SEED = 1
 
 
 class DecimationError(Exception):
-    """A mesh was not decimated in the time and memory that meshes of its size need."""
+    """Decimation of a mesh failed, or exceeded its time or memory limit."""
 
 
 def decimated(
     vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"], tolerance: float
 ) -> tuple[Float[np.ndarray, "W 3"], Int[np.ndarray, "G 3"], float]:
-    """Vertices and faces of a mesh with as few triangles as a tolerance allows, and the largest deviation [m].
+    """Decimate a mesh as far as a tolerance allows; returns vertices, faces and the largest deviation [m].
 
     Args:
-        vertices: of the mesh [m].
-        tolerance: how far points of either surface may be from the other one [m].
+        vertices: mesh vertices [m].
+        tolerance: largest distance of points of either surface from the other [m].
 
     Raises:
-        DecimationError: it takes too long or too much memory, or fails.
+        DecimationError: decimation takes too long or too much memory, or fails.
     """
     limits = Limits(_SECONDS + _SECONDS_PER_FACE * len(faces), _MEMORY)
     try:
@@ -62,10 +63,10 @@ def deviation(
     other_faces: Int[np.ndarray, "G 3"],
     tolerance: float | None = None,
 ) -> float:
-    """How far two surfaces are from each other where they are farthest, both ways [m], measured at samples.
+    """Symmetric Hausdorff distance of two surfaces [m], measured at samples.
 
-    With a tolerance it takes less time: the result is then an upper bound if it is within the tolerance, and some
-    distance that occurs if it is above.
+    A tolerance saves time: a result within the tolerance is then an upper bound, and a result above it is a lower
+    bound.
     """
     first, second = vertices[faces], other_vertices[other_faces]
     moved = _farthest(first, second, tolerance)
@@ -77,9 +78,10 @@ def deviation(
 def _farthest(
     triangles: Float[np.ndarray, "F 3 3"], others: Float[np.ndarray, "G 3 3"], tolerance: float | None
 ) -> float:
-    """Largest distance of samples on some triangles to the surface of others.
+    """Largest distance of samples on `triangles` from the surface of `others` [m].
 
-    The triangles with the nearest samples give upper bounds; where these are largest, all triangles are looked at.
+    The triangles of the nearest samples give upper bounds; for points with the largest bounds, all triangles are
+    tested.
     """
     from scipy.spatial import KDTree  # noqa: PLC0415 - only the process that decimates needs it
 
@@ -109,7 +111,7 @@ def _farthest(
 
 
 def _samples(triangles: Float[np.ndarray, "F 3 3"]) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, " n"]]:
-    """Corners, centres, and further points by area; and the triangle of each."""
+    """Sample triangles at corners, centres, and further points by area; returns the points and the triangle of each."""
     count = len(triangles)
     a, b, c = triangles.swapaxes(0, 1)
     areas = np.linalg.norm(np.cross(b - a, c - a), axis=1)
@@ -149,7 +151,7 @@ def _to_segments(points: np.ndarray, a: np.ndarray, b: np.ndarray) -> Float[np.n
 def fewest(vertices: np.ndarray, faces: np.ndarray, tolerance: float) -> tuple[np.ndarray, np.ndarray, float]:
     """Vertices, triangles and deviation [m] of the mesh with the fewest triangles within a tolerance [m].
 
-    Trials have fewer and fewer triangles; the last one within the tolerance counts.
+    The number of triangles is reduced step by step; the last mesh within the tolerance is returned.
     """
     import fast_simplification  # noqa: PLC0415 - only the process that decimates needs it
 

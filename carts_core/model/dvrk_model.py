@@ -1,8 +1,8 @@
-"""Robots from dVRK's own model tree (jhu-dvrk/dvrk_model): an arm with one of its instruments as a plain URDF.
+"""Robots from the dVRK's model tree (jhu-dvrk/dvrk_model): an arm with one of its instruments as a plain URDF.
 
-The tree is xacro for ROS; it is expanded without ROS. An endoscope sees the instrument from its shaft on, so only that
-is taken. The three joints that carry it are those of the dVRK's controller, which is what recordings are in: the tree's
-linkage of the Si arm is tilted by 9.3 degrees of pitch against it, since it was made for looking at.
+The tree consists of xacro files for ROS, which are expanded without ROS. Links before the instrument's shaft are
+omitted, since an endoscope does not see them. The three joints that carry the shaft follow the dVRK's controller, as
+recordings do; the tree's linkage of the Si arm, made for visualization, is pitched by 9.3 degrees relative to it.
 """
 
 import os
@@ -24,31 +24,31 @@ from .xacro_guard import expanded
 PACKAGE = "dvrk_model"
 _PREFIX = "PSM1_"
 _FIRST_SEEN = "roll_link"
-"""This link and what hangs on it can be in view."""
+"""First link that can be in view, followed by its descendants."""
 _CARRIED_BY = "insertion_link"
 _TABLE = Path("urdf/common/instruments/instruments.yaml")
 
 
 @dataclass(frozen=True)
 class Instrument:
-    """An instrument that the tree names."""
+    """Instrument in the model tree."""
 
     number: str
     """Last six digits of its model number, such as `420093`."""
     name: str
     generation: str
-    """Of the arm: `Classic` or `Si`."""
+    """Generation of the arm: `Classic` or `Si`."""
     tip: str
     """Number of its tip, such as `093`."""
     has_tip: bool
-    """Whether the tree has the tip's shape; else it draws boxes of 5 mm."""
+    """Whether the tree has the meshes of the tip; otherwise it uses boxes of 5 mm."""
 
 
 def list_instruments(model: Path) -> dict[str, Instrument]:
-    """The instruments of a model tree, by number.
+    """Instruments of a model tree, by number.
 
     Raises:
-        RobotError: it is no such folder.
+        RobotError: the folder is not a model tree.
     """
     table = model / _TABLE
     if not table.is_file():
@@ -73,10 +73,10 @@ def list_instruments(model: Path) -> dict[str, Instrument]:
 
 
 def choose_instrument(model: Path, number: str) -> Instrument:
-    """The instrument of a number, given with or without the dots of a `tool_type`.
+    """Find an instrument by its number, with or without the dots of a `tool_type`.
 
     Raises:
-        RobotError: the tree does not name it, or has no shape of its tip.
+        RobotError: the tree does not list it, or lacks the meshes of its tip.
     """
     instruments = list_instruments(model)
     if number not in instruments:
@@ -95,12 +95,12 @@ def choose_instrument(model: Path, number: str) -> Instrument:
 
 
 def dvrk_urdf(model: Path, number: str, folder: Path) -> str:
-    """The URDF of an arm with an instrument, for a file in `folder`.
+    """URDF of an arm with an instrument, for a file in `folder`.
 
-    Its root is the DH base of the arm, in the remote centre; joints are called as in the sequence format.
+    Its root is the DH base of the arm, at the remote centre; joints are named as in the sequence format.
 
     Args:
-        folder: where the URDF will lie; meshes are named from there, and stay where they are.
+        folder: folder of the URDF, to which mesh paths are relative; meshes are not copied.
 
     Raises:
         RobotError: the tree or the instrument is not usable, a mesh is missing or was not fetched by Git LFS.
@@ -133,7 +133,7 @@ def _expanded(model: Path, chosen: Instrument) -> str:
 
 
 def _keep_what_is_seen(root: ElementTree.Element) -> None:
-    """Leave the links from the shaft on, their joints and shapes."""
+    """Remove all but the links from the shaft on, with their joints and visuals."""
     joints = {_link(joint, "child"): joint for joint in root.findall("joint")}
     if _FIRST_SEEN not in joints:
         raise RobotError(
@@ -146,7 +146,7 @@ def _keep_what_is_seen(root: ElementTree.Element) -> None:
             if name in joints:
                 root.remove(joints[name])
         for part in list(link):
-            # A box stands for a shape that the tree does not have.
+            # A box is a placeholder for a mesh that the tree lacks.
             if part.tag != "visual" or part.find("geometry/box") is not None:
                 link.remove(part)
     for parent in joints[_FIRST_SEEN].iter("parent"):

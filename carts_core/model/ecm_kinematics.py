@@ -8,7 +8,7 @@ jhu-dvrk/sawIntuitiveResearchKit: share/kinematic/ecm.json and ecm-si.json:
     insertion     pi/2   0   0           q3 - 0.3822
     roll          0      0   q4          0.3829
 
-The base frame lies in the remote centre of motion; z of the tip looks along the shaft.
+The base frame is at the remote centre of motion; the tip's z axis points along the shaft.
 """
 
 import numpy as np
@@ -17,10 +17,10 @@ from jaxtyping import Float
 from .psm_kinematics import modified_dh
 
 JOINT_NAMES = ("yaw", "pitch", "insertion", "roll")
-"""Joints in the order of the arrays here."""
+"""Names of the joints, in the order of all arrays of this module."""
 
 _REMOTE_CENTER, _ENDOSCOPE = 0.3822, 0.3829
-"""[m]"""
+"""Offsets of insertion and roll in the table above [m]."""
 
 
 def forward(joints: Float[np.ndarray, "*batch 4"]) -> Float[np.ndarray, "*batch 4 4"]:

@@ -17,14 +17,14 @@ from .robot import Robot
 from .scene import Arm, Scene, SceneState
 
 MOST_KEYPOINTS = 6
-"""Per arm; those nearest to the tip are kept."""
+"""Largest number of keypoints of an arm; those nearest to the tip are kept."""
 _SAME_POINT = 5e-4
-"""Joints closer to each other than this are one point [m]."""
+"""Distance below which joints are merged into one point [m]."""
 
 
 @dataclass(frozen=True)
 class Keypoint:
-    """A point that is fixed to a link."""
+    """Named point that is fixed to a link."""
 
     arm: str
     name: str
@@ -32,14 +32,14 @@ class Keypoint:
     link: int
     """Index into `Robot.link_names`."""
     position: tuple[float, float, float]
-    """In the link's frame [m]."""
+    """Position in the link's frame [m]."""
 
 
 def keypoints(arm: Arm) -> tuple[Keypoint, ...]:
-    """The named points of an arm, from the tip backwards: the tips of its last links, then the links' joints.
+    """Keypoints of an arm, from the tip backwards: the tips of its last links, then the links' joints.
 
-    The shipped instrument has the tips of both jaws, the centre of the wrist's yaw joint (where the jaws turn) and
-    that of its pitch joint (where the shaft ends).
+    The shipped instrument has the tips of both jaws, the centre of the wrist's yaw joint (about which the jaws rotate)
+    and that of its pitch joint (where the shaft ends).
     """
     robot = arm.robot
     moved_by = _moved_by(robot)
@@ -77,7 +77,7 @@ def project_keypoints(
 
 
 def _moved_by(robot: Robot) -> np.ndarray:
-    """Which degrees of freedom move which link [links, dofs]."""
+    """Whether each link is moved by each degree of freedom [links, dofs]."""
     rest = torch.full((len(robot.joint_names),), 0.01, dtype=torch.float64)
     before = robot.forward_kinematics(rest)
     after = robot.forward_kinematics(rest + 0.01 * torch.eye(len(rest), dtype=torch.float64))
@@ -85,8 +85,8 @@ def _moved_by(robot: Robot) -> np.ndarray:
 
 
 def _joints(robot: Robot, depth: np.ndarray) -> list[tuple[int, str]]:
-    """Points about which links turn, from the base on: a link that they are fixed to, and a name."""
-    # Not at 0, where joints may lie on each other that move apart later.
+    """Joint centres from the base on: the link to which each is fixed, and its name."""
+    # Not at 0, where joints may coincide that are apart in other configurations.
     somewhere = torch.full((len(robot.joint_names),), 0.1, dtype=torch.float64)
     origins = robot.forward_kinematics(somewhere)[:, :3, 3].numpy()
     groups: list[list[int]] = []
@@ -98,7 +98,7 @@ def _joints(robot: Robot, depth: np.ndarray) -> list[tuple[int, str]]:
             group.append(link)
     named = []
     for group in groups:
-        # The shaft ends where the wrist begins: called after the wrist. Two jaws turn on one link: called after that.
+        # The end of the shaft is named after the wrist, and the axis of two jaws after the link that carries them.
         alone = [link for link in group if (depth[group] == depth[link]).sum() == 1]
         named.append((group[0], _named(robot, alone[-1] if alone else group[0])))
     return named
@@ -109,7 +109,7 @@ def _vertices(robot: Robot, link: int) -> Float[np.ndarray, "V 3"]:
 
 
 def _tip(robot: Robot, link: int) -> tuple[float, float, float]:
-    """The point of a link's meshes that is furthest from its joint."""
+    """Point of a link's meshes that is farthest from its joint, in the link's frame [m]."""
     vertices = _vertices(robot, link)
     x, y, z = vertices[np.linalg.norm(vertices, axis=-1).argmax()]
     return float(x), float(y), float(z)
@@ -123,20 +123,20 @@ TIP = "tip"
 SHAFT_EDGE = "shaft edge"
 SHAFT_MIDDLE = "shaft middle"
 _OUTER_SHARE = 90
-"""Percentile of the distances of a shaft's vertices from its axis that is taken for its radius."""
+"""Percentile of the distances of a shaft's vertices from its axis that is taken as its radius."""
 _LEAST_SLENDERNESS = 5.0
-"""A link that is longer than its width by this factor is a shaft."""
+"""Smallest ratio of length to width of a shaft [1]."""
 
 
 class LandmarkKind(StrEnum):
-    """Kind of constraint that a landmark in the image gives."""
+    """Type of constraint from a landmark marked in the image."""
 
     POINT = "point"
-    """The point is seen exactly there."""
+    """The point projects to the marked position."""
     EDGE = "edge"
-    """One of the two outlines of a cylinder passes there, whichever."""
+    """One of the two outlines of a cylinder, either one, passes through the marked position."""
     AXIS = "axis"
-    """The axis of a cylinder is seen there, at any depth."""
+    """The projected axis of a cylinder passes through the marked position, at any depth."""
 
 
 @dataclass(frozen=True)
@@ -148,9 +148,9 @@ class Landmark:
     hint: str
     """Description of its position, for the page."""
     points: tuple[tuple[int, tuple[float, float, float]], ...]
-    """Link and position in its frame [m]. The mean of all for a point, two ends of the axis otherwise."""
+    """Link and position in its frame [m]; a point is the mean of all, and a line has the two ends of its axis."""
     radius: float = 0.0
-    """Of the cylinder [m]."""
+    """Radius of the cylinder [m]."""
 
     def positions(self, Ts_base_link: Float[np.ndarray, "links 4 4"]) -> Float[np.ndarray, "points 3"]:
         """Positions in the arm's base frame [m]: one for a point, two for a line."""
@@ -159,9 +159,9 @@ class Landmark:
 
 
 def landmarks(arm: Arm) -> Mapping[str, Landmark]:
-    """The places of an arm by their names, in the order in which they are best looked for.
+    """Landmarks of an arm by name, in the recommended order of annotation.
 
-    The shipped instrument has its tip, the two joints of the wrist, and edges and middle of the shaft.
+    Those of the shipped instrument are its tip, the two joints of the wrist, and the edges and axis of the shaft.
     """
     points = keypoints(arm)
     tips = [point for point in points if point.name.endswith(" tip")]
@@ -196,13 +196,14 @@ def link_transforms(
 
 
 def _shaft(arm: Arm) -> tuple[int, tuple[float, float, float], tuple[float, float, float], float] | None:
-    """Link, two ends of the axis in the link's frame and radius [m] of the longest slender link; None without one."""
+    """Link, two ends of the axis in the link's frame and radius [m] of the longest slender link; None if no link is
+    slender."""
     best, longest = None, 0.0
     for link in range(len(arm.robot.link_names)):
         vertices = _vertices(arm.robot, link)
         centre = vertices.mean(0)
         _, _, directions = np.linalg.svd(vertices - centre, full_matrices=False)
-        # A tube's vertices are at its ends mainly, so that the first direction is the tube's own.
+        # A tube's vertices are mainly at its ends, so the first direction is along its axis.
         along = (vertices - centre) @ directions[0]
         length = float(along.max() - along.min())
         around = np.linalg.norm((vertices - centre) - along[:, None] * directions[0], axis=-1)

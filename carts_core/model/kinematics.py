@@ -16,19 +16,19 @@ from ..errors import RobotError
 from ..imports import deferred
 from ..wording import listed, shown
 
-with deferred("matplotlib", "pyplot"):  # only its solvers' plots need it; .2 s
+with deferred("matplotlib", "pyplot"):  # needed only to plot its solvers; 0.2 s
     import pytorch_kinematics
 
 NO_LIMIT = 1e3
-"""A larger joint limit [rad], [m] means none."""
+"""Joint limit [rad], [m] above which a joint counts as unlimited."""
 _JOINT_PARTS = ("parent", "child", "origin", "axis", "mimic")
-"""What of a joint moves links; limits and dynamics have required attributes that many URDFs leave out."""
+"""Elements of a joint that define its motion; limits and dynamics have required attributes that many URDFs omit."""
 ROUND_OFF = 1e-5
-"""Angles this close [rad] to a multiple of 90 degrees mean that multiple: URDF exporters print 1.5708 for pi/2."""
+"""Distance [rad] below which angles are set to a multiple of 90 degrees: URDF exporters print 1.5708 for pi/2."""
 
 
 def exact_right_angles(root: Element) -> None:
-    """Put every `rpy` angle of a URDF that is a rounded multiple of pi/2 back to the exact one.
+    """Replace every `rpy` angle of a URDF that is a rounded multiple of pi/2 by the exact one.
 
     At an instrument's length the 3.7e-6 rad of "1.5708" are more than a micrometre at the tip.
     """
@@ -54,7 +54,7 @@ def _skeleton(urdf_text: str) -> str:
                 if part.tag not in _JOINT_PARTS:
                     child.remove(part)
             if child.find("axis") is None:
-                ElementTree.SubElement(child, "axis", xyz="1 0 0")  # as URDF has it; the parser takes z
+                ElementTree.SubElement(child, "axis", xyz="1 0 0")  # URDF's default; the parser's is z
     return ElementTree.tostring(root, encoding="unicode")
 
 
@@ -62,8 +62,8 @@ class Kinematics:
     """Transforms of a robot's links from its independent joint positions.
 
     Args:
-        urdf_text: its text, with exact right angles.
-        base_link: the frame that transforms are given in; it must not move with any joint.
+        urdf_text: text of the URDF, with exact right angles.
+        base_link: reference frame of the transforms; it must not move with any joint.
     """
 
     def __init__(self, model: yourdfpy.URDF, urdf_text: str, base_link: str | None, source: Path) -> None:
@@ -103,7 +103,7 @@ class Kinematics:
     def __call__(
         self, joint_positions: Float[Tensor, "*batch dofs"], link_names: tuple[str, ...]
     ) -> Float[Tensor, "*batch links 4 4"]:
-        """Ts_base_link of the named links; computed in double precision, returned in the input's.
+        """Ts_base_link [m] of the named links; computed in double precision, returned in the precision of the input.
 
         Raises:
             RobotError: the last dimension is not the number of degrees of freedom, or there is no such link.
@@ -128,7 +128,7 @@ def _limits(joint: yourdfpy.Joint) -> tuple[float, float]:
     limit = joint.limit
     if joint.type == "continuous" or limit is None or limit.lower is None or limit.upper is None:
         return -np.inf, np.inf
-    # Some robots write a huge number for no limit.
+    # Some URDFs have a huge number for an unlimited joint.
     lower, upper = (
         math.copysign(math.inf, value) if abs(value) > NO_LIMIT else float(value)
         for value in (limit.lower, limit.upper)
@@ -137,7 +137,7 @@ def _limits(joint: yourdfpy.Joint) -> tuple[float, float]:
 
 
 def _mimic_matrix(model: yourdfpy.URDF, parameters: list[str]) -> tuple[Tensor, Tensor]:
-    """Matrix and offset that turn independent joint positions into all joint positions of the chain."""
+    """Matrix and offset that map independent joint positions to all joint positions of the chain."""
     independent = list(model.actuated_joint_names)
     expand = torch.zeros(len(parameters), len(independent), dtype=torch.float64)
     offset = torch.zeros(len(parameters), dtype=torch.float64)

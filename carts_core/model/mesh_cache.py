@@ -74,7 +74,7 @@ def read(key: str) -> Made | None:
 
 
 def write(key: str, meshes: tuple[LinkMesh, ...], decimation: Decimation) -> None:
-    """Store `meshes` under `key`; a cache that cannot be written is no error."""
+    """Store `meshes` under `key`; a cache that cannot be written is not an error."""
     arrays: dict[str, np.ndarray] = {
         "count": np.array(len(meshes)),
         "before": np.array(decimation.before),

@@ -1,4 +1,4 @@
-"""Link meshes: files that a URDF names, and their conversion to few triangles, smooth normals and one colour."""
+"""Link meshes: files of a URDF, and their conversion to few triangles, smooth normals and one colour."""
 
 import os
 import re
@@ -24,7 +24,7 @@ FORMATS = ("obj", "stl", "ply", "glb", "gltf", "dae")
 FARTHEST = 100.0
 """Largest coordinate of a mesh after scaling [m]; instruments and robots are far smaller."""
 _HEAD = 2**16
-"""Bytes of a COLLADA file in which its unit and up axis are looked for."""
+"""Number of bytes at the start of a COLLADA file that are searched for its unit and up axis."""
 _UNIT = re.compile(rb"<unit\b[^>]*?\bmeter\s*=\s*[\"']\s*([0-9.eE+-]+)\s*[\"']")
 _UP_AXIS = re.compile(rb"<up_axis>\s*([XYZ]_UP)\s*</up_axis>")
 
@@ -33,11 +33,11 @@ _PACKAGE_LEVELS = 6
 
 
 def mesh_path(urdf_folder: Path, name: str) -> Path:
-    """The file that a `<mesh filename=...>` means; it need not exist.
+    """Path of the file of a `<mesh filename=...>`; it need not exist.
 
-    `package://NAME/REST` is looked for as ROS lays packages out: `REST` inside the folder of the URDF or one above it
-    (`NAME/urdf` beside `NAME/meshes`), or inside a folder `NAME` in one of these. `file://` and plain paths are taken
-    as they are; relative ones belong to the URDF's folder.
+    `package://NAME/REST` is searched in the layout of ROS packages: `REST` in the folder of the URDF or a parent of it
+    (`NAME/urdf` beside `NAME/meshes`), or in a folder `NAME` in one of these. `file://` and plain paths are used
+    directly; relative paths start at the URDF's folder.
     """
     scheme, mark, rest = name.partition("://")
     if not mark:
@@ -54,7 +54,7 @@ def mesh_path(urdf_folder: Path, name: str) -> Path:
 
 
 def collada_asset(path: Path) -> tuple[float, str]:
-    """Unit [m] and up axis ("X_UP", "Y_UP", "Z_UP") of a COLLADA file; 1 and "" of other files and where not stated."""
+    """Unit [m] and up axis ("X_UP", "Y_UP", "Z_UP") of a COLLADA file; 1 and "" for other files and missing values."""
     if path.suffix.lower() != ".dae" or not is_regular(path):
         return 1.0, ""
     with open_regular(path, MESH) as file:
@@ -66,12 +66,13 @@ def collada_asset(path: Path) -> tuple[float, str]:
 
 
 def read_mesh(path: Path, scale: np.ndarray, named: str) -> list[tuple[trimesh.Trimesh, np.ndarray | None]]:
-    """The triangle meshes of a file with their colours; those of COLLADA files scaled by their unit.
+    """Read the triangle meshes of a file with their colours; COLLADA meshes are scaled by their unit.
 
-    The up axis of COLLADA files is not applied, as in RViz: a URDF's <origin> is for coordinates as they are stored.
+    The up axis of COLLADA files is not applied, as in RViz: a URDF's <origin> refers to the coordinates as stored.
 
     Raises:
-        RobotError: it is missing, cannot be read, has no or too many triangles, or is not finite or huge.
+        RobotError: the file is missing or cannot be read, it has no or too many triangles, or coordinates are not
+            finite or too large.
     """
     allowed = f"Allowed are {', '.join(FORMATS).upper()} files."
     if not is_regular(path):
@@ -79,7 +80,7 @@ def read_mesh(path: Path, scale: np.ndarray, named: str) -> list[tuple[trimesh.T
     kind = path.suffix.lower().removeprefix(".")
     if kind not in FORMATS:
         raise RobotError(f"mesh {path} is of an unknown kind, {shown(path.suffix)}. {allowed}")
-    limits = Limits.of(path.parent if kind == "gltf" else path)  # glTF keeps its numbers in a file beside it.
+    limits = Limits.of(path.parent if kind == "gltf" else path)  # glTF stores its arrays in a separate file.
     try:
         parts = called(mesh_parts, path, kind, limits=limits)
     except RobotError:
@@ -101,13 +102,13 @@ def read_mesh(path: Path, scale: np.ndarray, named: str) -> list[tuple[trimesh.T
 
 
 def check_mesh(mesh: trimesh.Trimesh, name: str, farthest: float = FARTHEST) -> None:
-    """Check that a mesh can be worked on.
+    """Check the coordinates and indices of a mesh.
 
     Args:
-        farthest: largest coordinate.
+        farthest: largest allowed coordinate.
 
     Raises:
-        RobotError: a coordinate is not finite or too large, or a triangle names a vertex that is not there.
+        RobotError: a coordinate is not finite or too large, or a triangle refers to a missing vertex.
     """
     vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
     if vertices.ndim != 2 or vertices.shape[1] != 3 or faces.ndim != 2 or faces.shape[1] != 3:
@@ -121,23 +122,23 @@ def check_mesh(mesh: trimesh.Trimesh, name: str, farthest: float = FARTHEST) -> 
 
 
 SHARP_EDGE = np.deg2rad(38.0)
-"""Faces that meet at a larger angle [rad] do not share a smooth normal."""
+"""Largest angle between faces that share a smooth normal [rad]."""
 
 _DEFAULT_COLOR = np.array([0.6, 0.6, 0.6])
 _OPAQUE = 0.99
 _AT_ONCE = 4
-"""Meshes that are decimated at the same time at most: each may take much memory."""
+"""Largest number of meshes that are decimated concurrently; each may take much memory."""
 MOST_KEPT = 10
-"""Meshes with this many times the triangles asked for are clustered first."""
+"""Ratio of triangles to the requested number from which meshes are clustered first [1]."""
 _CLUSTERED = MOST_KEPT / 2
-"""Times the triangles asked for that clustering leaves at most."""
+"""Largest ratio of triangles to the requested number after clustering [1]."""
 _FIRST_CELL = 0.25
-"""Cells of the first clustering, in tolerances."""
+"""Cell size of the first clustering, relative to the tolerance [1]."""
 
 
 @dataclass(frozen=True)
 class LinkMesh:
-    """One part of a link, of one colour, in the frame of its link [m]."""
+    """Part of a link with a single colour, in the frame of its link [m]."""
 
     link: int
     """Index into `Robot.link_names`."""
@@ -148,7 +149,7 @@ class LinkMesh:
     color: Float[np.ndarray, "3"]
     """Linear RGB in [0, 1]."""
     closed: bool
-    """Whether it encloses a volume, so that backs of triangles are never seen."""
+    """Whether it encloses a volume, so that backs of triangles are never visible."""
 
 
 def is_closed(vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]) -> bool:
@@ -169,7 +170,7 @@ def is_closed(vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"])
 def load_visual(visual: yourdfpy.Visual, folder: Path, materials: dict) -> list[tuple[trimesh.Trimesh, np.ndarray]]:
     """Meshes of one URDF visual in its link's frame, each with its colour.
 
-    Translucent visuals are markers for people (a ball at the remote centre, say) and are left out.
+    Translucent visuals are markers (such as a ball at the remote centre) and are omitted.
 
     Raises:
         RobotError: a mesh file is missing or cannot be read.
@@ -198,7 +199,7 @@ def _urdf_color(visual: yourdfpy.Visual, materials: dict) -> tuple[np.ndarray | 
 
 
 def _geometry(geometry: yourdfpy.Geometry, folder: Path) -> list[tuple[trimesh.Trimesh, np.ndarray | None]]:
-    """Meshes, and their colours."""
+    """Meshes of a URDF geometry, with their colours."""
     shape = None
     if geometry.box is not None:
         shape = trimesh.creation.box(extents=geometry.box.size)
@@ -218,11 +219,11 @@ def _geometry(geometry: yourdfpy.Geometry, folder: Path) -> list[tuple[trimesh.T
 def simplify(
     mesh: trimesh.Trimesh, tolerance: float | None
 ) -> tuple[Float[np.ndarray, "V 3"], Float[np.ndarray, "V 3"], Int[np.ndarray, "F 3"], float]:
-    """Vertices, vertex normals and faces of a mesh, decimated if a tolerance is given, and what it deviates by [m].
+    """Vertices, vertex normals and faces of a mesh, decimated if a tolerance is given, and its largest deviation [m].
 
     Args:
-        mesh: [m]
-        tolerance: how far its surface may move [m]; None leaves it as it is.
+        mesh: mesh in metres.
+        tolerance: largest deviation of its surface [m]; None for no decimation.
 
     Raises:
         DecimationError: the mesh is degenerate, or so irregular that it takes too long.
@@ -249,9 +250,9 @@ class Decimation:
     """Summary of the decimation of a robot's meshes."""
 
     before: int
-    """Triangles of the files."""
+    """Number of triangles in the files."""
     after: int
-    """Triangles that are rendered."""
+    """Number of rendered triangles."""
     deviation: float
     """Largest surface deviation of a part [m]."""
 
@@ -270,12 +271,12 @@ def build_link_meshes(
     tolerance: float,
     progress: Callable[[str], None],
 ) -> tuple[tuple[LinkMesh, ...], Decimation]:
-    """The meshes of links, decimated to a tolerance where they have more than `max_faces` triangles together.
+    """Build the meshes of links, decimated to a tolerance if they have more than `max_faces` triangles in total.
 
     Args:
         parts: index of a link, a mesh of it [m], and its colour.
-        max_faces: so many triangles in all are left as they are.
-        tolerance: how far surfaces may move [m].
+        max_faces: total number of triangles up to which meshes are not decimated.
+        tolerance: largest deviation of a surface [m].
 
     Raises:
         RobotError: a mesh is degenerate, or so irregular that it takes too long or keeps too many triangles.
@@ -289,7 +290,7 @@ def build_link_meshes(
         progress(f"{before} triangles in {len(parts)} meshes: clustering their vertices first")
         parts, moved = _clustered_parts(parts, int(_CLUSTERED * max_faces), tolerance)
     result, deviations = [], [0.0]
-    # Each mesh is decimated in a process of its own, so that threads are enough to use several cores.
+    # Each mesh is decimated in its own process, so threads suffice to use several cores.
     pool = ThreadPoolExecutor(min(os.cpu_count() or 1, _AT_ONCE), "decimation")
     try:
         bounds = [bound if bound is None else max(bound - each, bound / 2) for each in moved]
@@ -316,9 +317,9 @@ Parts = Sequence[tuple[int, trimesh.Trimesh, np.ndarray]]
 
 
 def _clustered_parts(parts: Parts, most: int, tolerance: float) -> tuple[Parts, list[float]]:
-    """Meshes within a total number of triangles, and how far vertices of each moved [m].
+    """Cluster meshes to a total number of triangles; also returns the largest vertex displacement of each [m].
 
-    Cells grow until few enough triangles are left, so surfaces may move farther than the tolerance.
+    Cells grow until few enough triangles remain, so displacements may exceed the tolerance.
     """
     cell = _FIRST_CELL * tolerance
     while True:
@@ -334,13 +335,13 @@ def _clustered_parts(parts: Parts, most: int, tolerance: float) -> tuple[Parts, 
 def clustered(
     vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"], cell: float
 ) -> tuple[Float[np.ndarray, "W 3"], Int[np.ndarray, "G 3"], float]:
-    """A mesh whose vertices of each cell of a grid are one, their mean, and how far a vertex moved at most [m].
+    """Merge the vertices in each cell of a grid into their mean; also returns the largest displacement [m].
 
-    It takes any triangles, and time in proportion to their number (Rossignac and Borrel, Multi-resolution 3D
+    Works for any triangles, in time proportional to their number (Rossignac and Borrel, Multi-resolution 3D
     approximations for rendering complex scenes, 1993).
 
     Args:
-        vertices: [m]
+        vertices: mesh vertices [m].
         cell: side of the cells [m].
     """
     places = np.floor(vertices / cell).astype(np.int64)

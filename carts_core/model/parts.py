@@ -1,8 +1,8 @@
-"""Parts that surgical instruments have in common, and the channels of surface maps.
+"""Parts common to surgical instruments, and the channels of surface maps.
 
 A surface map has `SURFACE_CHANNELS` channels: the share of each pixel that each of `PARTS` covers, in [0, 1], and the
 mean unit normal of the covering surface times that coverage, in the camera's frame (x right, y down, z forward).
-Background is zero. The renderer makes surface maps of a state, and the surface network predicts them from an image.
+Background is zero. The renderer computes surface maps of a state, and the surface network predicts them from an image.
 """
 
 from collections.abc import Sequence
@@ -16,7 +16,7 @@ from .robot import SLENDER, Robot
 from .scene import Arm
 
 PARTS = ("shaft", "wrist", "jaws")
-"""In the order of their index."""
+"""Names of the parts, in the order of their index."""
 
 _PROBE = 0.1
 
@@ -26,19 +26,19 @@ class PartClass:
     """A part of an arm as a class of pixels."""
 
     number: int
-    """From 1, and 3 to an arm whatever parts it has: 1 + 3 * index of the arm + index of the part."""
+    """Number of the class, from 1: 1 + 3 * index of the arm + index of the part."""
     arm: str
     part: str
     """One of `PARTS`."""
 
     @property
     def name(self) -> str:
-        """Name in the page."""
+        """Name shown in the page."""
         return f"{self.arm} {self.part}"
 
 
 def part_classes(arms: Sequence[Arm]) -> tuple[PartClass, ...]:
-    """The classes of these arms, of parts that have a mesh."""
+    """Classes of the parts of these arms that have a mesh."""
     classes: list[PartClass] = []
     for index, arm in enumerate(arms):
         seen = link_parts(arm.robot)[[mesh.link for mesh in arm.robot.meshes]]
@@ -48,22 +48,22 @@ def part_classes(arms: Sequence[Arm]) -> tuple[PartClass, ...]:
 
 
 def link_classes(arms: Sequence[Arm]) -> Int[np.ndarray, " links"]:
-    """Number of the class of every link, counted through all arms."""
+    """Class number of every link, with the links of all arms in order."""
     return np.concatenate([1 + len(PARTS) * index + link_parts(arm.robot) for index, arm in enumerate(arms)])
 
 
 def link_parts(robot: Robot) -> Int[np.ndarray, " links"]:
-    """Index into `PARTS` of each link with a mesh, by how many degrees of freedom move it.
+    """Index into `PARTS` of each link with a mesh, from the number of degrees of freedom that move it.
 
-    Links that all but the last two degrees of freedom move are the wrist, those that more of them move are the jaws
-    with their bearing, and all others belong to the shaft. For instruments without moving jaws (a hook), links that
-    move with the shaft, which is the longest mesh if that is slender, are no wrist.
+    Links moved by all but the last two degrees of freedom are the wrist, links moved by more are the jaws with their
+    bearing, and all others belong to the shaft. For instruments without moving jaws (a hook), links that move with the
+    shaft (the longest mesh, if slender) do not count as wrist.
     """
     dofs = len(robot.joint_names)
     probes = torch.cat([torch.zeros(1, dofs), _PROBE * torch.eye(dofs)]).double()
     Ts = robot.forward_kinematics(probes)
     movers = ((Ts[1:] - Ts[:1]).abs().amax((-2, -1)) > 1e-9).sum(0).numpy()
-    # A robot without a wrist is all shaft.
+    # All links of a robot without a wrist are shaft.
     wrist = max(movers.max() - 2, _shaft_movers(robot, movers) + 1)
     return (movers >= wrist).astype(int) + (movers >= wrist + 1)
 

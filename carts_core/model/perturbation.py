@@ -17,7 +17,7 @@ def perturb(
 ) -> dict[str, Float[np.ndarray, " dofs"]]:
     """Move every joint by `degrees`, each with a random sign (the paper's kinematics errors).
 
-    Prismatic joints move by as many millimetres. Joint limits hold.
+    Prismatic joints move by the same number of millimetres. Positions are clamped to the joint limits.
 
     Args:
         joint_positions: arm name -> [rad, m].
@@ -28,7 +28,7 @@ def perturb(
     for arm in scene.arms:
         robot = arm.robot
         step = np.array([np.deg2rad(degrees) if kind == "revolute" else degrees / 1e3 for kind in robot.joint_types])
-        # Signs are drawn for every joint, so that they do not depend on which joints move.
+        # Signs are drawn for every joint, so that they do not depend on the selection of joints.
         step = step * generator.choice((-1.0, 1.0), len(step))
         if joints is not None:
             step = step * [name in joints.get(arm.name, ()) for name in robot.joint_names]

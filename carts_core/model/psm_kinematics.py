@@ -10,8 +10,8 @@ The chain, in modified Denavit-Hartenberg parameters (alpha [rad], a [m], theta 
     wrist yaw    -pi/2   wrist_length  q6 - pi/2   0
     tip          -pi/2   0             pi/2        0
 
-The base frame lies in the remote centre of motion. The tip is the dVRK's: a point on the wrist's yaw axis, with z along
-the closed jaws. Poses that a robot controller reports further out are brought there with `tip_offset`.
+The base frame is at the remote centre of motion. The tip frame is the dVRK's: its origin is on the wrist's yaw axis,
+and z is along the closed jaws. `tip_offset` converts poses that a controller reports for a point further out.
 """
 
 from dataclasses import dataclass, field
@@ -22,7 +22,7 @@ from jaxtyping import Bool, Float
 from ..errors import SettingsError
 
 JOINT_NAMES = ("yaw", "pitch", "insertion", "roll", "wrist_pitch", "wrist_yaw")
-"""Joints in the order of every array here."""
+"""Names of the joints, in the order of all arrays of this module."""
 
 ROLL = 3
 _SINGULAR = 1e-9
@@ -37,15 +37,15 @@ class PsmGeometry:
     """Lengths and joint limits of one arm with one instrument.
 
     Raises:
-        SettingsError: a length is impossible.
+        SettingsError: a length is out of range.
     """
 
     shaft_length: float = 0.4162
-    """From the instrument's base to the wrist's pitch axis [m]: 0.4162 classic, 0.4670 Si."""
+    """Distance from the instrument's base to the wrist's pitch axis [m]: 0.4162 classic, 0.4670 Si."""
     wrist_length: float = 0.0091
-    """From the wrist's pitch axis to its yaw axis [m]."""
+    """Distance from the wrist's pitch axis to its yaw axis [m]."""
     remote_center: float = 0.4318
-    """From the instrument's base at insertion 0 to the remote centre [m]: 0.4318 classic, 0.4826 Si."""
+    """Distance from the instrument's base at insertion 0 to the remote centre [m]: 0.4318 classic, 0.4826 Si."""
     limits: tuple[tuple[float, float], ...] = field(
         default=((-1.588, 1.588), (-0.925, 0.925), (0.0, 0.24), (-4.538, 4.538), (-1.396, 1.396), (-1.571, 1.571))
     )
@@ -79,10 +79,10 @@ SI = PsmGeometry(
 
 @dataclass(frozen=True)
 class Unreachable:
-    """Rows that no joint vector within the limits reaches, for one reason."""
+    """Rows that are unreachable within the joint limits, for a common reason."""
 
     rows: tuple[int, ...]
-    """Counted from 0."""
+    """Row numbers from 0."""
     reason: str
     """Message without a full stop."""
 
@@ -97,12 +97,12 @@ class InverseKinematics:
     """Joint positions found for a series of poses."""
 
     joints: Float[np.ndarray, "rows 6"]
-    """[rad], [m]; NaN in rows that are not reachable."""
+    """Joint positions [rad], [m]; NaN in unreachable rows."""
     unreachable: tuple[Unreachable, ...]
 
     @property
     def reachable(self) -> Bool[np.ndarray, " rows"]:
-        """Whether each row has joint positions."""
+        """Whether each row is reachable."""
         return np.asarray(np.isfinite(self.joints).all(1))
 
 
@@ -126,7 +126,7 @@ def forward(joints: Float[np.ndarray, "*batch 6"], geometry: PsmGeometry = CLASS
 
 
 def modified_dh(alpha: float, a: float, theta: np.ndarray, d: np.ndarray) -> np.ndarray:
-    """Rx(alpha) Tx(a) Rz(theta) Tz(d) of the modified convention, [batch ..., 4, 4]."""
+    """Transform Rx(alpha) Tx(a) Rz(theta) Tz(d) of the modified DH convention, [batch ..., 4, 4]."""
     c, s = np.cos(theta), np.sin(theta)
     ca, sa = np.cos(alpha), np.sin(alpha)
     T = np.zeros((*theta.shape, 4, 4))
@@ -145,17 +145,18 @@ def inverse(
     continuous: bool = True,
     roll_near: float = 0.0,
 ) -> InverseKinematics:
-    """Joint positions that put the tip at poses; nothing is clamped.
+    """Inverse kinematics: joint positions for poses of the tip; nothing is clamped.
 
-    A pose has up to two solutions whose wrist is bent by less than 90 degrees: one has the wrist behind the remote
-    centre, which only insertions below some 16 mm allow. The one within the limits is taken, and of two within the
-    limits of an Si arm, whose yaw reaches further, the one that is not behind.
+    A pose has up to two solutions with the wrist bent by less than 90 degrees. In one of them the wrist is behind the
+    remote centre, which requires an insertion below about 16 mm. The solution within the limits is returned; if both
+    are, which the wider yaw range of Si arms allows, the one that is not behind.
 
     Args:
         Ts_base_tip: poses of the tip in the arm's base frame, translation in [m].
-        tip_offset: where the poses' origin lies, seen from the tip described above, in the pose's axes [m].
-        continuous: rows follow each other in time, so that the roll, which has more than one turn, may not jump.
-        roll_near: where more than one turn fits, the one is taken whose (mean) roll is nearest to this [rad].
+        tip_offset: position of the poses' origin relative to the tip defined above, in the pose's axes [m].
+        continuous: whether rows are consecutive in time, so that the roll, whose range exceeds one revolution, must not
+            jump.
+        roll_near: if several revolutions are within the limits, the (mean) roll nearest to this is chosen [rad].
 
     Raises:
         SettingsError: poses are not 4x4 matrices.
@@ -235,7 +236,7 @@ def _solve_link(
 
 
 def _roll_turns(roll: np.ndarray, limits: tuple[float, float], continuous: bool, near: float) -> np.ndarray:
-    """The roll with whole turns added: without jumps if it is `continuous`, within the limits if that can be."""
+    """The roll with full revolutions added: without jumps if `continuous`, within the limits if possible."""
     known = np.isfinite(roll)
     if not known.any():
         return roll

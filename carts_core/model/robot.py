@@ -1,4 +1,4 @@
-"""A robot: its checked URDF, joints, forward kinematics and link meshes."""
+"""Robot model: checked URDF, joints, forward kinematics and link meshes."""
 
 import io
 import math
@@ -36,10 +36,11 @@ _XACRO = "ros.org/wiki/xacro}"
 
 
 def parsed_urdf(text: str, source: Path) -> Element:
-    """The root of a URDF's elements, checked.
+    """Parse and check a URDF; returns its root element.
 
     Raises:
-        RobotError: it is no URDF, links and joints are not one tree, or a number is not finite or impossible.
+        RobotError: the text is not a URDF, links and joints do not form one tree, or a number is not finite or out of
+            range.
     """
     if "<!DOCTYPE" in text or "<!ENTITY" in text:
         raise RobotError(f"robot {source} declares a document type or entities, which no URDF needs. Remove them.")
@@ -84,7 +85,7 @@ def _check_elements(root: Element, source: Path) -> None:
 
 
 def _check_tree(root: Element, source: Path) -> None:
-    """Check that names are unique, and that joints make one tree of all links."""
+    """Check that names are unique, and that the joints connect all links to one tree."""
     links, joints = root.findall("link"), root.findall("joint")
     if not 1 <= len(links) <= _MOST_LINKS or len(joints) > _MOST_LINKS:
         raise RobotError(f"robot {source} has {len(links)} links; allowed are 1 to {_MOST_LINKS}.")
@@ -187,7 +188,7 @@ def _finite(words: list[str]) -> Iterator[float]:
 
 
 def _vector(element: Element, key: str, count: int, source: Path, smallest: float = -_FARTHEST) -> list[float]:
-    """The numbers of an attribute, none where it is absent."""
+    """Numbers of an attribute; empty if it is absent."""
     values = _floats(element, key, source)
     if element.get(key) is not None and (
         len(values) != count or not smallest <= min(values) <= max(values) <= _FARTHEST
@@ -212,24 +213,24 @@ INSTRUMENT_TOLERANCE = 2e-4
 REACH_TOLERANCE = 1e-3
 """Largest surface deviation for other robots, relative to their reach [1]."""
 SLENDER = 0.1
-"""Largest width of a shaft, in lengths [1]."""
+"""Largest width of a shaft, relative to its length [1]."""
 
 
 class Robot:
-    """Articulated robot with link meshes. Made by `Robot.load`.
+    """Articulated robot with link meshes. Created by `Robot.load`.
 
     Attributes:
         name: the URDF's robot name.
         urdf: path of the URDF.
-        base_link: link whose frame link transforms are given in.
-        joint_names: independent degrees of freedom; a mimic joint counts to the joint that it follows.
+        base_link: link that is the reference frame of link transforms.
+        joint_names: independent degrees of freedom; a mimic joint belongs to the joint that it follows.
         joint_types: "revolute" or "prismatic", per degree of freedom.
         joint_limits: lower and upper limit per degree of freedom [dofs, 2], [rad] or [m], infinite where not given.
-        link_names: the links that carry a visual mesh.
+        link_names: links with a visual mesh.
         meshes: parts of these links; `LinkMesh.link` indexes `link_names`.
-        decimation: how many triangles were taken away, and how far surfaces moved.
-        remarks: sentences on what is changed about the files' meshes: scaled by their unit, simplified further than
-            asked for; and on up axes, which are not applied.
+        decimation: summary of the decimation of the meshes.
+        remarks: sentences on changes to the files' meshes (scaling by their unit, simplification beyond the tolerance),
+            and on up axes, which are not applied.
     """
 
     def __init__(
@@ -267,19 +268,19 @@ class Robot:
         tolerance: float | None = None,
         progress: Callable[[str], None] | None = None,
     ) -> "Robot":
-        """Read a URDF and its visual meshes; decimated meshes come from the cache the second time.
+        """Read a URDF and its visual meshes; decimated meshes are cached.
 
         Args:
-            urdf: path of the URDF, mesh paths are relative to it; or `builtin:NAME`.
-            base_link: frame of the link transforms, the URDF's root by default.
-            max_faces: a robot with so many triangles is left as it is; those of others are decimated.
-            tolerance: how far decimation may move surfaces [m]; by default 0.2 mm for an instrument, which has a
+            urdf: path of the URDF, to which mesh paths are relative, or `builtin:NAME`.
+            base_link: reference frame of the link transforms; the URDF's root by default.
+            max_faces: total number of triangles above which meshes are decimated.
+            tolerance: largest surface deviation by decimation [m]; by default 0.2 mm for an instrument, which has a
                 slender shaft, and a thousandth of the reach for other robots.
 
         Raises:
             RobotError: the URDF or one of its meshes is missing or broken, or `base_link` is not in it.
         """
-        # Resolved once, here: what is found beside the URDF stays found when the working directory changes.
+        # Resolved here, so that files beside the URDF are found even if the working directory changes later.
         urdf = robot_file(urdf).absolute()
         report = progress or (lambda line: None)
         try:
@@ -294,7 +295,7 @@ class Robot:
             raise RobotError(f"robot {urdf} is missing. Give the path of a URDF file.") from error
         except RobotError:
             raise
-        except Exception as error:  # the URDF parser raises many kinds
+        except Exception as error:  # the URDF parser raises many types
             raise RobotError(f"robot {urdf} is not a readable URDF ({error}). Check it with a URDF viewer.") from error
         if not kinematics.joint_names:
             raise RobotError(f"robot {model.robot.name} ({urdf}) has no joint that moves. Name a robot that has one.")
@@ -330,7 +331,7 @@ class Robot:
         return self._kinematics(joint_positions, (link_name,))[..., 0, :, :]
 
     def joint_index(self, joint_name: str) -> int:
-        """Position of a joint in `joint_names`.
+        """Index of a joint in `joint_names`.
 
         Raises:
             RobotError: the robot has no such degree of freedom.
@@ -353,7 +354,7 @@ def _mesh_files(model: yourdfpy.URDF, urdf: Path) -> list[Path]:
 def _cache_key(model: yourdfpy.URDF, kinematics: Kinematics, urdf: Path, limits: tuple[int, float | None]) -> str:
     """Cache key of link meshes; `limits` are `max_faces` and `tolerance` of `Robot.load`."""
     files = _mesh_files(model, urdf)
-    # Meshes in units other than metres were not scaled before.
+    # Units other than metres are part of the key, since older entries of the cache are not scaled by them.
     units = tuple(metres for file in files if (metres := collada_asset(file)[0]) != 1.0)
     settings = (kinematics.base_link, *limits, units) if units else (kinematics.base_link, *limits)
     return mesh_cache.fingerprint([urdf, *files], *settings)
@@ -381,7 +382,7 @@ def _prepared_meshes(
     limits: tuple[int, float | None],
     report: Callable[[str], None],
 ) -> mesh_cache.Made:
-    """Meshes of links from their files, decimated."""
+    """Read and decimate the meshes of links."""
     report(f"{model.robot.name}: preparing meshes (once)")
     materials = {material.name: material for material in model.robot.materials}
     links = {link.name: link for link in model.robot.links}

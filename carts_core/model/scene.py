@@ -30,7 +30,7 @@ class Light:
     """White point light fixed to the camera (L_d of the paper), and the reflection model of surfaces."""
 
     position: tuple[float, float, float] = (0.0, 0.0, -0.02)
-    """In the camera's frame [m]; behind the lens by default."""
+    """Position in the camera's frame [m]; behind the lens by default."""
     ambient: float = 0.25
     """Ambient reflection, relative to a surface's colour."""
     diffuse: float = 0.75
@@ -43,17 +43,17 @@ class Light:
 
 @dataclass(frozen=True)
 class SceneState:
-    """Values of a scene that may be optimized: a point, or a batch of points, in parameter space.
+    """Optimizable values of a scene: a point, or a batch of points, in parameter space.
 
-    Leaves are tensors that may carry gradients; `*batch` are hypotheses.
+    Fields are tensors that may carry gradients; `*batch` are hypotheses.
     """
 
     joint_positions: tuple[Float[Tensor, "*batch dofs"], ...]
-    """One per arm, in the scene's order [rad, m] (K of the paper)."""
+    """Joint positions of each arm, in the scene's order [rad, m] (K of the paper)."""
     T_world_base: Float[Tensor, "*batch arms 4 4"]
     """Base frames (F_B of the paper)."""
     T_camera_world: Float[Tensor, "*batch cameras 4 4"]
-    """Camera extrinsics (C of the paper); of a moving camera, `T_camera_mount`."""
+    """Camera extrinsics (C of the paper); `T_camera_mount` for a moving camera."""
     intrinsics: Float[Tensor, "*batch cameras 4"]
     """fx, fy, cx, cy of the full-size image [px]."""
     T_mount_world: Float[Tensor, "*batch cameras 4 4"]
@@ -92,7 +92,7 @@ class Scene:
     light: Light = field(default_factory=Light)
 
     def arm(self, name: str) -> Arm:
-        """The arm of that name.
+        """Look up an arm by name.
 
         Raises:
             RobotError: there is none.
@@ -104,7 +104,7 @@ class Scene:
         raise RobotError(f"no arm is called {name!r}. The arms are: {', '.join(known)}.{closest(name, known)}")
 
     def camera(self, name: str) -> Camera:
-        """The camera of that name.
+        """Look up a camera by name.
 
         Raises:
             RobotError: there is none.
@@ -116,7 +116,7 @@ class Scene:
         raise RobotError(f"no camera is called {name!r}. The cameras are: {', '.join(known)}.{closest(name, known)}")
 
     def with_cameras(self, names: Sequence[str] | None) -> "Scene":
-        """The scene seen by these cameras only (all of them for None), in this order."""
+        """The scene with these cameras only (all of them for None), in this order."""
         return self if names is None else replace(self, cameras=tuple(self.camera(name) for name in names))
 
     def with_arms(self, names: Sequence[str] | None) -> "Scene":
@@ -127,7 +127,7 @@ class Scene:
         return replace(self, arms=tuple(arm for arm in self.arms if arm.name in wanted))
 
     def distance(self, state: SceneState) -> float:
-        """Median distance of the middles of all links from the cameras [m], at one state (no batch)."""
+        """Median distance of the link centres from the cameras [m], at one state (no batch)."""
         found = []
         for arm, joints, T_world_base in zip(self.arms, state.joint_positions, state.T_world_base, strict=True):
             Ts = state.T_view_world[:, None] @ (T_world_base @ arm.robot.forward_kinematics(joints))
@@ -144,7 +144,7 @@ class Scene:
         device: str | torch.device = "cpu",
         mounts: Mapping[str, Float[np.ndarray, "4 4"]] | None = None,
     ) -> SceneState:
-        """The scene's state at the given joint positions, with the calibration as given.
+        """State of the scene at given joint positions, with the scene's calibration.
 
         Args:
             joint_positions: arm name -> values `[*batch, dofs]` in the order of `Robot.joint_names`.

@@ -1,7 +1,7 @@
-"""Safe xacro: evaluates expressions of a model without Python, since xacro would run any code in them.
+"""Safe xacro: evaluates expressions of a model without Python's `eval`, which would run any code in them.
 
-Xacro hands what stands in `${...}` and `$(eval ...)` to Python's `eval`, and keeps it from little. Here an expression
-is numbers, texts, lists, comparisons, properties and the functions of this module; everything else is refused.
+Xacro passes the content of `${...}` and `$(eval ...)` to `eval` with few restrictions. Here an expression consists of
+numbers, strings, lists, comparisons, properties and the functions of this module; everything else is rejected.
 """
 
 import ast
@@ -17,12 +17,12 @@ from ..errors import RobotError
 from ..files.reading import CALIBRATION, ROBOT, parse_yaml, read_text
 
 _LONGEST = 100_000
-"""Longest text or list of an expression."""
+"""Longest string or list in an expression."""
 _LARGEST = 2.0**63
-"""Largest whole number."""
+"""Largest integer in an expression."""
 _LONGEST_EXPRESSION = 2_000
 LIBRARIES = {"expanded": ("xacro", "xacrodoc")}
-"""Imported before the memory of a child process is counted."""
+"""Modules that a child process imports before its memory is measured."""
 _DECLARES = re.compile(r"<!(?:DOCTYPE|ENTITY)", re.IGNORECASE)
 
 _BINARY: dict[type[ast.operator], Callable[[Any, Any], Any]] = {
@@ -61,10 +61,10 @@ _MESSAGES = ("message", "warning", "error")
 
 
 def expanded(path: Path, packages: dict[str, str], arguments: dict[str, str]) -> str:
-    """The URDF of a model; for a child process, since xacro is changed to use the expressions of this module.
+    """Expand a model to a URDF; for a child process, since xacro is patched to use the expressions of this module.
 
     Raises:
-        Exception: it cannot be expanded; the class is that of xacro, or of an expression.
+        Exception: the model cannot be expanded; the class is that of xacro, or of `Expression.value`.
     """
     import xacro  # noqa: PLC0415 - an extra
     import xacrodoc  # noqa: PLC0415
@@ -74,7 +74,7 @@ def expanded(path: Path, packages: dict[str, str], arguments: dict[str, str]) ->
         if content is None:
             content = read_text(Path(xacro.root_dir or "", filename or ""), ROBOT)
         if not isinstance(content, str):
-            return content  # It is parsed already.
+            return content  # Already parsed.
         if _DECLARES.search(content):
             raise RobotError(f"{filename or 'the model'} declares a document type or entities, which no model needs")
         return minidom.parseString(content)
@@ -93,17 +93,18 @@ def expanded(path: Path, packages: dict[str, str], arguments: dict[str, str]) ->
 
 
 class Expression:
-    """Evaluates expressions."""
+    """Evaluator of xacro expressions."""
 
     def __init__(self, symbols: Mapping[str, Any], path_of: Callable[[str], str]) -> None:
         self._symbols, self._path_of = symbols, path_of
 
     def value(self, text: str) -> Any:
-        """The value of an expression.
+        """Evaluate an expression.
 
         Raises:
-            RobotError: it holds something that is not calculated here.
-            SyntaxError, TypeError, ValueError, ArithmeticError, LookupError: it is none, or has no value.
+            RobotError: the expression contains something that is not supported.
+            SyntaxError, TypeError, ValueError, ArithmeticError, LookupError: it is not a valid expression, or has no
+                value.
         """
         if len(text) > _LONGEST_EXPRESSION:
             raise RobotError(f"an expression is longer than {_LONGEST_EXPRESSION:,} characters")
@@ -160,7 +161,7 @@ class Expression:
         return entries[name]
 
     def _first(self, values: list[ast.expr], wanted: bool) -> Any:
-        """Of `or`, the first true value, of `and`, the first that is not; else the last."""
+        """First operand whose truth is `wanted`, else the last: the value of `or` (True) and `and` (False)."""
         result: Any = None
         for value in values:
             result = self._of(value)
@@ -188,7 +189,7 @@ class Expression:
 
 
 def _binary(op: ast.operator, left: Any, right: Any) -> Any:
-    # A text times a number, or formatted with one, may become as long as it likes before anybody sees.
+    # Repetition and formatting are not allowed, since they could make a string arbitrarily long.
     if not isinstance(op, ast.Add) and not (isinstance(left, int | float) and isinstance(right, int | float)):
         raise TypeError(f"{type(op).__name__} is for numbers")
     return _BINARY[type(op)](left, right)

@@ -1,4 +1,4 @@
-"""Derivatives of surface maps and outlines by the unknowns, without autograd."""
+"""Derivatives of surface maps and outlines with respect to the unknowns, without autograd."""
 
 from dataclasses import dataclass
 
@@ -16,7 +16,8 @@ _HALF = np.float32(0.5)
 
 @compiled
 def _move(pixel, begin, end, dT, dK, K, point, position, normal, left, top, width, height, velocity, turning):
-    """Fill velocity [2, rows, columns] and turning [3, rows, columns] of one view where one link is seen."""
+    """Fill velocity [2, rows, columns] and rotation of normals [3, rows, columns] of one view where one link is
+    visible."""
     for k in range(begin, end):
         x, y, z = point[0, k], point[1, k], point[2, k]
         dx = dT[0, 0] * x + dT[0, 1] * y + dT[0, 2] * z + dT[0, 3]
@@ -34,7 +35,8 @@ def _move(pixel, begin, end, dT, dK, K, point, position, normal, left, top, widt
 
 @compiled
 def _carry(maps, near, speed, down, right, out):
-    """Add to `out` what the neighbours that many pixels down and right bring at that speed; see `carry_motion`."""
+    """Add to `out` the change by neighbours at offset (`down`, `right`) [px] that move at `speed`; see
+    `carry_motion`."""
     channels, rows, columns = maps.shape
     for row in range(rows - down):
         for column in range(columns - right):
@@ -53,18 +55,18 @@ def _carry(maps, near, speed, down, right, out):
 
 @compiled
 def fill_jacobian(unknowns, runs, pixel, point, position, normal, dTs, dKs, Ks, maps, near, left, top, first, out):
-    """Fill the derivative of a block of surface maps by some unknowns; see `jacobian.map_jacobian`.
+    """Fill the derivative of a block of surface maps with respect to some unknowns; see `jacobian.map_jacobian`.
 
     Args:
-        unknowns [g]: which of the tangents' they are.
-        runs [r, 4]: view, link, first point and one past the last one, of each link that is seen in a view.
-        pixel [K], point, position, normal [3, K]: of visible points: index into the maps, where it is in its link's
-            frame and in the camera's [m], and the normal in its link's frame, towards the camera.
+        unknowns [g]: indices into the tangents.
+        runs [r, 4]: view, link, first point and last point + 1 of each visible link in a view.
+        pixel [K], point, position, normal [3, K]: of visible points: index into the maps, position in the link's frame
+            and in the camera's [m], and normal in the link's frame, towards the camera.
         dTs [unknowns, views, links, 4, 4], dKs [unknowns, views, 4]: tangents.
         Ks [views, 4]: intrinsics [px].
         maps [views, channels, height, width], near [views, height, width]: surface maps and inverse depth [1/m].
-        left, top: of the block [px].
-        out [g, views, channels, rows, columns]: zeros.
+        left, top: upper left corner of the block [px].
+        out [g, views, channels, rows, columns]: output, initially zero.
     """
     views, _, rows, columns = out.shape[1:]
     height, width = near.shape[1:]
@@ -104,22 +106,22 @@ class Tangents:
 
     Ts_camera_link: Float[Tensor, "unknowns cameras links 4 4"]
     intrinsics: Float[Tensor, "unknowns cameras 4"]
-    """[px] of the rendered size."""
+    """Derivatives of the intrinsics at the rendered size [px]."""
 
 
 @dataclass(frozen=True)
 class JacobianBlock:
-    """Derivatives by unknowns that move common links, in a window around these; zero elsewhere."""
+    """Derivatives with respect to unknowns that move common links, in a window around these; zero elsewhere."""
 
     unknowns: Int[Tensor, " g"]
-    """Which they are."""
+    """Indices of the unknowns."""
     left: int
     top: int
-    """Upper left corner of the values in the maps [px]."""
+    """Upper left corner of the window in the maps [px]."""
     values: Float[Tensor, "g cameras 6 rows columns"]
 
     def dense(self, unknowns: int, like: Float[Tensor, "cameras 6 height width"]) -> Tensor:
-        """The derivative of whole maps by all unknowns, [unknowns, cameras, 6, height, width]."""
+        """Derivative of whole maps with respect to all unknowns, [unknowns, cameras, 6, height, width]."""
         whole = like.new_zeros(unknowns, *like.shape)
         rows, columns = self.values.shape[-2:]
         whole[self.unknowns, :, :, self.top : self.top + rows, self.left : self.left + columns] = self.values
@@ -136,14 +138,14 @@ def map_jacobian(
     tangents: Tangents,
     margin: int,
 ) -> tuple[JacobianBlock, ...]:
-    """The derivative of surface maps by the unknowns.
+    """Derivatives of surface maps with respect to the unknowns.
 
     Args:
-        position: where that is in the camera's frame [m].
-        facing: its normal in its link's frame, towards the camera.
+        position: positions of the points in the camera's frame [m].
+        facing: normals in the links' frames, towards the camera.
         inverse_depth: 1 / depth [1/m], 0 for background.
-        intrinsics: of the cameras [px].
-        margin: what blocks hold around what is moved [px].
+        intrinsics: intrinsics of the cameras [px].
+        margin: margin of blocks around the moved pixels [px].
     """
     seen = (points, position, facing, maps, inverse_depth, intrinsics, tangents)
     blocks = []
@@ -155,11 +157,11 @@ def map_jacobian(
 
 
 _Run = tuple[int, int, slice]
-"""View, link, and the range of its points."""
+"""View, link, and range of the link's points."""
 
 
 def _families(points: VisiblePoints, tangents: Tangents) -> list[tuple[list[int], list[_Run]]]:
-    """Unknowns that move common links, with all the visible links that they move."""
+    """Groups of unknowns that move common links, with all visible links that they move."""
     moves = tangents.Ts_camera_link.abs().amax((-2, -1)) > 0
     moves |= (tangents.intrinsics.abs().amax(-1) > 0)[..., None]
     runs = points.runs()
@@ -177,7 +179,7 @@ def _families(points: VisiblePoints, tangents: Tangents) -> list[tuple[list[int]
 
 @dataclass(frozen=True)
 class _Box:
-    """A rectangle of all cameras' maps [px]."""
+    """Rectangle in the maps of all cameras [px]."""
 
     left: int
     top: int
@@ -196,7 +198,7 @@ class _Box:
         return _Box(left, top, right - left, bottom - top)
 
     def of(self, maps: Tensor) -> Tensor:
-        """This part of maps [..., height, width]."""
+        """Crop of maps [..., height, width]."""
         return maps[..., self.top : self.top + self.rows, self.left : self.left + self.columns]
 
 
@@ -212,7 +214,7 @@ def jacobian_of_box(
     runs: list[_Run],
     box: _Box,
 ) -> Float[Tensor, "g cameras 6 rows columns"]:
-    """The derivative of a box of surface maps by some unknowns."""
+    """Derivative of a box of surface maps with respect to some unknowns."""
     values = np.zeros((len(unknowns), *maps.shape[:2], box.rows, box.columns), np.float32)
     spans = np.array([(view, link, here.start, here.stop) for view, link, here in runs])
     seen = points.pixel, points.point_link, position, facing

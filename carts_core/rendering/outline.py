@@ -1,7 +1,7 @@
 """Occluding contours at subpixel precision, and their motion with the state.
 
-Where a smooth surface turns away from the camera, its contour moves with the surface along the contour's normal, so the
-motion of the visible surface point there is sufficient.
+The occluding contour of a smooth surface moves along its normal as the surface does, so the motion of the visible
+surface point there is sufficient.
 """
 
 from dataclasses import dataclass, replace
@@ -19,12 +19,12 @@ from .points import VisiblePoints, as_array
 
 @compiled
 def keep_outline(face_ids, inverse_depth, nearness, border):
-    """`face_ids` of the pixels that have something much further away beside, above or below them; -1 elsewhere.
+    """Keep `face_ids` of pixels with a much farther surface beside, above or below them; set the others to -1.
 
     Args:
-        face_ids, inverse_depth [cameras, height, width]: what is seen, and 1 / depth [1/m].
-        nearness: share of its inverse depth below which a neighbour is much further away [1].
-        border: width of the rim of the image that is left out [px].
+        face_ids, inverse_depth [cameras, height, width]: visible triangle, and 1 / depth [1/m].
+        nearness: share of a pixel's inverse depth below which a neighbour is much farther away [1].
+        border: width of the image border that is omitted [px].
     """
     cameras, height, width = face_ids.shape
     kept = np.full(face_ids.shape, -1, face_ids.dtype)
@@ -50,9 +50,9 @@ def place_outline(inverse_depth, pixel, kernels, nearness, position, normal):
     Args:
         inverse_depth [cameras, height, width]: 1 / depth [1/m].
         pixel [K]: indices into the flattened images, farther from their border than the kernels reach.
-        kernels [3, side, side]: a Gaussian and its derivatives, right and down.
-        nearness: share of the pixel's inverse depth from which another one counts as no further away [1].
-        position, normal [2, K]: where the outline is [px], and unit vectors away from what is nearer.
+        kernels [3, side, side]: a Gaussian and its derivatives in x and y.
+        nearness: share of the pixel's inverse depth from which another pixel counts as equally near [1].
+        position, normal [2, K]: output: position of the outline [px], and unit vectors away from the nearer surface.
     """
     height, width = inverse_depth.shape[1:]
     side = kernels.shape[1]
@@ -77,15 +77,15 @@ def place_outline(inverse_depth, pixel, kernels, nearness, position, normal):
 
 @compiled
 def move_along_normal(runs, point, normal, Ts, Ks, dTs, dKs, out):
-    """Fill how fast points move along a direction in the image [px per unit of each unknown].
+    """Fill the speed of points along a direction in the image [px per unit of each unknown].
 
     Args:
-        runs [r, 4]: view, link, first point and one past the last one, of each link that is seen in a view.
-        point [3, K]: in its link's frame [m].
-        normal [2, K]: the direction.
-        Ts [views, links, 4, 4], Ks [views, 4]: where links are [m], and intrinsics [px].
+        runs [r, 4]: view, link, first point and last point + 1 of each visible link in a view.
+        point [3, K]: position in the link's frame [m].
+        normal [2, K]: direction of each point.
+        Ts [views, links, 4, 4], Ks [views, 4]: poses of links [m], and intrinsics [px].
         dTs [unknowns, views, links, 4, 4], dKs [unknowns, views, 4]: their derivatives.
-        out [unknowns, K]: what is filled.
+        out [unknowns, K]: output.
     """
     for run in range(len(runs)):
         view, link = runs[run, 0], runs[run, 1]
@@ -112,10 +112,10 @@ BEHIND = 0.01
 """Least relative depth difference at an outline [1]; with less, folds of a surface count."""
 
 _BLUR = 1.5
-"""Deviation of the blur that gives outlines their normals [px]."""
+"""Standard deviation of the blur from which normals of outlines are computed [px]."""
 
 BORDER = 6
-"""Outlines nearer than this to the border of the image are left out; their normals are not known there [px]."""
+"""Distance to the image border below which outlines are omitted, since their normals are unknown there [px]."""
 
 
 @dataclass(frozen=True)
@@ -124,13 +124,13 @@ class Outline:
 
     camera: Int[Tensor, " K"]
     position: Float[Tensor, "2 K"]
-    """Position x and y; the centre of the first pixel is (0, 0) [px]."""
+    """Position (x, y) [px]; the centre of the first pixel is (0, 0)."""
     normal: Float[Tensor, "2 K"]
-    """Unit vectors, outwards."""
+    """Unit normals, outwards."""
     parts: Int[Tensor, " K"]
     """Index into `carts_core.model.parts.PARTS`."""
     motion: Float[Tensor, "unknowns K"]
-    """Along the normal [px per unit of each unknown]."""
+    """Motion along the normal [px per unit of each unknown]."""
 
     def at(self, step: Float[Tensor, " unknowns"]) -> "Outline":
         """Outlines after a small step of the unknowns."""
@@ -145,7 +145,7 @@ class Outline:
 def outline_faces(
     face_ids: Int[Tensor, "cameras height width"], inverse_depth: Float[Tensor, "cameras height width"]
 ) -> Int[Tensor, "cameras height width"]:
-    """The faces seen by pixels with something much further away beside, above or below them; -1 elsewhere.
+    """Visible faces at pixels with a much farther surface beside, above or below them; -1 elsewhere.
 
     Pixels nearer than `BORDER` to the border of the image do not count.
 
@@ -159,11 +159,11 @@ def outline_faces(
 def outline_position(
     inverse_depth: Float[Tensor, "cameras height width"], pixel: Int[Tensor, " K"]
 ) -> tuple[Float[Tensor, "2 K"], Float[Tensor, "2 K"]]:
-    """Positions of outline pixels, and their normals away from the nearer surface.
+    """Positions of outline pixels, and normals away from the nearer surface.
 
     Args:
         inverse_depth: 1 / depth [1/m], 0 for background.
-        pixel: of the outlines, as indices into the flattened images.
+        pixel: outline pixels, as indices into the flattened images.
     """
     position, normal = np.empty((2, len(pixel)), np.float32), np.empty((2, len(pixel)), np.float32)
     place_outline(as_array(inverse_depth), as_array(pixel), gaussian_kernels(), 1.0 - BEHIND, position, normal)
@@ -180,7 +180,7 @@ def normal_motion(
     """Speed of points along a direction in the image [px per unit of each unknown].
 
     Args:
-        Ts_camera_link, intrinsics: where links are, and the cameras [m, px].
+        Ts_camera_link, intrinsics: poses of the links [m], and intrinsics of the cameras [px].
     """
     runs = [(view, link, here.start, here.stop) for view, link, here in points.runs()]
     motion = np.empty((len(tangents.intrinsics), normal.shape[1]), np.float32)
@@ -191,7 +191,7 @@ def normal_motion(
 
 @cache
 def gaussian_kernels() -> Float[np.ndarray, "3 side side"]:
-    """A Gaussian and its derivatives, right and down."""
+    """Gaussian kernel and its derivatives in x and y."""
     radius = BORDER - 1
     steps = torch.arange(-radius, radius + 1, dtype=torch.float32)
     bell = torch.exp(-0.5 * (steps / _BLUR).square())

@@ -17,13 +17,13 @@ from ..model.scene import Light, Scene, SceneState
 
 @dataclass(frozen=True)
 class SceneGeometry:
-    """All triangles of all arms. Links are numbered through all arms, and vertices stand in the order of their links.
+    """All triangles of all arms. Links are numbered across all arms, and vertices are in the order of their links.
 
     Vectors are columns (`3 V`, not `V 3`), because products along a short last dimension are slow.
     """
 
     vertices: Float[Tensor, "3 V"]
-    """In link frames [m]."""
+    """Vertex positions in link frames [m]."""
     vertex_counts: tuple[int, ...]
     """Number of vertices per link."""
     vertex_links: Int[Tensor, " V"]
@@ -33,16 +33,16 @@ class SceneGeometry:
     face_parts: Int[Tensor, " F"]
     """Index into `carts_core.model.parts.PARTS`."""
     face_surfaces: Int[Tensor, " F"]
-    """Index of the closed surface that a triangle is part of, -1 for none; a camera outside sees no back of it."""
+    """Index of the closed surface of each triangle, -1 for none; its back is invisible to a camera outside."""
     face_colors: Float[Tensor, "3 F"]
     face_barycentric: Float[Tensor, "8 F"]
-    """Affine maps from a point on the triangle to its second and third barycentric coordinate, one after the other."""
+    """Affine maps from a point on the triangle to its second and third barycentric coordinate, concatenated."""
     face_normals: Float[Tensor, "9 F"]
-    """Unit vertex normals of each triangle's corners, in its link's frame, one after the other."""
+    """Unit vertex normals of each triangle's corners in its link's frame, concatenated."""
 
     @staticmethod
     def of(scene: Scene, device: str | torch.device = "cpu") -> "SceneGeometry":
-        """Gather the link meshes of a scene; once, for all renderers of the same robots."""
+        """Collect the link meshes of a scene; call once for all renderers of the same robots."""
         return SceneGeometry._of(tuple(arm.robot for arm in scene.arms), torch.device(device))
 
     @staticmethod
@@ -91,7 +91,7 @@ def _barycentric_maps(corners: np.ndarray) -> np.ndarray:
     a, ab, ac = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     cross = np.cross(ab, ac)
     squared = np.maximum((cross**2).sum(-1, keepdims=True), 1e-30)
-    # A coordinate grows along the direction in the plane that is normal to the edge opposite its corner.
+    # A coordinate grows in the plane along the normal of the edge opposite its corner.
     maps = np.stack([np.cross(ac, cross) / squared, np.cross(cross, ab) / squared], 1)
     offsets = -np.einsum("fki,fi->fk", maps, a)
     return np.concatenate([maps, offsets[..., None]], -1)
@@ -101,7 +101,7 @@ def link_transforms(scene: Scene, state: SceneState) -> Float[Tensor, "*batch ca
     """Ts_camera_link of every link in every camera, differentiable (f_FK of the paper, then F_B and C)."""
     Ts_base_link: dict[int, Tensor] = {}
     for robot in {id(arm.robot): arm.robot for arm in scene.arms}.values():
-        # Arms of one kind go through forward kinematics together, which takes as long for all as for one.
+        # Forward kinematics of equal robots is batched, which takes as long for all as for one.
         same = [index for index, arm in enumerate(scene.arms) if arm.robot is robot]
         Ts = robot.forward_kinematics(torch.stack([state.joint_positions[index] for index in same]))
         Ts_base_link.update(zip(same, Ts, strict=True))
@@ -113,7 +113,7 @@ def link_transforms(scene: Scene, state: SceneState) -> Float[Tensor, "*batch ca
 def vertices_in_camera(
     geometry: SceneGeometry, Ts_camera_link: Float[Tensor, "*batch links 4 4"]
 ) -> Float[Tensor, "*batch 3 V"]:
-    """All vertices in the frame of a camera [m]."""
+    """Positions of all vertices in the frame of a camera [m]."""
     parts = geometry.vertices.split(geometry.vertex_counts, dim=1)
     Ts = Ts_camera_link.unbind(-3)
     return torch.cat([T[..., :3, :3] @ part + T[..., :3, 3:] for T, part in zip(Ts, parts, strict=True)], -1)
@@ -135,7 +135,7 @@ def phong(
     """Phong shading with one point light, two-sided.
 
     Args:
-        points: in the camera's frame [m].
+        points: surface points in the camera's frame [m].
 
     Returns:
         Linear RGB in [0, 1].
@@ -143,10 +143,10 @@ def phong(
     to_light = unit(points.new_tensor(light.position)[:, None] - points)
     to_camera = -unit(points)
     towards_camera = (normals * to_camera).sum(0)
-    # A surface that is seen from behind is lit from behind.
+    # A surface seen from behind is lit from behind.
     side = torch.where(towards_camera.detach() < 0, -1.0, 1.0)
     cosine = (normals * to_light).sum(0) * side
-    # The mirrored direction of the light is 2 (n . l) n - l; only its cosine to the camera is needed.
+    # The reflected light direction is 2 (n . l) n - l; only its cosine to the camera is needed.
     mirrored = 2.0 * cosine * towards_camera * side - (to_light * to_camera).sum(0)
     highlight = light.specular * mirrored.clamp(min=1e-4) ** light.shininess * (cosine > 0)
     lit = light.ambient + light.diffuse * cosine.clamp(min=0.0)
@@ -157,7 +157,7 @@ def phong(
 def _gather(
     face_ids, inverse_depth, Ts_camera_link, intrinsics, face_links, barycentric, normals, starts, pixels, faces, out
 ):
-    """Fill pixels, faces and `out` (points above normals), each run of a view and a link from its start on."""
+    """Fill pixels, faces and `out` (points, then normals) in runs of a view and a link that begin at `starts`."""
     views, height, width = face_ids.shape
     links = Ts_camera_link.shape[1]
     for view in range(views):
@@ -179,7 +179,7 @@ def _gather(
                 z = depth - T[2, 3]
                 for axis in range(3):
                     out[axis, k] = T[0, axis] * x + T[1, axis] * y + T[2, axis] * z
-                # A pixel at the rim of its triangle may leave it by a rounding error.
+                # A pixel at the edge of its triangle may be outside by a rounding error.
                 b = _affine(barycentric[:4, face], out[:3, k])
                 c = _affine(barycentric[4:, face], out[:3, k])
                 n = normals[:, face]
@@ -245,7 +245,7 @@ class VisiblePoints:
     groups: tuple[tuple[int, int, int], ...]
     """View, link and number of points of each run of points on the same link in the same view."""
     point_link: Float[Tensor, "3 K"]
-    """The surface point, in the frame of its link [m]."""
+    """Surface point, in the frame of its link [m]."""
     normal_link: Float[Tensor, "3 K"]
     """Interpolated normal there, in the frame of its link."""
 
@@ -285,7 +285,7 @@ def visible_points(
     Ts_camera_link: Float[Tensor, "views links 4 4"],
     intrinsics: Float[Tensor, "views 4"],
 ) -> VisiblePoints:
-    """The surface point and the normal that each visible pixel sees."""
+    """Surface point and normal at each visible pixel."""
     faces = geometry.face_links, geometry.face_barycentric, geometry.face_normals
     *found, counts = gather_points(*map(as_array, (face_ids, inverse_depth, Ts_camera_link, intrinsics, *faces)))
     links = Ts_camera_link.shape[1]

@@ -1,4 +1,4 @@
-"""A picture of a robot by itself: the tip of an instrument from near by, or a whole arm."""
+"""Portrait of a single robot: a close-up of an instrument's tip, or a whole arm."""
 
 import numpy as np
 import torch
@@ -12,11 +12,11 @@ from .renderer import Renderer
 
 _BACKDROP = 0.92
 _FOCAL_LENGTH = 2.4
-"""In widths of the picture [1]."""
+"""Focal length, relative to the width of the picture [1]."""
 _MARGIN = 1.25
 _TILT = np.deg2rad(35.0)
 _OPEN = 0.45
-"""Joint positions as a share of their range above 0, so that jaws are open [1]."""
+"""Joint position relative to the upper limit, so that jaws are open [1]."""
 _SUPERSAMPLING = 2
 _GAMMA = 1 / 1.5
 _STEP = 0.1
@@ -24,10 +24,10 @@ _STEP = 0.1
 
 
 def portrait(robot: Robot, width: int = 480, height: int = 320) -> UInt8[np.ndarray, "height width 3"]:
-    """A robot before a plain backdrop, RGB: what its shaft carries if it is an instrument, else all of it.
+    """Render a robot on a plain background, RGB: the tip beyond the shaft for an instrument, else the whole robot.
 
     Args:
-        width, height: of the picture [px].
+        width, height: size of the picture [px].
     """
     joints, opening = _pose(robot)
     parts = link_parts(robot)[[mesh.link for mesh in robot.meshes]]
@@ -57,7 +57,7 @@ def portrait(robot: Robot, width: int = 480, height: int = 320) -> UInt8[np.ndar
 
 
 def _pose(robot: Robot) -> tuple[Float[torch.Tensor, " dofs"], Float[np.ndarray, "3"]]:
-    """Joints that are straight, with jaws open; and the direction in which the last joint moves what it moves."""
+    """Straight joint positions with open jaws, and the direction of motion of the links that the last joint moves."""
     low, high = robot.joint_limits.double().clamp(-np.pi, np.pi).T
     joints = torch.zeros(len(low), dtype=torch.float64).clamp(low, high)
     moved = joints.clone()
@@ -65,20 +65,20 @@ def _pose(robot: Robot) -> tuple[Float[torch.Tensor, " dofs"], Float[np.ndarray,
     ways = [after - before for before, after in zip(_points(robot, joints), _points(robot, moved), strict=True)]
     means = np.array([way.mean(0) for way in ways])
     if (means @ means.T).min() < -1e-9:
-        # Jaws move against each other.
+        # Jaws move in opposite directions.
         joints[-1] = (_OPEN * high[-1]).clamp(low[-1], high[-1])
     _, _, axes = np.linalg.svd(np.concatenate(ways), full_matrices=False)
     return joints, axes[0]
 
 
 def _points(robot: Robot, joints: torch.Tensor) -> list[Float[np.ndarray, "V 3"]]:
-    """The vertices of every mesh in the base frame [m]."""
+    """Vertices of every mesh in the base frame [m]."""
     Ts = robot.forward_kinematics(joints).numpy()
     return [mesh.vertices @ Ts[mesh.link, :3, :3].T + Ts[mesh.link, :3, 3] for mesh in robot.meshes]
 
 
 def _side_view(along: Float[np.ndarray, "3"], opening: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
-    """R_camera_base that has the tip on the right, seen obliquely onto the plane in which jaws open."""
+    """R_camera_base of a view with the tip on the right, oblique to the plane in which jaws open."""
     right = along / np.linalg.norm(along)
     across = opening - (opening @ right) * right
     across /= np.linalg.norm(across)
@@ -87,7 +87,7 @@ def _side_view(along: Float[np.ndarray, "3"], opening: Float[np.ndarray, "3"]) -
 
 
 def _from_above() -> Float[np.ndarray, "3 3"]:
-    """R_camera_base of a look at the base frame's origin, obliquely from above; z is up."""
+    """R_camera_base of a view of the base frame's origin, obliquely from above; z is up."""
     forward = np.array([-1.0, 0.8, -0.55])
     forward /= np.linalg.norm(forward)
     right = np.cross(forward, [0.0, 0.0, 1.0])

@@ -1,4 +1,4 @@
-"""Visibility: the triangle that each pixel sees, by a compiled kernel."""
+"""Visibility: the nearest triangle at each pixel, computed by a compiled kernel."""
 
 from collections.abc import Sequence
 
@@ -8,7 +8,7 @@ from jaxtyping import Float, Int
 from ..compiled import compiled
 
 BACKGROUND = -1
-"""Face index of a pixel that sees no triangle."""
+"""Face index of a pixel without a triangle."""
 
 NEAR = 1e-3
 """Depth of the near plane [m]; triangles that cross it are clipped, not dropped."""
@@ -20,7 +20,7 @@ _WIDE = 8
 
 @compiled
 def _first_and_last(value, slope, first, last):
-    """Those of steps 0 to `last` at which `value + slope * step` may be positive; one too many on either side."""
+    """First and last step from 0 to `last` at which `value + slope * step` may be positive, with a margin of one."""
     if slope > 0.0:
         first = max(first, int(min(-value / slope, last + 1.0)) - 1)
     elif slope < 0.0:
@@ -32,9 +32,9 @@ def _first_and_last(value, slope, first, last):
 
 @compiled
 def _fill_triangle(face, u, v, inverse_z, a, b, c, two_sided, face_ids, inverse_depth):
-    """Z-buffer one projected triangle (corners a, b, c of the points u, v with 1/z), seen from behind if two-sided."""
+    """Z-buffer one projected triangle (corners a, b, c of the points u, v with 1/z); its back only if two-sided."""
     area = (u[b] - u[a]) * (v[c] - v[a]) - (u[c] - u[a]) * (v[b] - v[a])
-    # An image's y points down, so corners that go round counterclockwise span a negative area.
+    # The image's y axis points down, so counterclockwise corners span a negative area.
     if area == 0.0 or (area > 0.0 and not two_sided):
         return
     height, width = face_ids.shape
@@ -73,7 +73,7 @@ def _fill_triangle(face, u, v, inverse_z, a, b, c, two_sided, face_ids, inverse_
 
 @compiled
 def _clip(corners, inverse_z, vertices, fx, fy, cx, cy, clipped_u, clipped_v, clipped_inverse_z):
-    """Cut a triangle off at the near plane (Sutherland-Hodgman); the number of corners that are left, 0, 3 or 4."""
+    """Clip a triangle at the near plane (Sutherland-Hodgman); returns the number of remaining corners, 0, 3 or 4."""
     count = 0
     for k in range(3):
         here, there = corners[k], corners[(k + 1) % 3]
@@ -94,7 +94,7 @@ def _clip(corners, inverse_z, vertices, fx, fy, cx, cy, clipped_u, clipped_v, cl
 
 @compiled
 def _opened(vertices, faces, surfaces, closed, inverse_z, fx, fy, cx, cy, width, height):
-    """Whether the near plane may open each closed surface where the camera sees it: by the bounds of the cut."""
+    """Whether the near plane may cut each closed surface open within the image, from the bounds of the cut."""
     u, v, inverse_near = np.empty(4), np.empty(4), np.empty(4)
     low, high = np.full((closed, 2), np.inf), np.full((closed, 2), -np.inf)
     for face in range(faces.shape[0]):
@@ -117,7 +117,7 @@ def _rasterize(vertices, faces, surfaces, closed, fx, fy, cx, cy, face_ids, inve
     u, v, inverse_z = np.zeros(count), np.zeros(count), np.zeros(count)
     for index in range(count):
         z = vertices[index, 2]
-        if z >= NEAR:  # what is nearer keeps an inverse depth of 0
+        if z >= NEAR:  # nearer vertices keep an inverse depth of 0
             inverse_z[index] = 1.0 / z
             u[index] = fx * vertices[index, 0] * inverse_z[index] + cx
             v[index] = fy * vertices[index, 1] * inverse_z[index] + cy
@@ -150,15 +150,15 @@ def rasterize(
     """The nearest triangle at every pixel centre, and the inverse of its depth.
 
     Args:
-        vertices_camera: in the camera's frame [m].
+        vertices_camera: vertices in the camera's frame [m].
         intrinsics: fx, fy, cx, cy [px].
         width, height: size of the image [px].
-        surfaces: of each triangle, the index of the closed surface that it is part of, -1 for none (the default). Seen
-            from outside, its corners go round counterclockwise. As long as the near plane does not cut a surface open
-            within the image, its front hides its back. The back is then skipped: the result is the same, in less time.
+        surfaces: index of the closed surface of each triangle, -1 for none (the default). Its corners are
+            counterclockwise seen from outside. Unless the near plane cuts a surface open within the image, its front
+            hides its back, and the back is skipped, which saves time and does not change the result.
 
     Returns:
-        `face_ids` (int32, `BACKGROUND` where nothing is seen) and `inverse_depth` (float32, [1/m], 0 there).
+        `face_ids` (int32, `BACKGROUND` without a triangle) and `inverse_depth` (float32, [1/m], 0 there).
     """
     face_ids = np.full((height, width), BACKGROUND, np.int32)
     inverse_depth = np.zeros((height, width), np.float32)
@@ -180,7 +180,7 @@ def visibility(
     width: int,
     height: int,
 ) -> tuple[Int[np.ndarray, "height width"], Float[np.ndarray, "height width"]]:
-    """The nearest triangle at every pixel centre, and its depth [m], 0 where nothing is seen; see `rasterize`."""
+    """The nearest triangle at every pixel centre, and its depth [m], 0 without a triangle; see `rasterize`."""
     face_ids, inverse_depth = rasterize(vertices_camera, faces, intrinsics, width, height)
     depth = np.zeros_like(inverse_depth)
     np.divide(1.0, inverse_depth, out=depth, where=face_ids >= 0)

@@ -18,7 +18,7 @@ from .rasterizer import rasterize
 
 
 class _CarryMotion(torch.autograd.Function):
-    """Identity on the image whose backward sends the image's gradient to the moving points as well."""
+    """Identity on the image; its backward pass also propagates the image's gradient to the moving points."""
 
     @staticmethod
     def forward(ctx, image: Tensor, positions: Tensor, pixels: Tensor, inverse_depth: Tensor) -> Tensor:
@@ -53,12 +53,12 @@ def carry_motion(
     pixels: Int[Tensor, " K"],
     inverse_depth: Float[Tensor, "views height width"],
 ) -> Float[Tensor, "channels views height width"]:
-    """The image, unchanged in value, moving with its visible points.
+    """Make the image's gradient depend on the motion of its visible points; its values are unchanged.
 
     Args:
         image: rendered channels, which may carry gradients of their own (shading).
         positions: projected surface point of every visible pixel [px], with gradient.
-        pixels: index of these pixels in the flattened `views x height x width`.
+        pixels: indices of these pixels in the flattened `views x height x width`.
         inverse_depth: 1 / depth [1/m], 0 for background.
     """
     return _CarryMotion.apply(image, positions, pixels, inverse_depth)  # pyright: ignore[reportReturnType]
@@ -69,16 +69,16 @@ class SurfaceRendering:
     """Surface maps of all cameras, without autograd."""
 
     maps: Float[Tensor, "cameras 6 height width"]
-    """See `carts_core.model.parts`."""
+    """Surface maps; see `carts_core.model.parts`."""
     image: Float[Tensor, "cameras 3 height width"]
-    """Shaded, linear RGB in [0, 1]."""
+    """Shaded images, linear RGB in [0, 1]."""
     jacobian: tuple[JacobianBlock, ...]
-    """Derivative of the maps by the unknowns; empty if it was not asked for."""
+    """Derivatives of the maps with respect to the unknowns; empty if not requested."""
 
 
 def surface_values(parts: Int[Tensor, " K"], normal: Float[Tensor, "3 K"]) -> Float[Tensor, "6 K"]:
-    """Surface map where points are seen, from their parts (index into `carts_core.model.parts.PARTS`) and their
-    normals, which point to the camera."""
+    """Surface map values of points, from their parts (index into `carts_core.model.parts.PARTS`) and their normals,
+    which point to the camera."""
     values = normal.new_zeros(SURFACE_CHANNELS, len(parts))
     values[parts, torch.arange(len(parts), device=parts.device)] = 1.0
     values[NORMALS] = normal
@@ -88,8 +88,8 @@ def surface_values(parts: Int[Tensor, " K"], normal: Float[Tensor, "3 K"]) -> Fl
 def scattered(
     values: Float[Tensor, "channels K"], pixel: Int[Tensor, " K"], shape: torch.Size
 ) -> Float[Tensor, "views channels height width"]:
-    """Values of pixels, as indices into flattened images of a shape [views, height, width], in their places; 0 between
-    them."""
+    """Scatter values to pixels (indices into flattened images) of images of a shape [views, height, width]; 0
+    elsewhere."""
     dense = values.new_zeros(len(values), shape.numel())
     dense[:, pixel] = values
     return dense.view(-1, *shape).transpose(0, 1).contiguous()
@@ -100,9 +100,9 @@ class Rendering:
     """Images of all cameras of all hypotheses."""
 
     image: Float[Tensor, "*batch cameras 3 height width"]
-    """Linear RGB in [0, 1], black where no robot is (Î of the paper)."""
+    """Linear RGB in [0, 1], black without a robot (Î of the paper)."""
     silhouette: Float[Tensor, "*batch cameras height width"]
-    """1 where a robot is, 0 elsewhere (Ŝ of the paper); its gradient is that of the boundary."""
+    """1 for robots, 0 for background (Ŝ of the paper); its gradient is that of the boundary."""
     face_ids: Int[Tensor, "*batch cameras height width"]
     """Index of the visible triangle in the scene's geometry, -1 for background."""
     inverse_depth: Float[Tensor, "*batch cameras height width"]
@@ -127,10 +127,10 @@ class Renderer:
     Args:
         width, height: size of the rendered images [px], by default that of the first camera. The intrinsics of a
             state are those of the camera's own size and are scaled.
-        cameras: names of the cameras to render, in this order; all by default. States are of all cameras of the scene,
-            or of these alone where they are fewer.
-        window: left, top, width and height [px] of the part of these images that is rendered, all of it by default.
-        device: of the images and of all that is differentiable; visibility is always found on the CPU.
+        cameras: names of the cameras to render, in this order; all by default. States have all cameras of the scene, or
+            only these.
+        window: left, top, width and height [px] of the part of these images to render; all of it by default.
+        device: device of the images and of differentiable computations; visibility is always computed on the CPU.
     """
 
     def __init__(
@@ -157,7 +157,7 @@ class Renderer:
         self._count = len(scene.cameras)
 
     def __call__(self, state: SceneState) -> Rendering:
-        """Render; gradients reach every tensor of the state."""
+        """Render a state; gradients reach every tensor of the state."""
         Ts, intrinsics = self._views(state)
         batch = Ts.shape[:-4]
         views_T, views_K = Ts.flatten(0, -4), intrinsics.flatten(0, -2)
@@ -182,13 +182,14 @@ class Renderer:
         )
 
     def segment(self, state: SceneState) -> Int[np.ndarray, "*batch cameras height width"]:
-        """Index of the visible arm per pixel, -1 for background; visibility alone, so faster than a rendering."""
+        """Index of the visible arm per pixel, -1 for background; computes only visibility, and is faster than
+        rendering."""
         return self._visible(state, self.geometry.face_arms)
 
     def segment_links(self, state: SceneState) -> Int[np.ndarray, "*batch cameras height width"]:
         """Index of the visible link per pixel, -1 for background.
 
-        Links are counted through all arms: `Robot.link_names` of the first arm, then those of the second.
+        Links are numbered across all arms: `Robot.link_names` of the first arm, then those of the second.
         """
         return self._visible(state, self.geometry.face_links)
 
@@ -196,7 +197,7 @@ class Renderer:
     def visibility(
         self, state: SceneState
     ) -> tuple[Int[Tensor, "*batch cameras h w"], Float[Tensor, "*batch cameras h w"]]:
-        """`face_ids` and `inverse_depth` of a `Rendering`, and nothing else."""
+        """Only `face_ids` and `inverse_depth` of a `Rendering`."""
         Ts, intrinsics = self._views(state)
         shape = (*Ts.shape[:-3], self.height, self.width)
         face_ids, inverse_depth = self._visibility(Ts.flatten(0, -4), intrinsics.flatten(0, -2))
@@ -210,7 +211,7 @@ class Renderer:
 
     @torch.no_grad()
     def surface_maps(self, state: SceneState) -> Float[Tensor, "*batch cameras 6 height width"]:
-        """Surface maps of all hypotheses, see `carts_core.model.parts`, and nothing else."""
+        """Only the surface maps of all hypotheses; see `carts_core.model.parts`."""
         Ts, intrinsics = self._views(state)
         views_T, views_K = Ts.flatten(0, -4), intrinsics.flatten(0, -2)
         face_ids, inverse_depth = self._visibility(views_T, views_K)
@@ -222,12 +223,12 @@ class Renderer:
 
     @torch.no_grad()
     def surface(self, state: SceneState, distance: float | None = None, margin: int = 1) -> SurfaceRendering:
-        """Surface maps of one state, shaded, and how they change.
+        """Surface maps and shaded images of one state, with derivatives.
 
         Args:
             state: one state (no batch); with `distance`, a batch as that of `tangents`.
-            distance: of the states on both sides; None leaves the Jacobian out.
-            margin: what the Jacobian's blocks hold around what is moved [px].
+            distance: distance between the states on both sides; None omits the Jacobian.
+            margin: margin of the Jacobian's blocks around the moved pixels [px].
         """
         assert state.intrinsics.ndim == (2 if distance is None else 3), "one state, or those around it"
         Ts, intrinsics = self._views(state)
@@ -252,7 +253,7 @@ class Renderer:
 
     @torch.no_grad()
     def outline(self, state: SceneState, tangents: Tangents) -> Outline:
-        """The outlines of one state (no batch), and how they move with the unknowns."""
+        """Outlines of one state (no batch), and their motion with the unknowns."""
         Ts, intrinsics = self._views(state)
         face_ids, inverse_depth = self._visibility(Ts, intrinsics)
         rim = outline_faces(face_ids, inverse_depth)
@@ -268,18 +269,18 @@ class Renderer:
 
     @torch.no_grad()
     def tangents(self, states: SceneState, distance: float) -> Tangents:
-        """Derivatives at a state from those on both sides of it.
+        """Central-difference derivatives at a state.
 
         Args:
-            states: a batch: the state, those below it, an unknown each, and those above it.
-            distance: between the two of an unknown.
+            states: batch of the state, then the state with each unknown decreased, then with each unknown increased.
+            distance: difference between the two values of an unknown.
         """
         return _tangents(*self._views(states), distance)
 
     def _views(self, state: SceneState) -> tuple[Tensor, Tensor]:
         """Ts_camera_link [*batch, cameras, links, 4, 4] and scaled intrinsics of the rendered cameras."""
         if state.T_camera_world.shape[-3] == self._count and self._indices != list(range(self._count)):
-            # A state of the whole scene is cut down to the cameras that are rendered, in their order.
+            # A state of the whole scene is reduced to the rendered cameras, in their order.
             state = SceneState(
                 state.joint_positions,
                 state.T_world_base,
@@ -298,7 +299,7 @@ class Renderer:
             rasterize(points.numpy(), self._faces, intrinsics.tolist(), *size, self._surfaces)
             for points, intrinsics in zip(vertices, views_K.cpu(), strict=True)
         ]
-        if len(seen) == 1:  # the usual case, without a copy
+        if len(seen) == 1:  # the common case, without a copy
             face_ids, inverse_depth = (array[None] for array in seen[0])
         else:
             face_ids, inverse_depth = (np.stack(arrays) for arrays in zip(*seen, strict=True))
@@ -319,15 +320,15 @@ def _side(position: Float[Tensor, "3 K"], normal: Float[Tensor, "3 K"]) -> Float
 def pick_point(
     scene: Scene, renderer: Renderer, state: SceneState, pixel: tuple[float, float], radius: float = 0.0
 ) -> Keypoint | None:
-    """The point of the rendered surface at a pixel, fixed to its link.
+    """Find the point of the rendered surface at a pixel, fixed to its link.
 
     Args:
-        renderer: of one camera of the scene alone, at its full size.
+        renderer: renderer of a single camera of the scene, at full size.
         pixel: column and row, pixel centres at 0.5 [px].
-        radius: how far the centre of the nearest pixel with an arm may be [px]; 0 for the pixel that holds the place.
+        radius: largest distance to the centre of the nearest pixel with an arm [px]; 0 for the given pixel only.
 
     Returns:
-        The point, called after its link; None where no arm is that near.
+        The point, named after its link; None if no arm is within the radius.
     """
     (camera,) = renderer.scene.cameras
     faces, inverse_depth = renderer.visibility(state)

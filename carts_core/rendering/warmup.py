@@ -1,6 +1,6 @@
 """`python -m carts_core.rendering.warmup`: compile the kernels, and prepare the shipped robot's meshes.
 
-Both are kept on disk, so that the first picture does not wait for them.
+Both are cached on disk, which speeds up the first rendering.
 """
 
 import numpy as np
@@ -14,9 +14,9 @@ from .renderer import Renderer
 
 
 def main() -> None:
-    """Render the shipped robot once, in a small picture, and how it changes."""
+    """Render the shipped robot once, in a small picture, with derivatives."""
     robot = Robot.load(shipped_robot(), progress=print)
-    # From a little behind the base, along the instrument.
+    # The camera is slightly behind the base and looks along the instrument.
     T_camera_world = np.eye(4)
     T_camera_world[2, 3] = 0.05
     camera = Camera("camera", 64, 48, (64.0, 64.0, 32.0, 24.0), T_camera_world)

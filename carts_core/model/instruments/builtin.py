@@ -1,7 +1,7 @@
 """`builtin:NAME`: the shipped robot and the built-in instruments as URDFs with meshes.
 
-The meshes are made when a robot is named, and lie in the cache; the shaft, and the wrist and the jaws of the Large
-Needle Driver, are those of the shipped robot.
+Meshes are generated on demand and cached; the shaft, and the wrist and the jaws of the Large Needle Driver, are those
+of the shipped robot.
 """
 
 from collections.abc import Iterator
@@ -26,24 +26,24 @@ from .shapes import CHEEK_OUTSIDE, FIRST, SECOND, Electrode, Jaws, Solid, cylind
 
 SCHEME = "builtin:"
 SHIPPED = "psm_lnd"
-"""The robot that is shipped as files."""
+"""Name of the robot that is shipped as files."""
 
 METAL, CARBIDE, TUBE, CABLE, COLLAR = "metal", "carbide", "tube", "cable", "collar"
 _COLORS = {METAL: 0.60, CARBIDE: 0.50, TUBE: 0.20, CABLE: 0.05, COLLAR: 0.35}
 _SLIM_WRIST = 9.1
 _JAW_LOWEST = -0.349066
-"""Jaws read less than 0 while they grasp [rad]."""
+"""Lower limit of jaws [rad]; measured angles are negative while they grasp."""
 _TURNED_JAW = 'xyz="0 0 -2.5e-05" rpy="0 3.141592653589793 0"'
 """Pose of the first jaw's mesh in the second jaw of the shipped robot."""
 
 
 def builtin_names() -> tuple[str, ...]:
-    """Names after `builtin:`."""
+    """Names that can follow `builtin:`."""
     return (SHIPPED, *(name + suffix for name in BY_NAME for suffix in ("", SI_SUFFIX)))
 
 
 def robot_file(robot: Path | str) -> Path:
-    """The URDF of a robot that is named as a path or as `builtin:NAME`.
+    """URDF file of a robot given as a path or as `builtin:NAME`.
 
     Raises:
         RobotError: there is no built-in robot of that name.
@@ -54,7 +54,7 @@ def robot_file(robot: Path | str) -> Path:
 
 @cache
 def builtin_urdf(name: str) -> Path:
-    """URDF of a built-in robot; its files are generated, or replaced where those in the cache differ.
+    """URDF file of a built-in robot; its files are generated in the cache, where differing ones are replaced.
 
     Raises:
         RobotError: there is no such robot.
@@ -70,7 +70,7 @@ def builtin_urdf(name: str) -> Path:
     try:
         return _written(name, folder)
     except OutputError:
-        # A cache that cannot be written to is no error.
+        # A cache that cannot be written is not an error.
         return _written(name, Path(_scratch().name) / name)
 
 
@@ -81,7 +81,7 @@ def _scratch() -> TemporaryDirectory:
 
 
 def instrument_of(name: str) -> tuple[Instrument, PsmGeometry]:
-    """The instrument and the arm's lengths of a built-in robot other than the shipped one."""
+    """Instrument and arm geometry of a built-in robot other than the shipped one."""
     si = name.endswith(SI_SUFFIX)
     instrument = BY_NAME[name.removesuffix(SI_SUFFIX)]
     arm = SI if si else CLASSIC
@@ -172,7 +172,7 @@ def _urdf(name: str, instrument: Instrument, geometry: PsmGeometry) -> str:
 
 
 def _wrist_joints(geometry: PsmGeometry) -> Iterator[ElementTree.Element]:
-    """From the instrument's base to the link that the jaws turn on."""
+    """Joints from the instrument's base to the link that carries the jaws."""
     roll, pitch, yaw = geometry.limits[3:]
     turn = quarter_turns(0, -1, -1)
     along = f"{geometry.wrist_length:.6g} 0 0"

@@ -1,6 +1,6 @@
 """The built-in instruments: their names, their published kinematics, and the shapes of their tips.
 
-Wrist lengths are those of the dVRK's tool files. Shapes are ours: simple ones of about the right size.
+Wrist lengths are those of the dVRK's tool files. Shapes are simplified, with approximately the right sizes.
 """
 
 from dataclasses import dataclass
@@ -14,16 +14,16 @@ _SLIM = Hub(2.4, 2.0)
 
 @dataclass(frozen=True)
 class Instrument:
-    """A kind of instrument; each exists for the classic arm and for Si."""
+    """Type of instrument, available for the classic and the Si arm."""
 
     name: str
     title: str
     numbers: str
-    """Last three digits of the model numbers of instruments that are built like this."""
+    """Last three digits of the model numbers of this type."""
     wrist_length: float
-    """From the pitch axis to the yaw axis [mm]."""
+    """Distance from the pitch axis to the yaw axis [mm]."""
     tip: Tip | None
-    """None for the shape of the shipped Large Needle Driver."""
+    """Shape of the tip; None for that of the shipped Large Needle Driver."""
     opening: float = 1.39626
     """Largest angle between the jaws [rad]."""
 
@@ -34,7 +34,7 @@ class Instrument:
 
     @property
     def length(self) -> float:
-        """From the yaw axis to the end of the tip [mm]."""
+        """Distance from the yaw axis to the end of the tip [mm]."""
         if self.tip is None:
             return 9.65
         if isinstance(self.tip, Electrode):
@@ -181,6 +181,6 @@ INSTRUMENTS = (
     Instrument("clip_applier", "Clip applier", "230 327", 10.7, ClipApplier(), 0.733),
     Instrument("small_clip_applier", "Small clip applier", "003", 9.1, ClipApplier(18.5, 2.7, 0.9, _SLIM), 0.733),
 )
-"""In the order in which they are listed."""
+"""Built-in instruments, in the order in which they are listed."""
 
 BY_NAME = {instrument.name: instrument for instrument in INSTRUMENTS}

@@ -1,9 +1,9 @@
 """Shapes of the built-in instruments [mm]: closed meshes from cross-sections, the wide wrist, and the tips.
 
-Meshes of an instrument may overlap, since the renderer draws the outside of their union. The wrist is in the wrist
+Meshes of an instrument may overlap, since the renderer shows the outside of their union. The wrist is in the wrist
 pitch link's frame: x to the tip, the pitch axis along z through the origin, the yaw axis parallel to y at x = the
-wrist's length. Tips are in the jaw link's frame: y to the tip, the yaw axis along z; a jaw lies on the side of its sign
-along x, its gripping face near x = 0.
+wrist's length. Tips are in the jaw link's frame: y to the tip, the yaw axis along z; the sign of a jaw is that of its x
+coordinates, and its gripping face is near x = 0.
 """
 
 import itertools
@@ -18,26 +18,26 @@ _AXES = {"x": [[0, 0, 1], [1, 0, 0], [0, 1, 0]], "y": [[0, 1, 0], [0, 0, 1], [1,
 
 @dataclass(frozen=True)
 class Solid:
-    """A closed surface, or several of them."""
+    """Mesh of one or several closed surfaces."""
 
     vertices: Float[np.ndarray, "V 3"]
-    """[mm]"""
+    """Vertex positions [mm]."""
     faces: Int[np.ndarray, "F 3"]
-    """Counter-clockwise seen from outside."""
+    """Vertex indices, counter-clockwise seen from outside."""
 
     def mirrored(self, axis: int) -> "Solid":
-        """The solid with the sign of one coordinate changed."""
+        """The solid mirrored along one axis."""
         vertices = self.vertices.copy()
         vertices[:, axis] *= -1
         return Solid(vertices, self.faces[:, ::-1])
 
     def moved(self, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> "Solid":
-        """The solid, displaced [mm]."""
+        """The solid translated by (x, y, z) [mm]."""
         return Solid(self.vertices + np.array([x, y, z]), self.faces)
 
 
 def together(parts: Iterable[Solid]) -> Solid:
-    """Several solids as one mesh."""
+    """Combine several solids into one mesh."""
     vertices, faces, count = [], [], 0
     for part in parts:
         vertices.append(part.vertices)
@@ -47,7 +47,7 @@ def together(parts: Iterable[Solid]) -> Solid:
 
 
 def loft(rings: Float[np.ndarray, "rings n 3"]) -> Solid:
-    """The solid through a stack of star-shaped rings of equally many points [mm], closed by flat ends."""
+    """Loft a solid through star-shaped rings with equal numbers of points [mm], closed by flat ends."""
     rings = np.asarray(rings, dtype=float)
     count, n, _ = rings.shape
     vertices = np.concatenate([rings.reshape(-1, 3), rings[0].mean(0)[None], rings[-1].mean(0)[None]])
@@ -66,7 +66,7 @@ def loft(rings: Float[np.ndarray, "rings n 3"]) -> Solid:
 
 
 def turned(profile: Sequence[tuple[float, float]], axis: str, segments: int = 28) -> Solid:
-    """A profile of (radius, height) [mm] turned about an axis; heights rise, radii are above 0."""
+    """Solid of revolution from a profile of (radius, height) [mm]; heights increase, radii are positive."""
     angles = np.arange(segments) * (2 * np.pi / segments)
     circle = np.stack([np.cos(angles), np.sin(angles), np.zeros(segments)], axis=1)
     rings = [circle * (radius, radius, 0.0) + (0.0, 0.0, height) for radius, height in profile]
@@ -81,7 +81,7 @@ def cylinder(radius: float, low: float, high: float, axis: str, segments: int = 
 
 
 def plate(outline: Sequence[tuple[float, float]], low: float, high: float, axis: str) -> Solid:
-    """A star-shaped outline with a small bevel, from `low` to `high` [mm] along an axis.
+    """Extrude a star-shaped outline from `low` to `high` [mm] along an axis, with a small bevel.
 
     Args:
         outline: corners [mm], (y, z) for axis "x", (z, x) for axis "y", (x, y) for axis "z".
@@ -122,8 +122,8 @@ def bar(stations: Float[np.ndarray, "n 5"], roundness: float = 0.35) -> Solid:
     """A bar along y with a rounded rectangle as its cross-section.
 
     Args:
-        stations: y, lower and upper x, lower and upper z [mm] of each cross-section, y rising.
-        roundness: radius of the corners, a part of the smaller side's half.
+        stations: y, lower and upper x, lower and upper z [mm] of each cross-section, with increasing y.
+        roundness: radius of the corners, relative to half the smaller side [1].
     """
     quarter = np.linspace(-np.pi / 2, 0.0, 3)
     rings = []
@@ -142,19 +142,19 @@ def bar(stations: Float[np.ndarray, "n 5"], roundness: float = 0.35) -> Solid:
 
 
 CHEEK_OUTSIDE = 4.2
-"""Half the wrist's width along the yaw axis."""
+"""Half the wrist's width along the yaw axis [mm]."""
 CHEEK_INSIDE = 2.95
 _NECK = 1.2
-"""Half the thickness of the part between the shaft's fork arms."""
+"""Half the thickness of the part between the shaft's fork arms [mm]."""
 _END = 4.1
 """Extent of the cheeks beyond the yaw axis [mm]."""
 
 
 def wide_body(length: float) -> Solid:
-    """Neck, block and the two cheeks that hold the tip, with pins and pulleys.
+    """Body of the wide wrist: neck, block and the two cheeks that hold the tip, with pins and pulleys.
 
     Args:
-        length: from the pitch axis to the yaw axis [mm].
+        length: distance from the pitch axis to the yaw axis [mm].
     """
     neck = [(-2.4, 1.2), (-1.2, 2.4), (0.0, 2.85), (1.0, 3.3), (2.0, 3.8), (4.5, 4.0)]
     outline = [*((x, -y) for x, y in neck), *neck[::-1]]
@@ -171,7 +171,7 @@ def wide_body(length: float) -> Solid:
 
 
 def _block(length: float) -> Solid:
-    """The middle part that carries the cheeks: as wide as they are, and slimmer towards the jaws."""
+    """Block that carries the cheeks: as wide as they are, and tapered towards the jaws."""
     rings = []
     for x, y, z in ((2.9, 3.6, 2.9), (3.3, 4.0, 3.3), (length - 5.8, 4.0, 3.4), (length - 5.0, 3.4, 2.6)):
         half = np.array([(1, 0.55), (0.8, 1), (-0.8, 1), (-1, 0.55), (-1, -0.55), (-0.8, -1), (0.8, -1), (1, -0.55)])
@@ -180,7 +180,7 @@ def _block(length: float) -> Solid:
 
 
 def _cheek(length: float, side: float) -> Solid:
-    """The plate beside the tip's hub: straight flanks, round about the yaw axis, domed outside."""
+    """Plate beside the tip's hub, with straight flanks, rounded about the yaw axis and domed outside."""
     angles = np.deg2rad(np.linspace(-75, 75, 11))
     nose = np.stack([length + _END * np.cos(angles), 3.95 * np.sin(angles)], axis=1)
     flank = np.array([(6.0, 3.45), (3.6, 3.3), (2.7, 2.6), (2.5, 1.2)])
@@ -194,14 +194,14 @@ def _cheek(length: float, side: float) -> Solid:
 
 
 def wide_cables(length: float) -> Solid:
-    """The two cables that run between the cheeks to the tip's hub."""
+    """Two cables that run between the cheeks to the tip's hub."""
     run = np.array([(2.5, -0.3, 2.5), (5.0, 0.4, 3.3), (length - 1.5, 0.9, 3.5), (length + 0.5, 0.9, 3.45)])
     first = wire(run, 0.25, 6)
     return together([first, Solid(first.vertices * (1, -1, -1), first.faces)])
 
 
 Table = tuple[tuple[float, float], ...]
-"""Pairs of a place along the blade, 0 at its root and 1 at its end, and a length [mm]."""
+"""Pairs of a position along the blade, 0 at its root and 1 at its end, and a length [mm]."""
 
 FIRST, SECOND = -1, 1
 """Sides of the jaws `jaw_1_link` and `jaw_2_link`."""
@@ -209,12 +209,12 @@ FIRST, SECOND = -1, 1
 
 @dataclass(frozen=True)
 class Hub:
-    """The discs around the yaw axis that the tip turns on."""
+    """Discs on the yaw axis about which the tip rotates."""
 
     radius: float = 3.4
-    """[mm]"""
+    """Radius of the discs [mm]."""
     height: float = 2.6
-    """Half the height of both together [mm]."""
+    """Half the height of both discs together [mm]."""
 
 
 @dataclass(frozen=True)
@@ -222,20 +222,20 @@ class Jaws:
     """Two blades that open like pliers."""
 
     length: float
-    """From the yaw axis to the end of the closed jaws [mm]."""
+    """Distance from the yaw axis to the end of the closed jaws [mm]."""
     widths: Table
     """Half width of a blade, across the opening plane."""
     thickness: Table
-    """From the gripping face outwards."""
+    """Thickness of a blade, from the gripping face outwards."""
     hub: Hub = Hub()
     root: float = 4.0
-    """Where the blades begin [mm]."""
+    """Distance from the yaw axis to the root of the blades [mm]."""
     arch: float = 0.0
     """Lateral bend of the blades' middle [mm]."""
     turn: float = 0.0
     """Lateral bend of their ends [mm]."""
     windows: tuple[tuple[float, float], ...] = ()
-    """Openings in a blade, from and to, places along it."""
+    """Openings in a blade: start and end, as positions along it from 0 to 1."""
     rim: float = 0.75
     """Width of the rim beside a window [mm]."""
     insert: float = 0.0
@@ -271,7 +271,7 @@ class Jaws:
         return together([cylinder(self.hub.radius, -self.hub.height, self.hub.height, "z", 32), bridge])
 
     def inserted(self, side: int) -> Solid | None:
-        """The insert of one jaw, if it has one."""
+        """Insert of one jaw; None if it has none."""
         if not self.insert:
             return None
         table = self._stations(side, np.linspace(0.3, 0.985, 8), self.root - self.pivot)
@@ -299,7 +299,7 @@ class Scissors:
     """Two thin blades that pass each other."""
 
     length: float
-    """From the yaw axis to the end [mm]."""
+    """Distance from the yaw axis to the end of the tip [mm]."""
     widths: Table
     """Half width of a blade in the opening plane."""
     blade: float = 0.95
@@ -308,9 +308,9 @@ class Scissors:
     turn: float = 0.0
     """Lateral bend of the ends [mm]."""
     root: float = 2.0
-    """Where the blades begin [mm]."""
+    """Distance from the yaw axis to the root of the blades [mm]."""
     pivot: float = 0.0
-    """Always 0: blades turn about the yaw axis."""
+    """Always 0: blades rotate about the yaw axis."""
 
     def jaw(self, side: int) -> Solid:
         """One blade with its hub."""
@@ -326,7 +326,7 @@ class Scissors:
         return together([_hub(self.hub, side, 0.0), bar(table, 0.15)])
 
     def inserted(self, side: int) -> Solid | None:
-        """Nothing: a blade is of one material."""
+        """None: a blade is made of one material."""
         return None
 
 
@@ -335,14 +335,14 @@ class ClipApplier:
     """Two bowed arms with a groove for a clip at their ends."""
 
     length: float = 22.2
-    """From the yaw axis to the end [mm]."""
+    """Distance from the yaw axis to the end of the tip [mm]."""
     bow: float = 3.7
     """Largest distance of an arm's outside from the middle [mm]."""
     height: float = 1.15
     """Half the width of an arm across the opening plane [mm]."""
     hub: Hub = Hub()
     pivot: float = 0.0
-    """Always 0: the arms turn about the yaw axis."""
+    """Always 0: the arms rotate about the yaw axis."""
 
     def jaw(self, side: int) -> Solid:
         """One arm with its base."""
@@ -356,7 +356,7 @@ class ClipApplier:
         inner = side * np.interp(places, [0, 0.2, 0.85, 1.0], [0.45, 1.7, 0.7, 0.7])
         x = np.sort(np.stack([inner, outer], axis=1), axis=1)
         y = near - 1.5 + places * (far - near + 1.5)
-        # At its foot the arm is as high as the base, which lies off the middle.
+        # At its foot the arm is as high as the base, which is off-centre.
         foot = (places < 0.2).astype(float)
         below = -self.height + foot * min(0.0, low + self.height)
         above = self.height + foot * max(0.0, high - self.height)
@@ -367,7 +367,7 @@ class ClipApplier:
         return together(parts)
 
     def inserted(self, side: int) -> Solid | None:
-        """Nothing: an arm is of one material."""
+        """None: an arm is made of one material."""
         return None
 
 
@@ -376,16 +376,16 @@ class Electrode:
     """A tip without jaws: a bent wire, or a paddle, on an insulated collar."""
 
     path: tuple[tuple[float, float], ...]
-    """Middle of the wire from the collar on, (x, y) [mm]."""
+    """Centre line of the wire from the collar on, (x, y) [mm]."""
     radius: float = 0.62
-    """Of the wire [mm]."""
+    """Radius of the wire [mm]."""
     collar: float = 6.4
-    """Where the collar ends [mm]."""
+    """End of the collar along y [mm]."""
     paddle: tuple[float, float, float] | None = None
     """Length, half width and half thickness of a paddle at the end of the wire [mm]."""
     hub: Hub = Hub(3.3, 2.5)
     height: float = 0.9
-    """Of the wire over the middle, along the yaw axis [mm]."""
+    """Offset of the wire from the middle, along the yaw axis [mm]."""
 
     def body(self) -> Solid:
         """Hub and collar."""
@@ -394,7 +394,7 @@ class Electrode:
         return together([hub, *(part.moved(z=self.height) for part in collar)])
 
     def electrode(self) -> Solid:
-        """The wire, and the paddle if there is one."""
+        """Wire, with its paddle if it has one."""
         path = np.array([(x, y, self.height) for x, y in self.path])
         parts = [wire(path, [self.radius] * (len(path) - 1) + [0.7 * self.radius])]
         if self.paddle:
@@ -417,13 +417,13 @@ def _at(table: Sequence[tuple[float, float]], places: np.ndarray) -> np.ndarray:
 
 
 def _hub(hub: Hub, side: int, pivot: float) -> Solid:
-    """The half of the hub that one jaw has, above or below the other's; a jaw with a pivot has a lug instead."""
+    """One jaw's half of the hub, above or below the other's; a jaw with a pivot has a lug instead."""
     low, high = (0.03, hub.height) if side == FIRST else (-hub.height, -0.03)
     return cylinder(0.6 * hub.radius if pivot else hub.radius, low, high, "z", 32)
 
 
 def _neck(tip: Jaws, side: int) -> Solid:
-    """From the hub's half, off the middle, to the blade in the middle."""
+    """Transition from a jaw's half of the hub, which is off-centre, to its centred blade."""
     first = tip.root - tip.pivot
     width, thickness = tip.widths[0][1], tip.thickness[0][1]
     low, high = (0.05, tip.hub.height - 0.1) if side == FIRST else (0.1 - tip.hub.height, -0.05)
