@@ -36,8 +36,8 @@ class ImageMessage(msgspec.Struct, forbid_unknown_fields=True):
     encoding: Literal["jpeg", "png", "rgb8"] = "jpeg"
     """Encoding of the image; `rgb8` has three bytes per pixel, row by row."""
     width: int = 0
-    """Width of an `rgb8` image [px]."""
     height: int = 0
+    """Size of an `rgb8` image, `width` and `height` [px]."""
 
 
 class FrameMessage(msgspec.Struct, tag="frame", forbid_unknown_fields=True):

@@ -1,4 +1,4 @@
-"""Recordings: the sequence format and its loader. Wrong or missing content is a `SequenceError`."""
+"""Recordings: the sequence format and its loader. Invalid or missing content raises `SequenceError`."""
 
 from .background import MeanBackground as MeanBackground
 from .background import background_of_recording as background_of_recording

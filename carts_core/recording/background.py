@@ -27,7 +27,7 @@ _FEWEST = 3
 """Smallest number of views whose agreement makes a pixel known [1]."""
 
 _AGREE = 3.0, 4.0
-"""Largest difference between views of the empty scene: multiple of the image's usual deviation, plus grey levels."""
+"""Largest difference between views of the empty scene: multiple of the image's typical deviation, plus grey levels."""
 
 _COVERED = 256
 _ROWS_AT_ONCE = 64
@@ -41,7 +41,7 @@ class MeanBackground:
     known: Bool[np.ndarray, "height width"]
     """Pixels that show no arm, even with the expected error of measured kinematics."""
     problem: str | None = None
-    """Why the background is not reliable, as a sentence; None where it is."""
+    """Why the background is not reliable, as a sentence; None if it is reliable."""
 
 
 def spread(length: int, count: int = FRAMES) -> list[int]:
@@ -61,13 +61,13 @@ def background_of_recording(
 ) -> MeanBackground:
     """The mean background of a recording: the median of each pixel over the views in which no arm covers it.
 
-    A pixel that is always covered is filled in from its surroundings. A pixel is known where the arms are far away in
-    most of the views that it is the median of, or where many views agree: an arm that is there despite wrong
-    kinematics moves and changes its shading.
+    A pixel that is always covered is filled in from its surroundings. A pixel is known if the arms are far from it in
+    most of the views in its median, or if many views agree: an arm that is present despite inaccurate kinematics moves
+    and changes its shading.
 
     Args:
-        scene: with the camera.
-        camera: its name.
+        scene: scene with the camera.
+        camera: name of the camera.
         states: measured state of the scene in each view.
         image: index in `states` -> image of the frame.
 
@@ -136,8 +136,8 @@ def _middle(values: Int[np.ndarray, "views ..."], count: Int[np.ndarray, "rows c
 def filled_in(
     image: UInt8[np.ndarray, "height width 3"], hole: Bool[np.ndarray, "height width"]
 ) -> UInt8[np.ndarray, "height width 3"]:
-    """`image` with the pixels that are never seen filled in from their surroundings."""
-    # Beside always covered pixels the arm itself may be visible, if its error exceeds the margin.
+    """`image` with permanently covered pixels filled in from their surroundings."""
+    # Next to permanently covered pixels the arm itself may be visible, if its error exceeds the margin.
     rim = widen(hole)
     return fill(image, hole if rim.all() else rim)
 
@@ -145,7 +145,7 @@ def filled_in(
 def fill(
     image: UInt8[np.ndarray, "height width 3"], hole: Bool[np.ndarray, "height width"]
 ) -> UInt8[np.ndarray, "height width 3"]:
-    """`image` with the pixels of `hole` blended in smoothly from around it (pull-push over a pyramid)."""
+    """`image` with the pixels of `hole` filled in smoothly from their surroundings (pull-push over a pyramid)."""
     if not hole.any():
         return image
     weight = (~hole).astype(np.float32)

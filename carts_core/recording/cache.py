@@ -45,7 +45,7 @@ class ByteCache(Generic[T]):
         return value
 
     def find(self, key: Hashable) -> T | None:
-        """The cached value of `key`; None without one."""
+        """The cached value of `key`; None if it is not cached."""
         with self._changed:
             if key in self._values:
                 self._values.move_to_end(key)

@@ -25,7 +25,7 @@ EXAMPLES = '"left/{frame}.jpg", "left/{frame:06d}.png", "{domain}/{index:04d}.jp
 
 
 class FrameId(str):
-    """Id of a frame that a pattern can pad: `{frame}` is the text, `{frame:03d}` its number."""
+    """Id of a frame for use in patterns: `{frame}` gives its text, `{frame:03d}` its padded number."""
 
     def __format__(self, spec: str) -> str:
         return format(int(self), spec) if spec.endswith("d") else format(str(self), spec)
@@ -124,7 +124,7 @@ class FrameNames:
         else:
             ids = tuple(expand(self.pattern, key, frame=FrameId(cell)) for cell in cells)
         if all(map(str.isdecimal, ids)) and max(map(len, ids)) <= _SHORT and len(set(ids)) == len(ids):
-            return ids  # Fast path: numbers can only be wrong by repetition, and an hour has a hundred thousand.
+            return ids  # Fast path, since an hour has 100,000 frames: numbers can only be wrong by repetition.
         lines: dict[str, int] = {}
         for frame_id, line in zip(ids, table.lines, strict=True):
             if not frame_id:
@@ -143,7 +143,7 @@ class FrameNames:
 
 
 def take_frame_names(section: TomlTable) -> FrameNames:
-    """The keys `frame` and `frame_id`."""
+    """Read the keys `frame` and `frame_id`."""
     return FrameNames(section.take("frame", str, "frame"), _take_pattern(section), f"`frame` in {section.where}")
 
 
@@ -165,10 +165,10 @@ def take_frame_list(section: TomlTable) -> FrameList:
 
 
 def list_of_rows(table: Table, names: FrameNames, timestamp: str, section: TomlTable, counted: str) -> FrameList:
-    """One frame per row of a table that a section describes, its key `video_frame` included.
+    """Frames from the rows of a table, and from the key `video_frame` of its section.
 
     Args:
-        timestamp: column with the time [s]; empty for frames without times.
+        timestamp: name of the column with times [s]; empty for frames without times.
         counted: number of frames, as a clause for errors.
     """
     frame_ids = names.of(table)
@@ -179,7 +179,7 @@ def list_of_rows(table: Table, names: FrameNames, timestamp: str, section: TomlT
 
 
 def take_delimiter(section: TomlTable) -> str:
-    """The key `delimiter`."""
+    """Read the key `delimiter`."""
     delimiter = section.take("delimiter", str, ",")
     if len(delimiter) != 1:
         raise section.error("delimiter", f"is {delimiter!r}, but must be one character.")
@@ -267,7 +267,7 @@ def _matching(base: Path, key: str) -> tuple[Path, list[Path]]:
 
 
 def check_present(key: str, files: tuple[Path, ...], frames: FrameList, hint: str = "") -> None:
-    """Check that every frame's file is there."""
+    """Check that the file of every frame exists."""
     missing = [(file, frame_id) for file, frame_id in zip(files, frames.frame_ids, strict=True) if not is_regular(file)]
     if missing:
         shown = ", ".join(f"{file} (frame {frame_id})" for file, frame_id in missing[:_SHOWN_MISSING])

@@ -1,4 +1,4 @@
-"""Image sources beside plain files and videos: crops of other sources, and topics of ROS bags."""
+"""Image sources other than files and videos: crops of other sources, and topics of ROS bags."""
 
 import hashlib
 import threading
@@ -50,7 +50,7 @@ class Cropped:
         return self.source.name(index)
 
     def read(self, index: int) -> UInt8[np.ndarray, "height width 3"]:
-        """The rectangle, RGB; `SequenceError` if the image cannot be read or the rectangle leaves it."""
+        """The rectangle, RGB; `SequenceError` if the image cannot be read or does not contain the rectangle."""
         image = self.source.read(index)
         left, top, width, height = self.crop
         if left + width > image.shape[1] or top + height > image.shape[0]:
@@ -70,7 +70,7 @@ class Cropped:
 
 
 class Bag:
-    """An opened ROS bag, read in a child process, one call at a time; use as a context.
+    """An opened ROS bag, read in a child process, one call at a time; use as a context manager.
 
     Attributes:
         topics: name and message type of each topic.
@@ -105,7 +105,7 @@ class Bag:
         return record, stamps
 
     def message(self, topic: str, time: int | None = None) -> Any:
-        """The message recorded at a time [ns], or the first one; None if there is none. Errors as of the
+        """The message recorded at a time [ns], or the first one; None if there is no such message. Errors as of the
         constructor."""
         fields = self._call(bags.message, topic, time)
         return None if fields is None else SimpleNamespace(**fields)
@@ -134,7 +134,7 @@ class BagImages:
 
     Args:
         path: ROS 1 bag, MCAP file or ROS 2 bag folder.
-        topic: of `sensor_msgs/Image` or `sensor_msgs/CompressedImage`.
+        topic: topic of type `sensor_msgs/Image` or `sensor_msgs/CompressedImage`.
         times: record time of every frame's message [ns].
 
     Raises:
@@ -172,7 +172,7 @@ class BagImages:
         return message
 
     def remarks(self) -> tuple[str, ...]:
-        """No remarks: messages are used as they are."""
+        """No remarks: images are used unchanged."""
         return ()
 
 

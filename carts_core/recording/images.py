@@ -1,6 +1,6 @@
 """Image files and masks: strict decoding, upright orientation, 8 bits, and remarks on every change to stored pixels.
 
-Unusable files are a `SequenceError`; a truncated one gives no half grey image.
+Unusable files raise `SequenceError`; truncated files are rejected, never decoded partially.
 """
 
 import hashlib
@@ -61,7 +61,7 @@ class ImageFiles:
     """An image file per frame.
 
     Args:
-        files: their paths.
+        files: paths of the files.
         bits: bit depth of files of 16 bits; None for the depth in use, measured in some of them.
     """
 
@@ -101,10 +101,10 @@ class ImageFiles:
 
 
 def read_image(path: Path, bits: Callable[[], int] | None = None) -> UInt8[np.ndarray, "height width 3"]:
-    """An image file as RGB, rotated as its EXIF orientation requires.
+    """Read an image file as RGB, rotated according to its EXIF orientation.
 
     Args:
-        path: of the file.
+        path: path of the file.
         bits: bit depth of a file of 16 bits; by default the depth in use.
 
     Raises:
@@ -114,12 +114,13 @@ def read_image(path: Path, bits: Callable[[], int] | None = None) -> UInt8[np.nd
 
 
 def decode_image(content: bytes, what: str) -> UInt8[np.ndarray, "height width 3"]:
-    """As `read_image`, for an encoded image in memory."""
+    """Like `read_image`, for an encoded image in memory."""
     return _eight_bits(_raster(content, what, colour=True), what)
 
 
 def read_mask(path: Path) -> Bool[np.ndarray, "height width"]:
-    """A mask file: white, one colour, or opaque on transparent is instrument; values from 128 of 255 are white.
+    """Read a mask file: instruments are white, of one colour, or opaque on transparent; values from 128 of 255 count as
+    white.
 
     Raises:
         SequenceError: the file is missing, truncated, not an image, or has labels instead of black and white.
@@ -156,13 +157,13 @@ class LabelImage:
     values: np.ndarray | None
     """Grey values in full depth, or palette indices [height, width]; None for colours."""
     colours: UInt8[np.ndarray, "height width 3"]
-    """RGB"""
+    """Colour of each pixel, RGB."""
     remarks: tuple[str, ...]
     """Changes and decisions, as clauses that follow the file's name."""
 
 
 def read_labels(path: Path) -> LabelImage:
-    """A label image or mask, in full depth."""
+    """Read a label image or mask, in full depth."""
     raster = _decode(path, colour=False)
     grey, remarks = raster.grey, _orientation_remarks([raster.traits])
     mask = _white_part(raster, f"mask {path}")
@@ -257,14 +258,14 @@ class _Raster:
     pixels: np.ndarray
     """[height, width] or [height, width, 3], RGB, of 8 or 16 bits."""
     opaque: np.ndarray | None
-    """Opaque pixels; None where all are."""
+    """Opaque pixels; None if all are."""
     indices: np.ndarray | None
     """Palette indices; None without a palette."""
     traits: ImageTraits
 
     @property
     def white(self) -> int:
-        """Largest value of a pixel."""
+        """Largest possible value of a pixel."""
         return int(np.iinfo(self.pixels.dtype).max)
 
     @property
@@ -407,7 +408,7 @@ def _orientation_remarks(traits: Sequence[ImageTraits]) -> list[str]:
 
 
 def find_damage(content: bytes) -> str | None:
-    """Description of the damage of a JPEG or PNG file; None for a whole one and for other kinds.
+    """Description of the damage of a JPEG or PNG file; None for an intact one and for other formats.
 
     OpenCV decodes a truncated JPEG without an error and leaves the rest grey, so the file itself is checked.
     """

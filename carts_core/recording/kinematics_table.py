@@ -47,7 +47,7 @@ class Table:
         try:
             values = np.fromiter(map(float, self._cells(column, asked_by)), np.float64, len(self))
         except ValueError:
-            # A cell is not a number; this slower way finds it.
+            # A cell is not a number; this slower loop finds it.
             values = np.fromiter(map(_number, self._cells(column, asked_by)), np.float64, len(self))
         if (wrong := np.flatnonzero(~np.isfinite(values))).size:
             row, cells = wrong[0], self.text(column, asked_by)
@@ -132,12 +132,12 @@ class Joint:
     name: str
     revolute: bool
     lower: float
-    """[rad], [m]; infinite where not given."""
+    """Lower limit [rad], [m]; infinite if not given."""
     upper: float
 
     @property
     def kind(self) -> str:
-        """Type of the joint, as `Robot.joint_types` has it."""
+        """Type of the joint, as in `Robot.joint_types`."""
         return "revolute" if self.revolute else "prismatic"
 
     @property
@@ -208,7 +208,7 @@ class Misfit:
 
     joint: Joint
     lowest: float
-    """[rad], [m]"""
+    """Smallest position [rad], [m]."""
     highest: float
     remedies: tuple[Remedy, ...] = ()
 
@@ -239,7 +239,7 @@ def misfits(
 
 
 def _remedies(joint: Joint, values: np.ndarray) -> list[Remedy]:
-    """Units and signs that bring positions read as SI units within the limits."""
+    """Changes of unit or sign that would bring the joint's positions within its limits."""
     found = [Remedy("the other sign", f"--flip {joint.name}")] if joint.fits(-values) else []
     for unit, factor in joint.units.items():
         if factor != 1.0 and joint.fits(values * factor) and not (found and unit != "deg"):
@@ -280,9 +280,9 @@ class JointColumn:
     joint: Joint
     column: str
     scale: float
-    """[rad or m per unit of the column]"""
+    """Scale [rad or m per unit of the column]."""
     offset: float
-    """[rad] or [m]"""
+    """Offset [rad] or [m]."""
     unit: str
     given: bool = False
     """Whether the file states the unit, so that positions beyond the limits are intended."""
@@ -342,7 +342,7 @@ class JointColumns:
 
 
 def take_joints(table: TomlTable, robot: Robot) -> JointColumns:
-    """The keys `joints`, `defaults`, `angle_unit` and `length_unit` of an `[[arms]]` table."""
+    """Read the keys `joints`, `defaults`, `angle_unit` and `length_unit` of an `[[arms]]` table."""
     units = {
         "revolute": (table.take_choice("angle_unit", (*ANGLE_UNITS, PERCENT), "rad"), "angle_unit" in table),
         "prismatic": (table.take_choice("length_unit", (*LENGTH_UNITS, PERCENT), "m"), "length_unit" in table),

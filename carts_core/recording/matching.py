@@ -32,7 +32,7 @@ class TimeMatching:
 
 
 def take_matching(section: TomlTable) -> TimeMatching:
-    """The keys `time_offset`, `interpolation` and `max_gap` of `[frames]`."""
+    """Read the keys `time_offset`, `interpolation` and `max_gap` of `[frames]`."""
     time_offset = float(section.take("time_offset", float, 0.0))
     interpolation = section.take_choice("interpolation", INTERPOLATIONS, "linear")
     max_gap = float(section.take("max_gap", float, TimeMatching.max_gap))
@@ -133,7 +133,7 @@ class Rows:
     names: FrameNames | None
     """Column and pattern of the frames' ids; None where rows are matched by time."""
     timestamp: str
-    """Column with the time of a row; empty without one."""
+    """Column with the time of a row; empty if there is none."""
 
     def measured_of(self, arm: TomlTable, columns: JointColumns) -> Samples:
         """The measured joint positions of an arm, from its own `table` or that of the sequence; errors as `read`."""
@@ -150,7 +150,7 @@ class Rows:
         return self.samples(table, columns.read(table))
 
     def read(self, path: Path) -> Table:
-        """Another table with the same frames, or of the same clock."""
+        """Read another table with the same frames or the same clock."""
         table = read_table(path, self.delimiter)
         if self.names is None:
             return table
@@ -182,7 +182,7 @@ class Rows:
 
 
 def take_rows(section: TomlTable, frames_section: TomlTable | None) -> Rows:
-    """Read the tables that `[kinematics]` and `[frames]` describe; without the latter, every row is a frame."""
+    """Read the tables that `[kinematics]` and `[frames]` describe; without `[frames]`, every row is a frame."""
     delimiter = take_delimiter(section)
     table = read_table(section.path(section.take("table", str)), delimiter)
     timestamp, truth = section.take("timestamp", str, ""), section.take("truth", str, "")
@@ -208,7 +208,7 @@ def take_rows(section: TomlTable, frames_section: TomlTable | None) -> Rows:
 
 POSES = ("T_world_mount", "T_mount_world")
 POSITION, ORIENTATION = ("x", "y", "z"), ("qx", "qy", "qz", "qw")
-"""Columns of a pose by default [m], unit quaternion."""
+"""Default columns of a pose: position [m] and unit quaternion."""
 
 _NORM_TOLERANCE = 0.01
 """Largest deviation of a quaternion's norm from 1."""
@@ -217,7 +217,7 @@ _FARTHEST = 100.0
 
 
 def take_camera_motion(table: TomlTable, rows: Rows) -> Samples | None:
-    """The key `motion` of a `[[cameras]]` table; None without one."""
+    """Read the key `motion` of a `[[cameras]]` table; None if it is absent."""
     given = table.take("motion", (str, dict), {})
     if not given:
         return None

@@ -39,11 +39,11 @@ class Frame:
     measured: dict[str, Float[np.ndarray, " dofs"]]
     """Arm -> joint positions [rad, m] in the order of `Robot.joint_names`; unmeasured joints are at their default."""
     truth: dict[str, Float[np.ndarray, " dofs"]] | None
-    """Arm -> true joint positions, None where the sequence has none."""
+    """Arm -> true joint positions [rad, m]; None if the sequence has none."""
     masks: dict[str, Bool[np.ndarray, "height width"]] | None
-    """Camera -> instrument mask, undistorted; None where no camera has a mask in this frame."""
+    """Camera -> instrument mask, undistorted; None if no camera has a mask in this frame."""
     timestamp: float | None
-    """[s]"""
+    """Acquisition time [s]; None if not known."""
     mounts: dict[str, Float[np.ndarray, "4 4"]] = field(default_factory=dict)
     """Camera -> T_mount_world [m], of the cameras that move."""
 
@@ -59,7 +59,7 @@ class Logged:
 
 
 class Sequence:
-    """A recording described by a sequence file. Made by `Sequence.open`; thread-safe.
+    """A recording described by a sequence file. Created by `Sequence.open`; thread-safe.
 
     Attributes:
         path: the sequence file.
@@ -67,13 +67,13 @@ class Sequence:
         scene: arms and cameras as calibrated, cameras without distortion.
         domains: the variants of every image; the first is the default.
         frame_ids: name of every frame.
-        timestamps: when each image was taken [frames] [s], or None.
+        timestamps: acquisition time of each image [frames] [s], or None.
         matching: how joint positions are matched with frames by time, or None where each row of the table is a frame.
         measured_joints: arm -> joints that the kinematics table measures, in the robot's order.
         measured: arm -> joint positions of all frames [frames, dofs] [rad, m].
         truth: arm -> true joint positions of all frames, or None; only the arms that have one.
-        remarks: sentences on what is changed about images and masks before they are used (turned, scaled to 8 bits,
-            deinterlaced), and on what is unusual about calibrations.
+        remarks: sentences on changes to images and masks before they are used (rotation, scaling to 8 bits,
+            deinterlacing), and on unusual calibrations.
     """
 
     def __init__(self, description: Description) -> None:
@@ -107,8 +107,8 @@ class Sequence:
             progress: called with a line of progress.
 
         Raises:
-            SequenceError: the file or something it points at is missing or wrong.
-            RobotError: a robot or one of its meshes is missing or wrong.
+            SequenceError: the file, or a file that it refers to, is missing or invalid.
+            RobotError: a robot or one of its meshes is missing or invalid.
         """
         # Absolute, so that images are found later from any working directory.
         return Sequence(read_description(Path(path).absolute(), progress))
@@ -180,7 +180,7 @@ class Sequence:
         return Logged(arms, {name: motion.logged_at(times) for name, motion in cameras.items()})
 
     def checked_matching(self) -> TimeMatching:
-        """Matching of frames and rows by time; `SequenceError` without it."""
+        """Matching of frames and rows by time; `SequenceError` if rows are not matched by time."""
         if self.matching is None:
             raise SequenceError(
                 f"{self.path} has a row of joint positions for each frame, so there is no time to offset. "
@@ -197,7 +197,7 @@ class Sequence:
         return self._camera(camera).images[self._domain(domain)]
 
     def image_file(self, index: int, camera: str, domain: str | None = None) -> Path | None:
-        """The file with exactly the pixels of a frame's image; None where the image is undistorted, cropped, turned or
+        """File with exactly the pixels of a frame's image; None if the image is undistorted, cropped, rotated, or
         decoded from a video or a bag. Errors as `has_masks`."""
         entry = self._camera(camera)
         source = entry.images[self._domain(domain)]
@@ -210,21 +210,21 @@ class Sequence:
         return self._camera(camera).images[self._domain(domain)].fingerprint(index)
 
     def mask_fingerprint(self, index: int, camera: str, domain: str | None = None) -> str | None:
-        """SHA-256 of the mask file of a frame; None without one. Errors as `image_fingerprint`."""
+        """SHA-256 of the mask file of a frame; None if it has no mask. Errors as `image_fingerprint`."""
         masks = self._camera(camera).masks.get(self._domain(domain))
         path = None if masks is None else masks[index]
         return None if path is None else hashlib.sha256(read_file(path)).hexdigest()
 
     def has_masks(self, camera: str, domain: str | None = None, index: int | None = None) -> bool:
-        """Whether the sequence file gives masks for a camera (in a domain), or one for the frame at a position."""
+        """Whether the sequence file gives masks for a camera, optionally in a domain or for one frame."""
         masks = self._camera(camera).masks.get(self._domain(domain))
         return masks is not None and (index is None or masks[index] is not None)
 
     def background(self, camera: str, domain: str | None = None) -> UInt8[np.ndarray, "height width 3"]:
         """Mean background BG_m: the undistorted view of the camera without arms, RGB.
 
-        It is the image that the sequence file names, else the median over the recording of what the arms, as measured,
-        do not cover. The first call may take seconds.
+        It is the image given in the sequence file, else the median over the recording, excluding pixels covered by the
+        arms at their measured positions. The first call may take seconds.
 
         Raises:
             SequenceError: there is no such domain or camera, or an image is not usable.

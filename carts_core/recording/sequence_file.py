@@ -27,7 +27,7 @@ from .video import SUFFIXES, Video
 
 
 def take_value(table: TomlTable, key: str, default: Any) -> Any:
-    """The value of `key`; text `file.json#a/b` stands for the value under `a`, `b` in that JSON file."""
+    """Read the value of `key`; text `file.json#a/b` refers to the value under `a`, `b` in that JSON file."""
     value = table.take(key, object, default)
     if not isinstance(value, str):
         return value
@@ -59,7 +59,7 @@ def take_value(table: TomlTable, key: str, default: Any) -> Any:
 
 
 def take_transform(table: TomlTable, key: str, default: Any) -> np.ndarray:
-    """A rigid transform [4, 4], translation in [m]."""
+    """Read a rigid transform [4, 4], translation in [m]."""
     value = take_value(table, key, default)
     try:
         return rigid_transform(value, table.name(key))
@@ -68,7 +68,7 @@ def take_transform(table: TomlTable, key: str, default: Any) -> np.ndarray:
 
 
 def take_camera(table: TomlTable) -> Camera:
-    """The camera that a `[[cameras]]` table describes."""
+    """Read the camera of a `[[cameras]]` table."""
     name = table.take("name", str)
     size = take_value(table, "size", [])
     if not (isinstance(size, list) and len(size) == 2 and all(isinstance(value, int) and value > 0 for value in size)):
@@ -146,7 +146,7 @@ class CameraInput:
 
 
 def take_camera_input(table: TomlTable, rows: Rows, domains: tuple[str, ...]) -> CameraInput:
-    """The camera that a `[[cameras]]` table describes; all its files are checked to exist."""
+    """Read the camera of a `[[cameras]]` table with its images, masks and motion; all its files must exist."""
     camera, frames = take_camera(table), rows.frames
     motion = take_camera_motion(table, rows)
     patterns = _by_domain(table, "images", domains, required=True)
@@ -171,7 +171,7 @@ def _path(table: TomlTable, key: str, pattern: str, domain: str, camera: str) ->
 
 
 def _by_domain(table: TomlTable, key: str, domains: tuple[str, ...], required: bool = False) -> dict[str, str]:
-    """Domain -> pattern: text holds for all domains, a table names them one by one."""
+    """Domain -> pattern: a text applies to all domains, a table has one for each."""
     value = table.take(key, (str, dict)) if required else table.take(key, (str, dict), {})
     if isinstance(value, str):
         if required and len(domains) > 1 and "{domain" not in value:
@@ -369,14 +369,14 @@ def calibrated_sequence_file(
 ) -> str:
     """Text of a copy of a sequence file for another folder, with another calibration.
 
-    What differs between the scenes is written as numbers; everything else, comments included, stays. Relative paths are
-    changed for the new folder.
+    Differences between the scenes are written as numbers; everything else is kept, including comments. Relative paths
+    are adapted to the new folder.
 
     Args:
         before: the scene that `path` describes.
-        after: the same with other base frames, extrinsics or intrinsics.
+        after: the same scene with other base frames, extrinsics or intrinsics.
         command: the `carts` command that found them, for the heading.
-        time_offset: the key of that name in `[frames]` [s]; None leaves it as it is.
+        time_offset: new `time_offset` in `[frames]` [s]; None keeps it.
     """
     document: dict[str, Any] = tomlkit.parse(read_text(path, SEQUENCE))
     source, target = path.parent.resolve(), folder.resolve()
@@ -420,5 +420,5 @@ def calibrated_sequence_file(
 
 
 def _matrix(values: np.ndarray) -> Any:
-    # Adding 0 makes -0.0 a plain zero.
+    # Adding 0 turns -0.0 into 0.0.
     return tomlkit.item((np.round(values, 12) + 0.0).tolist()).multiline(True)  # pyright: ignore

@@ -46,7 +46,7 @@ _POSTURES = 3
 """Number of principal directions of link positions that modulate the flow."""
 _RIDGE = 1e-3
 _LEVER = 0.1
-"""Lever by which rotations of a camera are converted to lengths [m]."""
+"""Lever arm by which rotations of a camera are converted to lengths [m]."""
 _FEWEST_KNOWN = 0.5
 """Smallest share of the steps with logged rows."""
 _STILL = 0.02
@@ -74,9 +74,9 @@ class TimeOffsetEstimate:
     explained: float
     """Share of the flow that the estimate predicts in held-out blocks [1]."""
     explained_now: float
-    """Share that the present offset predicts; below 0 if it is worse than none [1]."""
+    """Share that the current offset predicts; below 0 if it is worse than no prediction [1]."""
     problem: str | None
-    """Why the estimate is not reliable, as a sentence; None where it is."""
+    """Why the estimate is not reliable, as a sentence; None if it is reliable."""
     others: tuple[float, ...] = ()
     """Other delays with nearly the same explained share [s]."""
     at_end: bool = False
@@ -84,7 +84,7 @@ class TimeOffsetEstimate:
 
     @property
     def proposed(self) -> float | None:
-        """Proposed new offset [s]; None where the present one should stay."""
+        """Proposed new offset [s]; None to keep the current one."""
         deviations, least = _WORTH_A_CHANGE
         off = abs(self.seconds - self.present)
         return None if self.problem or off < max(deviations * self.deviation, least) else round(self.seconds, 4)
@@ -114,11 +114,11 @@ def estimate_time_offset(
     """Estimate the `time_offset` of a sequence from the motion in its images; the sequence is not changed.
 
     Args:
-        sequence: rows of its tables are matched with frames by time.
-        camera: of the images; the first one by default.
-        domain: of the images; the first one by default.
-        largest: search range around the present offset [s]; widened to 3 s where the best one is at its end.
-        progress: called with the numbers of frames that are read, and of all.
+        sequence: sequence whose rows are matched with frames by time.
+        camera: camera of the images; the first one by default.
+        domain: domain of the images; the first one by default.
+        largest: search range around the current offset [s]; widened to 3 s if the best offset is at its end.
+        progress: called with the number of frames read, and the total.
 
     Raises:
         SequenceError: rows are not matched by time, or an image is not usable.
@@ -192,7 +192,7 @@ class _Delays:
         self._bases: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
 
     def estimate(self, present: float, largest: float) -> TimeOffsetEstimate:
-        """Best offset around the present one [s]."""
+        """Estimate the offset within `largest` of the current one [s]."""
         steps = round(largest / _GRID)
         grid = [present + step * _GRID for step in range(-steps, steps + 1)]
         tried = {offset: parts for offset in grid if (parts := self._parts(offset)) is not None}
@@ -219,7 +219,7 @@ class _Delays:
         )
 
     def _refined(self, around: float, blocks: np.ndarray) -> float:
-        """Refined offset near another one for some blocks [s]."""
+        """Refine an offset [s] on some of the blocks."""
 
         def unexplained(offset: float) -> float:
             parts = self._parts(offset)
@@ -299,7 +299,7 @@ def _points(robot: Robot, joints: Float[np.ndarray, "rows dofs"]) -> Float[np.nd
 
 
 def _predicted(parts: tuple[np.ndarray, np.ndarray, np.ndarray]) -> float:
-    """Share of the flow of every block predicted by a fit to the others; below 0 if worse than none [1]."""
+    """Share of the flow of every block predicted by a fit to the others; below 0 if worse than no prediction [1]."""
     XX, XY, YY = parts
     unexplained = 0.0
     for left in range(_BLOCKS):

@@ -55,8 +55,8 @@ class TomlTable:
         """The value of `key`.
 
         Args:
-            key: its name.
-            kind: type it must have (or a tuple of them); `float` takes whole numbers too, `object` takes anything.
+            key: name of the key.
+            kind: type of the value (or a tuple of types); `float` also accepts integers, `object` accepts anything.
             default: value when the key is absent; without one the key is required.
         """
         self._known.append(key)
@@ -80,7 +80,7 @@ class TomlTable:
         return value
 
     def take_choice(self, key: str, choices: tuple[str, ...], default: str) -> str:
-        """The text of `key`, one of `choices`."""
+        """Take the text of `key`, one of `choices`."""
         value = self.take(key, str, default)
         if value not in choices:
             raise self.error(

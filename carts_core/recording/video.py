@@ -1,6 +1,6 @@
 """Video files as images of a camera. Frames are found by presentation time, never by counting while seeking.
 
-Videos that cannot be decoded are a `SequenceError`.
+Videos that cannot be decoded raise `SequenceError`.
 """
 
 import copy
@@ -37,7 +37,7 @@ _EXACT = ("mp4", "matroska")
 _COMPLETE = ("mp4",)
 """Exact containers whose packets have complete times and key frame flags."""
 _COMPARED = 16
-"""Number of places, and of packets at each of them, at which the container's index is compared with the packets."""
+"""Number of positions, and of packets at each, at which the container's index is compared with the packets."""
 _REMEMBERED = 32
 _OPTIONS = {
     "protocol_whitelist": "file",
@@ -87,11 +87,11 @@ def index_video(path: Path) -> VideoIndex:
 
 
 def open_video(path: Path, *, parsed: bool = True) -> tuple[InputContainer, VideoStream]:
-    """An open video file, which is a context, and its video stream.
+    """Open a video file; returns the container, a context manager, and its video stream.
 
     Args:
-        path: the file.
-        parsed: parse packets for data missing in the container, which takes as long as reading them.
+        path: video file.
+        parsed: whether packets are parsed for data missing in the container, which takes as long as reading them.
     """
     options = _OPTIONS if parsed else {**_OPTIONS, "fflags": "+noparse"}
     try:
@@ -112,7 +112,7 @@ def open_video(path: Path, *, parsed: bool = True) -> tuple[InputContainer, Vide
 
 
 def decoded_frames(container: InputContainer, stream: VideoStream) -> Iterator[VideoFrame]:
-    """Frames from the present position on; damaged ones are skipped."""
+    """Decode frames from the current position on; damaged ones are skipped."""
     packets = container.demux(stream)
     while True:
         try:
@@ -133,11 +133,11 @@ def _index(path: Path, modified: int, size: int) -> VideoIndex:
 
 
 def _by_table(path: Path) -> VideoIndex | None:
-    """Index from the container's own table, without reading all packets; None where the table is not reliable.
+    """Index from the container's own table, without reading all packets; None if the table is not reliable.
 
-    The table has decoding times, which are presentation times only where frames are shown in the order in which they
-    are decoded; it lacks what a file's later fragments hold, and has what was cut off its end. So packets here and
-    there, and all from the last key frame on, are compared with it.
+    The table has decoding times, which are presentation times only if frames are presented in decoding order. It lacks
+    the frames of later fragments, and includes frames that are missing at a truncated end. Therefore packets at several
+    positions, and all from the last key frame on, are compared with it.
     """
     container, stream = open_video(path, parsed=False)
     with container:
@@ -174,7 +174,7 @@ def _as_in_table(
 
 
 def _by_packets(path: Path, *, parsed: bool) -> VideoIndex | None:
-    """Index from the packets; None where their times are not reliable."""
+    """Index from the packets; None if their times are not reliable."""
     container, stream = open_video(path, parsed=parsed)
     with container:
         if not parsed and not any(name in container.format.name for name in _COMPLETE):
@@ -237,17 +237,17 @@ _KEPT_BYTES = 32 * 2**20
 class Video:
     """Frames of a video file by number; thread-safe.
 
-    Decoding begins at the last key frame that is shown no later than the frame asked for, and frames that come out are
-    identified by their presentation time. Where seeking does not arrive where it should, decoding begins at an earlier
-    key frame; where the container's times are not to be relied on, at the first frame, which is slow and right.
+    Decoding begins at the last key frame that is presented no later than the requested frame, and decoded frames are
+    identified by their presentation time. If seeking is inexact, decoding begins at an earlier key frame; if the
+    container's times are not reliable, at the first frame, which is slow but exact.
 
-    Frames are turned and mirrored by the file's display matrix, as browsers do. Of interlaced frames the field that is
-    shown first is used, with the lines between interpolated; both fields together would show edges twice.
+    Frames are rotated and mirrored by the file's display matrix, as in browsers. Of interlaced frames only the field
+    that is shown first is used, with missing rows interpolated; both fields together would show edges twice.
 
     Args:
         path: the video file.
-        numbers: number in the video, from 0 in the order shown, of each of the sequence's frames.
-        deinterlace: False uses frames that are marked as interlaced whole, for videos that are marked so by mistake.
+        numbers: number in the video, from 0 in presentation order, of each frame of the sequence.
+        deinterlace: False uses both fields of frames marked as interlaced, for videos that are marked so by mistake.
 
     Raises:
         SequenceError: the file is missing, cannot be decoded, or is too short.

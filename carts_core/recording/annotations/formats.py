@@ -21,9 +21,9 @@ from ..images import read_labels
 MOST_LABELS = 255
 """Largest number of labels of a layer, whose pixels have 8 bits."""
 MOST_IMAGES = 100_000
-MOST_SHAPES = 5_000
-"""In one image, and polygons of one annotation."""
 """Largest number of images of a source."""
+MOST_SHAPES = 5_000
+"""Largest number of shapes of an image, and of polygons of an annotation."""
 MOST_KEYPOINTS = 200
 """Largest number of keypoints of an image."""
 
@@ -40,9 +40,9 @@ class ForeignImage:
     keypoints: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     """Name -> column and row [px], from the upper left corner of the image."""
     frame: str = ""
-    """Id of the frame, where the source has it."""
+    """Id of the frame; empty if the source does not give it."""
     camera: str = ""
-    """Name of the camera, where the source has it."""
+    """Name of the camera; empty if the source does not give it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +50,7 @@ class FrameAnnotation:
     """Annotations of one frame in one camera."""
 
     frame: int
-    """Position in the sequence."""
+    """Index in the sequence."""
     camera: str
     labels: UInt8[np.ndarray, "height width"] | None
     """Label of each pixel of the undistorted image, from 1; 0 elsewhere. None without masks."""
@@ -98,7 +98,7 @@ def runs_of_text(text: str) -> list[int]:
 
 
 def mask_of_runs(runs: Sequence[int], height: int, width: int, *, by_columns: bool) -> Bool[np.ndarray, "height width"]:
-    """A mask from alternating run lengths, the first of them outside; `ValueError` if their sum is another size."""
+    """Mask from alternating run lengths, beginning with background; `ValueError` if their sum is not the image size."""
     lengths = np.asarray(runs, np.int64)
     if lengths.ndim != 1 or (lengths < 0).any() or (lengths > height * width).any() or lengths.sum() != height * width:
         raise ValueError(f"the run lengths do not make {width} x {height} pixels")
@@ -116,14 +116,14 @@ def mask_of_polygon(
         low, high = min(y0, y1), max(y0, y1)
         rows = np.arange(max(0, int(np.ceil(low - 0.5))), min(height, int(np.ceil(high - 0.5))))
         if len(rows):
-            # Where the edge crosses the middle of the row; from the next centre on one is on its other side.
+            # Column where the edge crosses the middle of the row; pixel centres to the right are on its other side.
             crossing = x0 + (rows + 0.5 - y0) * (x1 - x0) / (y1 - y0)
             np.add.at(flips, (rows, np.clip(np.ceil(crossing - 0.5), 0, width).astype(int)), 1)
     return np.cumsum(flips, axis=1)[:, :width] % 2 == 1
 
 
 _LARGEST_SIDE = 16384
-"""[px]"""
+"""Largest width or height of an image [px]."""
 _FEWEST_CORNERS = 3
 
 
@@ -376,7 +376,7 @@ def read_mask_folder(path: Path, remarks: Counter[str], *, confined: bool = Fals
 
     Args:
         remarks: numbers of files with a change or decision are added while they are decoded.
-        confined: whether links are left out, and names of values are not looked for above the folder.
+        confined: whether links are ignored, and names of values are not searched for above the folder.
     """
     # An export of carts has a folder with links, which are the finest labels.
     finest = path / "links" if (path / "labels.json").is_file() and (path / "links").is_dir() else path

@@ -43,16 +43,16 @@ def read_annotations(
     """Read masks and keypoints for the frames of a sequence.
 
     Frames are found by their ids, or the numbers in the names of images; cameras by their names, or by left and right.
-    What was marked in images with distortion is undistorted, unless carts exported it.
+    Annotations of images with distortion are undistorted, unless they were exported by carts.
 
     Args:
         source: a COCO file, a CVAT file, keypoints of SurgPose, a folder of masks, or the folder of an export.
-        sequence: with the frames.
-        camera: of the images, where their names do not contain it.
+        sequence: sequence with the frames.
+        camera: camera of the images, if their names do not contain it.
         confined: whether files beside the source and links in it are ignored.
 
     Raises:
-        SequenceError: it is of another kind or cannot be read; also raised while frames are iterated.
+        SequenceError: the source has another format or cannot be read; also raised while frames are iterated.
     """
     if camera is not None:
         sequence.recorded_camera(camera)

@@ -1,4 +1,4 @@
-"""Import of recordings from foreign formats; content that is missing, damaged or contradictory is a `SequenceError`."""
+"""Import of recordings from foreign formats; missing, damaged or contradictory content raises `SequenceError`."""
 
 from .calibrations import DvrkBaseFrame as DvrkBaseFrame
 from .calibrations import read_base_frames as read_base_frames

@@ -28,7 +28,7 @@ _DISTORTIONS = ("distortion_coefficients", "distortion_coeffs", "distortion", "D
 _SIZES = (("image_width", "image_height"), ("width", "height"), ("nx", "ny"), ("res_x", "res_y"))
 _PAIRS = ("imageSize", "image_size", "resolution", "img_size")
 _METRES_TO = 1.0
-"""Baseline above which lengths are millimetres [m]."""
+"""Baseline above which lengths are assumed to be in millimetres [m]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,7 +89,7 @@ def calibration_from_info(info: Any) -> Calibration | None:
 
 
 def check_model(model: str, camera_model: str = "") -> None:
-    """Check that a camera model is OpenCV's pinhole model; otherwise it is a `ValueError`."""
+    """Check that a camera model is OpenCV's pinhole model; `ValueError` otherwise."""
     pinhole = camera_model.lower() in _PINHOLES
     if not pinhole or model.lower() not in _MODELS:
         given = f"distortion model {model!r}" if pinhole else f"camera model {camera_model!r}"
@@ -185,7 +185,7 @@ def _from_camodocal(content: Mapping[str, Any]) -> Calibration:
 
 
 def _calibration(K: np.ndarray, D: np.ndarray | None, size: tuple[int, int] | None) -> Calibration:
-    """Calibration with a matrix of 9 numbers, or fx, fy, cx, cy; `ValueError` if it is none of OpenCV's models."""
+    """Calibration with a matrix of 9 numbers, or fx, fy, cx, cy; `ValueError` if it is not one of OpenCV's models."""
     numbers, remarks = np.asarray(K, np.float64).reshape(-1), ()
     if numbers.size == 9:
         matrix = numbers.reshape(3, 3)
@@ -305,14 +305,14 @@ class DvrkBaseFrame:
     reference: str
     """Name of the reference frame of the transform; empty if not given."""
     T_camera_base: Float[np.ndarray, "4 4"]
-    """[m], with OpenCV's axes of the camera: `T_world_base` where the world is the camera."""
+    """Pose of the base in the camera, with OpenCV's axes [m]: `T_world_base` if the world is the camera's frame."""
 
 
 def read_base_frames(path: Path, axes: Axes | None = None) -> tuple[DvrkBaseFrame, ...]:
     """Base frames in a JSON file of the dVRK (see `_BASE_FRAME_KINDS`).
 
     Args:
-        axes: of the camera in the file; by default those of its kind and name.
+        axes: axes of the camera in the file; by default those of its format and name.
     """
     try:
         content = parse_json(read_text(path, VALUES))

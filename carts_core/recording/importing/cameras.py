@@ -134,7 +134,7 @@ def check_intrinsics(camera: FoundCamera, job: Import) -> None:
 def placed_cameras(cameras: tuple[FoundCamera, ...], job: Import) -> tuple[FoundCamera, ...]:
     """Cameras with their poses; the world is the frame of the first camera, or of the left one of a pair.
 
-    Where the pose of another one is not stated, it follows from the rectification of both:
+    If the pose of another one is not given, it follows from the rectification of both:
     T_right_left = R_right^T [I | t] R_left, with t from the last column of P. A camera of unknown pose gets
     the pose of the first one, which leaves it free in hand-eye calibration.
     """
@@ -162,7 +162,7 @@ def _placed(camera: FoundCamera, first: FoundCamera, job: Import) -> FoundCamera
 
 
 def _from_rectification(left: FoundCamera, right: FoundCamera) -> np.ndarray:
-    """T_right_left [m] from ROS' P[:, 3]: (-fx * baseline, 0, 0), or (0, -fy * baseline, 0) for one above the other."""
+    """T_right_left [m] from ROS' P[:, 3]: (-fx * baseline, 0, 0), or (0, -fy * baseline, 0) for a vertical pair."""
     assert left.projection is not None and right.projection is not None
     assert left.rectification is not None and right.rectification is not None
     T = np.eye(4)
@@ -209,7 +209,7 @@ def image_files(folder: Path) -> list[Path]:
 
 
 def find_images(path: Path, only: str = "") -> Images:
-    """The frames of a folder of images, of which names end with `only`, or of a video."""
+    """Find the frames of a video, or of a folder of images whose names end with `only`."""
     if path.is_file() and path.suffix.lower() in SUFFIXES:
         return _video(path)
     files = [file for file in image_files(path) if file.name.endswith(only)]
@@ -255,7 +255,7 @@ def _video(path: Path) -> Images:
 
 
 def common_ids(images: Mapping[str, Images], path: Path) -> tuple[str, ...]:
-    """Ids of the frames that all cameras have, in the first one's order."""
+    """Ids of the frames that all cameras have, in the order of the first camera."""
     first, *others = images.values()
     shared = set(first.ids).intersection(*(each.ids for each in others))
     if not shared and first.ids:

@@ -38,7 +38,7 @@ _POSE = {
     **{f"rotation {axis}": f"q{axis}" for axis in "xyzw"},
 }
 _STATE = set("pos position q state observation measured actual rad deg angle value action".split())
-"""Words beside the name of a joint that name the kind of value."""
+"""Words next to the name of a joint that describe the type of value."""
 _POSE_ORDER = ("x", "y", "z", "qx", "qy", "qz", "qw")
 _TIMES = (
     *("timestamp", "timestamp ns", "timestamp s", "timestamp ms", "time", "stamp", "t", "time s", "time ms", "time ns"),
@@ -56,7 +56,7 @@ _REACH = 0.5
 
 @dataclass(frozen=True)
 class ColumnMeanings:
-    """Columns by meaning."""
+    """Meanings of the columns of a table."""
 
     time: str | None
     frame: str | None
@@ -67,7 +67,7 @@ class ColumnMeanings:
 
 
 def guess_columns(table: ForeignTable, options: ImportOptions) -> ColumnMeanings:
-    """Meanings of the columns of a table: user's choices first, then names, then positions."""
+    """Guess the meanings of the columns of a table: from the user's choices, then names, then positions."""
     others = other_robots(options)
     known = [joint.name for joints in others.values() for joint in joints] or [*JOINT_NAMES, "jaw", *_POSE_ORDER]
     for meaning, column in options.columns.items():
@@ -108,14 +108,14 @@ def guess_columns(table: ForeignTable, options: ImportOptions) -> ColumnMeanings
 
 
 def other_robots(options: ImportOptions) -> dict[str, tuple[Joint, ...]]:
-    """Arm -> joints, of the given robots that are no PSM."""
+    """Arm -> joints, of the given robots that are not PSMs."""
     given = {arm: joints_of(robot) for arm, robot in options.robot.items() if robot_file(robot).is_file()}
     return {arm: joints for arm, joints in given.items() if not {joint.name for joint in joints} >= set(JOINT_NAMES)}
 
 
 @lru_cache(maxsize=64)
 def order_of_names(names: tuple[str, ...], joints: tuple[str, ...] = JOINT_NAMES) -> tuple[int, ...] | None:
-    """Order of `joints` among the names beside positions, such as `outer_yaw`; None without usable names."""
+    """Index of each joint in the names logged with positions, such as `outer_yaw`; None if names are not usable."""
     meanings = [_meaning(_words(name), pose=False) for name in names]
     if set(joints) <= set(meanings):
         return tuple(meanings.index(joint) for joint in joints)
@@ -135,7 +135,7 @@ def track_of(
     """Logged values of a topic, joint positions in the order of `joints`; None if empty.
 
     Args:
-        groups: of `decoders.bags.rows`: names in the messages, times and values.
+        groups: result of `decoders.bags.rows`: names in the messages, times and values.
         role: "joints", "jaw" or a pose.
     """
     chosen = []
@@ -155,20 +155,20 @@ def strange_names(names: tuple[str, ...], joints: tuple[str, ...] = JOINT_NAMES)
 
 
 def arm_in(text: str) -> str:
-    """Name of the PSM in a text, in capitals; empty without one."""
+    """Name of the PSM in a text, in capitals; empty if there is none."""
     match = _ARM.search(text.replace("_", " "))
     return match.group(1).upper() if match else ""
 
 
 def _words(column: str) -> str:
-    """Words and numbers of a name in lower case, `camelCase` being two words."""
+    """Words and numbers of a name in lower case; `camelCase` counts as two words."""
     return " ".join(re.findall(r"[a-z]+|\d+", re.sub(r"([a-z])([A-Z])", r"\1 \2", column).lower()))
 
 
 def _joints_by_name(
     table: ForeignTable, words: dict[str, str], joints: tuple[Joint, ...], chosen: dict[str, str]
 ) -> dict[str, str]:
-    """Joint of another robot -> column of the same name."""
+    """Map each joint of a robot other than the PSM to the column of the same name."""
     found: dict[str, str] = {}
     for joint in joints:
         own = _words(joint.name)
@@ -252,7 +252,7 @@ def sample(value: object) -> str:
 
 
 def _numbered_family(words: dict[str, str], others: tuple[str | None, ...]) -> dict[str, dict[str, str]]:
-    """The only family of six or seven columns that differ in a number, which are joints under another name."""
+    """The only family of six or seven columns that differ only in a number, assumed to be joints."""
     families: dict[str, dict[str, str]] = {}
     for column, text in words.items():
         number = re.fullmatch(r"(.*?)(\d+)(\D*)", text)
@@ -284,7 +284,7 @@ def _meaning(text: str, pose: bool) -> str | None:
 
 
 def _numbers_to_joints(found: dict[str, str]) -> dict[str, str]:
-    """Joint names in place of numbers, which begin with 0 or 1."""
+    """Replace joint numbers, which begin with 0 or 1, by joint names."""
     numbers = sorted(int(key[1:]) for key in found if key.startswith("#"))
     if not numbers:
         return found
@@ -310,8 +310,8 @@ def arm_log(
 
     Args:
         found: joint or part of a pose -> column.
-        times: of the rows, or positions of their images; NaN for rows of no image.
-        stated: columns whose meaning is no guess.
+        times: times of the rows, or indices of their images; NaN for rows without an image.
+        stated: columns whose meaning is not a guess.
     """
     other = other_robots(job.options).get(arm)
     if other is None and not found.keys() >= _PSM:

@@ -27,7 +27,7 @@ TABLE_SUFFIXES = (".csv", ".txt", ".tsv", ".parquet", ".npy", ".npz")
 
 @dataclass(frozen=True, eq=False)
 class ForeignTable:
-    """Named columns of equal length; columns with non-numeric texts stay texts."""
+    """Named columns of equal length; columns with non-numeric cells remain text."""
 
     path: Path
     columns: dict[str, np.ndarray]
@@ -44,7 +44,7 @@ class ForeignTable:
         return len(next(iter(self.columns.values()))) if self.columns else 0
 
     def numbers(self, column: str) -> np.ndarray:
-        """A column as numbers [rows]; whole numbers stay exact."""
+        """A column as numbers [rows]; integers stay exact."""
         if column not in self.columns:
             raise PartError("columns", f"{self.path} has no column {column!r}. It has: {', '.join(self.columns)}.")
         values = self.columns[column]
@@ -64,7 +64,7 @@ class ForeignTable:
 
 
 def read_foreign_table(path: Path) -> ForeignTable:
-    """A table of any known kind."""
+    """Read a table of any known format."""
     readers: dict[str, Callable[[Path], ForeignTable | dict[str, np.ndarray]]] = {
         ".parquet": _parquet,
         ".npy": _numpy,
@@ -98,7 +98,7 @@ def _csv(path: Path) -> ForeignTable:
     lines = text.splitlines()
     numbers = [number for number, line in enumerate(lines, start=1) if line.strip()]
     lines = [lines[number - 1] for number in numbers]
-    # Extracted dVRK topics begin with their name and type behind a mark.
+    # Extracted dVRK topics begin with a marker, their name and type.
     begin = 0
     while begin + 1 < len(lines) and re.match(r"\s*#", lines[begin]) and not re.match(r"\s*\d", lines[begin + 1]):
         begin += 1
@@ -207,11 +207,11 @@ def _is_number(cell: str, commas: bool = False) -> bool:
 
 
 def read_parquet(path: Path) -> dict[str, np.ndarray]:
-    """Columns of a Parquet file by name [rows]; [rows, values] where each row holds as many numbers.
+    """Columns of a Parquet file by name [rows]; [rows, values] if rows have equally many numbers.
 
     Raises:
         CartsError: the package that reads it is not installed.
-        OSError, ValueError: it cannot be read, or is too large.
+        OSError, ValueError: the file cannot be read, or is too large.
     """
     needs_extra("pyarrow", "import")
     columns = decoded(tables.read_parquet, path)
@@ -239,7 +239,7 @@ def _numpy(path: Path) -> dict[str, np.ndarray]:
         if values.ndim == 1:
             columns[name] = values
         elif values.ndim >= 2:
-            # Position, velocity and effort of a joint state lie one after the other; positions come first.
+            # Position, velocity and effort of a joint state are concatenated; positions come first.
             flat = values[:, 0] if values.ndim == 3 else values
             columns.update({f"{name}_{index + 1}": flat[:, index] for index in range(flat.shape[1])})
     return columns

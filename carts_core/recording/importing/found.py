@@ -78,7 +78,7 @@ class Import:
         return replace(self, options=replace(self.options, **changes))
 
     def arm_name(self, recorded: str) -> str | None:
-        """Name of a recorded arm in the sequence; None for one that is left out."""
+        """Name of a recorded arm in the sequence; None if the arm is omitted."""
         names = {given: name for name, given in self.options.arms.items()}
         return names.get(recorded) if names else recorded
 
@@ -120,11 +120,11 @@ class FoundCamera:
     intrinsics: tuple[float, float, float, float] | None = None
     """fx, fy, cx, cy [px]; None if not known."""
     pixel_center: float = 0.0
-    """Position of the first pixel's centre: 0 in OpenCV's convention, 0.5 in ours."""
+    """Position of the first pixel's centre: 0 in OpenCV's convention, 0.5 in that of carts."""
     distortion: tuple[float, ...] = ()
     """OpenCV's coefficients."""
     T_camera_world: Float[np.ndarray, "4 4"] | None = None
-    """[m]; None if not known. The world is the frame of the first camera."""
+    """Extrinsics [m]; None if not known. The world is the frame of the first camera."""
     rectification: Float[np.ndarray, "3 3"] | None = None
     """R of ROS: from the camera's frame to the common frame of a rectified pair."""
     projection: Float[np.ndarray, "3 4"] | None = None
@@ -150,12 +150,12 @@ class FoundArm:
     columns: tuple[str, ...] = ()
     """Names of the measured joints."""
     values: Float[np.ndarray, "rows columns"] | None = None
-    """[rad], [m]; None without kinematics."""
+    """Joint positions [rad], [m]; None without kinematics."""
     times: Float[np.ndarray, " rows"] | None = None
     """Times in the recording's clock, increasing [s]; None where row n belongs to frame n."""
     robot: str = "builtin:psm_lnd"
     T_world_base: Float[np.ndarray, "4 4"] | None = None
-    """[m]; None if not known."""
+    """Base frame [m]; None if not known."""
     base_from: str = ""
     """Source of the base frame, for the report."""
     beyond_limits: bool = False
@@ -196,6 +196,7 @@ class Source:
     detect: Callable[[Path], bool]
     """Whether a path is of this format; quick, never raises."""
     uses: tuple[str, ...]
-    """Names of the `ImportOptions` that it uses, besides those of arms, robots and calibrations, which all use."""
+    """Names of the `ImportOptions` that it uses, besides those of arms, robots and calibrations, which all sources
+    use."""
     read: Callable[[Path, Import], FoundRecording]
     """Reads the recording; raises a `CartsError` for damaged or contradictory content."""

@@ -20,7 +20,7 @@ _UNFINISHED = {
 
 
 def known_kinds() -> str:
-    """Known formats in order of detection, one a line."""
+    """Known formats in order of detection, one per line."""
     return "\n".join(f"  {source.name}: {source.label} ({source.looked_for})" for source in SOURCES)
 
 
@@ -45,7 +45,7 @@ def detect(path: Path, name: str | None = None) -> Source:
 
 
 def find(path: Path, options: ImportOptions | None = None) -> FoundRecording:
-    """Content of a recording, completed with stand-ins; nothing is written. `CartsError` for unusable content."""
+    """Content of a recording, completed with defaults; nothing is written. `CartsError` for unusable content."""
     options = _with_places(path.absolute(), options or ImportOptions())
     source = detect(path, options.source)
     for name in ("images", "kinematics", "columns", "clock", "time_offset", "frame_rate"):
@@ -121,7 +121,7 @@ def import_recording(
         The sequence file, and the content of the recording.
 
     Raises:
-        CartsError: it is of no known kind, damaged, or contradicts itself; nothing is written then.
+        CartsError: the recording is of an unknown format, damaged or contradictory; nothing is written.
     """
     recording = find(path, options)
     return write_sequence(recording, folder, overwrite=overwrite), recording

@@ -28,7 +28,8 @@ def in_si(
 
     Args:
         columns: names of a table's columns, whose units are guessed; empty for messages, which are in SI units.
-        instrument: whether angles can be guessed to be degrees; those of other robots may be shares of their range.
+        instrument: whether angles can be guessed to be degrees; those of other robots may be percentages of their
+            range.
     """
     names, options = [joint.name for joint in joints], job.options
     for option, joint in [*(("flip", joint) for joint in options.flip), *(("units", joint) for joint in options.units)]:
@@ -63,7 +64,7 @@ def in_si(
 
 
 def psm_joints(arm: str, names: Sequence[str], job: Import) -> list[Joint]:
-    """Joints of the robot given for an arm, else of the default one; those that it lacks are without limits."""
+    """Joints of the robot given for an arm, else of the default one; joints that it lacks have no limits."""
     robot = job.options.robot.get(arm, FoundArm.robot)
     if not robot_file(robot).is_file():
         raise SequenceError(f"robot {robot} of {arm} is missing. Give the path of a URDF (carts robot makes one).")
@@ -114,7 +115,7 @@ def _length_unit(values: np.ndarray, joints: Sequence[Joint], arm: str, columns:
 
 
 def named_length_unit(text: str) -> str | None:
-    """Unit of length other than metres in the names of columns; None without one."""
+    """Unit of length other than metres in the names of columns; None if there is none."""
     units = [unit for unit in LENGTH_UNITS if unit != "m"]
     return next((unit for unit in units if re.search(rf"(?i)(^|[^a-z]){unit}([^a-z]|$)", text)), None)
 

@@ -24,9 +24,9 @@ SAME_CYCLE = 2e-3
 def clock_offset(times: Float[np.ndarray, " rows"], other: Float[np.ndarray, " other_rows"]) -> float:
     """Time stamp difference between rows of `times` and of `other` from the same cycle [s].
 
-    Topics of one cycle are stamped one after the other, so their stamps differ by a constant, which is not motion. It
-    is the median over rows that are within `SAME_CYCLE` of each other; 0 where fewer than half are, as between topics
-    of different rates.
+    Topics of one cycle are stamped one after the other, so their stamps differ by a constant that is not due to motion.
+    It is the median over rows that are within `SAME_CYCLE` of each other; 0 where fewer than half are, as between
+    topics of different rates.
     """
     difference = times - other[nearest(times, other)]
     same = np.abs(difference) <= SAME_CYCLE
@@ -107,9 +107,9 @@ def fit_tool_point(
     joints: Float[np.ndarray, "rows 6"],
     geometry: PsmGeometry = CLASSIC,
 ) -> tuple[Float[np.ndarray, "3"], float]:
-    """Position of the point of poses in the tip's frame, and the remaining deviation of the base in the median row [m].
+    """Position in the tip's frame of the point that poses refer to, and deviation of the base in the median row [m].
 
-    With T_reference_base = (R, p) and T_base_tip = (R_i, t_i), the places of the point at d from the tip are
+    With T_reference_base = (R, p) and T_base_tip = (R_i, t_i), the positions of the point at offset d from the tip are
     p_i = R (R_i d + t_i) + p: R is the mean of the rotations, and d and p solve a linear least squares problem.
     """
     known = np.isfinite(joints).all(1) & np.isfinite(Ts_reference_point).all((1, 2))
@@ -168,7 +168,7 @@ def check_instrument(
     """Rank instruments (name -> lengths) by how constant the arm's base is with each.
 
     Args:
-        Ts_reference_tip: poses of the tip in any frame that does not move against the base [m].
+        Ts_reference_tip: poses of the tip in any frame that is fixed relative to the base [m].
         joints: joint positions at the same times [rad, m].
 
     Raises:
@@ -197,30 +197,30 @@ class ArmLog:
     joints: Track | None = None
     """Six joint positions [rad], [m]."""
     jaw: Track | None = None
-    """[rad]"""
+    """Jaw angle [rad]."""
     poses: Track | None = None
-    """Tip in some frame: x y z [m], quaternion x y z w."""
+    """Poses of the tip in any frame: x y z [m], quaternion x y z w."""
     local_poses: Track | None = None
-    """Tip in the arm's base frame."""
+    """Poses of the tip in the arm's base frame."""
     setup: Track | None = None
-    """Base of the arm in the camera's frame, from set-up joints."""
+    """Poses of the arm's base in the camera's frame, from set-up joints."""
     tool: str = ""
     """The dVRK's `tool_type`."""
     opencv_axes: bool = False
     """Whether `poses` and `setup` use OpenCV's camera axes instead of the dVRK's."""
     names: tuple[str, ...] = ()
-    """Joints in `joints` of another robot than a PSM; empty for a PSM."""
+    """Names of the joints of a robot other than a PSM; empty for a PSM."""
     si: bool = False
     """Whether given units and signs are already applied."""
 
     @property
     def T_axes(self) -> Float[np.ndarray, "4 4"]:
-        """From the axes of `poses` and `setup` to those of OpenCV."""
+        """Transform from the axes of `poses` and `setup` to those of OpenCV."""
         return np.eye(4) if self.opencv_axes else T_DVRK_OPENCV
 
 
 def track(times: ArrayLike, values: ArrayLike) -> Track | None:
-    """Rows sorted by time; rows that are not finite or repeat a time are dropped. None without rows."""
+    """Rows sorted by time; rows that are not finite or repeat a time are dropped. None if no rows remain."""
     times, values = np.asarray(times, np.float64), np.asarray(values, np.float64)
     if not len(times) or values.ndim > 2:
         return None
@@ -293,7 +293,7 @@ def _joints_at(poses: Track, joints: Track) -> Float[np.ndarray, "rows 6"]:
 
 
 def _at_the_tip(log: ArmLog, job: Import) -> ArmLog:
-    """The log with poses of the tip, where they are those of another point of the tool."""
+    """Convert the poses of a log to those of the tip, if they refer to another point of the tool."""
     if job.options.tool_point is not None:
         point = np.array([0.0, 0.0, job.options.tool_point])
     elif (both := _checked_rows(log)) is not None and not _stands_still(*both):
@@ -433,7 +433,8 @@ _MOVES = 5e-4, 0.1
 def endoscope_motion(poses: Track | None, joints: Track | None, start: float, job: Import) -> Track | None:
     """Pose of the camera over time, in a world with its origin at the first image; None if it is static.
 
-    The tip of the ECM, by its poses or joints, counts as the camera, whose pose there `carts calibrate` estimates.
+    The ECM's tip, from its poses or joints, is the camera mount; `carts calibrate` estimates the camera's pose relative
+    to it.
 
     Args:
         start: time of the first image [s].

@@ -1,8 +1,8 @@
 """Matching of log rows with images: by times, frame rate, file names, numbers or order.
 
-Times win, then a given frame rate, then a column with the images' file names or numbers, then the order of rows that
-are as many as the images. A video's own times are only its nominal rate: one row for each image comes before them. A
-note names the way, and what was left out.
+In order of precedence: times, a given frame rate, a column with the images' file names or numbers, and the order of
+rows if there are as many as images. A video's own times only reflect its nominal rate, so one row per image takes
+precedence over them. A note reports the method and omissions.
 """
 
 import re
@@ -39,7 +39,7 @@ class FrameTimes:
     stems: tuple[str, ...]
     """File names without suffix; the ids for a video."""
     times: Float[np.ndarray, " frames"] | None
-    """[s]; None if not known."""
+    """Time of each frame [s]; None if not known."""
     source: str
     """Source of the times, for the report."""
     nominal: bool = False
@@ -73,7 +73,7 @@ class RowMatch:
     """Time of each row [s]; with `by_image` the index of its image, NaN for none."""
     by_image: bool
     frame_times: Float[np.ndarray, " frames"] | None
-    """[s]; None where rows are images and there are no times."""
+    """Time of each frame [s]; None if rows are images and have no times."""
     time_offset: float = 0.0
     """Time in the log minus time of the image [s]."""
 
@@ -301,7 +301,7 @@ def _numbers_to_positions(numbers: list[int | None], frames: FrameTimes, rows: L
     best, shift = sum(number in position for number in known), 0
     for other in (-1, 1):
         hits = sum(number + other in position for number in known)
-        # Counted from the other end of the first step: every row has an image then, and not all have one without.
+        # The column counts from 0 instead of 1, or the reverse, if only then every row has an image.
         if hits > best and hits == len(known) and min(known) + other == ids[0]:
             best, shift = hits, other
     column = f"{rows.name}: column {rows.image_column!r} counts from"
@@ -318,13 +318,13 @@ def _numbers_to_positions(numbers: list[int | None], frames: FrameTimes, rows: L
 def by_rows(
     arms: Sequence[FoundArm], ids: Sequence[str], job: Import, times: Float[np.ndarray, " frames"] | None = None
 ) -> tuple[tuple[FoundArm, ...], tuple[str, ...], np.ndarray]:
-    """Arms whose times are positions in `ids`, restricted to the frames that all of them have.
+    """Arms whose times are indices into `ids`, restricted to the frames that all of them have.
 
     Args:
-        times: of the frames [s], which become those of the rows, so that a delay can be estimated.
+        times: times of the frames [s], assigned to the rows so that a delay can be estimated.
 
     Returns:
-        The arms, the ids that remain, and their positions in `ids`.
+        The arms, the ids that remain, and their indices in `ids`.
     """
     positions = {arm.name: np.asarray(arm.times, int) for arm in arms if arm.times is not None}
     keep = np.all([np.isin(np.arange(len(ids)), rows) for rows in positions.values()], axis=0) & np.ones(len(ids), bool)

@@ -51,7 +51,7 @@ def tips_of(arm: FoundArm) -> Float[np.ndarray, "rows 3"]:
 
 
 def check_in_view(arm: FoundArm, camera: FoundCamera, job: Import) -> None:
-    """Warn if a base frame puts the tip out of view and another reading of it puts it in view."""
+    """Warn if a base frame puts the tip out of view and another interpretation of it puts the tip in view."""
     if arm.values is None or arm.T_world_base is None or camera.intrinsics is None:
         return
     tips = tips_of(arm)[:: max(1, len(arm.values) // _ROWS)]
@@ -220,7 +220,7 @@ _HANDLE = "frame"
 
 
 def write_sequence(recording: FoundRecording, folder: Path, *, overwrite: bool = False) -> Path:
-    """Write FOLDER/sequence.toml, whose path is returned, and tables, whole or not at all; images stay in place."""
+    """Atomically write FOLDER/sequence.toml and its tables; returns the sequence file. Images are not copied."""
     with TemporaryDirectory() as trial:
         _write(recording, Path(trial), Path(trial))
         try:
@@ -356,7 +356,7 @@ def _toml(recording: FoundRecording, place: Path) -> str:
         column=_column,
         text=_text,
         K=lambda camera: zip(("fx", "fy", "cx", "cy"), map(float, camera.intrinsics), strict=True),
-        rows=lambda T: (np.round(T, 12) + 0.0).tolist(),  # Adding 0 makes -0.0 a plain zero.
+        rows=lambda T: (np.round(T, 12) + 0.0).tolist(),  # Adding 0 turns -0.0 into 0.0.
     )
 
 

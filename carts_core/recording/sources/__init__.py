@@ -1,4 +1,4 @@
-"""Foreign recording formats; the first that detects a path reads it. Unusable content is a `SequenceError`."""
+"""Foreign recording formats; the first that detects a path reads it. Unusable content raises `SequenceError`."""
 
 from ..importing.found import Source as Source
 from .bag import SOURCE as _BAG

@@ -1,4 +1,4 @@
-"""ROS 1 and ROS 2 bags with topics of the dVRK: 1.x, 2.0, 2.2 and later, and of simulators that speak CRTK."""
+"""ROS 1 and ROS 2 bags with topics of the dVRK: 1.x, 2.0, 2.2 and later, and of simulators that use CRTK."""
 
 import os
 import re
@@ -207,7 +207,7 @@ def _cameras(bag: Bag, job: Import) -> tuple[tuple[FoundCamera, ...], np.ndarray
 
 
 def _camera_info(bag: Bag, topic: str) -> Any:
-    """The camera_info of an image topic: beside it, or of the same side; None without one."""
+    """The camera_info of an image topic: of the same namespace, or of the same side; None if there is none."""
     infos = [info for info, kind in bag.topics if kind == _INFO_TYPE]
     parents = [topic.rsplit("/", depth)[0] for depth in (1, 2, 3)]
     chosen = [info for parent in parents for info in infos if info.rsplit("/", 1)[0] == parent]

@@ -1,4 +1,4 @@
-"""Public data sets with layouts of their own: SurgPose, EndoVis 2017 and 2018, JIGSAWS, SurgSync.
+"""Public data sets with specific layouts: SurgPose, EndoVis 2017 and 2018, JIGSAWS, SurgSync.
 
 SurgPose   NNNNNN/{regular,green}/{left,right}_video.mp4, api_jp_data.yaml, StereoCalibrationDVRK.ini
 EndoVis    {instrument_dataset_N,seq_N}/{left_frames,right_frames}/frame000.png, camera_calibration.txt

@@ -1,8 +1,8 @@
 """Sessions of the dVRK's official recorder: index.json, videos with JSON sidecars, a ROS 2 bag or extracted CSV files.
 
-The time of a frame is that of its own camera or of both (mono, else the middle of left and right, else left, else
-right), else when the recorder received it. Frames are found by their number, never by their time. The latency that a
-sidecar estimates is not applied there; it is the time offset that is proposed here.
+The time of a frame is that of its camera or of both (mono, else the mean of left and right, else left, else right),
+else the time at which the recorder received it. Frames are identified by number, never by time. The latency estimated
+in a sidecar is not applied to these times; it is proposed as the time offset.
 """
 
 from dataclasses import dataclass, replace
@@ -38,7 +38,7 @@ class _Stream:
     numbers: np.ndarray
     """Frames of the video, from 0."""
     times: np.ndarray
-    """[s]"""
+    """Time of each frame [s]."""
     side_by_side: str
     latency: float
     """Estimated latency of the images [s]."""

@@ -116,7 +116,7 @@ def _looks_like_calibration(file: Path) -> bool:
 
 
 def kinematics_table(path: Path, options: ImportOptions) -> ForeignTable | None:
-    """The table of kinematics: as named, with an arm, or else with many numbers."""
+    """Find the table of kinematics: the given one, one with an arm, or else one with many numbers."""
     if options.kinematics == NO_TABLE:
         return None
     if options.kinematics is not None:
@@ -139,7 +139,7 @@ def _is_wide(table: ForeignTable) -> bool:
 
 
 def _kinematics(path: Path, job: Import) -> list[tuple[ForeignTable, ColumnMeanings]]:
-    """Tables that contain an arm, each another one, with the meanings of their columns."""
+    """Tables that contain an arm, each a different one, with the meanings of their columns."""
     options = job.options
     if options.kinematics == NO_TABLE:
         return []
@@ -228,7 +228,7 @@ def _read(path: Path, job: Import) -> FoundRecording:
 
 
 def _note_missing_kinematics(path: Path, job: Import) -> None:
-    """Say why no kinematics were found, with the columns of the tables that were considered."""
+    """Report why no kinematics were found, with the columns of the tables that were considered."""
     if job.options.kinematics == NO_TABLE:
         job.found("kinematics are left out, as given.")
         return

@@ -88,7 +88,7 @@ def _times(root: Path, episode: _Episode, rate: float, job: Import) -> np.ndarra
             "row n is taken for image n of the episode."
         )
         return times
-    # Numbers of single precision are no better than the rate.
+    # Times in single precision are no more accurate than the rate.
     return even
 
 
