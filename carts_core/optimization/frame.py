@@ -29,17 +29,17 @@ from .variables import Variables
 from .verdict import Assessment
 
 BASE_FRAME_GAIN = 0.12
-"""Least share of the residual that free base frames explain from which they are suspected to be wrong [1]."""
+"""Share of the residual explained by free base frames above which base frames are probably wrong [1]."""
 
 _BLUR = 3.0
-"""Blur of the linear model, and about its range of validity [px of the working image]."""
+"""Blur of the linear model, approximately its range of validity [px of the working image]."""
 
 
 @torch.no_grad()
 def base_frame_gain(problem: FrameProblem, offsets: Float[Tensor, " n"], free: FreeParameters) -> float:
     """Share of the surface residual at a point that free base frames would explain [1].
 
-    What the present unknowns alone would still explain does not count, and a joint at its limit stays there.
+    The part that the current unknowns alone would explain is excluded, and joints at a limit stay there.
     """
     settings, own = problem.settings, problem.variables
     wider = Variables(problem.scene, own.start, replace(free, base_frames=True), settings.length_scale)
@@ -69,26 +69,26 @@ class Iterate:
     """One iterate of an optimization with its rendering; an immutable copy."""
 
     index: int
-    """Number of steps before it; 0 is the start."""
+    """Iteration number; 0 is the start."""
     state: SceneState
     loss: float
-    """Without the prior. Comparable within one observation, and if not `live` under one blur."""
+    """Loss without the prior. Comparable within one observation and, if not `live`, one blur."""
     gradient_norms: dict[str, float]
-    """Per unknown, in radian-like units."""
+    """Gradient norm per unknown, in radian-like units."""
     seconds: float
     """Duration of this iteration [s]."""
     arm_names: tuple[str, ...]
     joint_names: tuple[tuple[str, ...], ...]
-    """Per arm."""
+    """Joint names per arm."""
     silhouette: Float[np.ndarray, "cameras h w"]
-    """At the resolution at which it was compared, as are the other maps."""
+    """Rendered silhouette; all maps are at the resolution of comparison."""
     image: UInt8[np.ndarray, "cameras h w 3"]
     """Rendered arms, RGB."""
     uncertainty: Uncertainty | None
     """Standard deviations; None for losses without curvature."""
     attention: Float[np.ndarray, "cameras h w"]
     similarity: Float[np.ndarray, "cameras h w"]
-    """Cosine of features, or 1 minus the squared difference of surface maps; at most 1."""
+    """Cosine similarity of features, or 1 minus the squared difference of surface maps; at most 1."""
 
     def joint_positions(self) -> dict[str, np.ndarray]:
         """Arm name -> joint positions [dofs], [rad, m]."""
@@ -96,37 +96,37 @@ class Iterate:
         return dict(zip(self.arm_names, values, strict=True))
 
     def joint_std(self) -> dict[str, np.ndarray]:
-        """Arm name -> standard deviation of the joint positions [dofs], [rad, m]; NaN where it is not known."""
+        """Arm name -> standard deviation of the joint positions [dofs], [rad, m]; NaN if unknown."""
         known = self.uncertainty or Uncertainty((), (), ())
         return {arm: known.joint_std(arm, joints) for arm, joints in zip(self.arm_names, self.joint_names, strict=True)}
 
 
 @dataclass(frozen=True)
 class Progress:
-    """Scalars of an iterate, kept in the history."""
+    """Scalars of an iterate, stored in the history."""
 
     index: int
     loss: float
     seconds: float
     stage: int = 0
-    """Counts from 0; losses compare within one, see `FrameOptimizer.comparable_losses`."""
+    """Stage index, from 0; losses are comparable within one stage, see `FrameOptimizer.comparable_losses`."""
 
 
 class FrameOptimizer:
-    """Optimization of one frame (paper, section 3), one iterate at a time.
+    """Step-wise optimization of one frame (paper, section 3).
 
     Args:
         frame: observed images and measured joint positions.
-        backgrounds: camera name -> mean background BG_m. A `DescentSolver` needs them all; a `SurfaceSolver` discards
-            false detections in them, and does without where one is missing. `Backgrounds` cache this across frames.
+        backgrounds: camera name -> mean background BG_m. A `DescentSolver` requires all of them; a `SurfaceSolver` uses
+            them to discard false detections, and skips missing ones. `Backgrounds` caches this across frames.
         networks: the networks, or another predictor of surface maps.
-        ignore: camera name -> pixels that show an occluder; a `SurfaceSolver` leaves them out.
+        ignore: camera name -> pixels that show an occluder; a `SurfaceSolver` excludes them.
         start: arm name -> joint positions to start from, the measured ones by default.
         settings: the solver, `SurfaceSolver()` by default.
-        factors: makes further factors over the unknowns, which a `SurfaceSolver` adds to its objective.
-        cameras: names of the cameras that take part, all by default.
-        live: whether iterates are displayed. If not, a `SurfaceSolver` saves a third of its time: iterates of coarse
-            stages are then rendered as coarsely as they are compared. The result is the same.
+        factors: creates additional factors over the unknowns for the objective of a `SurfaceSolver`.
+        cameras: names of the cameras to use, all by default.
+        live: whether iterates are displayed. If not, a `SurfaceSolver` renders iterates of coarse stages only at the
+            stage's resolution, which saves a third of the time. The result is the same.
 
     Raises:
         SettingsError: an image or background is missing or of the wrong size, nothing is free, or factors are
@@ -173,21 +173,21 @@ class FrameOptimizer:
         self.reset()
 
     def reset(self) -> None:
-        """Go back to the start; the history is emptied."""
+        """Return to the start and clear the history."""
         self.history: list[Progress] = []
         self._visited: list[tuple[torch.Tensor, object]] = []
         self.best: Iterate | None = None
         self.stop_reason: StopReason | None = None
         if isinstance(self._problem, FrameProblem):
             self._problem.reset()
-        # A descent evaluates where its last step leads.
+        # A descent evaluates the point after its last step.
         budget = self.settings.iterations + int(isinstance(self._problem, FeatureProblem))
         self._fit = Fit(self._problem, torch.zeros_like(self._variables.lower), budget)
         self._points = run_stages(self.settings.stages, self._fit)
 
     @property
     def assessment(self) -> Assessment | None:
-        """Verdict at the end; None before, and for a solver without `RejectFailed`."""
+        """Final verdict; None before the end, and for solvers without `RejectFailed`."""
         return self._fit.assessment
 
     @property
@@ -200,7 +200,7 @@ class FrameOptimizer:
         self.stop_reason = self.stop_reason or StopReason.CANCELLED
 
     def step(self) -> Iterate | None:
-        """The next iterate; None once the optimization has stopped. The first one is iterate 0, the start."""
+        """Compute the next iterate; None once the optimization has stopped. Iterate 0 is the start."""
         if self.stop_reason is not None:
             return None
         began = time.perf_counter()
@@ -221,9 +221,9 @@ class FrameOptimizer:
         return iter(self.step, None)
 
     def comparable_losses(self) -> list[float]:
-        """Losses of all iterates under the last observation.
+        """Losses of all iterates that refer to the last observation.
 
-        The loss of an iterate refers to the observation of its stage, and compares within that stage alone.
+        The loss of an iterate refers to the observation of its stage, and is comparable only within that stage.
         """
         problem = self._problem
         if not isinstance(problem, FrameProblem):
@@ -233,11 +233,11 @@ class FrameOptimizer:
     def base_frame_gain(self) -> float | None:
         """Share of the surface residual at the best iterate that free base frames would explain [1].
 
-        It follows from the linear model at the cost of one comparison. Ignored pixels are left out. All cameras are
-        combined, so that the effect of a single one with a wrong pose is smaller.
+        It is computed from the linear model, at the cost of one comparison, without ignored pixels. All cameras are
+        combined, which reduces the effect of a single camera with a wrong pose.
 
         Returns:
-            None before the end, if base frames are free already, or for losses without a surface factor.
+            The share; None before the end, if base frames are free already, or for losses without a surface factor.
         """
         ended = self.stop_reason not in (None, StopReason.CANCELLED, StopReason.NOT_OPTIMIZED)
         if not ended or self._free.base_frames or not isinstance(self._problem, FrameProblem):

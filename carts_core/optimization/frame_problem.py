@@ -1,4 +1,4 @@
-"""One frame as an optimization problem: images, unknowns, prior and the last observation."""
+"""Optimization problem of one frame: images, unknowns, prior and last observation."""
 
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -33,7 +33,7 @@ _CONTRADICTS = 0.5
 _SMALLEST, _NEAR, _GAP, _RIM = 2, 5, 7, 2
 """Radii at an image width of 320 px [px]: smallest object, distance from the silhouette, closed holes, and margin."""
 _MOST = 0.5
-"""Share of the silhouette above which the estimate is wrong, not occluded [1]."""
+"""Contradicting share of the silhouette above which the estimate counts as wrong, not as occluded [1]."""
 
 
 def propose_ignore(
@@ -41,14 +41,14 @@ def propose_ignore(
 ) -> dict[str, Bool[np.ndarray, "height width"]]:
     """Probable occluders: areas at the arms where the prediction differs from the rendering.
 
-    Occluders predicted as background are gaps in the arm, occluders predicted as instruments extend it; both count if
-    they touch the silhouette.
+    Occluders predicted as background leave gaps in the arm; occluders predicted as instruments extend it. Both are
+    proposed if they touch the silhouette.
 
     Args:
-        silhouette: of an estimate, as an `Iterate` carries it.
+        silhouette: silhouette of an estimate, as in `Iterate`.
 
     Returns:
-        Camera name -> mask at the camera's size; cameras without a proposal are left out.
+        Camera name -> mask at the camera's size; cameras without a proposal are omitted.
     """
     proposals = {}
     for camera, inside, alike in zip(scene.cameras, silhouette > 0.5, similarity, strict=True):
@@ -71,19 +71,19 @@ def _disc(radius: float) -> np.ndarray:
 
 
 _COVERED = 0.5
-"""Coverage from which a pixel belongs to a mask [1]."""
+"""Coverage threshold for mask pixels [1]."""
 
 _ELITE = 0.1
-"""Share of candidates that the next round is drawn around [1]."""
+"""Elite share of candidates, around which the next round is drawn [1]."""
 
 _FIRST = 4
-"""Factor on the number of candidates of the first round [1]."""
+"""Factor for the number of candidates in the first round [1]."""
 
 _LEAST = 0.02
 """Smallest standard deviation of a round, relative to the first one [1]."""
 
 _HOLD = 0.05
-"""Cost of a mean squared offset of one standard deviation [px]."""
+"""Cost of a mean squared offset of 1, in standard deviations [px]."""
 
 
 def mask_distances(mask: Bool[np.ndarray, "*cameras h w"]) -> Float[np.ndarray, "*cameras h w"]:
@@ -108,13 +108,13 @@ def silhouette_distance(
     rendered, masks = rendered & weight, masks & weight
     outside = (rendered * to_masks).sum((1, 2, 3)) / rendered.sum((1, 2, 3)).clip(min=1)
     missed = (mask_distances(rendered) * masks).sum((1, 2, 3)) / max(int(masks.sum()), 1)
-    # An empty silhouette gets the largest distance.
+    # An empty silhouette has the largest distance.
     outside[~rendered.any((1, 2, 3))] = rendered.shape[-1]
     return 0.5 * (outside + missed)
 
 
 class SilhouetteComparison:
-    """Silhouettes of one frame against its given masks, in small images."""
+    """Comparison of one frame's silhouettes with given masks, in small images."""
 
     def __init__(self, images: FrameImages, predictor: FramePredictor) -> None:
         nothing = images.images.new_zeros(len(images.images), SURFACE_CHANNELS, *images.images.shape[-2:])
@@ -124,14 +124,14 @@ class SilhouetteComparison:
         self._renderer = images.renderer
 
     def overlap(self, state: SceneState) -> float:
-        """Dice of silhouettes and masks in all cameras together; 1 where both are empty."""
+        """Dice of silhouettes and masks over all cameras together; 1 if both are empty."""
         rendered = (self._renderer.segment(state) >= 0) & self._weight
         masks = self._masks & self._weight
         total = int(rendered.sum()) + int(masks.sum())
         return 2 * int((rendered & masks).sum()) / total if total else 1.0
 
     def distances(self, states: SceneState) -> Float[np.ndarray, " batch"]:
-        """See `silhouette_distance`, of a batch of states."""
+        """Distances for a batch of states; see `silhouette_distance`."""
         return silhouette_distance(self._renderer.segment(states) >= 0, self._masks, self._weight)
 
 
@@ -141,7 +141,7 @@ def search_silhouettes(
     clamp: Callable[[Tensor], Tensor],
     stage: SilhouetteSearch,
 ) -> Float[Tensor, " n"]:
-    """The point with the smallest distance of silhouettes and masks [px], by the cross-entropy method."""
+    """Minimize the distance between silhouettes and masks [px] by the cross-entropy method."""
     best, lowest = torch.zeros_like(deviation), float("inf")
     for start in range(stage.starts):
         generator = torch.Generator().manual_seed(start)
@@ -170,25 +170,26 @@ _SHOWN_BLUR = 1.6
 
 
 _BESIDE = ThreadPoolExecutor(2, "edges")
-"""Extracts image edges while the network runs."""
+"""Thread pool that extracts image edges while the network runs."""
 
 
 class FrameProblem:
-    """The sum of the surface factor of the last observation, the prior, and further factors.
+    """Objective of one frame: surface factor of the last observation, prior, and additional factors.
 
     Args:
         ignore: camera name -> pixels that show an occluder.
-        prior: of the unknowns; as the settings expect by default.
-        backgrounds: of the cameras; predictions in them are false positives.
-        live: whether coarse stages are also compared under a fine blur for display, which takes a third more time.
+        prior: prior of the unknowns; by default that of the settings.
+        backgrounds: mean backgrounds of the cameras; predictions in them are false positives.
+        live: whether coarse stages are also compared under a fine blur for display, which increases the time by a
+            third.
 
     Attributes:
-        observation: the last one; stages replace it.
-        observations: their number.
+        observation: the last observation; replaced by stages.
+        observations: number of observations made.
         proposed: camera name -> pixels of proposed occluders.
 
     Raises:
-        SettingsError: an image is missing, or an image or a mask is of another size than its camera.
+        SettingsError: an image is missing, or the size of an image or mask differs from that of its camera.
     """
 
     def __init__(
@@ -221,7 +222,7 @@ class FrameProblem:
         self.proposed: dict[str, Bool[np.ndarray, "h w"]] = {}
         self.images(first_observe(settings.stages).scale)
         if any(isinstance(stage, AlignEdges) for stage in settings.stages):
-            # Edges of the image are found while the network runs.
+            # Image edges are extracted while the network runs.
             self._edges = self._edges_beside()
 
     @property
@@ -231,7 +232,7 @@ class FrameProblem:
 
     @property
     def observation(self) -> Observation:
-        """The last one."""
+        """The last observation."""
         assert self._observation is not None, "a solver begins with Observe"
         return self._observation
 
@@ -241,7 +242,7 @@ class FrameProblem:
         self.observations += 1
 
     def images(self, scale: float) -> FrameImages:
-        """The images at a scale."""
+        """Images at a scale relative to the working image."""
         if scale not in self._images:
             self._images[scale] = FrameImages.of(
                 self.scene,
@@ -256,7 +257,7 @@ class FrameProblem:
         return self._images[scale]
 
     def toggle_background_mode(self) -> None:
-        """Switch between replacing the empty background and subtracting the predictions in it."""
+        """Switch between replacing the empty background in the images and subtracting the predictions in it."""
         self._replaced = not self.images(1.0).replaced
         self._images, self._evidence = {}, None
 
@@ -273,7 +274,7 @@ class FrameProblem:
         self.observation = observe(self.images(stage.scale), self.predictor, state, stage, whole=whole)
 
     def ignore_occluders(self, evaluation: Evaluation) -> bool:
-        """Ignore probable occluders from now on; returns whether there are any."""
+        """Add probable occluders to the ignore mask; returns whether there are any."""
         silhouette, similarity = evaluation.silhouette.cpu().numpy(), evaluation.similarity.cpu().numpy()
         self.proposed = propose_ignore(self.scene, silhouette, similarity)
         if self.proposed:
@@ -283,23 +284,23 @@ class FrameProblem:
         return bool(self.proposed)
 
     def factor(self, stage: Descend) -> SurfaceFactor:
-        """The surface factor of the last observation, as a stage compares it."""
+        """Surface factor of the last observation, with the blur of a stage."""
         key = stage.blur, stage.robust
         if key not in self._factors:
             self._factors[key] = SurfaceFactor(self.scene, self.variables, self.observation, self.settings, stage)
         return self._factors[key]
 
     def objective_key(self, blur: float) -> tuple[int, float]:
-        """Key of the objective: the observation and, if not live, the blur. Losses compare within one key."""
+        """Key of the objective: the observation and, if not live, the blur. Losses are comparable within one key."""
         return self.observations, 0.0 if self._live else blur
 
     @torch.no_grad()
     def costs(self, offsets: Float[Tensor, "batch n"], stage: Descend) -> Float[Tensor, " batch"]:
-        """The objective at each of a batch of points, as a stage compares it."""
+        """Objective at a batch of points, under the blur of a stage."""
         return self.factor(stage).costs(offsets) + self.other_costs(offsets)
 
     def other_costs(self, offsets: Float[Tensor, "batch n"]) -> Float[Tensor, " batch"]:
-        """The cost of all factors but the surface factor at each of a batch of points."""
+        """Cost of all factors except the surface factor at a batch of points."""
         return torch.stack([factor.costs(offsets) for factor in self._other_factors]).sum(0)
 
     def uncertainty_after(self, offsets: Float[Tensor, " n"], evaluation: Evaluation) -> Uncertainty | None:
@@ -314,7 +315,8 @@ class FrameProblem:
 
     @torch.no_grad()
     def evaluate(self, offsets: Float[Tensor, " n"], stage: Descend, *, gradient: bool = True) -> Evaluation:
-        """The objective at a point, as a stage compares it; with a gradient, its quadratic model, too."""
+        """Evaluate the objective at a point, under the blur of a stage; with `gradient`, including its quadratic
+        model."""
         factor = self.factor(stage)
         others = reduce(add, (other.linearize(offsets) for other in self._other_factors))
         slope, hessian, common, known = torch.zeros_like(offsets), None, None, None
@@ -348,14 +350,14 @@ class FrameProblem:
         )
 
     def evidence(self, offsets: Float[Tensor, " n"], loss: float) -> Evidence:
-        """Evidence for and against a point of known loss."""
+        """Evidence for and against a point with known loss."""
         if self._evidence is None or not torch.equal(self._evidence[0], offsets):
             start, end = (self.variables.state(at) for at in (self.start, offsets))
             self._evidence = offsets.clone(), evidence(self.images(1.0), start, end, self.predictor, loss)
         return replace(self._evidence[1], loss=loss)
 
     def evidence_at(self, offsets: Float[Tensor, " n"]) -> Evidence:
-        """Evidence for and against a point, with its loss under the last observation."""
+        """Evidence for and against a point; its loss is computed under the last observation."""
         return self.evidence(offsets, self.evaluate(offsets, FINEST, gradient=False).loss)
 
     @property
@@ -369,11 +371,11 @@ class FrameProblem:
         return self.predictor.masked
 
     def silhouettes(self, scale: float) -> SilhouetteComparison:
-        """Silhouettes against the given masks, in images of a scale."""
+        """Comparison of silhouettes with the given masks, at an image scale."""
         return SilhouetteComparison(self.images(scale), self.predictor)
 
     def silhouette_overlap(self, offsets: Float[Tensor, " n"], scale: float) -> float:
-        """Overlap of silhouettes and masks (Dice)."""
+        """Dice of silhouettes and masks."""
         return self.silhouettes(scale).overlap(self.variables.state(offsets))
 
     def search_silhouettes(self, stage: SilhouetteSearch) -> Float[Tensor, " n"]:
@@ -385,9 +387,9 @@ class FrameProblem:
         )
 
     def _loss(self, factor: SurfaceFactor, compared) -> float:
-        """Cost per pixel of the arms, averaged over the rendered and the observed area.
+        """Cost per arm pixel, where the area is the mean of the rendered and observed areas.
 
-        The area is weighted as the cost is, so that losses compare between clear and hazy images.
+        The area has the same weights as the cost, so that losses of clear and hazy images are comparable.
         """
         coverage = compared.rendering.maps[:, COVERAGE].sum(1)
         rendered = total(coverage * factor.certainty[:, 0]) * factor.area
@@ -396,13 +398,13 @@ class FrameProblem:
     def aligned(
         self, stage: AlignEdges, offsets: Float[Tensor, " n"], known: Evaluation
     ) -> tuple[Float[Tensor, " n"], Linearization]:
-        """Alignment with edges from an evaluated point; see `align_edges`."""
+        """Align outlines with edges, starting at an evaluated point; see `align_edges`."""
         assert known.hessian is not None
         model = Linearization(known.value, known.gradient, known.hessian)
         return align_edges(self._edge_factor(), stage, offsets, model, self.observation.whole_coverage())
 
     def edge_distance(self, offsets: Float[Tensor, " n"]) -> float:
-        """Distance of outlines from edges at a point; see `EdgeFactor.cost`."""
+        """Edge cost of the outlines at a point; see `EdgeFactor.cost`."""
         return self._edge_factor().near(offsets, self.observation.whole_coverage(), AlignEdges.weight).cost()
 
     def _edge_factor(self) -> EdgeFactor:

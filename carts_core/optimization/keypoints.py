@@ -1,4 +1,4 @@
-"""Joint positions from keypoints placed by a person, by bounded least squares."""
+"""Joint positions from manually placed keypoints, by bounded least squares."""
 
 import math
 from collections.abc import Sequence
@@ -18,12 +18,12 @@ from ..settings.ranges import Count, Positive, Ranged
 from .variables import Variables
 
 _ROOM = 1e-12
-"""Least distance of the start from a joint limit [rad]."""
+"""Minimum distance of the start from a joint limit [rad]."""
 
 
 @dataclass(frozen=True)
 class Pin:
-    """A keypoint with its position in an image, set by a person."""
+    """A keypoint with its manually set position in an image."""
 
     keypoint: Keypoint
     camera: str
@@ -36,18 +36,18 @@ class KeypointSettings(Ranged):
     """Weights of pins and of the initial joint positions."""
 
     prior_deg: Positive = 10.0
-    """Expected error of a joint at the start [deg]; a prismatic joint's is `length_scale` times as many metres."""
+    """Expected error of an initial joint position [deg]; `length_scale` converts it to metres."""
     pixel_error: Positive = 0.5
     """Expected error of a pin [px]."""
     length_scale: Positive = SurfaceSolver.length_scale
-    """Metres of translation that count as one radian [m]."""
+    """Translation equivalent to one radian [m]."""
     iterations: Count = 60
-    """Largest number of steps [1]."""
+    """Largest number of iterations [1]."""
 
 
 @dataclass(frozen=True, eq=False)
 class KeypointFit:
-    """State of the arms that fits the pins."""
+    """Result of fitting the arms to pins."""
 
     state: SceneState
     residuals: tuple[float, ...]
@@ -58,13 +58,13 @@ class KeypointFit:
 def fit_keypoints(
     scene: Scene, start: SceneState, pins: Sequence[Pin], settings: KeypointSettings | None = None
 ) -> KeypointFit:
-    """Move the joints of the pinned arms so that their keypoints come to lie on the pins; joint limits hold.
+    """Estimate the joint positions of pinned arms so that their keypoints coincide with the pins, within joint limits.
 
     Minimizes the squared distances in the image and the squared joint motion, each over its expected error
-    (`scipy.optimize.least_squares`). So pins alone decide what they determine, and the rest stays near the start.
+    (`scipy.optimize.least_squares`). Directions not determined by pins stay near the start.
 
     Args:
-        pins: one or more, also in several cameras.
+        pins: one or more pins, in one or several cameras.
 
     Raises:
         SettingsError: there is no pin, or a keypoint starts behind its camera.
@@ -104,7 +104,7 @@ def fit_keypoints(
         lambda offsets: residuals(torch.from_numpy(offsets)).numpy(),
         origin.numpy(),
         jac=jacobian,  # pyright: ignore[reportArgumentType]
-        # The method needs some room for a start that is at or beyond a joint limit.
+        # The method requires a start strictly inside the joint limits.
         bounds=(
             np.minimum(variables.lower.double().numpy(), -_ROOM),
             np.maximum(variables.upper.double().numpy(), _ROOM),

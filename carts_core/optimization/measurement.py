@@ -1,4 +1,4 @@
-"""Measurements of single frames in a sequence, and checkpoints of them."""
+"""Measurements of single frames in a sequence, with checkpoints."""
 
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import CancelledError
@@ -46,14 +46,14 @@ class Measurement:
     """Measurement of one frame at the end of a descent."""
 
     correction: Float[np.ndarray, " n"]
-    """Maximum a posteriori [rad]."""
+    """Maximum a posteriori estimate of the correction [rad]."""
     information: Information
-    """Information of the image alone, linearized there and scaled for correlated pixels."""
+    """Information of the image alone, linearized at the correction and scaled for correlated pixels."""
     loss: float
     iterations: int
 
     def left_out(self) -> "Measurement":
-        """The measurement without the information of its image."""
+        """Copy of the measurement without the information of its image."""
         return replace(self, information=Information.nothing(len(self.correction)))
 
 
@@ -62,20 +62,20 @@ class SolvedAlone:
     """Result of the single-frame solver."""
 
     correction: Float[np.ndarray, " n"]
-    """[rad]"""
+    """Correction of the measured values [rad]."""
     uncertainty: Uncertainty | None
-    """With allowance for the verdict; None where it is not known."""
+    """Uncertainty that accounts for the verdict; None if unknown."""
     loss: float
     iterations: int
     assessment: Assessment | None
-    """None for stages without `RejectFailed`."""
+    """Verdict; None for stages without `RejectFailed`."""
 
 
 def sequence_checkpoint(path: OutputPath, made_with: str) -> Checkpoint:
-    """The checkpoint of a `SequenceOptimizer`.
+    """Create the checkpoint of a `SequenceOptimizer`.
 
     Args:
-        made_with: fingerprint of scene, weights, settings and code; frames and what is expected of them need not be in.
+        made_with: fingerprint of scene, weights, settings and code; frames and predictions need not be included.
     """
     return Checkpoint(path, made_with, (Measurement, Information, Evidence))
 
@@ -83,7 +83,7 @@ def sequence_checkpoint(path: OutputPath, made_with: str) -> Checkpoint:
 def _checkpointed(
     method: "Callable[Concatenate[FrameSolver, Frame, Variables, P], Found]",
 ) -> "Callable[Concatenate[FrameSolver, Frame, Variables, P], Found]":
-    """Makes a method of `FrameSolver` look its result up in the solver's checkpoint: the same to the last bit."""
+    """Decorator that caches results of a `FrameSolver` method in its checkpoint; cached results are bit-identical."""
 
     @wraps(method)
     def looked_up(
@@ -108,8 +108,8 @@ class FrameSolver:
 
     Args:
         model: stages of cold and warm starts, and the noise of a measurement.
-        ignore: position of a frame -> camera name -> pixels that show an occluder.
-        checkpoint: made by `sequence_checkpoint`; keeps what was found.
+        ignore: frame index -> camera name -> pixels that show an occluder.
+        checkpoint: created by `sequence_checkpoint`; stores the results.
     """
 
     def __init__(
@@ -131,7 +131,7 @@ class FrameSolver:
     def warm(
         self, frame: Frame, variables: Variables, expected: Gaussian, start: np.ndarray, *, wide: bool = False
     ) -> Measurement:
-        """Find the correction near `start` [n]; wide with more room around the arms, and more steps."""
+        """Find the correction near `start` [n]; `wide` uses a larger margin around the arms, and more steps."""
         prior = _prior(expected, variables)
         fit = self._run(frame, variables, prior, self._wide if wide else self._warm, start)
         assert fit.reached is not None
@@ -153,7 +153,7 @@ class FrameSolver:
         quick: bool = False,
         cancelled: Callable[[], bool] = lambda: False,
     ) -> Measurement:
-        """Find the correction from the measured values on; quick in smaller images but for the end.
+        """Find the correction, starting at the measured values; `quick` uses smaller images except in the last stages.
 
         Raises:
             CancelledError: `cancelled` returned True after an evaluation.
@@ -166,7 +166,7 @@ class FrameSolver:
         return replace(end, iterations=fit.used + end.iterations)
 
     def alone(self, frame: Frame, variables: Variables) -> SolvedAlone | None:
-        """Run the stages of the settings, as `FrameOptimizer` does; None if they evaluate nothing."""
+        """Run the stages of the settings, like `FrameOptimizer`; None if nothing is evaluated."""
         fit = self._run(frame, variables, None, self._settings.stages, np.zeros(len(variables)))
         if fit.best is None:
             return None
@@ -185,7 +185,7 @@ class FrameSolver:
 
     @_checkpointed
     def losses(self, frame: Frame, variables: Variables, corrections: Sequence[np.ndarray]) -> list[float]:
-        """Losses of corrections [n] in a smaller image, observed conditioned on each."""
+        """Losses of corrections [n] in a smaller image, each with an observation conditioned on it."""
         problem, found = self._problem(frame, variables, None), []
         for correction in corrections:
             offsets = _offsets(correction, variables)
@@ -195,12 +195,12 @@ class FrameSolver:
 
     @_checkpointed
     def evidence(self, frame: Frame, variables: Variables, correction: np.ndarray, loss: float) -> Evidence:
-        """Evidence for and against a correction [n] of known loss."""
+        """Evidence for and against a correction [n] with known loss."""
         offsets = _offsets(correction, variables)
         return self._problem(frame, variables, None).evidence(offsets, loss)
 
     def arms_out_of_view(self, variables: Variables, correction: np.ndarray) -> bool:
-        """Whether some arm is out of view at a correction [n]."""
+        """Whether any arm is out of view at a correction [n]."""
         offsets = _offsets(correction, variables)
         width, height = working_size(self._scene, self._settings.working_width, 1)
         labels = Renderer(self._scene, width=width, height=height).segment(variables.state(offsets).to("cpu"))
@@ -252,7 +252,7 @@ def _prior(expected: Gaussian, variables: Variables) -> Prior:
 
 
 def _offsets(correction: np.ndarray, variables: Variables) -> Tensor:
-    """A correction [n] within the joint limits."""
+    """Convert a correction [n] to offsets within the joint limits."""
     return variables.clamp(torch.from_numpy(correction).to(variables.lower))
 
 
@@ -261,7 +261,7 @@ def _information(offsets: Tensor, evaluation: Evaluation, prior: Prior) -> Infor
     assert evaluation.hessian is not None
     known = prior.linearize(offsets)
     precision = _double(evaluation.hessian - known.hessian)
-    # Rounding must not make information negative.
+    # Rounding errors must not make information negative.
     values, vectors = np.linalg.eigh(0.5 * (precision + precision.T))
     precision = vectors @ np.diag(values.clip(min=0.0)) @ vectors.T
     slope = _double(evaluation.gradient - known.gradient)

@@ -1,4 +1,4 @@
-"""Evaluations of an objective, their standard deviations, and the joints that an image determines."""
+"""Evaluations of an objective, their standard deviations, and the observability of joints."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -24,7 +24,7 @@ Observability = Literal["determined", "weak", "not visible"]
 _DETERMINED, _VISIBLE = 1 / 3, 0.9
 _OPEN_ANGLE = _DETERMINED * math.radians(SurfaceSolver.prior_deg)
 _OPEN_LENGTH = _OPEN_ANGLE * SurfaceSolver.length_scale
-"""Standard deviations above which a joint is not determined [rad, m]."""
+"""Standard deviation above which a joint is not determined [rad, m]."""
 
 
 @dataclass(frozen=True)
@@ -32,16 +32,18 @@ class Uncertainty:
     """Standard deviations of the unknowns after an optimization."""
 
     names: tuple[str, ...]
-    """As in `Variables.names`, such as `PSM1/yaw`."""
+    """Names of the unknowns as in `Variables.names`, such as `PSM1/yaw`."""
     std: tuple[float, ...]
-    """Standard deviation [rad], [m] for prismatic joints and translations."""
+    """Standard deviation [rad]; [m] for prismatic joints and translations."""
     expected: tuple[float, ...]
     """Prior standard deviation; at the end of a fit, rescaled by the size of the corrections."""
     left: tuple[float, ...] | None = None
-    """Posterior over prior standard deviation for the prior of the settings [1]; None if `expected` is that prior."""
+    """Ratio of posterior to prior standard deviation for the prior of the settings [1]; None if `expected` is that
+    prior."""
 
     def observability(self, name: str) -> Observability:
-        """Whether the image determines an unknown: its deviation falls to a third, a little, or hardly at all."""
+        """Observability of an unknown: whether its standard deviation decreases to a third, a little, or hardly at
+        all."""
         index = self.names.index(name)
         share = self.std[index] / self.expected[index] if self.left is None else self.left[index]
         return "determined" if share < _DETERMINED else "weak" if share < _VISIBLE else "not visible"
@@ -52,9 +54,9 @@ class Uncertainty:
         return np.array([known.get(f"{arm}/{joint}", np.nan) for joint in joints])
 
     def doubted(self, probability: float) -> "Uncertainty":
-        """Standard deviations if the fit is wrong with a probability [1], and then leaves the prior as it was.
+        """Standard deviations given a probability that the fit is wrong [1], in which case the prior applies.
 
-        The variance of a mixture of both cases, by the law of total variance.
+        They are those of the mixture of both cases, by the law of total variance.
         """
 
         def mixed(right: Sequence[float], wrong: Sequence[float]) -> tuple[float, ...]:
@@ -65,7 +67,7 @@ class Uncertainty:
         return replace(self, std=mixed(self.std, self.expected), left=left)
 
     def rescaled(self, later: "Uncertainty") -> "Uncertainty":
-        """Standard deviations under a rescaled prior; observability stays that under the original one."""
+        """Standard deviations under a rescaled prior; observability still refers to the original prior."""
         return replace(later, left=tuple(std / given for std, given in zip(self.std, self.expected, strict=True)))
 
 
@@ -75,10 +77,10 @@ def undetermined_joints(
     """`ARM.JOINT` of each joint whose standard deviation after a fit exceeds a third of the prior's.
 
     Args:
-        joint_std: arm -> standard deviations [rad, m]; None and NaN (joints that were held) do not count.
+        joint_std: arm -> standard deviations [rad, m]; None and NaN (fixed joints) are ignored.
 
     Returns:
-        None where no deviation is known.
+        The names; None if no standard deviation is known.
     """
     known, undetermined = False, []
     for arm in scene.arms:
@@ -96,7 +98,7 @@ def fit_words(verdict: str, undetermined: Sequence[str] | None) -> str:
     """Verdict on the mask and number of undetermined joints as text: `mask good, 4 joints not determined`.
 
     Args:
-        undetermined: as from `undetermined_joints`; None where no deviation is known.
+        undetermined: result of `undetermined_joints`; None if no standard deviation is known.
     """
     if undetermined is None:
         return f"mask {verdict}"
@@ -110,13 +112,13 @@ def uncertainty(
     """Uncertainty under the prior of the settings, from the curvature of an objective in units of its noise.
 
     Args:
-        prior: of their offsets, before the image was used.
+        prior: prior of the offsets, before the image was used.
         curvature: J^T J / noise^2 and the prior's precision, per offset.
-        common: change of the gradient for one standard deviation of an error that all pixels share. It does not average
-            out, so its effect is added to that of the noise; the sum never exceeds the prior.
+        common: change of the gradient for one standard deviation of an error common to all pixels. It does not average
+            out, so its effect is added to that of the noise, up to the prior.
 
     Returns:
-        None where the prior does not constrain an unknown.
+        The uncertainty; None if the prior does not constrain an unknown.
     """
     if not (prior.precision.diagonal() > 0).all():
         return None
@@ -134,15 +136,15 @@ def uncertainty_after(
 ) -> Uncertainty:
     """Uncertainty under a prior that is rescaled by the size of the corrections.
 
-    The fit is the optimum under the original prior, so a part of an error e of the start remains:
+    The fit is the optimum under the original prior, so part of an error e of the start remains:
     (P + a I) (I + P)^-1 e, where I is the image's information, P the prior's precision and a the share of the start in
     the network's prediction. Noise is added to it.
 
     Args:
-        prior: of their offsets, before the image was used; it informs all of them.
+        prior: prior of the offsets, before the image was used; it must constrain all of them.
         curvature: J^T J / noise^2 and the prior's precision, per offset.
-        moved: offsets at the optimum, less the prior's mean.
-        start_share: share of an error of the start that is left in what the image seems to show [1].
+        moved: offsets at the optimum, minus the prior's mean.
+        start_share: share of an error of the start that remains in the network's prediction [1].
     """
     precision, curvature = prior.precision.double(), curvature.double()
     information, inverse = curvature - precision, torch.linalg.inv(curvature)
@@ -162,23 +164,23 @@ def _uncertainty(
 
 
 _SQUARES = torch.logspace(-3, 2, 241, dtype=torch.float64)
-"""Squares of the scales that `expected_scale` weighs, in steps of 5 % [1]."""
+"""Squared scales over which `expected_scale` integrates, in steps of 5 % [1]."""
 _SHOWN = 1e-4
-"""Least information of a direction, in units of the prior's precision, that enters the scale [1]."""
+"""Minimum information of a direction that is used for the scale, in units of the prior's precision [1]."""
 
 
 def expected_scale(
     moved: Float[Tensor, " n"], information: Float[Tensor, "n n"], prior: Float[Tensor, "n n"], start_share: float = 0.0
 ) -> float:
-    """Ratio of the likely size of the start's errors to the prior's, from the corrections of a fit [1].
+    """Estimated ratio of the start's errors to the prior standard deviation, from the corrections of a fit [1].
 
     Hierarchical prior (Gelman et al., Bayesian Data Analysis, 2013, chapter 5): the square of the scale is lognormal
-    with mean 1 and a deviation of 1 of its logarithm, and corrections are Gaussian in each direction, given the scale.
-    The result is the root of the posterior mean of the square; it is 1 if the image determines nothing.
+    with mean 1 and a standard deviation of 1 of its logarithm, and corrections are Gaussian in each direction, given
+    the scale. The result is the root of the posterior mean of the square; it is 1 if the image determines nothing.
 
     Args:
-        information: curvature of the image's part of the objective.
-        prior: inverse covariance of the offsets before the image was used.
+        information: curvature of the image term of the objective.
+        prior: precision of the offsets before the image was used.
     """
     root = torch.linalg.cholesky(torch.linalg.inv(prior.double()))
     shown, axes = torch.linalg.eigh(root.T @ information.double() @ root)
@@ -196,27 +198,27 @@ def expected_scale(
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Objective at one point. Maps are at the resolution of comparison, without autograd."""
+    """Evaluation of the objective at one point. Maps are at the resolution of comparison, without autograd."""
 
     value: float
     """Sum of all factors, the prior included."""
     loss: float
-    """Without the prior, per pixel of the arms. Comparable among evaluations of one observation, and unless
-    the problem is live under one blur."""
+    """Loss per arm pixel, without the prior. Comparable within one observation and, unless the problem is live, one
+    blur."""
     stage_loss: float
-    """The same under the blur of the descent."""
+    """Loss under the blur of the descent."""
     gradient: Float[Tensor, " n"]
     """Gradient of `value`; zero if not requested."""
     hessian: Float[Tensor, "n n"] | None
-    """Gauss-Newton's approximation of the second derivative of `value`; None where there is none."""
+    """Gauss-Newton approximation of the Hessian of `value`; None if not available."""
     uncertainty: Uncertainty | None
-    """Standard deviations that follow from the hessian, for errors as large as expected."""
+    """Standard deviations from the Hessian, under the prior of the settings."""
     image: Float[Tensor, "cameras 3 h w"]
     """Rendered arms, RGB, black elsewhere."""
     silhouette: Float[Tensor, "cameras h w"]
     similarity: Float[Tensor, "cameras h w"]
-    """At most 1; 1 where nothing was compared."""
+    """Similarity per pixel, at most 1; 1 where nothing was compared."""
     attention: Float[Tensor, "cameras h w"]
     """Weight of each pixel, in [0, 1]."""
     common: Float[Tensor, " n"] | None = field(default=None, kw_only=True)
-    """Change of the gradient for one standard deviation of an error that all pixels share; None as the hessian."""
+    """Change of the gradient for one standard deviation of an error common to all pixels; None without a Hessian."""

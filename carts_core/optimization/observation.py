@@ -1,4 +1,4 @@
-"""Observations: images of a frame in a size in which they are compared, and the surface maps predicted in them."""
+"""Observations: images of a frame at the size of comparison, and the surface maps predicted from them."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -21,12 +21,12 @@ from .backgrounds import DECEPTIVE, Backgrounds, Change, without_background
 from .predictor import FramePredictor
 
 HAS_LEFT = 0.3
-"""Share of its area at the start below which an arm has left the image [1]."""
+"""Share of its initial area below which an arm has left the image [1]."""
 
 
 @dataclass(frozen=True)
 class FrameImages:
-    """Images in one size with weights of their pixels. Made by `FrameImages.of`."""
+    """Images at one size, with pixel weights. Created by `FrameImages.of`."""
 
     scale: float
     """Size relative to the working image [1]."""
@@ -35,13 +35,13 @@ class FrameImages:
     images: Float[Tensor, "cameras 3 h w"]
     """RGB in [0, 1], without smoke and haze."""
     weight: Float[Tensor, "cameras 1 h w"]
-    """0 where an occluder is known to be, 1 elsewhere."""
+    """Pixel weight: 0 at known occluders, 1 elsewhere."""
     certainty: Float[Tensor, "cameras 1 h w"]
-    """Information of a pixel, as a share of what it would have without smoke and haze [1]."""
+    """Information of a pixel, relative to an image without smoke and haze [1]."""
     explained: Float[Tensor, "cameras 1 h w"] | None
-    """Share of the predicted coverage that the empty background explains [1]; None where not known."""
+    """Share of the predicted coverage explained by the empty background [1]; None if unknown."""
     change: Change | None
-    """Difference from the empty background; None where that is not known."""
+    """Difference from the empty background; None if that is unknown."""
     renderer: Renderer
     """Renderer of the whole image."""
 
@@ -63,7 +63,7 @@ class FrameImages:
         before: tuple[Int[np.ndarray, "cameras h w"], SceneState],
         after: tuple[Int[np.ndarray, "cameras h w"], SceneState],
     ) -> float:
-        """Area of an arm relative to the start's [1], by labels and state before and after; occluded parts count."""
+        """Ratio of an arm's area after and before [1], from labels and state of each; occluded parts count."""
         share = int((after[0] == arm).sum()) / max(int((before[0] == arm).sum()), 1)
         if share >= HAS_LEFT or len(self.renderer.scene.arms) < 2:
             return share
@@ -71,7 +71,7 @@ class FrameImages:
 
     @property
     def replaced(self) -> bool:
-        """Whether the empty background was replaced in the images."""
+        """Whether the unchanged background was replaced in the images."""
         return self.change is not None and self.explained is None
 
     @staticmethod
@@ -86,23 +86,23 @@ class FrameImages:
         backgrounds: Backgrounds | None = None,
         replaced: bool | None = None,
     ) -> "FrameImages":
-        """Images at `scale` times the working size, as far as the predictor's stride allows.
+        """Prepare images at `scale` times the working size, rounded to the predictor's stride.
 
         Args:
             ignore: camera name -> pixels that show an occluder.
             settings: working size and dehazing.
-            predictor: sizes are multiples of its stride; it also sees the backgrounds, once.
-            scale: times the working size [1].
+            predictor: image sizes are multiples of its stride; it is also run once on the backgrounds.
+            scale: image size relative to the working size [1].
             replaced: whether unchanged background is replaced before prediction; otherwise predictions in the
                 background are subtracted. By default it is replaced where it causes false detections.
 
         Raises:
-            SettingsError: an image is missing, or an image or a mask is of another size than its camera.
+            SettingsError: an image is missing, or the size of an image or mask differs from that of its camera.
         """
         unit, _ = working_size(scene, settings.working_width, predictor.stride)
         size = working_size(scene, round(settings.working_width * scale), predictor.stride)
         stacked = stacked_images(scene, images, size, "image").to(predictor.device)
-        # Given masks need neither dehazing nor a background.
+        # Given masks require neither dehazing nor a background.
         through = transmission(stacked, settings.dehaze if predictor.knows_parts else 0.0)
         explained, change = None, None
         if not predictor.masked and backgrounds is not None and backgrounds.covers(scene):
@@ -118,7 +118,7 @@ class FrameImages:
             size=size,
             images=dehazed(stacked, through),
             weight=pixel_weights(scene, ignore, size).to(predictor.device),
-            # Smoke misleads the network by more than noise does: docs/explanation/decisions.md.
+            # Smoke affects the network more than noise: docs/explanation/decisions.md.
             certainty=torch.ones_like(through) if predictor.masked else certainty(through).square(),
             explained=explained,
             change=change,
@@ -131,19 +131,19 @@ class Observation:
     """Predicted surface maps in a window of the images, with weights of their pixels."""
 
     images: FrameImages
-    """The images that were observed."""
+    """The observed images."""
     window: Window
-    """Part of the images that is observed [px of these images]."""
+    """Observed part of the images [px of these images]."""
     maps: Float[Tensor, "cameras 6 h w"]
-    """Predicted surface maps, in the window."""
+    """Surface maps predicted in the window."""
     weight: Float[Tensor, "cameras 1 h w"]
     """Weight of each pixel: 0 far from the arms and at known occluders."""
     certainty: Float[Tensor, "cameras 1 h w"]
-    """Information of a pixel, as a share of what it would have without smoke and haze [1]."""
+    """Information of a pixel, relative to an image without smoke and haze [1]."""
     knows_parts: bool = True
-    """Whether parts and normals are predicted, and not only the coverage of the whole arm."""
+    """Whether parts and normals are predicted in addition to the coverage of the whole arm."""
     masked: bool = False
-    """Whether the coverage is that of given masks."""
+    """Whether the coverage comes from given masks."""
 
     @property
     def coverage(self) -> Float[Tensor, "cameras h w"]:
@@ -166,7 +166,7 @@ class Observation:
 def observe(
     images: FrameImages, predictor: FramePredictor, state: SceneState, stage: Observe, *, whole: bool = False
 ) -> Observation:
-    """Predict surface maps."""
+    """Predict surface maps conditioned on a state, around its arms or in the whole image."""
     given = images.renderer.surface_maps(state)
     everything = whole or predictor.masked
     margin = max(images.size) if everything else round(stage.margin * images.scale)

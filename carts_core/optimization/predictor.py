@@ -1,4 +1,4 @@
-"""Predictors of surface maps: the network, and masks given in its place."""
+"""Predictors of surface maps: the network, and given masks."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -22,24 +22,23 @@ class FramePredictor(Protocol):
 
     @property
     def masked(self) -> bool:
-        """Whether coverage comes from given masks. Then the whole image is compared, without haze, backgrounds and
+        """Whether coverage comes from given masks. If so, the whole image is compared, without haze, backgrounds and
         edges."""
         ...
 
     @property
     def knows_parts(self) -> bool:
-        """Whether it predicts parts and normals, and not only the coverage of the whole arm, which is then in the
-        first channel."""
+        """Whether parts and normals are predicted. If not, the first channel is the coverage of the whole arm."""
         ...
 
     @property
     def device(self) -> torch.device:
-        """Device of its computations and predictions."""
+        """Device of computations and predictions."""
         ...
 
     @property
     def stride(self) -> int:
-        """Width and height of windows and images are multiples of this [px]."""
+        """Stride: width and height of windows and images must be multiples of it [px]."""
         ...
 
     def predict(
@@ -48,11 +47,11 @@ class FramePredictor(Protocol):
         given: Float[Tensor, "cameras 6 height width"],
         window: Window,
     ) -> Float[Tensor, "cameras 6 h w"]:
-        """The surface maps in a window of the images.
+        """Predict the surface maps in a window of the images.
 
         Args:
-            images: RGB in [0, 1], whole.
-            given: surface maps of the state that the prediction is conditioned on.
+            images: whole images, RGB in [0, 1].
+            given: surface maps of the state on which the prediction is conditioned.
         """
         ...
 
@@ -71,7 +70,7 @@ class SurfacePredictor(Protocol):
 
 
 class ImagePredictor:
-    """Base of predictors that depend on images alone; one serves all frames."""
+    """Base of predictors that depend only on the images and are shared by all frames."""
 
     masked = False
     knows_parts = True
@@ -83,19 +82,20 @@ class ImagePredictor:
 
 @dataclass(frozen=True)
 class NetworkPredictor(ImagePredictor):
-    """The surface network. Predictors with the same network are equal, so predictions can be cached."""
+    """Predictor that uses the surface network. Predictors with the same network are equal, so predictions can be
+    cached."""
 
     extractor: FeatureExtractor
 
     @property
     def device(self) -> torch.device:
-        """The CPU, wherever the network runs. The rest of a frame is thousands of small operations; a GPU would wait
-        between them."""
+        """The CPU, independent of the network's device: the rest of a frame consists of thousands of small operations,
+        which are slower on a GPU."""
         return torch.device("cpu")
 
     @property
     def stride(self) -> int:
-        """See `FramePredictor`."""
+        """See `FramePredictor.stride`."""
         return self.extractor.stride
 
     def predict(
@@ -109,7 +109,7 @@ class NetworkPredictor(ImagePredictor):
 
 
 def predictor_of(source: "FeatureExtractor | SurfacePredictor") -> SurfacePredictor:
-    """The predictor itself, or the networks as a predictor."""
+    """Return the predictor itself, or wrap networks as a predictor."""
     return NetworkPredictor(source) if isinstance(source, FeatureExtractor) else source
 
 
@@ -122,30 +122,31 @@ _STRIDE = 8
 
 @dataclass(frozen=True, eq=False)
 class GivenMasks:
-    """Masks that are not part of the recording, by frame."""
+    """Masks from outside the recording, by frame."""
 
     origin: str
-    """Name in messages, such as "imported mask"."""
+    """Noun for messages, such as "imported mask"."""
     masks: Callable[[int], Mapping[str, GivenMask]]
-    """Position of a frame -> camera name -> mask in the camera's size, for the cameras that have one."""
+    """Frame index -> camera name -> mask at the camera's size, for the cameras that have one."""
     there: Callable[[int, str], bool]
-    """Whether a frame, by position, has a mask of a camera."""
+    """(frame index, camera name) -> whether there is a mask."""
     ignored: Callable[[int], Mapping[str, Bool[np.ndarray, "h w"]]] = lambda _: {}
-    """As `masks`: unlabelled pixels, which are not compared."""
+    """Frame index -> camera name -> unlabelled pixels, which are not compared."""
 
     def filled(self, frame: Frame) -> Frame:
-        """The frame with these masks for cameras without masks in the recording."""
+        """Copy of the frame with these masks for cameras without recorded masks."""
         masks = {**self.masks(frame.index), **(frame.masks or {})}
         whole = {name: np.asarray(mask) >= 0.5 for name, mask in masks.items()}
         return replace(frame, masks=whole or None)
 
 
 class MaskPredictor:
-    """Uses given masks in place of a network; a `SurfacePredictor`.
+    """Predictor that uses given masks instead of a network. Implements `SurfacePredictor`.
 
     Args:
-        network: predicts parts and normals inside the masks, and all of a frame that has no mask; None goes without.
-        masks: position of a frame -> camera name -> mask in the camera's size; `Frame.masks` by default.
+        network: predicts parts and normals inside the masks, and everything in frames without a mask; None for masks
+            only.
+        masks: frame index -> camera name -> mask at the camera's size; `Frame.masks` by default.
     """
 
     def __init__(
@@ -158,10 +159,10 @@ class MaskPredictor:
         self.device = torch.device("cpu") if network is None else network.device
 
     def for_frame(self, frame: Frame, cameras: Sequence[str]) -> FramePredictor:
-        """The predictor of one frame.
+        """Predictor of one frame.
 
         Raises:
-            SettingsError: a camera has no mask of the frame and there is no network, or a mask is of another size.
+            SettingsError: a camera has no mask of the frame and there is no network, or a mask has the wrong size.
         """
         network = None if self._network is None else self._network.for_frame(frame, cameras)
         given = (frame.masks or {}) if self._masks is None else self._masks(frame.index)
@@ -185,22 +186,22 @@ class MaskPredictor:
 
 @dataclass(frozen=True, eq=False)
 class _FrameMasks:
-    """Masks of one frame as coverage, with parts and normals from the network if there is one."""
+    """Predictor of one frame: masks as coverage, parts and normals from the network if available."""
 
     masks: tuple[Float[np.ndarray, "height width"], ...]
-    """In the order of the cameras."""
+    """Masks in the order of the cameras."""
     network: FramePredictor | None
     device: torch.device
     masked: bool = True
 
     @property
     def knows_parts(self) -> bool:
-        """See `FramePredictor`."""
+        """See `FramePredictor.knows_parts`."""
         return self.network is not None
 
     @property
     def stride(self) -> int:
-        """See `FramePredictor`."""
+        """See `FramePredictor.stride`."""
         return _STRIDE if self.network is None else self.network.stride
 
     def predict(
@@ -217,7 +218,7 @@ class _FrameMasks:
             maps = covered.new_zeros(len(covered), SURFACE_CHANNELS, *covered.shape[-2:])
         else:
             maps = self.network.predict(images, given, window) * covered[:, None]
-        # All of the mask is some part; where the network predicts none, it is the first one.
+        # Every mask pixel belongs to some part: the first one where the network predicts none.
         parts = maps[:, COVERAGE]
         parts = parts * (covered / parts.sum(1).clamp(min=1e-6)).clamp(max=1.0)[:, None]
         parts[:, 0] += covered - parts.sum(1)

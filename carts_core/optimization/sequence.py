@@ -1,4 +1,4 @@
-"""Optimizer of sequences: frames inform one another through a model of the errors over time."""
+"""Optimizer of sequences, which couples frames through a temporal error model."""
 
 import math
 import statistics
@@ -28,14 +28,14 @@ from .verdict import SequenceAssessment, Verdict, assess, assess_sequence
 
 
 def visiting_gaps(times: Mapping[int, float | None], model: SequenceSettings) -> dict[int, float]:
-    """Position -> seconds from the frame visited before it, in the order of the visits; 0 for the first one.
+    """Frame index -> time from the previously visited frame [s], in visiting order; 0 for the first one.
 
     Args:
-        times: position -> time [s], or None where times are not known.
-        model: direction, and the time between frames whose times are not known.
+        times: frame index -> time [s], or None if unknown.
+        model: direction, and the time between frames with unknown times.
 
     Raises:
-        SettingsError: there are no frames, some have times and others none, or times do not increase.
+        SettingsError: there are no frames, only some have times, or times do not increase.
     """
     if not times:
         raise SettingsError("there are no frames to correct. Choose at least one.")
@@ -64,9 +64,11 @@ def initial_correction(
     open_frame: Callable[[int], tuple[Frame, Variables]],
     allowance: float,
 ) -> Float[np.ndarray, " n"]:
-    """Correction [rad] with the lowest mean loss over the frames (by position) that were solved alone.
+    """Of the corrections [rad] of frames solved alone (frame index -> correction), the one with the lowest mean loss
+    over these frames.
 
-    Those whose loss in the first frame is beyond `allowance` times the lowest are excluded: the error may have jumped.
+    Corrections whose loss in the first frame exceeds `allowance` times the lowest are excluded, since the error may
+    have jumped.
     """
     candidates = list(corrections.values())
     losses = np.array([solver.losses(*open_frame(index), candidates) for index in corrections])
@@ -75,12 +77,12 @@ def initial_correction(
 
 
 _LOOKED_AT = 3
-"""Number of frames in which base frames are checked."""
+"""Number of frames used to check base frames."""
 _IN_VAIN = 5
-"""Number of consecutive failures of the single-frame solver after which it is not tried again."""
+"""Number of consecutive failures after which the single-frame solver is no longer tried."""
 
 GivenPositions = Mapping[int, Mapping[str, ArrayLike]]
-"""Position of a frame -> arm name -> a value for each joint."""
+"""Frame index -> arm name -> one value per joint."""
 
 
 class Keyframes:
@@ -88,7 +90,7 @@ class Keyframes:
 
     Args:
         positions: joint positions [rad, m].
-        std: standard deviations [rad, m]; those that are missing or NaN are 0.
+        std: standard deviations [rad, m]; missing or NaN values count as 0.
 
     Raises:
         RobotError: an arm lacks joint positions, or has the wrong number.
@@ -109,14 +111,14 @@ class Keyframes:
         return len(self._positions)
 
     def correction(self, index: int, variables: Variables) -> tuple[Float[np.ndarray, " n"], Information]:
-        """Correction of a frame's measured values, NaN for unknowns that are no joints, and its information."""
+        """Correction of a frame's measured values, NaN for unknowns other than joints, and its information."""
         given, std = self._positions[index], self._deviations(index)
         correction = variables.joint_offsets([given[arm.name] for arm in self._scene.arms])
         farther = variables.joint_offsets([given[arm.name] + std[arm.name] for arm in self._scene.arms])
         return correction, Information.known(correction, farther - correction)
 
     def as_given(self, estimate: FrameEstimate) -> FrameEstimate:
-        """The estimate with the given joint positions and deviations, if the frame is a keyframe."""
+        """Estimate with the joint positions and standard deviations of the keyframe; unchanged for other frames."""
         if estimate.index not in self:
             return estimate
         given = self._positions[estimate.index]
@@ -143,30 +145,30 @@ def _arrays(given: GivenPositions | None) -> dict[int, dict[str, np.ndarray]]:
 class SequenceOptimizer:
     """Corrects the frames of a sequence one after another.
 
-    A few evenly spread frames are solved alone first; the first frame starts at the correction that fits all of them
+    A few evenly spaced frames are solved alone first; the first frame starts at the correction that fits all of them
     best. Each later frame starts at its predicted correction, with the covariance of the prediction as prior. After the
     last frame all corrections are smoothed backwards, and frames whose images contradict the result are visited again.
-    In the end all estimates are assessed. Failed frames are solved alone if only joints are free; if the sequence
-    failed, frames that still fail return to their measured values. Frames in `keyframes` stay as given.
+    Finally, all estimates are assessed. Failed frames are solved alone if only joints are free; if the sequence failed,
+    frames that still fail return to their measured values. Frames in `keyframes` are not changed.
 
     Args:
-        load: returns the frame at a position of the sequence; its `measured` values are corrected.
-        times: position of each frame to be corrected -> its time [s], or None where times are not known.
+        load: returns the frame at an index of the sequence, whose `measured` values are corrected.
+        times: index of each frame to be corrected -> time [s], or None if unknown.
         networks: the networks, or another predictor of surface maps.
         settings: noise, weights and working size; the stages are those of `model`.
-        model: of the measurement error, and the direction.
-        keyframes: position -> arm name -> joint positions [rad, m] set by hand.
-        keyframe_std: position -> arm name -> standard deviations [rad, m] of keyframes that are accepted results of an
-            optimizer. Other keyframes, and NaN deviations, count as exact.
-        ignore: position -> camera name -> pixels that show an occluder; none by default.
-        backgrounds: of the cameras, in which detections are false.
-        cameras: names of the cameras that take part, all by default.
+        model: model of the measurement error, direction and stages.
+        keyframes: frame index -> arm name -> manually set joint positions [rad, m].
+        keyframe_std: frame index -> arm name -> standard deviations [rad, m] of keyframes that are accepted optimizer
+            results. Other keyframes, and NaN values, count as exact.
+        ignore: frame index -> camera name -> pixels that show an occluder; none by default.
+        backgrounds: mean backgrounds of the cameras, in which detections are false positives.
+        cameras: names of the cameras to use, all by default.
         checkpoint: stores intermediate results, so that a stopped run can continue; see `sequence_checkpoint`.
 
     Raises:
         RobotError: a keyframe lacks an arm, or has the wrong number of joint positions.
-        SettingsError: there are no frames, a keyframe is none of them, times do not increase, nothing is free, or
-            the settings are those of another solver.
+        SettingsError: there are no frames, a keyframe is not among them, times do not increase, nothing is free, or the
+            settings belong to another solver.
     """
 
     def __init__(
@@ -200,7 +202,7 @@ class SequenceOptimizer:
         self._queue, self._frames = list(gaps), len(gaps)
         initial = {self._queue[place] for place in spread(len(self._queue), self.model.initial_frames)}
         initial.update([index for index in self._queue if index in self._keyframes][:1])
-        # A single frame, or a keyframe at the beginning, needs no initial frames.
+        # A single frame, or an initial keyframe, requires no initial frames.
         alone = len(initial) == 1 or self._queue[0] in self._keyframes
         self._initial_queue = [] if alone else [index for index in self._queue if index in initial]
         self._initial: dict[int, Visit] = {}
@@ -239,7 +241,7 @@ class SequenceOptimizer:
 
     @property
     def estimates(self) -> dict[int, FrameEstimate]:
-        """Position -> smoothed estimate of each visited frame, in the order of visits."""
+        """Frame index -> smoothed estimate of each visited frame, in visiting order."""
         if self._estimates is None:
             corrections = self._smoother.smoothed()
             certain = self._smoother.cautious(self.model.shared_seconds).smoothed()
@@ -248,18 +250,18 @@ class SequenceOptimizer:
         return dict(self._estimates)
 
     def cancel(self) -> None:
-        """Stop; `estimates` are kept."""
+        """Stop the optimization; `estimates` are kept."""
         self.stop_reason = self.stop_reason or "cancelled"
 
     def __iter__(self) -> Iterator[FrameEstimate]:
-        """Step until all is done."""
+        """Step until all frames are finished."""
         return iter(self.step, None)
 
     def step(self) -> FrameEstimate | None:
-        """Visit the next frame; None once all is done.
+        """Visit the next frame; None once all frames are finished.
 
-        The first steps solve a few frames alone; their results are not in `estimates`. Later ones return the filtered
-        estimate, given the frames visited before; those in `estimates` are smoothed, given all frames.
+        The first steps solve a few frames alone; their results are not in `estimates`. Later steps return the filtered
+        estimate, based on the frames visited so far; `estimates` has smoothed ones, based on all visited frames.
         """
         if self.stop_reason is not None:
             return None
@@ -282,7 +284,7 @@ class SequenceOptimizer:
         return None
 
     def base_frame_gain(self) -> float | None:
-        """As `FrameOptimizer.base_frame_gain`, of a few frames; None before the end, or where base frames are free."""
+        """Like `FrameOptimizer.base_frame_gain`, from a few frames; None before the end, or if base frames are free."""
         if self.assessment is None or self._free.base_frames:
             return None
         corrections = self._smoother.smoothed()
@@ -321,7 +323,8 @@ class SequenceOptimizer:
                 return
 
     def _assess_whole(self) -> None:
-        """Verdict on the sequence; if it failed without keyframes, failed frames return to their measured values."""
+        """Assess the sequence; if it failed and there are no keyframes, failed frames return to their measured
+        values."""
         kept = self.estimates
         found = {index: estimate.assessment for index, estimate in kept.items() if estimate.assessment is not None}
         self.assessment = assess_sequence(list(found.values()))
@@ -334,7 +337,7 @@ class SequenceOptimizer:
         self._estimates = kept
 
     def _solve_alone(self, index: int) -> FrameEstimate | None:
-        """Measurement of a frame alone; None if it is not usable, which is reported at its visit."""
+        """Measure a frame alone; None if it cannot be used, which is reported when it is visited."""
         began = time.perf_counter()
         try:
             frame, variables = self._open(index)
@@ -360,7 +363,7 @@ class SequenceOptimizer:
         else:
             start, measurement, lost = self._measure(frame, variables, expected)
             if self._visits and measurement.information.contradicts(expected):
-                # If the image fits badly it is left out; otherwise the prediction is wrong, and the filter restarts.
+                # A badly fitting image is ignored; otherwise the prediction is wrong, and the filter restarts.
                 if lost:
                     start, measurement = Origin.CARRIED, measurement.left_out()
                 else:
@@ -375,7 +378,8 @@ class SequenceOptimizer:
         return self._estimate(index, visit, self._smoother.add(index, measurement.information))
 
     def _measure(self, frame: Frame, variables: Variables, expected: Gaussian) -> tuple[Origin, Measurement, bool]:
-        """Warm start, or a cold one for the first frame or an unusual loss; returns whether recovery failed, too."""
+        """Measure a frame from a warm start, or a cold one for the first frame or after an unusual loss; the last value
+        tells whether recovery failed."""
         if not self._visits:
             if self._initial_correction is None:
                 return Origin.COLD, self._solver.cold(frame, variables, self._prior), False

@@ -19,44 +19,44 @@ class Origin(StrEnum):
     """Source of a frame's values."""
 
     WARM = "warm"
-    """An optimization from the neighbour's correction."""
+    """Optimized from the neighbouring frame's correction."""
     COLD = "cold"
-    """An optimization from the measured values."""
+    """Optimized from the measured values."""
     KEYFRAME = "keyframe"
-    """Set by hand."""
+    """Set manually."""
     CARRIED = "carried"
-    """Predicted from the other frames; the image contradicts them and is left out."""
+    """Predicted from the other frames; the image contradicts them and is ignored."""
     MEASURED = "measured"
     """Measured values, kept because the sequence and this frame failed."""
 
 
 @dataclass(frozen=True)
 class FrameEstimate:
-    """Estimate of one frame, given the measurements of the others."""
+    """Estimate of one frame, based on its own and the other frames' measurements."""
 
     index: int
     frame_id: str
     state: SceneState
     joint_positions: dict[str, Float[np.ndarray, " dofs"]]
-    """Arm name -> [rad, m]."""
+    """Arm name -> joint positions [rad, m]."""
     joint_std: dict[str, Float[np.ndarray, " dofs"]]
-    """Arm name -> standard deviation [rad, m]; 0 at a keyframe, NaN where a joint is not free."""
+    """Arm name -> standard deviation [rad, m]; 0 for exact keyframes, NaN for fixed joints."""
     uncertainty: Uncertainty
-    """Standard deviations of all unknowns, with those of the prior."""
+    """Posterior and prior standard deviations of all unknowns."""
     loss: float
     """Loss of the surface factor when the frame was last solved."""
     start: Origin
     iterations: int
     """Number of optimization steps over all visits."""
     seconds: float
-    """Time spent on the frame over all visits, reading included [s]."""
+    """Time spent on the frame over all visits, including reading [s]."""
     assessment: Assessment | None = None
     """Verdict; None before all frames are visited."""
 
     def judged(self, assessment: Assessment, scene: Scene) -> "FrameEstimate":
-        """The estimate with a verdict, and deviations that allow for a wrong fit.
+        """Estimate with a verdict, and standard deviations that account for a wrong fit.
 
-        Deviations of keyframes stay, and those that come from other frames.
+        Standard deviations of keyframes, and of values predicted from other frames, are not changed.
         """
         if assessment.nothing_there or self.start in (Origin.KEYFRAME, Origin.CARRIED):
             return replace(self, assessment=assessment)
@@ -64,7 +64,7 @@ class FrameEstimate:
         return replace(self, assessment=assessment, uncertainty=known, joint_std=_joint_std(known, scene))
 
     def solved_alone(self, scene: Scene, variables: Variables, found: SolvedAlone, seconds: float) -> "FrameEstimate":
-        """The estimate replaced by the result of the single-frame solver.
+        """Estimate whose values are replaced by those of the single-frame solver.
 
         Args:
             found: the result; its uncertainty must be known.
@@ -97,7 +97,7 @@ class Visit:
     seconds: float
 
     def estimate(self, scene: Scene, index: int, correction: Gaussian, prior: Gaussian) -> FrameEstimate:
-        """Estimate of the frame for a correction of the measured values, given its prior before any image [rad]."""
+        """Estimate of the frame for a correction of the measured values [rad], given the prior before any image."""
         variables = self.variables
         state, joint_positions = _positions(scene, variables, correction.mean)
         scales = variables.scales.cpu().double().numpy()

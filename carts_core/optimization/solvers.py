@@ -1,4 +1,4 @@
-"""Descent methods: Levenberg-Marquardt with bounds, and first-order descent with the schedule of the paper."""
+"""Descent methods: Levenberg-Marquardt with bounds, and first-order descent with the paper's schedule."""
 
 from dataclasses import dataclass
 
@@ -12,10 +12,10 @@ from ..settings import DescentSolver
 _FIRST_DAMPING, _LEAST_DAMPING = 1e-2, 1e-4
 _SOFTER, _HARDER = 0.25, 8.0
 _LONGEST_STEP = 0.15
-"""Largest change of an unknown in one step [rad]; the linear model is not valid beyond it."""
+"""Largest change of an unknown in one step [rad], the range of validity of the linear model."""
 
 REJECTIONS = 3
-"""Number of rejected steps in a row after which a descent has converged [1]."""
+"""Number of consecutive rejected steps after which a descent has converged [1]."""
 
 
 @dataclass(frozen=True)
@@ -28,10 +28,10 @@ class Step:
 
 
 class LevenbergMarquardt:
-    """Minimizes the damped quadratic model; accepted steps lower the damping, rejected ones raise it.
+    """Levenberg-Marquardt with bounds: accepted steps lower the damping, rejected steps raise it.
 
     Args:
-        lower, upper: bounds of the unknowns; one that is at a bound and would leave it stays there.
+        lower, upper: bounds of the unknowns; an unknown at a bound that would leave the interval stays there.
     """
 
     def __init__(self, lower: Float[Tensor, " n"], upper: Float[Tensor, " n"]) -> None:
@@ -47,11 +47,11 @@ class LevenbergMarquardt:
         self._damping = max(self._damping * _SOFTER, _LEAST_DAMPING)
 
     def rejected(self) -> None:
-        """Raise the damping after a step that did not."""
+        """Raise the damping after a step that did not lower the objective."""
         self._damping *= _HARDER
 
     def step(self, offsets: Float[Tensor, " n"], gradient: Float[Tensor, " n"], hessian: Float[Tensor, "n n"]) -> Step:
-        """The step from a point with this quadratic model."""
+        """Compute a step from a point with this quadratic model."""
         slope, curvature = gradient.double(), hessian.double()
         damped = curvature + self._damping * torch.diag(curvature.diagonal().clamp(min=1e-9))
         change = shortened(bounded_step(offsets, slope, damped, self._lower, self._upper), _LONGEST_STEP)
@@ -66,11 +66,11 @@ def bounded_step(
     lower: Float[Tensor, " n"],
     upper: Float[Tensor, " n"],
 ) -> Float[Tensor, " n"]:
-    """Minimum of the quadratic model over the unknowns that are free to move.
+    """Step to the minimum of the quadratic model over the unknowns not held at a bound.
 
     Args:
-        offsets: the present point [rad].
-        lower, upper: bounds; an unknown at a bound that would leave it stays.
+        offsets: current point [rad].
+        lower, upper: bounds; an unknown at a bound that would leave the interval stays there.
     """
     free = ~(((offsets <= lower) & (gradient > 0)) | ((offsets >= upper) & (gradient < 0)))
     step = torch.zeros_like(gradient, dtype=torch.float64)
@@ -84,7 +84,7 @@ def shortened(step: Float[Tensor, " n"], longest: float) -> Float[Tensor, " n"]:
 
 
 class FirstOrderDescent:
-    """Adam, or gradient descent whose largest component moves by the present step size.
+    """Adam, or gradient descent with steps scaled so that the largest component equals the current step size.
 
     Args:
         start: initial values [rad].

@@ -1,4 +1,4 @@
-"""Runs the stages of a solver. The stages themselves are data: `carts_core.settings.stages`."""
+"""Execution of a solver's stages. The stages themselves are data: `carts_core.settings.stages`."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -41,19 +41,19 @@ from .verdict import Assessment, Verdict, assess
 
 
 class StopReason(StrEnum):
-    """Why an optimization ended."""
+    """Reason for the end of an optimization."""
 
     CONVERGED = "converged"
     ITERATIONS = "iterations"
     START_KEPT = "start kept"
     FAILED = "failed"
-    """The image contradicts the estimate, so the start is kept."""
+    """The image contradicts the estimate; the start is kept."""
     NOT_OPTIMIZED = "not optimized"
     CANCELLED = "cancelled"
 
 
 class Problem(Protocol):
-    """Optimization problem of one frame, or of many that share a calibration."""
+    """Optimization problem of one frame, or of many frames with a shared calibration."""
 
     @property
     def variables(self) -> Variables:
@@ -61,15 +61,15 @@ class Problem(Protocol):
         ...
 
     def observe(self, stage: Observe, offsets: Float[Tensor, " n"]) -> None:
-        """Replace the observation."""
+        """Make a new observation, which replaces the last one."""
         ...
 
     def evaluate(self, offsets: Float[Tensor, " n"], stage: Any, *, gradient: bool = True) -> Evaluation:
-        """The objective at a point, as a stage compares it."""
+        """Evaluate the objective at a point, with the comparison settings of a stage."""
         ...
 
     def objective_key(self, blur: float) -> tuple[int, float]:
-        """Key of the objective that a stage with this blur evaluates; losses compare within one key."""
+        """Key of the objective evaluated by a stage with this blur; losses are comparable within one key."""
         ...
 
 
@@ -80,10 +80,10 @@ class Point:
     offsets: Float[Tensor, " n"]
     evaluation: Evaluation
     objective_key: tuple[Any, ...]
-    """Key of the objective; losses compare within one key."""
+    """Key of the objective; losses are comparable within one key."""
 
     def improves_on(self, best: "Point | None") -> bool:
-        """Whether its loss is lower than that of the best point so far, or does not compare with it."""
+        """Whether the loss is lower than that of the best point so far, or not comparable with it."""
         return best is None or self.objective_key != best.objective_key or self.evaluation.loss < best.evaluation.loss
 
 
@@ -92,8 +92,8 @@ class Fit:
     """State of a run, updated by each stage.
 
     Args:
-        problem: what is solved.
-        offsets: the present estimate, at first the start.
+        problem: the optimization problem.
+        offsets: current estimate, initially the start.
         budget: largest number of evaluations.
     """
 
@@ -102,18 +102,18 @@ class Fit:
     budget: int
     stop_reason: StopReason = StopReason.NOT_OPTIMIZED
     best: Point | None = None
-    """The best point so far."""
+    """Best point so far."""
     reached: Point | None = None
-    """The best point of the last descent."""
+    """Best point of the last descent."""
     edges: Linearization | None = None
     """Quadratic model of the edge factor around the estimate, after `AlignEdges`."""
     restarts: int = 0
-    """Number of jumps of the estimate; after the first one, descents stop at a smaller tolerance."""
+    """Number of jumps of the estimate; after the first one, descents use a smaller tolerance."""
     used: int = 0
-    """Evaluations so far."""
+    """Number of evaluations so far."""
     solver: LevenbergMarquardt = field(init=False)
     descent: FirstOrderDescent | None = None
-    """Kept from one `FirstOrder` stage to the next."""
+    """First-order optimizer, kept from one `FirstOrder` stage to the next."""
     losses: list[float] = field(default_factory=list)
     """Losses of all points of `FirstOrder` stages."""
     assessment: Assessment | None = None
@@ -129,33 +129,33 @@ class Fit:
 
     @property
     def loss(self) -> float:
-        """Loss of the best point of the last descent [1]; infinite before any."""
+        """Loss of the best point of the last descent [1]; infinite before the first descent."""
         return float("inf") if self.reached is None else self.reached.evaluation.stage_loss
 
     def evaluate(self, stage: Descend | FirstOrder, *, gradient: bool = True) -> Point:
-        """Evaluate the present estimate."""
+        """Evaluate the current estimate."""
         self.used += 1
         evaluation = self.problem.evaluate(self.offsets, stage, gradient=gradient)
         return Point(self.offsets, evaluation, (self.restarts, *self.problem.objective_key(stage.blur)))
 
     def jump_to(self, offsets: Float[Tensor, " n"]) -> None:
-        """Replace the estimate; later descents stop at the smaller tolerance."""
+        """Replace the estimate; later descents use the smaller tolerance."""
         self.offsets, self.restarts = offsets, self.restarts + 1
         self.solver.reset()
 
     def start_over(self, start: Float[Tensor, " n"]) -> None:
-        """Drop the estimate and restore the budget."""
+        """Discard the estimate and restore the budget."""
         self.offsets, self.restarts, self.used = start, 0, 0
         self.reached, self.edges = None, None
         self.solver.reset()
 
 
 _SUPPORT = 0.5
-"""Least share of an arm's silhouette that is observed as an arm; below it the arm is lost [1]."""
+"""Share of an arm's silhouette observed as arm below which the arm is lost [1]."""
 
 
 def arm_is_lost(problem: FrameProblem, offsets: Float[Tensor, " n"]) -> bool:
-    """Whether an arm visible at the start has left the image, or lies where no arm was observed."""
+    """Whether an arm visible at the start has left the image, or is where no arm was observed."""
     seen, images = problem.observation, problem.observation.images
     before, after = (problem.variables.state(point) for point in (problem.start, offsets))
     start, end = (images.renderer.segment(state) for state in (before, after))
@@ -179,7 +179,7 @@ def best_random_start(
 
     Args:
         problem: one frame; its observation is replaced by that of the whole image.
-        offsets: the present estimate; it and the start are among the candidates.
+        offsets: current estimate; it and the start are among the candidates.
     """
     generator = torch.Generator().manual_seed(seed)
     deviation = stage.deviation * problem.prior.marginal_precision.rsqrt().cpu()
@@ -198,10 +198,10 @@ def best_random_start(
 
 @torch.no_grad()
 def start_explains_as_well(problem: FrameProblem, offsets: Float[Tensor, " n"], stage: PreferStart) -> bool:
-    """Whether the start fits an observation conditioned on it, and the edges, as well as the estimate does.
+    """Whether the start fits the edges and an observation conditioned on it as well as the estimate does.
 
-    False, without an observation, where the silhouettes of both differ much. If True, that observation becomes the
-    problem's. Always False where a calibration is free, since its start is expected to be wrong.
+    If the two silhouettes differ strongly, the result is False without an observation. If True, that observation
+    replaces the problem's. Always False if a calibration is free, since its start is expected to be wrong.
     """
     if problem.variables.moves_calibration:
         return False
@@ -250,7 +250,7 @@ def run_observe(stage: Observe, fit: Fit) -> Iterator[Point]:
 @run_stage.register
 def run_descend(stage: Descend, fit: Fit) -> Iterator[Point]:
     """Levenberg-Marquardt on the objective under one blur, until the predicted reduction is small."""
-    # After a restart no later stage refines the result.
+    # After a restart, no later stage refines the result.
     tolerance = min(stage.tolerance, Descend.tolerance) if fit.restarts else stage.tolerance
     best, rejections = None, 0
     for taken in range(1, stage.steps + 1):
@@ -267,7 +267,7 @@ def run_descend(stage: Descend, fit: Fit) -> Iterator[Point]:
         step = fit.solver.step(best.offsets, known.gradient, known.hessian)
         converged = rejections >= REJECTIONS or step.reduction < tolerance * known.value
         fit.reached = best
-        # After rejections, too: the step is short then, and a next stage compares under another blur.
+        # This also holds after rejections, where the step is short and the next stage uses another blur.
         fit.offsets = fit.problem.variables.clamp(best.offsets + step.change)
         fit.stop_reason = StopReason.CONVERGED if converged else StopReason.ITERATIONS
         yield point
@@ -286,7 +286,8 @@ def run_random_restart(stage: RandomRestart, fit: Fit) -> Iterator[Point]:
 
 @run_stage.register
 def run_silhouette_search(stage: SilhouetteSearch, fit: Fit) -> Iterator[Point]:
-    """Continue from the silhouettes nearest to the given masks if the overlap with them is small."""
+    """If silhouettes and given masks overlap little, continue from the state whose silhouettes are nearest to the
+    masks."""
     problem = fit.problem
     assert isinstance(problem, FrameProblem | CalibrationProblem), "a stage of the surface solver"
     if problem.masked and problem.silhouette_overlap(fit.offsets, stage.scale) < stage.if_overlap:
@@ -299,7 +300,7 @@ def run_align_edges(stage: AlignEdges, fit: Fit) -> Iterator[Point]:
     """Align outlines with image edges, from the best point of the last descent."""
     assert fit.reached is not None, "AlignEdges follows a Descend"
     if _one_frame(fit).predictor.masked:
-        # The descent has led one step beyond the best point, which nothing would evaluate before the end.
+        # The descent is one step beyond the best point, and that step would not be evaluated before the end.
         fit.offsets = fit.reached.offsets
         return
     fit.offsets, fit.edges = _one_frame(fit).aligned(stage, fit.reached.offsets, fit.reached.evaluation)
@@ -316,17 +317,17 @@ def run_prefer_start(stage: PreferStart, fit: Fit) -> Iterator[Point]:
 
 @run_stage.register
 def run_evaluate(stage: Evaluate, fit: Fit) -> Iterator[Point]:
-    """Evaluate the estimate for the record."""
+    """Evaluate the estimate, without changing it."""
     kept, known = fit.stop_reason is StopReason.START_KEPT, fit.reached
     point = fit.evaluate(FINEST, gradient=kept)
     if known is not None and not kept:
-        # Edges add no uncertainty model, so the one of the last descent is kept.
+        # Edges have no uncertainty model, so that of the last descent is kept.
         before = known.evaluation
         evaluation = replace(point.evaluation, gradient=before.gradient)
         if isinstance(fit.problem, FrameProblem):
             evaluation = replace(evaluation, uncertainty=fit.problem.uncertainty_after(fit.offsets, before))
         point = replace(point, evaluation=evaluation)
-    # The last evaluation is the result whatever its loss, since that does not include edges.
+    # The last evaluation is the result independent of its loss, which does not include edges.
     yield replace(point, objective_key=(*point.objective_key, "end"))
 
 
@@ -354,7 +355,7 @@ def run_other_background(stage: OtherBackground, fit: Fit) -> Iterator[Point]:
 
 @run_stage.register
 def run_reject_failed(stage: RejectFailed, fit: Fit) -> Iterator[Point]:
-    """Assess the best point; return to the start if it failed and the start fits better, or no arm is there."""
+    """Assess the best point; return to the start if it failed and the start fits better, or if no arm is visible."""
     problem, found = _one_frame(fit), fit.best
     if found is None:
         return
@@ -374,7 +375,7 @@ def run_reject_failed(stage: RejectFailed, fit: Fit) -> Iterator[Point]:
 
 
 def _judged(point: Point, verdict: Assessment) -> Point:
-    """The point with standard deviations that allow for a wrong fit."""
+    """Point with standard deviations that account for a wrong fit."""
     if (known := point.evaluation.uncertainty) is None:
         return point
     return replace(point, evaluation=replace(point.evaluation, uncertainty=verdict.of(known)))
@@ -382,7 +383,7 @@ def _judged(point: Point, verdict: Assessment) -> Point:
 
 @run_stage.register
 def run_ignore_occluders(stage: IgnoreOccluders, fit: Fit) -> Iterator[Point]:
-    """Ignore pixels that contradict the fit, and run again."""
+    """Ignore pixels that contradict the fit, and repeat the optimization."""
     problem = _one_frame(fit)
     if fit.reached is not None and problem.ignore_occluders(fit.reached.evaluation):
         fit.start_over(problem.start)
@@ -391,7 +392,7 @@ def run_ignore_occluders(stage: IgnoreOccluders, fit: Fit) -> Iterator[Point]:
 
 @run_stage.register
 def run_first_order(stage: FirstOrder, fit: Fit) -> Iterator[Point]:
-    """Steps of a first-order method on a loss of image features."""
+    """Run steps of a first-order method on a loss of image features."""
     problem = fit.problem
     assert isinstance(problem, FeatureProblem)
     settings, planned = problem.settings, problem.settings.iterations
@@ -399,7 +400,7 @@ def run_first_order(stage: FirstOrder, fit: Fit) -> Iterator[Point]:
         variables = problem.variables
         fit.descent = FirstOrderDescent(settings, fit.offsets, variables.lower, variables.upper)
     end = min(fit.used + math.ceil(stage.share * planned), planned)
-    # The point after the last step is evaluated, too.
+    # The point after the last step is also evaluated.
     while fit.used < end or fit.used == end == planned:
         point = fit.evaluate(stage)
         fit.losses.append(point.evaluation.loss)

@@ -1,4 +1,4 @@
-"""Between a scene's state and the vector of unknowns that a solver sees."""
+"""Mapping between a scene's state and the solver's vector of unknowns."""
 
 import math
 from collections.abc import Sequence
@@ -16,19 +16,19 @@ from ..settings import FreeParameters, SurfaceSolver
 from .factors import Prior
 
 STEP = 1e-3
-"""Distance of an unknown's two neighbouring states from its value [rad]."""
+"""Step of central differences: offset of each of the two neighbouring states [rad]."""
 
 APART = 2 * STEP
-"""Distance of these from each other [rad]."""
+"""Distance between the two neighbouring states [rad]."""
 
 
 @dataclass(frozen=True)
 class _Block:
-    """A stretch of the vector of unknowns."""
+    """A contiguous block of the vector of unknowns."""
 
     kind: str
     index: int
-    """Of the arm or the camera."""
+    """Index of the arm or camera."""
     columns: tuple[int, ...]
     """Free joints of the arm; empty for other kinds."""
     start: int
@@ -38,13 +38,14 @@ class _Block:
 class Variables:
     """Unknowns as one vector of offsets from a start, in radian-like units.
 
-    A prismatic joint or a translation counts `length_scale` metres as one radian, so that one step size suits all.
+    For prismatic joints and translations, `length_scale` metres count as one radian, so that one step size suits all
+    unknowns.
 
     Args:
-        length_scale: [m/rad].
+        length_scale: translation equivalent to one radian [m/rad].
 
     Attributes:
-        names: what each unknown is.
+        names: name of each unknown.
 
     Raises:
         SettingsError: nothing is free, or `free` names a joint that does not exist.
@@ -109,7 +110,7 @@ class Variables:
             scale = self._joint_scale(scene, index, column)
             low, high = arm.robot.joint_limits[column].tolist()
             value = start[..., column]
-            # A start outside the limits (a wrong calibration of the encoder, say) may stay, but not go further out.
+            # A start outside the limits (such as from a wrong encoder calibration) may stay, but not move further out.
             lower.append((min(low, float(value.min())) - float(value.min())) / scale)
             upper.append((max(high, float(value.max())) - float(value.max())) / scale)
         self._add("joints", index, arm.name, tuple(arm.robot.joint_names[c] for c in columns), columns)
@@ -124,8 +125,8 @@ class Variables:
         return len(self.names)
 
     def units(self) -> list[tuple[str, str, float]]:
-        """Per unknown its name, the unit that a person reads (deg, mm, px; % of a focal length), and that unit's number
-        per radian-like unit."""
+        """Per unknown: name, display unit (deg, mm, px or % of the focal length), and factor from the internal to the
+        display unit."""
         radian, length = ("deg", math.degrees(1.0)), ("mm", 1000.0 * self._length_scale)
         focal = ("%", 100.0)
         read: list[tuple[str, float]] = []
@@ -141,7 +142,7 @@ class Variables:
         return [(name, *unit) for name, unit in zip(self.names, read, strict=True)]
 
     def joint_offsets(self, joint_positions: Sequence[ArrayLike]) -> Float[np.ndarray, " n"]:
-        """Offsets that bring the arms to joint positions [rad, m]; NaN for unknowns that are no joints."""
+        """Offsets that move the arms to joint positions [rad, m]; NaN for unknowns other than joints."""
         offsets = np.full(len(self), math.nan)
         for block in self._blocks:
             if block.kind == "joints":
@@ -153,17 +154,17 @@ class Variables:
 
     @property
     def groups(self) -> list[range]:
-        """Unknowns that belong to the same arm's joints, the same base frame, or the same camera."""
+        """Index ranges of unknowns of the same arm's joints, the same base frame, or the same camera."""
         return [range(block.start, block.start + block.size) for block in self._blocks]
 
     @property
     def moves_calibration(self) -> bool:
-        """Whether base frames, cameras or intrinsics are unknown."""
+        """Whether base frames, extrinsics or intrinsics are among the unknowns."""
         return any(block.kind != "joints" for block in self._blocks)
 
     @property
     def scales(self) -> Float[Tensor, " n"]:
-        """Value of an offset of 1 in its unit: 1 for angles and intrinsics, `length_scale` metres for lengths."""
+        """Scale per unknown: value of a unit offset, 1 for angles and intrinsics, `length_scale` [m] for lengths."""
         scales = torch.ones_like(self.lower)
         for block in self._blocks:
             part = scales[block.start : block.start + block.size]
@@ -177,9 +178,9 @@ class Variables:
         """Expected error of each unknown [rad].
 
         Args:
-            joints_deg: of joint positions at the start [deg]; `length_scale` makes it metres.
-            frames_deg: of base frames and camera extrinsics [deg].
-            intrinsics: of focal lengths and principal points, as a share of the focal length [1].
+            joints_deg: expected error of initial joint positions [deg]; `length_scale` converts it to metres.
+            frames_deg: expected error of base frames and camera extrinsics [deg].
+            intrinsics: expected error of focal lengths and principal points, as a share of the focal length [1].
         """
         expected = torch.full_like(self.lower, intrinsics)
         for block in self._blocks:
@@ -192,9 +193,10 @@ class Variables:
         """Standard deviations of a search [rad]; 0 for intrinsics.
 
         Args:
-            joints_deg: of joint positions [deg]; `length_scale` makes it metres.
-            frames_deg: of base frames and camera extrinsics [deg]; their places deviate by half of it times `distance`.
-            distance: of the arms from the cameras [m].
+            joints_deg: standard deviation of joint positions [deg]; `length_scale` converts it to metres.
+            frames_deg: standard deviation of rotations of base frames and cameras [deg]; half of this angle times
+                `distance` is that of translations.
+            distance: distance of the arms from the cameras [m].
         """
         deviation = self.expected(joints_deg, frames_deg, 0.0)
         for block in self._blocks:
@@ -203,12 +205,12 @@ class Variables:
         return deviation
 
     def prior(self, settings: SurfaceSolver) -> Prior:
-        """Independent errors around the start, as large as the settings expect."""
+        """Prior of independent errors around the start, with the standard deviations of the settings."""
         expected = self.expected(settings.prior_deg, settings.frame_prior_deg, settings.intrinsics_prior)
         return Prior.around_start(expected**-2)
 
     def clamp(self, offsets: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch n"]:
-        """Offsets that respect the joint limits."""
+        """Clamp offsets to the joint limits."""
         return torch.minimum(torch.maximum(offsets, self.lower), self.upper)
 
     def state(self, offsets: Float[Tensor, "*batch n"]) -> SceneState:
@@ -224,12 +226,12 @@ class Variables:
                 step = part * self._joint_scales[block.start].to(part)
                 joints[block.index] = joints[block.index].index_add(-1, columns, step)
             elif block.kind == "base_frame":
-                # The base frame turns about its own origin, the remote centre, and not about the world's.
+                # The base frame rotates about its own origin, the remote centre, not about the world origin.
                 T_world_base = _update(T_world_base, block.index, lambda T, s=part: T @ self._rigid(s))
             elif block.kind == "extrinsics":
                 T_camera_world = _update(T_camera_world, block.index, lambda T, s=part: self._rigid(s) @ T)
             else:
-                # One unit of a focal length is a factor of e; a principal point moves by the focal length.
+                # A unit offset scales a focal length by e, and moves a principal point by the focal length.
                 intrinsics = _update(
                     intrinsics,
                     block.index,
@@ -241,12 +243,13 @@ class Variables:
         return SceneState(tuple(joints), T_world_base, T_camera_world, intrinsics, start.T_mount_world)
 
     def around(self, offsets: Float[Tensor, " n"]) -> SceneState:
-        """A batch of 1 + 2 n states: that at the offsets, those `STEP` below it, one unknown each, and those above."""
+        """States for central differences [1 + 2 n]: the state itself, then with each unknown decreased by `STEP`, then
+        increased."""
         step = STEP * torch.eye(len(offsets), device=offsets.device)
         return self.state(torch.cat([offsets[None], offsets - step, offsets + step]))
 
     def _rigid(self, step: Float[Tensor, "*batch 6"]) -> Float[Tensor, "*batch 4 4"]:
-        import roma  # noqa: PLC0415 -- it loads the compiler of torch, which takes a second; joints do without
+        import roma  # noqa: PLC0415 -- it loads torch's compiler, which takes a second; joints do not need it
 
         rotation = roma.rotvec_to_rotmat(step[..., :3])
         translation = step[..., 3:] * self._length_scale

@@ -1,4 +1,4 @@
-"""Verdicts: whether a fit, a sequence or a calibration can be relied on, and whether a network knows a robot."""
+"""Verdicts on the reliability of fits, sequences and calibrations, and check of a network on a recording."""
 
 import math
 from collections import Counter
@@ -33,7 +33,7 @@ class Verdict(Enum):
 
     @classmethod
     def of(cls, probability: float) -> "Verdict":
-        """Verdict for a probability of failure [1] alone."""
+        """Verdict from the probability of failure [1]."""
         if probability >= _LIKELY:
             return cls.FAILED
         return cls.DOUBTFUL if probability >= _POSSIBLE else cls.GOOD
@@ -52,17 +52,17 @@ class Assessment:
     """Probability that the mask is wrong (Dice below 0.9), calibrated on frames with ground truth [1]."""
     evidence: Evidence
     nothing_there: bool = False
-    """Whether no arm is in view or detected, so that there is nothing to fit."""
+    """Whether no arm is in view or detected."""
 
     @property
     def certain(self) -> bool:
-        """Whether the fit is good with a probability of failure so small that its deviations need not allow for it."""
+        """Whether the probability of failure is so small that standard deviations need not account for it."""
         return self.verdict is Verdict.GOOD and self.probability < _UNCERTAIN
 
     def of(self, known: Uncertainty) -> Uncertainty:
-        """Uncertainty that allows for a wrong fit.
+        """Uncertainty that accounts for a wrong fit.
 
-        That of a certain fit stays as it is; that of a failed fit becomes the prior.
+        For a certain fit it is unchanged; for a failed fit it becomes the prior.
         """
         if self.certain:
             return known
@@ -70,14 +70,14 @@ class Assessment:
 
 
 _UNCERTAIN, _POSSIBLE, _LIKELY = 0.1, 0.13, 0.5
-"""Probability of failure from which deviations allow for a wrong fit, a fit is doubtful, and it has failed [1]; see
-docs/explanation/decisions.md."""
+"""Probabilities of failure from which standard deviations account for a wrong fit, a fit is doubtful, and a fit has
+failed [1]; see docs/explanation/decisions.md."""
 
 
 def assess(found: Evidence) -> Assessment:
     """Verdict on the fit of a frame."""
     what = "The given mask" if found.masked else "The image"
-    # The overlap with given masks is the Dice itself, so they need no margin.
+    # The overlap with given masks is the Dice itself, so no margin is needed.
     doubtful_from = _UNCERTAIN if found.masked else _POSSIBLE
     return _assessed(found, doubtful_from, f"{what} contradicts", f"{what} supports", "fit")
 
@@ -85,7 +85,8 @@ def assess(found: Evidence) -> Assessment:
 def assess_calibration(frames: Sequence[Evidence]) -> Assessment:
     """Verdict on a calibration, from the median evidence of its frames with measured joints.
 
-    It is doubtful earlier than a frame: all frames depend on it, and its masks can be right while it is wrong.
+    Its threshold for doubt is lower than a frame's, since all frames depend on it, and its masks can be right although
+    it is wrong.
     """
     median = median_evidence(frames)
     what = "given masks" if median.masked else "images"
@@ -96,11 +97,11 @@ def assess_calibration(frames: Sequence[Evidence]) -> Assessment:
 
 
 def _assessed(found: Evidence, doubtful_from: float, contradicts: str, supports: str, subject: str) -> Assessment:
-    """The verdict on a fit or a calibration.
+    """Verdict on a fit or a calibration.
 
     Args:
-        doubtful_from: probability of failure from which it is doubtful [1].
-        contradicts, supports: subject and verb of the reasons.
+        doubtful_from: probability of failure from which the verdict is doubtful [1].
+        contradicts, supports: subject and verb of the sentences that give the reason.
     """
     probability = 1.0 / (1.0 + math.exp(-log_odds_of_failure(found.loss, found, found.masked)))
     for applies, reason, remedy in _NOTHING_THERE:
@@ -133,10 +134,10 @@ _PART_UNSEEN = 0.2
 """Share of the rendered wrists, or jaws, below which they are not predicted [1]."""
 
 _LOOKS_LIKE_ONE = 5e-3
-"""Share of the images from which a prediction elsewhere may be the arm out of view [1]."""
+"""Share of the images above which a prediction elsewhere may be the arm that is out of view [1]."""
 
 _MOST, _MORE = 0.5, 2.0
-"""Share of the images, and multiple of the measured arms' area, above which a given mask is not one of arms [1]."""
+"""Share of the images, and multiple of the measured arms' area, above which a given mask does not show arms [1]."""
 
 _NOTHING_THERE: tuple[tuple[Callable[[Evidence], bool], str, str], ...] = (
     (
@@ -192,7 +193,7 @@ _CALIBRATION_REMEDY = (
 
 
 def _weakest(found: Evidence) -> str:
-    """Strongest evidence against a fit, as text."""
+    """Text on the strongest evidence against a fit."""
     if found.masked:
         return "what is rendered and the given mask differ."
     against = {
@@ -205,13 +206,14 @@ def _weakest(found: Evidence) -> str:
 
 
 _TISSUE = 0.75, 0.55, 0.45
-"""Plain background of the rendering that is recognized, RGB."""
+"""Uniform background of the rendering for the domain check, RGB."""
 
 _NEAR = 40
-"""Distance from the measured arms within which predictions count as theirs [px of the working image]."""
+"""Distance from the measured arms within which predictions are attributed to them [px of the working image]."""
 
 RECOGNIZED, _ELSEWHERE = 0.95, 0.05
-"""Least overlap of a rendering of a known robot, and share of an image from which false predictions mislead [1]."""
+"""Minimum overlap for a rendering of a robot in the training domain, and share of an image above which false
+predictions are harmful [1]."""
 
 UNKNOWN_ROBOT_REMEDY = "Give masks (--observe masks, or both), or train for this recording (`carts train`, --weights)."
 
@@ -223,20 +225,20 @@ def overlap_below_usual(overlap: float) -> str:
 
 @dataclass(frozen=True)
 class DomainCheck:
-    """Check of whether a network knows the arms and images of a recording, from one frame."""
+    """Check on one frame whether arms and images of a recording are in the network's domain."""
 
     recognized: float | None
-    """Overlap (soft Dice) of a rendering of the arms before plain tissue with the network's unconditioned prediction in
-    it [1]; None where no arm is in view."""
+    """Overlap (soft Dice) of a rendering of the arms over a uniform background with the network's unconditioned
+    prediction from it [1]; None if no arm is in view."""
     elsewhere: float
-    """Share of the image, far from the measured arms, that is predicted as arms [1]."""
+    """Share of the image that is predicted as arms far from the measured ones [1]."""
 
     def warnings(self, where: str, remedy: str = UNKNOWN_ROBOT_REMEDY, *, background: bool = False) -> list[str]:
-        """Warnings before an optimization; empty where the network fits the recording.
+        """Warnings before an optimization; empty if the network suits the recording.
 
         Args:
-            remedy: for a network that does not know arms or images.
-            background: whether the empty background is known; then false detections in it do no harm.
+            remedy: remedy for a network that does not suit arms or images.
+            background: whether the empty background is known, so that false detections in it are harmless.
         """
         found = []
         if self.recognized is None:
@@ -259,10 +261,10 @@ class DomainCheck:
 def check_domain(
     scene: Scene, frame: Frame, networks: FeatureExtractor | SurfacePredictor, settings: SurfaceSolver | None = None
 ) -> DomainCheck:
-    """Check a network on a frame, with two predictions.
+    """Check whether a network suits a frame; runs two predictions.
 
     Raises:
-        SettingsError: an image is missing, or of another size than its camera.
+        SettingsError: an image is missing, or its size differs from that of its camera.
     """
     settings = settings or SurfaceSolver()
     predictor = predictor_of(networks).for_frame(frame, [camera.name for camera in scene.cameras])
@@ -285,11 +287,11 @@ def check_domain(
 
 
 _MANY, _MOST_FAILED = 0.1, 0.5
-"""Share of unreliable frames from which a sequence is doubtful, and share of failed ones from which it has failed
+"""Share of unreliable frames above which a sequence is doubtful, and share of failed frames above which it has failed
 [1]."""
 
 _LEVEL = 0.05
-"""Family-wise significance level of the tests for worse measures [1]."""
+"""Family-wise significance level of the tests for deteriorated measures [1]."""
 
 _SCATTER, _SCATTER_FREEDOM = 0.01, 4
 """Prior standard deviation of a measure's change between frames, and its degrees of freedom [1]."""
@@ -300,7 +302,7 @@ _BETTER_LOWER = ("residual", "loss")
 
 @dataclass(frozen=True)
 class SequenceAssessment:
-    """Verdict on frames that were corrected together."""
+    """Verdict on frames that were corrected jointly."""
 
     verdict: Verdict
     reason: str
@@ -308,9 +310,9 @@ class SequenceAssessment:
     remedy: str
     """Remedy as one sentence; empty if none is needed."""
     probability: float
-    """Mean probability of the frames that their masks are wrong [1]."""
+    """Mean probability over the frames that the mask is wrong [1]."""
     counts: Mapping[str, int]
-    """Verdict -> frames."""
+    """Verdict -> number of frames."""
 
 
 def assess_sequence(frames: Sequence[Assessment]) -> SequenceAssessment:
@@ -332,7 +334,7 @@ def assess_sequence(frames: Sequence[Assessment]) -> SequenceAssessment:
 
 
 def without_knowledge(found: Assessment, known: Sequence[DomainCheck]) -> Assessment:
-    """Verdict on a calibration that fails a doubtful one where the network does not know the robot."""
+    """Verdict on a calibration; a doubtful one becomes failed if the network does not suit the robot."""
     recognized = [one.recognized for one in known if one.recognized is not None]
     if found.verdict is not Verdict.DOUBTFUL or not recognized or float(np.median(recognized)) >= RECOGNIZED:
         return found
@@ -344,7 +346,7 @@ def without_knowledge(found: Assessment, known: Sequence[DomainCheck]) -> Assess
 
 
 def median_evidence(frames: Sequence[Evidence]) -> Evidence:
-    """Median over frames; a measure that one of them lacks is None."""
+    """Median of each measure over frames; None if any frame lacks it."""
     values = {}
     for field in fields(Evidence):
         known = [value for frame in frames if (value := getattr(frame, field.name)) is not None]
@@ -359,7 +361,7 @@ def worse_in(before: Sequence[Evidence], after: Sequence[Evidence]) -> list[str]
     2004) with Holm's correction for several tests (A simple sequentially rejective multiple test procedure, 1979).
 
     Args:
-        before, after: of the same frames, in the same order.
+        before, after: evidence of the same frames, in the same order.
     """
     chances = {}
     for names, sign in ((_BETTER_HIGHER, -1.0), (_BETTER_LOWER, 1.0)):
@@ -376,7 +378,7 @@ def worse_in(before: Sequence[Evidence], after: Sequence[Evidence]) -> list[str]
 
 
 def _chance(rises: Float[np.ndarray, " frames"]) -> float:
-    """p-value of a mean rise under the hypothesis of none [1]."""
+    """p-value of a mean increase under the null hypothesis of no increase [1]."""
     freedom = len(rises) - 1 + _SCATTER_FREEDOM
     squares = ((rises - rises.mean()) ** 2).sum() + _SCATTER_FREEDOM * _SCATTER**2
     return float(stdtr(freedom, -rises.mean() / np.sqrt(squares / freedom / len(rises))))

@@ -10,11 +10,12 @@ from .state import ProjectState
 from .values import Key, Source
 
 _SOURCE_ORDER = (Source.HAND, Source.PROPAGATED, Source.OPTIMIZER, Source.MEASURED)
-"""Precedence of sources of a frame whose arms have different ones."""
+"""Precedence of sources for a frame whose arms have different sources."""
 
 
 def corrected_sequence(sequence: Sequence, project: ProjectState) -> Sequence:
-    """The recording with the project's time offset, calibration and joints; `SequenceError` if no row fits it."""
+    """Recording with the project's time offset, calibration and joints; `SequenceError` if no table row matches a
+    frame."""
     offset = project.get(Key.time_offset())
     if offset is not None and sequence.matching is not None and offset.seconds != sequence.matching.time_offset:
         sequence = sequence.with_time_offset(offset.seconds)
@@ -26,7 +27,7 @@ def corrected_sequence(sequence: Sequence, project: ProjectState) -> Sequence:
 
 
 def calibrated_scene(scene: Scene, project: ProjectState) -> Scene:
-    """The scene with base frames, extrinsics and intrinsics as the project corrects them."""
+    """Scene with the project's corrected base frames, extrinsics and intrinsics."""
     arms, cameras = [], []
     for arm in scene.arms:
         base = project.get(Key.base_frame(arm.name))
@@ -45,7 +46,8 @@ def source_of(project: ProjectState, frame: int) -> Source:
 
 
 def corrected_state(scene: Scene, frame: Frame, project: ProjectState) -> SceneState:
-    """The state of a frame: joint positions as corrected, of other arms as measured, in the project's calibration."""
+    """State of a frame under the project's calibration, with corrected joint positions where available, else measured
+    ones."""
     measured = {name: frame.measured[name] for name in project.identity.arms}
     corrected = {name: found.joint_positions for name, found in project.joints(frame.index).items()}
     return calibrated_scene(scene, project).state({**measured, **corrected}, mounts=frame.mounts)

@@ -20,33 +20,33 @@ TABLES = {
     "figures": ("frame", "revision", "loss", "dice"),
     "exports": ("time", "format", "path", "frames", "settings"),
 }
-"""Columns of each table that its rows' digests cover."""
+"""Columns of each table that are covered by the rows' digests."""
 NONCE_BYTES = 16
 _BYTES = 16
 _MODULUS = 1 << (8 * _BYTES)
 
 
 def row_digest(table: str, row: Sequence[object]) -> bytes:
-    """Digest of a row as SQLite gives it back."""
-    # `ascii` tells texts, bytes, integers, floats and None apart, and does not change from one Python to the next.
+    """Digest of a row as returned by SQLite."""
+    # `ascii` distinguishes strings, bytes, integers, floats and None, and is stable across Python versions.
     return blake2b(ascii((table, tuple(row))).encode(), digest_size=_BYTES).digest()
 
 
 def as_number(digest: bytes) -> int:
-    """A digest as a summand of the total."""
+    """Convert a digest to a number that is added to the total."""
     return int.from_bytes(digest, "big")
 
 
 @dataclass(frozen=True)
 class Seal:
-    """Content of `seal`, except for the position in the history."""
+    """Content of the table `seal`, except for the position in the history."""
 
     nonce: bytes
     """Random number that identifies the file."""
     about: bytes
-    """Digest of the constants: nonce, identity and time of creation."""
+    """Digest of the constants: nonce, identity and creation time."""
     total: int
-    """The sum of all rows' digests."""
+    """Sum of the digests of all rows."""
 
     @staticmethod
     def of(nonce: bytes, identity: str, created: float, total: int) -> "Seal":
@@ -55,18 +55,18 @@ class Seal:
         return Seal(nonce, about, total % _MODULUS)
 
     def plus(self, change: int) -> "Seal":
-        """The seal after adding digests, as one number; negative for removed rows."""
+        """Seal after adding a sum of digests, which is negative for removed rows."""
         return replace(self, total=(self.total + change) % _MODULUS)
 
     def row(self, position: int) -> tuple[bytes, bytes, bytes]:
-        """The row of `seal` at a position of the history."""
+        """Row of the table `seal` at a position of the history."""
         total = self.total.to_bytes(_BYTES, "big")
         whole = blake2b(ascii((self.about, position, total)).encode(), digest_size=_BYTES).digest()
         return self.nonce, total, whole
 
 
 def seal(connection: sqlite3.Connection, nonce: bytes) -> None:
-    """Compute the digests of all rows, inside a transaction of the caller; `nonce` is for a file without one."""
+    """Compute the digests of all rows in the caller's transaction; `nonce` is used if the file has none."""
     total = 0
     for table, columns in TABLES.items():
         rows = connection.execute(f"SELECT rowid, {', '.join(columns)} FROM {table}").fetchall()
@@ -81,7 +81,8 @@ def seal(connection: sqlite3.Connection, nonce: bytes) -> None:
 
 
 def check_seal(connection: sqlite3.Connection, total: int) -> Seal:
-    """The seal of a file whose verified rows have digests that add up to `total`; `ProjectError` if it does not fit."""
+    """Return the seal of a file, given the sum `total` of its verified rows' digests; `ProjectError` if they do not
+    match."""
     projects = connection.execute("SELECT identity, position, created FROM project").fetchmany(2)
     seals = connection.execute("SELECT nonce, total, digest FROM seal").fetchmany(2)
     if len(projects) != 1 or len(seals) != 1:
@@ -98,9 +99,10 @@ def check_seal(connection: sqlite3.Connection, total: int) -> Seal:
 
 
 def checked_rows(connection: sqlite3.Connection, table: str) -> Iterable[tuple]:
-    """Verified rows of a table, with their digests as numbers in the last column; `ProjectError` for a changed row."""
+    """Yield the rows of a table, verified, with their digests as numbers in the last column; `ProjectError` for a
+    changed row."""
     columns = TABLES[table]
-    # No index is trusted: rows are read in the order in which they lie.
+    # Indices are not trusted: rows are read in storage order.
     query = f"SELECT {', '.join(columns)}, digest FROM {table} NOT INDEXED ORDER BY rowid"
     for row in connection.execute(query):
         if row_digest(table, row[:-1]) != row[-1]:
@@ -109,12 +111,12 @@ def checked_rows(connection: sqlite3.Connection, table: str) -> Iterable[tuple]:
 
 
 def verify(connection: sqlite3.Connection) -> Seal:
-    """The seal of a file after verification of every row; values are not decoded. `ProjectError` for any change."""
+    """Verify every row without decoding values, and return the seal of the file; `ProjectError` for any change."""
     return check_seal(connection, sum(row[-1] for table in TABLES for row in checked_rows(connection, table)))
 
 
 APPLICATION_ID = 0x43415254
-"""Marks an SQLite file as a project of carts ("CART")."""
+"""SQLite application id of CaRTS projects ("CART")."""
 
 MIGRATIONS: tuple[str, ...] = (
     """
@@ -173,7 +175,8 @@ CREATE TABLE seal (               -- one row
     "-- The same tables. Changes may be of the kinds imported_mask, imported_keypoints and imported_labels.\n",
     "-- The same tables. Changes may be of the kind part_labels.\n",
 )
-"""Script number n migrates a project from schema n to n + 1; a new project runs all of them. Never change one."""
+"""Script n migrates a project from schema n to n + 1; a new project runs all scripts. Existing scripts must not be
+changed."""
 SEALED = 3
 """First schema with digests."""
 
@@ -198,12 +201,12 @@ _NEVER = {
     sqlite3.SQLITE_CREATE_VTABLE,
 }
 _STEPS_BETWEEN_LOOKS = 10_000
-"""Instructions of SQLite's virtual machine between checks of the time limit; some tens of microseconds."""
+"""Number of SQLite virtual machine instructions between checks of the time limit; some tens of microseconds."""
 _DISK_FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO}
 
 
 class DamagedProject(ProjectError):
-    """A project file is not as carts wrote it."""
+    """A project file differs from what CaRTS wrote."""
 
 
 def hardened(connection: sqlite3.Connection) -> sqlite3.Connection:
@@ -217,13 +220,14 @@ def hardened(connection: sqlite3.Connection) -> sqlite3.Connection:
 
 
 def _authorized(action: int, _first: object, _second: object, _schema: object, inside: str | None) -> int:
-    """Deny actions that carts never takes, and those requested by a foreign trigger or view."""
+    """Deny actions not used by CaRTS, and those requested by a foreign trigger or view."""
     return sqlite3.SQLITE_DENY if action in _NEVER or inside not in (None, "current") else sqlite3.SQLITE_OK
 
 
 @contextmanager
 def time_limit(connection: sqlite3.Connection, seconds: float) -> Iterator[None]:
-    """Interrupt SQLite (`sqlite3.OperationalError`) when the block takes longer [s], which only crafted files do."""
+    """Interrupt SQLite (`sqlite3.OperationalError`) if the block exceeds a time limit [s], which happens only for
+    crafted files."""
     end = time.monotonic() + seconds
     connection.set_progress_handler(lambda: time.monotonic() > end, _STEPS_BETWEEN_LOOKS)
     try:
@@ -233,7 +237,7 @@ def time_limit(connection: sqlite3.Connection, seconds: float) -> Iterator[None]
 
 
 def empty(identity: SequenceIdentity) -> sqlite3.Connection:
-    """A new project in memory."""
+    """Create a new project in memory."""
     connection = hardened(sqlite3.connect(":memory:", isolation_level=None, check_same_thread=False))
     connection.execute(f"PRAGMA application_id = {APPLICATION_ID}")
     with transaction(connection):
@@ -247,7 +251,8 @@ def empty(identity: SequenceIdentity) -> sqlite3.Connection:
 
 
 def migrate(connection: sqlite3.Connection, nonce: bytes) -> None:
-    """Run the missing migrations of a checked project as one transaction; without any, check that it can be written."""
+    """Run the missing migrations of a verified project in one transaction; if there are none, check that it is
+    writable."""
     missing = MIGRATIONS[version(connection) :]
     with transaction(connection):
         for statement in _statements("".join(missing)):
@@ -258,7 +263,7 @@ def migrate(connection: sqlite3.Connection, nonce: bytes) -> None:
 
 
 def check_version(connection: sqlite3.Connection, path: Path) -> None:
-    """Refuse files that are no project, or of a newer version, by a `ProjectError`."""
+    """Check that a file is a project of a supported version; `ProjectError` otherwise."""
     if connection.execute("PRAGMA application_id").fetchone()[0] != APPLICATION_ID:
         raise not_a_project(path)
     found = version(connection)
@@ -270,7 +275,8 @@ def check_version(connection: sqlite3.Connection, path: Path) -> None:
 
 
 def check_schema(connection: sqlite3.Connection) -> None:
-    """Compare the schema with the expected one, as text, so that no foreign trigger, view or expression runs."""
+    """Check that the schema text equals the expected one, so that no foreign trigger, view or expression is
+    executed."""
     found = version(connection)
     ours = _schema_of(MIGRATIONS[:found]) if found > 0 else frozenset()
     theirs = frozenset(connection.execute("SELECT type, name, tbl_name, sql FROM sqlite_schema").fetchmany(1000))
@@ -280,18 +286,18 @@ def check_schema(connection: sqlite3.Connection) -> None:
 
 
 def version(connection: sqlite3.Connection) -> int:
-    """Number of the schema."""
+    """Schema version of a project."""
     return connection.execute("PRAGMA user_version").fetchone()[0]
 
 
 def not_a_project(path: Path) -> ProjectError:
-    """Error for a file that is no project."""
+    """Error for a file that is not a project."""
     return ProjectError(f"{path} is not a project of carts; nothing was changed. Name another file.")
 
 
 @contextmanager
 def transaction(connection: sqlite3.Connection) -> Iterator[sqlite3.Connection]:
-    """Transaction that is committed, and on disk, when the block ends without an exception."""
+    """Transaction that is committed and synchronized to disk if the block ends without an exception."""
     connection.execute("BEGIN IMMEDIATE")
     try:
         yield connection
@@ -313,7 +319,7 @@ def _schema_of(scripts: tuple[str, ...]) -> frozenset[tuple]:
 
 
 def _statements(script: str) -> Iterator[str]:
-    """Statements of a script, one by one, since `executescript` would end the transaction."""
+    """Yield the statements of a script, since `executescript` would commit the transaction."""
     statement = ""
     for line in script.splitlines(keepends=True):
         statement += line
@@ -324,7 +330,7 @@ def _statements(script: str) -> Iterator[str]:
 
 @contextmanager
 def errors_explained(path: Path) -> Iterator[None]:
-    """Turn errors of SQLite and of the operating system into `ProjectError`."""
+    """Convert errors of SQLite and the operating system to `ProjectError`."""
     try:
         yield
     except sqlite3.Error as error:

@@ -1,9 +1,9 @@
 """The project file on disk: file checks, writer lock, verified copy in memory, and verified commits.
 
-The lock covers the bytes that SQLite locks and belongs to the open file (F_OFD_SETLK), so it ends with the process
-and not with another descriptor. Edits go into SQLite's log while the file is open, so any other change of the file is
-foreign. SQLite replays a log up to its first damaged frame; what follows may only be the beginning of an
-unacknowledged transaction. Format: https://www.sqlite.org/fileformat2.html#the_write_ahead_log
+The lock covers the bytes that SQLite locks and belongs to the open file description (F_OFD_SETLK), so it is released at
+the end of the process, not when another descriptor is closed. While the file is open, edits are written to SQLite's
+write-ahead log, so any other change of the file is foreign. SQLite replays a log up to its first damaged frame; only an
+incomplete, unacknowledged transaction may follow. Format: https://www.sqlite.org/fileformat2.html#the_write_ahead_log
 """
 
 import ctypes
@@ -40,8 +40,8 @@ def check_files(path: Path) -> bool:
     """Check a project and its companion files before any is opened; returns whether the project exists.
 
     Raises:
-        ProjectError: something is a link, has a second name, or is no regular file; or a journal of another program is
-            there, which SQLite would play back.
+        ProjectError: a file is a link, has a second hard link or is not a regular file; or another program left a
+            journal, which SQLite would apply.
         OSError: the folder cannot be read.
     """
     there = _is_there(path)
@@ -60,7 +60,8 @@ def check_files(path: Path) -> bool:
 
 
 def open_regular(path: Path, *, write: bool = False) -> int:
-    """Descriptor of a regular file with one name; links are not followed, and pipes do not block."""
+    """Open a regular file with a single hard link and return its descriptor; links are not followed, and pipes do not
+    block."""
     _is_there(path)
     descriptor = os.open(path, (os.O_RDWR if write else os.O_RDONLY) | _OPEN)
     try:
@@ -116,7 +117,7 @@ def try_lock(descriptor: int) -> bool:
 
 
 def holder(path: Path) -> str:
-    """The process that has a project open, as text, if the system shows it."""
+    """Text that names the process that has a project open, if the system provides it."""
     own = str(os.getpid())
     with suppress(OSError):
         wanted = os.stat(path, follow_symlinks=False)
@@ -130,18 +131,18 @@ def holder(path: Path) -> str:
 
 
 HEADER, FRAME_HEADER = 32, 24
-"""Sizes of the header of a log, and of a frame's, before its page [bytes]."""
+"""Sizes of the log header, and of the header before each page [bytes]."""
 _ORDERS: dict[int, Literal["<", ">"]] = {0x377F0682: "<", 0x377F0683: ">"}
-"""Magic number -> byte order of the words in checksums."""
+"""Magic number -> byte order of checksum words."""
 _WORD = 0xFFFFFFFF
 _FRAMES_AT_ONCE = 256
 _PAGE_SIZES = frozenset(1 << n for n in range(9, 17))
 
 
 def _recovered(main: bytes, log: bytes) -> tuple[bytearray, bool]:
-    """The database after all finished transactions of a log, as SQLite recovers it, and whether the log is damaged.
+    """Database after all committed transactions of a log, as recovered by SQLite, and whether the log is damaged.
 
-    Logs of carts begin empty, so behind the finished transactions there is at most the beginning of one.
+    Logs start empty, so the committed transactions are followed by at most one incomplete transaction.
     """
     result, unfinished = bytearray(main), []
     for frame in _frames(log):
@@ -160,12 +161,12 @@ def _recovered(main: bytes, log: bytes) -> tuple[bytearray, bool]:
 
 
 def _frames(log: bytes) -> Iterator[tuple[int, int, bytes] | None]:
-    """Page number, size of the database [pages] if the frame ends a transaction, and page of each complete frame.
+    """Yield each complete frame: page number, database size [pages] if the frame commits a transaction, and page.
 
-    The last one is None if that frame, or the header, is damaged.
+    The last item is None if that frame or the header is damaged.
     """
     if len(log) < HEADER:
-        # The header is written first and at once; an incomplete one means a kill at that moment.
+        # The header is written first, in one call; it is incomplete only if the process was killed at that moment.
         return
     magic, _, page_size, _, *salts, s, t = struct.unpack_from(">8I", log)
     order = _ORDERS.get(magic)
@@ -179,7 +180,7 @@ def _frames(log: bytes) -> Iterator[tuple[int, int, bytes] | None]:
         ]
         *sums, (a, c), (b, d) = _checksums(order, *(frame[:8] + frame[FRAME_HEADER:] for frame in frames))
         for frame, (x, y) in zip(frames, sums, strict=True):
-            # A checksum is linear in the data and in the checksum before it.
+            # A checksum is linear in the data and in the previous checksum.
             s, t = (x + a * s + b * t) & _WORD, (y + c * s + d * t) & _WORD
             page, pages, *rest = struct.unpack_from(">6I", frame)
             if rest != [*salts, s, t] or page == 0:
@@ -189,7 +190,7 @@ def _frames(log: bytes) -> Iterator[tuple[int, int, bytes] | None]:
 
 
 def _checksums(order: Literal["<", ">"], *parts: bytes) -> list[list[int]]:
-    """Checksums of parts of equal length, followed by those of zeros after the checksums (1, 0) and (0, 1)."""
+    """WAL checksums of equal-length parts, each from (0, 0), then of a zero block from (1, 0) and from (0, 1)."""
     words = np.frombuffer(b"".join([*parts, bytes(2 * len(parts[0]))]), np.dtype(np.uint32).newbyteorder(order))
     s, t = np.zeros((2, len(parts) + 2), np.uint32)
     s[-2] = t[-1] = 1
@@ -200,11 +201,11 @@ def _checksums(order: Literal["<", ">"], *parts: bytes) -> list[list[int]]:
 
 
 LARGEST = 768 * 2**20
-"""Largest size of a project with its log [bytes]; opening needs twice as much memory."""
+"""Largest size of a project including its log [bytes]; opening it requires twice as much memory."""
 _TRIES = 5
 _MAGIC = b"SQLite format 3\0"
 _WRITE_VERSION = slice(18, 20)
-"""Header bytes for the journal mode (WAL or rollback); a database in memory needs a rollback journal."""
+"""Header bytes of the journal mode (WAL or rollback); an in-memory database requires a rollback journal."""
 
 
 @dataclass(frozen=True)
@@ -217,11 +218,11 @@ class Content:
 
 @dataclass(frozen=True)
 class Copy:
-    """An unverified copy in memory.
+    """An unverified copy of a project in memory.
 
     Attributes:
-        connection: to it.
-        fault: damage of the files, as a clause; None if there is none.
+        connection: connection to the copy.
+        fault: clause that describes damage of the files; None if there is none.
     """
 
     connection: sqlite3.Connection
@@ -229,7 +230,7 @@ class Copy:
 
 
 def read_files(path: Path) -> Content:
-    """Content of project and log at one moment; `ProjectError` if it is missing, too large, or always changing."""
+    """Read a consistent snapshot of project and log; `ProjectError` if it is missing, too large, or keeps changing."""
     if not check_files(path):
         raise ProjectError(f"there is no project {path}. Name an existing one, or open it for writing to begin one.")
     for _ in range(_TRIES):
@@ -249,14 +250,15 @@ def read_files(path: Path) -> Content:
             after = os.fstat(descriptor)
         finally:
             os.close(descriptor)
-        # A writer appends to the log, and moves it into the file when it is full or closed.
+        # A writer appends to the log, and checkpoints it into the file when it is full or closed.
         if (before.st_size, before.st_mtime_ns) == (after.st_size, after.st_mtime_ns):
             return Content(main, log)
     raise ProjectError(f"project {path} is being changed all the time. Try again when that has ended.")
 
 
 def open_copy(content: Content, path: Path) -> Copy:
-    """An unverified copy of a project in memory; `ProjectError` or `sqlite3.Error` if it is none or too new."""
+    """Open a project as an unverified copy in memory; `ProjectError` or `sqlite3.Error` if it is not a project or is
+    too new."""
     main = content.database
     if not main.startswith(_MAGIC) or len(main) < 512:
         raise database.not_a_project(path)
@@ -264,7 +266,7 @@ def open_copy(content: Content, path: Path) -> Copy:
     memory = sqlite3.connect(":memory:", isolation_level=None, check_same_thread=False)
     try:
         patched[_WRITE_VERSION] = b"\1\1"
-        # SQLite opens no truncated file; filled with zeros, the rest can be read.
+        # SQLite does not open truncated files; padded with zeros, the rest can be read.
         page_size = int.from_bytes(patched[16:18], "big")
         promised = int.from_bytes(patched[28:32], "big") * (65536 if page_size == 1 else page_size)
         missing = min(promised, LARGEST) - len(patched)
@@ -275,14 +277,14 @@ def open_copy(content: Content, path: Path) -> Copy:
     except BaseException:
         memory.close()
         raise
-    # Logs of older versions were used again without being emptied, so that old frames lie at their end.
+    # Older versions reused logs without truncating them, so old frames remain at the end.
     drops = damaged and database.version(memory) >= database.SEALED
     fault = "the last edits in its log (-wal) cannot be read" if drops else None
     return Copy(memory, f"{missing} bytes at its end are missing" if missing > 0 else fault)
 
 
 def check_copy(copy: Copy) -> None:
-    """Check that a copy has the schema of carts and is a sound database, before rows are read."""
+    """Check schema and database integrity of a copy before rows are read."""
     memory = copy.connection
     if copy.fault is not None:
         raise database.DamagedProject(copy.fault)
@@ -311,18 +313,18 @@ SealRow = tuple[bytes, bytes, bytes]
 """Row of the table `seal`."""
 
 LARGEST_LOG = 64 * 2**20
-"""Size of the log beyond which it is moved into the file [bytes]."""
+"""Size of the log above which it is checkpointed into the file [bytes]."""
 
 
 class LostFile(ProjectError):
-    """The file on disk is not, or may not be, the opened one. The message says what happened to it."""
+    """The file on disk is not, or may not be, the opened one. The message describes the incident."""
 
 
 class ProjectFile:
     """A project file locked for writing. Made by `locked`.
 
     Attributes:
-        path: of the file.
+        path: path of the file.
     """
 
     def __init__(self, path: Path, descriptor: int) -> None:
@@ -333,9 +335,9 @@ class ProjectFile:
         self._connection: sqlite3.Connection | None = None
         self._seal: SealRow = (b"", b"", b"")
         self._left: tuple[object, ...] = ()
-        """Identity, size and time of file and log after the last write of this process."""
+        """Identity, size and modification time of file and log after the last write of this process."""
         self._end, self._written = 0, (b"", b"")
-        """End of the last transaction in the log, and headers of the log and of its last frame."""
+        """End of the last transaction in the log [bytes], and headers of the log and of its last frame."""
 
     @classmethod
     def locked(cls, path: Path) -> "ProjectFile | None":
@@ -351,18 +353,18 @@ class ProjectFile:
         return None
 
     def connect(self, nonce: bytes, seal: SealRow) -> None:
-        """Open the file, whose content was verified, with SQLite, and migrate it.
+        """Open the verified file with SQLite, and migrate it.
 
         Args:
-            nonce: for a file of a schema without one.
-            seal: its seal after the migration.
+            nonce: nonce for a file whose schema has none.
+            seal: seal of the file after the migration.
 
         Raises:
-            ProjectError: it cannot be written to, or is another file by now.
+            ProjectError: it cannot be written to, or was replaced by another file.
         """
         uri = f"{self.path.as_uri()}?mode=rw&vfs=unix-none"
         with database.errors_explained(self.path):
-            # The lock is ours already, so SQLite takes none, and keeps its index of the log in memory.
+            # This process already holds the lock, so SQLite takes none and keeps its log index in memory.
             connection = sqlite3.connect(uri, uri=True, isolation_level=None, check_same_thread=False)
             self._connection = connection
             connection.execute("PRAGMA locking_mode = EXCLUSIVE")
@@ -371,7 +373,7 @@ class ProjectFile:
                 raise ProjectError(f"project {self.path} cannot be opened for writing. Open it read-only.")
             connection.execute("PRAGMA synchronous = FULL")
             connection.execute("PRAGMA wal_autocheckpoint = 0")
-            # Logs of carts begin empty; see `_recovered`.
+            # Logs start empty; see `_recovered`.
             connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
             database.migrate(connection, nonce)
             self._log = open_regular(self._log_path)
@@ -381,11 +383,11 @@ class ProjectFile:
         self._check_names()
 
     def commit(self, statements: Statements, seal: SealRow) -> None:
-        """Run statements as one transaction, which is on disk when this returns.
+        """Run statements as one transaction, synchronized to disk on return.
 
         Raises:
-            LostFile: the file is not the same any more; whether the edit is in it is not known.
-            ProjectError: it could not be written; nothing of it was.
+            LostFile: the file has changed; it is unknown whether the edit was written.
+            ProjectError: the transaction could not be written; nothing is changed then.
         """
         connection = self._usable()
         self.check()
@@ -397,7 +399,7 @@ class ProjectFile:
             self._check_since(committed=False)
             if getattr(error.__cause__, "sqlite_errorname", "").startswith(("SQLITE_CORRUPT", "SQLITE_NOTADB")):
                 raise LostFile("was damaged") from error
-            # The log may have grown by an unfinished transaction.
+            # The log may have grown by an incomplete transaction.
             self._remember()
             raise
         self._check_since(committed=True)
@@ -405,7 +407,7 @@ class ProjectFile:
         self._remember()
 
     def checkpoint(self) -> None:
-        """Move a large log into the file, and verify the result; `LostFile` if that fails."""
+        """Checkpoint a large log into the file, and verify the result; `LostFile` if that fails."""
         if os.fstat(self._open_log()).st_size < LARGEST_LOG:
             return
         with suppress(sqlite3.Error):
@@ -417,15 +419,15 @@ class ProjectFile:
         self._remember()
 
     def check(self) -> None:
-        """Check that file and log are unchanged since this process last wrote; otherwise they are a `LostFile`."""
+        """Check that file and log are unchanged since the last write of this process; `LostFile` otherwise."""
         self._check_names()
         if self._look() != self._left:
-            # The file may have been touched without a change.
+            # The file may have a new modification time without a change.
             self._check_content()
             self._remember()
 
     def close(self) -> None:
-        """Move the log into the file, verify its content (else `LostFile`), and release the lock."""
+        """Checkpoint the log into the file, verify its content (`LostFile` if it differs), and release the lock."""
         if self._connection is not None:
             self.check()
             self._connection.close()
@@ -435,7 +437,7 @@ class ProjectFile:
         self._release()
 
     def dismiss(self) -> None:
-        """Close a file without edits of this process."""
+        """Close a file in which this process made no edits."""
         if self._connection is not None and _lies_at(self.path, self._descriptor):
             with suppress(sqlite3.Error):
                 self._connection.close()
@@ -445,11 +447,11 @@ class ProjectFile:
     def abandon(self) -> None:
         """Close a lost file without writing to it again."""
         if self._connection is not None:
-            # Closing it would move the log into the file, and remove whatever has the log's name by now.
+            # Closing it would checkpoint the log into the file, and remove any file that now has the log's name.
             ctypes.pythonapi.Py_IncRef(ctypes.py_object(self._connection))
             self._connection = None
         if self._log is not None and not _lies_at(self.path, self._descriptor) and _lies_at(self._log_path, self._log):
-            # It is useless without its file, and SQLite would apply it to another one of that name.
+            # The log is useless without its file, and SQLite would apply it to another file of that name.
             with suppress(OSError):
                 self._log_path.unlink()
         self._release()
@@ -476,7 +478,7 @@ class ProjectFile:
         self._left = self._look()
 
     def _check_names(self, *, log: bool = True) -> None:
-        """Check that both files still have their paths."""
+        """Check that both paths still refer to the opened files."""
         if not _lies_at(self.path, self._descriptor):
             if os.path.lexists(self.path):
                 raise LostFile("was replaced by another file")
@@ -496,7 +498,7 @@ class ProjectFile:
         raise LostFile("was changed by something else, and does not hold what was saved in it")
 
     def _check_since(self, *, committed: bool) -> None:
-        """Check that no other process changed the file or cut its log during a transaction."""
+        """Check that no other process changed the file or truncated its log during a transaction."""
         self._check_names()
         if _look(self._descriptor) != self._left[0]:
             raise LostFile("was changed by something else while an edit was being saved")
@@ -511,7 +513,7 @@ class ProjectFile:
         self._end, self._written = end, headers
 
     def _headers(self, end: int) -> tuple[bytes, bytes]:
-        """Headers of the log and of its frame that ends at an offset [bytes]."""
+        """Headers of the log and of the frame that ends at an offset [bytes]."""
         log = self._open_log()
         header = os.pread(log, HEADER, 0)
         size = FRAME_HEADER + int.from_bytes(header[8:12], "big")

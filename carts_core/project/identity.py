@@ -1,4 +1,4 @@
-"""The recording of a project: its identity, and the default path of its project file."""
+"""Identity of a project's recording, and default path of its project file."""
 
 import hashlib
 import json
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class SequenceIdentity:
-    """Identity of a recording, which does not change when it is moved or its calibration or name are corrected."""
+    """Identity of a recording, independent of its location, calibration and name."""
 
     name: str = field(compare=False)
     """Name of the sequence."""
@@ -32,11 +32,11 @@ class SequenceIdentity:
     cameras: Mapping[str, tuple[int, int]]
     """Camera -> (width, height) of its images [px]."""
     kinematics_sha256: str
-    """SHA-256 of the kinematics tables, independent of line ends."""
+    """SHA-256 of the kinematics tables, independent of line endings."""
 
     @staticmethod
     def of(sequence: "Sequence") -> "SequenceIdentity":
-        """The identity of an open sequence; reads its kinematics tables once more."""
+        """Compute the identity of an open sequence; reads its kinematics tables again."""
         root = parse_toml(read_text(sequence.path, SEQUENCE))
         tables = [root["kinematics"]["table"], *(arm["table"] for arm in root["arms"] if arm.get("table"))]
         digest = hashlib.sha256()
@@ -69,7 +69,7 @@ class SequenceIdentity:
         )
 
     def difference(self, other: "SequenceIdentity") -> str | None:
-        """First difference to `other`, as a clause; None if they are the same recording."""
+        """First difference from `other`, as a clause; None if they are the same recording."""
         if len(self.frame_ids) != len(other.frame_ids):
             return f"{counted(len(self.frame_ids), 'frame')} against {len(other.frame_ids)}"
         for index, (own, others) in enumerate(zip(self.frame_ids, other.frame_ids, strict=True)):
@@ -90,7 +90,7 @@ def _list(parts: Mapping[str, tuple]) -> str:
 
 SUFFIX = ".carts"
 _RESCUED = r"\.rescued-\d{8}-\d{6}(?:-\d+)?"
-"""Pattern of the suffix from `rescue_paths`."""
+"""Pattern of the suffix made by `rescue_paths`."""
 
 
 def data_dir() -> Path:
@@ -103,14 +103,14 @@ def data_dir() -> Path:
 def default_path(sequence_file: Path) -> Path:
     """`NAME.carts` beside `NAME.toml`; in `data_dir()` for the shipped sequence and where the folder is read-only.
 
-    A project that is there already is used in any case.
+    An existing project beside the sequence is used in any case.
     """
     sequence_file = sequence_file.resolve()
     beside = sequence_file.with_suffix(SUFFIX)
     shipped = sequence_file.is_relative_to(sample_data_dir().resolve())
     if beside.exists() or (os.access(sequence_file.parent, os.W_OK) and not shipped):
         return beside
-    # Sequences of the same name in different folders are different ones.
+    # Sequences of the same name in different folders are distinct.
     folder = hashlib.sha256(str(sequence_file.parent).encode()).hexdigest()[:8]
     return data_dir() / f"{sequence_file.stem}-{folder}{SUFFIX}"
 

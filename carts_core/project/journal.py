@@ -1,6 +1,6 @@
-"""The journal: all steps with their changes. The state is the journal up to a position; undo moves that position.
+"""Journal of all steps with their changes. The state is given by the journal up to a position, which undo moves.
 
-Changes are returned as a `Script`, which is run on the file and on its copy in memory.
+Changes are returned as a `Script` that is run on the file and on its in-memory copy.
 """
 
 import sqlite3
@@ -19,10 +19,10 @@ class Script:
     """Statements of one transaction.
 
     Attributes:
-        statements: SQL, each with the rows of its parameters.
+        statements: SQL statements, each with its parameter rows.
         digests: change of the sum of all digests.
-        position: in the history, afterwards; None: as before.
-        cut_at: rows of this step and later ones are removed first; None: none are.
+        position: position in the history afterwards; None if unchanged.
+        cut_at: step from which rows are removed first; None to remove none.
     """
 
     statements: list[tuple[str, list[tuple]]] = field(default_factory=list)
@@ -45,10 +45,10 @@ class Script:
 
 
 def load(connection: sqlite3.Connection) -> tuple[ProjectState, Seal]:
-    """State and seal of a project. Every row is verified, including undone values.
+    """Load state and seal of a project. Every row is verified, including undone values.
 
     Raises:
-        ProjectError, sqlite3.Error and those of `store.UNREADABLE`: it cannot be read, or is not as it was written.
+        ProjectError, sqlite3.Error and those of `store.UNREADABLE`: it cannot be read, or was changed.
     """
     row = connection.execute("SELECT identity, position FROM project").fetchone()
     if row is None:
@@ -87,7 +87,7 @@ def load(connection: sqlite3.Connection) -> tuple[ProjectState, Seal]:
 
 
 def append(memory: sqlite3.Connection, step: Step, edits: Edits, last: int) -> Script:
-    """Append a step at the present position and remove undone ones, up to the step numbered `last`."""
+    """Append a step at the current position, and remove the undone steps after it (through `last`)."""
     script = Script(position=step.number)
     if last >= step.number:
         script.cut_at = step.number
@@ -117,7 +117,7 @@ def move(memory: sqlite3.Connection, start: int, target: int) -> tuple[Script, d
 
 
 def _newest(memory: sqlite3.Connection, about: tuple[str, int, str], last: int) -> tuple[int, Any]:
-    """Newest step up to `last` that set a key, and the stored value; (-1, None) if there is none."""
+    """Latest step up to `last` that set a key, and the stored value; (-1, None) if there is none."""
     query = "SELECT step, value FROM changes WHERE kind = ? AND frame = ? AND name = ? AND step <= ?"
     return memory.execute(f"{query} ORDER BY step DESC LIMIT 1", (*about, last)).fetchone() or (-1, None)
 
@@ -125,7 +125,7 @@ def _newest(memory: sqlite3.Connection, about: tuple[str, int, str], last: int) 
 def before(memory: sqlite3.Connection, step: int, position: int) -> tuple[dict[Key[Any], Any], int | None]:
     """Edits that undo a step, and the number of a later step that changed the same keys, if any.
 
-    Verdicts are omitted, since their validity depends on all values of their frame.
+    Verdicts are omitted, since they depend on all values of their frame.
     """
     edits: dict[Key[Any], Any] = {}
     later: list[int] = []
@@ -140,7 +140,7 @@ def before(memory: sqlite3.Connection, step: int, position: int) -> tuple[dict[K
 
 
 def add_figures(memory: sqlite3.Connection, script: Script, figures: Mapping[tuple[int, int], Figures]) -> Script:
-    """Add figures of (frame, revision)."""
+    """Add quality figures by (frame, revision)."""
     for key in figures:
         if script.cut_at is not None and key[1] >= script.cut_at:
             continue
@@ -152,7 +152,7 @@ def add_figures(memory: sqlite3.Connection, script: Script, figures: Mapping[tup
 
 
 def add_remark(memory: sqlite3.Connection, key: Key[Any], entry: Entry) -> Script:
-    """Set a value as part of a done step, replacing that step's own."""
+    """Set a value as part of an existing step, replacing that step's value."""
     script, row = Script(), (key.kind.value, int(key.frame), str(key.name), entry.step)
     found = "SELECT digest FROM changes WHERE kind = ? AND frame = ? AND name = ? AND step = ?"
     script.take_out(memory.execute(found, row))

@@ -17,7 +17,7 @@ _HEADER = b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR"
 
 @dataclass(frozen=True)
 class Layer:
-    """A painted layer, made by the `of` of its subclasses; `ProjectError` for bytes that are no PNG."""
+    """A painted layer, created by `of` of its subclasses; `ProjectError` if the bytes are not a PNG."""
 
     png: bytes
 
@@ -27,20 +27,20 @@ class Layer:
 
     @property
     def size(self) -> tuple[int, int]:
-        """(width, height) [px], as the PNG's header says."""
+        """(width, height) [px] from the PNG header."""
         return struct.unpack_from(">II", self.png, len(_HEADER))
 
     def encode(self) -> bytes:
-        """The layer as stored."""
+        """Encode the layer for storage."""
         return self.png
 
     @classmethod
     def decode(cls, data: bytes) -> Self:
-        """The layer from `encode`; `ProjectError` for other bytes."""
+        """Decode the result of `encode`; `ProjectError` for other bytes."""
         return cls(bytes(data))
 
     def pixels(self) -> UInt8[np.ndarray, "height width"]:
-        """Values of the PNG, read-only; `ProjectError` if it is damaged."""
+        """Pixel values of the PNG, read-only; `ProjectError` if it is damaged."""
         return _decoded(self.png, self.size)
 
 
@@ -49,7 +49,7 @@ class MaskCorrection(Layer):
 
     @classmethod
     def of(cls, added: Bool[np.ndarray, "height width"], removed: Bool[np.ndarray, "height width"]) -> Self:
-        """A correction of these pixels; `ProjectError` if the shapes differ or a pixel is both."""
+        """Create a correction from masks of pixels; `ProjectError` if the shapes differ or a pixel is in both."""
         added, removed = np.asarray(added, bool), np.asarray(removed, bool)
         if added.shape != removed.shape or added.ndim != 2 or (added & removed).any():
             raise ProjectError(
@@ -59,25 +59,25 @@ class MaskCorrection(Layer):
         return cls(_png(added * _ADDED + removed * _REMOVED))
 
     def added(self) -> Bool[np.ndarray, "height width"]:
-        """Pixels that belong to an arm although none is rendered there."""
+        """Arm pixels where no arm is rendered."""
         return self.pixels() == _ADDED
 
     def removed(self) -> Bool[np.ndarray, "height width"]:
-        """Pixels that belong to no arm although one is rendered there."""
+        """Background pixels where an arm is rendered."""
         return self.pixels() == _REMOVED
 
     def applied_to(self, mask: Bool[np.ndarray, "height width"]) -> Bool[np.ndarray, "height width"]:
-        """The corrected mask."""
+        """Apply the correction to a mask."""
         pixels = self.pixels()
         return (mask | (pixels == _ADDED)) & (pixels != _REMOVED)
 
 
 class IgnoreRegion(Layer):
-    """Pixels where something hides the arms (255); 0 elsewhere. The optimizer leaves them out."""
+    """Pixels where the arms are occluded (255); 0 elsewhere. The optimizer ignores them."""
 
     @classmethod
     def of(cls, region: Bool[np.ndarray, "height width"]) -> Self:
-        """The region of these pixels; `ProjectError` unless they are a mask."""
+        """Create a region from a mask; `ProjectError` if it is not a mask."""
         region = np.asarray(region, bool)
         if region.ndim != 2:
             raise ProjectError(f"an ignore region has shape {region.shape}. Give a mask [height, width].")
@@ -89,11 +89,11 @@ class IgnoreRegion(Layer):
 
 
 class LabelLayer(Layer):
-    """A label image; 0 is no label."""
+    """A label image; 0 means unlabelled."""
 
     @classmethod
     def of(cls, labels: UInt8[np.ndarray, "height width"]) -> Self:
-        """The layer of these numbers; `ProjectError` unless they are an image of 8 bits."""
+        """Create a layer from label numbers; `ProjectError` unless they are an 8-bit image."""
         labels = np.asarray(labels)
         if labels.ndim != 2 or labels.dtype != np.uint8:
             raise ProjectError(f"labels are {labels.dtype} {labels.shape}. Give 8 bits per pixel [height, width].")

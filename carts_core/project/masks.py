@@ -1,4 +1,4 @@
-"""Masks of a project: imported annotations as layers, and masks that the optimizer fits."""
+"""Masks of a project: import of annotations as layers, and masks fitted by the optimizer."""
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
@@ -35,7 +35,7 @@ Masks = dict[str, Bool[np.ndarray, "height width"]]
 
 
 def project_masks(layer: MaskLayer, state: ProjectState, recording: Recording) -> GivenMasks:
-    """Imported masks, or rendered masks corrected with a brush, of a project in this state; without ignore regions."""
+    """Imported masks, or rendered masks with brush corrections, of a project state; ignore regions are excluded."""
     cameras = [camera.name for camera in recording.scene.cameras]
     if layer == "imported":
         known = state.get(Key.imported_labels())
@@ -66,7 +66,7 @@ def project_masks(layer: MaskLayer, state: ProjectState, recording: Recording) -
 
 
 def file_masks(source: Path, recording: Recording) -> GivenMasks:
-    """Masks from a file or folder, as read by `read_annotations`; `ProjectError` if it has none of any frame."""
+    """Masks from a file or folder, read by `read_annotations`; `ProjectError` if it has no mask of any frame."""
     found = read_annotations(source, recording)
     layers = {
         (frame.frame, frame.camera): ImportedMask.of(frame.labels) for frame in found.frames if frame.labels is not None
@@ -94,7 +94,7 @@ def _labelled(
     names: Sequence[str],
     state: ProjectState | None = None,
 ) -> GivenMasks:
-    """Masks from label images, without ignore regions and ignored labels."""
+    """Masks from label images; ignore regions and ignored labels are excluded."""
     cameras = tuple(cameras)
 
     def layers(index: int) -> dict[str, ImportedMask]:
@@ -136,11 +136,11 @@ class ImportReport:
     labels: tuple[str, ...]
     """Labels of the masks."""
     unknown: tuple[str, ...]
-    """Images of the source that belong to no frame."""
+    """Images of the source that match no frame."""
     changed: bool
     """Whether the project changed."""
     remarks: tuple[str, ...] = ()
-    """Decisions on masks, and omitted annotations with reasons."""
+    """Remarks on the interpretation of masks, and on omitted annotations with reasons."""
 
     def sentence(self) -> str:
         """Report as a sentence."""
@@ -165,10 +165,11 @@ def import_annotations(
 
     Args:
         source: name of the file or folder, for the history.
-        replace: whether layers that were imported before may be replaced by others.
+        replace: whether previously imported layers may be replaced.
 
     Raises:
-        ProjectError: nothing belongs to a frame, or a layer would be replaced that may not be. Nothing is changed then.
+        ProjectError: no annotation matches a frame, or a layer would be replaced without permission. Nothing is changed
+            then.
         SequenceError: the source cannot be read.
     """
     state = project.state

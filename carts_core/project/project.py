@@ -27,15 +27,15 @@ Action = Literal["apply", "undo", "redo", "figures", "export"]
 
 @dataclass(frozen=True)
 class Change:
-    """A saved change. The new state is that of the project."""
+    """A saved change; the new state is `Project.state`."""
 
     action: Action
     step: Step | None
-    """The step that was done or, for "undo", taken back; the outermost one of several."""
+    """The step that was done or undone; the outermost one if several were."""
     keys: frozenset[Key[Any]]
     """Keys whose values may have changed."""
     frames: tuple[int, ...]
-    """Indices of the affected frames, sorted; without values of the whole project."""
+    """Sorted indices of the affected frames; values of the whole project are not included."""
 
 
 Listener = Callable[[Change], None]
@@ -46,22 +46,22 @@ LONGEST_NAME = 200
 
 
 class Project:
-    """The corrections of one sequence, in one file. Thread-safe.
+    """Project with the corrections of one sequence, stored in one file. Thread-safe.
 
     Attributes:
-        state: present state, an immutable snapshot that is read without a lock.
-        read_only_reason: why nothing can be saved, as a sentence; None if it can.
+        state: current state, an immutable snapshot that is read without a lock.
+        read_only_reason: sentence on why nothing can be saved; None if the project is writable.
 
     Args:
-        read_only: do not write; later edits of other processes are not seen.
+        read_only: do not write; later edits of other processes are not loaded.
 
     Raises:
-        ProjectError: the file belongs to another sequence or to a newer version of carts, is not a project, is not
-            there (read-only), or cannot be written (folder read-only, disk full). Nothing is changed then.
+        ProjectError: the file belongs to another sequence or to a newer version of carts, is not a project, does not
+            exist (if read-only), or cannot be written (folder read-only, disk full). Nothing is changed then.
     """
 
     def __init__(self, identity: SequenceIdentity, path: Path, *, read_only: bool = False) -> None:
-        # Links on the way to the file's folder are the user's; the file itself must be none.
+        # Links in the path to the file's folder are allowed; the file itself must not be a link.
         self._path = path.parent.resolve() / path.name
         self.read_only_reason = "It was opened read-only." if read_only else None
         self._edit = threading.RLock()
@@ -73,9 +73,9 @@ class Project:
 
     @classmethod
     def open(cls, sequence: "Sequence", path: Path | None = None, *, read_only: bool = False) -> Self:
-        """Open the project of a sequence, created if it is missing; by default at `default_path`.
+        """Open the project of a sequence, by default at `default_path`; created if missing.
 
-        While another process has it open for writing, it opens read-only; see `writable`. Errors as of the class.
+        If another process has it open for writing, it is opened read-only; see `writable`. Errors as in the class.
         """
         if path is None:
             path = default_path(Path(sequence.path))
@@ -86,7 +86,7 @@ class Project:
 
     @property
     def path(self) -> Path:
-        """The file; another one after a rescue, see `incident`."""
+        """Path of the project file; another file after a rescue, see `incident`."""
         return self._path if self._store is None else self._store.path
 
     @property
@@ -96,7 +96,7 @@ class Project:
 
     @property
     def incident(self) -> str | None:
-        """What happened to the opened file and where its edits are now, as a sentence; None if nothing happened."""
+        """Sentence on what happened to the opened file and where its edits are saved; None without an incident."""
         return self._incident if self._store is None else self._store.incident
 
     @property
@@ -105,28 +105,28 @@ class Project:
         return self._store is None or self._store.safe
 
     def check(self) -> None:
-        """Check that the file is unchanged since the last write; otherwise everything is saved to another one, see
+        """Check that the file is unchanged since the last write; otherwise everything is saved to another file, see
         `incident`.
 
-        Every edit does this, too.
+        Every edit does this as well.
 
         Raises:
-            ProjectError: it is not, and nothing could be saved elsewhere yet.
+            ProjectError: the file has changed, and the project could not be saved elsewhere.
         """
         with self._edit:
             if self._store is not None:
                 self._store.check()
 
     def apply(self, name: str, edits: Edits, figures: Mapping[int, Figures] | None = None) -> Change | None:
-        """Save one gesture as one undo step. It is on disk when this returns.
+        """Save edits as one undo step, synchronized to disk on return.
 
         Args:
-            name: for the history, say "Drag PSM1"; shortened to `LONGEST_NAME` characters.
-            edits: what changes; see `ProjectState.changed` for what is left out and added.
-            figures: frame -> figures of the frame with these edits; kept even if nothing else differs.
+            name: name in the history, such as "Drag PSM1"; shortened to `LONGEST_NAME` characters.
+            edits: new values by key; see `ProjectState.changed` for omitted and additional edits.
+            figures: frame -> quality figures with these edits; saved even if nothing else changes.
 
         Returns:
-            What was saved; None if nothing differs.
+            The saved change; None if nothing changes.
 
         Raises:
             ProjectError: an edit does not fit the sequence, or could not be saved. Nothing is changed then.
@@ -142,7 +142,7 @@ class Project:
             title = " ".join(name.encode("utf-8", "replace").decode().split())
             if not title:
                 raise ProjectError("a step's name is empty. Give one.")
-            # Names of arms, joints and frames, of which steps' names are made, may be long.
+            # Names of arms, joints and frames, which are part of step names, may be long.
             title = title if len(title) <= LONGEST_NAME else f"{title[: LONGEST_NAME - 1]}…"
             step = Step(state.position + 1, title, time.time())
             after = state.after(step, changed)
@@ -158,12 +158,13 @@ class Project:
             return self.go_to(max(self.state.position - 1, 0))
 
     def redo(self) -> Change | None:
-        """Redo the step that was undone last; None if there is none. Errors as `undo`."""
+        """Redo the last undone step; None if there is none. Errors as in `undo`."""
         with self._edit:
             return self.go_to(min(self.state.position + 1, len(self.state.steps)))
 
     def go_to(self, position: int) -> Change | None:
-        """Undo or redo to a position of the history, None if it is the present one; `ProjectError` if there is none."""
+        """Undo or redo to a position of the history; None if it is the current one. `ProjectError` if it does not
+        exist."""
         with self._edit:
             state = self.state
             if not 0 <= position <= len(state.steps):
@@ -183,10 +184,10 @@ class Project:
     def reverting(self, number: int) -> tuple[Edits, Mapping[int, Figures]]:
         """Edits that undo a single step and keep all later ones, with figures as for `apply`.
 
-        Nothing is changed. A frame that is restored to its state before the step regains its verdict and figures.
+        The project is not changed. A frame restored to its state before the step regains its verdict and figures.
 
         Raises:
-            ProjectError: there is no such step, or a later one has changed the same.
+            ProjectError: there is no such step, or a later step has changed the same keys.
         """
         with self._edit:
             state = self.state
@@ -210,14 +211,14 @@ class Project:
     def record_figures(self, figures: Mapping[int, Figures], state: ProjectState) -> None:
         """Save figures that were computed for frames of `state`. Not an undo step.
 
-        They come back whenever undo or redo brings those frames back to that state.
+        Undo and redo restore them when they restore that state of the frames.
 
         Raises:
-            ProjectError: there is no such frame, or it could not be saved.
+            ProjectError: a frame does not exist, or the figures could not be saved.
         """
         with self._edit:
             known = by_revision(state, figures)
-            # The state may belong to a dropped branch of the history.
+            # The state may belong to a discarded branch of the history.
             known = {
                 key: value for key, value in known.items() if step_at(state, key[1]) == step_at(self.state, key[1])
             }
@@ -227,7 +228,7 @@ class Project:
                 self._saved(self.state.with_figures(known), "figures", frames=[frame for frame, _ in known])
 
     def record_verdict(self, frame: int, verdict: FitVerdict) -> None:
-        """Save the verdict on the present fit of a frame. Not an undo step. Errors as `record_figures`."""
+        """Save the verdict on the current fit of a frame. Not an undo step. Errors as in `record_figures`."""
         key = Key.verdict(frame)
         with self._edit:
             check_edit(self.state.identity, key, verdict)
@@ -237,7 +238,7 @@ class Project:
             self._saved(self.state.with_entries({key: entry}), "figures", frames=[frame])
 
     def log_export(self, format: str, path: Path, frames: int, settings: Mapping[str, Any]) -> None:
-        """Log a finished export, which is no undo step. `ProjectError` if it could not be saved."""
+        """Log a finished export. Not an undo step. `ProjectError` if it could not be saved."""
         record = ExportRecord(time.time(), format, str(path), frames, json.dumps(settings, allow_nan=False))
         with self._edit:
             self._writer().commit(journal.add_export(record))
@@ -300,12 +301,12 @@ class Project:
         for listener in tuple(self._listeners):
             try:
                 listener(change)
-            except Exception:  # The edit is saved all the same.
+            except Exception:  # The edit is saved nevertheless.
                 logging.getLogger(__name__).exception("a listener of project %s failed", self.path)
         return change
 
 
 def read_state(path: Path) -> ProjectState:
-    """State of a project file of any sequence, also one that is open elsewhere; `ProjectError` if unreadable."""
+    """Read the state of a project file of any sequence, even if it is open elsewhere; `ProjectError` if unreadable."""
     with database.errors_explained(path):
         return read_project(path, None)

@@ -1,4 +1,4 @@
-"""The state of a project at one moment, as an immutable snapshot, and queries for frames to review."""
+"""Immutable snapshots of a project's state, and queries for frames to review."""
 
 import math
 from bisect import bisect_left, bisect_right
@@ -30,10 +30,10 @@ V = TypeVar("V")
 
 @dataclass(frozen=True)
 class Step:
-    """One gesture, which is one undo step."""
+    """One undo step."""
 
     number: int
-    """From 1, without gaps."""
+    """Step number, from 1 without gaps."""
     name: str
     time: float
     """Time of the step [s since 1970]."""
@@ -50,12 +50,12 @@ class ExportRecord:
     frames: int
     """Number of exported frames."""
     settings: str
-    """JSON text."""
+    """Settings of the export, as JSON text."""
 
 
 @dataclass(frozen=True)
 class Entry:
-    """A value and the step that set it. The value is None if the step removed it."""
+    """A value and the step that set it; None if the step removed the value."""
 
     step: int
     value: Any
@@ -68,12 +68,12 @@ class Record:
     entries: Mapping[Key[Any], Entry]
     """Values that differ, or once differed, from the sequence."""
     figures: Mapping[int, Figures]
-    """By revision; see `ProjectState.revision`."""
+    """Quality figures by revision; see `ProjectState.revision`."""
 
-    # Computed once per record; records outlive states, so that queries of all frames compute few anew.
+    # Computed once per record; records are shared by successive states, so queries over all frames recompute only few.
     @cached_property
     def review(self) -> Review:
-        """Review state and note. Without a person's review, the state depends on the source of the joint positions."""
+        """Review state and note. Without a manual review, the state depends on the source of the joint positions."""
         said = next(self._values(Kind.REVIEW), Review())
         if said.state not in UNREVIEWED:
             return said
@@ -86,7 +86,7 @@ class Record:
 
     @cached_property
     def _optimized(self) -> bool:
-        """Whether the joint positions are from an optimizer run, alone or with other frames; copies have no
+        """Whether the joint positions come from an optimizer run of one or several frames; copied ones have no
         settings."""
         made = [correction.provenance for correction in self._values(Kind.JOINTS)]
         by_hand = any(one.source is Source.HAND for one in made)
@@ -99,7 +99,7 @@ class Record:
 
     @cached_property
     def is_kept(self) -> bool:
-        """Whether propagation must not change the frame: a keyframe, or accepted by a person."""
+        """Whether propagation must not change the frame, because it is a keyframe or was manually accepted."""
         return self.is_keyframe or self.review.state is ReviewState.ACCEPTED
 
     def _values(self, kind: Kind) -> Iterator[Any]:
@@ -122,20 +122,20 @@ class ProjectState:
     steps: tuple[Step, ...] = ()
     """The history, oldest first; those after `position` are undone and can be redone."""
     position: int = 0
-    """Number of the done steps."""
+    """Number of steps in effect."""
     records: Mapping[int, Record] = field(default_factory=dict)
-    """Records by frame. An edit copies this table and the affected records, so it is not one flat table."""
+    """Records by frame. Nested, because an edit copies this mapping and the affected records only."""
     exports: tuple[ExportRecord, ...] = ()
 
     def get(self, key: Key[V]) -> V | None:
-        """The value of a key; None where it is as in the sequence."""
+        """Value of a key; None if it is the sequence's own."""
         entry = self._record(key.frame).entries.get(key)
         return None if entry is None else entry.value
 
     def changed(self, edits: Edits) -> dict[Key[Any], Any]:
-        """Edits that change something, among them all verdicts on a changed pose.
+        """The edits that change values, including given verdicts on changed poses even if these verdicts are equal.
 
-        A change of an accepted frame withdraws its acceptance in the same step, unless an edit sets its review.
+        Changing an accepted frame withdraws its acceptance in the same step, unless an edit sets its review.
         """
         changed = {key: value for key, value in edits.items() if self.get(key) != value}
         moved = {key.frame for key in changed if key.kind not in _MARKS}
@@ -172,27 +172,27 @@ class ProjectState:
         return self._record(frame).review
 
     def verdict(self, frame: int) -> FitVerdict | None:
-        """Verdict on a frame's fit; None if the fit changed since."""
+        """Verdict on a frame's fit; None if the fit has changed since then."""
         entry = self._record(frame).entries.get(Key.verdict(frame))
         return None if entry is None or entry.step < self.revision(frame) else entry.value
 
     def remark(self, key: Key[V], value: V) -> Entry:
-        """Entry for a value that belongs to the step that last changed its frame, so that undo affects both."""
+        """Entry for a value that is assigned to the step that last changed its frame, so that undo affects both."""
         known = self._record(key.frame).entries.get(key)
         return Entry(max(self.revision(key.frame), 0 if known is None else known.step), value)
 
     def is_keyframe(self, frame: int) -> bool:
-        """Whether propagation must keep the frame, by user's choice or, by default, for joint positions made by
-        hand."""
+        """Whether the frame is a keyframe, by the user's choice or, by default, because its joint positions were set
+        manually."""
         return self._record(frame).is_keyframe
 
     @cached_property
     def kept_frames(self) -> tuple[int, ...]:
-        """Frames that propagation must not change, sorted: keyframes and those accepted by a person."""
+        """Sorted frames that propagation must not change: keyframes and manually accepted ones."""
         return tuple(sorted(i for i, record in self.records.items() if i != WHOLE_PROJECT and record.is_kept))
 
     def figures(self, frame: int) -> Figures | None:
-        """Figures of a frame; None if it changed since they were computed."""
+        """Quality figures of a frame; None if it has changed since they were computed."""
         return self._record(frame).figures.get(self.revision(frame))
 
     def revision(self, frame: int) -> int:
@@ -204,7 +204,7 @@ class ProjectState:
     def regained(
         self, past: "ProjectState", edits: Edits
     ) -> tuple[dict[Key[FitVerdict], FitVerdict], dict[int, Figures]]:
-        """Verdicts and figures of frames that edits restore to an earlier state."""
+        """Verdicts and figures of the frames that edits restore to an earlier state."""
         after = self.after(Step(self.position + 1, "", 0.0), edits)
         changed = {key.frame for key in edits if key.kind not in _MARKS}
         frames = set(past.records) - {WHOLE_PROJECT} if WHOLE_PROJECT in changed else changed
@@ -232,7 +232,7 @@ class ProjectState:
         return self.steps[self.position] if self.position < len(self.steps) else None
 
     def after(self, step: Step, edits: Edits) -> "ProjectState":
-        """The state after one more step, without the redoable ones."""
+        """State after one more step, with redoable steps discarded."""
         state = self
         if self.redoable is not None:
             records = {
@@ -244,7 +244,7 @@ class ProjectState:
         return replace(state.with_entries(changed), steps=(*state.steps, step), position=step.number)
 
     def with_entries(self, changed: Mapping[Key[Any], Entry | None]) -> "ProjectState":
-        """The state with other entries under these keys; None removes an entry."""
+        """State with entries replaced under these keys; None removes an entry."""
         by_frame: defaultdict[int, dict[Key[Any], Entry | None]] = defaultdict(dict)
         for key, entry in changed.items():
             by_frame[key.frame][key] = entry
@@ -256,7 +256,7 @@ class ProjectState:
         return replace(self, records=records)
 
     def with_figures(self, figures: Mapping[tuple[int, int], Figures]) -> "ProjectState":
-        """The state with these figures of (frame, revision) added."""
+        """State with figures added, by (frame, revision)."""
         records = dict(self.records)
         for (frame, revision), value in figures.items():
             record = records.get(frame, _EMPTY)
@@ -290,19 +290,19 @@ def frames_in(state: ProjectState, review_states: Collection[ReviewState]) -> li
 
 
 def by_hand(state: ProjectState, frame: int) -> bool:
-    """Whether a person moved the frame's arms and the frame is not reviewed."""
+    """Whether the frame's arms were moved manually and the frame is not reviewed."""
     record = state.records.get(frame)
     untouched = record is not None and record.review.state is ReviewState.UNTOUCHED
     return record is not None and untouched and Source.HAND in record.sources
 
 
 def next_unreviewed(state: ProjectState, after: int, step: int = 1, within: range | None = None) -> int | None:
-    """The next frame without review, cyclically; None if there is none.
+    """Next frame without review, cyclically; None if there is none.
 
     Args:
-        after: index of the present frame, which comes last.
+        after: index of the current frame, which is considered last.
         step: 1 forwards, -1 backwards.
-        within: frames to stay in, of which the present one is one; None: all of them.
+        within: range to search, which contains the current frame; None for all frames.
     """
     frames = within or range(len(state.identity.frame_ids))
     place = after - frames.start
@@ -311,9 +311,10 @@ def next_unreviewed(state: ProjectState, after: int, step: int = 1, within: rang
 
 
 def between_kept(state: ProjectState, frame: int, within: range | None = None) -> range:
-    """The frames between the neighbouring kept frames, both included; see `ProjectState.kept_frames`.
+    """Range between the neighbouring kept frames, inclusive; see `ProjectState.kept_frames`.
 
-    Where there is none, the sequence's first or last frame takes its place, or that of `within` if the frame is there.
+    Without a neighbouring kept frame, the range extends to the first or last frame of the sequence, or of `within` if
+    it contains the frame.
     """
     frames = range(len(state.identity.frame_ids)) if within is None or frame not in within else within
     kept = [index for index in state.kept_frames if index in frames]
@@ -331,9 +332,9 @@ def worst_first(
     """Frames sorted by decreasing badness of fit; those without figures come last, in order.
 
     Args:
-        frames: indices to order, by default all.
-        badness: larger is worse, None unknown. By default 1 - Dice if any of the frames has Dice, else the probability
-            of a failure if any has a verdict, else the loss.
+        frames: indices of the frames to sort, by default all.
+        badness: measure that is larger for worse fits, None if unknown. By default 1 - Dice if any frame has Dice, else
+            the probability of failure if any has a verdict, else the loss.
     """
     indices = list(range(len(state.identity.frame_ids)) if frames is None else frames)
     if badness is None:
@@ -345,7 +346,7 @@ def worst_first(
 
 
 def _badness(state: ProjectState, indices: Iterable[int]) -> dict[int, float]:
-    """Badness of frames with figures, all by the same measure, the most reliable one available."""
+    """Badness of frames with figures, using for all the most reliable measure available."""
     dice, failure, loss = {}, {}, {}
     for index in indices:
         figures, verdict = state.figures(index), state.verdict(index)

@@ -1,7 +1,7 @@
-"""Opening, committing to and rescuing a project, which is a file with a copy in memory.
+"""Opening, committing and rescuing of projects, each a file with an in-memory copy.
 
-Everything is checked on the copy first, so a refused file stays as it is. A file that is lost while open is rescued
-from the copy; of a damaged file, what can be read becomes a new project.
+All checks run on the copy first, so a refused file is not changed. A file that is lost while open is rescued from the
+copy; the readable content of a damaged file becomes a new project.
 """
 
 import logging
@@ -26,14 +26,14 @@ from .state import ProjectState
 from .values import Figures, Key, Kind, check_edit, decode
 
 UNREADABLE = (ValueError, TypeError, KeyError, AttributeError, OverflowError, RecursionError, MemoryError)
-"""Errors of decoding untrusted values, besides `ProjectError`."""
+"""Exceptions raised on decoding untrusted values, besides `ProjectError`."""
 _TYPES: dict[str, tuple[Any, ...]] = {
     "steps": (int, str, float),
     "changes": (str, int, str, int, str | bytes | None),
     "figures": (int, int, float | None, float | None),
     "exports": (float, str, str, int, str),
 }
-"""Types of a row's values."""
+"""Table -> types of a row's values."""
 _LISTED = 5
 _LOST_STEP = "A step whose name was lost to damage"
 
@@ -128,7 +128,7 @@ def _fits(identity: SequenceIdentity, table: str, row: tuple, rescued: Rescued) 
 
 
 def _position(old: sqlite3.Connection, numbers: list[int]) -> int:
-    """Number of the done steps; all, if the file does not give it."""
+    """Number of steps in effect; all steps if it cannot be read."""
     try:
         (position,) = old.execute("SELECT position FROM project").fetchone()
     except (sqlite3.Error, TypeError):
@@ -139,7 +139,7 @@ def _position(old: sqlite3.Connection, numbers: list[int]) -> int:
 _log = logging.getLogger(__name__)
 
 _WRITE_VERSION = slice(18, 20)
-"""Header bytes for the journal mode."""
+"""Header bytes of the journal mode."""
 _LOG = b"\2\2"
 _TRIES = 3
 
@@ -155,9 +155,9 @@ class Store:
     """A project open for writing.
 
     Attributes:
-        memory: the same as the file, in memory.
-        path: the file that edits go to; another one after a rescue.
-        incident: what happened to the opened file, as a sentence; None if nothing did.
+        memory: connection to the in-memory copy.
+        path: file to which edits are written; another one after a rescue.
+        incident: sentence on what happened to the opened file; None without an incident.
     """
 
     def __init__(self, memory: sqlite3.Connection, seal: Seal, position: int, file: ProjectFile) -> None:
@@ -176,7 +176,7 @@ class Store:
         return self._file is not None
 
     def commit(self, script: Script) -> None:
-        """Write a transaction to `path`; `ProjectError` if nothing of it could be written."""
+        """Write a transaction to `path`; `ProjectError` if it could not be written."""
         position = self._position if script.position is None else script.position
         seal = self._seal.plus(script.digests)
         row = seal.row(position)
@@ -202,7 +202,7 @@ class Store:
         self._guarded(lambda file: file.check())
 
     def close(self) -> None:
-        """Close the file and verify its content; `ProjectError` if acknowledged edits are on no disk."""
+        """Close the file and verify its content; `ProjectError` if acknowledged edits are not on disk."""
         for _ in range(_TRIES):
             try:
                 self._usable().close()
@@ -229,7 +229,7 @@ class Store:
         return self._file
 
     def _rescue(self, what: str) -> None:
-        """Write everything to a new file, which takes the place of the lost one."""
+        """Write everything to a new file that replaces the lost one."""
         lost = self.path
         if self._file is not None:
             self._what = what
@@ -261,7 +261,7 @@ class Store:
         _log.error("%s", self.incident)
 
     def _moved_to(self, path: Path, content: bytes) -> ProjectFile | None:
-        """A new project file with everything in it; None if its name is taken."""
+        """Create a project file with all content at `path`; None if the name is taken."""
         if path.parent != data_dir() and not path.parent.is_dir():
             return None
         if not write_new(path, content):
@@ -278,10 +278,11 @@ class Store:
 
 
 def open_or_begin(path: Path, identity: SequenceIdentity) -> tuple[ProjectState, Store | str]:
-    """State and store of the project of a sequence, created if missing; for a store in use elsewhere, the reason.
+    """Open the project of a sequence, created if missing; returns its state, and its store or the reason why another
+    process holds it.
 
     Raises:
-        DamagedProject: it is damaged; what can be read of it is in a new file by now.
+        DamagedProject: it is damaged; its readable content was saved to a new file.
         ProjectError, OSError, sqlite3.Error: it cannot be opened; nothing is changed.
     """
     if not check_files(path):
@@ -302,7 +303,7 @@ def open_or_begin(path: Path, identity: SequenceIdentity) -> tuple[ProjectState,
 
 
 def read_project(path: Path, identity: SequenceIdentity | None) -> ProjectState:
-    """State of the project of a sequence, or with None of any sequence; errors as `open_or_begin`."""
+    """Read the state of the project of a sequence (of any sequence if None); errors as in `open_or_begin`."""
     memory, state, _ = _load(path, identity, keep_what_is_left=False)
     memory.close()
     return state
@@ -310,7 +311,7 @@ def read_project(path: Path, identity: SequenceIdentity | None) -> ProjectState:
 
 def _begin(path: Path, identity: SequenceIdentity) -> None:
     try:
-        # A process that creates it at the same time writes the same content.
+        # A process that creates it concurrently writes the same content.
         write_new(path, file_content(database.empty(identity)))
     except OutputError as error:
         if isinstance(error.__cause__, OSError):
@@ -321,7 +322,7 @@ def _begin(path: Path, identity: SequenceIdentity) -> None:
 def _load(
     path: Path, identity: SequenceIdentity | None, *, keep_what_is_left: bool
 ) -> tuple[sqlite3.Connection, ProjectState, Seal]:
-    """A migrated copy of the file in memory, with its state and seal."""
+    """Load a migrated copy of the file into memory, with its state and seal."""
     content = read_files(path)
     try:
         copy = open_copy(content, path)
@@ -368,7 +369,7 @@ def _damaged(
         return database.DamagedProject(f"{begin} Nothing of it can be read. Go back to a copy of it.")
     when = time.time()
     with suppress(OSError, OverflowError, ValueError):
-        # Named by the time of the file, so that another attempt finds the same rescued file.
+        # Named by the file's modification time, so that another attempt finds the same rescued file.
         when = path.stat().st_mtime
         time.localtime(when)
     target, new = next(rescue_paths(path, when)), False

@@ -1,4 +1,4 @@
-"""Values of a project, all immutable, and the keys that name them."""
+"""Immutable values of a project, and their keys."""
 
 import json
 import math
@@ -38,7 +38,7 @@ class Provenance:
     """Origin of a value, with settings and weights.
 
     Raises:
-        ProjectError: an optimizer's value without settings, settings that are not JSON, or a hash that is none.
+        ProjectError: an optimizer's value lacks settings, settings are not JSON, or a hash is invalid.
     """
 
     source: Source
@@ -66,9 +66,10 @@ class Provenance:
         """Provenance of an optimizer's result.
 
         Args:
-            settings: what JSON can hold, say what `carts_core.settings.serialization.to_plain` makes of a solver's.
-            weights_sha256: of the weights file; None where masks alone were fitted, which settings say as `observe`.
-            source: OPTIMIZER, or PROPAGATED for a frame that was solved between keyframes.
+            settings: JSON-compatible values, such as a solver's settings converted by
+                `carts_core.settings.serialization.to_plain`.
+            weights_sha256: SHA-256 of the weights file; None if only masks were fitted (`observe` in the settings).
+            source: OPTIMIZER, or PROPAGATED for a frame solved between keyframes.
         """
         return Provenance(source, json.dumps(settings, sort_keys=True, allow_nan=False), weights_sha256)
 
@@ -82,7 +83,7 @@ class JsonValue:
 
     @classmethod
     def decode(cls, text: str) -> Self:
-        """The value from `encode`; `ValueError`, `TypeError` or `ProjectError` for other texts."""
+        """Decode the result of `encode`; `ValueError`, `TypeError` or `ProjectError` for other texts."""
         values = json.loads(text)
         if "provenance" in values:
             values["provenance"] = _shared_provenance(**values["provenance"])
@@ -101,7 +102,7 @@ class JointCorrection(JsonValue):
     """In the order of `Robot.joint_names` [rad, m]."""
     provenance: Provenance
     standard_deviations: tuple[float | None, ...] | None = None
-    """Of each joint [rad, m], None where it is not determined; NaN and infinity become None."""
+    """Standard deviation of each joint [rad, m], None if not determined; NaN and infinity become None."""
 
     def __post_init__(self) -> None:
         _set(self, "joint_positions", _finite(self.joint_positions, "joint positions"))
@@ -120,7 +121,7 @@ class CorrectedTransform(JsonValue):
     """A rigid transform of the calibration: `T_world_base` of an arm or `T_camera_world` of a camera."""
 
     transform: tuple[tuple[float, ...], ...]
-    """4 rows of 4 numbers [m]."""
+    """Transform as 4 rows of 4 numbers [m]."""
     provenance: Provenance
 
     def __post_init__(self) -> None:
@@ -133,13 +134,13 @@ class CorrectedTransform(JsonValue):
 
     @property
     def matrix(self) -> Float[np.ndarray, "4 4"]:
-        """A copy of the transform."""
+        """Transform as a new matrix."""
         return np.array(self.transform)
 
 
 @dataclass(frozen=True)
 class CorrectedIntrinsics(JsonValue):
-    """Intrinsics of a camera: four finite numbers, the focal lengths positive."""
+    """Intrinsics of a camera: four finite numbers, with positive focal lengths."""
 
     intrinsics: tuple[float, ...]
     """fx, fy, cx, cy [px]."""
@@ -154,10 +155,11 @@ class CorrectedIntrinsics(JsonValue):
 
 @dataclass(frozen=True)
 class TimeOffset(JsonValue):
-    """Time in the kinematics table minus time of the image, overriding the sequence's; see `TimeMatching`."""
+    """Time in the kinematics table minus time of the image, which overrides that of the sequence; see
+    `TimeMatching`."""
 
     seconds: float
-    """[s]"""
+    """Time offset [s]."""
 
     def __post_init__(self) -> None:
         _set(self, "seconds", _finite([self.seconds], "the time offset")[0])
@@ -171,7 +173,7 @@ class Keyframe(JsonValue):
 
 
 class ReviewState(StrEnum):
-    """Review state of a frame, set by a person or the last run."""
+    """Review state of a frame, set by the user or the last run."""
 
     UNTOUCHED = "untouched"
     OPTIMIZED = "optimized"
@@ -181,12 +183,12 @@ class ReviewState(StrEnum):
 
 
 UNREVIEWED = frozenset({ReviewState.UNTOUCHED, ReviewState.OPTIMIZED})
-"""States without a review by a person."""
+"""States without a manual review."""
 
 
 @dataclass(frozen=True)
 class Review(JsonValue):
-    """Review state of a frame and a note about it, of at most `LONGEST_NOTE` characters."""
+    """Review state of a frame, with a note of at most `LONGEST_NOTE` characters."""
 
     state: ReviewState = ReviewState.UNTOUCHED
     note: str = ""
@@ -202,9 +204,9 @@ class Figures:
     """Quality of the fit of a frame; finite numbers."""
 
     loss: float | None = None
-    """Loss of the optimizer; smaller is better."""
+    """Loss of the optimizer; lower is better."""
     dice: float | None = None
-    """Overlap with the true mask, 0 to 1; None without a true mask."""
+    """Dice with the ground-truth mask, 0 to 1; None without ground truth."""
 
     def __post_init__(self) -> None:
         for name in ("loss", "dice"):
@@ -215,7 +217,7 @@ class Figures:
 
 @lru_cache(maxsize=1024)
 def _shared_provenance(source: str, settings: str | None, weights_sha256: str | None) -> Provenance:
-    """The same object for equal provenances, since settings are long and frames are many."""
+    """Interned provenance: equal values share one object, which saves memory."""
     return Provenance(Source(source), settings, weights_sha256)
 
 
@@ -236,7 +238,7 @@ def _finite(values: Iterable[float], what: str) -> tuple[float, ...]:
         numbers = tuple(map(float, values))
     except (TypeError, ValueError) as error:
         raise ProjectError(f"{what} must be a list of numbers, not {values!r}.") from error
-    # The sum is a fast test: it is finite unless a number is not, or all are huge.
+    # The sum is a fast test: it is finite unless a number is not finite, or the sum overflows.
     if not math.isfinite(sum(numbers)) and not all(map(math.isfinite, numbers)):
         raise ProjectError(f"{what} are {list(numbers)}. Give finite numbers.")
     return numbers
@@ -248,7 +250,7 @@ def _deviations(values: Iterable[float | None]) -> tuple[float | None, ...]:
         if math.isfinite(sum(given)) and min(given, default=0.0) >= 0:  # pyright: ignore
             return tuple(map(float, given))  # pyright: ignore
     except TypeError:
-        pass  # Some are not known.
+        pass  # Unknown values.
     return tuple(_deviation(value) for value in given)
 
 
@@ -262,7 +264,7 @@ def _deviation(value: float | None) -> float | None:
 
 @dataclass(frozen=True)
 class ImportedLabels(JsonValue):
-    """Label names of imported masks: at most 255 texts."""
+    """Label names of imported masks, at most 255."""
 
     names: tuple[str, ...]
     """Names of the labels from 1."""
@@ -275,7 +277,7 @@ class ImportedLabels(JsonValue):
 
 @dataclass(frozen=True)
 class ImportedKeypoints(JsonValue):
-    """Imported keypoints of a frame, at finite places."""
+    """Imported keypoints of a frame, with finite coordinates."""
 
     points: tuple[tuple[str, float, float], ...]
     """Name, column and row in the undistorted image [px]."""
@@ -293,7 +295,7 @@ class ImportedKeypoints(JsonValue):
 
 
 VERDICTS = ("good", "doubtful", "failed")
-"""As `carts_core.optimization.Verdict` has them."""
+"""Names of verdicts, as in `carts_core.optimization.Verdict`."""
 LONGEST_TEXT = 2_000
 """Largest length of a text [characters]."""
 
@@ -311,7 +313,7 @@ class FitVerdict(JsonValue):
     failure: float = 0.0
     """Probability that the mask is wrong (Dice below 0.9) [1]."""
     cameras: tuple[tuple[str, float], ...] = ()
-    """Verdicts by camera, where there are several."""
+    """Verdicts by camera, if there are several cameras."""
 
     def __post_init__(self) -> None:
         if self.verdict not in VERDICTS:
@@ -328,7 +330,7 @@ class FitVerdict(JsonValue):
 V_co = TypeVar("V_co", covariant=True)
 
 WHOLE_PROJECT = -1
-"""Frame index of values that hold for all frames."""
+"""Frame index of values that apply to all frames."""
 
 
 class Kind(StrEnum):
@@ -367,7 +369,7 @@ VALUE_TYPES: dict[Kind, type] = {
     Kind.IMPORTED_LABELS: ImportedLabels,
 }
 CALIBRATION = frozenset({Kind.BASE_FRAME, Kind.EXTRINSICS, Kind.INTRINSICS, Kind.TIME_OFFSET})
-"""Kinds of values that hold for all frames and affect the pose of their arms."""
+"""Kinds of values that apply to all frames and affect the pose of the arms."""
 _OF_ARM = {Kind.JOINTS, Kind.BASE_FRAME}
 _MARKS = {Kind.KEYFRAME, Kind.REVIEW, Kind.VERDICT}
 _IMPORTED = {Kind.IMPORTED_MASK, Kind.IMPORTED_KEYPOINTS}
@@ -378,7 +380,7 @@ _OF_NOBODY = {*_MARKS, Kind.TIME_OFFSET, Kind.IMPORTED_LABELS}
 
 @dataclass(frozen=True)
 class Key(Generic[V_co]):
-    """Name of one value. Made by its static methods, which know the value's type."""
+    """Key of one value, created by static methods that fix the value's type."""
 
     kind: Kind
     frame: int
@@ -398,12 +400,12 @@ class Key(Generic[V_co]):
 
     @staticmethod
     def ignore_region(frame: int, camera: str) -> "Key[IgnoreRegion]":
-        """Pixels where something hides the arms."""
+        """Pixels where the arms are occluded."""
         return Key(Kind.IGNORE_REGION, operator.index(frame), camera)
 
     @staticmethod
     def part_labels(frame: int, camera: str) -> "Key[PartLabels]":
-        """Part classes painted by a person."""
+        """Manually painted part classes."""
         return Key(Kind.PART_LABELS, operator.index(frame), camera)
 
     @staticmethod
@@ -458,11 +460,11 @@ class Key(Generic[V_co]):
 
 
 Edits = Mapping[Key[Any], Any]
-"""Changes of one gesture: key -> new value, or None to restore the sequence's own."""
+"""Edits of one step: key -> new value, or None to restore the sequence's own."""
 
 
 def decode(kind: Kind, stored: str | bytes | None) -> Any:
-    """Decode a value of this kind from a project file; `ValueError`, `TypeError` or `ProjectError` if it is none."""
+    """Decode a stored value of the given kind; raises `ValueError`, `TypeError` or `ProjectError` if it is invalid."""
     if stored is None:
         return None
     return _decoded_mark(kind, stored) if kind in _MARKS else VALUE_TYPES[kind].decode(stored)
@@ -470,12 +472,12 @@ def decode(kind: Kind, stored: str | bytes | None) -> Any:
 
 @lru_cache(maxsize=1024)
 def _decoded_mark(kind: Kind, stored: str | bytes) -> Any:
-    """The same object for equal marks of many frames."""
+    """Interned marks: equal values of many frames share one object."""
     return VALUE_TYPES[kind].decode(stored)
 
 
 def check_edit(identity: SequenceIdentity, key: Key[Any], value: object) -> None:
-    """Check that a key fits the sequence and the value fits the key; otherwise it is a `ProjectError`."""
+    """Check that a key matches the sequence and the value matches the key; `ProjectError` otherwise."""
     frames = len(identity.frame_ids)
     if key.kind in _OF_FRAME and not 0 <= key.frame < frames:
         raise ProjectError(f"the sequence has no frame number {key.frame}; its frames are 0 to {frames - 1}.")

@@ -1,4 +1,4 @@
-"""Points and results of hand-eye calibration in files, and cameras that move between frames."""
+"""Files of hand-eye calibration (points and results), and handling of moving cameras."""
 
 import csv
 import io
@@ -25,10 +25,10 @@ COLUMNS = ("frame", "camera", "arm", "landmark", "u", "v")
 
 
 def read_points(path: Path, sequence: Sequence) -> list[ImagePoint]:
-    """Points of a CSV file with the columns `frame` (its id), `camera`, `arm`, `landmark`, `u` and `v` [px].
+    """Read points from a CSV file with the columns `frame` (its id), `camera`, `arm`, `landmark`, `u` and `v` [px].
 
     Raises:
-        SettingsError: the file cannot be read, lacks a column, or names a frame that is not there.
+        SettingsError: the file cannot be read, lacks a column, or names a missing frame.
     """
     try:
         text = read_text(path, TABLE)
@@ -59,16 +59,17 @@ def read_points(path: Path, sequence: Sequence) -> list[ImagePoint]:
 
 @dataclass(frozen=True)
 class HandEyePrior:
-    """Uncertainty of a hand-eye calibration, as prior of a refinement."""
+    """Uncertainty of a hand-eye calibration, used as prior of a refinement."""
 
     base_covariances: Mapping[str, Float[np.ndarray, "6 6"]]
     """As in `HandEyeResult`."""
     free_cameras: tuple[str, ...]
-    """Cameras whose pose was unknown before."""
+    """Cameras whose pose was unknown before the hand-eye calibration."""
 
 
 def read_prior(sequence: Sequence) -> HandEyePrior | None:
-    """Uncertainty of the hand-eye calibration that wrote a sequence file; None without one, or if base frames changed.
+    """Read the uncertainty of the hand-eye calibration that wrote a sequence file; None if there is none or base frames
+    changed.
 
     Raises:
         SettingsError: `hand_eye.json` beside the sequence file cannot be read.
@@ -98,7 +99,8 @@ def read_prior(sequence: Sequence) -> HandEyePrior | None:
 def result_json(
     sequence: Sequence, points: Rows[ImagePoint], result: HandEyeResult, free_cameras: Rows[str] = ()
 ) -> dict[str, Any]:
-    """Points with their distances, poses with their standard deviations, base frames with their covariances."""
+    """Hand-eye result as JSON: points with residual distances, poses with standard deviations, base frames with
+    covariances."""
     return {
         "free_cameras": list(free_cameras),
         "base_frames": {
@@ -144,14 +146,14 @@ def result_json(
 
 
 RESTING = 1e-3
-"""Largest difference of the transforms of a resting mount [rad, m]."""
+"""Largest difference between transforms of a mount that counts as stationary [rad, m]."""
 
 
 def mounts_of_points(recording: Sequence, points: Rows[ImagePoint]) -> dict[str, Float[np.ndarray, "4 4"]]:
-    """Camera -> T_mount_world [m] in the frames of points, of the cameras that move.
+    """Moving camera -> T_mount_world [m] in the frames of its points.
 
     Raises:
-        SettingsError: a camera stands at different places in these frames, or a point names a missing frame.
+        SettingsError: a camera has different poses in these frames, or a point names a missing frame.
     """
     found: dict[str, tuple[int, np.ndarray]] = {}
     for point in points:
@@ -169,7 +171,7 @@ def mounts_of_points(recording: Sequence, points: Rows[ImagePoint]) -> dict[str,
 
 
 def moved_cameras(scene: Scene, mounts: Mapping[str, Float[np.ndarray, "4 4"]], *, back: bool = False) -> Scene:
-    """Scene with its cameras moved from their mounts (camera -> T_mount_world [m]) to the world, or back."""
+    """Scene with camera poses converted from mount to world coordinates (camera -> T_mount_world [m]), or `back`."""
     steps = {camera: np.linalg.inv(T) if back else T for camera, T in mounts.items()}
     cameras = (
         replace(camera, T_camera_world=camera.T_camera_world @ steps.get(camera.name, np.eye(4)))

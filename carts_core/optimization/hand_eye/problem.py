@@ -1,4 +1,4 @@
-"""Hand-eye calibration from points as a least-squares problem, with its start from homographies."""
+"""Hand-eye calibration from points as a least-squares problem, initialized by perspective-n-point."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -25,9 +25,9 @@ class HandEyeSettings(Ranged):
     pixel_error: Annotated[float, Range(0.05, 100, "px")] = 2.0
     """Expected error of a point [px]."""
     focal_length: bool = False
-    """Solve for the focal lengths of all cameras that have points, too."""
+    """Also estimate the focal lengths of all cameras that have points."""
     free_cameras: tuple[str, ...] = ()
-    """Cameras whose pose relative to the others is not known."""
+    """Cameras whose pose relative to the other cameras is unknown."""
 
 
 NEAREST = 1e-3
@@ -39,18 +39,18 @@ class ImagePoint:
     """A landmark of an arm clicked in an image."""
 
     frame: int
-    """Position in the sequence, from 0."""
+    """Frame index in the sequence, from 0."""
     camera: str
     arm: str
     landmark: str
-    """Its name, as in `model.keypoints.landmarks`."""
+    """Landmark name, as in `model.keypoints.landmarks`."""
     pixel: tuple[float, float]
     """Column and row in the undistorted image, from the upper left corner [px]."""
 
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """All points of one arm in one camera, with their positions in the base frame by forward kinematics."""
+    """All points of one arm in one camera, with landmark positions in the base frame by forward kinematics."""
 
     camera: int
     """Index into the scene's cameras."""
@@ -60,14 +60,14 @@ class View:
     frames: tuple[int, ...]
     landmarks: tuple[Landmark, ...]
     starts: Float[np.ndarray, "points 3"]
-    """The point itself, or one end of the axis [m]."""
+    """Position of a point landmark, or one end of an axis [m]."""
     ends: Float[np.ndarray, "points 3"]
-    """The same, or the other end of the axis [m]."""
+    """Position of a point landmark, or the other end of an axis [m]."""
     pixels: Float[np.ndarray, "points 2"]
 
     @property
     def is_point(self) -> np.ndarray:
-        """Mask of the points that are not lines [points]."""
+        """Mask of the point landmarks, as opposed to lines [points]."""
         return np.array([landmark.kind is LandmarkKind.POINT for landmark in self.landmarks])
 
     def distances(
@@ -77,7 +77,7 @@ class View:
 
         Args:
             intrinsics: fx, fy, cx, cy [px].
-            side: of the shaft that all its edges were found on, 1 or -1; 0 takes the nearer side for each.
+            side: side of the shaft on which all its edge points lie, 1 or -1; 0 selects the nearer side for each.
         """
         starts = self.starts @ T_camera_base[:3, :3].T + T_camera_base[:3, 3]
         ends = self.ends @ T_camera_base[:3, :3].T + T_camera_base[:3, 3]
@@ -96,7 +96,7 @@ def views_of(
     """Points by camera and arm, in the scene's order; `measured` has the joint positions of all frames [rad, m].
 
     Raises:
-        SettingsError: a point names a frame or a landmark that does not exist, or lies at no place.
+        SettingsError: a point names a frame or a landmark that does not exist, or has no finite position.
         RobotError: a point names an arm or a camera that does not exist.
     """
     grouped: dict[tuple[int, int], list[int]] = {}
@@ -128,14 +128,14 @@ def views_of(
 def _line_distance(
     start: np.ndarray, end: np.ndarray, pixel: np.ndarray, intrinsics: np.ndarray, landmark: Landmark, side: int
 ) -> float:
-    """Distance of the ray through a pixel from a cylinder's axis, less its radius [px at the depth of the nearest
+    """Distance between the ray through a pixel and a cylinder's axis, minus its radius [px at the depth of the nearest
     point]."""
     ray = np.array([*((pixel - intrinsics[2:]) / intrinsics[:2]), 1.0])
     ray /= np.linalg.norm(ray)
     axis = (end - start) / np.linalg.norm(end - start)
     across = np.cross(ray, axis)
     length = max(float(np.linalg.norm(across)), 1e-9)
-    # The point on the axis that is nearest to the ray from the origin.
+    # Point on the axis nearest to the ray from the origin.
     along = float(np.dot(np.cross(ray, start), across)) / length**2
     depth = max(float((start - along * axis)[2]), NEAREST)
     away = float(start @ across) / length
@@ -145,7 +145,7 @@ def _line_distance(
 
 
 FEWEST_POINTS = 4
-"""Three points allow up to four poses."""
+"""Minimum number of points; three points allow up to four poses."""
 _RANDOM_SUBSETS = 40
 _KEPT = 4
 """Number of best poses that are refined."""
@@ -154,7 +154,7 @@ _KEPT = 4
 def poses_of(
     view: View, intrinsics: Float[np.ndarray, "4"], pixel_error: float
 ) -> list[tuple[float, Float[np.ndarray, "4 4"]]]:
-    """Best poses T_camera_base with their costs, the best first.
+    """Candidate poses T_camera_base with their costs, best first.
 
     Perspective-n-point (SQPnP, EPnP) on all points, on all but one frame's, on all but one, and on random subsets, so
     that some subset is free of outliers; each pose is rated by the robust cost of all points.
@@ -167,7 +167,7 @@ def poses_of(
     for rows in _subsets(view):
         for T in _perspective(view, rows, intrinsics):
             if (T[2, :3] @ view.starts[view.is_point].T + T[2, 3] > 0).all():
-                # Cauchy's loss of the distances, in expected errors.
+                # Cauchy loss of the distances, in units of the expected error.
                 squared = ((view.distances(T, intrinsics) / pixel_error) ** 2).sum(-1)
                 found.append((float(np.log1p(squared / 4.0).sum()), T))
     found.sort(key=lambda entry: entry[0])
@@ -219,8 +219,8 @@ class HandEyeProblem:
         scene: arms and cameras as given.
         settings: free parameters.
         views: used points.
-        missing: (camera, arm) -> number of missing points.
-        focal: cameras whose focal length is free; their logarithms are the last unknowns.
+        missing: (camera, arm) -> number of points missing for a pose.
+        focal: cameras with free focal lengths, whose logarithms are the last unknowns.
         middles: arm -> centroid of its points in its base frame [m].
         origin: zeros, the initial estimate.
     """
@@ -265,10 +265,10 @@ class HandEyeProblem:
             )
 
     def _find_beginning(self, views: list[View], free: set[int]) -> None:
-        """Initial base frames from the view with most points, then poses of free cameras."""
+        """Initialize base frames from the view with most points, then poses of free cameras."""
         self._anchor = _anchor(views, free)
         unknown = free - {self._anchor}
-        # Known cameras first: their base frames place the free ones.
+        # Known cameras first: base frames seen by them determine the poses of free cameras.
         for view in sorted(views, key=lambda view: (view.camera in unknown, -int(view.is_point.sum()))):
             count = int(view.is_point.sum())
             known = view.arm in self._T_world_base
@@ -278,7 +278,7 @@ class HandEyeProblem:
                 continue
             poses = poses_of(view, self._intrinsics[view.camera], self.settings.pixel_error)
             if known:
-                # Cameras of one endoscope look nearly the same way, so the first one's pose is a start as well.
+                # Cameras of one endoscope have similar poses, so the first camera's pose is another initial value.
                 beside = self._T_camera_world[self._anchor] @ self._T_world_base[view.arm]
                 poses.append((0.0, beside))
             if not poses:
@@ -293,11 +293,11 @@ class HandEyeProblem:
                 self._T_camera_world[view.camera] = T_camera_base @ np.linalg.inv(self._T_world_base[view.arm])
                 unknown.discard(view.camera)
         for key in [key for key in self.missing if key[1] in self._T_world_base and key[0] not in unknown]:
-            # Another camera, or another arm in this one, determines it: these points are used as well.
+            # The pose is determined by another camera or another arm, so these points are used as well.
             del self.missing[key]
 
     def _refined(self, view: View, T: np.ndarray) -> tuple[float, np.ndarray]:
-        """Cost and pose of a single view, refined from a start."""
+        """Cost and refined pose of a single view, from an initial pose."""
         middle = view.starts[view.is_point].mean(0)
         scale = self.settings.pixel_error
 
@@ -336,7 +336,7 @@ class HandEyeProblem:
         ]
 
     def residuals(self, values: np.ndarray, sides: Sequence[int] | None = None) -> np.ndarray:
-        """Distances over their expected error [1]."""
+        """Distances divided by their expected error [1]."""
         return np.concatenate(self.distances(values, sides)).ravel() / self.settings.pixel_error
 
 
@@ -351,12 +351,13 @@ def moved(T: np.ndarray, step: np.ndarray, middle: np.ndarray) -> np.ndarray:
 
 
 def place_of(T: np.ndarray, point: np.ndarray) -> np.ndarray:
-    """A point transformed by T."""
+    """Transform a point by T."""
     return T[:3, :3] @ point + T[:3, 3]
 
 
 def _anchor(views: list[View], free: set[int]) -> int:
-    """Index of the camera that keeps its pose: a known one with most points, else a free one; -1 if none has enough."""
+    """Index of the camera whose pose is fixed: the known camera with most points, else a free one; -1 if none has
+    enough."""
     points: dict[int, int] = {}
     for view in views:
         if (count := int(view.is_point.sum())) >= FEWEST_POINTS:

@@ -1,4 +1,5 @@
-"""Solver of hand-eye calibration, its result with standard deviations, and its agreement with a later calibration."""
+"""Solver of hand-eye calibration, its result with standard deviations, and tests of later calibrations against the
+points."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -29,11 +30,11 @@ class PoseDeviation:
     """Standard deviations of an arm's pose in a camera's frame, at the centroid of its points."""
 
     rotation_deg: float
-    """[deg], of the worst direction."""
+    """Rotation in the worst direction [deg]."""
     sideways_mm: float
-    """Across the camera's view [mm], of the worst direction."""
+    """Translation perpendicular to the optical axis, in the worst direction [mm]."""
     depth_mm: float
-    """Along the camera's view [mm]."""
+    """Translation along the optical axis [mm]."""
 
     @staticmethod
     def of(covariance: Float[np.ndarray, "6 6"]) -> "PoseDeviation":
@@ -55,21 +56,21 @@ class HandEyeResult:
     distances: Float[np.ndarray, " points"]
     """Distance of each point from its projected landmark [px]; NaN for unused points."""
     deviations: Mapping[tuple[str, str], PoseDeviation]
-    """(arm, camera) -> standard deviations of the arm's pose in that camera."""
+    """(arm, camera) -> standard deviations of the arm's pose relative to that camera."""
     base_covariances: Mapping[str, Float[np.ndarray, "6 6"]]
     """Arm -> covariance of rotation and translation of its base frame in its own axes [rad, m]."""
     focal_deviation: Mapping[str, float]
     """Camera -> relative standard deviation of its focal length [1]; empty unless it was estimated."""
     contradicting: tuple[int, ...]
-    """Indices of points that contradict the others, and have little weight."""
+    """Indices of outliers, which have little weight."""
     noise: float
-    """Standard deviation of a point in each direction [px]: as expected, or larger if the residuals are."""
+    """Standard deviation of a point per axis [px]: the expected one, or a larger one estimated from the residuals."""
     missing: Mapping[tuple[str, str], int] = field(default_factory=dict)
-    """(arm, camera) -> number of missing points, for poses that stay as given."""
+    """(arm, camera) -> number of missing points, for poses that could not be estimated."""
 
     @property
     def error(self) -> float:
-        """Root mean square of the distances of points that agree [px]."""
+        """RMS distance of the inliers [px]."""
         good = np.setdiff1d(np.flatnonzero(np.isfinite(self.distances)), self.contradicting)
         return float(np.sqrt((self.distances[good] ** 2).mean())) if len(good) else float("nan")
 
@@ -80,7 +81,7 @@ def result_of(problem: HandEyeProblem, fit: OptimizeResult, count: int) -> HandE
     distances = np.full(count, np.nan)
     for view, found in zip(problem.views, problem.distances(fit.x), strict=True):
         distances[list(view.rows)] = np.linalg.norm(found, axis=-1)
-    # Variance of the points over the expected one [1].
+    # Ratio of estimated to expected variance of the points [1].
     excess = max(2.0 * fit.cost / _spare(problem, fit), 1.0)
     information = fit.jac.T @ fit.jac
     scale = np.sqrt(np.maximum(np.diag(information), 1e-300))
@@ -114,10 +115,10 @@ def _spare(problem: HandEyeProblem, fit: OptimizeResult) -> int:
 
 
 def _noise(problem: HandEyeProblem, fit: OptimizeResult, excess: float) -> float:
-    """Standard deviation of a point in each direction [px].
+    """Standard deviation of a point per axis [px].
 
-    Distances of points are Rayleigh distributed, whose median wrong points hardly change; Cauchy's loss alone
-    underestimates noise that is larger than expected.
+    It is estimated from the median of the Rayleigh-distributed distances, which is robust to outliers; the Cauchy loss
+    alone underestimates noise that is larger than expected.
     """
     points = [
         np.linalg.norm(found[view.is_point], axis=-1)
@@ -143,7 +144,7 @@ def _base_covariance(
 
 
 def _deviation(problem: HandEyeProblem, view: View, values: np.ndarray, covariance: np.ndarray) -> PoseDeviation:
-    """Standard deviations of an arm's pose in this camera."""
+    """Standard deviations of an arm's pose relative to the view's camera."""
 
     def seen(step: np.ndarray) -> np.ndarray:
         bases, cameras, _ = problem.poses(step)
@@ -171,17 +172,17 @@ def _filled(
 
 
 def _differences(function: Callable[[np.ndarray], np.ndarray], at: np.ndarray, step: float = 1e-6) -> np.ndarray:
-    """The Jacobian by central differences."""
+    """Jacobian by central differences."""
     columns = [(function(at + step * unit) - function(at - step * unit)) / (2 * step) for unit in np.eye(len(at))]
     return np.stack(columns, axis=1)
 
 
 _FOCAL_FACTORS = (1.0, 0.55, 0.75, 1.35, 1.8)
-"""Factors on the given focal length at which its search starts."""
+"""Initial values of the focal length, as factors of the given one."""
 _COMBINED = 4
 """Largest number of views with edges for which all combinations of sides are tried."""
 _STEPS = 60
-"""Largest number of steps from each start."""
+"""Largest number of steps from each initial value."""
 _TOLERANCE = 1e-12
 """Relative change at which the search ends."""
 
@@ -194,14 +195,14 @@ def solve_hand_eye(
 ) -> HandEyeResult:
     """Estimate base frames from points in a few frames; no initial pose is needed.
 
-    Minimizes the Cauchy loss of image distances over `pixel_error`, from several perspective-n-point solutions. Both
-    sides of a shaft are tried for its edges. Joint positions are taken as measured. Base frames and the cameras in
+    Minimizes the Cauchy loss of image distances divided by `pixel_error`, from several perspective-n-point solutions.
+    Both sides of a shaft are tried for its edges. Joint positions are taken as measured. Base frames and the cameras in
     `free_cameras` are estimated; if all cameras with points are free, the one with most points keeps its pose.
 
     Args:
-        scene: arms and cameras; its base frames are not used, those of arms without points stay.
-        measured: arm -> joint positions of all frames [rad, m], as `Sequence.measured`.
-        points: 3 to 6 frames with three or more points each are good; an arm needs 4 points in one camera.
+        scene: arms and cameras; its base frames are only kept for arms without points.
+        measured: arm -> joint positions of all frames [rad, m], as in `Sequence.measured`.
+        points: three or more points in each of 3 to 6 frames are recommended; an arm needs 4 points in one camera.
 
     Raises:
         SettingsError: no arm has enough points, all coincide, or a point names a missing frame or landmark.
@@ -238,7 +239,7 @@ def _minimum(problem: HandEyeProblem, start: np.ndarray, sides: Sequence[int] | 
 
 
 def _sides(problem: HandEyeProblem) -> Iterator[tuple[int, ...]]:
-    """Sides of the shafts in all views: each combination of few views, and the same side in all of many."""
+    """Side assignments to try: all combinations for few views, the same side in all views otherwise."""
     edges = [any(mark.kind is LandmarkKind.EDGE for mark in view.landmarks) for view in problem.views]
     choices = [(1, -1) if there else (0,) for there in edges]
     if sum(len(choice) > 1 for choice in choices) <= _COMBINED:
@@ -249,17 +250,19 @@ def _sides(problem: HandEyeProblem) -> Iterator[tuple[int, ...]]:
 
 
 _LEVEL = 0.01
-"""Significance level at which points disagree with a calibration, singly or together [1]."""
+"""Significance level for disagreement of points with a calibration, individually or jointly [1]."""
 _MOST_DISAGREEING = 0.25
-"""Share of single points that may disagree [1]; joint positions of real recordings are worse in some frames."""
+"""Share of points that may disagree individually [1]; joint positions of real recordings are less accurate in some
+frames."""
 
 
 @dataclass(frozen=True, eq=False)
 class PointAgreement:
-    """Residuals of points before and after a calibration, with the limits for noise."""
+    """Residuals of points before and after a calibration, with limits for the expected noise."""
 
     before: Float[np.ndarray, " points"]
-    """Under the calibration from the points [px]; NaN for unused points."""
+    """Residuals under the hand-eye calibration from the points Residuals under the calibration that is tested [px].;
+    NaN for unused points."""
     after: Float[np.ndarray, " points"]
     """[px]"""
     limits: Float[np.ndarray, " points"]
@@ -277,7 +280,7 @@ class PointAgreement:
 
     @property
     def agrees(self) -> bool:
-        """Whether most points agree with the calibration singly, and all of them together."""
+        """Whether the points agree with the calibration, most of them individually and all of them jointly."""
         most = _MOST_DISAGREEING * np.isfinite(self.limits).sum()
         return bool(len(self.disagreeing) <= most and self.rms_after <= max(self.rms_limit, self.rms_before))
 
@@ -288,13 +291,13 @@ def agreement_with_points(
     points: Sequence[ImagePoint],
     found: HandEyeResult,
 ) -> PointAgreement:
-    """Compare a calibration with points.
+    """Test a calibration against the clicked points.
 
-    Where a calibration is true, squared residuals over the variance of a point follow a chi-square distribution, with
-    two degrees of freedom for a point and one for a line. The variance is that of clicks and of measured joint
-    positions (`SurfaceSolver.frame_prior_deg`, as calibration assumes), which points from few frames cannot tell from
-    the pose. A single point is tested at a level that is divided by the number of points (Bonferroni), and the sum over
-    all points at the same level.
+    For a correct calibration, squared residuals divided by the variance of a point follow a chi-square distribution,
+    with two degrees of freedom for a point and one for a line. The variance is that of clicks and of measured joint
+    positions (`SurfaceSolver.frame_prior_deg`, as calibration assumes), which cannot be distinguished from pose errors
+    with few frames. Single points are tested at `_LEVEL` divided by the number of points (Bonferroni), and the sum over
+    all points at `_LEVEL`.
 
     Args:
         measured: arm -> joint positions of all frames [rad, m].
