@@ -1,6 +1,6 @@
-"""Settings as plain dataclasses that check their ranges.
+"""Settings as dataclasses with range checks.
 
-Nothing here imports torch, so that the command line starts fast.
+No module here imports torch, so that the command line starts quickly.
 """
 
 from .interchange import FormatName as FormatName

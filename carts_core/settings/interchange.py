@@ -13,55 +13,57 @@ Clock = Literal["s", "ms", "us", "ns"]
 AngleUnit = Literal["rad", "deg", "percent"]
 LengthUnit = Literal["m", "dm", "cm", "mm"]
 Axes = Literal["opencv", "dvrk"]
-"""Axes of the camera: x right, y down (OpenCV), or x left, y up (dVRK); z looks away from the viewer in both."""
+"""Camera axes: x right, y down (OpenCV), or x left, y up (dVRK); z points away from the viewer in both."""
 
 NO_TABLE = Path("none")
-"""Value of `kinematics` for images without a table."""
+"""Value of `kinematics` for images without joint data."""
 SECONDS: Mapping[Clock, float] = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 
 
 @dataclass(frozen=True)
 class ImportOptions:
-    """Information that a recording lacks."""
+    """Options of an import, for information that the recording lacks."""
 
     source: str | None = None
-    """Kind of source (`carts import` alone lists them); by default it is detected."""
+    """Source format (listed by `carts import` without arguments); detected by default."""
     images: Mapping[str, str] = field(default_factory=dict)
-    """Camera -> its images: a folder, pattern or video, or a topic of the bag."""
+    """Camera -> images: a folder, file pattern, video, or topic of the bag."""
     calibration: Mapping[str, Path] = field(default_factory=dict)
-    """Camera -> its calibration file (ROS, OpenCV or Kalibr YAML, JSON, MATLAB .mat)."""
+    """Camera -> calibration file (ROS, OpenCV or Kalibr YAML, JSON, MATLAB .mat)."""
     calibration_size: Mapping[str, str] = field(default_factory=dict)
-    """Camera -> size of the images that were calibrated, as 640x480, where the calibration does not state it."""
+    """Camera -> size of the images used for calibration, such as 640x480, if the calibration file does not contain
+    it."""
     kinematics: Path | None = None
     """Table of joint positions or tip poses (CSV, Parquet, NPY); `none` for images alone."""
     columns: Mapping[str, str] = field(default_factory=dict)
-    """Joint, or `time` or `frame` -> column of that table."""
+    """Joint, `time` or `frame` -> column of the table."""
     angle_unit: AngleUnit | None = None
-    """Of the angles; `percent` is -100 to 100 of the range of each joint."""
+    """Unit of angles; `percent` is -100 to 100 over the range of each joint."""
     length_unit: LengthUnit | None = None
-    """Of the lengths."""
+    """Unit of lengths."""
     units: Mapping[str, str] = field(default_factory=dict)
-    """Joint -> its unit, if it differs from the others."""
+    """Joint -> unit, if it differs from that of the others."""
     flip: tuple[str, ...] = ()
-    """Joints whose sign is the other way round."""
+    """Joints with inverted sign."""
     clock: Clock | None = None
     """Unit of the table's times."""
     time_offset: float | None = None
     """Time in the kinematics minus time of the image [s]."""
     frame_rate: float | None = None
-    """Of images without times, or in place of a video's constant rate [1/s]."""
+    """Frame rate of images without times, or replacement of a video's constant rate [1/s]."""
     arms: Mapping[str, str] = field(default_factory=dict)
-    """Arm -> its name in the recording; only these are imported."""
+    """Arm -> name in the recording; other arms are not imported."""
     robot: Mapping[str, str] = field(default_factory=dict)
-    """Arm -> its robot: a URDF, or `builtin:psm_lnd`, which is the default."""
+    """Arm -> robot: a URDF, or `builtin:NAME`; `builtin:psm_lnd` by default."""
     wrist_length: float | None = None
-    """From wrist pitch to wrist yaw [m], for inverse kinematics; by default that of the instrument, else 0.0091."""
+    """Distance between the wrist pitch and yaw axes [m], for inverse kinematics; by default that of the instrument,
+    else 0.0091."""
     tool_point: float | None = None
-    """Distance of the point of tip poses from the dVRK's tip along the tool [m]; by default estimated."""
+    """Distance along the tool from the dVRK's tip to the point described by tip poses [m]; estimated by default."""
     base: Mapping[str, Path] = field(default_factory=dict)
-    """Arm -> registration, configuration or set-up joint file of the dVRK with its base frame."""
+    """Arm -> registration, configuration or set-up joint file of the dVRK that contains its base frame."""
     axes: Axes | None = None
-    """Axes of the camera in these files, if not stated there."""
+    """Camera axes in these files, if not stated there."""
 
     def __post_init__(self) -> None:
         for camera, size in self.calibration_size.items():
@@ -101,4 +103,5 @@ Parts = Literal["arms", "parts", "links"]
 """Categories: one per arm, per part (shaft, wrist, jaws), or per link."""
 
 Images = Literal["named", "copied", "none"]
-"""Images of an export: labels name the recording's own files, or copies of them, byte for byte, or none are written."""
+"""Images of an export: `named` refers to the recording's files, `copied` writes byte-identical copies, `none` writes no
+images."""

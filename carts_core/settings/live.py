@@ -1,4 +1,4 @@
-"""Settings of live tracking, and names of streams such as `replay` or `socket:7000`."""
+"""Settings of live tracking, and addresses of streams such as `replay` or `socket:7000`."""
 
 from dataclasses import dataclass
 from enum import StrEnum
@@ -10,16 +10,16 @@ from .stages import LIVE_SEARCH, WARM, WARM_WIDE, Stage
 
 
 class StreamKind(StrEnum):
-    """Source of frames."""
+    """Kind of frame source."""
 
     REPLAY = "replay"
-    """The recording itself, at the speed of the clock."""
+    """The recording, replayed in real time."""
     CAMERA = "camera"
     VIDEO = "video"
     FOLDER = "folder"
-    """One that fills."""
+    """A folder to which images are added."""
     SOCKET = "socket"
-    """Of 127.0.0.1."""
+    """A socket on 127.0.0.1."""
 
 
 KNOWN = "replay, camera:NUMBER, video:FILE, folder:PATH or socket:PORT"
@@ -31,17 +31,17 @@ Seconds = Annotated[float, Range(0, 3600, "s")]
 
 @dataclass(frozen=True)
 class StreamAddress:
-    """Source of frames, and of joints if images have none."""
+    """Source of frames, and of joints if the frames contain none."""
 
     kind: StreamKind
     place: str = ""
-    """Number of a device, a file, a folder or a port."""
+    """Device number, file, folder or port."""
     joints_port: int | None = None
-    """With a camera or video: port of 127.0.0.1 for joints and results."""
+    """With a camera or video: port on 127.0.0.1 for joints and results."""
 
     @classmethod
     def parse(cls, text: str, joints_port: int | None = None) -> "StreamAddress":
-        """The address that a person has written; `SettingsError` for unknown kinds and places, and missing joints."""
+        """Parse an address; `SettingsError` for unknown kinds and locations, and for a missing joints port."""
         kind, _, place = text.partition(":")
         fits = {
             "replay": not place,
@@ -68,18 +68,18 @@ class LiveSettings(Ranged):
     """Stages of a tracker, and thresholds for lost arms."""
 
     small: tuple[Stage, ...] = WARM
-    """Stages of a frame near its prediction."""
+    """Stages for a frame near its prediction."""
     full: tuple[Stage, ...] = WARM_WIDE
-    """Stages after a bad fit of the small ones."""
+    """Stages after a bad fit with `small`."""
     search: tuple[Stage, ...] = LIVE_SEARCH
     """Stages for lost arms; `small` follows."""
     bad_loss: Annotated[float, Range(1e-3, 10)] = 0.06
-    """Loss from which a fit is bad [1]."""
+    """Loss above which a fit is bad [1]."""
     bad_factor: Annotated[float, Range(1, 100)] = 2.5
-    """A fit of that many times the usual loss is bad, too [1]."""
+    """Multiple of the usual loss above which a fit is also bad [1]."""
     lost_seconds: Seconds = 0.25
-    """After bad fits for so long, the arms are lost [s]."""
+    """Duration of bad fits after which the arms are lost [s]."""
     search_seconds: Seconds = 0.4
-    """Interval of searches for lost arms; frames between are compared with the last known pose [s]."""
+    """Interval between searches for lost arms; frames in between are compared with the last known pose [s]."""
     oldest_seconds: Seconds = 0.1
     """A frame whose result would be older, at the usual time for a frame, is dropped for the next one [s]."""

@@ -21,51 +21,51 @@ from .stages import (
 )
 
 Inference = Literal["auto", "torch", "onnx"]
-"""`torch`, `onnx` (ONNX Runtime, on a CPU), or whichever is faster here and gives the same."""
+"""Inference engine: `torch`, `onnx` (ONNX Runtime on the CPU), or `auto` for the faster one if results agree."""
 Engine = Literal["torch", "onnx"]
 """Selected inference engine."""
 
 
 Direction = Literal["forward", "backward"]
-"""In which direction corrections are handed on from frame to frame."""
+"""Direction in which corrections are propagated between frames."""
 
 
 @dataclass(frozen=True)
 class SequenceSettings(Ranged):
-    """Model of the measurement error, and how frames inform each other (docs: explanation/sequences)."""
+    """Sequence mode: temporal model of the measurement error (docs: explanation/sequences)."""
 
     constant_deg: Annotated[float, Range(1e-3, 360, "deg")] = 2.0
-    """Deviation of the constant part of the error [deg]; `length_scale` turns it into metres."""
+    """Standard deviation of the constant part of the error [deg]; `length_scale` converts it to metres."""
     drift_deg: Annotated[float, Range(1e-3, 360, "deg")] = 0.2
-    """Deviation of the slow drift about it [deg]."""
+    """Standard deviation of the slow drift about the constant part [deg]."""
     drift_seconds: Annotated[float, Range(1e-3, 1e6, "s")] = 4.0
     """Time constant of the drift's autocorrelation [s]."""
     jitter_deg: Annotated[float, Range(1e-3, 360, "deg")] = 0.05
-    """Deviation of the error that is independent in every frame [deg]."""
+    """Standard deviation of the error that is independent in every frame [deg]."""
     measurement_noise: Annotated[float, Range(1e-3, 100)] = 4.0
-    """As `SurfaceSolver.noise`, for a frame's measurement in the smoother; larger, since the errors of neighbouring
-    pixels are correlated [1]."""
+    """Like `SurfaceSolver.noise`, for a frame's measurement in the smoother [1]; larger, since errors of neighbouring
+    pixels are correlated."""
     correlation_seconds: Annotated[float, Range(1e-6, 1e6, "s")] = 0.5
-    """Time constant of the autocorrelation of image errors; frames that follow each other faster count less for the
-    others [s]."""
+    """Time constant of the autocorrelation of image errors [s]; more closely spaced frames have less weight for each
+    other."""
     shared_seconds: Annotated[float, Range(1e-6, 1e6, "s")] = 5.0
-    """The same for the reported deviations: a network errs alike for as long as an instrument is seen from one side,
-    and deviations are not to count on more than that [s]."""
+    """Like `correlation_seconds`, for the reported standard deviations [s]; longer, since the network's errors persist
+    while an instrument is seen from one side."""
     initial_frames: Annotated[int, Range(1, 20)] = 5
-    """How many frames, evenly spread, are solved alone to find where the first one starts; 1 takes the first frame
-    only [1]."""
+    """Number of evenly spaced frames solved alone to find the start of the first frame; 1 uses the first frame only
+    [1]."""
     cold_factor: Annotated[float, Range(1, 100)] = 2.0
-    """A loss of that many times the median has a frame start cold [1]."""
+    """Multiple of the median loss above which a frame gets a cold start [1]."""
     direction: Direction = "forward"
     """Direction of the first pass: from the first frame, or from the last one."""
     frame_seconds: Annotated[float, Range(1e-6, 1e6, "s")] = 0.25
-    """Time between frames, where the sequence has no times [s]."""
+    """Time between frames if the sequence has no times [s]."""
     cold: tuple[Stage, ...] = COLD
     """Stages from measured kinematics; `warm` follows."""
     warm: tuple[Stage, ...] = WARM
-    """Stages from the correction that the other frames predict."""
+    """Stages from the correction predicted by the other frames."""
     wide: tuple[Stage, ...] = WARM_WIDE
-    """Stages where `warm` ends with an unusual loss, before a cold start."""
+    """Stages after `warm` ends with an unusual loss, before a cold start."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -76,11 +76,11 @@ class Loss(StrEnum):
     """Losses of image features."""
 
     ACS = "acs"
-    """Mean dissimilarity inside the attention map, independent of how large that is."""
+    """Mean dissimilarity inside the attention map, independent of its size."""
     ACS_PAPER = "acs_paper"
-    """The paper's equation, 1 - mean(similarity x attention); falls when the silhouette grows."""
+    """The paper's equation, 1 - mean(similarity x attention); it decreases when the silhouette grows."""
     ACS_REFERENCE = "acs_reference"
-    """mean((1 - similarity) x attention), as in the released code; falls when the silhouette shrinks."""
+    """mean((1 - similarity) x attention), as in the released code; it decreases when the silhouette shrinks."""
     L1 = "l1"
     """Smooth L1 between the network's predictions ("CaRTS L1")."""
 
@@ -91,7 +91,7 @@ Method = Literal["adam", "gradient_descent"]
 
 @dataclass(frozen=True)
 class FreeParameters:
-    """Which values of the scene are unknown. Joints of all arms by default, as in the paper."""
+    """Free parameters of the scene; by default the joints of all arms, as in the paper."""
 
     joints: bool = True
     """Joint positions of the free arms."""
@@ -102,52 +102,53 @@ class FreeParameters:
     intrinsics: bool = False
     """Focal lengths and principal points."""
     arms: tuple[str, ...] = ()
-    """Names of the free arms; none named means all."""
+    """Names of the free arms; all if empty."""
     locked_joints: tuple[str, ...] = ()
-    """Joints that are held, as `joint` for every arm or `arm/joint` for one."""
+    """Joints held fixed, as `joint` for every arm or `arm/joint` for one."""
     locked_cameras: tuple[str, ...] = ()
-    """Cameras whose extrinsics are held."""
+    """Cameras whose extrinsics are held fixed."""
 
     @property
     def joints_only(self) -> bool:
-        """Whether no calibration is unknown, which frames share."""
+        """Whether only joints are free, and no calibration shared by frames."""
         return not (self.base_frames or self.extrinsics or self.intrinsics)
 
 
 @dataclass(frozen=True)
 class SurfaceSolver(Ranged):
-    """Compares predicted surface maps with rendered ones, by Levenberg-Marquardt: the default."""
+    """Minimizes the difference between predicted and rendered surface maps with Levenberg-Marquardt (default)."""
 
     stages: tuple[Stage, ...] = FRAME
-    """What runs, in this order."""
+    """Stages, in order of execution."""
     iterations: Annotated[int, Range(1, 10_000)] = 60
-    """Largest number of evaluations [1]; where stages run again from the start, they have as many again."""
+    """Largest number of evaluations [1]; stages that are repeated from the start get the same number again."""
     working_width: Annotated[int, Range(64, 4096, "px")] = 320
-    """Width of the working image [px]; stages say how many times larger their images are."""
+    """Width of the working image [px], to which the scales of stages refer."""
     noise: Annotated[float, Range(1e-3, 100)] = 1.33
-    """Deviation of the predicted surface map, per pixel [1]; a small value relies on the image."""
+    """Standard deviation of the predicted surface map, per pixel [1]; smaller values give the image more weight."""
     mask_noise: Annotated[float, Range(1e-3, 100)] = 0.5
-    """The same of given masks [1]."""
+    """Standard deviation of given masks, per pixel [1]."""
     parts_weight: Annotated[float, Range(0, 100)] = 0.1
-    """Weight of the coverage of single parts beside that of the whole arm [1]."""
+    """Weight of the coverage of single parts, relative to that of the whole arm [1]."""
     normals_weight: Annotated[float, Range(0, 100)] = 0.05
-    """Weight of normals beside that [1]."""
+    """Weight of normals, relative to the coverage of the whole arm [1]."""
     dehaze: Share = 0.8
     """Share of smoke and haze that is removed from images [1]."""
     outline_error: Annotated[float, Range(0, 100, "px")] = 0.3
-    """Expected error that all outlines in an image have in common, outwards or inwards [px of the working image].
-    It widens the reported deviations of what moves an arm along the line of sight."""
+    """Expected outward or inward error common to all outlines in an image [px of the working image]. It increases the
+    reported standard deviations of motions along the line of sight."""
     start_share: Share = 0.1
-    """Share of an error of the start that is left in what the network predicts, which is given a rendering of the start
-    [1]. It widens the reported deviations and changes no estimate; given masks have no such share."""
+    """Share of an error of the start that remains in the prediction of the network, which is conditioned on a rendering
+    of the start [1]. It increases the reported standard deviations and changes no estimate; it is not used with given
+    masks."""
     prior_deg: Annotated[float, Range(1e-3, 360, "deg")] = 2.5
-    """Expected error of a joint position at the start [deg]; `length_scale` turns it into metres."""
+    """Expected error of an initial joint position [deg]; `length_scale` converts it to metres."""
     frame_prior_deg: Annotated[float, Range(1e-3, 360, "deg")] = 0.5
-    """The same of base frames and camera extrinsics [deg]."""
+    """Expected error of base frames and camera extrinsics [deg]; `length_scale` converts it to metres."""
     intrinsics_prior: Annotated[float, Range(1e-6, 1)] = 0.01
-    """The same of focal lengths and principal points, as a share of the focal length [1]."""
+    """Expected error of focal lengths and principal points, as a share of the focal length [1]."""
     length_scale: Annotated[float, Range(1e-3, 10, "m")] = 0.15
-    """Metres of translation that count as one radian [m]: about the distance from the remote centre to the tip."""
+    """Translation equivalent to one radian [m]: about the distance from the remote centre to the tip."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -163,32 +164,33 @@ class SurfaceSolver(Ranged):
 
 @dataclass(frozen=True)
 class DescentSolver(Ranged):
-    """Compares features of the image with those of the hybrid image (rendered arms over the mean background)."""
+    """Maximizes the similarity of features of the image and the hybrid image (rendered arms over the mean
+    background)."""
 
     loss: Loss = Loss.ACS
-    """Which loss."""
+    """Loss to minimize."""
     method: Method = "adam"
-    """Optimizer that descends it."""
+    """First-order optimizer."""
     stages: tuple[Stage, ...] = FEATURES
-    """What runs, in this order."""
+    """Stages, in order of execution."""
     iterations: Annotated[int, Range(1, 10_000)] = 60
     """Planned number of steps [1]."""
     learning_rate: Annotated[float, Range(0, 1, "rad", above=True)] = 6e-3
-    """First step size [rad]; a prismatic joint or a translation moves `length_scale` times as many metres."""
+    """Initial step size [rad]; `length_scale` converts it to metres."""
     decay: Annotated[float, Range(0, 1, above=True)] = 0.82
-    """Factor on the step size every `decay_every` steps [1]."""
+    """Factor applied to the step size every `decay_every` steps [1]."""
     decay_every: Annotated[int, Range(1, 10_000)] = 5
     """Steps between two decays [1]."""
     length_scale: Annotated[float, Range(1e-3, 10, "m")] = 0.15
-    """Metres of translation that count as one radian [m]."""
+    """Translation equivalent to one radian [m]."""
     prior_weight: Annotated[float, Range(0, 1e6)] = 0.02
-    """Weight of the prior that holds unknowns at their start [1/rad^2]."""
+    """Weight of the prior around the start [1/rad^2]."""
     working_width: Annotated[int, Range(64, 4096, "px")] = 320
-    """Width of the images that are compared [px]."""
+    """Width of the compared images [px]."""
     tolerance: Annotated[float, Range(0, 1, below=True)] = 0.0
-    """It stops when the best loss has improved by less than this in `patience` steps; 0 never stops early."""
+    """Early stopping: minimum improvement of the best loss in `patience` steps; 0 disables it."""
     patience: Annotated[int, Range(1, 10_000)] = 10
-    """See `tolerance` [1]."""
+    """Number of steps for `tolerance` [1]."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -205,9 +207,11 @@ class DescentSolver(Ranged):
 
     @staticmethod
     def paper(iterations: int = 50, loss: Loss = Loss.ACS_PAPER) -> "DescentSolver":
-        """The paper's setting: Adam at 1e-3, times 0.9 every 5 steps, its own loss, no prior.
+        """The paper's settings: Adam with step size 1e-3, multiplied by 0.9 every 5 steps, the paper's loss, and no
+        prior.
 
-        Lengths of its released code are decimetres (`PSM.L_rcc` is 4.389), so a step of the insertion is 1e-3 dm.
+        Lengths in the released code are in decimetres (`PSM.L_rcc` is 4.389), so the step size of the insertion is 1e-3
+        dm.
         """
         return DescentSolver(
             loss=loss,
@@ -225,7 +229,7 @@ SolverSettings = SurfaceSolver | DescentSolver
 
 
 def surface_solver(settings: SolverSettings | None, what: str) -> SurfaceSolver:
-    """The settings, or the default ones; `SettingsError` if they are those of another solver."""
+    """Return the settings, or the defaults; `SettingsError` if they belong to another solver."""
     if settings is None or isinstance(settings, SurfaceSolver):
         return settings or SurfaceSolver()
     raise SettingsError(
@@ -235,26 +239,26 @@ def surface_solver(settings: SolverSettings | None, what: str) -> SurfaceSolver:
 
 
 class SolverName(StrEnum):
-    """The solvers that can be named."""
+    """Names of the solvers."""
 
     SURFACE = "surface"
     """The default: `SurfaceSolver`."""
     OCCLUDED = "occluded"
-    """The same, run again without pixels that probably show an occluder."""
+    """`SurfaceSolver`, repeated without pixels that probably show an occluder."""
     ACS = "acs"
     """Attentional cosine similarity, independent of the silhouette's size."""
     ACS_REFERENCE = "acs_reference"
-    """The form of the released code."""
+    """ACS as in the released code."""
     PAPER = "paper"
     """The paper's loss and schedule."""
     L1 = "l1"
     """Smooth L1 between predictions."""
     NONE = "none"
-    """Only compares the start."""
+    """Only evaluates the start."""
 
 
 def solver(name: SolverName | str) -> SolverSettings:
-    """The solver of a name, with its default settings; `SettingsError` for another name."""
+    """Default settings of a solver by name; `SettingsError` for an unknown name."""
     require(name in set(SolverName), "solver", str(name), ", ".join(SolverName))
     match SolverName(name):
         case SolverName.SURFACE:
@@ -284,5 +288,5 @@ CALIBRATION_SETTINGS = SurfaceSolver(
     frame_prior_deg=3.0,
     intrinsics_prior=0.05,
 )
-"""How a calibration goes about it by default. Normals are left out: where they are wrong by the same angle
-in every frame (an encoder's offset, a bias of the network) frames do not average it out, and base frames follow."""
+"""Default settings of a calibration. Normals are not used, since an error common to all frames (encoder offset, network
+bias) does not average out and would be absorbed by the base frames."""

@@ -1,4 +1,4 @@
-"""Ranges of settings as part of their types, and the check of them."""
+"""Ranges of settings as type annotations, and their validation."""
 
 from dataclasses import dataclass, fields
 from math import inf
@@ -9,7 +9,7 @@ from ..errors import SettingsError
 
 @dataclass(frozen=True)
 class Range:
-    """Allowed values of a field, such as `Annotated[float, Range(0, 1)]`; of each element of a tuple."""
+    """Allowed values of a field, or of each element of a tuple, such as `Annotated[float, Range(0, 1)]`."""
 
     low: float = -inf
     high: float = inf
@@ -37,11 +37,11 @@ class Range:
 Share = Annotated[float, Range(0, 1)]
 """A number from 0 to 1."""
 Count = Annotated[int, Range(1)]
-"""A number of things, at least one."""
+"""A positive integer."""
 Positive = Annotated[float, Range(0, above=True)]
-"""A number above 0."""
+"""A positive number."""
 NotNegative = Annotated[float, Range(0)]
-"""A number from 0 on."""
+"""A nonnegative number."""
 
 
 def require(condition: bool, name: str, value: object, allowed: object) -> None:
@@ -51,10 +51,10 @@ def require(condition: bool, name: str, value: object, allowed: object) -> None:
 
 
 class Ranged:
-    """Base of dataclasses whose fields have a `Range` in their types; None is allowed where the type has it."""
+    """Base of dataclasses with `Range` annotations; None is allowed if the type includes it."""
 
     def __post_init__(self) -> None:
-        """Check all ranges; `SettingsError` for a value outside of its range."""
+        """Check all ranges; `SettingsError` for a value out of range."""
         for field in fields(self):  # pyright: ignore[reportArgumentType]
             for allowed in getattr(field.type, "__metadata__", ()):
                 value = getattr(self, field.name)

@@ -1,4 +1,4 @@
-"""Settings as plain data and back, for results and settings files, and the documentation of their fields."""
+"""Conversion of settings to and from plain data, for results and settings files, and documentation of their fields."""
 
 import ast
 import inspect
@@ -16,7 +16,7 @@ from .stages import Stage
 
 @cache
 def field_docstrings(kind: type) -> dict[str, str]:
-    """The string below each field of a dataclass, which Python itself throws away."""
+    """Docstring of each field of a dataclass, read from the source."""
     body = ast.parse(textwrap.dedent(inspect.getsource(kind))).body[0]
     assert isinstance(body, ast.ClassDef)
     found = {}
@@ -27,7 +27,7 @@ def field_docstrings(kind: type) -> dict[str, str]:
 
 
 def described(kind: type) -> str:
-    """A settings dataclass as text: its summary, and each field with default and meaning."""
+    """Description of a settings dataclass: its summary, and each field with default and meaning."""
     lines = [f"{kind.__name__}: {inspect.getdoc(kind) or ''}"]
     texts = field_docstrings(kind)
     for field in fields(kind):
@@ -49,7 +49,7 @@ _STAGES: dict[str, type] = {kind.__name__: kind for kind in get_args(Stage)}
 
 
 def to_plain(value: Any) -> Any:
-    """Settings as numbers, strings, lists and dictionaries; a stage names its kind under `stage`."""
+    """Convert settings to numbers, strings, lists and dictionaries; the kind of a stage is stored under `stage`."""
     if is_dataclass(value) and not isinstance(value, type):
         kind = {"stage": type(value).__name__} if type(value).__name__ in _STAGES else {}
         return {**kind, **{field.name: to_plain(getattr(value, field.name)) for field in fields(value)}}
@@ -61,7 +61,7 @@ def to_plain(value: Any) -> Any:
 
 
 def changed(base: _Settings, table: Mapping[str, Any], where: str) -> _Settings:
-    """Settings with some fields replaced by those of a table; `SettingsError` for unknown or unusable ones."""
+    """Replace fields of settings by those of a table; `SettingsError` for unknown fields or invalid values."""
     types = get_type_hints(type(base))
     values: dict[str, Any] = {}
     for name, value in table.items():
@@ -78,7 +78,7 @@ def changed(base: _Settings, table: Mapping[str, Any], where: str) -> _Settings:
 
 
 def _like(value: Any, present: Any, where: str) -> Any:
-    """A value of the type that the present one has."""
+    """Convert a value to the type of the current one."""
     if isinstance(present, float) and isinstance(value, int) and not isinstance(value, bool):
         return float(value)
     if isinstance(present, StrEnum) and isinstance(value, str):

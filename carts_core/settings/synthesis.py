@@ -1,4 +1,4 @@
-"""Settings of a synthetic sequence. Everything random follows from `SynthesisConfig.seed`."""
+"""Settings of a synthetic sequence. All random choices are determined by `SynthesisConfig.seed`."""
 
 import zlib
 from dataclasses import dataclass, field
@@ -17,20 +17,20 @@ DOMAINS = ("regular", "low_brightness", "bleeding", "smoke", "background_change"
 
 @dataclass(frozen=True)
 class EndoscopeConfig(Ranged):
-    """Camera, and its pose above the tissue."""
+    """Endoscope camera, and its pose above the tissue."""
 
     width: Annotated[int, Range(32, 4096)] = 640
     """Image width [px]."""
     height: Annotated[int, Range(32, 4096)] = 480
     """Image height [px]."""
     focal_length: Annotated[float, Range(100, 5000)] = 560.0
-    """Focal length for an image 640 px wide [px]; other widths scale it."""
+    """Focal length for an image 640 px wide [px]; scaled for other widths."""
     distance: Annotated[float, Range(0.05, 10.0)] = 0.100
-    """From the camera to the middle of the scene [m]; at most 0.3 for instruments."""
+    """Distance from the camera to the centre of the scene [m]; at most 0.3 for instruments."""
     elevation: Annotated[float, Range(0.5, 1.57)] = 1.05
-    """Angle between the viewing direction and the tissue's plane [rad]."""
+    """Angle between the viewing direction and the tissue plane [rad]."""
     stereo: bool = False
-    """Render a right camera too."""
+    """Also render a right camera."""
     baseline: Share = 0.005
     """Distance between the left and the right camera [m]."""
 
@@ -48,11 +48,11 @@ class MotionConfig(Ranged):
     reach: Annotated[tuple[float, float, float], Range(0, 0.1, "m")] = (0.016, 0.012, 0.009)
     """Half size of the box in which each tool tip moves: right, away from the viewer, up [m]."""
     wrist_range: Share = 0.35
-    """Largest deviation of roll and wrist joints from their middle [rad]."""
+    """Largest deviation of roll and wrist joints from their central position [rad]."""
     jaw_range: tuple[float, float] = (0.0, 0.9)
     """Smallest and largest jaw angle [rad]."""
     clearance: Annotated[float, Range(0.0, 0.02)] = 0.0015
-    """Smallest distance kept between the instruments, and between instrument and tissue [m]."""
+    """Minimum distance between the instruments, and between instrument and tissue [m]."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -62,16 +62,17 @@ class MotionConfig(Ranged):
 
 @dataclass(frozen=True)
 class MeasurementError(Ranged):
-    """measured = true + bias + drift(t) + noise(t), for every joint; [rad] for revolute joints, [m] for insertion."""
+    """Measurement error model per joint: measured = true + bias + drift(t) + noise(t); [rad] for revolute joints, [m]
+    for insertion."""
 
     bias: tuple[float, ...] = (0.020, 0.020, 0.0012, 0.035, 0.035, 0.035, 0.035)
-    """Size of the constant offset; each joint draws its sign and a factor from 0.6 to 1.2."""
+    """Magnitude of the constant offset; its sign and a factor from 0.6 to 1.2 are drawn for each joint."""
     drift: tuple[float, ...] = (0.004, 0.004, 0.0003, 0.008, 0.008, 0.008, 0.008)
-    """Amplitude of the slow wandering about that offset."""
+    """Amplitude of the slow drift about that offset."""
     drift_period: Annotated[float, Range(0.1, 1e6)] = 20.0
-    """Typical period of the wandering [s]."""
+    """Typical period of the drift [s]."""
     noise: tuple[float, ...] = (0.0004, 0.0004, 0.00004, 0.001, 0.001, 0.001, 0.001)
-    """Standard deviation of the noise that is new in every frame."""
+    """Standard deviation of the noise, independent in every frame."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -87,26 +88,26 @@ class RenderConfig(Ranged):
     """Path tracing."""
 
     samples: Annotated[int, Range(1, 4096)] = 8
-    """Paths per pixel; noise falls with the square root."""
+    """Paths per pixel; noise is inversely proportional to the square root."""
     bounces: Annotated[int, Range(2, 16)] = 3
-    """Longest path, counted in segments; 2 has no light between tissue and metal."""
+    """Maximum path length in segments; 2 excludes interreflections between tissue and metal."""
     robot_faces: Annotated[int, Range(500, 1_000_000)] = 40_000
     """Triangles per robot, more than the optimizer's renderer uses."""
     tissue_resolution: Annotated[int, Range(32, 2048)] = 520
     """Grid points of the tissue's height field along each side."""
 
     texture_resolution: Annotated[int, Range(64, 8192)] = 1536
-    """Texels of the tissue's colour along each side."""
+    """Texels of the tissue's colour texture along each side."""
 
 
 @dataclass(frozen=True)
 class SensorConfig(Ranged):
-    """From radiance to the bytes of a picture."""
+    """Image sensor: conversion of radiance to pixel values."""
 
     exposure: Annotated[float, Range(0.01, 1.0)] = 0.18
     """Median radiance of the first frame as a fraction of white [1]."""
     vignette: Share = 0.45
-    """Light lost in the corners, as a fraction."""
+    """Fraction of light lost in the corners."""
     blur: Annotated[float, Range(0.0, 10.0)] = 0.65
     """Standard deviation of the lens blur for an image 640 px wide [px]."""
     shutter: Share = 1 / 80
@@ -128,15 +129,15 @@ class DomainConfig(Ranged):
     low_brightness: Share = 0.22
     """Light of the low brightness domain relative to the regular one."""
     blood_coverage: Share = 0.40
-    """Part of the tissue under blood."""
+    """Fraction of the tissue covered with blood."""
     blood_on_tools: Share = 0.30
-    """Part of the instruments' surface with a film or drops of blood."""
+    """Fraction of the instruments' surface with a film or drops of blood."""
     smoke_density: Annotated[float, Range(0.0, 200.0)] = 8.0
     """Mean extinction of the smoke [1/m]; at 8 and 0.1 m of depth, 55 % of the light is lost."""
     smoke_wavelength: Annotated[float, Range(0.002, 1.0)] = 0.042
     """Size of the largest eddies [m]."""
     smoke_speed: Share = 0.02
-    """Speed with which the smoke drifts [m/s]."""
+    """Drift speed of the smoke [m/s]."""
     overlay_opacity: Share = 0.50
     """Mean opacity of the two-dimensional overlay of the simulated smoke domain."""
 
@@ -146,13 +147,14 @@ class SynthesisConfig(Ranged):
     """A synthetic sequence of two arms."""
 
     seed: Annotated[int, Range(0, 2**32 - 1)] = 7
-    """Decides everything random: tissue, motion, errors, noise."""
+    """Random seed of tissue, motion, errors and noise."""
     name: str = "synthetic"
     """Name of the sequence."""
     robot: Path = field(default_factory=shipped_robot)
-    """URDF, or `builtin:NAME`. One with the joints of a PSM makes both arms, any other one a single arm."""
+    """URDF, or `builtin:NAME`. With the joints of a PSM it is used for two arms, otherwise for a single arm."""
     tip_link: str = "tool_tip_link"
-    """Link of the URDF whose origin is the point between the jaws' tips; of another robot the last link with a mesh."""
+    """Link of the URDF whose origin is the point between the jaw tips; for robots other than the PSM, the last link
+    with a mesh."""
     domains: tuple[str, ...] = DOMAINS
     """The conditions to render."""
     endoscope: EndoscopeConfig = EndoscopeConfig()
@@ -177,6 +179,6 @@ class SynthesisConfig(Ranged):
             )
 
     def rng(self, *purpose: str | int) -> np.random.Generator:
-        """A generator of its own for each purpose, so that changing one thing leaves the others as they were."""
+        """Random generator for a purpose; each purpose has its own, so that changing one does not affect the others."""
         words = [zlib.crc32(part.encode()) if isinstance(part, str) else part for part in purpose]
         return np.random.default_rng([self.seed, *words])

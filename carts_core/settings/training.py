@@ -1,4 +1,4 @@
-"""Settings of the training of networks, the paper's baselines included."""
+"""Settings for training networks, including the paper's baselines."""
 
 import json
 import re
@@ -21,7 +21,7 @@ class ObjectiveWeights(Ranged):
     dice: NotNegative = 0.5
     """One minus soft Dice per image, so that small instruments count as much as large ones."""
     consistency: NotNegative = 1.0
-    """Cosine of the features of an observed and a hybrid image: 1 for equal classes, 0 for different ones."""
+    """Cosine similarity of features of an observed and a hybrid image: 1 for equal classes, 0 for different ones."""
 
 
 @dataclass(frozen=True)
@@ -29,9 +29,9 @@ class SurfaceWeights(Ranged):
     """Weights of the terms of the surface network's loss; zero leaves a term out."""
 
     everywhere: NotNegative = 1.0
-    """Cross-entropy of coverage, all pixels."""
+    """Cross-entropy of coverage over all pixels."""
     near: NotNegative = 1.0
-    """The same near instruments, where the optimizer compares."""
+    """Cross-entropy of coverage near instruments, where the optimizer compares maps."""
     dice: NotNegative = 0.5
     """One minus soft Dice per image and part, so that small parts count as much as large ones."""
     normals: NotNegative = 1.0
@@ -48,14 +48,14 @@ class Architecture:
     widths: tuple[int, ...] = (12, 24, 48, 64, 96)
     """Channels per level, from full resolution down; each level halves the resolution."""
     encoder_convolutions: tuple[int, ...] = (1, 2, 2, 2, 2)
-    """3x3 convolutions per level on the way down. Full resolution costs most, so it has one."""
+    """3x3 convolutions per level of the encoder. Full resolution is the most expensive, so it has one."""
     decoder_convolutions: tuple[int, ...] = (1, 1, 1, 1)
-    """3x3 convolutions per level on the way up, from full resolution down."""
+    """3x3 convolutions per level of the decoder, from full resolution down."""
     local_mean: bool = True
-    """Take the local mean off an image first, and not that of the whole image: smooth haze then changes less."""
+    """Subtract the local instead of the global image mean, which reduces the effect of smooth haze."""
     local_contrast: float = 0.0
-    """How much an image is divided by its local contrast instead of that of the whole image, from 0 (not at all) to 1
-    (entirely); needs `local_mean`. What takes contrast from a part of an image then changes less."""
+    """Weight of local versus global contrast normalization, from 0 (global) to 1 (local); requires `local_mean`. It
+    reduces the effect of local loss of contrast."""
 
     def __post_init__(self) -> None:
         levels = len(self.widths)
@@ -79,16 +79,16 @@ class Architecture:
         return 2 ** (len(self.widths) - 1)
 
     def to_json(self) -> str:
-        """One line of JSON; the inverse of `from_json`."""
+        """Encode as one line of JSON; the inverse of `from_json`."""
         return json.dumps(asdict(self))
 
     @staticmethod
     def from_json(text: str) -> "Architecture":
-        """Read what `to_json` wrote.
+        """Decode the result of `to_json`.
 
         Raises:
             ValueError, TypeError, KeyError, AttributeError: the text is not an architecture.
-            SettingsError: it is one that cannot exist.
+            SettingsError: the architecture is impossible.
         """
         values = parse_json(text)
         local_mean, local_contrast = bool(values.pop("local_mean")), float(values.pop("local_contrast", 0.0))
@@ -100,24 +100,24 @@ class Architecture:
 
 
 Interval = Annotated[tuple[float, float], Range(0)]
-"""Lower and upper end."""
+"""Lower and upper bound."""
 
 DARKEST_BRIGHTNESS = 0.65
-"""Training images are never darkened below this factor: low light is a domain that is only evaluated."""
+"""Smallest brightness factor of training images, since low light is an evaluation domain."""
 
 
 @dataclass(frozen=True)
 class AppearanceRanges(Ranged):
-    """Ranges that the camera of an observed training image is drawn from.
+    """Ranges of the random image appearance of observed training images.
 
-    There is deliberately no smoke, no blood and no low light: robustness to those is to be shown, not trained.
-    Nothing red is ever drawn over an instrument, nothing hides a part of the image, and `brightness` has a floor.
+    Smoke, blood and low light are deliberately excluded, since robustness to them is evaluated, not trained: nothing
+    red is drawn over an instrument, no part of the image is hidden, and `brightness` has a lower bound.
     """
 
     brightness: Interval = (0.65, 1.35)
-    """Factor on the whole image [1]; at least `DARKEST_BRIGHTNESS`."""
+    """Factor for the whole image [1]; at least `DARKEST_BRIGHTNESS`."""
     contrast: Interval = (0.6, 1.3)
-    """Factor on the distance from the image's mean [1]."""
+    """Factor for the difference from the image's mean [1]."""
     gamma: Interval = (0.8, 1.25)
     """Exponent of the tone curve [1]."""
     white_balance: Interval = (0.82, 1.2)
@@ -127,11 +127,11 @@ class AppearanceRanges(Ranged):
     noise: Interval = (0.0, 0.03)
     """Standard deviation of the sensor noise [1]."""
     jpeg_quality: Interval = (45.0, 98.0)
-    """Quality of the JPEG artefacts, 100 is best."""
+    """JPEG quality; 100 is best."""
     vignette: Interval = (0.0, 0.45)
     """Darkening in the image corners [1]."""
     unevenness: Share = 0.4
-    """Largest deviation of the logarithm of the light over the image [1]; its mean is left as it is."""
+    """Largest deviation of the logarithm of the illumination over the image [1]; its mean is unchanged."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -156,29 +156,29 @@ class ImageSettings(Ranged):
     height: int = 160
     """Height of a training image [px]."""
     field_width: int = 320
-    """Width [px] of the camera image that a training image is a crop of; focal lengths refer to it."""
+    """Width of the camera image from which a training image is cropped [px]; focal lengths refer to it."""
     two_arms: Share = 0.4
     """Share of pairs with two arms."""
     same_kinematics: Share = 0.5
-    """Share of pairs whose hybrid image shows exactly the kinematics of the observed one."""
+    """Share of pairs whose hybrid image has exactly the kinematics of the observed image."""
     same_background: Share = 0.7
     """Share of pairs whose mean background is that of the observed image."""
     occluded: Share = 0.4
-    """Share of observed images in which something occludes the arms; the labels are those of the arms below it."""
+    """Share of observed images with occluded arms; the occluded surface remains the label."""
     things: Share = 0.35
-    """Share of observed images with rods, plates, cables and the like behind the arms."""
+    """Share of observed images with objects (rods, plates, cables) behind the arms."""
     absent: Share = 0.1
-    """Share of observed images in which one arm or all are claimed to be in view and are not."""
+    """Share of observed images in which one or all arms of the prior are absent."""
     photographs: Path | None = None
-    """Folder of photographs; `from_photographs` of the backgrounds are parts of them."""
+    """Folder of photographs; `from_photographs` sets the share of backgrounds cropped from them."""
     from_photographs: Share = 0.2
-    """Share of backgrounds that are parts of photographs, if a folder of them is given."""
+    """Share of backgrounds cropped from photographs, if `photographs` is given."""
     recording: Path | None = None
-    """Sequence file; arms are then where its cameras see them, about, and not 5 to 25 cm from the camera."""
+    """Sequence file; arms are placed near its recorded poses instead of 5 to 25 cm from the camera."""
     coverage: tuple[float, float] = (0.004, 0.5)
     """Allowed share of the image that shows arms."""
     appearance: AppearanceRanges = field(default_factory=AppearanceRanges)
-    """The camera's ranges."""
+    """Ranges of the random image appearance."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -193,20 +193,20 @@ class ImageSettings(Ranged):
 
 
 NetworkName = Literal["feature", "surface"]
-"""Which network is trained."""
+"""Network to train."""
 
 
 @dataclass(frozen=True)
 class TrainingConfig(Ranged):
-    """Everything that a training run depends on."""
+    """Settings of a training run."""
 
     network: NetworkName = "feature"
-    """Which network is trained: `feature` for the paper's loss, `surface` for Gauss-Newton."""
+    """Network to train: `feature` for the paper's loss, `surface` for Gauss-Newton."""
     robots: tuple[Path, ...] = field(default_factory=lambda: (shipped_robot(),))
-    """URDF files of the robots whose images are made, or `builtin:NAME`."""
+    """URDF files of the robots in the training images, or `builtin:NAME`."""
     start: Path | None = None
-    """Weights file to start from, for fine-tuning; random weights without it. The network is as large as these,
-    unless another architecture is asked for, into which it then grows."""
+    """Weights file to start from, for fine-tuning; by default random weights. The architecture is that of these
+    weights, unless a larger one is given."""
     steps: Count = 4000
     """Optimizer steps."""
     minutes: Annotated[float | None, Range(0, unit="min", above=True)] = None
@@ -215,7 +215,8 @@ class TrainingConfig(Ranged):
     batch_size: Count = 8
     """Samples per step: a pair of an observed and a hybrid image, or one observed image."""
     reuse: Count = 2
-    """How often a sample is used, mirrored by chance after the first time: making one takes as long as learning it."""
+    """Number of uses of each sample; repeats are mirrored at random. Generating a sample costs about as much as a
+    training step."""
     learning_rate: Positive = 3e-3
     """Peak learning rate of AdamW; it rises for `warmup` steps and then falls along a cosine to a hundredth."""
     weight_decay: NotNegative = 1e-4
@@ -223,21 +224,22 @@ class TrainingConfig(Ranged):
     warmup: Annotated[int, Range(0)] = 100
     """Steps until the learning rate is at its peak."""
     average: Annotated[float, Range(0, 1, below=True)] = 0.995
-    """Decay per step of the running average of the weights, which is what is saved."""
+    """Decay per step of the running average of the weights; the average is saved."""
     validation_every: Count = 250
     """Steps between validations."""
     patience: Annotated[int | None, Range(1)] = None
-    """Validations in a row without a gain after which a run ends, and whose weights are not kept."""
+    """Early stopping: number of validations without improvement after which training stops; their weights are
+    discarded."""
     validation_samples: Count = 32
     """Samples of the fixed validation set."""
     checkpoint_every: Count = 100
     """Steps between checkpoints."""
     workers: Annotated[int, Range(0)] = 2
-    """Processes that make images."""
+    """Number of processes that generate images."""
     threads: Count = 2
     """Threads of the training process itself."""
     seed: Annotated[int, Range(0)] = 0
-    """Seed of everything random."""
+    """Random seed."""
     device: str = "cpu"
     """Device of the training."""
     images: ImageSettings = field(default_factory=ImageSettings)
@@ -247,7 +249,7 @@ class TrainingConfig(Ranged):
     surface_objective: SurfaceWeights = field(default_factory=SurfaceWeights)
     """Weights of the surface network's loss terms."""
     architecture: Architecture = field(default_factory=Architecture)
-    """The network."""
+    """Architecture of the network."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -262,9 +264,9 @@ class TrainingConfig(Ranged):
 
 
 BaselineName = Literal["unet", "hrnet", "swin", "colleoni"]
-"""Baseline network. Three use the image alone, Colleoni's also a rendering of the kinematics."""
+"""Baseline network. Three use only the image, Colleoni's also a rendering of the kinematics."""
 Augmentation = Literal["none", "smoke", "autoaugment", "elastic", "projective"]
-"""What is done to training images besides mirroring them: simulated smoke (the paper), or what SegSTRONG-C compares."""
+"""Augmentation of training images besides mirroring: simulated smoke (the paper), or those compared by SegSTRONG-C."""
 
 _ENCODERS: dict[BaselineName, str] = {
     "hrnet": "hrnet_w18_small",
@@ -280,18 +282,19 @@ class BaselineNetwork:
     """Architecture of a baseline network, stored in the weights file."""
 
     name: BaselineName = "hrnet"
-    """Which network."""
+    """Baseline network."""
     encoder: str = ""
-    """timm's name of the encoder; empty for a small one of the kind, `hrnet_w18_small`, `swin_tiny_patch4_window7_224`
-    or `resnet10t` (twice, for Colleoni's). The paper has `hrnet_w48`. The U-Net has none."""
+    """Encoder name in timm; by default a small one of the architecture: `hrnet_w18_small`,
+    `swin_tiny_patch4_window7_224` or `resnet10t` (two encoders, for Colleoni's). The paper uses `hrnet_w48`; the U-Net
+    takes no encoder."""
     width: int | None = None
-    """Channels of the first stage of a Swin transformer, if not the encoder's own (96 for tiny)."""
+    """Channels of the first stage of a Swin transformer; by default those of the encoder (96 for tiny)."""
     decoder: tuple[int, ...] = (64, 48, 32, 24, 16)
     """Channels of the decoder's five levels, from the coarsest up."""
     unet: Architecture = field(default_factory=lambda: Architecture(local_mean=False))
-    """The U-Net."""
+    """Architecture of the U-Net."""
     size: tuple[int, int] = (256, 192)
-    """Width and height [px] of the images that it gets: multiples of 32."""
+    """Network input width and height [px], multiples of 32."""
 
     def __post_init__(self) -> None:
         if self.encoder and not _ENCODER.fullmatch(self.encoder):
@@ -305,7 +308,7 @@ class BaselineNetwork:
 
     @property
     def timm_encoder(self) -> str:
-        """timm's name of the encoder; empty for the U-Net."""
+        """Encoder name in timm; empty for the U-Net."""
         return self.encoder or _ENCODERS.get(self.name, "")
 
     @property
@@ -316,15 +319,15 @@ class BaselineNetwork:
 
 @dataclass(frozen=True)
 class BaselineTraining(Ranged):
-    """Everything that a training run of a baseline depends on."""
+    """Settings of a training run of a baseline."""
 
     augmentation: Augmentation = "smoke"
     """Augmentation of training images."""
     start: Path | None = None
-    """Safetensors file with timm's weights of the encoder, such as pretrained ones; for a U-Net one with a feature
-    network. Random weights without it."""
+    """Safetensors file with encoder weights from timm, such as pretrained ones; for a U-Net, a file with a feature
+    network. By default random weights."""
     frames: Annotated[int, Range(101)] = 3000
-    """Synthetic training frames; the last 100 validate."""
+    """Number of synthetic frames; the last 100 are used for validation."""
     steps: Count = 20_000
     """Optimizer steps."""
     minutes: Annotated[float | None, Range(0, unit="min", above=True)] = None
@@ -338,13 +341,13 @@ class BaselineTraining(Ranged):
     warmup: Annotated[int, Range(0)] = 50
     """Steps until the learning rate is at its peak."""
     bfloat16: bool | None = None
-    """Compute in bfloat16; weights stay float32. Without it, on a GPU alone: a processor that has no instructions for
-    bfloat16 takes ten times as long with it."""
+    """Compute in bfloat16 with float32 weights. By default only on a GPU; on CPUs without bfloat16 instructions it is
+    ten times slower."""
     checkpoint_every: Count = 100
     """Steps between checkpoints."""
     threads: Count = 2
-    """Threads of torch."""
+    """Number of torch threads."""
     seed: Annotated[int, Range(0)] = 0
-    """Seed of everything random, the frames included."""
+    """Random seed, also of the frames."""
     device: str = "cpu"
     """Device of the training."""
