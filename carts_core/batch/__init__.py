@@ -1,5 +1,5 @@
 """Batches of jobs over many recordings: manifest, engines, states and results.
 
-`manifest` reads the jobs, `folder` has their states and results, `engines` runs them side by side.
+`manifest` reads the jobs, `folder` stores their states and results, `engines` runs them in parallel.
 The function that runs a job is in `carts_core.cli.batch_job`.
 """

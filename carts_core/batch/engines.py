@@ -1,4 +1,4 @@
-"""Engines that run the jobs of a batch: worker processes on this machine, or a cluster of dask.distributed."""
+"""Engines that run the jobs of a batch: worker processes on this machine, or a dask.distributed cluster."""
 
 import multiprocessing
 import os
@@ -15,7 +15,7 @@ from ..stopping import Stopped, end_with_parent, stopped_by_signals
 from .manifest import Job
 
 ATTEMPTS = 5
-"""Number of attempts at a job whose worker dies, before it counts as failed."""
+"""Number of attempts at a job whose worker dies, before the job counts as failed."""
 
 
 @dataclass(frozen=True)
@@ -24,23 +24,23 @@ class Outcome:
 
     job: str
     status: Literal["done", "known", "busy", "failed", "stopped"]
-    """`known`: done before; `busy`: another process runs it."""
+    """`known`: already done earlier; `busy`: run by another process."""
     error: str = ""
     seconds: float = 0.0
 
 
 Work = Callable[[Job], Outcome]
-"""Runs a job; the outcome describes a failure."""
+"""Function that runs a job; failures are described in the outcome."""
 
 
 def lost(job: Job) -> Outcome:
-    """Outcome of a job whose worker died in each attempt."""
+    """Outcome of a job whose worker died in every attempt."""
     return Outcome(job.name, "failed", f"its worker died {ATTEMPTS} times; the machine may lack memory (see its log)")
 
 
 _THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
 _PATIENCE = 10.0
-"""Time for a process to end [s]."""
+"""Time allowed for a process to end [s]."""
 
 
 @dataclass
@@ -48,18 +48,18 @@ class _Worker:
     process: BaseProcess
     connection: Connection
     job: Job | None = None
-    """Its present job."""
+    """Current job of the worker."""
 
 
 class Pool:
-    """Worker processes with so many threads that run one job after another; `work` is importable by name."""
+    """Pool of worker processes with `threads` threads each; `work` must be importable by name."""
 
     def __init__(self, work: Work, workers: int, threads: int) -> None:
         self._work, self._workers, self._threads = work, workers, threads
         self._context = multiprocessing.get_context("spawn")
 
     def run(self, jobs: Sequence[Job]) -> Iterator[Outcome]:
-        """Run all jobs; yields outcomes as they arrive. Closing the iterator ends the processes."""
+        """Run all jobs; yields outcomes in order of completion. Closing the iterator ends the processes."""
         waiting, attempts = deque(jobs), dict.fromkeys((job.name for job in jobs), 0)
         workers: list[_Worker] = []
         try:
@@ -102,7 +102,7 @@ class Pool:
 
 
 def _hand(worker: _Worker, waiting: deque[Job], attempts: dict[str, int]) -> None:
-    """Send a job to a worker; a dead worker is noticed when its answer is received."""
+    """Send a job to a worker; the death of a worker is detected when its answer is received."""
     worker.job = waiting.popleft()
     attempts[worker.job.name] += 1
     with suppress(OSError):
@@ -120,7 +120,7 @@ def _end(worker: _Worker) -> None:
 
 @contextmanager
 def _threads_of_children(threads: int) -> Iterator[None]:
-    """Limit threads of child processes by environment variables, which libraries read when they are loaded."""
+    """Limit the threads of child processes by environment variables, which libraries read when they are loaded."""
     before = {name: os.environ.get(name) for name in _THREADS}
     os.environ.update(dict.fromkeys(_THREADS, str(threads)))
     try:
@@ -151,21 +151,21 @@ LOCAL = "local"
 
 
 class Cluster:
-    """Workers of dask.distributed, which share a file system with this machine.
+    """Cluster of dask.distributed workers, which share a file system with this machine.
 
     Args:
         work: function that runs a job; importable by name.
         scheduler: address such as `tcp://10.0.0.1:8786`, or `local` for workers on this machine.
         workers: number of local workers.
-        threads: of each worker.
+        threads: number of threads per worker.
     """
 
     def __init__(self, work: Work, scheduler: str, workers: int, threads: int) -> None:
         self._work, self._scheduler, self._workers, self._threads = work, scheduler, workers, threads
 
     def run(self, jobs: Sequence[Job]) -> Iterator[Outcome]:
-        """Run all jobs; yields outcomes as they arrive. `SettingsError` if the scheduler does not answer."""
-        # Optional dependencies, which worker processes on this machine do without.
+        """Run all jobs; yields outcomes in order of completion. `SettingsError` if the scheduler does not answer."""
+        # Optional dependencies, which worker processes on this machine do not need.
         import dask.config  # noqa: PLC0415
         from distributed import Client, KilledWorker, LocalCluster, as_completed  # noqa: PLC0415
 

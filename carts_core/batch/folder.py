@@ -1,4 +1,4 @@
-"""The folder of a batch: states of its jobs, their results, and the summary of both."""
+"""Folder of a batch: states of its jobs, their results, and the summary of both."""
 
 import json
 import os
@@ -36,7 +36,7 @@ class StepState:
     """State of a finished step."""
 
     key: str
-    """Fingerprint of its inputs; a step with another key runs again."""
+    """Fingerprint of the step's inputs; the step runs again if it changes."""
     seconds: float
     """Duration [s]."""
 
@@ -49,7 +49,7 @@ class JobState:
     steps: Mapping[str, StepState] = field(default_factory=dict)
     """Finished steps."""
     attempts: Annotated[int, msgspec.Meta(ge=0)] = 0
-    """Number of starts since it last finished or failed; more than one if a worker was lost."""
+    """Number of starts since the job last finished or failed; more than one if a worker was lost."""
     error: str = ""
     """Reason of a failure."""
     worker: str = ""
@@ -60,7 +60,7 @@ class JobState:
 
 
 def read_state(folder: OutputPath) -> JobState:
-    """State of the job of a folder; failed if its file is damaged."""
+    """State of the job in a folder; `failed` if its file is damaged."""
     try:
         return _read(folder)
     except (OSError, ValueError) as error:
@@ -69,7 +69,7 @@ def read_state(folder: OutputPath) -> JobState:
 
 
 def _read(folder: OutputPath) -> JobState:
-    """State of a job; `OSError` or `ValueError` for a damaged file."""
+    """Read the state of a job; `OSError` or `ValueError` if its file is damaged."""
     path = folder / JOB_FILE
     if not holds_file(path):
         return JobState()
@@ -82,7 +82,7 @@ def write_state(folder: OutputPath, state: JobState) -> None:
 
 
 def present_status(folder: OutputPath) -> tuple[str, JobState]:
-    """Status and state of a job; `lost` if it is marked as running and no process holds its lock."""
+    """Current status and state of a job; `lost` if it is marked as running but no process holds its lock."""
     state = read_state(folder)
     if state.status == "running":
         with suppress(BusyError), locked_folder(folder):
@@ -94,7 +94,7 @@ class RunningJob:
     """Job run by this process, with its state on disk.
 
     Attributes:
-        state: present state.
+        state: current state.
     """
 
     def __init__(self, folder: OutputPath) -> None:
@@ -141,9 +141,9 @@ def running(folder: OutputPath) -> Iterator[RunningJob | None]:
 
 FINDINGS_FILE = "findings.json"
 _WORST = 3
-"""Number of frames of a job with pictures."""
+"""Number of worst frames of a job with preview images."""
 _WIDTH = 480
-"""Largest width of pictures [px]."""
+"""Largest width of preview images [px]."""
 
 
 @dataclass(frozen=True)
@@ -156,9 +156,9 @@ class FrameFinding:
     """`good`, `doubtful` or `failed`."""
     reason: str
     probability: Annotated[float, msgspec.Meta(ge=0, le=1)]
-    """Probability that its mask is wrong [1]."""
+    """Probability that the frame's mask is wrong [1]."""
     picture: str = ""
-    """File in the job's folder; empty for frames that are not among the worst."""
+    """Preview image in the job's folder; empty for frames that are not among the worst."""
 
 
 @dataclass(frozen=True)
@@ -168,16 +168,16 @@ class Findings:
     recording: str
     frames: list[FrameFinding] = field(default_factory=list)
     corrections: dict[str, list[float]] = field(default_factory=dict)
-    """`ARM.JOINT` -> corrected minus measured, of each frame [deg, mm]."""
+    """`ARM.JOINT` -> corrected minus measured position of each frame [deg, mm]."""
     deviations: dict[str, list[float]] = field(default_factory=dict)
-    """`ARM.JOINT` -> reported standard deviation, of each frame that has one [deg, mm]."""
+    """`ARM.JOINT` -> reported standard deviations of the frames that have one [deg, mm]."""
     base_frames: dict[str, list[list[float]]] = field(default_factory=dict)
-    """`ARM in CAMERA` -> T_camera_base, calibrated if that was a step [4 x 4, m]."""
+    """`ARM in CAMERA` -> T_camera_base [4 x 4, m], from the calibration step if there is one."""
     format: Literal["carts-findings/1"] = "carts-findings/1"
 
 
 def read_findings(folder: OutputPath) -> Findings | None:
-    """Results of the job of a folder, None before it has ended; `OSError` or `ValueError` for a damaged file."""
+    """Results of the job in a folder; None before its end; `OSError` or `ValueError` if the file is damaged."""
     path = folder / FINDINGS_FILE
     if not holds_file(path):
         return None
@@ -188,7 +188,7 @@ def read_findings(folder: OutputPath) -> Findings | None:
 
 
 def write_findings(job: Job, folder: OutputPath, sequence_file: Path) -> None:
-    """Write `findings.json` of a finished job, and pictures of its worst frames."""
+    """Write `findings.json` of a finished job, and preview images of its worst frames."""
     sequence = Sequence.open(sequence_file)
     scene, found = sequence.scene, Findings(str(job.recording))
     for arm in scene.arms:
@@ -212,7 +212,7 @@ def write_findings(job: Job, folder: OutputPath, sequence_file: Path) -> None:
 
 
 def kinematics_tables(folder: OutputPath, job: Job) -> list[Path]:
-    """Tables of corrected joints of a job, one for each domain and group of cameras; none without optimization."""
+    """Tables of a job's corrected joints, one per domain and group of cameras; empty without optimization."""
     steps = [step for step in ("sequence", "optimize") if step in job.steps]
     return sorted((folder / steps[0]).path.glob("*/*/kinematics.csv")) if steps else []
 
@@ -239,7 +239,7 @@ def _records(path: Path) -> Mapping[str, Mapping[str, Any]]:
 
 
 def _pictured(folder: OutputPath, sequence: Sequence, part: Path, frames: list[FrameFinding]) -> Iterator[FrameFinding]:
-    """The frames, the worst ones with pictures of the mask's outline in the image."""
+    """Frames, the worst ones with preview images that show the mask's outline."""
     worst = sorted(frames, key=lambda frame: -frame.probability)[:_WORST]
     domain, first = part.parent.name, part.name.split("+")[0]
     masks = part / "masks" / first if "+" in part.name else part / "masks"
@@ -261,14 +261,14 @@ def _pictured(folder: OutputPath, sequence: Sequence, part: Path, frames: list[F
 
 BATCH_FILE = "batch.json"
 _LONGEST_ERROR = 1000
-"""Characters."""
+"""Largest length of a stored error [characters]."""
 ORDER = ("failed", "lost", "stopped", "running", "waiting", "done")
 """Statuses, most urgent first."""
 
 
 @dataclass(frozen=True)
 class KnownJob:
-    """A job with its state and results."""
+    """Job with its state and results."""
 
     job: Job
     status: str
@@ -276,17 +276,17 @@ class KnownJob:
     state: JobState
     findings: Findings | None
     damage: str = ""
-    """Reason why its results cannot be read."""
+    """Reason why the results cannot be read."""
 
     @property
     def error(self) -> str:
-        """Last line of its error, or reason why its results cannot be read; empty otherwise."""
+        """Last line of the job's error, or reason why its results cannot be read; empty if there is neither."""
         lines = self.state.error.strip().splitlines()
         return lines[-1][:_LONGEST_ERROR] if lines else self.damage
 
 
 def known_jobs(batch: OutputPath, jobs: Rows[Job]) -> list[KnownJob]:
-    """States and results of jobs, in their order."""
+    """States and results of jobs, in the given order."""
     return [_known(batch / "jobs" / job.name, job) for job in jobs]
 
 
@@ -308,7 +308,7 @@ def most_urgent_first(known: Rows[KnownJob]) -> list[KnownJob]:
 
 @dataclass(frozen=True)
 class _Batch:
-    """Content of the file."""
+    """Content of the batch's file with the list of jobs."""
 
     format: Literal["carts-batch-jobs/1"]
     jobs: list[Job]
@@ -323,12 +323,12 @@ def write_jobs(batch: OutputPath, jobs: Rows[Job]) -> None:
 
 
 def is_batch(folder: Path) -> bool:
-    """Whether a folder is that of a batch."""
+    """Whether a folder is a batch folder."""
     return (folder / BATCH_FILE).is_file()
 
 
 def read_jobs(folder: Path) -> list[Job]:
-    """The jobs of a batch's folder, without their options; `SettingsError` if it is none or its list is damaged."""
+    """Jobs of a batch folder, without options; `SettingsError` if it is not a batch folder or its list is damaged."""
     try:
         jobs = typed(parse_json(read_bytes(folder / BATCH_FILE, VALUES)), _Batch).jobs
         for job in jobs:

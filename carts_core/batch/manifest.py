@@ -23,28 +23,28 @@ class Job:
     """Steps for one recording in one domain, with one or all cameras."""
 
     name: str
-    """Name of its folder; unique in the manifest."""
+    """Name of the job's folder, unique in the manifest."""
     recording: Path
     """Sequence file, or source of `carts import` if `import` is the first step."""
     camera: str
-    """Name, or `all`."""
+    """Name of a camera, or `all`."""
     domain: str
-    """Name; empty for the sequence's first one."""
+    """Name of a domain; empty for the first one of the sequence."""
     steps: tuple[Step, ...]
-    """In this order; each one uses the results of those before."""
+    """Steps in order; each one uses the results of the previous ones."""
     options: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
-    """Step -> further options of its command."""
+    """Step -> additional options of its command."""
 
 
 def read_manifest(path: Path, output: Path | None = None) -> list[Job]:
-    """The jobs of a manifest, in its order.
+    """Jobs of a manifest, in order.
 
     Args:
-        path: of the manifest.
-        output: folder of the batch, if any; patterns do not match files in it.
+        path: path of the manifest.
+        output: folder of the batch, if any; files in it are not matched by patterns.
 
     Raises:
-        SettingsError: it cannot be read, has a key, step or value that is not allowed, or a pattern matches no file.
+        SettingsError: the manifest cannot be read or has an invalid key, step or value, or a pattern matches no file.
     """
     try:
         content = parse_toml(read_text(path, SETTINGS))
@@ -118,13 +118,13 @@ def _recordings(manifest: Path, output: Path | None, where: str, patterns: tuple
 
 
 def _name(recording: Path, domain: str, camera: str) -> str:
-    """Name of a job; of `sequence.toml` files, that of their folder."""
+    """Name of a job, from the recording (the folder of a `sequence.toml`), domain and camera."""
     stem = recording.parent.name if recording.name == "sequence.toml" else recording.stem
     return "-".join(part for part in (stem, domain, camera if camera != "all" else "") if part)
 
 
 def shard(jobs: list[Job], text: str) -> list[Job]:
-    """Every n-th job, from the i-th on, of `i/n` with 1 <= i <= n; all shards together have every job once."""
+    """Shard `i/n` of the jobs: every n-th job from the i-th on, 1 <= i <= n; all shards contain every job once."""
     first, _, count = text.partition("/")
     if not (first.isdecimal() and count.isdecimal() and 1 <= int(first) <= int(count)):
         raise SettingsError(f"--shard {text!r} is not readable. Give I/N, from 1/N to N/N, such as 2/8.")

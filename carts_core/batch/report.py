@@ -1,4 +1,4 @@
-"""Report over all jobs as an HTML page with plots and the worst frames, and as JSON."""
+"""Report on all jobs as an HTML page with plots and the worst frames, and as JSON."""
 
 import json
 from collections import Counter
@@ -21,12 +21,12 @@ matplotlib.use("Agg")
 matplotlib.rcParams["text.parse_math"] = False
 
 _SHOWN = 24
-"""Number of worst frames on the page."""
+"""Largest number of worst frames on the page."""
 _VERDICTS = ("good", "doubtful", "failed")
 
 
 def write_batch_report(batch: OutputPath, title: str, jobs: Sequence[Job]) -> Path:
-    """Write `report/report.html`, `report/report.json` and the pictures; returns the page's path."""
+    """Write `report/report.html`, `report/report.json` and images; returns the page's path."""
     folder, known = batch / "report", known_jobs(batch, jobs)
     drifts, joints = _drifts(known), _joints(known)
     page = render_page(
@@ -97,7 +97,7 @@ def _verdict_table(known: Sequence[KnownJob]) -> Table | None:
 
 
 def _worst(batch: OutputPath, folder: OutputPath, known: Sequence[KnownJob]) -> list[tuple[str, str]]:
-    """Captions and pictures of the frames with the largest probability of a wrong mask, copied into the report."""
+    """Captions and images of the frames with the largest probability of a wrong mask, copied into the report."""
     frames = [
         (entry.job, frame)
         for entry in known
@@ -122,7 +122,7 @@ def _worst(batch: OutputPath, folder: OutputPath, known: Sequence[KnownJob]) -> 
 
 
 def _drifts(known: Sequence[KnownJob]) -> list[dict[str, object]]:
-    """Change of each base frame since the job before, in the manifest's order."""
+    """Change of each base frame since the previous job that has it, in the manifest's order."""
     found, before = [], {}
     for entry in known:
         for name, rows in (entry.findings.base_frames if entry.findings else {}).items():
@@ -150,7 +150,7 @@ def _drift_table(drifts: list[dict[str, object]]) -> Table | None:
 
 
 _Values = tuple[list[float], list[float]]
-"""Corrections and reported deviations of a joint [deg, mm]."""
+"""Corrections and reported standard deviations of a joint [deg, mm]."""
 
 
 def _joints(known: Sequence[KnownJob]) -> dict[str, _Values]:
@@ -196,7 +196,7 @@ def _joint_table(joints: Mapping[str, _Values]) -> Table | None:
 
 
 def _joint_figure(folder: OutputPath, joints: Mapping[str, _Values]) -> tuple[str, str] | None:
-    """Caption and file of the plot."""
+    """Draw the plot of corrections and standard deviations; returns its caption and file."""
     if not joints:
         return None
     figure = Figure(figsize=(max(5.0, 1.5 + 0.5 * len(joints)), 5.0), layout="constrained")

@@ -17,17 +17,17 @@ from .folder import kinematics_tables
 from .manifest import Job
 
 _MADE = {"calibrate": "calibration", "import": "recording"}
-"""Step -> folder of the sequence file that it writes; the results of a job refer to the first one."""
+"""Step -> folder of the sequence file that it writes; a job's results refer to the first of these that exists."""
 
 
 def sequence_file(folder: OutputPath, job: Job) -> Path:
-    """Sequence file of a job's results, given its folder."""
+    """Sequence file to which a job's results refer."""
     made = [folder / name / "sequence.toml" for step, name in _MADE.items() if step in job.steps]
     return next((path.path for path in made if holds_file(path)), job.recording)
 
 
 def review_project(folder: OutputPath, job: Job) -> Path:
-    """Project for the review of a job, created if missing. New results get a new project; old ones are kept.
+    """Project for the review of a job, created if missing. New results get a new project; old projects are kept.
 
     Raises:
         CartsError: a table of results cannot be read.
@@ -49,7 +49,7 @@ def review_project(folder: OutputPath, job: Job) -> Path:
 
 
 def _edits(sequence: Sequence, table: Path) -> Iterator[tuple[Key[Any], Any]]:
-    """Corrected joints and the verdict of each frame of a table."""
+    """Edits with the corrected joints and the verdict of each frame of a table."""
     order = {frame_id: index for index, frame_id in enumerate(sequence.frame_ids)}
     try:
         records: Mapping[str, Any] = parse_json(read_bytes(table.parent / "results.json", VALUES))["frames"]

@@ -1,1 +1,1 @@
-"""Decoders of foreign formats that libraries read; each runs in the child process of `carts_core.files.decoding`."""
+"""Decoders of foreign file formats that are based on libraries; they run in the child process of `files.decoding`."""

@@ -1,4 +1,4 @@
-"""ROS bags: their topics, the numbers in messages of the dVRK, and single messages as plain values."""
+"""ROS bags: topics, numeric data in dVRK messages, and single messages as plain values."""
 
 from array import array
 from dataclasses import fields, is_dataclass
@@ -11,32 +11,33 @@ import numpy as np
 from ..files.reading import BAG, GIB, check_regular
 
 LIBRARIES = dict.fromkeys(("topics", "rows", "image_times", "message"), ("rosbags.highlevel", "rosbags.typesys"))
-"""Imported before the memory of a decoder is counted."""
+"""Modules per function that are imported before the memory limit applies."""
 _SAMPLED = 20
-"""Images whose headers are read in a bag that is too large to read each."""
+"""Number of image headers read from a bag that is too large to read all."""
 
 
 def topics(path: Path) -> list[tuple[str, str]]:
-    """Name and message type of each topic, in the order of the bag; a topic with several publishers occurs as often.
+    """Name and message type of each topic, in the order of the bag; repeated for topics with several publishers.
 
     Raises:
-        OSError: a file of the bag is no regular one.
-        Exception: the bag is damaged or of an unknown kind; the class is that of the storage format.
+        OSError: a file of the bag is not a regular file.
+        Exception: the bag is damaged or of an unknown kind; the class depends on the storage format.
     """
     return [(connection.topic, connection.msgtype) for connection in _opened(path).connections]
 
 
 def rows(path: Path, wanted: dict[str, tuple[str, str]]) -> dict[str, Any]:
-    """What is logged in some topics, in one pass.
+    """Read the data of several topics in one pass.
 
     Args:
-        path: of the bag.
-        wanted: for each topic, the name of what it is part of, and the kind of its messages: `joints`, `jaw`, `pose`
+        path: path of the bag.
+        wanted: topic -> name of the result to which it contributes, and kind of its messages: `joints`, `jaw`, `pose`
             or `text`.
 
     Returns:
-        For each name the last text, or for each list of joint names in the messages, empty but for `joints`, an array
-        [messages, 1 + values] of times [s] and joint positions, a jaw angle, or a pose (x y z, quaternion x y z w).
+        For each name, the last text; or, for each list of joint names in the messages (empty except for `joints`), an
+        array [messages, 1 + values] of times [s] and joint positions, a jaw angle, or a pose (x y z, quaternion
+        x y z w).
 
     Raises:
         Exception: as `topics`.
@@ -63,7 +64,7 @@ def rows(path: Path, wanted: dict[str, tuple[str, str]]) -> dict[str, Any]:
 
 
 def image_times(path: Path, topic: str) -> tuple[np.ndarray, np.ndarray]:
-    """Record times [ns] and times of the headers [s] of a topic's images; a large bag with an index is not read whole.
+    """Record times [ns] and header times [s] of a topic's images; large bags with an index are only sampled.
 
     Raises:
         Exception: as `topics`.
@@ -74,7 +75,7 @@ def image_times(path: Path, topic: str) -> tuple[np.ndarray, np.ndarray]:
     size = sum(file.stat().st_size for file in ([path] if path.is_file() else path.rglob("*")) if file.is_file())
     record: list[int] = []
     late: list[int] = []
-    # In bags up to 1 GiB every image message is read for the time in its header.
+    # In bags of up to 1 GiB, the header time of every image is read.
     if size > GIB and all(indexes):
         record = sorted(
             entry.time for index in indexes if index for connection in connections for entry in index[connection.id]
@@ -91,12 +92,12 @@ def image_times(path: Path, topic: str) -> tuple[np.ndarray, np.ndarray]:
 
 
 def message(path: Path, topic: str, time: int | None = None) -> dict[str, Any] | None:
-    """Fields of a message by name, None without one.
+    """Fields of a message by name; None if there is no message.
 
     Args:
-        path: of the bag.
-        topic: of the message.
-        time: at which it was recorded [ns]; None for the first one.
+        path: path of the bag.
+        topic: topic of the message.
+        time: record time [ns]; None for the first message.
 
     Raises:
         Exception: as `topics`.
@@ -111,7 +112,7 @@ def message(path: Path, topic: str, time: int | None = None) -> dict[str, Any] |
 
 @lru_cache(1)
 def _opened(path: Path) -> Any:
-    """A reader, kept open for further calls."""
+    """Reader of a bag, kept open for further calls."""
     from rosbags.highlevel import AnyReader  # noqa: PLC0415 - an extra
     from rosbags.typesys import Stores, get_typestore  # noqa: PLC0415
 
@@ -133,7 +134,7 @@ def _plain(value: Any) -> Any:
 
 
 def _stamp(decoded: Any, time: int) -> float:
-    """The time in a message's header, or that at which it was recorded [s]."""
+    """Time in a message's header, or the record time if there is none [s]."""
     stamp = getattr(getattr(decoded, "header", None), "stamp", None)
     nanoseconds = time if stamp is None or stamp.sec == 0 else stamp.sec * 10**9 + stamp.nanosec
     return nanoseconds * 1e-9
@@ -152,8 +153,8 @@ def _values(decoded: Any, kind: str) -> tuple[float, ...]:
 
 
 def _header_time(raw: bytes, time: int) -> int:
-    """The stamp of a message that begins with a header [ns], without decoding its pixels."""
-    start = 4  # ROS 1 has the sequence number there, ROS 2 the encapsulation.
+    """Time stamp of a message that begins with a header [ns], read without decoding the message."""
+    start = 4  # Preceded by the sequence number in ROS 1, and by the encapsulation header in ROS 2.
     seconds = int.from_bytes(raw[start : start + 4], "little")
     nanoseconds = int.from_bytes(raw[start + 4 : start + 8], "little")
     return seconds * 10**9 + nanoseconds if seconds and nanoseconds < 10**9 else time

@@ -1,4 +1,4 @@
-"""Triangle meshes of files that trimesh reads."""
+"""Triangle meshes, read with trimesh."""
 
 import io
 import os
@@ -14,20 +14,20 @@ from ..files.image_size import size_problem
 from ..files.reading import IMAGE, MESH, is_regular, read_bytes
 
 MOST_FACES = 1_000_000
-"""Triangles of one mesh file before it is simplified."""
+"""Largest number of triangles in a mesh file, before simplification."""
 MOST_PARTS = 1_000
-"""Instances of meshes in one file."""
+"""Largest number of mesh instances in a file."""
 _IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 
 
 class _BesideTheMesh(FilePathResolver):
-    """Materials and textures that a mesh names: regular files below its folder, of a bounded size."""
+    """Resolver of materials and textures of a mesh: regular files of limited size in its folder or below."""
 
     def get(self, name: str) -> bytes:
-        """The content of a file.
+        """Content of a file.
 
         Raises:
-            OSError, ValueError: it is missing, outside the folder, or not one that is read.
+            OSError, ValueError: the file is missing, outside the folder, or of a kind that is not read.
         """
         for candidate in (name.strip(), name.strip().lstrip("/"), os.path.split(name)[-1]):
             path = Path(self.absolute(candidate))
@@ -43,19 +43,19 @@ class _BesideTheMesh(FilePathResolver):
 def mesh_parts(
     path: Path, kind: str
 ) -> list[tuple[Float[np.ndarray, "V 3"], Int[np.ndarray, "F 3"], Float[np.ndarray, "3"] | None]]:
-    """Vertices, triangles and colour, None without one, of each mesh in a file.
+    """Vertices, triangles, and colour or None, of each mesh in a file.
 
     Args:
-        path: the file.
-        kind: as trimesh calls it, say "stl".
+        path: path of the mesh file.
+        kind: file type in trimesh, such as "stl".
 
     Raises:
-        OSError: it cannot be read.
-        RobotError: it has too many triangles or parts.
-        Exception: it is damaged; the class is that of the reader.
+        OSError: the file cannot be read.
+        RobotError: the file has too many triangles or parts.
+        Exception: the file is damaged; the class depends on the reader.
     """
     content = read_bytes(path, MESH)
-    # A binary STL has 84 bytes before its triangles and 50 for each of them.
+    # A binary STL has a header of 84 bytes and 50 bytes per triangle.
     if kind == "stl" and len(content) > 84 + 50 * MOST_FACES and not content.startswith(b"solid"):
         raise RobotError(f"mesh {path} has more than {MOST_FACES:,} triangles. Export a simpler one.")
     loaded = trimesh.load_scene(io.BytesIO(content), file_type=kind, resolver=_BesideTheMesh(str(path)))
@@ -70,7 +70,7 @@ def mesh_parts(
 
 
 def mesh_color(mesh: trimesh.Trimesh) -> Float[np.ndarray, "3"] | None:
-    """The main colour of a mesh's material, RGB in [0, 1]; None without one."""
+    """Main colour of a mesh's material, RGB in [0, 1], or None."""
     visual = mesh.visual
     material = getattr(visual, "material", None)
     rgba = getattr(material, "main_color", None) if material is not None else getattr(visual, "main_color", None)

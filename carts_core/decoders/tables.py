@@ -1,4 +1,4 @@
-"""Tables and arrays of other programs: Parquet, NumPy and MATLAB files."""
+"""Tables and arrays from Parquet, NumPy and MATLAB files."""
 
 import io
 from pathlib import Path
@@ -9,18 +9,19 @@ import numpy as np
 from ..files.reading import CALIBRATION, TABLE, read_bytes
 
 MOST_CELLS, MOST_ROWS, MOST_COLUMNS = 10_000_000, 1_500_000, 10_000
-"""Most values, rows and columns of a table."""
+"""Largest number of values, rows and columns of a table."""
 LIBRARIES = {"read_parquet": ("pyarrow.parquet",), "read_matlab": ("scipy.io",)}
-"""Imported before the memory of a decoder is counted."""
+"""Modules per function that are imported before the memory limit applies."""
 
 
 def read_parquet(path: Path) -> dict[str, Any]:
-    """Columns of a Parquet file by name [rows]; [rows, values] where each row holds as many numbers.
+    """Columns of a Parquet file by name [rows]; [rows, values] for lists of numbers of equal length.
 
-    Columns of texts and of rows of different lengths are lists; a field of a struct is the column `struct.field`.
+    Columns of texts, and of lists of different lengths, are Python lists; a field of a struct is the column
+    `struct.field`.
 
     Raises:
-        OSError, ValueError: it cannot be read, or has too many values.
+        OSError, ValueError: the file cannot be read, or has too many values.
     """
     import pyarrow  # noqa: PLC0415 - an extra
     import pyarrow.parquet  # noqa: PLC0415
@@ -28,7 +29,7 @@ def read_parquet(path: Path) -> dict[str, Any]:
     try:
         file = pyarrow.parquet.ParquetFile(io.BytesIO(read_bytes(path, TABLE)))
         groups = [file.metadata.row_group(number) for number in range(file.metadata.num_row_groups)]
-        # A run of equal values takes some bytes, however long it is.
+        # A run of equal values takes few bytes at any length, so the file size does not limit the number of values.
         cells = sum(group.column(number).num_values for group in groups for number in range(group.num_columns))
         check_size(-(-cells // max(file.metadata.num_columns, 1)), file.metadata.num_columns)
         table = file.read()
@@ -46,7 +47,7 @@ def read_parquet(path: Path) -> dict[str, Any]:
 
 
 def _matrix(rows: list[list[Any] | None]) -> Any:
-    """Rows of numbers as an array, missing ones as NaN; the list itself if they are no numbers or differ in length."""
+    """Rows of numbers as an array, missing rows as NaN; the list itself if rows are not numeric or differ in length."""
     lengths = {len(row) for row in rows if row is not None}
     if len(lengths) != 1:
         return rows
@@ -58,10 +59,10 @@ def _matrix(rows: list[list[Any] | None]) -> Any:
 
 
 def read_arrays(path: Path) -> dict[str, np.ndarray]:
-    """The arrays of a .npz file by name, or the one of a .npy file under an empty name.
+    """Arrays of a .npz file by name, or the array of a .npy file under an empty name.
 
     Raises:
-        OSError, ValueError: it cannot be read, or holds objects.
+        OSError, ValueError: the file cannot be read, or contains Python objects.
     """
     content = io.BytesIO(read_bytes(path, TABLE))
     loaded = np.load(content, allow_pickle=False)
@@ -72,11 +73,11 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
 
 
 def read_matlab(path: Path) -> dict[str, Any]:
-    """Variables of a MATLAB file (version 5) by name; structs as dictionaries.
+    """Variables of a MATLAB file (version 5) by name; structs are dictionaries.
 
     Raises:
-        OSError: it is missing, or no regular file of the size of a calibration.
-        ValueError: it is damaged, or of another version.
+        OSError: the file is missing, not a regular file, or larger than a calibration can be.
+        ValueError: the file is damaged or of another version.
     """
     from scipy.io import loadmat  # noqa: PLC0415
 
@@ -87,7 +88,7 @@ def read_matlab(path: Path) -> dict[str, Any]:
         variables = loadmat(io.BytesIO(content), simplify_cells=True)
     except MemoryError:
         raise
-    except Exception as error:  # scipy raises whatever its readers meet
+    except Exception as error:  # scipy's readers raise many kinds of errors
         raise ValueError(f"it is no MATLAB file of version 5 ({error})") from error
     names = [_name_of_object(name, value) for name, value in variables.items()]
     if name := next(filter(None, names), ""):
@@ -96,7 +97,7 @@ def read_matlab(path: Path) -> dict[str, Any]:
 
 
 def _name_of_object(name: str, value: Any) -> str:
-    """Name of a variable that is an object (MCOS), whose content is in a workspace of MATLAB's own; else empty."""
+    """Name of a variable that is a MATLAB object (MCOS), whose content cannot be read; empty for other variables."""
     if getattr(value, "dtype", None) is not None and value.dtype.names and "s0" in value.dtype.names:
         found = value["s0"].reshape(-1)[0]
         return found.decode("ascii", "replace") if isinstance(found, bytes) else str(found)
@@ -107,7 +108,7 @@ def check_size(rows: int, columns: int = 1) -> None:
     """Check the number of rows and columns of a table.
 
     Raises:
-        ValueError: there are too many.
+        ValueError: there are too many rows, columns or values.
     """
     limits = (rows * columns, MOST_CELLS, "values"), (rows, MOST_ROWS, "rows"), (columns, MOST_COLUMNS, "columns")
     for count, most, what in limits:

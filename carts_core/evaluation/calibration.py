@@ -1,4 +1,4 @@
-"""Evaluation of calibrations against the truth, and their report."""
+"""Evaluation of calibrations against ground truth, and reports."""
 
 import json
 from collections.abc import Mapping
@@ -29,16 +29,16 @@ class FrameResidual:
 
     frame: str
     weight: float
-    """Weight in the calibration, in [0, 1]."""
+    """Weight of the frame in the calibration, in [0, 1]."""
     loss_before: float
     loss_after: float
     dice_before: dict[str, float]
-    """Camera -> Dice; only cameras with a mask of this frame."""
+    """Camera -> Dice, for cameras with a mask of this frame."""
     dice_after: dict[str, float]
 
 
 def frame_residuals(sequence: Sequence, frames: Frames[Frame], result: CalibrationResult) -> list[FrameResidual]:
-    """Residuals of the frames of a calibration: losses, and Dice with masks where given."""
+    """Residuals of the frames of a calibration: losses, and Dice if masks are given."""
     overlaps = []
     for scene in (sequence.scene, result.scene):
         renderers = {camera: Renderer(scene, cameras=[camera]) for camera in frames[0].images}
@@ -58,7 +58,7 @@ def _overlap(scene: Scene, frame: Frame, renderers: dict[str, Renderer]) -> dict
 
 
 def mean_dice(residuals: Frames[FrameResidual], camera: str) -> tuple[float, float] | None:
-    """Mean Dice of a camera before and after; None where no frame has a mask."""
+    """Mean Dice of a camera before and after the calibration; None if no frame has a mask."""
     seen = [residual for residual in residuals if camera in residual.dice_before]
     if not seen:
         return None
@@ -67,7 +67,7 @@ def mean_dice(residuals: Frames[FrameResidual], camera: str) -> tuple[float, flo
 
 
 def calibration_json(before: Scene, result: CalibrationResult, residuals: Frames[FrameResidual]) -> dict[str, Any]:
-    """Both calibrations, their difference and the residuals as JSON; matrices in metres, other units in the keys."""
+    """Both calibrations, their difference and the residuals as JSON; matrices in metres, other units in key names."""
     cameras = zip(before.cameras, result.scene.cameras, strict=True)
     found = result.assessment
     return {
@@ -106,12 +106,12 @@ def moved_frames(before: Scene, after: Scene) -> list[tuple[str, float, float]]:
 
 
 def beyond_prior(before: Scene, result: CalibrationResult, known: Mapping[str, Float[np.ndarray, "6 6"]]) -> str | None:
-    """Text on base frames that moved farther than the hand-eye calibration allows; None if there are none.
+    """Warning about base frames that moved farther than the hand-eye calibration allows; None if there are none.
 
     Args:
-        before: scene with the calibration before.
-        result: the new calibration.
-        known: arm -> covariance of its base frame, as of `HandEyeResult`.
+        before: scene with the previous calibration.
+        result: result of the new calibration.
+        known: arm -> covariance of its base frame, as in `HandEyeResult`.
     """
     said = []
     for arm in result.beyond:
@@ -143,9 +143,9 @@ def _difference(before: Float[np.ndarray, "4 4"], after: Float[np.ndarray, "4 4"
 
 
 def pose_distance(before: Float[np.ndarray, "4 4"], after: Float[np.ndarray, "4 4"]) -> tuple[float, float]:
-    """Angle [deg] between two poses, and distance of their translations [mm]."""
+    """Rotation angle [deg] and translation distance [mm] between two poses."""
     turned = after[:3, :3] @ before[:3, :3].T
-    # The chord is exact for small angles, where the arc cosine of the trace is not.
+    # The chord length is accurate for small angles, unlike the arc cosine of the trace.
     angle = 2.0 * np.arcsin(np.clip(np.linalg.norm(turned - np.eye(3)) / np.sqrt(8.0), 0.0, 1.0))
     return float(np.rad2deg(angle)), float(1000.0 * np.linalg.norm(after[:3, 3] - before[:3, 3]))
 
@@ -156,11 +156,11 @@ def write_calibration(
     """Write `sequence.toml`, `calibration.json`, `frames.png`, `unknowns.png` and `README.md`.
 
     Args:
-        folder: output, created if missing.
-        target: final location of the folder, to which paths in the sequence file are relative.
-        sequence: with the calibration before.
-        result: the new calibration.
-        residuals: of its frames.
+        folder: output folder, created if missing.
+        target: final location of the folder; paths in the sequence file are relative to it.
+        sequence: sequence with the previous calibration.
+        result: result of the new calibration.
+        residuals: residuals of its frames.
     """
     text = calibrated_sequence_file(sequence.path, target, sequence.scene, result.scene)
     write_text(folder / "sequence.toml", text)
@@ -188,13 +188,13 @@ def _cameras(residuals: Frames[FrameResidual]) -> list[str]:
 
 
 def _figure(width: float, height: float) -> "Figure":
-    """An empty figure of a size [inch]."""
-    # Imported late: it takes 0.3 s.
+    """Create an empty figure of a given size [inch]."""
+    # Imported on use, because the import takes 0.3 s.
     import matplotlib  # noqa: PLC0415
     from matplotlib.figure import Figure  # noqa: PLC0415
 
     matplotlib.use("Agg")
-    # Names of frames and cameras are not formulas.
+    # Names of frames and cameras must not be parsed as formulas.
     matplotlib.rcParams["text.parse_math"] = False
     return Figure(figsize=(width, height), layout="constrained")
 

@@ -1,4 +1,4 @@
-"""Metrics of masks and joint positions, and evaluations of frames and sequences against the truth."""
+"""Metrics of masks and joint positions, and evaluation of frames and sequences against ground truth."""
 
 import time
 from collections.abc import Iterator, Mapping
@@ -34,7 +34,7 @@ Joints = dict[str, np.ndarray]
 
 
 def dice(a: Bool[np.ndarray, "h w"], b: Bool[np.ndarray, "h w"]) -> float:
-    """Dice score of two masks, 0 to 1; two empty masks agree."""
+    """Dice score of two masks in [0, 1]; 1 if both are empty."""
     total = int(a.sum()) + int(b.sum())
     return 1.0 if total == 0 else 2.0 * int((a & b).sum()) / total
 
@@ -43,7 +43,7 @@ def normalized_surface_distance(a: Bool[np.ndarray, "h w"], b: Bool[np.ndarray, 
     """Normalized surface distance (NSD): share of both outlines within `tolerance` [px] of the other one, in [0, 1].
 
     An outline consists of the mask's pixels with a 4-neighbour outside the mask. The image border does not count as
-    outline. Two masks without outline agree if they are equal.
+    outline. For two masks without outline, the score is 1 if they are equal, else 0.
     """
     outlines = [_outline(mask) for mask in (a, b)]
     total = sum(int(outline.sum()) for outline in outlines)
@@ -60,7 +60,7 @@ def normalized_surface_distance(a: Bool[np.ndarray, "h w"], b: Bool[np.ndarray, 
 
 def _outline(mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
     cross = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
-    # OpenCV extends the mask beyond the border.
+    # OpenCV extrapolates the mask beyond the border.
     return mask & (cv2.erode(mask.astype(np.uint8), cross) == 0)
 
 
@@ -73,7 +73,7 @@ def joint_mae_deg(
     """Mean absolute error [deg] of the named revolute joints over all arms; None without ground truth.
 
     Args:
-        scene: with the arms.
+        scene: scene with the arms.
         estimate, truth: arm name -> joint positions [rad, m].
         joints: arm name -> joints to compare.
     """
@@ -88,11 +88,11 @@ def joint_mae_deg(
 def joint_std_deg(
     scene: Scene, joint_std: Mapping[str, Float[np.ndarray, " dofs"]], joints: Mapping[str, tuple[str, ...]]
 ) -> float | None:
-    """Mean standard deviation [deg] of the named revolute joints over all arms; None where none is known.
+    """Mean standard deviation [deg] of the named revolute joints over all arms; None if none is known.
 
     Args:
-        scene: with the arms.
-        joint_std: arm name -> standard deviations [rad, m]; NaN ones do not count.
+        scene: scene with the arms.
+        joint_std: arm name -> standard deviations [rad, m]; NaN values are ignored.
         joints: arm name -> joints to compare.
     """
     values = [
@@ -108,7 +108,7 @@ def _revolute(arm: Arm, values: Float[np.ndarray, " dofs"], joints: Mapping[str,
 
 @dataclass(frozen=True)
 class FrameScore:
-    """Scores of one optimized frame; None without ground truth."""
+    """Scores of one optimized frame; fields are None without ground truth."""
 
     frame: str
     camera: str
@@ -120,17 +120,17 @@ class FrameScore:
     iterations: int
     seconds: float
     stopped: str
-    """Stop reason, or the source of the frame's values in sequence mode."""
+    """Termination reason, or the source of the frame's values in sequence mode."""
     joint_std_deg: float | None = None
-    """Mean standard deviation of measured revolute joints [deg]; None where it is not known."""
+    """Mean standard deviation of measured revolute joints [deg]; None if unknown."""
     verdict: str | None = None
-    """Verdict on the mask: good, doubtful or failed; None if not assessed."""
+    """Verdict on the mask: `good`, `doubtful` or `failed`; None if not assessed."""
     reason: str | None = None
-    """Reason of the verdict, one sentence."""
+    """Reason for the verdict, one sentence."""
     not_determined: list[str] | None = None
-    """`ARM.JOINT` of undetermined joints; None where no deviation is known."""
+    """Undetermined joints as `ARM.JOINT`; None if no standard deviation is known."""
     base_frame_gain: float | None = None
-    """Share of the residual that free base frames would explain [1]; None where not known."""
+    """Share of the residual that free base frames would explain [1]; None if unknown."""
 
 
 @dataclass(frozen=True)
@@ -139,13 +139,13 @@ class Estimate:
 
     state: SceneState
     joint_positions: dict[str, np.ndarray]
-    """Arm name -> [rad, m]."""
+    """Arm name -> joint positions [rad, m]."""
     joint_std: dict[str, np.ndarray]
     """Arm name -> standard deviations [rad, m]."""
     iterations: int
     seconds: float
     stopped: str
-    """Stop reason, or the source of the frame's values in sequence mode."""
+    """Termination reason, or the source of the frame's values in sequence mode."""
     base_frame_gain: float | None = None
     assessment: Assessment | None = None
 
@@ -177,19 +177,19 @@ def evaluate(
     """Optimize each frame in each domain and camera, and yield its score.
 
     Args:
-        sequence: with or without ground truth of masks and kinematics.
-        networks: the networks, or another predictor of surface maps.
-        frames: positions in the sequence.
-        cameras: names; optimized one by one, unless `together`.
-        domains: names.
-        settings, free: of the optimization.
-        model: of sequence mode (see `SequenceOptimizer`); by default, each frame is optimized alone.
-        perturb_deg: 0 starts at the measured joint positions. Otherwise starts at the true ones (the measured ones
-            without ground truth) with each measured joint moved by this much; see `perturb`.
-        seed: of the perturbation, which is the same for a frame in all cameras and domains. In sequence mode it is the
-            same for all frames, like an error of calibration.
-        together: optimize all cameras at once; the time is divided among their scores.
-        given: masks that `networks` fits. Their ignored pixels are not compared, and they serve as ground truth for
+        sequence: sequence with or without ground truth of masks and kinematics.
+        networks: networks or another predictor of surface maps.
+        frames: indices in the sequence.
+        cameras: names of cameras, optimized one by one unless `together`.
+        domains: names of domains.
+        settings, free: settings and free parameters of the optimization.
+        model: settings of sequence mode (see `SequenceOptimizer`); by default, frames are optimized separately.
+        perturb_deg: perturbation of each measured joint at the start, applied to the true joint positions (the measured
+            ones without ground truth); see `perturb`. 0 starts at the measured joint positions.
+        seed: seed of the perturbation, which is the same for a frame in all cameras and domains. In sequence mode, it
+            is the same for all frames, like a calibration error.
+        together: optimize all cameras jointly; the time is divided equally among their scores.
+        given: masks to which `networks` fits. Their ignored pixels are not compared, and they are the ground truth of
             cameras without masks in the sequence.
     """
 
@@ -257,13 +257,13 @@ def evaluate(
 def frame_score(
     sequence: Sequence, frame: Frame, camera: str, renderer: Renderer, start: Joints, found: Estimate
 ) -> FrameScore:
-    """Compare an estimate of a frame with the truth.
+    """Score an estimate of a frame against ground truth.
 
     Args:
-        sequence, frame, camera: that were optimized.
-        renderer: of that camera in full size.
-        start: arm name -> joint positions before [rad, m].
-        found: the estimate.
+        sequence, frame, camera: optimized sequence, frame and camera.
+        renderer: renderer of that camera at full resolution.
+        start: arm name -> initial joint positions [rad, m].
+        found: estimate to score.
     """
     mask, assessment = (frame.masks or {}).get(camera), found.assessment
 
@@ -293,14 +293,14 @@ def frame_score(
 
 
 def camera_groups(cameras: Names[str], together: bool) -> list[tuple[str, ...]]:
-    """Groups of cameras that are optimized together: all of them, or each alone."""
+    """Groups of jointly optimized cameras: one group of all, or one per camera."""
     return [tuple(cameras)] if together else [(camera,) for camera in cameras]
 
 
 def start_positions(
     sequence: Sequence, frame: Frame, perturb_deg: float, seed: int | tuple[int, ...]
 ) -> dict[str, np.ndarray]:
-    """Start of the optimization of a frame; see `evaluate`. A seed in a tuple gives all frames the same signs."""
+    """Initial joint positions of a frame [rad, m]; see `evaluate`. A tuple as seed gives all frames equal signs."""
     if perturb_deg == 0:
         return frame.measured
     origin = {**frame.measured, **(frame.truth or {})}
@@ -309,7 +309,7 @@ def start_positions(
 
 
 def mean_score(scores: Names[FrameScore]) -> dict[str, Any]:
-    """Means over frames under the same keys; None for values that are missing or not numbers."""
+    """Means over frames, under the names of the fields; None for missing or non-numeric values."""
     result: dict[str, Any] = {}
     for field in fields(FrameScore):
         values = [value for score in scores if isinstance(value := getattr(score, field.name), (int, float))]
@@ -324,7 +324,7 @@ def to_json(scores: Names[FrameScore]) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Starts:
-    """Frames as input of sequence mode, with the start as `measured`."""
+    """Frames as input of sequence mode, with the initial joint positions as `measured`."""
 
     sequence: Sequence
     domain: str
@@ -334,11 +334,11 @@ class Starts:
     """Seed of the perturbation, which is the same in all frames."""
 
     def frame(self, index: int) -> Frame:
-        """The frame at a position of the sequence."""
+        """Frame at an index of the sequence."""
         frame = self.sequence.frame(index, self.domain, self.cameras)
         return replace(frame, measured=start_positions(self.sequence, frame, self.perturb_deg, (self.seed,)))
 
     def times(self, frames: Names[int]) -> dict[int, float | None]:
-        """Position -> time of chosen frames [s]."""
+        """Index -> time of the given frames [s]."""
         stamps = self.sequence.timestamps
         return {index: None if stamps is None else float(stamps[index]) for index in frames}

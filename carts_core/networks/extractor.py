@@ -20,9 +20,9 @@ def hybrid(
     silhouette: Float[Tensor, "*batch h w"],
     background: Float[Tensor, "*#batch 3 h w"],
 ) -> Float[Tensor, "*batch 3 h w"]:
-    """BG_m + Î of the paper: the rendering where the silhouette is, the mean background elsewhere.
+    """Hybrid image (BG_m + Î in the paper): rendering inside the silhouette, mean background outside.
 
-    At a silhouette between 0 and 1 (blurred, or in a gradient) both are mixed as by a lens.
+    Where the silhouette is between 0 and 1 (blurred, or for gradients), the background is blended in linearly.
 
     Args:
         rendering_image: rendered arms, RGB in [0, 1], black where the silhouette is 0.
@@ -33,18 +33,18 @@ def hybrid(
 
 
 class FeatureExtractor:
-    """The trained feature and surface networks, frozen and folded. Made by `FeatureExtractor.load`.
+    """Trained feature and surface networks, frozen and folded. Created by `FeatureExtractor.load`.
 
-    Gradients flow to images, never to weights.
+    Gradients are computed for images, not for weights.
 
     Attributes:
-        weights: what was read, "feature" and "surface" network.
-        sha256: fingerprint of both.
+        weights: weights read from the files, by kind: "feature" and "surface".
+        sha256: fingerprint of both networks.
         working_size: width and height [px] of the images that the networks were trained for.
         stride: width and height of an input must be multiples of this [px].
         channels: number of feature channels.
-        device: where the networks live.
-        engine: who runs the surface network: "torch" or "onnx".
+        device: device of the networks.
+        engine: inference engine of the surface network, "torch" or "onnx".
     """
 
     def __init__(
@@ -67,21 +67,21 @@ class FeatureExtractor:
 
     @property
     def fingerprint(self) -> str:
-        """Fingerprint of the networks and the inference engine, as engines differ by round-off."""
+        """Fingerprint of the networks and of the inference engine, because engines differ by round-off."""
         return self.sha256 if self.engine == "torch" else f"{self.sha256} {self.engine}"
 
     @staticmethod
     def load(
         *weights: Path | str, device: str | torch.device = "cpu", inference: Inference = "torch"
     ) -> "FeatureExtractor":
-        """Read weights files; a network without one has the shipped weights.
+        """Load networks from weights files; a network without a file has the shipped weights.
 
         Args:
-            inference: who runs the surface network; `auto` measures once on each machine who is faster.
+            inference: engine of the surface network; `auto` selects the faster one, timed once on each machine.
 
         Raises:
-            SettingsError: `onnx` was asked for and is not possible.
-            WeightsError: a file is missing, is not safetensors, or holds no network, or two hold the same kind.
+            SettingsError: `onnx` was requested but cannot be used.
+            WeightsError: a file is missing, is not safetensors or contains no network, or two contain the same kind.
         """
         read: dict[str, tuple[Path, Weights]] = {}
         for path in map(Path, weights):
@@ -99,13 +99,13 @@ class FeatureExtractor:
         return FeatureExtractor(read["feature"][1], read["surface"][1], device, inference)
 
     def features(self, images: Float[Tensor, "batch 3 h w"]) -> Float[Tensor, "batch channels h w"]:
-        """Features of the last layer before the head (F_I and F_Î of the paper), not negative.
+        """Features of the last layer before the head (F_I and F_Î in the paper), which are non-negative.
 
         Args:
             images: RGB in [0, 1]; h and w are multiples of `stride`.
 
         Raises:
-            SettingsError: another number of channels or another size.
+            SettingsError: the number of channels or the size is not allowed.
         """
         return self._features.features(images.contiguous(memory_format=torch.channels_last))
 
@@ -117,9 +117,9 @@ class FeatureExtractor:
     def surface(
         self, images: Float[Tensor, "batch 3 h w"], given: Float[Tensor, "batch 6 h w"]
     ) -> Float[Tensor, "batch 6 h w"]:
-        """Predict surface maps of images, given those of the prior poses.
+        """Predict surface maps from images and the surface maps of prior poses.
 
-        They are where the images are, wherever the network runs. Arguments and errors as `SurfaceNetwork.forward`.
+        The result is on the device of the images. Arguments and errors as `SurfaceNetwork.forward`.
         """
         if self._faster is not None:
             self._surface.check_input(images, 3)

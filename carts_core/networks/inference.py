@@ -1,6 +1,6 @@
 """Inference engine of the surface network: torch or ONNX Runtime.
 
-`auto` takes the faster one on this machine, measured once and remembered.
+`auto` selects the faster one on this machine; the timing is stored.
 """
 
 import io
@@ -32,27 +32,27 @@ from ..settings.optimization import Engine, Inference
 from .network import SurfaceNetwork
 
 _VERSION = 1
-"""Version of the exported graph, in its file's name."""
+"""Version of the exported graph, part of its file name."""
 _OPSET = 17
 _AXES = {0: "cameras", 2: "height", 3: "width"}
 
 
 class _Maps(nn.Module):
-    """Graph from an image and a given surface map to a surface map."""
+    """Module to export: predicts a surface map from an image and a prior surface map."""
 
     def __init__(self, network: SurfaceNetwork) -> None:
         super().__init__()
         self.network = network
 
     def forward(self, images: Tensor, given: Tensor) -> Tensor:
-        """The surface maps."""
+        """Predicted surface maps."""
         return self.network(images, given).map()
 
 
 class OnnxSurface:
-    """A surface network in ONNX Runtime, with `inference_threads` as they are when it is made.
+    """Surface network in ONNX Runtime, with the value of `inference_threads` at creation.
 
-    Its graph is exported once and kept in the cache, under the fingerprint of the weights.
+    The graph is exported once and stored in the cache, under the fingerprint of the weights.
 
     Raises:
         RuntimeError: torch cannot export the network, or ONNX Runtime cannot load it.
@@ -63,7 +63,7 @@ class OnnxSurface:
         try:
             self._session = inference_session(read_bytes(path, WEIGHTS), inference_threads())
         except (OSError, RuntimeError, ValueError):
-            # It is not there yet, or was damaged.
+            # The file does not exist yet, or is damaged.
             graph = _exported(network)
             self._session = inference_session(graph, inference_threads())
             with suppress(OutputError):
@@ -72,7 +72,7 @@ class OnnxSurface:
     def __call__(
         self, images: Float[Tensor, "batch 3 h w"], given: Float[Tensor, "batch 6 h w"]
     ) -> Float[Tensor, "batch 6 h w"]:
-        """The same as `SurfaceNetwork.forward(images, given).map()`, but for rounding.
+        """Predict surface maps; equal to `SurfaceNetwork.forward(images, given).map()` up to rounding.
 
         Raises:
             RuntimeError: ONNX Runtime cannot run the graph.
@@ -80,20 +80,20 @@ class OnnxSurface:
         inputs = {"images": images.contiguous().numpy(), "given": given.contiguous().numpy()}
         try:
             (maps,) = self._session.run(["maps"], inputs)
-        except Exception as error:  # Its errors have no base class but this.
+        except Exception as error:  # ONNX Runtime's errors have no narrower base class.
             raise RuntimeError(f"ONNX Runtime cannot run the graph: {error}") from error
         assert isinstance(maps, np.ndarray)
         return torch.from_numpy(maps)
 
 
 def _exported(network: SurfaceNetwork) -> bytes:
-    """The network as an ONNX graph for images of any size."""
+    """Export the network as an ONNX graph for images of any size."""
     side = 2 * network.architecture.stride
     example = torch.rand(1, 3, side, side), torch.rand(1, network.inputs - 3, side, side)
     stream, names = io.BytesIO(), ["images", "given", "maps"]
     logging.getLogger("torch.onnx").setLevel(logging.ERROR)
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # Sizes are checked in Python, which the graph need not know of.
+        warnings.simplefilter("ignore")  # Sizes are checked in Python, so the graph needs no checks.
         torch.onnx.export(
             _Maps(network).eval(),
             example,
@@ -110,12 +110,12 @@ def _exported(network: SurfaceNetwork) -> bytes:
 TOLERANCE = 1e-4
 """Largest difference between equivalent surface maps [1]."""
 _GAIN = 0.9
-"""Share of torch's time below which another engine is preferred [1]."""
+"""Ratio to torch's time below which another engine is preferred [1]."""
 _ROUNDS = 7
 _MEASUREMENT = 2
-"""Version of the measurement in its file's name."""
+"""Version of the timing procedure, part of its file name."""
 _PROBE = 7, 13
-"""Height and width of the image that is measured, in strides of the network: a window around an arm."""
+"""Height and width of the timed image, in strides of the network; typical of a window around an arm."""
 
 Surface = Callable[[Tensor, Tensor], Tensor]
 
@@ -123,10 +123,10 @@ Surface = Callable[[Tensor, Tensor], Tensor]
 def surface_engine(
     network: SurfaceNetwork, sha256: str, device: torch.device, wanted: Inference
 ) -> "tuple[Engine, OnnxSurface | None]":
-    """Select the engine of the network.
+    """Select the inference engine of the surface network.
 
     Raises:
-        SettingsError: `onnx` was asked for and does not do.
+        SettingsError: `onnx` was requested but cannot be used.
     """
     if wanted == "torch":
         return "torch", None
@@ -147,7 +147,7 @@ def surface_engine(
 
 
 def full_precision(device: torch.device) -> AbstractContextManager[None]:
-    """Within it convolutions on a GPU are as exact as on a CPU; PyTorch's default has cuDNN round to 10 bits (TF32)."""
+    """Context manager that disables TF32 for convolutions on a GPU, whose 10-bit mantissa is PyTorch's default."""
     if device.type != "cuda":
         return nullcontext()
     return torch.backends.cudnn.flags(enabled=True, allow_tf32=False)
@@ -163,7 +163,7 @@ def _without(wanted: Inference, fault: str) -> tuple[Engine, None]:
 
 
 def _probe(network: SurfaceNetwork) -> tuple[Tensor, Tensor]:
-    """Fixed test image and given surface map."""
+    """Fixed test image and prior surface map."""
     height, width = (strides * network.architecture.stride for strides in _PROBE)
     chance = torch.Generator().manual_seed(0)
     images = torch.rand(1, 3, height, width, generator=chance)
@@ -177,7 +177,7 @@ def _difference(network: SurfaceNetwork, other: Surface) -> float:
 
 
 def _remembered(network: SurfaceNetwork, sha256: str, other: Surface) -> Engine:
-    """The faster engine, from a measurement stored on this machine."""
+    """Faster engine, from a timing that is stored on this machine."""
     versions = [version(name) for name in ("torch", "onnxruntime")]
     machine = platform.node(), platform.processor(), torch.get_num_threads(), inference_threads()
     key = fingerprint(_MEASUREMENT, sha256, versions, machine)[:32]
@@ -187,7 +187,7 @@ def _remembered(network: SurfaceNetwork, sha256: str, other: Surface) -> Engine:
     seconds = _times(network, other)
     engine: Engine = "onnx" if seconds["onnx"] < _GAIN * seconds["torch"] else "torch"
     try:
-        # Of several processes that measure at the same time, all take what the first one found.
+        # Processes that measure concurrently all use the result of the first one.
         write_new(output_path(path.parent, path.name), json.dumps({"engine": engine, "seconds": seconds}).encode())
     except OutputError:
         return engine

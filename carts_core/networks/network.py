@@ -1,7 +1,7 @@
 """Feature network and surface network.
 
-The feature network is a small U-Net whose last layer before the 1x1 head is what ACS compares. The surface network
-predicts a surface map from an image and the surface map of a prior pose.
+The feature network is a small U-Net; ACS compares the features of its last layer before the 1x1 head. The surface
+network predicts a surface map from an image and the surface map of a prior pose.
 """
 
 import copy
@@ -21,7 +21,7 @@ from ..settings import Architecture
 from ..threads import one_thread
 
 CONTRAST_FLOOR = 0.02
-"""Standard deviation [1] below which an image counts as empty and is not amplified any further."""
+"""Lower bound of the standard deviation by which images are normalized [1], so that noise is not amplified."""
 
 _SMOOTHINGS = 2
 _CONTRAST_SMOOTHINGS = 5
@@ -30,7 +30,7 @@ Network = TypeVar("Network", bound=nn.Module)
 
 
 class UNet(nn.Module):
-    """Convolution, batch norm and ReLU, down and up; skips are added, not concatenated, which costs half as much."""
+    """U-Net of convolution, batch norm and ReLU; skip connections are added, at half the cost of concatenation."""
 
     kind: ClassVar[str]
     """Name of the network in weights files."""
@@ -48,10 +48,10 @@ class UNet(nn.Module):
         self.decoder = nn.ModuleList(_block(o, o, n) for o, n in zip(widths[:-1], counts, strict=True))
 
     def decoded(self, x: Float[Tensor, "batch inputs h w"]) -> tuple[Tensor, Tensor]:
-        """Features at full resolution, and those at half the resolution from which they were computed.
+        """Features at full resolution, and the features at half the resolution from which they are computed.
 
         Raises:
-            SettingsError: another number of channels, or a size that is no multiple of `architecture.stride`.
+            SettingsError: the number of channels is wrong, or the size is not a multiple of `architecture.stride`.
         """
         self.check_input(x, self.inputs)
         skips: list[Tensor] = []
@@ -66,16 +66,16 @@ class UNet(nn.Module):
         return x, coarse
 
     def standardized(self, images: Float[Tensor, "batch 3 h w"]) -> Float[Tensor, "batch 3 h w"]:
-        """Images as the first convolution gets them; see `standardize`."""
+        """Standardized images, the input of the first convolution; see `standardize`."""
         self.check_input(images, 3)
         block = self.architecture.stride if self.architecture.local_mean else None
         return standardize(images, block, self.architecture.local_contrast)
 
     def check_input(self, x: Tensor, channels: int) -> None:
-        """Check the number of channels, and that the size can be halved at each level.
+        """Check the number of channels, and that the size is divisible by the stride.
 
         Raises:
-            SettingsError: it has not.
+            SettingsError: one of them is wrong.
         """
         stride = self.architecture.stride
         if x.ndim != 4 or x.shape[1] != channels or x.shape[2] % stride or x.shape[3] % stride:
@@ -85,7 +85,7 @@ class UNet(nn.Module):
             )
 
     def folded(self) -> Self:
-        """A frozen copy for inference: batch norms folded into the convolutions, channels-last, no gradients."""
+        """Frozen copy for inference: batch norms folded into the convolutions, channels-last, no gradients."""
         folded = copy.deepcopy(self).eval()
         for block in (*folded.encoder, *folded.decoder):
             _fold(block)
@@ -93,10 +93,10 @@ class UNet(nn.Module):
 
 
 class FeatureNetwork(UNet):
-    """The paper's network: a mask is a linear function of its features, and those are what ACS compares.
+    """Feature network of the paper: mask logits are a linear function of its features, which ACS compares.
 
-    Images are standardised: their local mean is subtracted, and the rest is scaled to unit deviation. The input is thus
-    nearly invariant to exposure, colour casts and smooth haze, without training on such images.
+    Images are standardised: their local mean is subtracted, and the difference is scaled to unit standard deviation.
+    The input is thus nearly invariant to exposure, colour casts and smooth haze, without training on such images.
     """
 
     kind = "feature"
@@ -106,13 +106,13 @@ class FeatureNetwork(UNet):
         self.head = nn.Conv2d(self.architecture.widths[0], 1, 1)
 
     def features(self, images: Float[Tensor, "batch 3 h w"]) -> Float[Tensor, "batch channels h w"]:
-        """The last layer before the head, F_I of the paper.
+        """Features of the last layer before the head, F_I in the paper.
 
         Args:
             images: RGB in [0, 1]; h and w are multiples of `architecture.stride`.
 
         Raises:
-            SettingsError: another number of channels, or a size that is no such multiple.
+            SettingsError: the number of channels or the size is not allowed.
         """
         return self.decoded(self.standardized(images))[0]
 
@@ -121,12 +121,12 @@ class FeatureNetwork(UNet):
         return self.head(self.features(images))
 
     def forward(self, images: Float[Tensor, "batch 3 h w"]) -> Float[Tensor, "batch 1 h w"]:
-        """The same as `logits`."""
+        """Same as `logits`."""
         return self.logits(images)
 
 
 def channels_last(network: Network) -> Network:
-    """The network with its weights in channels-last order, which is faster on CPUs and newer GPUs."""
+    """Network with weights in channels-last order, which is faster on CPUs and recent GPUs."""
     for parameter in network.parameters():
         if parameter.ndim == 4:
             parameter.data = parameter.data.contiguous(memory_format=torch.channels_last)
@@ -137,12 +137,13 @@ def channels_last(network: Network) -> Network:
 def standardize(
     images: Float[Tensor, "batch 3 h w"], block: int | None, local_contrast: float = 0.0
 ) -> Float[Tensor, "batch 3 h w"]:
-    """Images without their mean per channel, divided by their contrast: the deviation over all pixels and channels.
+    """Subtract the mean of each channel, and divide by the standard deviation over all pixels and channels.
 
     Args:
         images: RGB in [0, 1]; h and w are multiples of `block`.
-        block: the mean is a local one, smooth over about four blocks [px]; None takes that of the whole image.
-        local_contrast: share, as an exponent, of the deviation over about six blocks in what is divided by.
+        block: block size of a local mean, smooth over about four blocks [px]; None subtracts the mean of the image.
+        local_contrast: exponent of the local standard deviation (over about six blocks) in the divisor; that of the
+            global one is `1 - local_contrast`.
     """
     if block is None:
         detail = images - images.mean(dim=(2, 3), keepdim=True)
@@ -157,7 +158,7 @@ def standardize(
 
 
 def _local(images: Float[Tensor, "batch channels h w"], block: int, smoothings: int) -> Tensor:
-    """Means of blocks, each smoothing with its neighbours, at full size again."""
+    """Block means, smoothed `smoothings` times over 3 x 3 blocks and interpolated to full size."""
     mean = functional.avg_pool2d(images, block)
     for _ in range(smoothings):
         mean = functional.avg_pool2d(mean, 3, stride=1, padding=1, count_include_pad=False)
@@ -190,23 +191,23 @@ _HIDDEN = 24
 
 @dataclass(frozen=True)
 class SurfaceLogits:
-    """Predicted surface map with logits for its coverage; see `carts_core.model.parts`."""
+    """Predicted surface map with coverage as logits; see `carts_core.model.parts`."""
 
     coverage: Float[Tensor, "batch parts+1 h w"]
     """Log odds of background and of each part."""
     normals: Float[Tensor, "batch 3 h w"]
-    """Mean unit normal times coverage."""
+    """Mean unit normals times coverage."""
 
     @one_thread()
     def map(self) -> Float[Tensor, "batch 6 h w"]:
-        """The surface map."""
+        """Surface map, with coverage as probabilities."""
         return torch.cat([self.coverage.softmax(1)[:, 1:], self.normals], 1)
 
 
 class SurfaceNetwork(UNet):
-    """U-Net over a standardised image and the surface map of the measured kinematics.
+    """Surface network: a U-Net on a standardised image and the surface map of the measured kinematics.
 
-    The measured kinematics are wrong by a few degrees but give a prior pose of each arm, which the network corrects.
+    The measured kinematics have errors of a few degrees but provide prior poses, which the network corrects.
     """
 
     kind = "surface"
@@ -223,10 +224,10 @@ class SurfaceNetwork(UNet):
 
         Args:
             images: RGB in [0, 1]; h and w are multiples of `architecture.stride`.
-            given: surface maps of the kinematics as they are known; zero throughout where nothing is known.
+            given: surface maps of the prior poses; zero without prior.
 
         Raises:
-            SettingsError: another number of channels, or a size that is no such multiple.
+            SettingsError: the number of channels or the size is not allowed.
         """
         fine, coarse = self.decoded(torch.cat([self.standardized(images), given], 1))
         grown = functional.interpolate(self.coarse(coarse), scale_factor=2, mode="bilinear", align_corners=False)

@@ -1,6 +1,6 @@
 """Weights files: safetensors with the architecture and the training settings as metadata.
 
-Equal tensors give equal bytes.
+Files of equal tensors and metadata are byte-identical.
 """
 
 import hashlib
@@ -22,13 +22,14 @@ from ..wording import shortened
 from .network import FeatureNetwork, SurfaceNetwork, UNet
 
 _LENGTH = 8
-"""The header's own length comes first, and tensors begin at a multiple of it [bytes]."""
+"""Size of the header's length field and alignment of the tensors [bytes]."""
 
 
 def tensor_bytes(tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> bytes:
-    """A safetensors file; `safetensors` itself writes metadata in another order every time.
+    """Content of a safetensors file, reproducible, unlike that of `safetensors`, which varies the metadata's order.
 
     Args:
+        tensors: tensors by name.
         metadata: texts for the header, in this order.
     """
     content = save(dict(tensors))
@@ -58,7 +59,7 @@ class Weights:
     working_size: tuple[int, int]
     """Width and height [px] of the images that it was trained for."""
     training: dict
-    """Settings and figures of the training run, as written by `carts train`."""
+    """Settings and metrics of the training run, as written by `carts train`."""
     sha256: str
     """Fingerprint of the file."""
 
@@ -67,9 +68,9 @@ def save_weights(network: UNet, path: Path, training: dict, working_size: tuple[
     """Write a weights file atomically.
 
     Args:
-        network: the network whose state is written (batch norms included, so that training can go on from it).
-        path: the file, by convention `*.safetensors`; its folder is made.
-        working_size: width and height [px] of the images that the network is meant for.
+        network: network whose state is written, including batch norms, so that training can be continued.
+        path: path of the file, by convention `*.safetensors`; its folder is created.
+        working_size: width and height [px] of the images for which the network was trained.
     """
     metadata = {
         "format": f"carts-{network.kind}-network",
@@ -102,7 +103,7 @@ def read_weights(path: Path) -> Weights:
 
 
 def _header(path: Path) -> tuple[dict[str, str], dict[str, tuple[int, ...]]]:
-    """Metadata of a supported version, and the shape of every tensor."""
+    """Read the metadata, of a supported version, and the shape of every tensor."""
     try:
         check_regular(path, WEIGHTS)
         with safe_open(path, framework="pt") as file:
@@ -121,7 +122,7 @@ def _header(path: Path) -> tuple[dict[str, str], dict[str, tuple[int, ...]]]:
 
 
 def _described(path: Path, metadata: Mapping[str, str]) -> tuple[Architecture, tuple[int, ...], dict]:
-    """Architecture, working size [px] and the training settings."""
+    """Parse architecture, working size [px] and training settings from the metadata."""
     try:
         architecture = Architecture.from_json(metadata["architecture"])
         working_size = tuple(int(n) for n in parse_json(metadata["working_size"]))
@@ -143,8 +144,8 @@ def _filled(
     architecture: Architecture,
     shapes: Mapping[str, tuple[int, ...]],
 ) -> UNet:
-    """The network with the tensors of the file."""
-    # Without memory for its values: what does not fit the file is never allocated.
+    """Network with the tensors of the file."""
+    # Created without memory, so that nothing is allocated for an architecture that does not fit the file.
     with torch.device("meta"):
         wanted = {name: tuple(value.shape) for name, value in make_network(architecture).state_dict().items()}
     if wanted != shapes:

@@ -1,6 +1,6 @@
-"""Masks of what a person points at: a protocol for segmenters and the one that ships.
+"""Interactive segmentation: a protocol for segmenters, and the built-in one.
 
-`onnx_segmenter` loads SAM-type models; it needs ONNX Runtime, which nothing else here does.
+`onnx_segmenter` loads SAM-type models; only this module requires ONNX Runtime.
 """
 
 from .segmenter import NetworkSegmenter as NetworkSegmenter

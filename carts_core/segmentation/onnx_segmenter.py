@@ -1,8 +1,7 @@
-"""Segmenters of the SAM family from the user's own files: an encoder and a decoder as ONNX graphs.
+"""SAM-type segmenters from user-provided files: an encoder and a decoder as ONNX graphs.
 
-ONNX is a description of a computation, so a file from anywhere runs no code of its own; PyTorch's `.pt` and `.pth`
-files may, and are refused. The names of inputs and outputs are those that Segment Anything's own export gives its
-decoder, which the exports of its successors keep.
+An ONNX file describes a computation and executes no code of its own; PyTorch's `.pt` and `.pth` files can, and are
+rejected. Inputs and outputs are named as in the decoder export of Segment Anything and its successors.
 """
 
 from collections.abc import Mapping, Sequence
@@ -23,21 +22,21 @@ if TYPE_CHECKING:
     from ..onnx_runtime import InferenceSession
 
 _MEAN, _DEVIATION = (123.675, 116.28, 103.53), (58.395, 57.12, 57.375)
-"""Of the colours of an image, as SAM's encoders take it, RGB in 0..255."""
+"""Mean and standard deviation by which SAM's encoders normalize images, RGB in [0, 255]."""
 _INSIDE, _OUTSIDE, _CORNERS, _PADDING = 1.0, 0.0, (2.0, 3.0), -1.0
-"""SAM's labels of points: on the object, beside it, corners of a box, padding."""
+"""SAM's point labels: foreground, background, corners of a box, padding."""
 _REMEDY = (
     "Give two ONNX files, the encoder first, as Segment Anything's export_onnx_model.py and samexporter write them."
 )
 _KNOWN = {"point_coords", "point_labels", "mask_input", "has_mask_input", "orig_im_size"}
-"""Inputs of a decoder that no encoder makes."""
+"""Decoder inputs that are not outputs of the encoder."""
 
 
 class OnnxSegmenter:
-    """A SAM-type model; a plug-in of `Segmenter`. Made by `OnnxSegmenter.load`.
+    """SAM-type model; implements `Segmenter`. Created by `OnnxSegmenter.load`.
 
     Attributes:
-        name: of the decoder's file, for people.
+        name: display name, from the decoder's file.
     """
 
     def __init__(self, encoder: "InferenceSession", decoder: "InferenceSession", side: int, name: str) -> None:
@@ -48,15 +47,15 @@ class OnnxSegmenter:
 
     @staticmethod
     def load(encoder: Path, decoder: Path) -> "OnnxSegmenter":
-        """Read a model.
+        """Load a model.
 
         Args:
-            encoder: an image `[1, 3, side, side]` in; features of it out.
-            decoder: these features, `point_coords`, `point_labels`, and optionally `mask_input`, `has_mask_input` and
-                `orig_im_size` in; `masks` (logits) and, if there are several, `iou_predictions` out.
+            encoder: ONNX file; input: image `[1, 3, side, side]`; outputs: features.
+            decoder: ONNX file; inputs: these features, `point_coords`, `point_labels`, and optionally `mask_input`,
+                `has_mask_input` and `orig_im_size`; outputs: `masks` (logits) and, if several, `iou_predictions`.
 
         Raises:
-            WeightsError: a file is missing, is no ONNX graph, or is one of another kind.
+            WeightsError: a file is missing, is not an ONNX graph, or contains another kind of model.
         """
         first, second = _session(encoder), _session(decoder)
         images = first.get_inputs()
@@ -75,7 +74,7 @@ class OnnxSegmenter:
         offered = {found.name for found in first.get_outputs()}
         missing = {"point_coords", "point_labels"} - names
         foreign = names - offered - _KNOWN
-        # One output of the encoder under another name is what the decoder's one unknown input means.
+        # A single unmatched decoder input is matched with the encoder's single output, whatever its name.
         if missing or len(foreign) > 1 or (foreign and len(offered) != 1):
             raise WeightsError(
                 f"{decoder} takes {_listed(second.get_inputs())}, and {encoder} makes {', '.join(sorted(offered))}; a "
@@ -89,13 +88,13 @@ class OnnxSegmenter:
         """Mask of the object; see `Segmenter`.
 
         Raises:
-            WeightsError: the model cannot be run, or makes something else than masks.
+            WeightsError: the model cannot be run, or its output is not a mask.
         """
         try:
             return self._segment(image, prompt)
         except (ValueError, IndexError, RuntimeError, MemoryError) as error:
             raise WeightsError(f"{self.name} cannot segment: {shortened(str(error), 300)}. {_REMEDY}") from error
-        except Exception as error:  # ONNX Runtime's errors have no base class but this.
+        except Exception as error:  # ONNX Runtime's errors have no narrower base class.
             raise WeightsError(f"{self.name} cannot be run: {shortened(str(error), 300)}. {_REMEDY}") from error
 
     def _segment(self, image: np.ndarray, prompt: Prompt) -> np.ndarray:
@@ -121,7 +120,7 @@ class OnnxSegmenter:
         return _at_size(masks[best], (height, width)) > 0.0
 
     def _features(self, image: np.ndarray, scale: float) -> dict[str, np.ndarray]:
-        """Features of an image, cached for further clicks on the same image."""
+        """Encoder features of an image, cached for further prompts on the same image."""
         if self._last is None or self._last[0] is not image:
             height, width = image.shape[:2]
             size = round(width * scale), round(height * scale)
@@ -135,27 +134,27 @@ class OnnxSegmenter:
 
 
 def _run(session: "InferenceSession", inputs: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """All outputs by name."""
+    """Run a graph; returns all outputs by name."""
     names = [found.name for found in session.get_outputs()]
     values = session.run(None, dict(inputs))
     return {name: np.asarray(value) for name, value in zip(names, values, strict=True)}
 
 
 def _points(prompt: Prompt, scale: float) -> tuple[Float[np.ndarray, "points 2"], Float[np.ndarray, " points"]]:
-    """Points with their labels, in pixels of the encoder's image."""
+    """Points of a prompt in pixels of the encoder's image, and their labels."""
     places = [*prompt.inside, *prompt.outside]
     kinds = [_INSIDE] * len(prompt.inside) + [_OUTSIDE] * len(prompt.outside)
     if prompt.box is not None:
         places += [prompt.box[:2], prompt.box[2:]]
         kinds += list(_CORNERS)
     else:
-        # SAM's decoder was trained with such a point where no box is given.
+        # SAM's decoder was trained with a padding point if there is no box.
         places, kinds = [*places, (0.0, 0.0)], [*kinds, _PADDING]
     return np.array(places, np.float32) * np.float32(scale), np.array(kinds, np.float32)
 
 
 def _at_size(logits: Float[np.ndarray, "h w"], size: tuple[int, int]) -> Float[np.ndarray, "height width"]:
-    """The decoder's mask at the image's size; a low-resolution one covers the padded square."""
+    """Decoder mask at image size; low-resolution masks are upsampled and cropped from the padded square."""
     height, width = size
     if logits.shape == size:
         return logits
@@ -164,7 +163,7 @@ def _at_size(logits: Float[np.ndarray, "h w"], size: tuple[int, int]) -> Float[n
 
 
 def _typed(value: np.ndarray, kind: str) -> np.ndarray:
-    """A value as the graph wants it."""
+    """Convert an array to the type of a graph's input."""
     types = {"tensor(float)": np.float32, "tensor(float16)": np.float16, "tensor(double)": np.float64}
     types |= {"tensor(int64)": np.int64, "tensor(int32)": np.int32}
     if kind not in types:

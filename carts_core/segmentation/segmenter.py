@@ -14,23 +14,24 @@ from ..model.parts import COVERAGE, SURFACE_CHANNELS
 from ..networks import FeatureExtractor
 
 MOST_POINTS = 100
-"""Of one prompt."""
+"""Largest number of points in a prompt."""
 
 
 @dataclass(frozen=True)
 class Prompt:
-    """Prompt for an object in an image: points on it, points beside it, a box around it.
+    """Prompt for an object in an image: foreground points, background points, and a box.
 
     Raises:
-        SettingsError: neither a point on it nor a box, too many points, a place that is not finite, or an empty box.
+        SettingsError: there is neither a foreground point nor a box, too many points, a non-finite coordinate, or an
+            empty box.
     """
 
     inside: tuple[tuple[float, float], ...] = ()
-    """Points on it: column and row, pixel centres at 0.5 [px]."""
+    """Foreground points: column and row, pixel centres at 0.5 [px]."""
     outside: tuple[tuple[float, float], ...] = ()
-    """Points beside it [px]."""
+    """Background points: column and row [px]."""
     box: tuple[float, float, float, float] | None = None
-    """Left, top, right and lower end of a box that it is in [px]."""
+    """Left, top, right and bottom of a box around the object [px]."""
 
     def __post_init__(self) -> None:
         if not self.inside and self.box is None:
@@ -45,38 +46,39 @@ class Prompt:
 
 
 class Segmenter(Protocol):
-    """Protocol of segmenters: segments the object of a prompt."""
+    """Protocol of segmenters, which segment the object of a prompt."""
 
     def segment(self, image: UInt8[np.ndarray, "height width 3"], prompt: Prompt) -> Bool[np.ndarray, "height width"]:
         """Mask of the object.
 
         Raises:
-            CartsError: it could not be done.
+            CartsError: segmentation failed.
         """
         ...
 
 
 _LONGEST_SIDE = 640
-"""Of the image that outlines are looked for in [px]."""
+"""Longer side of the image in which outlines are refined [px]."""
 _ROUNDS = 3
 _BAND, _WIDE = 0.005, 0.2
-"""How far from the network's outline, or from the middle of a box in which the network sees nothing, the image decides,
-as shares of the image's longer side."""
+"""Half-width of the band around the network's outline, or around the initial region of a box without detections, that
+is segmented by image content, relative to the longer side of the image [1]."""
 _POINT, _AROUND = 0.006, 0.05
-"""Radius of what a point says for certain, and of what one beside the thing puts in question; shares as above."""
+"""Radius in which a point determines the label, and in which a background point makes foreground uncertain, relative to
+the longer side of the image [1]."""
 _ALIKE = 25
-"""Largest colour difference from a point outside of detections, in steps of 8 bits."""
+"""Largest colour difference in regions grown from points outside detections [grey levels]."""
 _SMALLEST = 0.02
-"""A piece in a box counts if it is at least this share of the largest."""
+"""Minimum area of a connected component in a box, relative to the largest one [1]."""
 
 Probability = Callable[[UInt8[np.ndarray, "height width 3"]], Float[np.ndarray, "height width"]]
 
 
 class NetworkSegmenter:
-    """Segments instruments; a plug-in of `Segmenter`.
+    """Segments instruments with the network and GrabCut; implements `Segmenter`.
 
     Args:
-        probability: gives the probability that a pixel of an RGB image shows an instrument.
+        probability: predicts from an RGB image the probability that a pixel shows an instrument.
     """
 
     def __init__(self, probability: Probability) -> None:
@@ -85,7 +87,7 @@ class NetworkSegmenter:
 
     @staticmethod
     def of(extractor: FeatureExtractor) -> "NetworkSegmenter":
-        """By the networks that the optimizer uses."""
+        """Create a segmenter from the optimizer's networks."""
         return NetworkSegmenter(lambda image: instrument_probability(extractor, image))
 
     def segment(self, image: UInt8[np.ndarray, "height width 3"], prompt: Prompt) -> Bool[np.ndarray, "height width"]:
@@ -104,7 +106,7 @@ class NetworkSegmenter:
         return smooth > 0.5
 
     def _likely(self, image: np.ndarray) -> np.ndarray:
-        # The clicks of a person come on the same image, and the network takes longest.
+        # Successive prompts usually concern the same image, and the network is the slowest part.
         if self._last is None or self._last[0] is not image:
             self._last = image, self._probability(image)
         return self._last[1]
@@ -121,14 +123,14 @@ def instrument_probability(
     size = tuple(max(round(side * scale / stride), 1) * stride for side in (width, height))
     small = cv2.resize(image, size, interpolation=cv2.INTER_AREA).astype(np.float32) / 255.0
     images = torch.from_numpy(small).permute(2, 0, 1)[None].to(extractor.device)
-    # Where arms are expected is an input of the network; without any, it goes by the image alone.
+    # With an empty prior surface map, the network uses only the image.
     nowhere = images.new_zeros(1, SURFACE_CHANNELS, *images.shape[2:])
     coverage = extractor.surface(images, nowhere)[0, COVERAGE].sum(0).float().cpu().numpy()
     return cv2.resize(coverage, (width, height), interpolation=cv2.INTER_LINEAR)
 
 
 class _Places:
-    """A prompt at the size that is worked at."""
+    """Prompt in pixels of the downscaled image."""
 
     def __init__(self, prompt: Prompt, scale: float, size: tuple[int, int]) -> None:
         self.size = size
@@ -148,14 +150,14 @@ class _Places:
         return u, v
 
     def discs(self, places: list[tuple[int, int]], share: float) -> Bool[np.ndarray, "h w"]:
-        """Discs around places."""
+        """Mask of discs around pixels; the radius is `share` of the longer side."""
         canvas = np.zeros(self.size[::-1], np.uint8)
         for place in places:
             cv2.circle(canvas, place, max(round(share * self.longest), 1), 1, cv2.FILLED)
         return canvas.astype(bool)
 
     def boxed(self) -> Bool[np.ndarray, "h w"]:
-        """The box, or the whole image."""
+        """Mask of the box, or of the whole image without a box."""
         inside = np.ones(self.size[::-1], bool)
         if self.box is not None:
             left, top, right, low = self.box
@@ -164,7 +166,7 @@ class _Places:
         return inside
 
     def chosen(self, mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
-        """The pieces that the prompt means: those with a point on them, or in a box all but tiny ones."""
+        """Connected components selected by the prompt: those with a foreground point, or all but tiny ones in a box."""
         count, labels, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=8)
         kept = {int(labels[v, u]) for u, v in self.inside}
         if not self.inside and count > 1:
@@ -177,18 +179,18 @@ class _Places:
 def _seeds(
     small: np.ndarray, likely: Bool[np.ndarray, "h w"], places: _Places
 ) -> tuple[Bool[np.ndarray, "h w"], float]:
-    """Probable object, and width of the band around its outline in which the image decides."""
+    """Mask of the probable object, and relative half-width of the band around its outline that is refined."""
     seen = likely & places.boxed()
     if places.inside:
         _, labels = cv2.connectedComponents(seen.astype(np.uint8))
         known = {int(labels[v, u]) for u, v in places.inside} - {0}
         missed = [(u, v) for u, v in places.inside if not labels[v, u]]
-        # An instrument may be seen in pieces, so all of them count if one was meant.
+        # An instrument can have several visible components, so all are selected if one is.
         seeds = seen if known else np.zeros_like(seen)
         return (seeds | _alike(small, missed)) & places.boxed(), _BAND
     if seen.any():
         return seen, _BAND
-    # Nothing that the network knows is in the box: what differs from its surroundings.
+    # Without detections in the box, its central part is assumed to be foreground.
     assert places.box is not None
     left, top, right, low = places.box
     inner = np.zeros_like(seen)
@@ -198,7 +200,7 @@ def _seeds(
 
 
 def _alike(small: np.ndarray, places: list[tuple[int, int]]) -> Bool[np.ndarray, "h w"]:
-    """Regions connected with these pixels, of similar colour."""
+    """Regions of similar colour that are connected to these pixels."""
     smooth = cv2.bilateralFilter(small, 7, 30, 5)
     found = np.zeros((small.shape[0] + 2, small.shape[1] + 2), np.uint8)
     flags = 8 | cv2.FLOODFILL_MASK_ONLY | cv2.FLOODFILL_FIXED_RANGE | (1 << 8)
@@ -210,7 +212,7 @@ def _alike(small: np.ndarray, places: list[tuple[int, int]]) -> Bool[np.ndarray,
 def _outlined(
     small: np.ndarray, places: _Places, seeds: Bool[np.ndarray, "h w"], share: float
 ) -> Bool[np.ndarray, "h w"]:
-    """The seeds with an outline along edges."""
+    """Refine the outline of the seeds with GrabCut, in a band of relative half-width `share`."""
     band = max(round(share * places.longest), 2)
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * band + 1, 2 * band + 1))
     inner = cv2.erode(seeds.astype(np.uint8), disc, borderType=cv2.BORDER_REPLICATE) > 0
@@ -225,7 +227,7 @@ def _outlined(
     states[places.discs(places.inside, _POINT) & places.boxed()] = cv2.GC_FGD
     if not np.isin(states, (cv2.GC_FGD, cv2.GC_PR_FGD)).any() or not np.isin(states, (cv2.GC_BGD, cv2.GC_PR_BGD)).any():
         return seeds
-    # It begins with clusters of colours, from random centres.
+    # GrabCut is initialized by clustering colours from random centres.
     cv2.setRNGSeed(0)
     models = np.zeros((1, 65)), np.zeros((1, 65))
     cv2.grabCut(np.ascontiguousarray(small[..., ::-1]), states, (0, 0, 1, 1), *models, _ROUNDS, cv2.GC_INIT_WITH_MASK)

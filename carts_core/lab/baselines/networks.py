@@ -33,10 +33,10 @@ _held: list[torch.library.Library] = []
 
 
 def segmentation_models() -> ModuleType:
-    """segmentation-models-pytorch, on timm and torchvision.
+    """Import segmentation-models-pytorch, which requires timm and torchvision.
 
     Raises:
-        CartsError: the extra is not installed.
+        CartsError: the optional dependencies are not installed.
     """
     for module in ("segmentation_models_pytorch", "timm", "torchvision"):
         needs_extra(module, EXTRA)
@@ -47,10 +47,10 @@ def segmentation_models() -> ModuleType:
 
 
 def _import_torchvision() -> None:
-    """Import torchvision, also beside another build of torch.
+    """Import torchvision, even with a build of torch that does not match it.
 
-    PyPI has torchvision for CUDA only. Beside a torch for CPUs, its compiled operators are not loaded, and the import
-    fails for those that it registers at once, so their names are declared here. None of them is used.
+    PyPI provides torchvision for CUDA only. With a CPU build of torch, its compiled operators are not loaded, and the
+    import fails for those that it registers immediately, so their names are declared here. None of them is used.
     """
     while True:
         try:
@@ -61,16 +61,16 @@ def _import_torchvision() -> None:
                 raise
             library = torch.library.Library("torchvision", "FRAGMENT")
             library.define(missing[1] + _DECLARED)
-            # The declaration lasts as long as its library.
+            # The declaration is valid as long as the library object exists.
             _held.append(library)
         else:
             return
 
 
 _MEAN, _DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
-"""Of ImageNet, as timm's weights expect."""
+"""Channel mean and standard deviation of ImageNet, as expected by timm's weights."""
 _HEADS = (1, 2, 4, 8)
-"""Heads of a Swin transformer's stages, times its width over 24."""
+"""Attention heads per stage of a Swin transformer of width 24; they scale with the width."""
 
 
 class Baseline(nn.Module):
@@ -78,7 +78,7 @@ class Baseline(nn.Module):
 
     Raises:
         CartsError: the extra is not installed.
-        SettingsError: timm does not know the encoder, or it does not fit.
+        SettingsError: timm does not provide the encoder, or it does not fit.
     """
 
     mean: Tensor
@@ -106,10 +106,10 @@ class Baseline(nn.Module):
     def forward(
         self, images: Float[Tensor, "batch 3 h w"], given: Float[Tensor, "batch 6 h w"] | None = None
     ) -> Float[Tensor, "batch 1 h w"]:
-        """Logits of the instrument mask.
+        """Predict logits of the instrument mask.
 
         Args:
-            images: RGB in [0, 1], of the size in the settings.
+            images: RGB in [0, 1], of the width and height in the settings.
             given: surface maps of the measured kinematics, for Colleoni's network.
         """
         if self.settings.name == "unet":
@@ -121,9 +121,9 @@ class Baseline(nn.Module):
 
 
 class _TwoEncoders(nn.Module):
-    """Image and rendering encoders, joined at every level, and one decoder, after Colleoni et al., 2007.09107.
+    """Encoders of image and rendering, fused at every level, and one decoder, after Colleoni et al., arXiv 2007.09107.
 
-    Their code is not public, so sizes are ours.
+    Their code is not public; layer sizes are our choice.
     """
 
     def __init__(self, settings: BaselineNetwork) -> None:
@@ -147,7 +147,7 @@ class _TwoEncoders(nn.Module):
 
 
 def _made(settings: BaselineNetwork, make: Any) -> Any:
-    """Result of `make`; an encoder that timm does not have is reported as an error."""
+    """Result of `make`; raises `SettingsError` for an encoder that timm does not provide."""
     import timm  # noqa: PLC0415
 
     if not timm.is_model(settings.timm_encoder):
@@ -174,14 +174,14 @@ class TrainedBaseline:
     """Contents of a weights file."""
 
     network: Baseline
-    """In evaluation mode."""
+    """Network in evaluation mode."""
     training: dict[str, Any]
-    """Settings and figures of the run, as `carts baseline` wrote them."""
+    """Settings and metrics of the training run, as written by `carts baseline`."""
     sha256: str
 
     @property
     def row(self) -> str:
-        """Its row in the benchmark: network and augmentation."""
+        """Name of the benchmark's row: network and augmentation."""
         return f"{self.network.settings.name}_{self.training['augmentation']}"
 
 
@@ -202,7 +202,7 @@ def read_baseline(path: Path) -> TrainedBaseline:
 
     Raises:
         CartsError: the extra is not installed.
-        WeightsError: the file is missing, is not what `carts baseline` writes, or its tensors do not fit.
+        WeightsError: the file is missing, was not written by `carts baseline`, or its tensors do not fit.
     """
     try:
         check_regular(path, WEIGHTS)
@@ -231,11 +231,11 @@ def read_baseline(path: Path) -> TrainedBaseline:
 
 
 def start_from(network: Baseline, path: Path) -> int:
-    """Put timm's weights, such as pretrained ones, into the encoder of the image; returns how many tensors fit.
+    """Load timm's weights, such as pretrained ones, into the image encoder; returns the number of fitting tensors.
 
     Raises:
-        WeightsError: the file is missing, is not safetensors, or nothing in it fits; a U-Net's is no feature network of
-            the same architecture.
+        WeightsError: the file is missing, is not safetensors, or contains no fitting tensor; for the U-Net, it is not a
+            feature network of the same architecture.
     """
     if isinstance(network.body, FeatureNetwork):
         trained = read_weights(path).network
@@ -256,7 +256,7 @@ def start_from(network: Baseline, path: Path) -> int:
             "safetensors; pickles are not read."
         ) from error
     own = network.state_dict()
-    # smp wraps timm's model, and features of HRNet and Swin are wrapped once more, so names have different prefixes.
+    # smp wraps timm's model, and the features of HRNet and Swin are wrapped twice, so names have different prefixes.
     ends = {name.split("model.", 1)[-1]: name for name in own if "rendering." not in name}
     fitting = {
         ends[name]: value for name, value in given.items() if name in ends and own[ends[name]].shape == value.shape

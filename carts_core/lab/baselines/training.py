@@ -1,6 +1,6 @@
 """Training of a baseline on shared synthetic frames.
 
-The loss is the paper's; augmentations are those of CaRTS and of SegSTRONG-C.
+The loss is that of the paper; augmentations are those of CaRTS and of SegSTRONG-C.
 """
 
 import json
@@ -32,16 +32,16 @@ from ..training.tasks import dice
 from .networks import Baseline, save_baseline, segmentation_models, start_from
 
 Change = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
-"""From an image [3, h, w], uint8, and its mask [1, h, w] to those that are learned from."""
+"""Augmentation of an image [3, h, w], uint8, and its mask [1, h, w]."""
 
 SMOKE_SHARE, SMOKE_STRENGTH = 0.2, 0.3
-"""Share of images with smoke and its largest opacity: `p` and `smoke_aug` of the paper's released configuration."""
+"""Share of images with smoke, and its largest opacity: `p` and `smoke_aug` in the paper's released configuration."""
 _SMOKE_WHITE = 255.0
 _GEOMETRIC = {"ShearX", "ShearY", "TranslateX", "TranslateY", "Rotate"}
 
 
 def augmentation(name: Augmentation, rng: np.random.Generator) -> Change:
-    """The change of that name; torchvision's draw from torch's own random numbers."""
+    """Create the augmentation of a name; those of torchvision use torch's global random numbers."""
     match name:
         case "none":
             return lambda image, mask: (image, mask)
@@ -54,7 +54,7 @@ def augmentation(name: Augmentation, rng: np.random.Generator) -> Change:
 
 
 def smoked(image: UInt8[Tensor, "3 h w"], rng: np.random.Generator) -> UInt8[Tensor, "3 h w"]:
-    """Add a flat layer of diamond-square smoke to every fifth image on average."""
+    """Add a layer of diamond-square smoke to one fifth of the images on average."""
     if rng.random() >= SMOKE_SHARE:
         return image
     height, width = image.shape[1:]
@@ -64,7 +64,7 @@ def smoked(image: UInt8[Tensor, "3 h w"], rng: np.random.Generator) -> UInt8[Ten
 
 
 def diamond_square(side: int, rng: np.random.Generator, roughness: float = 0.6) -> Float[np.ndarray, "side side"]:
-    """A plasma fractal in [0, 1]; `side` is a power of two plus one, `roughness` the ratio of amplitudes per level."""
+    """Plasma fractal in [0, 1]; `side` is a power of two plus one, `roughness` the ratio of amplitudes per level."""
     field = np.zeros((side, side), np.float32)
     step, amplitude = side - 1, 1.0
     field[::step, ::step] = rng.normal(size=(2, 2))
@@ -73,7 +73,7 @@ def diamond_square(side: int, rng: np.random.Generator, roughness: float = 0.6) 
         corners = field[::step, ::step]
         squares = (corners[:-1, :-1] + corners[1:, :-1] + corners[:-1, 1:] + corners[1:, 1:]) / 4
         field[half::step, half::step] = squares + amplitude * rng.normal(size=squares.shape)
-        # Each diamond's middle is the mean of its neighbours at half a step, of which the border has three.
+        # Each diamond's centre is the mean of its neighbours at half a step; at the border there are only three.
         padded = np.pad(field, half, constant_values=np.nan)
         for rows, columns in (
             (slice(0, None, step), slice(half, None, step)),
@@ -135,19 +135,19 @@ def _warped(name: Augmentation) -> Change:
 
 
 SIZE = (256, 192)
-"""Width and height of a training frame [px]: a whole image, not a crop."""
+"""Width and height of a training frame [px], which is a whole image, not a crop."""
 IMAGES = ImageSettings(width=SIZE[0], height=SIZE[1], field_width=SIZE[0], occluded=0.0, things=0.0, absent=0.0)
-"""Regular images: no smoke, blood, low light, occluders, distractors or absent arms."""
+"""Settings of regular images: no smoke, blood, low light, occluders, distractors or absent arms."""
 _SETTINGS = json.dumps(asdict(IMAGES))
 CHUNK = 250
-"""Frames of a file."""
+"""Number of frames per file."""
 
 
 class TrainingFrames:
-    """Images, surface maps of erroneous kinematics, and masks, from the numbered files of `make_chunk`.
+    """Training frames from the numbered files of `make_chunk`: images, surface maps of erroneous kinematics, and masks.
 
     Raises:
-        WeightsError: a file cannot be read, or holds other frames.
+        WeightsError: a file cannot be read, or contains other frames.
     """
 
     def __init__(self, folder: OutputPath, chunks: Iterable[int]) -> None:
@@ -171,16 +171,16 @@ class TrainingFrames:
     def batch(
         self, numbers: Iterable[int]
     ) -> tuple[UInt8[Tensor, "batch 3 h w"], Float[Tensor, "batch 6 h w"], Float[Tensor, "batch 1 h w"]]:
-        """Images, surface maps of the given kinematics, and masks, by their numbers."""
+        """Images, surface maps of the given kinematics, and masks of the frames with these numbers."""
         chosen = list(numbers)
         return (self._images[chosen], self._given[chosen].float() / SURFACE_UNIT, self._masks[chosen].float()[:, None])
 
 
 def make_chunk(folder: OutputPath, chunk: int, seed: int) -> None:
-    """Write one file of frames, which depends on the seed and its number only.
+    """Write one file of frames, which depends only on the seed and the file's number.
 
     Raises:
-        OutputError: it cannot be written.
+        OutputError: the file cannot be written.
     """
     generator = SurfaceGenerator([Robot.load(shipped_robot())], IMAGES, (seed, chunk))
     images, given, masks = [], [], []
@@ -201,7 +201,7 @@ def _file(folder: OutputPath, chunk: int) -> OutputPath:
 
 WEIGHTS_FILE = "baseline.safetensors"
 VALIDATION = 100
-"""Number of validation frames, the last ones."""
+"""Number of frames at the end that are used for validation."""
 _MAY_CHANGE = ("steps", "minutes", "checkpoint_every", "threads", "device")
 _LOG_EVERY = 20
 
@@ -213,19 +213,19 @@ class BaselineResult:
     weights: Path
     steps: int
     dice: float
-    """Of the validation frames, which no augmentation changed."""
+    """Mean Dice of the validation frames, without augmentation."""
     processor_seconds: float
-    """Time of the training process over all resumed parts [s]."""
+    """CPU time of the training process, including all resumed parts [s]."""
 
 
 def prepare_frames(
     folder: OutputPath, training: BaselineTraining, say: Callable[[str], None] = lambda line: None
 ) -> TrainingFrames:
-    """Training frames in a folder that baselines may share; missing ones are generated.
+    """Open training frames in a folder, which baselines can share; missing ones are generated.
 
     Raises:
         OutputError: the folder cannot be written to.
-        WeightsError: it holds other frames.
+        WeightsError: the folder contains other frames.
     """
     with locked_folder(folder.path):
         chunks = range(-(-training.frames // CHUNK))
@@ -246,15 +246,15 @@ def train_baseline(
     """Train a baseline, or resume the run in `output`.
 
     Args:
-        network, training: settings.
+        network, training: settings of the network and of its training.
         frames: training and validation frames.
         output: folder of `checkpoint.safetensors` and, at the end, `baseline.safetensors`.
-        say: called with lines of progress.
+        say: called with each line of progress.
 
     Raises:
-        CartsError: the extra is not installed.
+        CartsError: the optional dependencies are not installed.
         SettingsError: the network does not fit the frames, or `output` holds a run with other settings.
-        WeightsError: a file to start from cannot be read.
+        WeightsError: the initial weights or the checkpoint cannot be read.
         OutputError: `output` cannot be written to, or another process trains there.
     """
     if network.size != SIZE:
@@ -270,7 +270,7 @@ def train_baseline(
 
 
 class _Run:
-    """A training run of a baseline."""
+    """Training run of a baseline."""
 
     def __init__(
         self, network: BaselineNetwork, training: BaselineTraining, frames: TrainingFrames, output: Path
@@ -286,7 +286,7 @@ class _Run:
         self.loop = TrainingLoop(output, self.network, training, self.config, _MAY_CHANGE)
 
     def finish(self, say: Callable[[str], None]) -> BaselineResult:
-        """Do the steps that are left, validate, and write the weights."""
+        """Do the remaining steps, validate, and write the weights."""
         loop = self.loop
 
         def logged(means: dict[str, float], _: float) -> None:
@@ -317,7 +317,7 @@ class _Run:
         return functional.binary_cross_entropy_with_logits(self._logits(images, given), masks), {}
 
     def _batch(self) -> tuple[Tensor, Tensor, Tensor]:
-        """The batch of the next step: it depends on the seed and the step's number only."""
+        """Batch of the next step, which depends only on the seed and the step's number."""
         rng = np.random.default_rng((self.training.seed, self.loop.step))
         torch.manual_seed(int(rng.integers(2**63)))
         numbers = rng.integers(len(self.frames) - VALIDATION, size=self.training.batch_size)

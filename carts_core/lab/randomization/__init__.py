@@ -1,4 +1,4 @@
-"""Training images for the networks, made on the fly and varied far beyond any one operating room."""
+"""Training images for the networks, generated on the fly with domain randomization."""
 
 from ...settings import AppearanceRanges as AppearanceRanges
 from ...settings import ImageSettings as ImageSettings

@@ -1,4 +1,4 @@
-"""Arms of training images: variants of colour and proportion, meshes, and poses, random or from a recording."""
+"""Arms in training images: variants of colour and proportion, meshes, and poses, random or from a recording."""
 
 import copy
 from collections.abc import Sequence
@@ -18,15 +18,15 @@ from ...recording import Sequence as SequenceFile
 from ...rendering import Renderer
 
 THICKNESS = (0.88, 1.15)
-"""Factor on the thickness of links, so that the network is not tied to one instrument's exact shape."""
+"""Range of the scale of link thickness, so that the network does not depend on one instrument's exact shape."""
 
 PERFECT_MODEL = 0.5
-"""Share of scenes whose rendered arms have exactly the proportions of the observed ones."""
+"""Share of scenes whose rendered arms have the exact proportions of the observed ones."""
 
 
 @dataclass(frozen=True)
 class PosedRobot:
-    """Vertices of one arm in the camera's frame."""
+    """Vertices of one arm in the camera frame."""
 
     vertices: Float[np.ndarray, "V 3"]
     normals: Float[np.ndarray, "V 3"]
@@ -34,24 +34,24 @@ class PosedRobot:
 
 @dataclass
 class Body:
-    """Triangles of a robot or another object, by parts, to be rasterised and shaded."""
+    """Triangle mesh of a robot or another object, divided into parts, for rasterisation and shading."""
 
     vertices: Float[np.ndarray, "V 3"]
-    """Of all parts, each in the frame of its link [m]."""
+    """Vertices of all parts, each in the frame of its link [m]."""
     normals: Float[np.ndarray, "V 3"]
     faces: Int[np.ndarray, "F 3"]
     face_part: Int[np.ndarray, " F"]
-    """Index of the part that a triangle belongs to."""
+    """Index of the part to which each triangle belongs."""
     shaft: int
-    """Part that is painted as shafts are, mostly dark; -1 without one."""
+    """Index of the part with the material of a shaft (mostly dark); -1 if there is none."""
     shaft_axis: Float[np.ndarray, "3"]
-    """Unit vector along the shaft in its link's frame, pointing away from the tip."""
+    """Unit vector along the shaft in the frame of its link, pointing away from the tip."""
     shaft_end: Float[np.ndarray, "3"]
-    """The shaft's end at the tip, in its link's frame [m]."""
+    """Distal end of the shaft in the frame of its link [m]."""
 
 
 class RobotGeometry(Body):
-    """A robot for placing and shading; parts are `Robot.meshes`, and the shaft is the longest one.
+    """Robot geometry for placement and shading; parts are `Robot.meshes`, and the shaft is the longest part.
 
     Attributes:
         part_link: link of each part.
@@ -77,7 +77,7 @@ class RobotGeometry(Body):
         self.shaft_axis, self.shaft_end = self._shaft_line()
 
     def _shaft_line(self) -> tuple[np.ndarray, np.ndarray]:
-        """Direction of the shaft away from the tip, and its end there."""
+        """Unit direction of the shaft away from the tip, and its distal end [m]."""
         points = self.robot.meshes[self.shaft].vertices.astype(np.float64)
         centre = (points.min(0) + points.max(0)) / 2
         axis = np.zeros(3)
@@ -95,11 +95,11 @@ class RobotGeometry(Body):
         return axis, centre + axis * ((points - centre) @ axis).min()
 
     def link_transforms(self, joint_positions: np.ndarray) -> Float[np.ndarray, "links 4 4"]:
-        """Ts_base_link [m] at these joint positions [dofs]."""
+        """Forward kinematics: Ts_base_link [m] at joint positions [dofs]."""
         return self.robot.forward_kinematics(torch.as_tensor(joint_positions, dtype=torch.float64)).numpy()
 
     def posed(self, Ts_camera_link: Float[np.ndarray, "links 4 4"]) -> PosedRobot:
-        """Vertices and normals in the camera's frame."""
+        """Vertices and normals in the camera frame."""
         vertices = np.empty_like(self.vertices)
         normals = np.empty_like(self.normals)
         for link in np.unique(self.part_link):
@@ -111,29 +111,29 @@ class RobotGeometry(Body):
 
 
 DEPTH = (0.05, 0.25)
-"""Distance of the wrist from the camera [m]."""
+"""Range of the distance between wrist and camera [m]."""
 FOCAL_LENGTH = (0.7, 2.0)
-"""Focal length in image widths [1]: of whole endoscope images, and of enlarged ones."""
+"""Range of the focal length, in image widths [1], from whole to enlarged endoscope images."""
 OUTSIDE = 0.12
-"""Largest distance of a wrist from the image, in image sizes [1]."""
+"""Largest distance of a wrist outside the image, relative to the image size [1]."""
 ELEVATION = (-20.0, 60.0)
-"""Angle at which the shaft comes towards the camera [deg]; negative goes away from it."""
+"""Range of the angle between shaft and image plane [deg]; positive if the shaft extends towards the camera."""
 
 
 @dataclass(frozen=True)
 class Variant:
-    """One or two arms, ready to be posed, shaded and rendered."""
+    """One or two arms with varied appearance, to be posed, shaded and rendered."""
 
     geometries: tuple[RobotGeometry, ...]
-    """The arms that the camera observes."""
+    """Arms that the camera observes."""
     rendered: tuple[RobotGeometry, ...]
-    """Arms of the optimizer's model: equal, or with slightly different proportions, as real models have."""
+    """Arms of the optimizer's model: equal, or with slightly different proportions, as in real models."""
     renderer: Renderer
-    """The optimizer's renderer of `rendered`, for hybrid images."""
+    """Optimizer's renderer of `rendered`, for hybrid images."""
 
 
 def random_variant(rng: np.random.Generator, robots: Sequence[Robot], arms: int, width: int, height: int) -> Variant:
-    """A scene of `arms` arms, each a robot of `robots` with random colours and thickness."""
+    """Scene of `arms` arms, each one of `robots` with random colours and thickness."""
     chosen = [robots[int(rng.integers(len(robots)))] for _ in range(arms)]
     observed = [_vary(rng, robot) for robot in chosen]
     rendered = observed if rng.random() < PERFECT_MODEL else [_vary(rng, robot) for robot in chosen]
@@ -164,7 +164,7 @@ def _vary(rng: np.random.Generator, robot: Robot) -> Robot:
         extents = np.ptp(mesh.vertices, axis=0)
         scale = np.full(3, thickness * rng.uniform(0.94, 1.06))
         scale[np.argmax(extents)] = 1.0
-        # Normals of a surface that is stretched by S are those of the surface pressed by S.
+        # Normals transform with the inverse transpose of the scaling.
         normals = mesh.normals / scale
         normals /= np.linalg.norm(normals, axis=1, keepdims=True) + 1e-12
         color = mesh.color if own_colors else np.clip(shade * np.clip(rng.normal(1, 0.12, 3), 0.6, 1.5), 0, 1)
@@ -182,15 +182,15 @@ Intrinsics = tuple[float, float, float, float]
 
 @dataclass(frozen=True)
 class Placement:
-    """One arm in front of the camera."""
+    """Pose and joint positions of one arm in front of the camera."""
 
     joint_positions: Float[np.ndarray, " dofs"]
-    """[rad, m], in the order of `Robot.joint_names`."""
+    """Joint positions [rad, m], in the order of `Robot.joint_names`."""
     T_camera_base: Float[np.ndarray, "4 4"]
 
 
 def random_intrinsics(rng: np.random.Generator, width: int, height: int, field: int) -> Intrinsics:
-    """fx, fy, cx, cy [px] of a camera that is `field` px wide and of which a part of `width` x `height` px is seen."""
+    """fx, fy, cx, cy [px] of a crop of `width` x `height` px from a camera image that is `field` px wide."""
     focal = float(np.exp(rng.uniform(*np.log(FOCAL_LENGTH)))) * field
     cx, cy = rng.uniform(0.3, 0.7) * width, rng.uniform(0.3, 0.7) * height
     return focal, focal * rng.uniform(0.98, 1.02), cx, cy
@@ -199,7 +199,7 @@ def random_intrinsics(rng: np.random.Generator, width: int, height: int, field: 
 def random_placement(
     rng: np.random.Generator, geometry: RobotGeometry, intrinsics: Intrinsics, width: int, height: int
 ) -> Placement:
-    """A random configuration whose wrist is in or near the image and whose shaft leaves it across a random border."""
+    """Random placement with the wrist in or near the image and the shaft crossing a random border."""
     joints = _random_joints(rng, geometry)
     Ts_base_link = geometry.link_transforms(joints)
     T_base_shaft = Ts_base_link[geometry.part_link[geometry.shaft]]
@@ -220,21 +220,21 @@ def random_placement(
 
 
 def perturbed(rng: np.random.Generator, geometry: RobotGeometry, placement: Placement, scale: float) -> Placement:
-    """The placement with wrong kinematics: joints off by some degrees, the arm turned and moved a little.
+    """Placement with simulated kinematic errors: joint errors of some degrees, and a small rotation and translation.
 
-    A scale of 1 moves the wrist by some 3 mm and turns joints by some 3 degrees.
+    A scale of 1 moves the wrist by about 3 mm and rotates joints by about 3 degrees.
     """
     joints = placement.joint_positions.copy()
     for index, kind in enumerate(geometry.robot.joint_types):
         if kind == "revolute":
             joints[index] += rng.normal(0, np.deg2rad(3.0) * scale)
-    # The arm turns about its own wrist, so that the error in the image does not grow with the arm's length.
+    # The arm rotates about its wrist, so that the error in the image does not grow with the arm's length.
     shaft_link = geometry.part_link[geometry.shaft]
     T_camera_shaft = placement.T_camera_base @ geometry.link_transforms(placement.joint_positions)[shaft_link]
     T_camera_shaft_moved = placement.T_camera_base @ geometry.link_transforms(joints)[shaft_link]
     turn = turned(rng.normal(0, np.deg2rad(2.0) * scale, 3))
     wrist = T_camera_shaft[:3, :3] @ geometry.shaft_end + T_camera_shaft[:3, 3]
-    # At a larger distance, the same displacement in the image is a larger one in space.
+    # At a larger distance, the same displacement in the image requires a larger one in space.
     wrist = wrist + rng.normal(0, 0.003 * scale, 3) * max(1.0, np.linalg.norm(wrist) / DEPTH[1])
     R = turn @ T_camera_shaft[:3, :3]
     T = np.eye(4)
@@ -247,20 +247,20 @@ def _random_joints(rng: np.random.Generator, geometry: RobotGeometry) -> np.ndar
     low = np.where(np.isfinite(limits[:, 0]), limits[:, 0], -np.pi)
     high = np.where(np.isfinite(limits[:, 1]), limits[:, 1], np.pi)
     anywhere = rng.uniform(low, high)
-    # Instruments are mostly held rather straight and their jaws are mostly nearly closed.
+    # Instruments are mostly nearly straight, with nearly closed jaws.
     straight = np.clip(rng.normal(0, 0.4, len(low)), low, high)
     return np.where(rng.random(len(low)) < 0.6, straight, anywhere)
 
 
 def _frame(axis: np.ndarray, helper: np.ndarray) -> np.ndarray:
-    """A rotation whose last column is `axis`; `helper` fixes the angle about it."""
+    """Rotation whose last column is `axis`; `helper` determines the angle about it."""
     x = np.cross(axis, helper)
     x /= np.linalg.norm(x)
     return np.stack([x, np.cross(axis, x), axis], axis=1)
 
 
 def turned(vector: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
-    """The rotation about a vector by its length [rad]."""
+    """Rotation matrix of a rotation vector [rad]."""
     angle = np.linalg.norm(vector)
     if angle == 0:
         return np.eye(3)
@@ -270,24 +270,24 @@ def turned(vector: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
 
 
 _FRAMES = 200
-"""Number of frames of the recording with joint positions that are used."""
+"""Largest number of frames with joint positions used from the recording."""
 _TURN = np.deg2rad(8.0)
 """Standard deviation of an arm's rotation in front of the camera [rad]."""
 _SHIFT = 0.06
-"""Standard deviation of its translation, in distances from the camera [1]."""
+"""Standard deviation of an arm's translation, relative to its distance from the camera [1]."""
 _JOINTS = 0.12
-"""Standard deviation of joint motion, in parts of the joint's range in the recording [1]."""
+"""Standard deviation of joint motion, relative to the joint's range in the recording [1]."""
 _LEAST = np.deg2rad(6.0)
-"""Least standard deviation of joint motion [rad]; a tenth of that in [m] for sliding joints."""
+"""Minimum standard deviation of joint motion [rad]; for prismatic joints, a tenth of this value in [m]."""
 _ZOOM = 0.12
 """Standard deviation of the logarithm of the focal length [1]."""
 
 
 class RecordedPlacements:
-    """Placements like those of a sequence file.
+    """Generator of placements similar to those in a sequence file.
 
     Raises:
-        SequenceError: it cannot be read.
+        SequenceError: the sequence file cannot be read.
     """
 
     def __init__(self, path: Path) -> None:
@@ -303,12 +303,12 @@ class RecordedPlacements:
     def __call__(
         self, rng: np.random.Generator, geometries: tuple[RobotGeometry, ...], size: tuple[int, int], field: int
     ) -> tuple[Intrinsics, list[Placement]]:
-        """A camera and a place for each robot, with a part of the first one in the image.
+        """Draw intrinsics and a placement for each robot, with part of the first one in the image.
 
-        `size` is width and height of the image [px], a part of the camera's image, which is `field` px wide.
+        `size` is width and height [px] of the image, a crop of a camera image that is `field` px wide.
 
         Raises:
-            SettingsError: a robot is not in the recording.
+            SettingsError: the recording does not contain one of the robots.
         """
         camera = self._cameras[int(rng.integers(len(self._cameras)))]
         zoom = field / camera.width * float(np.exp(rng.normal(0, _ZOOM)))
@@ -327,7 +327,7 @@ class RecordedPlacements:
         if not len(seen):
             return (fx, fy, size[0] / 2, size[1] / 2), placements
         x, y, z = seen[int(rng.integers(len(seen)))]
-        # That point comes to lie anywhere in the image.
+        # The principal point is chosen such that this point is at a random position in the image.
         u, v = rng.uniform(0.1, 0.9, 2) * size
         return (fx, fy, u - fx * x / z, v - fy * y / z), placements
 
@@ -352,6 +352,6 @@ class RecordedPlacements:
 
 
 def _points(geometry: RobotGeometry, placement: Placement) -> Float[np.ndarray, "V 3"]:
-    """The arm's vertices in the camera's frame [m]."""
+    """Vertices of the arm in the camera frame [m]."""
     Ts_base_link = geometry.link_transforms(placement.joint_positions)
     return geometry.posed(placement.T_camera_base @ Ts_base_link).vertices.astype(float)

@@ -13,7 +13,7 @@ from ...files.reading import IMAGE, read_bytes
 
 
 def smooth_noise(rng: np.random.Generator, width: int, height: int, cells: float, octaves: int = 3) -> np.ndarray:
-    """Multi-octave noise, zero mean, about unit deviation [height, width]; `cells` are the coarsest cells per width."""
+    """Multi-octave noise [height, width], zero mean, about unit standard deviation; `cells` per width in octave one."""
     noise = np.zeros((height, width), np.float32)
     amplitude = 1.0
     for _ in range(octaves):
@@ -27,7 +27,7 @@ def smooth_noise(rng: np.random.Generator, width: int, height: int, cells: float
 
 
 def grain(rng: np.random.Generator, width: int, height: int) -> np.ndarray:
-    """Fine texture of about unit deviation, some pixels wide [height, width, 1]."""
+    """Noise on a scale of some pixels, about unit standard deviation [height, width, 1]."""
     texture = rng.standard_normal((height, width), np.float32)
     texture = cv2.GaussianBlur(texture, (0, 0), rng.uniform(0.5, 2.0))
     return (texture / (texture.std() + 1e-6))[..., None]
@@ -37,16 +37,16 @@ Image = Float[np.ndarray, "h w 3"]
 
 _SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".webp", ".tif", ".tiff")
 _LARGEST = 640
-"""Longer side that photographs are reduced to [px]."""
+"""Longer side of photographs after downscaling [px]."""
 _DARKEST = 0.25
-"""Mean brightness that photographs are raised to at least: low light is no part of the training data."""
+"""Minimum mean brightness of photographs [1]: training data exclude low light."""
 
 
 class Photographs:
-    """Random views of the image files in a folder and its subfolders.
+    """Generator of random crops of the image files in a folder and its subfolders.
 
     Raises:
-        SettingsError: there is no photograph, or one cannot be read.
+        SettingsError: the folder has no image file, or one cannot be read.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -61,12 +61,12 @@ class Photographs:
         return len(self._images)
 
     def __call__(self, rng: np.random.Generator, width: int, height: int) -> Image:
-        """A part of a photograph, turned, mirrored, enlarged and with other colours; RGB in [0, 1]."""
+        """Crop of a photograph, rotated, mirrored, enlarged and with changed colours; RGB in [0, 1]."""
         image = self._images[int(rng.integers(len(self._images)))]
         rows, columns = image.shape[:2]
         if rng.random() < 0.5:
             image = image[:, ::-1]
-        # The part is at most as large as the photograph, so that its border is rarely visible.
+        # The crop is at most as large as the photograph, so that its border is rarely visible.
         largest = min(columns / width, rows / height)
         step = largest * np.exp(rng.uniform(np.log(0.3), 0.0))
         turn = rng.normal(0, 12) + 90 * int(rng.integers(4)) * (rng.random() < 0.3)
@@ -80,7 +80,7 @@ class Photographs:
             image = cv2.GaussianBlur(image, (0, 0), 0.4 * step)
         part = cv2.warpAffine(image, motion, (width, height), flags=cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT_101)
         image = part.astype(np.float32) / 255
-        # Other exposure, saturation and white balance, sometimes channels swapped.
+        # Change exposure, saturation and white balance; sometimes swap channels.
         if rng.random() < 0.15:
             image = image[..., rng.permutation(3)]
         grey = image.mean(2, keepdims=True)
@@ -105,7 +105,7 @@ def _read(path: Path) -> np.ndarray:
 
 
 def room(rng: np.random.Generator, width: int, height: int) -> Image:
-    """Surfaces with straight borders, one in front of the other, with bars, holes and cables on them."""
+    """Overlapping surfaces with straight borders, covered with bars, holes and cables."""
     image = plain(rng, width, height)
     for _ in range(int(rng.integers(1, 7))):
         image = _panel(rng, image)
@@ -121,7 +121,7 @@ def room(rng: np.random.Generator, width: int, height: int) -> Image:
 
 
 def plain(rng: np.random.Generator, width: int, height: int) -> Image:
-    """One colour, grey or saturated, with a slope of light and a little texture."""
+    """Uniform grey or saturated colour with a brightness gradient and slight texture."""
     image = np.full((height, width, 3), _color(rng), np.float32)
     slope = 1 + rng.uniform(0, 0.25) * smooth_noise(rng, width, height, 2, 1)
     texture = 1 + rng.uniform(0, 0.05) * grain(rng, width, height)
@@ -129,7 +129,7 @@ def plain(rng: np.random.Generator, width: int, height: int) -> Image:
 
 
 def foil(rng: np.random.Generator, width: int, height: int) -> Image:
-    """Crumpled metal foil or wet plastic: facets that are bright or dark as they happen to face the light."""
+    """Crumpled metal foil or wet plastic: facets with brightness by random orientation to the light."""
     facets = np.zeros((height, width), np.float32)
     for _ in range(int(rng.integers(2, 5))):
         folded = np.abs(smooth_noise(rng, width, height, np.exp(rng.uniform(np.log(3), np.log(24))), 1))
@@ -155,14 +155,14 @@ def drape(rng: np.random.Generator, width: int, height: int) -> Image:
 
 
 def _color(rng: np.random.Generator) -> Float[np.ndarray, "3"]:
-    """A display colour that is not dark: saturated, pale or grey."""
+    """Random display colour that is not dark: saturated, pale or grey."""
     kind = rng.random()
     saturation = rng.uniform(0.5, 1.0) if kind < 0.4 else rng.uniform(0.1, 0.5) if kind < 0.7 else rng.uniform(0, 0.08)
     return np.array(colorsys.hsv_to_rgb(rng.random(), saturation, rng.uniform(0.4, 1.0)), np.float32)
 
 
 def _panel(rng: np.random.Generator, image: Image) -> Image:
-    """A wall, shelf or table top: a quadrangle with a shade, an edge and sometimes a shadow below it."""
+    """Draw a wall, shelf or table top: a shaded quadrangle with an edge and sometimes a shadow below it."""
     height, width = image.shape[:2]
     centre = rng.uniform(0, 1, 2) * (width, height)
     size = np.exp(rng.uniform(np.log(0.1), np.log(1.2), 2)) * width / 2
@@ -188,7 +188,7 @@ def _panel(rng: np.random.Generator, image: Image) -> Image:
 
 
 def _holes(rng: np.random.Generator, image: Image) -> Image:
-    """A regular grid of dark or light dots, as of a perforated board or a grating."""
+    """Draw a regular grid of dark or light dots, as of a perforated board or a grating."""
     height, width = image.shape[:2]
     y, x = np.mgrid[:height, :width].astype(np.float32)
     angle, period = rng.normal(0, 0.4), np.exp(rng.uniform(np.log(7), np.log(40)))
@@ -201,7 +201,7 @@ def _holes(rng: np.random.Generator, image: Image) -> Image:
 
 
 def _bars(rng: np.random.Generator, image: Image) -> Image:
-    """Parallel straight bars, round or flat, shiny, dark or coloured, that may cross the whole image."""
+    """Draw parallel straight bars, round or flat, shiny, dark or coloured, that may cross the whole image."""
     height, width = image.shape[:2]
     y, x = np.mgrid[:height, :width].astype(np.float32)
     angle, radius = rng.uniform(0, np.pi), np.exp(rng.uniform(np.log(2), np.log(22)))
@@ -229,7 +229,7 @@ def _cable(rng: np.random.Generator, image: Image) -> Image:
 
 
 def _hand(rng: np.random.Generator, image: Image) -> Image:
-    """A palm and some fingers in a glove of any colour, or bare."""
+    """Draw a palm and fingers, bare or in a glove of any colour."""
     height, width = image.shape[:2]
     palm = rng.uniform(0, 1, 2) * (width, height)
     size, heading = rng.uniform(0.08, 0.22) * width, rng.uniform(0, 2 * np.pi)
@@ -249,7 +249,7 @@ def _hand(rng: np.random.Generator, image: Image) -> Image:
 
 
 def _round(rng: np.random.Generator, t: np.ndarray, color: np.ndarray) -> Image:
-    """Colours across a cylinder, `t` from -1 to 1, under a random light, dull or shiny."""
+    """Colours across a dull or shiny cylinder, at `t` from -1 to 1, under a random light."""
     normal = np.sqrt(np.clip(1 - t * t, 0, 1))
     light = rng.uniform(-0.7, 0.7)
     facing = np.clip(light * t + np.sqrt(1 - light**2) * normal, 0, 1)
@@ -258,7 +258,7 @@ def _round(rng: np.random.Generator, t: np.ndarray, color: np.ndarray) -> Image:
 
 
 def _distance(points: np.ndarray, width: int, height: int) -> Float[np.ndarray, "h w"]:
-    """Distance of each pixel from a line through points [n, 2] [px]; up to the image's size where it is not in it."""
+    """Distance of each pixel from the polyline through points [n, 2] [px]; the image size if the line is outside it."""
     away = np.ones((height, width), np.uint8)
     cv2.polylines(away, [np.rint(np.vstack([points, points[-1:]])).astype(np.int32)], False, 0, 1)
     if away.all():
@@ -283,9 +283,9 @@ _BOARD = np.array(
 
 
 def random_background(rng: np.random.Generator, width: int, height: int) -> Image:
-    """A background without shadows, clutter or camera effects, RGB in [0, 1].
+    """Random background without shadows, clutter or camera effects, RGB in [0, 1].
 
-    Its mean brightness stays above about 0.25: low light is no part of the training data.
+    Its mean brightness is at least about 0.25, because training data exclude low light.
     """
     name = rng.choice(list(_SHARES), p=list(_SHARES.values()))
     image = MAKERS[name](rng, width, height).astype(np.float32)
@@ -293,7 +293,7 @@ def random_background(rng: np.random.Generator, width: int, height: int) -> Imag
     mean = image.mean()
     if mean < 0.25:
         image = np.clip(image + (0.25 - mean), 0, 1)
-    # Uneven light: a broad spot and a slope, never darker than about two thirds.
+    # Uneven light: a broad spot and a gradient, never darker than about two thirds.
     y, x = np.mgrid[:height, :width].astype(np.float32)
     x, y = x / width - rng.uniform(0.1, 0.9), y / height - rng.uniform(0.1, 0.9)
     spot = np.exp(-(x * x + y * y) / (2 * rng.uniform(0.3, 0.9) ** 2))
@@ -303,7 +303,7 @@ def random_background(rng: np.random.Generator, width: int, height: int) -> Imag
 
 
 def _free(rng: np.random.Generator, width: int, height: int) -> Image:
-    """Clouds of any colours."""
+    """Cloud-like noise in random colours."""
     image = _blend(rng, rng.uniform(0.1, 0.95, (3, 3)).astype(np.float32), width, height)
     return image * (1 + rng.uniform(0, 0.12) * grain(rng, width, height))
 
@@ -339,7 +339,7 @@ def _tissue(rng: np.random.Generator, width: int, height: int) -> Image:
 
 
 def _wet_relief(rng: np.random.Generator, image: np.ndarray) -> np.ndarray:
-    """Folds lit by a lamp at the lens, with the white highlights of a wet surface, small and large."""
+    """Add folds lit by a lamp at the lens, with small and large white highlights of a wet surface."""
     height, width = image.shape[:2]
     relief = smooth_noise(rng, width, height, np.exp(rng.uniform(np.log(3), np.log(14))), int(rng.integers(1, 4)))
     if rng.random() < 0.4:  # creases
@@ -356,7 +356,7 @@ def _wet_relief(rng: np.random.Generator, image: np.ndarray) -> np.ndarray:
     y, x = np.mgrid[:height, :width].astype(np.float32)
     focal = rng.uniform(0.8, 1.6) * width
     tilt_x, tilt_y = (x - rng.uniform(0.2, 0.8) * width) / focal, (y - rng.uniform(0.2, 0.8) * height) / focal
-    # The lamp is at the lens, so a point shines where its normal meets the view ray.
+    # The lamp is at the lens, so highlights are where the normal is parallel to the view ray.
     facing = (1 + slope_x * tilt_x + slope_y * tilt_y) / np.sqrt(
         (1 + slope_x**2 + slope_y**2) * (1 + tilt_x**2 + tilt_y**2)
     )
@@ -370,7 +370,7 @@ def _wet_relief(rng: np.random.Generator, image: np.ndarray) -> np.ndarray:
 
 
 def _folds(rng: np.random.Generator, width: int, height: int) -> np.ndarray:
-    """Heights of folds, gut and vessels: tubes that wind over one another [height, width], in [0, 1]."""
+    """Height map of folds, gut and vessels: overlapping winding tubes [height, width], in [0, 1]."""
     heights = np.zeros((height, width), np.float32)
     for _ in range(rng.integers(2, 14)):
         heading = rng.uniform(0, 2 * np.pi) + np.cumsum(rng.normal(0, rng.uniform(0.05, 0.4), 30))
@@ -386,7 +386,7 @@ def _folds(rng: np.random.Generator, width: int, height: int) -> np.ndarray:
 
 
 def _glare(rng: np.random.Generator, image: np.ndarray) -> np.ndarray:
-    """A wet bulge that mirrors the lamp: a bright patch, smooth or broken up by a rough surface, up to white."""
+    """Add the reflection of the lamp in a wet bulge: a bright patch, smooth or broken up by roughness, up to white."""
     height, width = image.shape[:2]
     y, x = np.mgrid[:height, :width].astype(np.float32)
     centre = rng.uniform(0, 1, 2) * (width, height)
@@ -422,7 +422,7 @@ def _board(rng: np.random.Generator, width: int, height: int) -> Image:
 
 
 def _pattern(rng: np.random.Generator, width: int, height: int) -> Image:
-    """Weave, stripes or checks between two colours."""
+    """Weave, stripes or checks of two colours."""
     y, x = np.mgrid[:height, :width].astype(np.float32)
     angle, period = rng.uniform(0, np.pi), np.exp(rng.uniform(np.log(4), np.log(60)))
     u = (x * np.cos(angle) + y * np.sin(angle)) * 2 * np.pi / period
@@ -444,7 +444,7 @@ MAKERS = {
     "drape": drape,
     "foil": foil,
 }
-"""Kinds of backgrounds by name; each takes random numbers, width and height [px]."""
+"""Generators of backgrounds by name; arguments are the random generator, width and height [px]."""
 
 _SHARES = dict(zip(MAKERS, (0.42, 0.14, 0.06, 0.06, 0.18, 0.05, 0.05, 0.04), strict=True))
-"""How often each kind of background is made; they add up to 1."""
+"""Probability of each kind of background; the sum is 1."""

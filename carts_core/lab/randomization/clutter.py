@@ -1,6 +1,6 @@
 """Distractors of training images: solid objects, small items, occluders and shadows.
 
-Solid objects (rods, plates, cables, tools) are shaded as the arms are, so that neither gloss nor shape alone identifies
+Solid objects (rods, plates, cables, tools) are shaded like the arms, so that neither gloss nor shape alone identifies
 an instrument. The occluded surface of an arm remains the label.
 """
 
@@ -16,11 +16,11 @@ Image = Float[np.ndarray, "h w 3"]
 
 _SUPERSAMPLING = 2
 _DEPTH = (0.05, 0.40)
-"""Distance from the camera [m]."""
+"""Range of the distance from the camera [m]."""
 
 
 def add_things(rng: np.random.Generator, image: Image, intrinsics: Intrinsics) -> Image:
-    """One to four random objects before a background, with shadows beside them."""
+    """Draw one to four random objects on a background, with shadows beside them."""
     height, width = image.shape[:2]
     things = [random_thing(rng) for _ in range(rng.choice([1, 2, 3, 4], p=[0.4, 0.3, 0.2, 0.1]))]
     posed = [_placed(rng, thing, intrinsics, width, height) for thing in things]
@@ -36,7 +36,7 @@ def add_things(rng: np.random.Generator, image: Image, intrinsics: Intrinsics) -
 
 
 def random_thing(rng: np.random.Generator) -> Body:
-    """A rod, plate, rail, cable, tool or ring of centimetres, about its own origin."""
+    """Random rod, plate, rail, cable, tool or ring, some centimetres large and centred at its origin."""
     kinds = [_rod, _plate, _rails, _cable, _tool, _ring]
     make = kinds[int(rng.choice(len(kinds), p=[0.3, 0.2, 0.12, 0.16, 0.14, 0.08]))]
     parts = make(rng)
@@ -61,7 +61,7 @@ def _log_uniform(rng: np.random.Generator, low: float, high: float) -> float:
 
 
 def _rod(rng: np.random.Generator) -> list[Part]:
-    """A rod or tube, sometimes of two materials or with a collar."""
+    """Rod or tube, sometimes of two materials or with a collar."""
     radius, length = _log_uniform(rng, 0.0008, 0.012), _log_uniform(rng, 0.04, 0.5)
     cut = length * rng.uniform(0.1, 0.9) if rng.random() < 0.4 else length
     parts = [_straight(0, cut, radius, radius * rng.uniform(0.8, 1.0))]
@@ -75,7 +75,7 @@ def _rod(rng: np.random.Generator) -> list[Part]:
 
 
 def _plate(rng: np.random.Generator) -> list[Part]:
-    """A disc or a rectangular plate, sometimes with a rim."""
+    """Disc or rectangular plate, sometimes with a rim."""
     thickness = _log_uniform(rng, 0.0008, 0.02)
     if rng.random() < 0.4:
         radius = _log_uniform(rng, 0.006, 0.12)
@@ -104,7 +104,7 @@ def _rails(rng: np.random.Generator) -> list[Part]:
 
 
 def _cable(rng: np.random.Generator) -> list[Part]:
-    """A winding cable, hose or wire."""
+    """Winding cable, hose or wire."""
     steps = 40
     turns = np.cumsum(rng.normal(0, rng.uniform(0.02, 0.25), (steps, 3)), axis=0)
     heading = np.array([0.0, 0.0, 1.0]) + turns
@@ -114,7 +114,7 @@ def _cable(rng: np.random.Generator) -> list[Part]:
 
 
 def _tool(rng: np.random.Generator) -> list[Part]:
-    """Two bars that cross, as of scissors, pliers and tweezers, often with rings to hold it by."""
+    """Two crossing bars, as of scissors, pliers and tweezers, often with finger rings."""
     length, thickness = rng.uniform(0.06, 0.2), _log_uniform(rng, 0.0015, 0.005)
     opening, joint = rng.uniform(0.02, 0.35), rng.uniform(-0.4, 0.4) * length
     parts: list[Part] = []
@@ -137,7 +137,7 @@ def _ring(rng: np.random.Generator) -> list[Part]:
 
 
 def _straight(low: float, high: float, near: float, far: float, sides: int = 20) -> Part:
-    """A cylinder or cone along z with flat ends and separate vertices for sharp edges."""
+    """Cylinder or cone along z with flat ends and separate vertices for sharp edges."""
     rings = [(low, 0.0), (low, near), (low, near), (high, far), (high, far), (high, 0.0)]
     angles = np.linspace(0, 2 * np.pi, sides, endpoint=False)
     circle = np.column_stack([np.cos(angles), np.sin(angles)])
@@ -146,7 +146,7 @@ def _straight(low: float, high: float, near: float, far: float, sides: int = 20)
 
 
 def _bent(points: np.ndarray, radius: float, sides: int = 10) -> Part:
-    """A tube along points [n, 3]; a closed one where the last point is the first."""
+    """Tube along points [n, 3]; closed if the last point equals the first."""
     along = np.gradient(points, axis=0)
     along /= np.linalg.norm(along, axis=1, keepdims=True) + 1e-12
     helper = np.eye(3)[np.abs(along).mean(0).argmin()]
@@ -160,7 +160,7 @@ def _bent(points: np.ndarray, radius: float, sides: int = 10) -> Part:
 
 
 def _band(start: int, sides: int) -> np.ndarray:
-    """Triangles between a ring of vertices and the next one."""
+    """Triangles between two consecutive rings of vertices."""
     here = start + np.arange(sides)
     beside = start + (np.arange(sides) + 1) % sides
     corners = np.stack([here, beside, here + sides, beside, beside + sides, here + sides], 1)
@@ -173,7 +173,7 @@ def _circle(radius: float) -> np.ndarray:
 
 
 def _box(extents: np.ndarray, centre: np.ndarray) -> Part:
-    """A box with separate vertices for each face."""
+    """Box with separate vertices for each face."""
     vertices, faces = [], []
     for axis in range(3):
         for sign in (-1.0, 1.0):
@@ -187,7 +187,7 @@ def _box(extents: np.ndarray, centre: np.ndarray) -> Part:
 
 
 def _normals(vertices: np.ndarray, faces: np.ndarray) -> Float[np.ndarray, "V 3"]:
-    """Means of the triangles at each vertex, weighted by area; the sign does not matter (see `render_gbuffer`)."""
+    """Vertex normals: area-weighted means over adjacent triangles; their sign is irrelevant (see `render_gbuffer`)."""
     a, b, c = (vertices[faces[:, corner]] for corner in range(3))
     cross, normals = np.cross(b - a, c - a), np.zeros_like(vertices)
     for corner in range(3):
@@ -196,7 +196,7 @@ def _normals(vertices: np.ndarray, faces: np.ndarray) -> Float[np.ndarray, "V 3"
 
 
 def _placed(rng: np.random.Generator, thing: Body, intrinsics: Intrinsics, width: int, height: int) -> PosedRobot:
-    """Random pose in or near the image."""
+    """Object at a random pose in or near the image."""
     fx, fy, cx, cy = intrinsics
     depth = _log_uniform(rng, *_DEPTH)
     u, v = rng.uniform(-0.1, 1.1, 2) * (width, height)
@@ -212,7 +212,7 @@ def _turn_about_y(angle: float) -> np.ndarray:
 
 
 def occlude(rng: np.random.Generator, image: Image, coverage: Float[np.ndarray, "h w"]) -> Image:
-    """One to three objects of any texture but red over the arms, ragged or smooth; none without arms."""
+    """Cover the arms with one to three ragged or smooth occluders of any texture but red; no change without arms."""
     rows, columns = np.nonzero(coverage > 0.5)
     if not len(rows):
         return image
@@ -225,9 +225,9 @@ def occlude(rng: np.random.Generator, image: Image, coverage: Float[np.ndarray, 
 
 
 def _texture(rng: np.random.Generator, width: int, height: int) -> Image:
-    """Any texture without red in it: blood over an instrument is evaluated, so it must not be trained on."""
+    """Random texture without red: blood on instruments is part of the evaluation, so it is excluded from training."""
     texture = random_background(rng, width, height).astype(np.float32) * rng.uniform(0.6, 1.2)
-    # Where red is strongest it changes places with the next, which leaves no seam where both are as strong.
+    # Where red is the strongest channel, it is swapped with the second strongest; this leaves no visible edges.
     red, strongest = texture[..., 0].copy(), 1 + texture[..., 1:].argmax(2)[..., None]
     other = np.take_along_axis(texture, strongest, 2)[..., 0]
     texture[..., 0] = np.minimum(red, other)
@@ -236,7 +236,7 @@ def _texture(rng: np.random.Generator, width: int, height: int) -> Image:
 
 
 def _shape(rng: np.random.Generator, centre: tuple[float, float], width: int, height: int) -> Float[np.ndarray, "h w"]:
-    """Share of each pixel that is hidden: an ellipse with a waved, ragged or smooth edge."""
+    """Occluded share of each pixel: an ellipse with a wavy, ragged or smooth edge."""
     y, x = np.mgrid[:height, :width].astype(np.float32)
     angle, radius = rng.uniform(0, np.pi), np.exp(rng.uniform(np.log(0.012), np.log(0.1))) * width
     u = ((x - centre[0]) * np.cos(angle) + (y - centre[1]) * np.sin(angle)) / (radius * np.exp(rng.uniform(0, 1)))
@@ -247,7 +247,7 @@ def _shape(rng: np.random.Generator, centre: tuple[float, float], width: int, he
 
 
 def add_clutter(rng: np.random.Generator, image: Image) -> Image:
-    """Shadow-like streaks, blobs, threads, crumbs and small objects on a background."""
+    """Draw shadow-like streaks, blobs, threads, crumbs and small objects on a background."""
     for _ in range(rng.choice([0, 1, 2, 3], p=[0.3, 0.35, 0.2, 0.15])):
         image = _streak(rng, image)
     for _ in range(rng.choice([0, 1, 2, 4], p=[0.5, 0.25, 0.15, 0.1])):
@@ -260,22 +260,22 @@ def add_clutter(rng: np.random.Generator, image: Image) -> Image:
 
 
 def cast_shadow(rng: np.random.Generator, image: Image, coverage: Float[np.ndarray, "h w"]) -> Image:
-    """The arms' own soft shadow: their silhouette moved, turned, blurred and used to darken the background.
+    """Darken the background by the arms' soft shadow: their silhouette, displaced, rotated and blurred.
 
-    The arms themselves are put over it later, so the shadow shows beside them only.
+    The arms are composited later, so the shadow is visible only beside them.
     """
     width = coverage.shape[1]
     reach = np.exp(rng.uniform(np.log(0.01), np.log(0.35))) * width
     moved = _displaced(rng, coverage, reach, turn=6, scale=(0.9, 1.15))
     soft = cv2.GaussianBlur(moved, (0, 0), np.clip(reach * rng.uniform(0.03, 0.2), 0.6, 8))
-    # Near its caster, a shadow can be nearly black.
+    # Close to the arm, a shadow can be nearly black.
     return _darken(rng, image, soft, 0.9 if reach < 0.08 * width else 0.6)
 
 
 def contact_shadow(
     rng: np.random.Generator, image: Image, coverage: Float[np.ndarray, "h w"], darkness: float
 ) -> Image:
-    """Sharp shadow beside the arms of about their brightness (`darkness` [1]), so that only its shape differs."""
+    """Draw a sharp shadow beside the arms, about as bright as the arms (`darkness` [1]): only its shape differs."""
     reach = np.exp(rng.uniform(np.log(0.006), np.log(0.06))) * coverage.shape[1]
     moved = _displaced(rng, coverage, reach, turn=2, scale=(1.0, 1.0))
     shape = cv2.GaussianBlur(moved, (0, 0), rng.uniform(0.4, 1.5))[..., None]
@@ -289,7 +289,7 @@ def contact_shadow(
 def _displaced(
     rng: np.random.Generator, coverage: np.ndarray, reach: float, turn: float, scale: tuple[float, float]
 ) -> np.ndarray:
-    """A silhouette moved by `reach` [px] in a random direction, turned with a deviation of `turn` [deg] and scaled."""
+    """Silhouette shifted by `reach` [px] in a random direction, randomly rotated (std `turn` [deg]) and scaled."""
     height, width = coverage.shape
     heading = rng.uniform(0, 2 * np.pi)
     centre = rng.uniform(0, width), rng.uniform(0, height)
@@ -304,7 +304,7 @@ def _darken(rng: np.random.Generator, image: np.ndarray, shape: np.ndarray, stro
 
 
 def _streak(rng: np.random.Generator, image: np.ndarray) -> np.ndarray:
-    """A tapered dark band with soft edges that keeps the texture below it: a shadow, never an instrument."""
+    """Draw a tapered dark band with soft edges, through which the texture is visible: a shadow, not an instrument."""
     height, width = image.shape[:2]
     start, heading = rng.uniform(-0.1, 1.1, 2) * (width, height), rng.uniform(0, 2 * np.pi)
     length = rng.uniform(0.2, 1.3) * width
@@ -325,7 +325,7 @@ def _streak(rng: np.random.Generator, image: np.ndarray) -> np.ndarray:
 
 
 def _object(rng: np.random.Generator, image: np.ndarray) -> np.ndarray:
-    """A small opaque thing with some shading: swab, clip, needle holder's target, fold."""
+    """Draw a small opaque object with some shading, such as a swab, clip or fold."""
     height, width = image.shape[:2]
     shape = np.zeros((height, width), np.float32)
     centre = rng.uniform(0, 1, 2) * (width, height)

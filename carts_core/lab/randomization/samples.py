@@ -1,4 +1,4 @@
-"""Training samples: observed images, pairs with hybrid images (feature network), and surface maps (surface network)."""
+"""Training samples: pairs of observed and hybrid images (feature network), and surface maps (surface network)."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -31,14 +31,14 @@ from .shading import GBuffer, photograph, render_gbuffer, shade, tone
 SUPERSAMPLING = 2
 _VARIANTS = 12
 _VARIANT_LIFE = 80
-"""Number of images between renewals of entries of the pool."""
+"""Number of images after which an entry of the pool is renewed."""
 _OBSERVATIONS, _SCENES = 0, 1
-"""Streams of random numbers."""
+"""Indices of the random streams."""
 _TRIES = 12
 _FAR = 100.0
-"""Distance of absent arms behind the camera [m]."""
+"""Distance behind the camera at which absent arms are placed [m]."""
 _CONTACT = 0.4
-"""Share of images with a crisp shadow beside the arms."""
+"""Share of images with a sharp shadow beside the arms."""
 
 
 @dataclass(frozen=True)
@@ -51,22 +51,22 @@ class Observation:
     placements: list[Placement]
     """Poses of the arms."""
     claimed: list[Placement]
-    """Given poses of the arms: equal to the true ones, except for absent arms."""
+    """Prior poses of the arms: equal to the true ones, except for absent arms."""
     intrinsics: Intrinsics
     view: GBuffer
     """Surfaces at the pixel centres."""
     fine: GBuffer
-    """The same, `SUPERSAMPLING` times as fine."""
+    """Surfaces at `SUPERSAMPLING` times the resolution."""
     coverage: Float[np.ndarray, "h w"]
     """Share of each pixel that shows an arm."""
     background: Float[np.ndarray, "h w 3"]
-    """Without arms, before the camera."""
+    """Scene without arms, before camera effects."""
     camera_seed: int
     """Seed of the camera effects."""
 
 
 class Observer:
-    """Generator of observed images; each depends on the seed and its number only."""
+    """Generator of observed images; each depends only on the seed and its number."""
 
     def __init__(self, robots: Sequence[Robot], settings: ImageSettings, seed: int | Sequence[int]) -> None:
         self._seed = (seed,) if isinstance(seed, int) else tuple(seed)
@@ -79,7 +79,7 @@ class Observer:
         self._variants: dict[tuple[int, int], tuple[Variant, int]] = {}
 
     def __call__(self, number: int | None = None) -> Observation:
-        """The observation of a number, counted from 0; by default the next one."""
+        """Observation of a number, from 0; by default the next one."""
         number = self._next if number is None else number
         self._next = number + 1
         self.rng = np.random.default_rng((*self._seed, _OBSERVATIONS, number))
@@ -101,9 +101,9 @@ class Observer:
         )
 
     def _variant(self, arms: int, number: int) -> Variant:
-        """A scene from a small pool with gradual renewal; building one costs as much as several images."""
+        """Scene from a small pool with gradual renewal, because building one costs as much as several images."""
         place, settings = int(self.rng.integers(_VARIANTS)), self.settings
-        # One place of the pool is renewed at a time.
+        # One entry of the pool is renewed at a time.
         life = number // _VARIANT_LIFE + place
         generation = life // _VARIANTS
         variant, made = self._variants.get((arms, place), (None, -1))
@@ -114,7 +114,7 @@ class Observer:
         return variant
 
     def _visible_placements(self, variant: Variant) -> tuple[Intrinsics, list[Placement], GBuffer]:
-        """Arms whose visible area is within bounds, or the last ones of `_TRIES`."""
+        """Draw placements until the visible area of the arms is within bounds, at most `_TRIES` times."""
         settings, rng = self.settings, self.rng
         size = settings.width, settings.height
         tries = 0
@@ -131,7 +131,7 @@ class Observer:
                 return intrinsics, placements, view
 
     def _without_some(self, placements: list[Placement]) -> list[Placement]:
-        """One of the arms, or all, moved behind the camera."""
+        """Placements with one or all of the arms moved behind the camera."""
         gone = self.rng.random(len(placements)) < 0.5
         if not gone.any():
             gone[:] = True
@@ -157,7 +157,7 @@ class Observer:
     ) -> Float[np.ndarray, "h w 3"]:
         rng = self.rng
         color = shade(rng, fine, list(variant.geometries), background.mean((0, 1)))
-        # Averaging the shaded subpixels gives colour times coverage, which is what compositing needs.
+        # Averaging the shaded subpixels yields premultiplied colour, as compositing requires.
         arms = cv2.resize(fine.image(color.astype(np.float32)), coverage.shape[::-1], interpolation=cv2.INTER_AREA)
         for _ in range(rng.choice([0, 1, 2], p=[0.3, 0.5, 0.2])):
             background = cast_shadow(rng, background, coverage)
@@ -176,7 +176,7 @@ def look(
     size: tuple[int, int],
     fine: int = 1,
 ) -> GBuffer:
-    """G-buffer of placed arms in an image of width and height `size`, `fine` times as fine."""
+    """G-buffer of placed arms in an image of width and height `size` [px], at `fine` times the resolution."""
     posed = [
         arm.posed(placement.T_camera_base @ arm.link_transforms(placement.joint_positions))
         for arm, placement in zip(arms, placements, strict=True)
@@ -186,12 +186,12 @@ def look(
 
 
 def to_uint8(image: np.ndarray) -> np.ndarray:
-    """An image in [0, 1] as bytes."""
+    """Convert an image in [0, 1] to bytes."""
     return (np.clip(image, 0, 1) * 255 + 0.5).astype(np.uint8)
 
 
 BACKGROUND, SHAFT, HEAD = 0, 1, 2
-"""Classes of a pixel: no instrument, shaft, or wrist and jaws."""
+"""Pixel classes: no instrument, shaft, or wrist and jaws."""
 
 _BLURRED = 0.7
 _BLUR = (0.4, 1.8)
@@ -199,7 +199,7 @@ _BLUR = (0.4, 1.8)
 
 @dataclass(frozen=True)
 class TrainingPair:
-    """An observed image and a hybrid image, each with the classes of its pixels."""
+    """Observed image and hybrid image, each with the classes of its pixels."""
 
     observed: Int[np.ndarray, "h w 3"]
     """RGB uint8."""
@@ -210,14 +210,14 @@ class TrainingPair:
 
 
 class PairGenerator:
-    """Generator of training pairs; each depends on the seed and its number only."""
+    """Generator of training pairs; each depends only on the seed and its number."""
 
     def __init__(self, robots: Sequence[Robot], settings: ImageSettings, seed: int | Sequence[int]) -> None:
         self._observer = Observer(robots, settings, seed)
         self._settings = settings
 
     def __call__(self, number: int | None = None) -> TrainingPair:
-        """The pair of a number, counted from 0; by default the next one."""
+        """Training pair of a number, from 0; by default the next one."""
         seen = self._observer(number)
         rng, settings = self._observer.rng, self._settings
         rendered = seen.placements
@@ -236,7 +236,7 @@ class PairGenerator:
         )
 
     def _mean_background(self, background: np.ndarray, camera_seed: int) -> np.ndarray:
-        """BG_m: the scene without arms through the same camera, without its noise; sometimes another scene."""
+        """Mean background BG_m: the scene without arms, with the same camera effects except noise; or another scene."""
         rng, appearance = self._observer.rng, self._settings.appearance
         if rng.random() < self._settings.same_background:
             image = photograph(np.random.default_rng(camera_seed), background, appearance)
@@ -261,7 +261,7 @@ class PairGenerator:
             rendering = variant.renderer(state)
         layers = np.dstack([rendering.image[0].permute(1, 2, 0).numpy(), rendering.silhouette[0].numpy()])
         rng = self._observer.rng
-        if rng.random() < _BLURRED:  # as the optimizer does, to have a gradient that reaches further
+        if rng.random() < _BLURRED:  # as in the optimizer, to widen the gradient's support
             layers = cv2.GaussianBlur(layers, (0, 0), rng.uniform(*_BLUR))
         image, silhouette, mean = (
             torch.from_numpy(np.ascontiguousarray(part)) for part in (layers[..., :3], layers[..., 3], background)
@@ -270,49 +270,49 @@ class PairGenerator:
 
 
 def _classes(variant: Variant, view: GBuffer, mask: np.ndarray | None) -> np.ndarray:
-    """Class per pixel; with `mask`, which is smoother, where an instrument is seen at all."""
+    """Class per pixel; with `mask`, an antialiased instrument mask, classes are adapted to it."""
     shafts = np.array([geometry.shaft for geometry in variant.geometries])
     classes = view.image(np.where(view.part == shafts[view.arm], SHAFT, HEAD).astype(np.uint8))
     if mask is not None:
-        # A pixel that is covered though its centre is not takes the class of a neighbour.
+        # A pixel in the mask whose centre is not covered takes the class of a neighbour.
         grown = cv2.dilate(classes, np.ones((3, 3), np.uint8))
         classes = np.where(mask, np.where(classes > 0, classes, np.maximum(grown, SHAFT)), BACKGROUND).astype(np.uint8)
     return classes
 
 
 SURFACE_UNIT = 127
-"""Scale of surface maps in samples."""
+"""Scale of surface maps stored as int8 in samples."""
 
 _LARGEST_ERROR = 3.0
-"""Scale of the largest error of the given kinematics; 1 is about 3 degrees and 3 mm."""
+"""Largest scale of the error of the prior kinematics; 1 is about 3 degrees and 3 mm."""
 
 _UNKNOWN = 0.08
-"""Share of samples in which nothing is given."""
+"""Share of samples without prior kinematics."""
 
 
 @dataclass(frozen=True)
 class SurfaceSample:
-    """One sample; see `carts_core.model.parts` for the maps."""
+    """Training sample of the surface network; see `carts_core.model.parts` for surface maps."""
 
     observed: Int[np.ndarray, "h w 3"]
     """RGB uint8."""
     given: Int[np.ndarray, "h w 6"]
-    """Surface map of wrong kinematics, times `SURFACE_UNIT`, int8."""
+    """Prior surface map from erroneous kinematics, times `SURFACE_UNIT`, int8."""
     surface: Int[np.ndarray, "h w 6"]
     """True surface map of the image, times `SURFACE_UNIT`, int8."""
 
 
 class SurfaceGenerator:
-    """Generator of surface samples; each depends on the seed and its number only."""
+    """Generator of surface samples; each depends only on the seed and its number."""
 
     def __init__(self, robots: Sequence[Robot], settings: ImageSettings, seed: int | Sequence[int]) -> None:
         self._observer = Observer(robots, settings, seed)
 
     def __call__(self, number: int | None = None) -> SurfaceSample:
-        """The sample of a number, counted from 0; by default the next one."""
+        """Surface sample of a number, from 0; by default the next one."""
         seen, rng = self._observer(number), self._observer.rng
         size = self._observer.settings.width, self._observer.settings.height
-        # Small errors are frequent, so that the network learns to be exact.
+        # Small errors are frequent, so that the network learns to be accurate.
         scale = _LARGEST_ERROR * float(rng.random()) ** 1.5
         given = [
             perturbed(rng, geometry, placement, scale)
@@ -325,7 +325,7 @@ class SurfaceGenerator:
 
 
 def _surface(geometries: Sequence[RobotGeometry], view: GBuffer, size: tuple[int, int]) -> np.ndarray:
-    """Surface map of arms seen at the given size or a finer one, as int8."""
+    """Surface map of arms as int8, from a G-buffer at the given size or a multiple of it."""
     values = np.zeros((len(view.rows), SURFACE_CHANNELS), np.float32)
     for index, geometry in enumerate(geometries):
         mine = np.flatnonzero(view.arm == index)

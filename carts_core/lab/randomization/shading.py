@@ -1,6 +1,6 @@
 """Deferred shading of observed training images: G-buffer, microfacet highlights, lights, environment, lens.
 
-It differs from the optimizer's Phong shading on purpose: the network must learn instruments and not one shader.
+It intentionally differs from the optimizer's Phong shading, so that the network does not overfit to one shader.
 """
 
 from collections.abc import Sequence
@@ -18,7 +18,7 @@ from .backgrounds import smooth_noise
 
 @dataclass(frozen=True)
 class GBuffer:
-    """Surface points of the pixels that see an arm; n is their number."""
+    """Surface points of the n pixels that show an arm."""
 
     size: tuple[int, int]
     """Width and height of the image [px]."""
@@ -26,13 +26,13 @@ class GBuffer:
     columns: Int[np.ndarray, " n"]
     arm: Int[np.ndarray, " n"]
     part: Int[np.ndarray, " n"]
-    """Index into `Robot.meshes`."""
+    """Part of each pixel: index into `Robot.meshes`."""
     points: Float[np.ndarray, "n 3"]
-    """In the camera's frame [m]."""
+    """Surface points in the camera frame [m]."""
     normals: Float[np.ndarray, "n 3"]
-    """Unit, towards the camera."""
+    """Unit normals in the camera frame, pointing towards the camera."""
     points_link: Float[np.ndarray, "n 3"]
-    """In the frame of the link, for textures that move with it [m]."""
+    """Surface points in the frame of their link, for textures that move with it [m]."""
 
     def image(self, values: np.ndarray, empty: float = 0.0) -> np.ndarray:
         """Scatter per-pixel values [n, ...] into an image [height, width, ...]."""
@@ -45,7 +45,7 @@ class GBuffer:
 def render_gbuffer(
     geometries: Sequence[Body], posed: Sequence[PosedRobot], intrinsics: Intrinsics, width: int, height: int
 ) -> GBuffer:
-    """Rasterise the arms with the same visibility kernel as the renderer; nothing else is shared with it."""
+    """Rasterise the arms with the renderer's visibility kernel, the only code shared with the renderer."""
     vertices = np.concatenate([arm.vertices for arm in posed])
     normals = np.concatenate([arm.normals for arm in posed])
     link_points = np.concatenate([geometry.vertices for geometry in geometries])
@@ -76,14 +76,14 @@ def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def _barycentric(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    """Weights [n, 3] of points [n, 3] in the planes of triangles [n, 3, 3]."""
+    """Barycentric coordinates [n, 3] of points [n, 3] in triangles [n, 3, 3]."""
     a = triangles[:, 0]
     u, v, w = triangles[:, 1] - a, triangles[:, 2] - a, points - a
     uu, vv, uv = _dot(u, u), _dot(v, v), _dot(u, v)
     wu, wv = _dot(w, u), _dot(w, v)
     scale = 1.0 / np.maximum(uu * vv - uv * uv, 1e-24)
     s, t = (vv * wu - uv * wv) * scale, (uu * wv - uv * wu) * scale
-    # Round-off on slivers must not extrapolate a normal.
+    # Avoids extrapolated normals due to round-off on sliver triangles.
     s, t = np.clip(s, 0, 1), np.clip(t, 0, 1)
     return np.stack([np.clip(1 - s - t, 0, 1), s, t], axis=1).astype(np.float32)
 
@@ -92,13 +92,13 @@ Image = Float[np.ndarray, "h w 3"]
 
 
 def photograph(rng: np.random.Generator, image: Image, ranges: AppearanceRanges) -> Image:
-    """Vignette, blur, exposure, colour, noise and JPEG artefacts, each drawn from `ranges`; result in [0, 1]."""
+    """Apply random vignette, blur, exposure, colour, noise and JPEG artefacts from `ranges`; result in [0, 1]."""
     height, width = image.shape[:2]
     image = image * _vignette(rng, width, height, ranges)
     sigma = rng.uniform(*ranges.blur)
     if sigma > 0.2:
         image = cv2.GaussianBlur(image, (0, 0), sigma)
-    if rng.random() < 0.25:  # cameras sharpen; that leaves bright seams along dark shafts
+    if rng.random() < 0.25:  # sharpening by the camera, which leaves bright seams along dark shafts
         image = image + rng.uniform(0.2, 1.0) * (image - cv2.GaussianBlur(image, (0, 0), rng.uniform(0.7, 1.5)))
     image = tone(rng, image, ranges)
     sigma = rng.uniform(*ranges.noise)
@@ -112,7 +112,7 @@ def photograph(rng: np.random.Generator, image: Image, ranges: AppearanceRanges)
         )
         assert decoded is not None
         image = decoded[..., ::-1].astype(np.float32) / 255
-    if rng.random() < 0.08:  # the black surround of a round endoscope image
+    if rng.random() < 0.08:  # the black border of a round endoscope image
         y, x = np.mgrid[:height, :width].astype(np.float32)
         radius = np.hypot(x - width * rng.uniform(0.4, 0.6), y - height * rng.uniform(0.4, 0.6))
         edge = rng.uniform(0.55, 0.75) * width
@@ -121,9 +121,9 @@ def photograph(rng: np.random.Generator, image: Image, ranges: AppearanceRanges)
 
 
 def tone(rng: np.random.Generator, image: Image, ranges: AppearanceRanges) -> Image:
-    """Exposure, white balance, contrast and tone curve alone."""
+    """Apply random exposure, white balance, contrast and tone curve only."""
     factor = rng.uniform(*ranges.brightness) * rng.uniform(*ranges.white_balance, size=3)
-    # The floor holds for the whole image; white balance moves colours about it.
+    # The brightness floor applies to the whole image, before white balance.
     factor *= max(1.0, ranges.brightness[0] / factor.mean())
     image = np.clip(image * factor.astype(np.float32), 0, 1.2)
     mean = image.mean()
@@ -139,7 +139,7 @@ def _vignette(rng: np.random.Generator, width: int, height: int, ranges: Appeara
         light = light * np.exp(
             rng.uniform(0, ranges.unevenness) * smooth_noise(rng, width, height, rng.uniform(2, 5), 1)
         )
-        # The mean brightness is kept, because low light is no part of the training data.
+        # The mean brightness is kept, because training data exclude low light.
         light = light / light.mean()
     return np.clip(light, 0.35, 1.6)[..., None]
 
@@ -150,7 +150,7 @@ _GAMMA = 1 / 2.2
 
 @dataclass(frozen=True)
 class _Surface:
-    """Material per pixel; n pixels."""
+    """Material of each of n pixels."""
 
     albedo: Float[np.ndarray, "n 3"]
     roughness: Float[np.ndarray, " n"]
@@ -229,7 +229,7 @@ def _reflections(rng, gbuffer, view, n_v, roughness, base, body, ambience) -> np
 
 
 def _random_environment(rng: np.random.Generator, ambience: np.ndarray) -> np.ndarray:
-    """A map over directions: a floor in the background's colour and some bright windows, whose mirror images on a
+    """Random environment map: a floor in the background's colour and some bright windows, whose reflections in a
     cylinder are the long highlights of a shaft."""
     rows, columns = _ENVIRONMENT
     level = rng.uniform(0.1, 0.7)
@@ -249,7 +249,7 @@ def _look_up(environment: np.ndarray, direction: np.ndarray) -> np.ndarray:
     rows, columns = environment.shape[:2]
     u = (np.arctan2(direction[:, 0], direction[:, 2]) / (2 * np.pi) + 0.5) * (columns - 1)
     v = (np.arcsin(np.clip(direction[:, 1], -1, 1)) / np.pi + 0.5) * (rows - 1)
-    # OpenCV's remap limits an image to 32,767 rows, so the list of pixels is folded into a square.
+    # OpenCV's remap limits an image to 32,767 rows, so the list of pixels is reshaped to a square.
     side = int(np.ceil(np.sqrt(len(u))))
     grid = np.zeros((2, side * side), np.float32)
     grid[0, : len(u)], grid[1, : len(v)] = u, v
@@ -308,7 +308,7 @@ def _random_metal(rng: np.random.Generator) -> tuple[np.ndarray, float, float]:
 
 
 def _grime(rng: np.random.Generator, points: np.ndarray) -> np.ndarray:
-    """Smooth noise over the surface, zero mean, about unit deviation."""
+    """Smooth noise over the surface, zero mean, about unit standard deviation."""
     noise = np.zeros(len(points), np.float32)
     for _ in range(4):
         wave = rng.normal(size=3)

@@ -1,4 +1,4 @@
-"""The counterfactual domains: blood, smoke, light and sensor over one motion."""
+"""Counterfactual domains: blood, smoke, light and sensor effects on the same motion."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ from .scene import EXTENT, Tissue, sample, smooth_noise, smoothstep
 _ABSORPTION = np.array([620.0, 4200.0, 4600.0])
 """Absorption of blood for red, green and blue light [1/m]."""
 _SCATTERED = np.array([0.030, 0.0012, 0.0011])
-"""Reflectance of blood itself."""
+"""Reflectance of thick blood, for red, green and blue light [1]."""
 _POOL_DEPTH = 0.0011
 _FILM_DEPTH = 0.00030
 _BLOOD_GRID = 64
@@ -24,7 +24,7 @@ _GRID_SIZE = 0.040
 
 
 class Bleeding:
-    """Blood at fixed places of the tissue, in its hollows, and fixed to the moving instruments."""
+    """Blood in hollows of the tissue, and in a pattern attached to the moving instruments."""
 
     def __init__(self, tissue: Tissue, config: DomainConfig, rng: np.random.Generator) -> None:
         shape = (len(tissue.albedo) // 2,) * 2
@@ -52,12 +52,12 @@ class Bleeding:
         lens: Float[np.ndarray, "3"],
         lamp: float,
     ) -> Float[np.ndarray, "h w 3"]:
-        """A picture with blood: absorption twice through its depth, its own red, and its wet highlights.
+        """Add blood to an image: absorption along the path in and out, scattered red light, and wet highlights.
 
         Args:
             light: linear RGB without blood.
-            surface: of the pixels.
-            Ts_world_link: pose of each link of `surface.link`.
+            surface: surface points of the pixels.
+            Ts_world_link: pose of each link in `surface.link`.
             lens: position of the lens and the light [m].
             lamp: radiant intensity of the light, in the unit of `light` times square metres.
         """
@@ -70,7 +70,7 @@ class Bleeding:
                 depth[there] = self._film((surface.position[there] - T_world_link[:3, 3]) @ T_world_link[:3, :3])
         pooled = smoothstep(depth, 0.00002, 0.00025)
 
-        # Highlights of the dry surface vanish below a pool.
+        # Pools hide the highlights of the surface below.
         dull = np.minimum(light, 1.3 * cv2.GaussianBlur(light.astype(np.float32), (0, 0), light.shape[1] / 100))
         base = light + (dull - light) * (pooled * on_tissue)[..., None]
         through = np.exp(-2.0 * depth[..., None] * _ABSORPTION)
@@ -95,7 +95,7 @@ class Bleeding:
         return _FILM_DEPTH * (0.25 * smoothstep(above, -0.05, 0.10) + smoothstep(above, 0.0, 1.0))
 
     def _wet_normal(self, surface: Surface, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """Pools are flatter than the tissue below, with small waves."""
+        """Normals of the blood's surface, which is flatter than the tissue below and has small waves."""
         slope = np.stack([sample(self._waves[..., axis], x, y) for axis in (0, 1)], axis=-1)
         waves = np.concatenate([-0.35 * slope, np.zeros((*slope.shape[:-1], 1))], axis=-1)
         soft = cv2.GaussianBlur(surface.normal.astype(np.float32), (0, 0), surface.normal.shape[1] / 60)
@@ -104,7 +104,7 @@ class Bleeding:
 
 
 def _level_of(field: np.ndarray, share: float) -> float:
-    """Level above which a share of the field lies; above its maximum for a share of 0."""
+    """Threshold exceeded by a share of the field's values; above its maximum for a share of 0."""
     return float(np.quantile(field, 1.0 - share)) if share > 0 else float(field.max()) + 10.0
 
 
@@ -113,13 +113,13 @@ _STEPS = 18
 _CONTRAST = 0.95
 """Standard deviation of the logarithm of the density."""
 _BACKSCATTER = 0.024
-"""Share of the extinguished light that comes back to the lens, per steradian, several scatterings included [1/sr]."""
+"""Share of the extinguished light scattered back to the lens, including multiple scattering [1/sr]."""
 _LAMP_SIZE = 0.060
-"""Distance within which scattered light hides the inverse square law [m]."""
+"""Distance below which the falloff of light is softened from the inverse square law by scattering [m]."""
 
 
 class Smoke:
-    """A turbulent cloud that drifts and changes its shape."""
+    """Turbulent smoke cloud that drifts and changes its shape."""
 
     def __init__(self, config: DomainConfig, rng: np.random.Generator) -> None:
         self._config = config
@@ -127,9 +127,9 @@ class Smoke:
         self._winds = [wind / np.linalg.norm(wind) for wind in rng.normal(size=(2, 3))]
 
     def density(self, points: Float[np.ndarray, "*n 3"], time: float) -> Float[np.ndarray, "*n"]:
-        """Extinction [1/m] at points of space [m] at a time [s]."""
+        """Extinction coefficient [1/m] at points [m] and a time [s]."""
         config = self._config
-        # Two patterns that slide through each other: where they agree it is dense, and that place is never the same.
+        # Two noise fields move in different directions; smoke is dense where both are high, so its shape varies.
         total = np.zeros(points.shape[:-1], dtype=np.float32)
         for field, wind in zip(self._fields, self._winds, strict=True):
             places = (points - wind * config.smoke_speed * time) * (_SMOKE_GRID / 3 / config.smoke_wavelength)
@@ -144,19 +144,19 @@ class Smoke:
         lamp: float,
         time: float,
     ) -> Float[np.ndarray, "h w 3"]:
-        """A picture seen through the smoke: Beer-Lambert's law and one scattering of the light beside the lens.
+        """Add smoke to an image: Beer-Lambert extinction and single scattering of the light beside the lens.
 
         Args:
             light: linear RGB without smoke.
-            positions: points that the pixels see [m].
+            positions: surface points of the pixels [m].
             lens: position of the lens and the light [m].
             lamp: radiant intensity of the light, in the unit of `light` times square metres.
-            time: [s].
+            time: time in the sequence [s].
         """
         height, width = light.shape[:2]
         small = (max(width // 3, 1), max(height // 3, 1))
-        # Smoke is smooth, so a third of the resolution will do, but depth must stay sharp at instruments: the march
-        # goes along each coarse ray to the farthest point, and each pixel stops at its own distance.
+        # Smoke is smooth, so a third of the resolution suffices, but depth must stay sharp at instruments: rays are
+        # marched at the coarse resolution up to the farthest point, and each pixel is evaluated at its own distance.
         offsets = positions - lens
         distance = np.linalg.norm(offsets, axis=-1).astype(np.float32)
         rays = cv2.resize((offsets / distance[..., None]).astype(np.float32), small, interpolation=cv2.INTER_AREA)
@@ -175,13 +175,13 @@ class Smoke:
             optical += share * cv2.resize(slab, (width, height), interpolation=cv2.INTER_CUBIC)
             glow += share * cv2.resize(slab_glow.astype(np.float32), (width, height), interpolation=cv2.INTER_CUBIC)
             depth_so_far += slab
-        # Light crosses the smoke twice, but forward scattering still arrives: hence a factor below 2.
+        # Light crosses the smoke twice, but forward-scattered light is not lost: hence a factor below 2.
         seen = light * np.exp(-1.2 * optical)[..., None]
         return seen + glow[..., None] * np.array([0.98, 1.0, 1.02], np.float32)
 
 
 class SmokeOverlay:
-    """A smooth white pattern laid over the finished picture, blind to depth: the usual augmentation."""
+    """Smooth white pattern blended over the final image, independent of depth: the usual augmentation."""
 
     def __init__(self, opacity: float, rng: np.random.Generator) -> None:
         self._opacity = opacity
@@ -189,7 +189,7 @@ class SmokeOverlay:
         self._drift = rng.normal(size=2)
 
     def over(self, image: UInt8[np.ndarray, "h w 3"], time: float = 0.0) -> UInt8[np.ndarray, "h w 3"]:
-        """The picture with the pattern, which slides by about 5 % of the width per second."""
+        """Image blended with the pattern, which moves by about 5 % of the width per second."""
         height, width = image.shape[:2]
         shift = np.asarray(self._drift, np.float32) * 25.0 * time
         rows, columns = np.indices((height, width), dtype=np.float32) * (512.0 / width)
@@ -204,7 +204,7 @@ _SHOULDER = 0.65
 
 
 def exposure_gain(radiance: Float[np.ndarray, "h w 3"], config: SensorConfig) -> float:
-    """The gain that brings the median of a picture to `SensorConfig.exposure`."""
+    """Gain that brings the median of an image to `SensorConfig.exposure`."""
     return config.exposure / max(float(np.median(radiance)), 1e-9)
 
 
@@ -214,17 +214,17 @@ def expose(
     rng: np.random.Generator,
     motion: Float[np.ndarray, "h w 2"] | None = None,
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """The picture of an endoscope camera.
+    """Simulate the image of an endoscope camera.
 
     Args:
         light: linear RGB, 1 = white.
-        config: the sensor.
-        rng: of the noise.
-        motion: motion of the image while the shutter is open [px].
+        config: sensor settings.
+        rng: random generator of the noise.
+        motion: image motion of each pixel while the shutter is open [px].
     """
     height, width = light.shape[:2]
     scale = width / 640.0
-    image = np.minimum(light, 30.0).astype(np.float32)  # the brightest glints would otherwise bloom over the picture
+    image = np.minimum(light, 30.0).astype(np.float32)  # the brightest glints would otherwise bloom over the image
     y, x = np.indices((height, width), dtype=np.float32) + 0.5
     radius = np.hypot(x - width / 2, y - height / 2) / np.hypot(width / 2, height / 2)
     image = image * (1.0 - config.vignette * radius**2.4)[..., None]
@@ -232,7 +232,7 @@ def expose(
         image = _motion_blur(image, motion)
     if config.blur > 0:
         image = cv2.GaussianBlur(image, (0, 0), max(config.blur * scale, 0.3))
-    # Light of the glints is scattered in the lens.
+    # Glints are scattered in the lens.
     image = image + 0.06 * cv2.GaussianBlur(np.maximum(image - 1.0, 0.0), (0, 0), max(5.0 * scale, 0.5))
     image = _noisy(image, config, rng)
     rest = 1.0 - _SHOULDER
@@ -246,16 +246,16 @@ def expose(
 
 
 def linear(image: UInt8[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w 3"]:
-    """Linear RGB in [0, 1] of a picture: the inverse of the sRGB curve."""
+    """Convert an sRGB image to linear RGB in [0, 1]."""
     value = image.astype(np.float32) / 255.0
     return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4).astype(np.float32)
 
 
 def _motion_blur(image: np.ndarray, motion: np.ndarray, taps: int = 5) -> np.ndarray:
-    """Mean of the picture along each pixel's motion; the motion field is widened so that edges smear, too."""
+    """Average the image along each pixel's motion; the motion field is dilated so that edges are blurred, too."""
     if np.abs(motion).max() < 0.25:
         return image
-    # A moving instrument smears over the tissue beside it, so its motion must reach beyond its outline.
+    # A moving instrument also blurs the tissue beside it, so its motion must extend beyond its outline.
     speed = np.hypot(motion[..., 0], motion[..., 1])
     reach = int(np.ceil(min(speed.max(), 12.0))) * 2 + 1
     kernel = np.ones((reach, reach), np.uint8)
@@ -280,36 +280,36 @@ def _noisy(image: np.ndarray, config: SensorConfig, rng: np.random.Generator) ->
     electrons = np.minimum(image, 2.0) * config.full_well
     deviation = np.sqrt(electrons + config.read_noise**2) / config.full_well
     noise = rng.standard_normal(image.shape).astype(np.float32)
-    # Colours are interpolated from the neighbours' on a real sensor, so noise has a grain of more than a pixel.
+    # Demosaicing on a real sensor correlates the noise of neighbouring pixels.
     noise = 0.55 * noise + 0.85 * cv2.GaussianBlur(noise, (0, 0), 0.8) * 1.6
     return image + deviation.astype(np.float32) * noise
 
 
 @dataclass(frozen=True)
 class View:
-    """One camera's view of one frame, before any condition is applied."""
+    """View of one frame in one camera, before any condition is applied."""
 
     frame: int
     time: float
-    """[s]"""
+    """Time in the sequence [s]."""
     camera: int
     """Index of the camera."""
     light: Float[np.ndarray, "h w 3"]
-    """Linear RGB over the regular background, 1 = white."""
+    """Linear RGB with the regular background, 1 = white."""
     lamp: float
     """Radiant intensity of the light at the lens, in the unit of `light` times square metres."""
     other_light: Float[np.ndarray, "h w 3"] | None
-    """Linear RGB over the other background; None where that domain is not wanted."""
+    """Linear RGB with the other background; None if that domain is not rendered."""
     surface: Surface
     motion: Float[np.ndarray, "h w 2"] | None
-    """[px] while the shutter is open."""
+    """Image motion while the shutter is open [px]."""
     lens: Float[np.ndarray, "3"]
-    """The lens, in the world [m]."""
+    """Position of the lens in the world [m]."""
     Ts_world_link: Mapping[int, Float[np.ndarray, "4 4"]]
 
 
 class Conditions:
-    """Pictures of all domains of a view; `tissue` is the regular background, which bleeds."""
+    """Renders all domains of a view; `tissue` is the regular background, which bleeds."""
 
     def __init__(self, config: SynthesisConfig, tissue: Tissue) -> None:
         self._config = config
@@ -318,14 +318,14 @@ class Conditions:
         self.overlay = SmokeOverlay(config.domain.overlay_opacity, config.rng("overlay"))
 
     def image(self, domain: str, view: View) -> UInt8[np.ndarray, "h w 3"]:
-        """The picture of one domain."""
+        """Image of a view in one domain."""
         if domain == "simulated_smoke":
             return self.overlay.over(self.image("regular", view), view.time)
         rng = self._config.rng("noise", domain, view.frame, view.camera)
         return expose(self.light(domain, view), self._config.sensor, rng, view.motion)
 
     def light(self, domain: str, view: View) -> Float[np.ndarray, "h w 3"]:
-        """Linear RGB of one domain, without sensor and overlay."""
+        """Linear RGB of a view in one domain, before overlay and sensor."""
         match domain:
             case "regular":
                 return view.light

@@ -1,7 +1,8 @@
-"""Placement and smooth motion of the arms, in view and above the tissue, and erroneous measurements of it.
+"""Placement and smooth motion of the arms, in view and above the tissue, and simulated measurement errors.
 
-Tissue, light, smoke and blood are made for an endoscope 0.1 m away. For any other robot's arm the scene is traced at
-that scale, with a miniature of the arm, and written enlarged, in metres: images do not determine scale.
+Tissue, light, smoke and blood are designed for an endoscope at a distance of 0.1 m. Distant cameras, for other robots,
+are rendered at that scale with a miniature of the arm; poses are written at full scale, since images do not determine
+scale.
 """
 
 from collections import Counter
@@ -33,7 +34,7 @@ def measure(
     """Measured joint positions T_m = T + bias + drift(t) + noise(t), [rad] or [m] per joint as in `truth`.
 
     Raises:
-        SettingsError: the error does not have one value per joint, or one more: that of jaws, which some tools lack.
+        SettingsError: the error has neither one value per joint nor one more, for the jaws that some tools lack.
     """
     dofs = truth.shape[-1]
     if len(error.bias) not in (dofs, dofs + 1):
@@ -47,27 +48,27 @@ def measure(
 
 
 WRIST_LENGTH = 0.0193
-"""From the wrist's first axis to the point between the jaws' tips [m]: 9.1 + 10.2 mm of the classic PSM."""
+"""Distance from the first wrist axis to the point between the jaw tips [m]: 9.1 + 10.2 mm of the classic PSM."""
 _ATTEMPTS = 400
 _LIMIT_MARGIN = 0.05
-"""Part of each joint's range kept free at both ends."""
+"""Margin at both ends of each joint's range, as a share of the range [1]."""
 _NUDGE = 1e-6
 _NEWTON_STEPS = 12
 _CONVERGED = 1e-9
-"""Step [rad, m] after which the next one, a square of it, would be below the precision of the numbers."""
+"""Newton step [rad, m] below which the next one, by quadratic convergence, is below floating-point precision."""
 _BORDER = 0.08
-"""The tips keep away from the picture's border by this part of its size."""
+"""Minimum distance of the tips from the image border, as a share of the image size [1]."""
 _MARGIN = 0.1
-"""Collisions are looked for in the picture and in a margin around it, a part of its size."""
+"""Margin around the image within which collisions are checked, as a share of the image size [1]."""
 _INWARDS = (np.array([0.55, 0.45, -0.70]), np.array([-0.60, 0.35, -0.72]))
-"""Where the jaws point in the middle of their range, in the world: to the other arm and down."""
+"""Direction of the jaws at mid-range in the world, per arm: towards the other arm and down."""
 
 
 Motion = TypeVar("Motion")
 
 
 class Rejected(Exception):
-    """Why a random motion cannot be used."""
+    """A random motion cannot be used; the message gives the reason."""
 
 
 def plan_motion(
@@ -75,10 +76,10 @@ def plan_motion(
 ) -> tuple[Float[np.ndarray, "frames dofs"], ...]:
     """True joint positions of each arm [rad, m].
 
-    Random splines are drawn until one keeps inside the joint limits, in view, and free of collisions.
+    Random splines are drawn until one stays within the joint limits, in view, and free of collisions.
 
     Raises:
-        SettingsError: no motion within the settings was found.
+        SettingsError: no motion that satisfies the settings was found.
     """
     bodies = tuple(surface_points(arm.robot, config.rng("surface points")) for arm in arms)
 
@@ -92,12 +93,12 @@ def plan_motion(
 
 
 def random_motion(draw: Callable[[np.random.Generator], Motion], config: SynthesisConfig) -> Motion:
-    """The first of many random motions that is not rejected.
+    """Draw random motions until one is not rejected.
 
-    `draw` makes one, or raises `Rejected`.
+    `draw` returns a motion or raises `Rejected`.
 
     Raises:
-        SettingsError: all are rejected.
+        SettingsError: all attempts are rejected.
     """
     reasons = Counter[str]()
     for attempt in range(_ATTEMPTS):
@@ -118,7 +119,7 @@ def sample_times(config: SynthesisConfig) -> Float[np.ndarray, " frames"]:
 
 
 def _spline(config: SynthesisConfig, rng: np.random.Generator, spread: np.ndarray) -> Float[np.ndarray, "frames n"]:
-    """Random smooth curves about 0, with knots within `spread`."""
+    """Random splines about 0, with knots within `spread`."""
     times = sample_times(config)
     controls = max(4, int(np.ceil(times[-1] / config.motion.control_interval)) + 1)
     knots = np.linspace(0.0, max(times[-1], 1e-3), controls)
@@ -128,10 +129,10 @@ def _spline(config: SynthesisConfig, rng: np.random.Generator, spread: np.ndarra
 def reach_tip(
     arm: Arm, tip_link: str, targets_world: Float[np.ndarray, "n 3"], joints: Float[np.ndarray, "n dofs"]
 ) -> Float[np.ndarray, "n dofs"]:
-    """Inverse kinematics: yaw, pitch and insertion that bring the tip to each target, the other joints as given.
+    """Inverse kinematics: yaw, pitch and insertion that bring the tip to each target; other joints are fixed.
 
-    Newton's method on the forward kinematics; the three joints are the shaft's spherical coordinates about the
-    remote centre, so it converges in a few steps from anywhere near.
+    Newton's method on the forward kinematics. The three joints are the shaft's spherical coordinates about the
+    remote centre, so it converges in a few steps from a nearby start.
     """
     solution = torch.from_numpy(joints.copy())
     goals = torch.from_numpy((targets_world - arm.T_world_base[:3, 3]) @ arm.T_world_base[:3, :3])
@@ -154,7 +155,7 @@ def _tips(robot: Robot, tip_link: str, joints: torch.Tensor) -> torch.Tensor:
 def _draw(
     arm: Arm, number: int, camera: Camera, config: SynthesisConfig, rng: np.random.Generator
 ) -> Float[np.ndarray, "frames dofs"]:
-    """One random motion of one arm, within its limits and in view."""
+    """Random motion of one arm, within its joint limits and in view."""
     motion = config.motion
     targets = np.asarray(WORK_POINTS[number]) + _spline(config, rng, np.asarray(motion.reach))
     if not in_view(targets, camera):
@@ -173,7 +174,7 @@ def _draw(
 
 
 def _wrist_middle(arm: Arm, number: int, config: SynthesisConfig, rng: np.random.Generator) -> Float[np.ndarray, " 3"]:
-    """Roll, wrist pitch and wrist yaw for which the jaws point inwards and down: the best of many random ones."""
+    """Roll, wrist pitch and wrist yaw [rad] that point the jaws inwards and down: the best of many random samples."""
     joints = np.zeros((600, len(arm.robot.joint_names)))
     joints[:, 2] = 0.14
     joints[:, 3] = rng.uniform(-1.8, 1.8, len(joints))
@@ -181,7 +182,7 @@ def _wrist_middle(arm: Arm, number: int, config: SynthesisConfig, rng: np.random
     straight = joints.copy()
     straight[:, 4:6] = 0.0
     tips, straight_tips = (_tips(arm.robot, config.tip_link, torch.from_numpy(q)).numpy() for q in (joints, straight))
-    # With a straight wrist the tip lies on the shaft's axis, which passes the remote centre at the base's origin.
+    # With a straight wrist, the tip is on the shaft axis, which passes through the remote centre at the base origin.
     shaft = straight_tips / np.linalg.norm(straight_tips, axis=-1, keepdims=True)
     jaws = (tips - (straight_tips - WRIST_LENGTH * shaft)) @ arm.T_world_base[:3, :3].T
     jaws /= np.linalg.norm(jaws, axis=-1, keepdims=True)
@@ -192,7 +193,7 @@ def _wrist_middle(arm: Arm, number: int, config: SynthesisConfig, rng: np.random
 def check_clearance(
     clouds: Sequence[list[np.ndarray]], tissues: Sequence[Tissue], camera: Camera, clearance: float
 ) -> None:
-    """Raise when, in some frame and in view, the instruments come too near to each other or to the tissue."""
+    """Raise `Rejected` if visible instruments come too close to each other or to the tissue in any frame."""
     for frame in zip(*clouds, strict=True):
         seen = [points[_seen(points, camera, _MARGIN)] for points in frame]
         for points in seen:
@@ -204,13 +205,13 @@ def check_clearance(
 
 
 def in_view(tips_world: np.ndarray, camera: Camera) -> bool:
-    """Whether tips stay in the picture, away from its border, and at a working distance."""
+    """Whether tips stay in the image, away from its border, and at a working distance."""
     depth = tips_world @ camera.T_camera_world[2, :3] + camera.T_camera_world[2, 3]
     return bool((_seen(tips_world, camera, -_BORDER) & (depth > 0.055) & (depth < 0.135)).all())
 
 
 def _seen(points_world: Float[np.ndarray, "n 3"], camera: Camera, margin: float) -> Bool[np.ndarray, " n"]:
-    """Which points are in the picture, or in a margin around it that is given as a part of its size."""
+    """Whether each point is in the image, enlarged by `margin` as a share of its size."""
     T, (fx, fy, cx, cy) = camera.T_camera_world, camera.intrinsics
     x, y, z = (points_world @ T[:3, :3].T + T[:3, 3]).T
     z_or_near = np.maximum(z, NEAR)
@@ -219,7 +220,7 @@ def _seen(points_world: Float[np.ndarray, "n 3"], camera: Camera, margin: float)
 
 
 def surface_points(robot: Robot, rng: np.random.Generator, spacing: float = 0.0018) -> list[np.ndarray]:
-    """Points spread over the surface of each link, in its frame [m]."""
+    """Points sampled on the surface of each link, in the link frame [m]."""
     points: list[list[np.ndarray]] = [[] for _ in robot.link_names]
     for mesh in robot.meshes:
         corners = np.asarray(mesh.vertices)[np.asarray(mesh.faces)]
@@ -232,7 +233,7 @@ def surface_points(robot: Robot, rng: np.random.Generator, spacing: float = 0.00
 
 
 def clouds(arm: Arm, positions: np.ndarray, body: list[np.ndarray]) -> list[np.ndarray]:
-    """Surface points of an arm in the world, per frame."""
+    """Surface points of an arm in the world [m], per frame."""
     Ts = arm.T_world_base @ arm.robot.forward_kinematics(torch.from_numpy(positions)).numpy()
     return [np.concatenate([p @ T[:3, :3].T + T[:3, 3] for p, T in zip(body, frame, strict=True)]) for frame in Ts]
 
@@ -240,28 +241,28 @@ def clouds(arm: Arm, positions: np.ndarray, body: list[np.ndarray]) -> list[np.n
 ARM_NAME = "arm"
 
 INSTRUMENT_DISTANCE = 0.3
-"""Cameras up to this distance see the world at its own scale [m]."""
+"""Distance of the camera up to which the world is rendered at its true scale [m]."""
 
 _USUAL = 0.1
-"""Distance for which the small world is made [m]."""
+"""Distance of the camera in the reduced world [m]."""
 
 _FREE = 1.5
-"""Range in which a joint without limits moves, to either side [rad, m]."""
+"""Largest motion of a joint without limits, to either side [rad, m]."""
 
 _ERROR = {"revolute": (0.02, 0.004, 0.0005), "prismatic": (0.002, 0.0004, 0.00005)}
-"""Bias, drift and noise of a joint [rad, m], where the settings are those of an instrument."""
+"""Default bias, drift and noise of a joint [rad, m], used if the settings are those of an instrument."""
 
 _TURN = 0.6
-"""How far, at random, the arm comes from elsewhere than its instrument would [rad]."""
+"""Random spread of the direction from which the arm enters the image (three standard deviations) [rad]."""
 
 
 def enlargement(config: EndoscopeConfig) -> float:
-    """How many times larger the world is than the one that is traced [1]."""
+    """Scale of the world relative to the rendered one [1]."""
     return config.distance / _USUAL if config.distance > INSTRUMENT_DISTANCE else 1.0
 
 
 def measurement_error(robot: Robot, error: MeasurementError) -> MeasurementError:
-    """The settings, or where they are an instrument's, typical values for the robot's kinds of joints."""
+    """Measurement error as set; typical values for the robot's joint types if the settings are an instrument's."""
     if error != MeasurementError():
         return error
     values = [_ERROR[kind] for kind in robot.joint_types]
@@ -275,14 +276,14 @@ def plan_arm(
     """Pose of the arm and its true joint positions [rad, m], with the tip near the image centre.
 
     Args:
-        robot: of the arm.
-        tissues: that it must not touch, in the small world.
-        camera: in the small world.
+        robot: robot of the arm.
+        tissues: tissues that the arm must not touch, in the reduced world.
+        camera: camera in the reduced world.
         config: motion and seed.
-        scale: of the large world.
+        scale: scale of the world relative to the reduced one [1].
 
     Raises:
-        SettingsError: no motion within the settings was found.
+        SettingsError: no motion that satisfies the settings was found.
         RobotError: `config.tip_link` names a link that the robot lacks.
     """
     body = surface_points(robot, config.rng("surface points"), spacing=0.0018 * scale)
@@ -306,7 +307,7 @@ def plan_arm(
 
 
 def _draw_arm(robot: Robot, config: SynthesisConfig, rng: np.random.Generator) -> Float[np.ndarray, "frames dofs"]:
-    """A random motion about a random pose, within the joints' limits."""
+    """Random motion about a random configuration, within the joint limits."""
     low, high = robot.joint_limits.numpy().T
     low, high = np.where(np.isfinite(low), low, -_FREE), np.where(np.isfinite(high), high, _FREE)
     reach = np.minimum(config.motion.wrist_range, 0.25 * (high - low))
@@ -315,7 +316,7 @@ def _draw_arm(robot: Robot, config: SynthesisConfig, rng: np.random.Generator) -
 
 
 def _placed(robot: Robot, tip: Float[np.ndarray, "3"], camera: Camera, rng: np.random.Generator, scale: float) -> Arm:
-    """The arm with a tip [m], in its base frame, at the work point; it comes in from beside the camera."""
+    """Arm whose tip, given in the base frame [m], is at the work point, and which enters from beside the camera."""
     right, down, forward = camera.T_camera_world[:3, :3]
     side = rng.choice((-1.0, 1.0))
     direction = -side * right - 0.5 * down + 0.35 * forward + rng.normal(0.0, _TURN / 3, 3)

@@ -1,4 +1,4 @@
-"""Path-traced radiance (Mitsuba 3, `scalar_rgb`): a shading path that shares nothing with the optimizer's renderer."""
+"""Path-traced radiance (Mitsuba 3, `scalar_rgb`), independent of the optimizer's renderer."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,7 +19,7 @@ from ...settings import RenderConfig
 from .scene import Tissue
 
 LIGHTS_CAMERA = ((-0.0042, -0.0030, 0.0), (0.0042, -0.0030, 0.0))
-"""Ends of the two light guides beside the lens, in the camera's frame [m]."""
+"""Ends of the two light guides beside the lens, in the camera frame [m]."""
 INTENSITY = 0.0055
 """Radiant intensity of each light [1/sr]; only ratios matter, since exposure is adjusted."""
 _TINT = (1.02, 1.0, 0.94)
@@ -43,34 +43,34 @@ def _mitsuba() -> ModuleType:
 
 @dataclass(frozen=True)
 class Part:
-    """A piece of an instrument at its place in the world."""
+    """Posed mesh of an instrument."""
 
     link: int
-    """Index of the link among all links of all arms, for `Surface.link`."""
+    """Index of the link, counted over all arms, for `Surface.link`."""
     vertices: Float[np.ndarray, "v 3"]
-    """In the world [m]."""
+    """Vertices in the world [m]."""
     normals: Float[np.ndarray, "v 3"]
     faces: Int[np.ndarray, "f 3"]
     material: dict[str, Any]
-    """Mitsuba's description of it."""
+    """Mitsuba's description of the material."""
 
 
 @dataclass(frozen=True)
 class Surface:
-    """Surface points of the pixels, one ray per pixel."""
+    """Surface points seen by the pixels, one ray per pixel."""
 
     position: Float[np.ndarray, "h w 3"]
     """Point in the world [m]."""
     normal: Float[np.ndarray, "h w 3"]
     """Unit normal in the world."""
     link: Int[np.ndarray, "h w"]
-    """Link index of `Part.link`, -1 on tissue."""
+    """Index as in `Part.link`, -1 on tissue."""
     depth: Float[np.ndarray, "h w"]
     """Distance along the camera's z axis [m]."""
 
 
 class PathTracer:
-    """Renders instruments over one patch of tissue, with the light beside the first camera.
+    """Renders instruments over a patch of tissue, with the lights beside the first camera.
 
     Raises:
         CartsError: Mitsuba is not installed.
@@ -89,19 +89,19 @@ class PathTracer:
             "clearcoat_gloss": 0.92,
         }
         mesh = self._mesh("tissue", vertices, faces, material, uv=uv, normals=normals)
-        # As a shape group, the tissue enters the ray tracer's tree only once.
+        # As a shape group, the tissue is added to the ray tracer's acceleration structure only once.
         group = self._mi.load_dict({"type": "shapegroup", "mesh": mesh})
         self._tissue: dict[str, Any] = {"tissue": group, "tissue_place": {"type": "instance", "group": group}}
 
     def radiance(
         self, parts: Sequence[Part], camera: Camera, T_light_world: np.ndarray, seed: int
     ) -> Float[np.ndarray, "h w 3"]:
-        """Linear RGB radiance, in arbitrary units; `T_light_world` is the frame of the camera beside the lights."""
+        """Linear RGB radiance in arbitrary units; `T_light_world` is the pose of the camera that carries the lights."""
         T_world_light = np.linalg.inv(T_light_world)
         scene = self._instruments(parts) | self._tissue
         integrator = {"type": "path", "max_depth": self._config.bounces, "rr_depth": 16}
         samples = -(-self._config.samples // len(LIGHTS_CAMERA))
-        # One light at a time: choosing between them at random would be most of the picture's noise.
+        # One light at a time: random light selection would dominate the image noise.
         total = np.zeros((camera.height, camera.width, 3), np.float32)
         for number, place in enumerate(LIGHTS_CAMERA):
             light = {
@@ -113,9 +113,9 @@ class PathTracer:
         return _without_specks(total)
 
     def coverage(self, parts: Sequence[Part], camera: Camera, samples: int = 16) -> Float[np.ndarray, "h w"]:
-        """Part of each pixel that instruments cover in front of the tissue, in [0, 1].
+        """Share of each pixel that instruments cover in front of the tissue, in [0, 1].
 
-        The tissue and the space around it glow, the instruments are black: no side of a mesh can be missed.
+        Instruments are rendered black against luminous tissue and surroundings, so that both sides of a mesh count.
         """
         scene = self._instruments(parts, _BLACK)
         glow = {"type": "area", "radiance": {"type": "rgb", "value": 1.0}}
@@ -125,12 +125,12 @@ class PathTracer:
         return 1.0 - self._render(scene, {"type": "path", "max_depth": 1}, camera, samples, 0)[..., 0]
 
     def surface(self, parts: Sequence[Part], camera: Camera, seed: int) -> Surface:
-        """What each pixel sees."""
+        """Surface points seen by the pixels."""
         scene = self._instruments(parts, _BLACK) | self._tissue
         integrator = {"type": "aov", "aovs": "position:position,normal:sh_normal,shape:shape_index"}
         layers = self._render(scene, integrator, camera, 1, seed)
         position, normal = layers[..., :3].astype(np.float64), layers[..., 3:6]
-        # Mitsuba counts shapes from 1, in the scene's order: first the parts, then the tissue; 0 is nothing at all.
+        # Mitsuba numbers shapes from 1 in scene order: first the parts, then the tissue; 0 is no hit.
         links = np.array([-1, *(part.link for part in parts), -1], dtype=np.int32)
         shape = np.round(layers[..., 6]).astype(int)
         T_camera_world = camera.T_camera_world
@@ -138,7 +138,7 @@ class PathTracer:
         return Surface(position, normal, links[shape], depth)
 
     def _instruments(self, parts: Sequence[Part], material: dict[str, Any] | None = None) -> dict[str, Any]:
-        """A scene of parts, all of one material or each of its own."""
+        """Mitsuba shapes of the parts, all with `material` or each with its own."""
         meshes = {
             f"a_part_{number:03d}": self._mesh(
                 f"part{number}", part.vertices, part.faces, material or part.material, normals=part.normals
@@ -185,7 +185,7 @@ class PathTracer:
         self, scene: dict[str, Any], integrator: dict[str, Any], camera: Camera, samples: int, seed: int
     ) -> np.ndarray:
         fx, _, cx, cy = camera.intrinsics
-        # Mitsuba's camera has x to the left and y up where ours has x to the right and y down.
+        # Mitsuba's camera has x to the left and y up; ours has x to the right and y down.
         T_world_sensor = np.linalg.inv(camera.T_camera_world) @ np.diag([-1.0, -1.0, 1.0, 1.0])
         scene = scene | {
             "integrator": integrator,
@@ -227,7 +227,7 @@ _BLACK: dict[str, Any] = {"type": "diffuse", "reflectance": {"type": "rgb", "val
 
 
 def _without_specks(image: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w 3"]:
-    """Remove fireflies: no pixel may be far brighter than the third brightest of its 3 x 3 neighbours.
+    """Remove fireflies: limit each pixel to 1.25 times the third brightest value of its 3 x 3 neighbourhood.
 
     Real highlights are wider than a pixel.
     """
@@ -236,28 +236,28 @@ def _without_specks(image: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w
 
 
 _DARK = 0.3
-"""Parts darker than this are rendered as plastic, and so is the longest part of the shaft."""
+"""Brightness below which parts are rendered as plastic, like the longest part of the shaft [1]."""
 
 
 @dataclass(frozen=True)
 class Stage:
-    """Arms and their motion.
+    """Arms and their motion, at the scale of rendering.
 
-    Links are numbered through all arms: link l of arm a is `a * len(link_names) + l`.
+    Links are numbered over all arms: link l of arm a is `a * len(link_names) + l`.
     """
 
     arms: tuple[Arm, ...]
     joints: tuple[Float[np.ndarray, "frames dofs"], ...]
     """True joint positions [rad, m], one table per arm."""
     times: Float[np.ndarray, " frames"]
-    """[s]"""
+    """Time of each frame [s]."""
     scale: float = 1.0
-    """How many times larger the arms and their world are than the world of this stage."""
+    """Scale of the arms and their world relative to the rendered world [1]."""
     painted: bool = False
-    """Whether the robots' own colours are shown, and not an instrument's materials."""
+    """Whether to render the robots' own colours instead of an instrument's materials."""
 
     def Ts_world_link(self, frame: int, time_offset: float = 0.0) -> dict[int, Float[np.ndarray, "4 4"]]:
-        """The place of every link at a frame, or shortly before or after it [s]."""
+        """Pose of every link at a frame, shifted by `time_offset` [s]."""
         transforms = []
         for arm, joints in zip(self.arms, self.joints, strict=True):
             positions = joints[frame]
@@ -270,7 +270,7 @@ class Stage:
         return dict(enumerate(transforms))
 
     def parts(self, frame: int) -> list[Part]:
-        """The instruments' meshes at a frame."""
+        """Posed meshes of the instruments at a frame."""
         transforms = self.Ts_world_link(frame)
         parts: list[Part] = []
         for index, arm in enumerate(self.arms):
@@ -291,7 +291,7 @@ class Stage:
     def motion_in_image(
         self, frame: int, surface: Surface, camera: Camera, duration: float
     ) -> Float[np.ndarray, "h w 2"]:
-        """How far each pixel's surface moves in the picture during `duration` [s], in pixels; 0 on tissue."""
+        """Image motion [px] of each pixel's surface point during `duration` [s]; 0 on tissue."""
         motion = np.zeros((*surface.link.shape, 2), np.float32)
         now = self.Ts_world_link(frame)
         before, after = self.Ts_world_link(frame, -duration / 2), self.Ts_world_link(frame, duration / 2)

@@ -1,6 +1,6 @@
-"""The synthetic scene: cameras, tissue (height field with folds, fat and vessels) and arms.
+"""Synthetic scene: cameras, tissue (height field with folds, fat and vessels) and arms.
 
-World frame: origin in the middle of the tissue, x right, y away, z up [m].
+World frame [m]: origin at the centre of the tissue, x right, y away from the camera, z up.
 """
 
 from collections.abc import Sequence
@@ -26,16 +26,16 @@ def smooth_noise(
     Args:
         shape: size of the field, in samples per dimension.
         wavelength: typical distance between neighbouring crests of the first octave [samples].
-        rng: of the noise.
-        octaves: number of bands, each of half the wavelength of the one before.
-        gain: amplitude of each band relative to the one before.
+        rng: random generator.
+        octaves: number of bands, each with half the wavelength of the previous one.
+        gain: amplitude of each band relative to the previous one.
     """
     spectrum = np.fft.rfftn(rng.standard_normal(shape).astype(np.float32))
     axes = [np.fft.fftfreq(n) for n in shape[:-1]] + [np.fft.rfftfreq(shape[-1])]
     frequency = np.sqrt(sum(axis**2 for axis in np.meshgrid(*axes, indexing="ij", sparse=True)))
     response = np.zeros_like(frequency)
     for octave in range(octaves):
-        # Each band has the same energy whatever its wavelength: the number of modes in it grows as f^dimensions.
+        # Each band has the same energy at any wavelength, since the number of modes grows as f^dimensions.
         center = 2.0**octave / wavelength
         band = np.exp(-0.5 * ((frequency - center) / (0.35 * center)) ** 2)
         energy = np.sqrt((band**2).sum())
@@ -48,26 +48,26 @@ def smooth_noise(
 
 
 def smoothstep(value: np.ndarray, low: float, high: float) -> np.ndarray:
-    """0 below `low`, 1 above `high`, and a curve without corners between them."""
+    """Smoothstep function: 0 below `low`, 1 above `high`, and a smooth transition in between."""
     x = np.clip((value - low) / (high - low), 0.0, 1.0)
     return x * x * (3.0 - 2.0 * x)
 
 
 ARM_NAMES = ("psm1", "psm2")
-"""Seen from the camera: the arm that comes in from the left, and the one from the right."""
+"""Names of the arms that enter from the left and from the right, as seen from the camera."""
 
 JOINT_TYPES = ("revolute", "revolute", "prismatic", "revolute", "revolute", "revolute", "revolute")
-"""Yaw, pitch, insertion, roll, wrist pitch, wrist yaw, jaw; instruments whose jaws do not move lack the last."""
+"""Types of yaw, pitch, insertion, roll, wrist pitch, wrist yaw and jaw; instruments without jaws lack the last."""
 
 _REMOTE_CENTRES_CAMERA = ((-0.092, 0.062, 0.006), (0.098, -0.010, 0.002))
-"""Where the instruments pass the body wall, in the left camera's frame [m]."""
+"""Points at which the instruments pass the body wall, in the frame of the left camera [m]."""
 
 WORK_POINTS = ((-0.011, -0.001, 0.014), (0.012, 0.002, 0.014))
-"""Points of the world that the instruments point at with centred joints [m]."""
+"""World points at which the instruments point with centred joints [m]."""
 
 
 def place_cameras(config: EndoscopeConfig) -> tuple[Camera, ...]:
-    """The left camera and, if wanted, the right one beside it."""
+    """Left camera and, if set, the right one beside it."""
     forward = np.array([0.0, np.cos(config.elevation), -np.sin(config.elevation)])
     right = np.array([1.0, 0.0, 0.0])
     rotation = np.stack([right, np.cross(forward, right), forward])
@@ -85,7 +85,7 @@ def place_cameras(config: EndoscopeConfig) -> tuple[Camera, ...]:
 
 
 def load_robot(config: SynthesisConfig) -> Robot:
-    """The robot, with finer meshes than the optimizer uses.
+    """Load the robot with finer meshes than the optimizer uses.
 
     Raises:
         RobotError: the URDF is unusable.
@@ -94,12 +94,12 @@ def load_robot(config: SynthesisConfig) -> Robot:
 
 
 def is_instrument(robot: Robot) -> bool:
-    """Whether the joints are those of a PSM: its seven, or all but the last."""
+    """Whether the joints are those of a PSM: all seven, or all but the last."""
     return robot.joint_types in (JOINT_TYPES, JOINT_TYPES[:-1])
 
 
 def place_arms(robot: Robot, tip_link: str, camera: Camera) -> tuple[Arm, ...]:
-    """Base frames such that, with all joints at zero, both instruments point at the middle of the scene."""
+    """Arms with base frames such that, at zero joint positions, the instruments point at the centre of the scene."""
     T_world_camera = np.linalg.inv(camera.T_camera_world)
     arms = []
     for name, centre, work in zip(ARM_NAMES, _REMOTE_CENTRES_CAMERA, WORK_POINTS, strict=True):
@@ -112,7 +112,7 @@ def place_arms(robot: Robot, tip_link: str, camera: Camera) -> tuple[Arm, ...]:
 
 
 def _shaft_direction(robot: Robot, tip_link: str) -> Float[np.ndarray, "3"]:
-    """Direction of insertion in the base frame with all joints at zero."""
+    """Direction of insertion in the base frame at zero joint positions."""
     joints = torch.zeros(2, len(robot.joint_names), dtype=torch.float64)
     joints[1, 2] = 0.1
     tips = robot.link_transform(joints, tip_link)[:, :3, 3].numpy()
@@ -120,7 +120,7 @@ def _shaft_direction(robot: Robot, tip_link: str) -> Float[np.ndarray, "3"]:
 
 
 def rotation_between(a: np.ndarray, b: np.ndarray) -> Float[np.ndarray, "3 3"]:
-    """A rotation that takes direction a to direction b and keeps their common 'up' as far as it can."""
+    """Rotation from direction a to direction b that preserves their common up direction as far as possible."""
     return _frame(b) @ _frame(a).T
 
 
@@ -133,7 +133,7 @@ def _frame(direction: np.ndarray) -> np.ndarray:
 
 
 EXTENT = 0.26
-"""Side of the square of tissue, centred on the world's origin [m]."""
+"""Side length of the square of tissue, centred at the world origin [m]."""
 
 
 @dataclass(frozen=True)
@@ -157,22 +157,22 @@ _KINDS = {
     "fat": _Kind((0.56, 0.36, 0.145), (0.46, 0.20, 0.085), (0.45, 0.15, 0.11), 0.26, 0.0022, 0.0016, 9, 0.38),
 }
 KINDS = tuple(_KINDS)
-"""Kinds of tissue of `grow_tissue`."""
+"""Names of the kinds of tissue, for `grow_tissue`."""
 
 
 @dataclass(frozen=True)
 class Tissue:
-    """Patch of tissue around the world's origin, z up; rows and columns of fields are y and x from -EXTENT / 2."""
+    """Patch of tissue around the world origin, z up; rows and columns of fields are y and x from -EXTENT / 2."""
 
     heights: Float[np.ndarray, "n n"]
-    """Height above z = 0 [m] at the grid's points."""
+    """Height above z = 0 at the grid points [m]."""
     albedo: Float[np.ndarray, "m m 3"]
     """Diffuse reflectance, linear RGB in [0, 1]."""
     roughness: Float[np.ndarray, "m m"]
     """Roughness of the wet surface in [0, 1]."""
 
     def height(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """Height [m] at points of the plane [m]; beyond the patch, that of its border."""
+        """Height [m] at points of the plane [m]; beyond the patch, the height of its border."""
         return sample(self.heights, x, y)
 
     def mesh(
@@ -193,14 +193,14 @@ class Tissue:
 
 
 def sample(field: Float[np.ndarray, "n n"], x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """A field of the tissue at points of the plane [m], bilinear."""
+    """Interpolate a field of the tissue bilinearly at points of the plane [m]."""
     scale = len(field) - 1
     rows, columns = (np.asarray(y) / EXTENT + 0.5) * scale, (np.asarray(x) / EXTENT + 0.5) * scale
     return map_coordinates(field, np.stack([rows, columns]), order=1, mode="nearest")
 
 
 def grow_tissue(kind: str, resolution: int, texels: int, rng: np.random.Generator) -> Tissue:
-    """Tissue of one of `KINDS`, with `resolution` grid points and `texels` of colour and roughness along each side."""
+    """Generate tissue of one of `KINDS`, with `resolution` grid points and `texels` of colour along each side."""
     look, paint = _KINDS[kind], _Canvas(texels, rng)
 
     patches = paint.grown(0.060, 0.003, octaves=4, gain=0.42)
@@ -225,7 +225,7 @@ def grow_tissue(kind: str, resolution: int, texels: int, rng: np.random.Generato
     color *= 1.0 + 0.05 * paint.noise(0.0012, octaves=2)[..., None]
 
     roughness = look.roughness + 0.05 * paint.noise(0.012, octaves=2) + 0.10 * patch
-    # Walls around the middle, so that the tissue fills every picture.
+    # Walls around the centre, so that the tissue fills every image.
     unit = np.linspace(-EXTENT / 2, EXTENT / 2, resolution)
     radius = np.hypot(*np.meshgrid(unit, unit))
     cavity = (6.0 * np.maximum(radius - 0.050, 0.0) ** 2).astype(np.float32)
@@ -249,7 +249,7 @@ class _Canvas:
         return smooth_noise((self._texels,) * 2, wavelength * self.scale, self._rng, octaves=octaves, gain=gain)
 
     def grown(self, wavelength: float, amount: float, octaves: int = 1, gain: float = 0.5) -> np.ndarray:
-        """Noise at displaced positions, which gives organic shapes."""
+        """Domain-warped noise, which yields organic shapes."""
         rows, columns = np.indices((self._texels,) * 2, dtype=np.float32)
         shift = np.float32(amount * self.scale)
         columns, rows = columns + shift * self._warp[0], rows + shift * self._warp[1]
@@ -257,7 +257,7 @@ class _Canvas:
         return cv2.remap(field, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
 
     def vessels(self, count: int) -> np.ndarray:
-        """Branching lines that get thinner, 1 in their middle and 0 away from them."""
+        """Branching, tapering lines with value 1 at their centre and 0 outside."""
         rng = self._rng
         canvas = np.zeros((self._texels,) * 2, np.float32)
         stack = [

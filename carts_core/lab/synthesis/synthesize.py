@@ -1,4 +1,4 @@
-"""Synthesis of a whole sequence on disk."""
+"""Synthesis of a sequence, written to disk."""
 
 import csv
 import hashlib
@@ -35,7 +35,7 @@ def write_table(
     times: Float[np.ndarray, " frames"],
     joints: Sequence[Float[np.ndarray, "frames dofs"]],
 ) -> None:
-    """A CSV file with a row per frame: its id, its time [s], and the joint positions of every arm [rad, m]."""
+    """Write a CSV file with one row per frame: id, time [s], and the joint positions of every arm [rad, m]."""
     columns = [f"{arm.name}.{joint}" for arm in arms for joint in arm.robot.joint_names]
     text = io.StringIO()
     table = csv.writer(text, lineterminator="\n")
@@ -47,22 +47,22 @@ def write_table(
 
 
 def synthesize(config: SynthesisConfig, output: OutputPath | Path | str, progress: Progress | None = None) -> Path:
-    """Render a sequence of two instruments, or of one arm of any other robot, in all domains of the settings.
+    """Render a sequence of two instruments, or of one arm of another robot, in all domains of the settings.
 
-    The files appear under `output` at the end. Until then they lie beside it, and a stopped run resumes when it is
-    started again with the same settings.
+    Files are written to a folder beside `output` and moved there at the end. A stopped run resumes if it is started
+    again with the same settings.
 
     Args:
-        config: the settings.
-        output: folder of the sequence; it must not exist, or be empty.
+        config: settings of the synthesis.
+        output: folder of the sequence; it must be missing or empty.
         progress: called after each frame.
 
     Returns:
-        The sequence file.
+        Path of the sequence file.
 
     Raises:
-        SettingsError: `output` holds something already, or no motion fits the settings.
-        RobotError: the robot is not usable.
+        SettingsError: `output` is not empty, or no motion satisfies the settings.
+        RobotError: the robot cannot be used.
         CartsError: Mitsuba is not installed.
     """
     target = output if isinstance(output, OutputPath) else Path(output)
@@ -79,7 +79,7 @@ def _write_sequence(config: SynthesisConfig, work: OutputPath, output: Path, rep
     frames = config.motion.frames
     report("tissue, robots and motion", 0, frames)
     endoscope, times, scale = config.endoscope, sample_times(config), enlargement(config.endoscope)
-    # Far cameras are placed in the small world.
+    # Distant cameras are placed in the reduced world.
     near = replace(endoscope, distance=endoscope.distance / scale, baseline=endoscope.baseline / scale)
     cameras = place_cameras(near)
     robot, error = load_robot(config), config.error
@@ -130,7 +130,7 @@ def _robot_reference(robot: Path, output: Path) -> str:
 
 
 class _Tracing:
-    """Renders one frame after the other into the work folder."""
+    """Renders frames one by one into the work folder."""
 
     def __init__(
         self, config: SynthesisConfig, stage: Stage, cameras: tuple[Camera, ...], tissue: Tissue, other: Tissue
@@ -143,7 +143,7 @@ class _Tracing:
         self._gains: list[float] = []
 
     def trace(self, folder: OutputPath, frame: int) -> None:
-        """Write all images of a frame; its masks, written last, mark it complete."""
+        """Render all images of a frame; the masks are written last and mark the frame as complete."""
         masks = []
         for number, camera in enumerate(self._cameras):
             view, mask = self._view(frame, number)
@@ -160,7 +160,7 @@ class _Tracing:
     def _view(self, frame: int, number: int) -> tuple[View, np.ndarray]:
         camera, stage = self._cameras[number], self._stage
         if not self._gains:
-            # The first frame fixes the exposure of the whole sequence, as of a camera without automatic exposure.
+            # The first frame determines the exposure of the sequence, as for a camera without automatic exposure.
             first = [self._radiance(tracer, 0, 0) for tracer in self._tracers]
             self._gains = [exposure_gain(radiance, self._config.sensor) for radiance in first]
         light = [
@@ -191,7 +191,7 @@ class _Tracing:
 
 
 def _grow_tissues(config: SynthesisConfig) -> tuple[Tissue, Tissue]:
-    """The regular background and another one of another kind."""
+    """Regular background, and another one of a different kind."""
     kinds = config.rng("kinds").permutation(KINDS)[:2]
     size = config.render.tissue_resolution, config.render.texture_resolution
     regular, other = (grow_tissue(kind, *size, config.rng("tissue", i)) for i, kind in enumerate(kinds))
@@ -199,7 +199,7 @@ def _grow_tissues(config: SynthesisConfig) -> tuple[Tissue, Tissue]:
 
 
 def _name(frame: int) -> str:
-    """The id of a frame: 001 for the first."""
+    """Id of a frame: 001 for the first."""
     return f"{frame + 1:03d}"
 
 
@@ -208,7 +208,7 @@ def _mask_file(folder: OutputPath, frame: int, camera: Camera) -> OutputPath:
 
 
 def _write(path: OutputPath, pixels: np.ndarray, options: list[int]) -> None:
-    """Write an image file, whole or not at all."""
+    """Atomically write an image file."""
     encoded, data = cv2.imencode(path.path.suffix, pixels, options)
     if not encoded:
         raise CartsError(f"{path} could not be encoded.")
