@@ -61,7 +61,7 @@ class LiveEstimate:
     """Loss of the surface factor [1]."""
     state: SceneState
     joint_positions: Mapping[str, Float[np.ndarray, " dofs"]]
-    """Arm name -> [rad, m]."""
+    """Arm name -> estimated joint positions [rad, m]."""
     joint_std: Mapping[str, Float[np.ndarray, " dofs"]]
     """Arm name -> standard deviation [rad, m]; NaN where a joint is not free."""
     seconds: float

@@ -59,7 +59,7 @@ def _skeleton(urdf_text: str) -> str:
 
 
 class Kinematics:
-    """Transforms of a robot's links from its independent joint positions.
+    """Computes transforms of a robot's links from its independent joint positions.
 
     Args:
         urdf_text: text of the URDF, with exact right angles.

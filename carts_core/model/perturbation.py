@@ -20,7 +20,7 @@ def perturb(
     Prismatic joints move by the same number of millimetres. Positions are clamped to the joint limits.
 
     Args:
-        joint_positions: arm name -> [rad, m].
+        joint_positions: arm name -> joint positions [rad, m].
         joints: arm name -> joints to move; every joint of every arm by default.
     """
     generator = np.random.default_rng(seed)

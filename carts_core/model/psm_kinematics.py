@@ -193,7 +193,7 @@ def inverse(
 
 
 def _solve(R: np.ndarray, tip: np.ndarray, geometry: PsmGeometry) -> np.ndarray:
-    """Joint positions [rows, 6] with the roll in (-pi, pi]; NaN where there are none."""
+    """Joint positions [rows, 6] with the roll in (-pi, pi]; NaN without a solution."""
     # The wrist's link runs from the pitch axis to the tip. It is normal to the yaw axis, which is the pose's -x, and
     # lies in the plane of the yaw axis and the shaft, in which the remote centre lies, too.
     yaw_axis = -R[:, :, 0]

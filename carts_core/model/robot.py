@@ -106,7 +106,7 @@ def _check_tree(root: Element, source: Path) -> None:
     if len(roots) != 1:
         found = "no link without a parent" if not roots else f"several links without a parent: {listed(roots)}"
         raise RobotError(f"robot {source} has {found}. Joints must make one tree of all its links.")
-    # As many joints as links below the root, and each reaches the root: then there is no loop.
+    # There are as many joints as links below the root, and each link reaches the root, so there is no loop.
     for start in parents:
         link = start
         for _ in range(len(parents)):
@@ -225,7 +225,7 @@ class Robot:
         base_link: link that is the reference frame of link transforms.
         joint_names: independent degrees of freedom; a mimic joint belongs to the joint that it follows.
         joint_types: "revolute" or "prismatic", per degree of freedom.
-        joint_limits: lower and upper limit per degree of freedom [dofs, 2], [rad] or [m], infinite where not given.
+        joint_limits: lower and upper limit per degree of freedom [dofs, 2], [rad] or [m]; infinite if not given.
         link_names: links with a visual mesh.
         meshes: parts of these links; `LinkMesh.link` indexes `link_names`.
         decimation: summary of the decimation of the meshes.

@@ -95,7 +95,7 @@ class Scene:
         """Look up an arm by name.
 
         Raises:
-            RobotError: there is none.
+            RobotError: there is no such name.
         """
         for arm in self.arms:
             if arm.name == name:
@@ -107,7 +107,7 @@ class Scene:
         """Look up a camera by name.
 
         Raises:
-            RobotError: there is none.
+            RobotError: there is no such name.
         """
         for camera in self.cameras:
             if camera.name == name:

@@ -125,7 +125,7 @@ def uncovered_median(
 
 
 def _middle(values: Int[np.ndarray, "views ..."], count: Int[np.ndarray, "rows columns"]) -> Int[np.ndarray, "..."]:
-    """Median over the `count` smallest values at every pixel, rounded up; 0 where there are none."""
+    """Median over the `count` smallest values at every pixel, rounded up; 0 for a count of 0."""
     values = np.sort(values, axis=0)
     middle = np.maximum(count - 1, 0).reshape(1, *count.shape, *(1,) * (values.ndim - 3)) / 2
     low = np.take_along_axis(values, np.floor(middle).astype(np.intp), 0)[0]

@@ -61,11 +61,11 @@ class Cropped:
         return np.ascontiguousarray(image[top : top + height, left : left + width])
 
     def fingerprint(self, index: int) -> str:
-        """Fingerprint of the whole image, with the rectangle. Errors as those of the source."""
+        """Fingerprint of the uncropped image, with the rectangle. Errors as those of the source."""
         return f"{self.source.fingerprint(index)} {self.crop}"
 
     def remarks(self) -> tuple[str, ...]:
-        """Remarks of the whole images."""
+        """Remarks on the uncropped images."""
         return self.source.remarks()
 
 

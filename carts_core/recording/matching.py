@@ -51,7 +51,7 @@ class Samples:
     lines: tuple[int, ...]
     """Line of each row in the table, for errors."""
     times: Float[np.ndarray, " rows"] | None
-    """Time of each row in the table's clock, increasing [s]; None where row n belongs to frame n."""
+    """Time of each row in the table's clock, increasing [s]; None if row n belongs to frame n."""
 
     def at_frames(self, frames: FrameList, matching: TimeMatching | None) -> Float[np.ndarray, "frames ..."]:
         """The value of every frame; joints and positions are interpolated linearly, rotations spherically."""
@@ -124,14 +124,14 @@ class Rows:
 
     frames: FrameList
     matching: TimeMatching | None
-    """Matching of rows and frames by time; None where every row is a frame."""
+    """Matching of rows and frames by time; None if every row is a frame."""
     table: Table
     """Measured joint positions."""
     truth: Path | None
     """Table of true joint positions."""
     delimiter: str
     names: FrameNames | None
-    """Column and pattern of the frames' ids; None where rows are matched by time."""
+    """Column and pattern of the frames' ids; None if rows are matched by time."""
     timestamp: str
     """Column with the time of a row; empty if there is none."""
 

@@ -68,7 +68,7 @@ class Sequence:
         domains: the variants of every image; the first is the default.
         frame_ids: name of every frame.
         timestamps: acquisition time of each image [frames] [s], or None.
-        matching: how joint positions are matched with frames by time, or None where each row of the table is a frame.
+        matching: matching of joint positions with frames by time, or None if each row of the table is a frame.
         measured_joints: arm -> joints that the kinematics table measures, in the robot's order.
         measured: arm -> joint positions of all frames [frames, dofs] [rad, m].
         truth: arm -> true joint positions of all frames, or None; only the arms that have one.

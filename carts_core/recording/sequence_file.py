@@ -137,7 +137,7 @@ class CameraInput:
         files = {file: None for domain in self.masks.values() for file in domain if file is not None}
         found: list[str] = []
         for source in self.images.values():
-            with suppress(SequenceError):  # It is an error where the image is used.
+            with suppress(SequenceError):  # The error is raised when the image is used.
                 found += source.remarks()
         found += mask_remarks(list(files))
         unusual = implausible_intrinsics(camera.width, camera.height, camera.intrinsics, camera.distortion)
@@ -284,7 +284,7 @@ class Description:
     domains: tuple[str, ...]
     frames: FrameList
     matching: TimeMatching | None
-    """Matching of rows and frames by time; None where every row of the tables is a frame."""
+    """Matching of rows and frames by time; None if every row of the tables is a frame."""
     cameras: Mapping[str, CameraInput]
     arms: Mapping[str, ArmInput]
     remarks: tuple[str, ...] = ()

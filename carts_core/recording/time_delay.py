@@ -233,7 +233,7 @@ class _Delays:
         return float(found.x)
 
     def _parts(self, offset: float) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
-        """Normal equations of motion X and flow Y at an offset, by block: X^T X, X^T Y, |Y|^2; None where rows are
+        """Normal equations of motion X and flow Y at an offset, by block: X^T X, X^T Y, |Y|^2; None if rows are
         missing."""
         places, motion = self._motion(offset)
         there = np.asarray(np.isfinite(motion).all(1))

@@ -57,7 +57,7 @@ class TomlTable:
         Args:
             key: name of the key.
             kind: type of the value (or a tuple of types); `float` also accepts integers, `object` accepts anything.
-            default: value when the key is absent; without one the key is required.
+            default: value if the key is absent; without a default the key is required.
         """
         self._known.append(key)
         if key not in self._values:

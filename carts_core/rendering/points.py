@@ -247,7 +247,7 @@ class VisiblePoints:
     point_link: Float[Tensor, "3 K"]
     """Surface point, in the frame of its link [m]."""
     normal_link: Float[Tensor, "3 K"]
-    """Interpolated normal there, in the frame of its link."""
+    """Interpolated normal at the point, in the frame of its link."""
 
     def runs(self) -> list[tuple[int, int, slice]]:
         """View, link and range of each run of points on the same link in the same view."""

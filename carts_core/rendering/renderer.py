@@ -40,7 +40,7 @@ class _CarryMotion(torch.autograd.Function):
                 exists = position < length - 1 if sign > 0 else position > 0
                 # A pixel at the image's border is its own neighbour, which adds nothing.
                 other = torch.where(exists, pixels + sign * step, pixels)
-                # Of two equally near points the first one carries the motion.
+                # Of two equally near points, the motion of the first one is used.
                 near = here_near >= nearness[other] if sign > 0 else here_near > nearness[other]
                 change = (flat_image[:, other] - here_image) * (flat_gradient[:, other] + here_gradient)
                 moving[axis] -= 0.5 * sign * change.sum(0) * near
@@ -226,7 +226,7 @@ class Renderer:
         """Surface maps and shaded images of one state, with derivatives.
 
         Args:
-            state: one state (no batch); with `distance`, a batch as that of `tangents`.
+            state: one state (no batch); with `distance`, a batch as for `tangents`.
             distance: distance between the states on both sides; None omits the Jacobian.
             margin: margin of the Jacobian's blocks around the moved pixels [px].
         """

@@ -358,7 +358,7 @@ def _surgpose_points(points: dict) -> dict[str, tuple[float, float]]:
 
 _SUFFIXES = (".png", ".bmp")
 _OTHER_SUFFIXES = (".tif", ".tiff", ".jpg", ".jpeg")
-"""Suffixes that are used only where a folder has no files with the preferred ones, since images may lie beside
+"""Suffixes that are used only if a folder has no files with the preferred ones, since it may contain images as well as
 masks."""
 _DEEPEST = 4
 _MEANINGS = ("labels.json", "mappings.json", "mapping.json", "instrument_type_mapping.json")

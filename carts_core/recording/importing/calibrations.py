@@ -38,7 +38,7 @@ class Calibration:
     intrinsics: tuple[float, float, float, float]
     """fx, fy, cx, cy [px]; the first pixel's centre is at 0."""
     distortion: tuple[float, ...] = ()
-    """OpenCV's coefficients."""
+    """OpenCV's distortion coefficients."""
     size: tuple[int, int] | None = None
     """Width and height of the calibrated images [px]."""
     T_right_left: Float[np.ndarray, "4 4"] | None = None

@@ -122,7 +122,7 @@ class FoundCamera:
     pixel_center: float = 0.0
     """Position of the first pixel's centre: 0 in OpenCV's convention, 0.5 in that of carts."""
     distortion: tuple[float, ...] = ()
-    """OpenCV's coefficients."""
+    """OpenCV's distortion coefficients."""
     T_camera_world: Float[np.ndarray, "4 4"] | None = None
     """Extrinsics [m]; None if not known. The world is the frame of the first camera."""
     rectification: Float[np.ndarray, "3 3"] | None = None
@@ -139,7 +139,8 @@ class FoundCamera:
     topic: str = ""
     """Topic in a bag; empty for other sources."""
     numbers: Int[np.ndarray, " frames"] | None = None
-    """Video frame number, or record time of the message [ns], of every frame; None where frames are counted."""
+    """Video frame number, or record time of the message [ns], of every frame; None if frames are numbered
+    consecutively."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,7 +153,7 @@ class FoundArm:
     values: Float[np.ndarray, "rows columns"] | None = None
     """Joint positions [rad], [m]; None without kinematics."""
     times: Float[np.ndarray, " rows"] | None = None
-    """Times in the recording's clock, increasing [s]; None where row n belongs to frame n."""
+    """Times in the recording's clock, increasing [s]; None if row n belongs to frame n."""
     robot: str = "builtin:psm_lnd"
     T_world_base: Float[np.ndarray, "4 4"] | None = None
     """Base frame [m]; None if not known."""
@@ -173,7 +174,7 @@ class FoundRecording:
     arms: tuple[FoundArm, ...]
     frame_ids: tuple[str, ...]
     frame_times: Float[np.ndarray, " frames"] | None
-    """Times in the recording's clock [s]; None where rows of the tables are frames."""
+    """Times in the recording's clock [s]; None if rows of the tables are frames."""
     notes: tuple[Note, ...] = ()
     time_offset: float = 0.0
     """Time in the kinematics minus time of the image [s]."""

@@ -175,7 +175,7 @@ def _frames_with_kinematics(recording: FoundRecording, job: Import) -> FoundReco
     ids = tuple(frame for frame, kept in zip(recording.frame_ids, keep, strict=True) if kept)
     cameras = []
     for camera in recording.cameras:
-        # Videos whose frames are counted need numbers once some are left out.
+        # Videos with consecutively numbered frames need explicit numbers if some frames are omitted.
         numbers = np.arange(len(keep)) if camera.numbers is None and not camera.pattern else camera.numbers
         cameras.append(replace(camera, numbers=None if numbers is None else numbers[keep]))
     return replace(recording, frame_ids=ids, frame_times=recording.frame_times[keep], cameras=tuple(cameras))

@@ -59,7 +59,7 @@ def _tables(path: Path) -> list[Path]:
 
 
 def _image_places(path: Path) -> list[Path]:
-    """Folders of images, and videos, except masks and the like."""
+    """Videos and folders of images, excluding masks and similar folders."""
     places = [folder for folder in _folders(path) if image_files(folder)] + _files(path, SUFFIXES)
     return [
         place
