@@ -148,7 +148,7 @@ _WIDTH = 480
 
 @dataclass(frozen=True)
 class FrameFinding:
-    """Verdict on a frame."""
+    """Verdict on one frame, with its reason and probability."""
 
     camera: str
     frame: str

@@ -112,7 +112,7 @@ class Truth:
     def within(
         self, scene: Scene, found: Mapping[str, np.ndarray], std: Mapping[str, np.ndarray]
     ) -> tuple[int, int, int] | None:
-        """Number of joints with ground truth and standard deviation, and of errors within one and two sigma.
+        """Number of joints with ground truth and standard deviation, and of errors within 1 and 2 sigma.
 
         `found` and `std` map arms to joint positions [rad, m] and their standard deviations, NaN where unknown. None if
         there are no such joints.

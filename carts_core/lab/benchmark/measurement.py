@@ -91,7 +91,7 @@ class Score:
     joint_mae_deg: float | None
     """Mean absolute error of measured revolute joints [deg]; None without true joint positions."""
     visible_joint_mae_deg: float | None
-    """The same over the joints that the image determines; None if the optimizer does not report them."""
+    """Mean absolute error of the joints that the image determines [deg]; None if the optimizer does not report them."""
     tip_depth_mm: float | None
     """Mean absolute depth error of the jaw tips [mm]; None without true joint positions, and for intermediate
     iterates."""

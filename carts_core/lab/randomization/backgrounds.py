@@ -13,7 +13,10 @@ from ...files.reading import IMAGE, read_bytes
 
 
 def smooth_noise(rng: np.random.Generator, width: int, height: int, cells: float, octaves: int = 3) -> np.ndarray:
-    """Multi-octave noise [height, width], zero mean, about unit standard deviation; `cells` per width in octave one."""
+    """Multi-octave noise [height, width] of zero mean and about unit standard deviation.
+
+    `cells` is the number of cells across the width in the coarsest octave.
+    """
     noise = np.zeros((height, width), np.float32)
     amplitude = 1.0
     for _ in range(octaves):

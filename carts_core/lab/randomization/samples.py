@@ -236,7 +236,7 @@ class PairGenerator:
         )
 
     def _mean_background(self, background: np.ndarray, camera_seed: int) -> np.ndarray:
-        """Mean background BG_m: the scene without arms, with the same camera effects except noise; or another scene."""
+        """Mean background BG_m: the scene without arms and camera noise; sometimes another scene."""
         rng, appearance = self._observer.rng, self._settings.appearance
         if rng.random() < self._settings.same_background:
             image = photograph(np.random.default_rng(camera_seed), background, appearance)

@@ -59,7 +59,7 @@ class Fits:
     edges: float
     """Mean image gradient along the outlines of arms and parts, relative to that of the whole images [1]."""
     parts: float
-    """Mean over frames of the share of rendered wrist or jaw pixels, the smaller one, predicted as that part [1]."""
+    """Mean over frames of the smaller of the shares of rendered wrist and jaw pixels predicted as that part [1]."""
     tips: tuple[Float[np.ndarray, "tips 2"], ...]
     """Tips of each frame in the first camera [px]; NaN outside the image."""
 
