@@ -1,6 +1,6 @@
 """Exceptions of the project.
 
-Each message says what was given, what is allowed and what to do.
+Each message states what was given, what is allowed, and a remedy.
 """
 
 from .wording import shortened

@@ -99,7 +99,7 @@ def _print(console: Console, sequence: "Sequence", points: "Points[ImagePoint]",
 
 @dataclass(frozen=True)
 class TimeOffset:
-    """Estimate the delay between images and joint positions by correlating their motion, and propose a time_offset.
+    """Estimate the delay between images and joint positions from their motion, and propose a time_offset.
 
     Neither a hand-eye calibration nor a network is needed. The sequence file is not changed.
     """

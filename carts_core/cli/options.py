@@ -199,8 +199,8 @@ class Perturbation:
     """Offset of the initial joint positions, for experiments."""
 
     perturb_deg: float = 0.0
-    """Offset of every initial joint position [deg, mm], from the true position if the sequence contains it, else from
-    the measured one. 0 starts at the measured positions.
+    """Offset of every initial joint position [deg, mm]: from the true joint positions where the sequence has them, else
+    from the measured ones. 0 starts at the measured positions.
     """
     seed: int = 0
     """Random seed of the offset's signs, which are equal in all frames in sequence mode."""
@@ -451,7 +451,7 @@ class Observer:
         missing.
 
         Args:
-            background: whether the solver knows the empty background.
+            background: whether the solver uses the empty background.
         """
         if self.masked:
             without = [camera for camera in cameras if not self._has_mask(sequence, index, camera, domain)]

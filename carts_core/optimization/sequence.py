@@ -64,8 +64,7 @@ def initial_correction(
     open_frame: Callable[[int], tuple[Frame, Variables]],
     allowance: float,
 ) -> Float[np.ndarray, " n"]:
-    """Of the corrections [rad] of frames solved alone (frame index -> correction), the one with the lowest mean loss
-    over these frames.
+    """Correction [rad] of a frame solved alone (by frame index) with the lowest mean loss over all these frames.
 
     Corrections whose loss in the first frame exceeds `allowance` times the lowest are excluded, since the error may
     have jumped.

@@ -142,7 +142,7 @@ class SurfaceSolver(Ranged):
     of the start [1]. It increases the reported standard deviations and changes no estimate; it is not used with given
     masks."""
     prior_deg: Annotated[float, Range(1e-3, 360, "deg")] = 2.5
-    """Expected error of an initial joint position [deg]; `length_scale` converts it to metres."""
+    """Expected error of a joint position at the start [deg]; `length_scale` converts it to metres."""
     frame_prior_deg: Annotated[float, Range(1e-3, 360, "deg")] = 0.5
     """Expected error of base frames and camera extrinsics [deg]; `length_scale` converts it to metres."""
     intrinsics_prior: Annotated[float, Range(1e-6, 1)] = 0.01

@@ -62,7 +62,7 @@ class HandEyePrior:
     """Uncertainty of a hand-eye calibration, used as prior of a refinement."""
 
     base_covariances: Mapping[str, Float[np.ndarray, "6 6"]]
-    """As in `HandEyeResult`."""
+    """Arm -> covariance of its base frame; see `HandEyeResult`."""
     free_cameras: tuple[str, ...]
     """Cameras whose pose was unknown before the hand-eye calibration."""
 
