@@ -10,7 +10,7 @@ _LONGEST = 4000
 
 
 class CartsError(Exception):
-    """Root of all errors with a message for the user."""
+    """Base class of all errors with a message for the user."""
 
     def __str__(self) -> str:
         return shortened(super().__str__(), _LONGEST)

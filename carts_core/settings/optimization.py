@@ -164,8 +164,7 @@ class SurfaceSolver(Ranged):
 
 @dataclass(frozen=True)
 class DescentSolver(Ranged):
-    """Maximizes the similarity of features of the image and the hybrid image (rendered arms over the mean
-    background)."""
+    """Minimizes a loss between features of the image and the hybrid image (rendered arms over the mean background)."""
 
     loss: Loss = Loss.ACS
     """Loss to minimize."""

@@ -85,7 +85,7 @@ class MeasurementError(Ranged):
 
 @dataclass(frozen=True)
 class RenderConfig(Ranged):
-    """Path tracing."""
+    """Settings of the path tracer."""
 
     samples: Annotated[int, Range(1, 4096)] = 8
     """Paths per pixel; noise is inversely proportional to the square root."""

@@ -266,12 +266,12 @@ class PointAgreement:
     after: Float[np.ndarray, " points"]
     """[px]"""
     limits: Float[np.ndarray, " points"]
-    """Largest residual that noise explains [px]; infinite for unused and contradicting points."""
+    """Largest residual explained by noise [px]; infinite for unused points and outliers."""
     rms_before: float
-    """Root mean square of the residuals of points with a limit [px]."""
+    """RMS residual of the points with a finite limit [px]."""
     rms_after: float
     rms_limit: float
-    """Largest root mean square that noise explains [px]."""
+    """Largest RMS residual explained by noise [px]."""
 
     @property
     def disagreeing(self) -> tuple[int, ...]:
