@@ -21,7 +21,10 @@ view: setup ## Open the shipped sample in the viewer (or SEQUENCE=path/to/sequen
 
 test: lint docs ## Check style and types, build the documentation, and run the tests, browser included
 	chromium=$$($(BIN)/python .ci/chromium.py) && \
-	CARTS_CHROMIUM=$$chromium $(BIN)/python -m pytest -n 3 --dist loadfile -m "not slow and not gpu" $(ARGS)
+	export CARTS_CHROMIUM=$$chromium && { \
+	$(BIN)/python -m pytest -n 3 --dist loadfile -m "not slow and not gpu" $(ARGS) || \
+	{ echo "Once more, one at a time, what failed beside other tests:"; \
+	$(BIN)/python -m pytest --last-failed --last-failed-no-failures none -m "not slow and not gpu" $(ARGS); }; }
 
 lint: setup-dev ## Check style, formatting and types
 	$(BIN)/ruff check
