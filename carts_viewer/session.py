@@ -27,12 +27,11 @@ from carts_core.project import (
     default_path,
     rescued_copies,
 )
-from carts_core.project.calibrated import calibrated_scene, corrected_state, source_of
+from carts_core.project.state import calibrated_scene, corrected_state, source_of
 from carts_core.recording import Frame, FrameReader, Sequence
-from carts_viewer.choices import NETWORK, Observed, Target, joint_range
 from carts_viewer.editing import Editor, People, Person
 from carts_viewer.start.roots import Roots
-from carts_viewer.state import Pose
+from carts_viewer.state import NETWORK, Observed, Pose, Target, joint_range
 
 
 class Session:

@@ -10,8 +10,8 @@ from ..errors import CartsError
 from ..export import KinematicsRow, read_kinematics_csv
 from ..files import OutputPath, holds_file
 from ..files.reading import TABLE, VALUES, parse_json, read_bytes
-from ..fingerprints import fingerprint
 from ..project import FitVerdict, JointCorrection, Key, Project, Provenance
+from ..provenance import fingerprint
 from ..recording import Sequence
 from .folder import kinematics_tables
 from .manifest import Job

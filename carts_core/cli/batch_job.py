@@ -25,8 +25,8 @@ from ..batch.manifest import Job, Step
 from ..console import Terminal, log_to_stderr
 from ..errors import CartsError, SettingsError
 from ..files import OutputPath, remove_file, set_aside, write_text
-from ..fingerprints import code_fingerprint, fingerprint
 from ..process import tune_process
+from ..provenance import code_fingerprint, fingerprint
 from ..settings.optimization import Inference
 from .calibrate import Calibrate
 from .export import Export

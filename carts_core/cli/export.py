@@ -141,7 +141,7 @@ class Export:
         project = self.source.read(sequence)
         if project is None:
             return sequence, measured_frames(sequence, indices)
-        from ..project.calibrated import corrected_sequence
+        from ..project.state import corrected_sequence
         from ..rendering import Renderer
 
         console.print(self.source.sentence(sequence, project, indices), soft_wrap=True)

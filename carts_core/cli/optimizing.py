@@ -14,9 +14,9 @@ from ..console import Bar, Terminal, track
 from ..evaluation import Starts, camera_groups, start_positions
 from ..export import KinematicsRow, read_kinematics_csv
 from ..files import remove_file
-from ..fingerprints import fingerprint
 from ..optimization import Backgrounds, FrameOptimizer, Origin, SequenceOptimizer, StopReason, sequence_checkpoint
 from ..optimization.variables import Variables
+from ..provenance import fingerprint
 from ..recording import Sequence
 from ..settings import SurfaceSolver
 from ..settings.serialization import to_plain

@@ -188,7 +188,7 @@ class FromProject:
         project = self.read(sequence)
         if project is None:
             return sequence
-        from ..project.calibrated import corrected_sequence
+        from ..project.state import corrected_sequence
 
         console.print(self.sentence(sequence, project, frames), soft_wrap=True)
         return corrected_sequence(sequence, project)

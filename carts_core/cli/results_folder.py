@@ -17,9 +17,9 @@ from ..export import KinematicsRow, kinematics_csv, mask_png, read_kinematics_cs
 from ..export.kinematics import position_values, std_values
 from ..files import OutputPath, holds_file, locked_folder, remove_file, write_bytes, write_text
 from ..files.reading import TABLE, parse_json, read_bytes, typed
-from ..fingerprints import calibration_fingerprint, code_fingerprint, fingerprint, robot_fingerprint
 from ..model.scene import Scene, SceneState
 from ..optimization import Assessment
+from ..provenance import calibration_fingerprint, code_fingerprint, fingerprint, robot_fingerprint
 from ..recording import Sequence
 from ..rendering import Renderer
 from ..stopping import finished_first

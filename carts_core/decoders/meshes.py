@@ -10,8 +10,7 @@ from jaxtyping import Float, Int
 from trimesh.resolvers import FilePathResolver
 
 from ..errors import RobotError
-from ..files.image_size import size_problem
-from ..files.reading import IMAGE, MESH, is_regular, read_bytes
+from ..files.reading import IMAGE, MESH, is_regular, read_bytes, size_problem
 
 MOST_FACES = 1_000_000
 """Largest number of triangles in a mesh file, before simplification."""

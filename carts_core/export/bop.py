@@ -20,8 +20,7 @@ from trimesh.exchange.ply import export_ply
 from ..files import OutputPath, write_bytes, write_text
 from ..model.camera import HALF_PIXEL
 from ..model.scene import Arm, SceneState
-from ..rendering.points import link_transforms, vertices_in_camera
-from ..rendering.rasterizer import rasterize
+from ..rendering.rasterizer import link_transforms, rasterize, vertices_in_camera
 from .dataset import Dataset, Monitor, View
 from .encodings import bounding_box, mask_png
 

@@ -11,7 +11,7 @@ from numpy import ndarray
 from ..errors import SequenceError
 from ..model.scene import SceneState
 from ..project import Key, MaskCorrection, ProjectState, Source
-from ..project.calibrated import corrected_state, source_of
+from ..project.state import corrected_state, source_of
 from ..recording import Sequence
 from .kinematics import KinematicsRow
 

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from ..errors import SettingsError
-from ..files.image_size import pixels_problem
+from ..files.reading import pixels_problem
 
 HALF_PIXEL = 0.5
 """Offset of pixel centres: +0.5 here and 0 in OpenCV, so OpenCV's principal point is smaller by this offset [px]."""

@@ -7,12 +7,10 @@ from ..settings import FreeParameters as FreeParameters
 from ..settings import SequenceSettings as SequenceSettings
 from ..settings import SolverSettings as SolverSettings
 from ..settings import SurfaceSolver as SurfaceSolver
-from .backgrounds import Backgrounds as Backgrounds
 from .calibration import CalibrationIterate as CalibrationIterate
 from .calibration import CalibrationOptimizer as CalibrationOptimizer
 from .calibration import CalibrationResult as CalibrationResult
 from .calibration import UnknownChange as UnknownChange
-from .evidence import Evidence as Evidence
 from .factors import Factor as Factor
 from .factors import Linearization as Linearization
 from .frame import BASE_FRAME_GAIN as BASE_FRAME_GAIN
@@ -23,6 +21,7 @@ from .frame_problem import propose_ignore as propose_ignore
 from .measurement import sequence_checkpoint as sequence_checkpoint
 from .observability import fit_words as fit_words
 from .observability import undetermined_joints as undetermined_joints
+from .observation import Backgrounds as Backgrounds
 from .predictor import FramePredictor as FramePredictor
 from .predictor import GivenMasks as GivenMasks
 from .predictor import ImagePredictor as ImagePredictor
@@ -35,6 +34,7 @@ from .sequence_estimate import Origin as Origin
 from .stages import StopReason as StopReason
 from .verdict import Assessment as Assessment
 from .verdict import DomainCheck as DomainCheck
+from .verdict import Evidence as Evidence
 from .verdict import SequenceAssessment as SequenceAssessment
 from .verdict import Verdict as Verdict
 from .verdict import check_domain as check_domain

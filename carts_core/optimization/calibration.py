@@ -26,11 +26,11 @@ from ..settings import (
     surface_solver,
 )
 from ..settings.stages import Descend
-from .backgrounds import Backgrounds
 from .calibration_problem import CalibrationEvaluation, CalibrationProblem, Ignored, with_joint_errors
 from .frame import Progress
 from .hand_eye.files import RESTING
 from .hand_eye.result import PoseDeviation
+from .observation import Backgrounds
 from .predictor import SurfacePredictor, predictor_of
 from .stages import Fit, Point, StopReason, run_stages
 from .variables import APART, Variables

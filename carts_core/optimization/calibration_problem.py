@@ -14,14 +14,14 @@ from ..recording import Frame
 from ..recording.background import spread
 from ..settings import FreeParameters, SurfaceSolver
 from ..settings.stages import Descend, Observe, SilhouetteSearch
-from .backgrounds import Backgrounds
-from .evidence import Evidence
 from .factors import Prior
-from .factors.surface import SurfaceFactor
 from .frame_problem import FrameProblem, search_silhouettes
+from .image_factors import SurfaceFactor
 from .observability import Evaluation
+from .observation import Backgrounds
 from .predictor import SurfacePredictor
 from .variables import Variables
+from .verdict import Evidence
 
 
 @dataclass(frozen=True)

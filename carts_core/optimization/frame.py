@@ -16,14 +16,13 @@ from ..networks.extractor import FeatureExtractor
 from ..recording import Frame
 from ..settings import FreeParameters, SolverSettings, SurfaceSolver
 from ..settings.stages import FINEST, Descend
-from .backgrounds import Backgrounds
-from .factors import Factor
-from .factors.surface import SurfaceFactor
+from .factors import Factor, bounded_step
 from .feature_problem import FeatureProblem
 from .frame_problem import FrameProblem
+from .image_factors import SurfaceFactor
 from .observability import Evaluation, Uncertainty
+from .observation import Backgrounds
 from .predictor import SurfacePredictor, predictor_of
-from .solvers import bounded_step
 from .stages import Fit, Point, StopReason, run_stages
 from .variables import Variables
 from .verdict import Assessment

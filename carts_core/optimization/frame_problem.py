@@ -18,15 +18,13 @@ from ..model.scene import Scene, SceneState
 from ..settings import SurfaceSolver
 from ..settings.stages import FINEST, AlignEdges, Descend, Given, Observe, SilhouetteSearch, first_observe
 from ..threads import total
-from .backgrounds import Backgrounds
-from .evidence import Evidence, evidence
 from .factors import Factor, Linearization, Prior
-from .factors.edges import EdgeFactor, align_edges
-from .factors.surface import SurfaceFactor
+from .image_factors import EdgeFactor, SurfaceFactor, align_edges
 from .observability import Evaluation, Uncertainty, uncertainty, uncertainty_after
-from .observation import FrameImages, Observation, observe
+from .observation import Backgrounds, FrameImages, Observation, observe
 from .predictor import FramePredictor
 from .variables import Variables
+from .verdict import Evidence, evidence
 
 _CONTRADICTS = 0.5
 """Similarity (1 minus the squared difference of surface maps) below which a pixel contradicts the estimate [1]."""

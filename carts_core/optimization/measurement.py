@@ -11,26 +11,24 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from ..checkpoint import Checkpoint
 from ..files import OutputPath
-from ..fingerprints import fingerprint
 from ..imaging.working_image import working_size
 from ..model.scene import Scene
+from ..provenance import Checkpoint, fingerprint
 from ..recording import Frame
 from ..rendering import Renderer
 from ..settings import FreeParameters, SequenceSettings, SurfaceSolver
 from ..settings.stages import COMPARE, FINEST, Observe, Stage, first_observe, reduced
-from .backgrounds import Backgrounds
 from .error_model import Gaussian, Information
-from .evidence import Evidence
 from .factors import Prior
 from .frame import base_frame_gain
 from .frame_problem import FrameProblem
 from .observability import Evaluation, Uncertainty
+from .observation import Backgrounds
 from .predictor import SurfacePredictor
 from .stages import Fit, run_stages
 from .variables import Variables
-from .verdict import Assessment
+from .verdict import Assessment, Evidence
 
 P = ParamSpec("P")
 Found = TypeVar("Found")

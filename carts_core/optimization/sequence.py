@@ -11,16 +11,16 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from ..checkpoint import Checkpoint
 from ..errors import CartsError, SettingsError
 from ..model.scene import Scene
 from ..networks.extractor import FeatureExtractor
+from ..provenance import Checkpoint
 from ..recording import Frame
 from ..recording.background import spread
 from ..settings import FreeParameters, SequenceSettings, SolverSettings, surface_solver
-from .backgrounds import Backgrounds
 from .error_model import ErrorModel, Gaussian, Information, Smoother, combined, remove_measurement
 from .measurement import FrameSolver, Ignore, Measurement
+from .observation import Backgrounds
 from .predictor import SurfacePredictor, predictor_of
 from .sequence_estimate import FrameEstimate, Origin, Visit
 from .variables import Variables

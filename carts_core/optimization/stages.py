@@ -30,12 +30,11 @@ from ..settings.stages import (
 )
 from ..threads import total
 from .calibration_problem import CalibrationProblem
-from .factors import Linearization
+from .factors import REJECTIONS, FirstOrderDescent, LevenbergMarquardt, Linearization
 from .feature_problem import FeatureProblem
 from .frame_problem import FrameProblem
 from .observability import Evaluation
 from .observation import HAS_LEFT
-from .solvers import REJECTIONS, FirstOrderDescent, LevenbergMarquardt
 from .variables import Variables
 from .verdict import Assessment, Verdict, assess
 

@@ -15,10 +15,9 @@ from ..recording import Sequence as Recording
 from ..recording.annotations import read_annotations
 from ..rendering import Renderer
 from ..wording import counted, listed
-from .calibrated import corrected_state
 from .layers import ImportedMask
 from .project import Project
-from .state import ProjectState
+from .state import ProjectState, corrected_state
 from .values import ImportedKeypoints, ImportedLabels, Key
 
 if TYPE_CHECKING:

@@ -16,8 +16,7 @@ from ..model.camera import Camera
 from ..model.scene import Scene
 from ..wording import closest, counted
 from .background import MeanBackground, background_of_recording, spread
-from .cache import ByteCache
-from .images import ImageFiles, ImageSource, read_file, read_image, read_mask
+from .images import ByteCache, ImageFiles, ImageSource, read_file, read_image, read_mask
 from .matching import TimeMatching
 from .sequence_file import CameraInput, Description, read_description
 

@@ -27,10 +27,9 @@ from av.video.stream import VideoStream
 from jaxtyping import Float, UInt8
 
 from ..errors import SequenceError
-from ..files.image_size import LARGEST_IMAGE, pixels_problem
-from ..files.reading import MIB, VIDEO, check_regular, is_regular, open_regular
+from ..files.reading import LARGEST_IMAGE, MIB, VIDEO, check_regular, is_regular, open_regular, pixels_problem
 from ..wording import counted
-from .cache import ByteCache
+from .images import ByteCache
 
 _EXACT = ("mp4", "matroska")
 """Containers with exact presentation times and seeking."""

@@ -1,8 +1,8 @@
 """Differentiable rendering: hard visibility, sparse shading, silhouette gradient."""
 
 from .jacobian import JacobianBlock as JacobianBlock
+from .jacobian import Outline as Outline
 from .jacobian import Tangents as Tangents
-from .outline import Outline as Outline
 from .rasterizer import visibility as visibility
 from .renderer import Renderer as Renderer
 from .renderer import Rendering as Rendering

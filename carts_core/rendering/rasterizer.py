@@ -1,11 +1,19 @@
-"""Visibility: the nearest triangle at each pixel, computed by a compiled kernel."""
+"""Rasterization: triangles of a scene, their visibility, and visible surface points with their motion."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from itertools import accumulate
 
 import numpy as np
+import torch
 from jaxtyping import Float, Int
+from torch import Tensor
 
 from ..compiled import compiled
+from ..model.parts import link_parts
+from ..model.robot import Robot
+from ..model.scene import Light, Scene, SceneState
 
 BACKGROUND = -1
 """Face index of a pixel without a triangle."""
@@ -185,3 +193,282 @@ def visibility(
     depth = np.zeros_like(inverse_depth)
     np.divide(1.0, inverse_depth, out=depth, where=face_ids >= 0)
     return face_ids, depth
+
+
+@dataclass(frozen=True)
+class SceneGeometry:
+    """All triangles of all arms. Links are numbered across all arms, and vertices are in the order of their links.
+
+    Vectors are columns (`3 V`, not `V 3`), because products along a short last dimension are slow.
+    """
+
+    vertices: Float[Tensor, "3 V"]
+    """Vertex positions in link frames [m]."""
+    vertex_counts: tuple[int, ...]
+    """Number of vertices per link."""
+    vertex_links: Int[Tensor, " V"]
+    faces: Int[Tensor, "F 3"]
+    face_links: Int[Tensor, " F"]
+    face_arms: Int[Tensor, " F"]
+    face_parts: Int[Tensor, " F"]
+    """Index into `carts_core.model.parts.PARTS`."""
+    face_surfaces: Int[Tensor, " F"]
+    """Index of the closed surface of each triangle, -1 for none; its back is invisible to a camera outside."""
+    face_colors: Float[Tensor, "3 F"]
+    face_barycentric: Float[Tensor, "8 F"]
+    """Affine maps from a point on the triangle to its second and third barycentric coordinate, concatenated."""
+    face_normals: Float[Tensor, "9 F"]
+    """Unit vertex normals of each triangle's corners in its link's frame, concatenated."""
+
+    @staticmethod
+    def of(scene: Scene, device: str | torch.device = "cpu") -> "SceneGeometry":
+        """Collect the link meshes of a scene; call once for all renderers of the same robots."""
+        return SceneGeometry._of(tuple(arm.robot for arm in scene.arms), torch.device(device))
+
+    @staticmethod
+    @lru_cache(maxsize=4)
+    def _of(robots: tuple[Robot, ...], device: torch.device) -> "SceneGeometry":
+        vertices, normals, faces, face_links, arms, face_parts, surfaces, colors, counts = ([] for _ in range(9))
+        first_link, first_vertex = 0, 0
+        for arm_index, robot in enumerate(robots):
+            counts += [0] * len(robot.link_names)
+            parts = link_parts(robot)
+            for mesh in sorted(robot.meshes, key=lambda mesh: mesh.link):
+                link, count = first_link + mesh.link, len(mesh.faces)
+                vertices.append(mesh.vertices)
+                normals.append(mesh.normals)
+                counts[link] += len(mesh.vertices)
+                faces.append(mesh.faces + first_vertex)
+                face_links.append(np.full(count, link))
+                arms.append(np.full(count, arm_index))
+                face_parts.append(np.full(count, parts[mesh.link]))
+                surfaces.append(np.full(count, len(surfaces) if mesh.closed else -1))
+                colors.append(np.broadcast_to(mesh.color, (count, 3)))
+                first_vertex += len(mesh.vertices)
+            first_link += len(robot.link_names)
+        vertex, face = np.concatenate(vertices).astype(np.float64), np.concatenate(faces)
+
+        def tensor(array: np.ndarray, dtype: torch.dtype = torch.float32) -> Tensor:
+            return torch.tensor(np.ascontiguousarray(array), dtype=dtype, device=device)
+
+        return SceneGeometry(
+            tensor(vertex.T),
+            tuple(counts),
+            tensor(np.repeat(np.arange(len(counts)), counts), torch.int64),
+            tensor(face, torch.int32),
+            tensor(np.concatenate(face_links), torch.int64),
+            tensor(np.concatenate(arms), torch.int64),
+            tensor(np.concatenate(face_parts), torch.int64),
+            tensor(np.concatenate(surfaces), torch.int64),
+            tensor(np.concatenate(colors).T),
+            tensor(_barycentric_maps(vertex[face]).reshape(-1, 8).T),
+            tensor(np.concatenate(normals)[face].reshape(-1, 9).T),
+        )
+
+
+def _barycentric_maps(corners: np.ndarray) -> np.ndarray:
+    """Affine maps [F, 2, 4] from a point on a triangle [F, 3, 3] to two of its barycentric coordinates."""
+    a, ab, ac = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    cross = np.cross(ab, ac)
+    squared = np.maximum((cross**2).sum(-1, keepdims=True), 1e-30)
+    # A coordinate grows in the plane along the normal of the edge opposite its corner.
+    maps = np.stack([np.cross(ac, cross) / squared, np.cross(cross, ab) / squared], 1)
+    offsets = -np.einsum("fki,fi->fk", maps, a)
+    return np.concatenate([maps, offsets[..., None]], -1)
+
+
+def link_transforms(scene: Scene, state: SceneState) -> Float[Tensor, "*batch cameras links 4 4"]:
+    """Ts_camera_link of every link in every camera, differentiable (f_FK of the paper, then F_B and C)."""
+    Ts_base_link: dict[int, Tensor] = {}
+    for robot in {id(arm.robot): arm.robot for arm in scene.arms}.values():
+        # Forward kinematics of equal robots is batched, which takes as long for all as for one.
+        same = [index for index, arm in enumerate(scene.arms) if arm.robot is robot]
+        Ts = robot.forward_kinematics(torch.stack([state.joint_positions[index] for index in same]))
+        Ts_base_link.update(zip(same, Ts, strict=True))
+    bases = state.T_world_base.unbind(-3)
+    Ts_world_link = torch.cat([base[..., None, :, :] @ Ts_base_link[index] for index, base in enumerate(bases)], -3)
+    return state.T_view_world[..., :, None, :, :] @ Ts_world_link[..., None, :, :, :]
+
+
+def vertices_in_camera(
+    geometry: SceneGeometry, Ts_camera_link: Float[Tensor, "*batch links 4 4"]
+) -> Float[Tensor, "*batch 3 V"]:
+    """Positions of all vertices in the frame of a camera [m]."""
+    parts = geometry.vertices.split(geometry.vertex_counts, dim=1)
+    Ts = Ts_camera_link.unbind(-3)
+    return torch.cat([T[..., :3, :3] @ part + T[..., :3, 3:] for T, part in zip(Ts, parts, strict=True)], -1)
+
+
+def as_array(values: Tensor) -> np.ndarray:
+    """A tensor as a C-ordered array on the CPU, copied only if necessary."""
+    return values.contiguous().cpu().numpy()
+
+
+def unit(vectors: Float[Tensor, "3 K"]) -> Float[Tensor, "3 K"]:
+    """Columns scaled to length 1."""
+    return vectors * vectors.square().sum(0).clamp(min=1e-24).rsqrt()
+
+
+def phong(
+    color: Float[Tensor, "3 K"], points: Float[Tensor, "3 K"], normals: Float[Tensor, "3 K"], light: Light
+) -> Float[Tensor, "3 K"]:
+    """Phong shading with one point light, two-sided.
+
+    Args:
+        points: surface points in the camera's frame [m].
+
+    Returns:
+        Linear RGB in [0, 1].
+    """
+    to_light = unit(points.new_tensor(light.position)[:, None] - points)
+    to_camera = -unit(points)
+    towards_camera = (normals * to_camera).sum(0)
+    # A surface seen from behind is lit from behind.
+    side = torch.where(towards_camera.detach() < 0, -1.0, 1.0)
+    cosine = (normals * to_light).sum(0) * side
+    # The reflected light direction is 2 (n . l) n - l; only its cosine to the camera is needed.
+    mirrored = 2.0 * cosine * towards_camera * side - (to_light * to_camera).sum(0)
+    highlight = light.specular * mirrored.clamp(min=1e-4) ** light.shininess * (cosine > 0)
+    lit = light.ambient + light.diffuse * cosine.clamp(min=0.0)
+    return (color * lit + highlight).clamp(max=1.0)
+
+
+@compiled
+def _gather(
+    face_ids, inverse_depth, Ts_camera_link, intrinsics, face_links, barycentric, normals, starts, pixels, faces, out
+):
+    """Fill pixels, faces and `out` (points, then normals) in runs of a view and a link that begin at `starts`."""
+    views, height, width = face_ids.shape
+    links = Ts_camera_link.shape[1]
+    for view in range(views):
+        fx, fy, cx, cy = intrinsics[view]
+        for row in range(height):
+            for column in range(width):
+                face = face_ids[view, row, column]
+                if face < 0:
+                    continue
+                link = face_links[face]
+                k = starts[view * links + link]
+                starts[view * links + link] += 1
+                pixels[k] = (view * height + row) * width + column
+                faces[k] = face
+                T = Ts_camera_link[view, link]
+                depth = 1.0 / inverse_depth[view, row, column]
+                x = (column + 0.5 - cx) / fx * depth - T[0, 3]
+                y = (row + 0.5 - cy) / fy * depth - T[1, 3]
+                z = depth - T[2, 3]
+                for axis in range(3):
+                    out[axis, k] = T[0, axis] * x + T[1, axis] * y + T[2, axis] * z
+                # A pixel at the edge of its triangle may be outside by a rounding error.
+                b = _affine(barycentric[:4, face], out[:3, k])
+                c = _affine(barycentric[4:, face], out[:3, k])
+                n = normals[:, face]
+                squared = 0.0
+                for axis in range(3):
+                    value = n[axis] + b * (n[3 + axis] - n[axis]) + c * (n[6 + axis] - n[axis])
+                    out[3 + axis, k] = value
+                    squared += value * value
+                for axis in range(3, 6):
+                    out[axis, k] /= np.sqrt(max(squared, 1e-24))
+
+
+@compiled
+def _affine(coefficients, point):
+    """A barycentric coordinate of a point, in [0, 1]."""
+    value = coefficients[0] * point[0] + coefficients[1] * point[1] + coefficients[2] * point[2] + coefficients[3]
+    return min(max(value, 0.0), 1.0)
+
+
+@compiled
+def _count(face_ids, face_links, links, counts):
+    views, height, width = face_ids.shape
+    for view in range(views):
+        for row in range(height):
+            for column in range(width):
+                face = face_ids[view, row, column]
+                if face >= 0:
+                    counts[view * links + face_links[face]] += 1
+
+
+def gather_points(
+    face_ids: Int[np.ndarray, "views height width"],
+    inverse_depth: Float[np.ndarray, "views height width"],
+    Ts_camera_link: Float[np.ndarray, "views links 4 4"],
+    intrinsics: Float[np.ndarray, "views 4"],
+    face_links: Int[np.ndarray, " F"],
+    face_barycentric: Float[np.ndarray, "8 F"],
+    face_normals: Float[np.ndarray, "9 F"],
+) -> tuple[Int[np.ndarray, " K"], Int[np.ndarray, " K"], Float[np.ndarray, "3 K"], Float[np.ndarray, "3 K"], list[int]]:
+    """Surface points of visible pixels, in the order of views, links and pixels; see `VisiblePoints`.
+
+    Returns:
+        `pixel`, `face`, `point_link`, `normal_link`, and the number of points of each link in each view.
+    """
+    links = Ts_camera_link.shape[1]
+    counts = np.zeros(len(face_ids) * links, np.int64)
+    _count(face_ids, face_links, links, counts)
+    starts, total = np.cumsum(counts) - counts, int(counts.sum())
+    pixels, faces = np.empty(total, np.int64), np.empty(total, np.int64)
+    out = np.empty((6, total), np.float32)
+    seen = face_ids, inverse_depth, Ts_camera_link, intrinsics, face_links, face_barycentric, face_normals
+    _gather(*seen, starts, pixels, faces, out)
+    return pixels, faces, out[:3], out[3:], counts.tolist()
+
+
+@dataclass(frozen=True)
+class VisiblePoints:
+    """Surface points of visible pixels, without gradients. `K` counts visible pixels in all views."""
+
+    pixel: Int[Tensor, " K"]
+    """Index into the flattened `views x height x width`."""
+    face: Int[Tensor, " K"]
+    groups: tuple[tuple[int, int, int], ...]
+    """View, link and number of points of each run of points on the same link in the same view."""
+    point_link: Float[Tensor, "3 K"]
+    """Surface point, in the frame of its link [m]."""
+    normal_link: Float[Tensor, "3 K"]
+    """Interpolated normal at the point, in the frame of its link."""
+
+    def runs(self) -> list[tuple[int, int, slice]]:
+        """View, link and range of each run of points on the same link in the same view."""
+        ends = list(accumulate(count for _, _, count in self.groups))
+        return [
+            (view, link, slice(end - count, end)) for (view, link, count), end in zip(self.groups, ends, strict=True)
+        ]
+
+    def transformed(self, Ts_camera_link: Float[Tensor, "views links 4 4"]) -> tuple[Tensor, Tensor]:
+        """Points and normals in the frames of their cameras, each [3, K], differentiable in the transforms."""
+        counts = [count for _, _, count in self.groups]
+        points, normals = self.point_link.split(counts, 1), self.normal_link.split(counts, 1)
+        moved, turned = [], []
+        for (view, link, _), point, normal in zip(self.groups, points, normals, strict=True):
+            T = Ts_camera_link[view, link]
+            moved.append(T[:3, :3] @ point + T[:3, 3:])
+            turned.append(T[:3, :3] @ normal)
+        if not moved:
+            return self.point_link, self.normal_link
+        return torch.cat(moved, 1), torch.cat(turned, 1)
+
+    def intrinsics(self, intrinsics: Float[Tensor, "views 4"]) -> Float[Tensor, "4 K"]:
+        """fx, fy, cx, cy of each point's view."""
+        if len(intrinsics) == 1:
+            return intrinsics[0][:, None]
+        views = [intrinsics[view][:, None].expand(-1, count) for view, _, count in self.groups]
+        return torch.cat(views, 1) if views else intrinsics.new_zeros(4, 0)
+
+
+@torch.no_grad()
+def visible_points(
+    geometry: SceneGeometry,
+    face_ids: Int[Tensor, "views height width"],
+    inverse_depth: Float[Tensor, "views height width"],
+    Ts_camera_link: Float[Tensor, "views links 4 4"],
+    intrinsics: Float[Tensor, "views 4"],
+) -> VisiblePoints:
+    """Surface point and normal at each visible pixel."""
+    faces = geometry.face_links, geometry.face_barycentric, geometry.face_normals
+    *found, counts = gather_points(*map(as_array, (face_ids, inverse_depth, Ts_camera_link, intrinsics, *faces)))
+    links = Ts_camera_link.shape[1]
+    groups = tuple((index // links, index % links, count) for index, count in enumerate(counts) if count)
+    pixel, face, point, normal = (torch.from_numpy(values).to(face_ids.device) for values in found)
+    return VisiblePoints(pixel, face, groups, point, normal)

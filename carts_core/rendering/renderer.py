@@ -11,10 +11,8 @@ from torch import Tensor
 from ..model.keypoints import Keypoint
 from ..model.parts import NORMALS, SURFACE_CHANNELS
 from ..model.scene import Scene, SceneState
-from .jacobian import JacobianBlock, Tangents, map_jacobian
-from .outline import Outline, normal_motion, outline_faces, outline_position
-from .points import SceneGeometry, link_transforms, phong, vertices_in_camera, visible_points
-from .rasterizer import rasterize
+from .jacobian import JacobianBlock, Outline, Tangents, map_jacobian, normal_motion, outline_faces, outline_position
+from .rasterizer import SceneGeometry, link_transforms, phong, rasterize, vertices_in_camera, visible_points
 
 
 class _CarryMotion(torch.autograd.Function):

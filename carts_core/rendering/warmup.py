@@ -8,7 +8,7 @@ import numpy as np
 from ..model.camera import Camera
 from ..model.robot import Robot
 from ..model.scene import Arm, Scene
-from ..optimization.factors.edges import nearest_edges
+from ..optimization.image_factors import nearest_edges
 from ..resources import shipped_robot
 from .renderer import Renderer
 

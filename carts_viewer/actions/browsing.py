@@ -9,8 +9,7 @@ from carts_core.errors import SequenceError
 from carts_core.project import Key, TimeOffset
 from carts_viewer.actions import intents
 from carts_viewer.actions.context import Context, Handler, clamped, finite, one_of
-from carts_viewer.choices import Against, Reach
-from carts_viewer.state import RunState
+from carts_viewer.state import Against, Reach, RunState
 
 _log = logging.getLogger(__name__)
 SPEEDS = (0.5, 60.0)

@@ -16,7 +16,7 @@ from carts_core.errors import CartsError, SettingsError
 from carts_core.export import FORMATS, Dataset, Monitor, Parts, export, mask_png, project_frame
 from carts_core.files import OutputPath, file_name, output_path
 from carts_core.project import ProjectState, ReviewState, frames_in, import_annotations
-from carts_core.project.calibrated import calibrated_scene
+from carts_core.project.state import calibrated_scene
 from carts_core.project.values import UNREVIEWED
 from carts_core.recording.annotations import read_annotations
 from carts_viewer.actions import intents

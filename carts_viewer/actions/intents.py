@@ -10,9 +10,9 @@ from typing import Any, ClassVar, Literal
 from carts_core.export import FormatName, Parts
 from carts_core.project import ReviewState
 from carts_core.settings import Direction
-from carts_viewer.choices import Against, Reach
 from carts_viewer.picture.layers import Layer
 from carts_viewer.picture.strokes import Stroke, Target, Tool
+from carts_viewer.state import Against, Reach
 from carts_viewer.transport.events import Event
 
 

@@ -11,11 +11,10 @@ from carts_core.settings import solver as named_solver
 from carts_core.settings.serialization import changed
 from carts_viewer.actions import intents
 from carts_viewer.actions.context import Context, Handler
-from carts_viewer.choices import NETWORK, PRESETS, Observed
 from carts_viewer.jobs.comparison import FitCheck
 from carts_viewer.jobs.optimizers import ActiveRun, FrameTask, OptimizerFactory, scene_at
 from carts_viewer.picture.layers import Layer
-from carts_viewer.state import Curves, Maps, Phase, RunState, Scores
+from carts_viewer.state import NETWORK, PRESETS, Curves, Maps, Observed, Phase, RunState, Scores
 
 _REASONS = {
     "iterations": "Done: the best iteration is the result",

@@ -11,11 +11,10 @@ from carts_core.optimization import Assessment, FrameEstimate, FreeParameters, S
 from carts_core.project import Edits, Figures, FitVerdict, Key, ProjectState, Provenance, Source
 from carts_core.project.values import VERDICTS
 from carts_core.recording import Frame
-from carts_viewer.choices import Target
 from carts_viewer.jobs.optimizers import ActiveRun, FrameTask, OptimizerFactory, SequenceRun
 from carts_viewer.picture.overlay import OverlayRenderer
 from carts_viewer.session import Session, joint_correction
-from carts_viewer.state import Pose, ViewState
+from carts_viewer.state import Pose, Target, ViewState
 
 _OUT_OF_VIEW = 5e-4
 """Share of an image below which no arm is in view of a camera [1]."""

@@ -36,8 +36,7 @@ from carts_core.settings.optimization import Inference
 from carts_core.settings.serialization import to_plain
 from carts_core.settings.stages import NONE
 from carts_core.wording import spoken_time
-from carts_viewer.choices import NETWORK, Target
-from carts_viewer.state import Pose
+from carts_viewer.state import NETWORK, Pose, Target
 
 
 class Optimizer(Protocol):

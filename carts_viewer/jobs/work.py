@@ -15,8 +15,8 @@ from typing import Any
 from carts_core.errors import CartsError
 from carts_core.evaluation.calibration import moved_frames
 from carts_core.model.scene import Scene
-from carts_core.optimization.backgrounds import Backgrounds
 from carts_core.optimization.calibration import CalibrationOptimizer
+from carts_core.optimization.observation import Backgrounds
 from carts_core.project import (
     CorrectedIntrinsics,
     CorrectedTransform,

@@ -11,12 +11,11 @@ from carts_core.wording import counted
 from carts_viewer.actions import intents
 from carts_viewer.actions.browsing import SPEEDS
 from carts_viewer.actions.frame_filter import SOLVED, copied
-from carts_viewer.choices import Against
 from carts_viewer.panels.inputs import PanelPage, humanized, swatch, write
 from carts_viewer.picture.layers import ARM_COLORS, TRUTH_COLORS, Layer, label_color
 from carts_viewer.picture.overlay import with_imported
 from carts_viewer.session import Session
-from carts_viewer.state import Scores, ViewState
+from carts_viewer.state import Against, Scores, ViewState
 from carts_viewer.transport.document import escaped
 
 _SOURCES = {

@@ -9,7 +9,7 @@ import viser
 from carts_viewer.actions.intents import Intent, Refresh
 from carts_viewer.state import ViewState
 from carts_viewer.transport.document import escaped
-from carts_viewer.transport.tab_page import TabPage
+from carts_viewer.transport.page import TabPage
 from carts_viewer.transport.viser_private import on_sent
 
 

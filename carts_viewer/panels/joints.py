@@ -7,11 +7,10 @@ import viser
 from carts_core.settings import SurfaceSolver
 from carts_viewer.actions import intents
 from carts_viewer.actions.posing import LARGEST_PERTURBATION
-from carts_viewer.choices import JointRange, Reach
 from carts_viewer.panels.inputs import PanelPage, humanized, valid, write
 from carts_viewer.picture.overlay import labelled_keypoints
 from carts_viewer.session import Session
-from carts_viewer.state import ViewState
+from carts_viewer.state import JointRange, Reach, ViewState
 from carts_viewer.transport.document import escaped
 
 _STEP = 0.05

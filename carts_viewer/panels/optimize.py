@@ -15,11 +15,10 @@ from carts_core.project import ReviewState
 from carts_core.settings import DescentSolver, SolverName, SurfaceSolver
 from carts_core.settings.serialization import field_docstrings
 from carts_viewer.actions import intents
-from carts_viewer.choices import PRESETS
 from carts_viewer.panels.inputs import PanelPage, humanized, write
 from carts_viewer.panels.sequence import CalibrationHint
 from carts_viewer.session import Session
-from carts_viewer.state import Curves, Phase, ViewState
+from carts_viewer.state import PRESETS, Curves, Phase, ViewState
 from carts_viewer.transport.document import escaped
 
 SOLVER_LABELS = {

@@ -6,13 +6,12 @@ from typing import Any
 
 from carts_viewer.actions import intents
 from carts_viewer.actions.frame_filter import review_name
-from carts_viewer.choices import Reach
 from carts_viewer.panels.fit import quality
 from carts_viewer.picture.layers import Layer
 from carts_viewer.picture.overlay import keypoints_in_image, labelled_keypoints
 from carts_viewer.session import Session
-from carts_viewer.state import ViewState
-from carts_viewer.transport.tab_page import TabPage
+from carts_viewer.state import Reach, ViewState
+from carts_viewer.transport.page import TabPage
 
 
 class PageState:

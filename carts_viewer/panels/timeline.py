@@ -29,7 +29,7 @@ from carts_viewer.session import Session
 from carts_viewer.state import ViewState
 from carts_viewer.transport.events import Trace
 from carts_viewer.transport.guard import response
-from carts_viewer.transport.tab_page import TabPage
+from carts_viewer.transport.page import TabPage
 
 _FIGURES = ("Loss [1]", "Dice [1]", "Probability of failure [1]")
 _MOST_COLUMNS = 4000

@@ -8,15 +8,14 @@ from functools import cache
 from carts_core.model.scene import SceneState
 from carts_core.project import IgnoreRegion, Key, Kind, MaskCorrection
 from carts_core.project.values import WHOLE_PROJECT
-from carts_viewer.choices import composed, other_pose
 from carts_viewer.panels.inputs import Panel
 from carts_viewer.picture.layers import Layer, Rgba, imported, paint_over, parts
 from carts_viewer.picture.overlay import OverlayRenderer, with_imported
 from carts_viewer.picture.scene_view import SceneView
 from carts_viewer.picture.strokes import Tool
 from carts_viewer.session import Session
-from carts_viewer.state import Maps, ViewState
-from carts_viewer.transport.tab_page import TabPage
+from carts_viewer.state import Maps, ViewState, composed, other_pose
+from carts_viewer.transport.page import TabPage
 
 
 @cache

@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING, Any
 import viser
 
 from carts_core.console import visible
-from carts_viewer.transport.page import Page
-from carts_viewer.transport.tab_page import call
+from carts_viewer.transport.page import Page, call
 
 if TYPE_CHECKING:
     import jinja2

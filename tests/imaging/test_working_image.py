@@ -5,8 +5,7 @@ from pathlib import Path
 import torch
 from torch.nn.functional import avg_pool2d
 
-from carts_core.imaging.haze import certainty, dehazed, transmission
-from carts_core.imaging.working_image import blurred, box_mean, smoothed
+from carts_core.imaging.working_image import blurred, box_mean, certainty, dehazed, smoothed, transmission
 from carts_core.recording import Sequence
 
 

@@ -10,8 +10,8 @@ import pytest
 import torch
 
 from carts_core.errors import SettingsError
-from carts_core.networks import FeatureExtractor, inference
-from carts_core.networks.inference import OnnxSurface
+from carts_core.networks import FeatureExtractor
+from carts_core.networks.extractor import TOLERANCE, OnnxSurface, _times
 from carts_core.networks.network import SurfaceNetwork
 from carts_core.networks.weights import save_weights
 from carts_core.settings import Architecture
@@ -44,7 +44,7 @@ def test_onnx_predicts_what_torch_predicts(weights: Path, size: tuple[int, int],
     assert one.sha256 == other.sha256 == one.fingerprint != other.fingerprint
     images, given = torch.rand(2, 3, *size), torch.rand(2, 6, *size)
     expected, found = one.surface(images, given), other.surface(images, given)
-    assert float((expected - found).abs().max()) < inference.TOLERANCE and float(expected.std()) > 1e-3
+    assert float((expected - found).abs().max()) < TOLERANCE and float(expected.std()) > 1e-3
     # A part of a larger tensor, which is not contiguous.
     window = images[..., : size[0] // 2 // 16 * 16 or 16, :]
     torch.testing.assert_close(
@@ -59,7 +59,7 @@ def test_onnx_predicts_what_torch_predicts(weights: Path, size: tuple[int, int],
 def test_a_gpu_predicts_what_a_cpu_predicts_and_gives_it_back_where_the_images_are() -> None:
     images, given = torch.rand(1, 3, 112, 208), torch.rand(1, 6, 112, 208)
     here, there = (FeatureExtractor.load(device=device).surface(images, given) for device in ("cpu", "cuda"))
-    torch.testing.assert_close(there, here, atol=inference.TOLERANCE, rtol=0)
+    torch.testing.assert_close(there, here, atol=TOLERANCE, rtol=0)
 
 
 def test_the_number_of_threads_changes_no_bit(weights: Path) -> None:
@@ -87,7 +87,7 @@ def test_the_graph_is_exported_once_and_again_where_it_was_damaged(
     FeatureExtractor.load(weights, inference="onnx")
     (graph,) = cache.glob("surface-*.onnx")
     whole = graph.read_bytes()
-    monkeypatch.setattr("carts_core.networks.inference._exported", lambda network: pytest.fail("exported again"))
+    monkeypatch.setattr("carts_core.networks.extractor._exported", lambda network: pytest.fail("exported again"))
     assert FeatureExtractor.load(weights, inference="onnx").engine == "onnx"
     monkeypatch.undo()
     monkeypatch.setenv("CARTS_CACHE", str(cache))
@@ -111,25 +111,25 @@ def test_another_networks_graph_is_not_used(weights: Path, cache: Path) -> None:
 def test_the_faster_engine_is_measured_once_and_remembered(
     weights: Path, cache: Path, monkeypatch: pytest.MonkeyPatch, seconds: float, engine: str
 ) -> None:
-    monkeypatch.setattr(inference, "_times", lambda network, other: {"torch": 1.0, "onnx": seconds})
+    monkeypatch.setattr("carts_core.networks.extractor._times", lambda network, other: {"torch": 1.0, "onnx": seconds})
     assert FeatureExtractor.load(weights, inference="auto").engine == engine
     (remembered,) = cache.glob("inference-*.json")
     assert json.loads(remembered.read_text())["engine"] == engine
-    monkeypatch.setattr(inference, "_times", lambda network, other: pytest.fail("measured again"))
+    monkeypatch.setattr("carts_core.networks.extractor._times", lambda network, other: pytest.fail("measured again"))
     assert FeatureExtractor.load(weights, inference="auto").engine == engine
 
 
 def test_times_are_measured(weights: Path) -> None:
     extractor = FeatureExtractor.load(weights)
     network = extractor._surface
-    times = inference._times(network, OnnxSurface(network, extractor.weights["surface"].sha256))
+    times = _times(network, OnnxSurface(network, extractor.weights["surface"].sha256))
     assert set(times) == {"torch", "onnx"} and all(0 < value < 10 for value in times.values())
 
 
 def test_where_onnx_runtime_is_missing_torch_runs_and_asking_for_it_is_an_error(
     weights: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(inference, "find_spec", lambda name: None)
+    monkeypatch.setattr("carts_core.networks.extractor.find_spec", lambda name: None)
     assert FeatureExtractor.load(weights, inference="auto").engine == "torch"
     with pytest.raises(SettingsError, match="onnxruntime and onnx is not installed"):
         FeatureExtractor.load(weights, inference="onnx")

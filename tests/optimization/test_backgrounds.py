@@ -16,8 +16,7 @@ from carts_core.model.parts import COVERAGE
 from carts_core.model.scene import Scene
 from carts_core.networks import FeatureExtractor
 from carts_core.optimization import Backgrounds, FrameOptimizer, ImagePredictor, SurfaceSolver, Verdict
-from carts_core.optimization.backgrounds import Background, without_background
-from carts_core.optimization.observation import FrameImages
+from carts_core.optimization.observation import Background, FrameImages, without_background
 from carts_core.recording import Sequence
 from carts_core.rendering import Renderer
 from carts_core.settings.stages import OtherBackground

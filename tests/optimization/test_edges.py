@@ -16,7 +16,7 @@ from carts_core.evaluation import dice, start_positions
 from carts_core.networks import FeatureExtractor
 from carts_core.optimization import FrameOptimizer, FreeParameters
 from carts_core.optimization.factors import Linearization, Prior
-from carts_core.optimization.factors.edges import EdgeFactor, align_edges
+from carts_core.optimization.image_factors import EdgeFactor, align_edges
 from carts_core.optimization.variables import Variables
 from carts_core.recording import Sequence
 from carts_core.rendering import Outline, Renderer
@@ -87,7 +87,7 @@ def test_moving_outlines_as_they_say_is_as_good_as_rendering_them(
     monkeypatch.setattr(Renderer, "outline", lambda *given: rendered.append(render(*given)) or rendered[-1])
     moved = align(sequence)
     few = len(rendered)
-    monkeypatch.setattr("carts_core.optimization.factors.edges._RENDERED_ANEW", 0.0)
+    monkeypatch.setattr("carts_core.optimization.image_factors._RENDERED_ANEW", 0.0)
     always = align(sequence)
     assert few < 0.8 * (len(rendered) - few)
     assert (moved.offsets - always.offsets)[:2].abs().max() < 0.05 * OFF.max()
@@ -107,11 +107,11 @@ def test_edges_of_an_occluder_do_not_count(sequence: Sequence) -> None:
 def test_edges_behind_haze_count_by_the_square_of_what_comes_through(
     sequence: Sequence, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("carts_core.optimization.factors.edges.dehazed", lambda images, _: images)
+    monkeypatch.setattr("carts_core.optimization.image_factors.dehazed", lambda images, _: images)
     found = []
     for through in (1.0, 0.5):
         monkeypatch.setattr(
-            "carts_core.optimization.factors.edges.transmission",
+            "carts_core.optimization.image_factors.transmission",
             lambda images, _, t=through: t * torch.ones_like(images[:, :1]),
         )
         found.append(align(sequence, steps=1, dehaze=0.8).edges.hessian)

@@ -14,9 +14,9 @@ from perfect_predictor import PerfectPredictor
 
 from carts_core.imaging.working_image import Window
 from carts_core.optimization import FreeParameters
+from carts_core.optimization.factors import FirstOrderDescent
 from carts_core.optimization.frame_problem import FrameProblem
 from carts_core.optimization.observability import Evaluation
-from carts_core.optimization.solvers import FirstOrderDescent
 from carts_core.optimization.stages import Fit, StopReason, run_stage, run_stages, start_explains_as_well
 from carts_core.optimization.variables import Variables
 from carts_core.recording import Sequence
@@ -183,7 +183,7 @@ def test_first_order_descent_takes_the_steps_of_torch(method: Literal["adam", "g
 def test_first_order_descent_imports_no_compiler() -> None:
     code = (
         "import sys, torch\n"
-        "from carts_core.optimization.solvers import FirstOrderDescent\n"
+        "from carts_core.optimization.factors import FirstOrderDescent\n"
         "from carts_core.settings import DescentSolver\n"
         "zero = torch.zeros(3)\n"
         "FirstOrderDescent(DescentSolver(), zero, zero - 1, zero + 1).step(zero + 0.5)\n"

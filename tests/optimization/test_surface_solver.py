@@ -13,8 +13,8 @@ from carts_core.imaging.working_image import Window
 from carts_core.networks import FeatureExtractor
 from carts_core.optimization import DescentSolver, FrameOptimizer, FreeParameters, SurfaceSolver
 from carts_core.optimization.factors import Prior
-from carts_core.optimization.factors.surface import SurfaceFactor
 from carts_core.optimization.frame_problem import FrameProblem
+from carts_core.optimization.image_factors import SurfaceFactor
 from carts_core.optimization.observation import FrameImages, Observation
 from carts_core.optimization.variables import Variables
 from carts_core.recording import Sequence
@@ -150,7 +150,7 @@ def test_many_states_are_compared_at_once_as_each_alone(
     assert costs.tolist() == pytest.approx(alone, rel=1e-4)
     assert factor.linearize(offsets[1]).cost == pytest.approx(alone[1], rel=1e-4)
     assert len({round(cost, 1) for cost in alone}) == len(alone)
-    monkeypatch.setattr("carts_core.optimization.factors.surface._PIXELS_AT_ONCE", 2 * factor.window.area)
+    monkeypatch.setattr("carts_core.optimization.image_factors._PIXELS_AT_ONCE", 2 * factor.window.area)
     assert torch.equal(factor.costs(offsets), costs), "in parts where they are too many"
 
 

@@ -30,13 +30,14 @@ from carts_core.optimization import (
     Verdict,
     check_domain,
 )
-from carts_core.optimization.evidence import _SHOWN, evidence
 from carts_core.optimization.observability import Uncertainty
 from carts_core.optimization.observation import FrameImages
 from carts_core.optimization.verdict import (
+    _SHOWN,
     assess,
     assess_calibration,
     assess_sequence,
+    evidence,
     median_evidence,
     without_knowledge,
     worse_in,

@@ -7,10 +7,8 @@ from torch.nn import functional
 
 from carts_core.model.parts import NORMALS
 from carts_core.model.scene import Light
-from carts_core.rendering.jacobian import Tangents
-from carts_core.rendering.outline import BEHIND, BORDER, gaussian_kernels
-from carts_core.rendering.points import SceneGeometry, VisiblePoints, unit
-from carts_core.rendering.rasterizer import BACKGROUND, NEAR
+from carts_core.rendering.jacobian import BEHIND, BORDER, Tangents, gaussian_kernels
+from carts_core.rendering.rasterizer import BACKGROUND, NEAR, SceneGeometry, VisiblePoints, unit
 
 
 def visibility_ref(

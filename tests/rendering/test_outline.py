@@ -12,8 +12,7 @@ from carts_core.model.scene import Scene, SceneState
 from carts_core.optimization import FreeParameters
 from carts_core.optimization.variables import APART, Variables
 from carts_core.rendering import Outline, Renderer
-from carts_core.rendering import outline as outlines
-from carts_core.rendering.outline import BORDER, outline_position
+from carts_core.rendering.jacobian import BORDER, outline_position
 
 WIDTH, HEIGHT, FINER = 640, 480, 4
 
@@ -121,8 +120,7 @@ def test_compiled_kernels_find_what_torch_finds(
     zero, renderer = torch.zeros(len(parameters)), Renderer(scene)
     compiled = outline(renderer, parameters, zero)
     monkeypatch.setattr(
-        outlines,
-        "keep_outline",
+        "carts_core.rendering.jacobian.keep_outline",
         lambda faces, near, *_: np.where(outline_pixels_ref(torch.from_numpy(near)), faces, -1),
     )
     monkeypatch.setattr("carts_core.rendering.renderer.outline_position", outline_position_ref)

@@ -9,8 +9,13 @@ from slow_references import visible_points_ref
 from torch import Tensor
 
 from carts_core.recording import Sequence
-from carts_core.rendering.points import SceneGeometry, link_transforms, vertices_in_camera, visible_points
-from carts_core.rendering.rasterizer import rasterize
+from carts_core.rendering.rasterizer import (
+    SceneGeometry,
+    link_transforms,
+    rasterize,
+    vertices_in_camera,
+    visible_points,
+)
 
 WIDTH, HEIGHT = 160, 120
 

@@ -4,7 +4,7 @@ import torch
 from slow_references import carry_motion_ref, phong_ref
 
 from carts_core.model.scene import Light
-from carts_core.rendering.points import phong
+from carts_core.rendering.rasterizer import phong
 from carts_core.rendering.renderer import carry_motion
 
 

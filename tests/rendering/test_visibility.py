@@ -11,8 +11,7 @@ from carts_core.model.meshes import is_closed
 from carts_core.model.robot import Robot
 from carts_core.recording import Sequence
 from carts_core.rendering import Renderer, visibility
-from carts_core.rendering.points import SceneGeometry, link_transforms, vertices_in_camera
-from carts_core.rendering.rasterizer import rasterize
+from carts_core.rendering.rasterizer import SceneGeometry, link_transforms, rasterize, vertices_in_camera
 from carts_core.resources import sample_sequence
 
 INTRINSICS = (30.0, 34.0, 17.3, 11.8)

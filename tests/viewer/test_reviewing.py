@@ -23,14 +23,13 @@ from carts_viewer.actions.frame_filter import (
     found,
     review_name,
 )
-from carts_viewer.choices import Against, Compare, JointRange, composed, other_pose
 from carts_viewer.jobs.comparison import Fit
 from carts_viewer.panels.fit import fit_text
 from carts_viewer.panels.optimize import note, undetermined_lines
 from carts_viewer.panels.sequence import calibration_line
 from carts_viewer.picture.layers import Layer
 from carts_viewer.picture.strokes import Stroke, Target
-from carts_viewer.state import Curves, Maps, Phase, RunState
+from carts_viewer.state import Against, Compare, Curves, JointRange, Maps, Phase, RunState, composed, other_pose
 
 CORNERS = np.array(((5.0, 5.0), (60.0, 5.0), (60.0, 40.0), (5.0, 40.0)))
 

@@ -22,7 +22,7 @@ from ...recording import Sequence as SequenceFile
 from ...recording.background import spread
 from ...recording.images import read_image
 from ...rendering import Renderer
-from ...rendering.points import link_transforms, visible_points
+from ...rendering.rasterizer import link_transforms, visible_points
 from ...settings import DOMAINS, DomainConfig, EndoscopeConfig, SensorConfig, SynthesisConfig
 from ..synthesis.domains import Conditions, View, expose, exposure_gain, linear
 from ..synthesis.path_tracer import PathTracer, Surface

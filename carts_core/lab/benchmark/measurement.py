@@ -15,7 +15,7 @@ import msgspec
 import numpy as np
 import torch
 
-from ... import fingerprints
+from ... import provenance
 from ...errors import CartsError
 from ...evaluation import start_positions
 from ...files import OutputPath, append_line, write_text
@@ -26,8 +26,7 @@ from ...networks.extractor import FeatureExtractor
 from ...optimization import DescentSolver, FrameOptimizer, SolverSettings, SurfaceSolver
 from ...recording import Sequence
 from ...rendering import Renderer
-from ...rendering.points import link_transforms, vertices_in_camera
-from ...rendering.rasterizer import rasterize
+from ...rendering.rasterizer import link_transforms, rasterize, vertices_in_camera
 from ...resources import sample_sequence
 from ...settings.serialization import to_plain
 from ...settings.stages import Observe
@@ -57,7 +56,7 @@ _MEASURED = (
 
 def code_fingerprint(patterns: tuple[str, ...] = _MEASURED) -> str:
     """SHA-256 over modules of the package; by default, those that affect estimates and scores."""
-    return fingerprints.code_fingerprint(patterns)
+    return provenance.code_fingerprint(patterns)
 
 
 def run_fingerprint(

@@ -8,8 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ...errors import SettingsError
-from ...files.image_size import size_problem
-from ...files.reading import IMAGE, read_bytes
+from ...files.reading import IMAGE, read_bytes, size_problem
 
 
 def smooth_noise(rng: np.random.Generator, width: int, height: int, cells: float, octaves: int = 3) -> np.ndarray:
