@@ -49,9 +49,10 @@ class Import:
         folder = self.output or Path(f"{recording_name(self.source)}_sequence")
         path, recording = import_recording(self.source, folder, self.options, overwrite=self.overwrite)
         print_report(console, recording)
-        console.print(f"wrote {path}. Look at it: carts view {path}", markup=False, soft_wrap=True)
+        console.print(f"wrote {path}. To view it: carts view {path}", markup=False, soft_wrap=True)
         if any(arm.times is not None for arm in recording.arms):
-            console.print(f"Are images and log late? carts time-offset {path}", markup=False, soft_wrap=True)
+            text = f"To estimate a delay between images and log: carts time-offset {path}"
+            console.print(text, markup=False, soft_wrap=True)
 
 
 def print_report(console: Console, recording: "FoundRecording") -> None:
@@ -65,7 +66,7 @@ def print_report(console: Console, recording: "FoundRecording") -> None:
             console.print(f"{arm.name}: {rows}, {', '.join(arm.columns)}", markup=False)
     for note in recording.notes:
         console.print(f"[{_STYLES[note.kind]}]{note.kind}[/]: ", end="")
-        console.print(note.text, markup=False, highlight=False, soft_wrap=True)
+        console.print(str(note), markup=False, highlight=False, soft_wrap=True)
 
 
 def _rate(times: "np.ndarray") -> float:

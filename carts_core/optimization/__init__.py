@@ -20,6 +20,7 @@ from .frame import Progress as Progress
 from .frame_problem import propose_ignore as propose_ignore
 from .measurement import sequence_checkpoint as sequence_checkpoint
 from .observability import fit_words as fit_words
+from .observability import joint_words as joint_words
 from .observability import undetermined_joints as undetermined_joints
 from .observation import Backgrounds as Backgrounds
 from .predictor import FramePredictor as FramePredictor

@@ -100,10 +100,15 @@ def fit_words(verdict: str, undetermined: Sequence[str] | None) -> str:
     Args:
         undetermined: result of `undetermined_joints`; None if no standard deviation is known.
     """
+    joints = joint_words(undetermined)
+    return f"mask {verdict}, {joints}" if joints else f"mask {verdict}"
+
+
+def joint_words(undetermined: Sequence[str] | None) -> str:
+    """Number of undetermined joints as text; empty if no standard deviation is known."""
     if undetermined is None:
-        return f"mask {verdict}"
-    joints = f"{counted(len(undetermined), 'joint')} not determined" if undetermined else "all joints determined"
-    return f"mask {verdict}, {joints}"
+        return ""
+    return f"{counted(len(undetermined), 'joint')} not determined" if undetermined else "all joints determined"
 
 
 def uncertainty(

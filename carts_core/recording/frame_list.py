@@ -126,18 +126,15 @@ class FrameNames:
         if all(map(str.isdecimal, ids)) and max(map(len, ids)) <= _SHORT and len(set(ids)) == len(ids):
             return ids  # Fast path, since an hour has 100,000 frames: numbers can only be wrong by repetition.
         lines: dict[str, int] = {}
-        for frame_id, line in zip(ids, table.lines, strict=True):
+        for row, (frame_id, line) in enumerate(zip(ids, table.lines, strict=True)):
             if not frame_id:
-                raise SequenceError(f"{key}, line {line}: the frame has no id. Fill it in.")
+                raise table.error(f", column {self.column!r}: the frame has no id. Add one.", row)
             if frame_id in lines:
-                raise SequenceError(
-                    f"{key}: frame {frame_id!r} is in line {lines[frame_id]} and again in line {line}. "
-                    "Remove one of them, or number the frames anew."
-                )
+                text = f"frame {frame_id!r} is already in line {lines[frame_id]}. Remove it, or renumber the frames."
+                raise table.error(f", column {self.column!r}: {text}", row)
             if fault := name_fault(frame_id):
-                raise SequenceError(
-                    f"{key}, line {line}: the frame is called {frame_id!r}, {fault}. {allowed_names()}."
-                )
+                text = f"the frame is called {frame_id!r}, {fault}. {allowed_names()}."
+                raise table.error(f", column {self.column!r}: {text}", row)
             lines[frame_id] = line
         return ids
 
@@ -153,7 +150,7 @@ def take_frame_list(section: TomlTable) -> FrameList:
         return _frames_of_video(section)
     if "table" not in section:
         raise section.error(
-            "table", "is missing. Name a CSV file with a row per frame and its time, or a `video` whose times count."
+            "table", "is missing. Name a CSV file with a row per frame and its time, or a `video` with frame times."
         )
     table = read_table(section.path(section.take("table", str)), take_delimiter(section), "table of frames")
     timestamp = section.take("timestamp", str, "timestamp")
@@ -190,12 +187,12 @@ def _frames_of_video(section: TomlTable) -> FrameList:
     path = section.path(section.take("video", str))
     for key in ("table", "frame", "timestamp", "video_frame", "delimiter"):
         if key in section:
-            raise section.error(key, "does not go with `video`, all of whose frames are meant. Remove one of them.")
+            raise section.error(key, "cannot be combined with `video`, of which all frames are used. Remove one.")
     pattern = _take_pattern(section)
     index = index_video(path)
     if index.timestamps is None:
         raise section.error(
-            "video", f"is {path}, which gives its frames no times. Name a `table` with the time of every frame instead."
+            "video", f"is {path}, whose frames have no times. Name a `table` with the time of every frame instead."
         )
     numbers = tuple(range(index.count))
     ids = tuple(expand(pattern, section.name("frame_id"), frame=FrameId(number)) for number in numbers)
@@ -207,7 +204,7 @@ def _frames_of_video(section: TomlTable) -> FrameList:
 def _take_pattern(section: TomlTable) -> str:
     pattern = section.take("frame_id", str, _FRAME_ALONE)
     if "{frame" not in pattern:
-        raise section.error("frame_id", f'is {pattern!r}. It must contain {{frame}}, say "{{frame:03d}}".')
+        raise section.error("frame_id", f'is {pattern!r}, but must contain {{frame}}, such as "{{frame:03d}}".')
     return pattern
 
 
@@ -215,10 +212,8 @@ def numbers_of_frames(table: Table, column: str, asked_by: str) -> tuple[int, ..
     """Video frame numbers of the rows, from a column of a table."""
     numbers = table.numbers(column, asked_by)
     if (wrong := np.flatnonzero((numbers < 0) | (numbers != np.round(numbers)))).size:
-        raise SequenceError(
-            f"{table.path}, line {table.lines[wrong[0]]}, column {column!r}: {numbers[wrong[0]]:g} is not a frame "
-            "number. Frames of a video are counted 0, 1, 2, ..."
-        )
+        text = f", column {column!r}: {numbers[wrong[0]]:g} is not a frame number. Frames of a video count from 0."
+        raise table.error(text, wrong[0])
     return tuple(int(number) for number in numbers)
 
 
@@ -240,8 +235,8 @@ def frame_files(
     if len(found) != len(frames.frame_ids):
         raise SequenceError(
             f"{key}: {filled!r} matches {counted(len(found), 'file')} in {fixed}, but {frames.counted}. "
-            f"The n-th file belongs to the n-th of them: make them as many, "
-            "or name the files by frame, as in " + EXAMPLES + "."
+            f"The numbers must be equal, since the n-th file belongs to the n-th frame. Or name the files by frame, as "
+            f"in {EXAMPLES}."
         )
     return tuple(found)
 
@@ -252,8 +247,8 @@ def _matching(base: Path, key: str) -> tuple[Path, list[Path]]:
     wild = base.relative_to(fixed)
     if "**" in wild.parts or len(wild.parts) > _MOST_WILD_PARTS:
         raise SequenceError(
-            f"{key}: {str(wild)!r} would search whole trees of folders. Wildcards are allowed from the last "
-            f"{_MOST_WILD_PARTS} parts of the path on, and ** is not; name the folder."
+            f"{key}: {str(wild)!r} has ** or wildcards before the last {_MOST_WILD_PARTS} parts of the path, which is "
+            "not allowed. Name the folder."
         )
 
     def natural(path: Path) -> list[tuple[int, str]]:
@@ -273,6 +268,6 @@ def check_present(key: str, files: tuple[Path, ...], frames: FrameList, hint: st
         shown = ", ".join(f"{file} (frame {frame_id})" for file, frame_id in missing[:_SHOWN_MISSING])
         rest = f" and {len(missing) - _SHOWN_MISSING} more" if len(missing) > _SHOWN_MISSING else ""
         raise SequenceError(
-            f"{key}: {len(missing)} of {counted(len(files), 'file')} missing: {shown}{rest}, but {frames.counted} "
-            f"and every one needs its file: put them back, correct the pattern, or remove the rows.{hint}"
+            f"{key}: {len(missing)} of {counted(len(files), 'file')} missing: {shown}{rest}, but {frames.counted}, and "
+            f"each needs a file. Restore the files, correct the pattern, or remove the rows.{hint}"
         )

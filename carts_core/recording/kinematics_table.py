@@ -25,6 +25,20 @@ MOST_CELLS = 10_000_000
 """Largest table; an hour at 100 rows per second has room for 27 columns."""
 
 
+class TableError(SequenceError):
+    """Unusable table of a sequence.
+
+    Attributes:
+        path: path of the table.
+        row: index of the row; None for the whole table.
+        text: message that follows the location.
+    """
+
+    def __init__(self, path: Path, text: str, row: int | None = None, line: int | None = None) -> None:
+        super().__init__(f"{path}{'' if line is None else f', line {line}'}{text}")
+        self.path, self.text, self.row = path, text, row
+
+
 @dataclass(frozen=True)
 class Table:
     """A CSV file as text; cells are parsed when their column is requested."""
@@ -50,18 +64,23 @@ class Table:
             # A cell is not a number; this slower loop finds it.
             values = np.fromiter(map(_number, self._cells(column, asked_by)), np.float64, len(self))
         if (wrong := np.flatnonzero(~np.isfinite(values))).size:
-            row, cells = wrong[0], self.text(column, asked_by)
-            raise SequenceError(
-                f"{self.path}, line {self.lines[row]}, column {column!r}: {shown(cells[row])} is not a finite number. "
-                "Correct the cell, or leave the whole row out (and, where images are numbered by row, its image)."
+            cell = self.text(column, asked_by)[wrong[0]]
+            raise self.error(
+                f", column {column!r}: {shown(cell)} is not a finite number. Correct the cell, or remove the row and, "
+                "if images are numbered by row, its image.",
+                wrong[0],
             )
         return values
+
+    def error(self, text: str, row: int | np.integer | None = None) -> TableError:
+        """Error about the table or one of its rows."""
+        return TableError(self.path, text) if row is None else TableError(self.path, text, int(row), self.lines[row])
 
     def _cells(self, column: str, asked_by: str) -> Iterator[str]:
         """Unparsed cells of a column."""
         if column not in self.header:
-            raise SequenceError(
-                f"{self.path} has no column {column!r}, which {asked_by} names.{closest(column, self.header)} "
+            raise self.error(
+                f" has no column {column!r}, which {asked_by} names.{closest(column, self.header)} "
                 f"Its columns are: {listed(self.header)}."
             )
         return map(itemgetter(self.header.index(column)), self.rows)
@@ -90,8 +109,8 @@ def read_table(path: Path, delimiter: str = ",", what: str = "kinematics table")
     header = tuple(name.strip() for name in rows[0])
     if len(header) == 1 and (found := next((mark for mark in ";\t," if mark in header[0]), None)):
         raise SequenceError(
-            f"{path} is not separated by {delimiter!r} but, it seems, by {found!r}. "
-            f"Set `delimiter = {found!r}` in [kinematics] (decimal points are points)."
+            f"the cells of {path} are not separated by {delimiter!r}, but probably by {found!r}. "
+            f"Set `delimiter = {found!r}` in [kinematics]; the decimal separator must be a point."
         )
     repeated = sorted(name for name, count in Counter(header).items() if name and count > 1)
     if repeated:
@@ -197,7 +216,7 @@ class Remedy:
     """An interpretation of positions that is within the limits."""
 
     text: str
-    """The other sign, a unit, or an order of the columns, as a noun."""
+    """Sign, unit or order of the columns, as a noun."""
     option: str
     """Its option of `carts import`."""
 
@@ -240,7 +259,7 @@ def misfits(
 
 def _remedies(joint: Joint, values: np.ndarray) -> list[Remedy]:
     """Changes of unit or sign that would bring the joint's positions within its limits."""
-    found = [Remedy("the other sign", f"--flip {joint.name}")] if joint.fits(-values) else []
+    found = [Remedy("the opposite sign", f"--flip {joint.name}")] if joint.fits(-values) else []
     for unit, factor in joint.units.items():
         if factor != 1.0 and joint.fits(values * factor) and not (found and unit != "deg"):
             text = f"{unit} (read as {values.min() * factor:.3g} to {values.max() * factor:.3g} {joint.unit})"
@@ -265,7 +284,7 @@ def _other_order(joints: Sequence[Joint], values: np.ndarray, wrong: list[int]) 
         order = list(range(len(joints)))
         order[a], order[b] = b, a
         if (a in wrong or b in wrong) and fit(order):
-            found.append(Remedy(f"the columns of {names[a]} and {names[b]} the other way round", OTHER_COLUMNS))
+            found.append(Remedy(f"exchanged columns of {names[a]} and {names[b]}", OTHER_COLUMNS))
     return found
 
 
@@ -294,11 +313,11 @@ class JointColumn:
             values = table.numbers(self.column, f"{key} {joint.name}") * self.scale + self.offset
         allowed, other = PLAUSIBLE[joint.kind], "deg" if joint.revolute else "mm"
         if not (worst := np.abs(values).max()) <= allowed:
-            raise SequenceError(
-                f"{table.path}, line {table.lines[int(np.abs(values).argmax())]}, {where}: read as {self.unit}, joint "
-                f"{joint.name!r} is at {worst:.4g} {joint.unit}, which no instrument reaches ({allowed:.3g} "
-                f"{joint.unit} is allowed). If the column is in {other}, say so: "
-                f'{joint.name} = {{ column = "{self.column}", unit = "{other}" }}.'
+            raise table.error(
+                f", {where}: read as {self.unit}, joint {joint.name!r} is at {worst:.4g} {joint.unit}, which no "
+                f"instrument reaches ({allowed:.3g} {joint.unit} is allowed). If the column is in {other}, set "
+                f'{joint.name} = {{ column = "{self.column}", unit = "{other}" }}.',
+                np.abs(values).argmax(),
             )
         if self.given or joint.fits(values, FAR):
             return values
@@ -306,11 +325,11 @@ class JointColumn:
         fitting = [unit for unit, factor in joint.units.items() if factor != 1.0 and joint.fits(values * factor)]
         if fitting:
             option = "angle_unit" if joint.revolute else "length_unit"
-            raise SequenceError(
-                f"{table.path}, {where}: read as {joint.unit}, joint {joint.name!r} is from {values.min():.4g} to "
+            raise table.error(
+                f", {where}: read as {joint.unit}, joint {joint.name!r} is from {values.min():.4g} to "
                 f"{values.max():.4g} {joint.unit}, and its limits are {joint.lower:.4g} to {joint.upper:.4g}. "
-                f'Say the unit in [[arms]]: {option} = "{fitting[0]}" or "{PERCENT}" (-100 to 100 of the range), or '
-                f'"{joint.unit}" if it is that.'
+                f'Set the unit in [[arms]]: {option} = "{fitting[0]}" or "{PERCENT}" (-100 to 100 of the range), or '
+                f'"{joint.unit}" if it is correct.'
             )
         return values
 
@@ -362,7 +381,7 @@ def take_joints(table: TomlTable, robot: Robot) -> JointColumns:
             raise mapping.error(
                 name,
                 f"is missing: robot {robot.name!r} has this joint. Name its column here, or give its constant position "
-                f"[{_joint(mapping, name, robot).unit}] under [arms.defaults], say {name} = 0.0.",
+                f"[{_joint(mapping, name, robot).unit}] under [arms.defaults], such as {name} = 0.0.",
             )
     return JointColumns(robot, columns, values, mapping.where)
 
@@ -400,6 +419,6 @@ def _conversion(joint: Joint, unit: str, robot: Robot) -> tuple[float, float]:
         return joint.units[unit], 0.0
     if not np.isfinite([joint.lower, joint.upper]).all():
         raise SequenceError(
-            f"joint {joint.name!r} of {robot.urdf} has no limits, so {PERCENT} of its range is not known."
+            f"joint {joint.name!r} of {robot.urdf} has no limits, so {PERCENT} cannot be converted. Give another unit."
         )
     return (joint.upper - joint.lower) / 200, (joint.upper + joint.lower) / 2

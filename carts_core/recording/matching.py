@@ -46,10 +46,8 @@ class Samples:
     """Logged rows of a table: joint positions [rows, dofs] [rad], [m], or poses T_world_mount [rows, 4, 4] [m]."""
 
     values: Float[np.ndarray, "rows ..."]
-    path: Path
-    """Path of the table, for errors."""
-    lines: tuple[int, ...]
-    """Line of each row in the table, for errors."""
+    table: Table
+    """The table, for errors."""
     times: Float[np.ndarray, " rows"] | None
     """Time of each row in the table's clock, increasing [s]; None if row n belongs to frame n."""
 
@@ -104,14 +102,14 @@ class Samples:
         wanted = frames.timestamps + matching.time_offset
         after = int(np.searchsorted(self.times, wanted[row]))
         near = " and ".join(
-            f"line {self.lines[index]} at {self.times[index]:.6g} s"
+            f"line {self.table.lines[index]} at {self.times[index]:.6g} s"
             for index in (after - 1, after)
             if 0 <= index < len(self.times)
         )
-        return SequenceError(
-            f"{self.path} has no {what} for {len(far)} of {counted(len(wanted), 'frame')}. The first is frame "
+        return self.table.error(
+            f" has no {what} for {len(far)} of {counted(len(wanted), 'frame')}. The first is frame "
             f"{frames.frame_ids[row]!r} at {wanted[row]:.6g} s of the table's clock (image time plus time_offset = "
-            f"{matching.time_offset:g} s), next to {near}; a row that is used may be {matching.max_gap:g} s away. "
+            f"{matching.time_offset:g} s), next to {near}; at most {matching.max_gap:g} s are allowed. "
             f"The frames are from {wanted.min():.6g} to {wanted.max():.6g} s, the rows from {self.times[0]:.6g} to "
             f"{self.times[-1]:.6g} s. Correct `time_offset` in [frames] (both clocks are in seconds), leave the frames "
             "out by a table of the others, or allow a larger `max_gap`."
@@ -158,27 +156,27 @@ class Rows:
         same = "All tables of a sequence must have the same frames in the same order."
         if len(ids) != len(wanted):
             rows = counted(len(ids), "row")
-            raise SequenceError(f"{path} has {rows}, but the kinematics table has {len(wanted)}. {same}")
-        for given, expected, line in zip(ids, wanted, table.lines, strict=True):
+            raise table.error(f" has {rows}, but the kinematics table has {len(wanted)}. {same}")
+        for row, (given, expected) in enumerate(zip(ids, wanted, strict=True)):
             if given != expected:
-                text = f"is frame {given!r}, but the kinematics table has frame {expected!r} there. {same}"
-                raise SequenceError(f"{path}, line {line} {text}")
+                text = f" is frame {given!r}, but the kinematics table has frame {expected!r} there. {same}"
+                raise table.error(text, row)
         return table
 
     def samples(self, table: Table, values: np.ndarray) -> Samples:
         """Values of the rows of a table with their times."""
         if self.matching is None:
-            return Samples(values, table.path, table.lines, None)
+            return Samples(values, table, None)
         column = self.timestamp
         times = table.numbers(column, "`timestamp` in [kinematics]")
         if (wrong := np.flatnonzero(np.diff(times) <= 0.0)).size:
             row = wrong[0] + 1
-            raise SequenceError(
-                f"{table.path}, line {table.lines[row]}, column {column!r}: {times[row]:.9g} s does not come after "
-                f"{times[row - 1]:.9g} s in line {table.lines[row - 1]}. Sort the rows by time, and keep one of each "
-                "time."
+            raise table.error(
+                f", column {column!r}: {times[row]:.9g} s is not after {times[row - 1]:.9g} s in line "
+                f"{table.lines[row - 1]}. Sort the rows by time, and keep one row for each time.",
+                row,
             )
-        return Samples(values, table.path, table.lines, times)
+        return Samples(values, table, times)
 
 
 def take_rows(section: TomlTable, frames_section: TomlTable | None) -> Rows:
@@ -194,7 +192,7 @@ def take_rows(section: TomlTable, frames_section: TomlTable | None) -> Rows:
     else:
         for key in ("frame", "frame_id", "video_frame"):
             if key in section:
-                raise section.error(key, "describes frames, which [frames] does here. Move it there.")
+                raise section.error(key, "describes frames. Move it to [frames].")
         if not timestamp:
             raise section.error(
                 "timestamp", "is missing: with [frames], rows are matched by time. Name the column with the time [s]."
@@ -246,14 +244,16 @@ def _poses(section: TomlTable, table: Table) -> Float[np.ndarray, "rows 4 4"]:
     with np.errstate(over="ignore"):
         lengths = np.linalg.norm(turns, axis=1)
     if (wrong := np.flatnonzero(~(np.abs(lengths - 1.0) <= _NORM_TOLERANCE))).size:
-        raise SequenceError(
-            f"{table.path}, line {table.lines[wrong[0]]}: the quaternion has the length {lengths[wrong[0]]:.4g}, it "
-            "must be 1. Name its columns as `orientation`, in the order x, y, z, w."
+        raise table.error(
+            f": the norm of the quaternion is {lengths[wrong[0]]:.4g}, but must be 1. Name its columns as "
+            "`orientation`, in the order x, y, z, w.",
+            wrong[0],
         )
     if (far := np.flatnonzero(~(np.abs(positions).max(1) <= _FARTHEST))).size:
-        raise SequenceError(
-            f"{table.path}, line {table.lines[far[0]]}: the camera is {np.abs(positions[far[0]]).max():.4g} m away, "
-            f'{_FARTHEST:g} m is allowed. If the columns are in mm, say so: length_unit = "mm".'
+        raise table.error(
+            f": the camera is {np.abs(positions[far[0]]).max():.4g} m away, {_FARTHEST:g} m is allowed. If the columns "
+            'are in mm, set length_unit = "mm".',
+            far[0],
         )
     Ts = np.tile(np.eye(4), (len(table), 1, 1))
     Ts[:, :3, :3], Ts[:, :3, 3] = Rotation.from_quat(turns).as_matrix(), positions

@@ -238,9 +238,9 @@ def _message_times(table: TomlTable, column: str, frames: FrameList) -> tuple[in
     if frames.table is None or not column:
         raise table.error("message_time", "is missing: with `topic`, name the column of the table with times [ns].")
     cells = frames.table.text(column, table.name("message_time"))
-    for cell, line in zip(cells, frames.table.lines, strict=True):
+    for row, cell in enumerate(cells):
         if not cell.isdecimal():
-            raise SequenceError(f"{frames.table.path}, line {line}, column {column!r}: {cell!r} is no time [ns].")
+            raise frames.table.error(f", column {column!r}: {cell!r} is not a time [ns].", row)
     return tuple(map(int, cells))
 
 

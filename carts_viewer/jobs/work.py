@@ -14,6 +14,7 @@ from typing import Any
 
 from carts_core.errors import CartsError
 from carts_core.evaluation.calibration import moved_frames
+from carts_core.files.reading import VALUES, parse_json, read_text
 from carts_core.model.scene import Scene
 from carts_core.optimization.calibration import CalibrationOptimizer
 from carts_core.optimization.observation import Backgrounds
@@ -198,9 +199,17 @@ def adapt(sequence: Path, folder: Path, minutes: float) -> Generator[Progress]:
         training.end()
     if training.failed:
         raise CartsError(f"The network could not be adapted: {' '.join(lines[-3:]) or 'training ended early'}")
-    kept = next((line for line in lines if line.startswith("kept, the best:")), lines[-1] if lines else "")
-    refused = next((line for line in lines if line.startswith("not offered, since worse:")), None)
-    yield Progress(total, total, refused or kept.partition(": ")[2] or kept)
+    yield Progress(total, total, _outcome(folder) or (lines[-1] if lines else ""))
+
+
+def _outcome(folder: Path) -> str:
+    """Gain of an adaptation, or the metrics that became worse; empty without a report."""
+    try:
+        report = parse_json(read_text(folder / "report" / "fits.json", VALUES))
+        worse, gain = "; ".join(report["worse"]), str(report["gain"])
+    except (OSError, ValueError, TypeError, KeyError):
+        return ""
+    return f"not offered, since worse: {worse}" if worse else gain
 
 
 class _Training:

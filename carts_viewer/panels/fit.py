@@ -2,7 +2,7 @@
 
 import viser
 
-from carts_core.optimization import Verdict, fit_words, undetermined_joints
+from carts_core.optimization import Verdict, joint_words, undetermined_joints
 from carts_core.project import FitVerdict
 from carts_viewer.actions import intents
 from carts_viewer.panels.inputs import PanelPage
@@ -159,11 +159,11 @@ def fit_text(
             name += f' <span class="carts-spinner"></span>{escaped(busy)} …'
         return f'<div class="carts-verdict unknown" role="status"><b>Fit {name}</b>{line}</div>'
     remedy = f"<br><i>Try:</i> {escaped(verdict.remedy)}" if verdict.remedy else ""
-    name, (mask, _, joints) = verdict.verdict, fit_words(verdict.verdict, undetermined).partition(", ")
+    name, joints = verdict.verdict, joint_words(undetermined)
     listed = ", ".join(undetermined or ()).replace("_", " ")
     known = f', <b title="{escaped(listed)}">{joints}</b>' if joints else ""
     return (
-        f'<div class="carts-verdict {name}" role="status" title="{_MEANING}"><b>{mask.capitalize()}</b>{known}<br>'
+        f'<div class="carts-verdict {name}" role="status" title="{_MEANING}"><b>Mask {name}</b>{known}<br>'
         f"{escaped(verdict.reason)}{remedy}{line}</div>"
     )
 

@@ -287,8 +287,7 @@ def calibrated_recording(
         if not np.allclose(found.intrinsics, before.camera(camera.name).intrinsics, rtol=1e-9, atol=0.0):
             placed = replace(placed, intrinsics=found.intrinsics, pixel_center=0.5)
         cameras.append(placed)
-    stale = ("no base frame (hand-eye calibration)",)
-    notes = [note for note in recording.notes if not any(words in note.text for words in stale)]
+    notes = [note for note in recording.notes if note.placeholder != "T_world_base"]
     return replace(recording, arms=arms, cameras=tuple(cameras), notes=(*notes, Note("found", f"calibration: {text}.")))
 
 

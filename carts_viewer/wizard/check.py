@@ -1,7 +1,6 @@
 """The Check step of New recording: content of the files, previews, problems, and corrections of guesses."""
 
-import re
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -16,7 +15,7 @@ from carts_core.recording import Sequence, TimeOffsetEstimate, estimate_time_off
 from carts_core.recording.importing.cameras import find_images
 from carts_core.recording.importing.columns import ColumnMeanings, guess_columns, sample
 from carts_core.recording.importing.foreign_tables import ForeignTable
-from carts_core.recording.importing.found import FoundArm, FoundRecording, Note, PartError
+from carts_core.recording.importing.found import FoundArm, FoundRecording, Note, NoteKind, Part, PartError
 from carts_core.recording.importing.importer import detect, find
 from carts_core.recording.importing.writing import write_sequence
 from carts_core.recording.sources.datasets import JIGSAWS, jigsaws_trials
@@ -91,6 +90,8 @@ def previews(sequence: Sequence, camera: str) -> list[tuple[str, bytes]]:
 
 
 FOLDER = "folder"
+_WHOLE: tuple[Part, str] = ("recording", "")
+"""Key of problems of the recording as a whole."""
 
 
 @dataclass(frozen=True)
@@ -100,9 +101,9 @@ class Guess:
     kind: str
     """Name of the source."""
     recording: FoundRecording | None
-    """None while something is wrong."""
-    problems: Mapping[str, str] = field(default_factory=dict)
-    """"images NAME", "calibration NAME", "kinematics", "columns" or "recording" -> problem of that part."""
+    """None while it cannot be read."""
+    problems: Mapping[tuple[Part, str], str] = field(default_factory=dict)
+    """Part and its camera (empty for all) -> problem."""
     table: ForeignTable | None = None
     """Table of the kinematics, where its columns have names."""
     meanings: ColumnMeanings | None = None
@@ -121,18 +122,15 @@ class Guess:
         column = getattr(self.meanings, role) if role in ("time", "frame") else self.columns.get(role)
         return f"{column} ({'by name' if column in self.meanings.stated else 'guessed'})" if column else "none"
 
-    def notes(
-        self, *, about: str | None = None, kinds: tuple[str, ...] = ("warning", "missing", "guessed")
-    ) -> list[Note]:
-        """Remarks about a camera or arm, or for None those about neither."""
-        if self.recording is None:
-            return []
-        names = [each.name for each in (*self.recording.cameras, *self.recording.arms)]
+    def notes(self, about: str, *kinds: NoteKind) -> list[Note]:
+        """Notes of some kinds about a camera or arm, or about neither if `about` is empty."""
+        notes = () if self.recording is None else self.recording.notes
+        return [note for note in notes if note.kind in kinds and note.about == about]
 
-        def of(note: Note) -> str | None:
-            return next((name for name in names if note.text.startswith((f"{name}:", f"{name} "))), None)
 
-        return [note for note in self.recording.notes if note.kind in kinds and of(note) == about]
+def problem_of(error: CartsError) -> str:
+    """Message of an error without options of the command line, which do not apply in the page."""
+    return error.problem if isinstance(error, PartError) else str(error)
 
 
 def guess(draft: Draft) -> Guess:
@@ -142,32 +140,33 @@ def guess(draft: Draft) -> Guess:
         kind = detect(source, draft.options.source).name
     except CartsError as error:
         if not source.is_dir():
-            return Guess("", None, {"recording": str(error)})
+            return Guess("", None, {_WHOLE: problem_of(error)})
         # In a folder, the user can assign the files by hand.
         kind = FOLDER
     options = replace(draft.options, source=kind)
-    problems = _problems_of_parts(source, options) if kind == FOLDER else {}
+    problems = _problems_of_images(source, options) if kind == FOLDER else {}
     table, meanings = (None, None)
     try:
         recording = find(source, options)
     except CartsError as error:
         if not problems:
-            problems[error.part if isinstance(error, PartError) else "recording"] = str(error)
-        about_table = not any(place.startswith(("calibration", "images")) for place in problems)
+            place = (error.part, error.about) if isinstance(error, PartError) else _WHOLE
+            problems[place] = problem_of(error)
+        about_table = not any(part in ("calibration", "images") for part, _ in problems)
         recording = _images_alone(source, options) if kind == FOLDER and about_table else None
     if kind == FOLDER:
         try:
             table = kinematics_table(source, options)
             meanings = None if table is None else guess_columns(table, options)
         except CartsError as error:
-            problems.setdefault("kinematics" if table is None else "columns", str(error))
+            problems.setdefault(("kinematics" if table is None else "columns", ""), problem_of(error))
     if table is not None and meanings is not None and not meanings.arms:
-        problems["columns"] = (
-            "Six joints are not recognized among the columns, nor a tip's pose. Choose a column for each joint."
+        problems["columns", ""] = (
+            "Neither six joints nor a tip pose are recognized among the columns. Choose a column for each joint."
         )
     trials = jigsaws_trials(source) if kind == JIGSAWS.name and recording is None else ()
     if len(trials) > 1:
-        problems = {"recording": f"The folder has {len(trials)} trials of JIGSAWS. Choose one."}
+        problems = {_WHOLE: f"The folder has {len(trials)} trials of JIGSAWS. Choose one."}
     return Guess(kind, recording, problems, table, meanings, trials)
 
 
@@ -179,18 +178,14 @@ def _images_alone(source: Path, options: ImportOptions) -> FoundRecording | None
     return None
 
 
-def _problems_of_parts(source: Path, options: ImportOptions) -> dict[str, str]:
-    """Problems of the files that the user has chosen."""
-    found: dict[str, str] = {}
-
-    def attempt(place: str, work: Callable[[], object]) -> None:
-        try:
-            work()
-        except CartsError as error:
-            found[place] = str(error)
-
+def _problems_of_images(source: Path, options: ImportOptions) -> dict[tuple[Part, str], str]:
+    """Problems of the images that the user has chosen, by camera."""
+    found: dict[tuple[Part, str], str] = {}
     for camera, place in options.images.items():
-        attempt(f"images {camera}", lambda place=place: find_images(source / place))
+        try:
+            find_images(source / place)
+        except CartsError as error:
+            found["images", camera] = problem_of(error)
     return found
 
 
@@ -225,13 +220,4 @@ def check_form(
         no_table=NO_TABLE,
         number=lambda value: "" if value is None else f"{value:g}",
         basename=lambda path: Path(path).name,
-        for_page=_for_page,
     )
-
-
-def _for_page(text: str) -> str:
-    """A remark without the options of the command line, which do not apply here."""
-    before, found, _ = text.partition(" (change: --")
-    text = before + "." if found else text
-    sentences = re.split(r"(?<=[.:;]) ", text)
-    return " ".join(sentence for sentence in sentences if " --" not in f" {sentence}") or text

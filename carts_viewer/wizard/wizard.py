@@ -12,7 +12,7 @@ from carts_core.recording.video import SUFFIXES
 from carts_viewer.start.host import FileBrowser, Host
 from carts_viewer.start.roots import Entry
 from carts_viewer.transport.document import render
-from carts_viewer.wizard.check import Guess, check_form, estimated_delay, guess, opened, previews
+from carts_viewer.wizard.check import Guess, check_form, estimated_delay, guess, opened, previews, problem_of
 from carts_viewer.wizard.draft import Draft, DraftFile, Step, changed, picked
 from carts_viewer.wizard.hand_eye import HandEyeStep
 from carts_viewer.wizard.points import ClickPrompt
@@ -137,7 +137,7 @@ class RecordingWizard:
 
     def fail(self, error: Exception) -> None:
         """Show an error."""
-        self._problem = str(error) or type(error).__name__
+        self._problem = (problem_of(error) if isinstance(error, CartsError) else str(error)) or type(error).__name__
         if self._step is not None:
             self._step.problem = self._problem
         self.show()
@@ -248,7 +248,7 @@ class RecordingWizard:
                 self._tell("Hand-eye", "Opening the images …", "side")
                 self._step = HandEyeStep(self._host, found.recording, self._draft, self._calibrated)
             except CartsError as error:
-                self._problem = str(error)
+                self._problem = problem_of(error)
                 self._change(replace(self._draft, step=Step.CHECK))
                 return False
         return True

@@ -142,7 +142,7 @@ WRONG: list[tuple[Callable[[Path], object], list[str]]] = [
         ["line 2, column 'pitch': read as rad", 'pitch = { column = "pitch", unit = "deg" }'],
     ),
     (edit_cell("kinematics.csv", 1, "insertion", "151"), ['insertion = { column = "insertion", unit = "mm" }']),
-    (edit_cell("kinematics.csv", 3, "frame", "1"), ["frame '001' is in line 2 and again in line 4"]),
+    (edit_cell("kinematics.csv", 3, "frame", "1"), ["line 4, column 'frame': frame '001' is already in line 2"]),
     (
         edit_file(lambda text: "\n".join(text.splitlines()[:-1]), "truth.csv"),
         ["FOLDER/truth.csv has 5 rows, but the kinematics table has 6"],

@@ -58,9 +58,9 @@ def test_a_table_of_unknown_columns_is_shown_with_values_and_the_cameras_stay(tm
     draft = recording(tmp_path / "rec", [f"{letter} thing" for letter in "abcdef"], JOINTS)
     found = guess(draft)
     assert found.recording is not None and [camera.name for camera in found.recording.cameras] == ["left"]
-    assert "not recognized" in found.problems["columns"]
+    assert "Neither six joints" in found.problems["columns", ""]
     form = check_form(draft, found, {})
-    assert "c thing (0.12)" in form and "log.csv" in form and "64 × 48" in form
+    assert "c thing (0.12)" in form and "log.csv" in form and "64 × 48" in form and " --" not in form
     joints = [(f"column {joint}", f"{letter} thing") for joint, letter in zip(JOINT_NAMES, "abcdef", strict=True)]
     _, found = after(draft, *joints)
     assert found.recording is not None and not found.problems
@@ -73,7 +73,7 @@ def test_a_question_about_units_and_rates_is_answered_in_the_form(tmp_path: Path
     decimetres = JOINTS * np.where(np.arange(6) == 2, 10, 1)
     draft = recording(tmp_path / "rec", list(JOINT_NAMES), decimetres)
     found = guess(draft)
-    assert "insertion is not clear" in found.problems["columns"]
+    assert "insertion is ambiguous" in found.problems["columns", ""]
     assert 'value="dm"' in check_form(draft, found, {})
     for choice in (("length_unit", "dm"), ("unit insertion", "dm")):
         _, found = after(draft, choice)

@@ -255,6 +255,8 @@ _SAMPLES = 48
 _PATIENCE = 5
 
 
+FITS = "fits.json"
+"""File name of the report that compares fits with the initial and the adapted weights."""
 REFUSED = "refused.safetensors"
 """File name of weights that are not offered, because a metric became worse."""
 
@@ -344,11 +346,12 @@ def offer(config: TrainingConfig, result: TrainingResult, progress: Progress, ma
     assert config.start is not None
     aside = output_path(result.weights.parent, REFUSED)
     if not result.weights.is_file():
-        return Offer(aside.path, ["the weights were refused before; see report/fits.json"], [])
+        return Offer(aside.path, [f"the weights were refused before; see report/{FITS}"], [])
     judgement = judge(config, config.start, result.weights, made=made, own=own, progress=progress)
     worse = judgement.worse()
-    report = {"worse": worse, "figures": judgement.lines(), "made": made, "own": own}
-    write_text(output_path(result.weights.parent, "report") / "fits.json", json.dumps(report, indent=1))
+    gained = "" if result.first is None else gain(result.first, result.validation)
+    report = {"worse": worse, "gain": gained, "figures": judgement.lines(), "made": made, "own": own}
+    write_text(output_path(result.weights.parent, "report") / FITS, json.dumps(report, indent=1))
     if worse:
         # The page and later commands load weights only under the usual name.
         write_bytes(aside, read_bytes(result.weights, WEIGHTS))

@@ -38,9 +38,8 @@ def camera_from_info(camera: FoundCamera, info: Any, job: Import, *, rectified: 
     try:
         found = None if info is None else calibration_from_info(info)
     except ValueError as error:
-        raise PartError(
-            f"calibration {camera.name}", f"{what} cannot be used: {error}. Or give --calibration {camera.name} FILE."
-        ) from error
+        remedy = f"Give another one: --calibration {camera.name} FILE."
+        raise PartError("calibration", f"{what} cannot be used: {error}.", remedy, about=camera.name) from error
     return camera if found is None else _calibrated(camera, found, what, job, rectified=rectified)
 
 
@@ -49,31 +48,31 @@ def calibration_of(camera: FoundCamera, job: Import) -> FoundCamera:
     path = job.options.calibration.get(camera.name)
     if path is None:
         if camera.intrinsics is not None:
-            job.found(f"calibration of {camera.name}: from the recording.")
+            job.found("calibration from the recording.", camera.name)
         return camera
-    job.found(f"calibration of {camera.name}: from {path}.")
+    job.found(f"calibration from {path}.", camera.name)
     side = side_of(camera.name) or "left"
     if side_of(path.stem) not in (None, side):
-        name = camera.name
-        job.warning(f"{name}: {path.name} has the other camera's name. Check --calibration {name} FILE.")
+        text, remedy = f"{path.name} has the name of the other camera.", f"Check --calibration {camera.name} FILE."
+        job.warning(text, camera.name, remedy=remedy)
     parts = [part.lower() for part in camera.images.parts[-2:]]
     rectified = any("rect" in re.split(r"[^a-z]+", part) or "rectified" in part for part in parts)
     try:
         found = read_calibration(path, side)
     except SequenceError as error:
-        raise PartError(f"calibration {camera.name}", f"camera {camera.name}: {error}") from error
+        raise PartError("calibration", f"camera {camera.name}: {error}", about=camera.name) from error
     return _calibrated(camera, found, str(path), job, rectified=rectified)
 
 
 def _calibrated(camera: FoundCamera, found: Calibration, what: str, job: Import, *, rectified: bool) -> FoundCamera:
     """A camera with a calibration, scaled to the size of its images."""
     for text in found.remarks:
-        job.guessed(f"{camera.name}: {what}: {text}")
+        job.guessed(f"{what}: {text}", camera.name)
     intrinsics, distortion, R = found.intrinsics, found.distortion, found.R
     if rectified and found.P is not None:
         fx, _, cx, _, _, fy, cy, *_ = map(float, found.P.reshape(-1))
         intrinsics, distortion, R = (fx, fy, cx, cy), (), np.eye(3)
-        job.guessed(f"{camera.name}: images are rectified, by their name; P of {what} is used.")
+        job.guessed(f"images are rectified, by their name; P of {what} is used.", camera.name)
     given = job.options.calibration_size.get(camera.name)
     size = found.size
     if given is not None:
@@ -98,16 +97,17 @@ def _scaled(camera: FoundCamera, size: tuple[int, int], what: str, job: Import) 
     x, y = camera.size[0] / size[0], camera.size[1] / size[1]
     if abs(x / y - 1) > _SAME_SHAPE:
         raise PartError(
-            f"calibration {camera.name}",
+            "calibration",
             f"{what} is for images of {size[0]} x {size[1]}, but those of {camera.name} are {camera.size[0]} x "
-            f"{camera.size[1]}, which is another shape (cropped or turned?). Give the calibration of these images: "
-            f"--calibration {camera.name} FILE.",
+            f"{camera.size[1]}, which is another aspect ratio (cropped or rotated?).",
+            f"Give the calibration of these images: --calibration {camera.name} FILE.",
+            about=camera.name,
         )
     fx, fy, cx, cy = camera.intrinsics
     shift = 0.5 - camera.pixel_center
     intrinsics = (fx * x, fy * y, (cx + shift) * x - shift, (cy + shift) * y - shift)
     text = f"{what} is for images of {size[0]} x {size[1]}; it is scaled to {camera.size[0]} x {camera.size[1]}"
-    job.guessed(f"{camera.name}: {text}, as if they were resized and not cropped.")
+    job.guessed(f"{text}, as if they were resized and not cropped.", camera.name)
     return replace(camera, intrinsics=intrinsics)
 
 
@@ -119,15 +119,16 @@ def check_intrinsics(camera: FoundCamera, job: Import) -> None:
     problem = implausible_intrinsics(*camera.size, (fx, fy, cx + shift, cy + shift), camera.distortion)
     if problem is None:
         return
-    text = f"the calibration of {camera.name} has {problem}."
     if camera.name in job.options.calibration_size and min(fx, fy) > 0:
-        job.warning(f"{camera.name}: {text}")
+        job.warning(f"the calibration has {problem}.", camera.name)
         return
     raise PartError(
-        f"calibration {camera.name}",
-        f"{text} Give another one (--calibration {camera.name} FILE), or the size of the images that were calibrated "
-        f"(--calibration-size {camera.name} WIDTHxHEIGHT), from which it is scaled; the images' own size "
-        f"({camera.size[0]}x{camera.size[1]}) takes it as it is.",
+        "calibration",
+        f"the calibration of {camera.name} has {problem}. Give another one, or the size of the images that were "
+        f"calibrated, from which it is scaled; with the size of these images ({camera.size[0]}x{camera.size[1]}) it is "
+        "accepted unchanged.",
+        f"Options: --calibration {camera.name} FILE, --calibration-size {camera.name} WIDTHxHEIGHT.",
+        about=camera.name,
     )
 
 
@@ -149,14 +150,16 @@ def _placed(camera: FoundCamera, first: FoundCamera, job: Import) -> FoundCamera
     if not lacking:
         T = _from_rectification(first, camera)
         angle = np.degrees(np.arccos(np.clip((np.trace(T[:3, :3]) - 1) / 2, -1, 1)))
-        text = f"{1e3 * np.linalg.norm(T[:3, 3]):.2f} mm from {first.name} and turned by {angle:.2f} deg"
-        job.found(f"{camera.name}: {text}, from the rectification of both.")
+        text = f"{1e3 * np.linalg.norm(T[:3, 3]):.2f} mm from {first.name} and rotated by {angle:.2f} deg"
+        job.found(f"{text}, from the rectification of both.", camera.name)
         return replace(camera, T_camera_world=T)
     why = "" if camera.intrinsics is None else f" ({' and '.join(lacking)}: no rectification and projection)"
     job.missing(
-        f"{camera.name}: its pose relative to {first.name} is not known{why}; it stands where {first.name} stands. "
-        f"Give a stereo calibration (--calibration {camera.name} FILE), or click points (New recording, "
-        "carts hand-eye)."
+        f"no pose relative to {first.name}{why}; the pose of {first.name} is the placeholder.",
+        camera.name,
+        remedy=f"Give a stereo calibration (--calibration {camera.name} FILE), or click points (New recording, "
+        "carts hand-eye).",
+        placeholder="T_camera_world",
     )
     return camera
 
@@ -214,7 +217,8 @@ def find_images(path: Path, only: str = "") -> Images:
         return _video(path)
     files = [file for file in image_files(path) if file.name.endswith(only)]
     if not files:
-        raise SequenceError(f"{path} has no images ({', '.join(IMAGE_SUFFIXES)}) and is no video. Name another place.")
+        kinds = ", ".join(IMAGE_SUFFIXES)
+        raise SequenceError(f"{path} is neither a video nor a folder with images ({kinds}). Name another one.")
     pattern, ids = _numbered(files, path)
     source = ImageFiles(tuple(path / pattern.format(frame=name) for name in ids))
     first, remarks = source.read(0), (*image_remarks(source.files), *bits_remark(source.files))
@@ -232,8 +236,8 @@ def _numbered(files: list[Path], folder: Path) -> tuple[str, tuple[str, ...]]:
     if len(kinds) != 1:
         shown = ", ".join(sorted(file.name for file in files)[:3])
         raise SequenceError(
-            f"the images in {folder} are not numbered in one way (say frame0001.png, frame0002.png): {shown} ... "
-            "Rename them, or put those of each camera into a folder of its own."
+            f"the names of the images in {folder} differ in more than one number: {shown} ... Rename them (such as "
+            "frame0001.png, frame0002.png), or put the images of each camera into a separate folder."
         )
     ((before, after), numbers) = next(iter(kinds.items()))
     ids = tuple(sorted(numbers, key=lambda number: (int(number), number)))
@@ -260,7 +264,8 @@ def common_ids(images: Mapping[str, Images], path: Path) -> tuple[str, ...]:
     shared = set(first.ids).intersection(*(each.ids for each in others))
     if not shared and first.ids:
         raise SequenceError(
-            f"{path}: no frame has an image of every camera and domain. Number them alike, or import one camera."
+            f"{path}: no frame has an image of every camera and domain. Number the images of all cameras in the same "
+            "way, or import one camera."
         )
     return tuple(frame for frame in first.ids if frame in shared)
 
@@ -272,9 +277,9 @@ def cameras_of(
     job = job.with_options(calibration={**(calibrations or {}), **job.options.calibration})
     cameras = []
     for name, each in images.items():
-        job.found(f"camera {name}: {each.path}, {len(each.ids)} images, {each.size[0]} x {each.size[1]}.")
+        job.found(f"{each.path}, {len(each.ids)} images, {each.size[0]} x {each.size[1]}.", name)
         for text in each.remarks:
-            job.guessed(f"{name}: {text}")
+            job.guessed(text, name)
         camera = FoundCamera(name, each.size, each.path, each.pattern, bits=each.bits)
         cameras.append(calibration_of(camera, job))
     return tuple(cameras)

@@ -6,7 +6,6 @@ from functools import lru_cache
 
 import numpy as np
 
-from ...errors import SequenceError
 from ...model.instruments import robot_file
 from ...model.psm_kinematics import JOINT_NAMES
 from ...settings.interchange import ImportOptions
@@ -72,7 +71,8 @@ def guess_columns(table: ForeignTable, options: ImportOptions) -> ColumnMeanings
     known = [joint.name for joints in others.values() for joint in joints] or [*JOINT_NAMES, "jaw", *_POSE_ORDER]
     for meaning, column in options.columns.items():
         if meaning not in ("time", "frame", *known):
-            raise PartError("columns", f"--columns {meaning} is not known. Known are: {', '.join(known)}, time, frame.")
+            problem = f"{meaning} is not a meaning of a column. Allowed are: {', '.join(known)}, time, frame."
+            raise PartError("columns", problem, "Correct --columns.")
         if column not in table.columns:
             raise PartError("columns", f"{table.path} has no column {column!r}. It has: {', '.join(table.columns)}.")
     spoken = {column: _words(column) for column in table.columns}
@@ -122,9 +122,11 @@ def order_of_names(names: tuple[str, ...], joints: tuple[str, ...] = JOINT_NAMES
     known = [meaning in joints for meaning in meanings]
     in_place = all(meaning == joint for meaning, joint, there in zip(meanings, joints, known, strict=False) if there)
     if len(set(names)) > 1 and any(known) and not in_place:
-        raise SequenceError(
-            f"joint states have the names {', '.join(names)}, which are not those of {', '.join(joints)} and not in "
-            "their order. Correct the names, or import the positions from a table: --kinematics."
+        raise PartError(
+            "kinematics",
+            f"joint states have the names {', '.join(names)}, which do not match {', '.join(joints)} by name or order. "
+            "Correct the names, or import the positions from a table.",
+            "Option: --kinematics.",
         )
     return None
 
@@ -182,8 +184,8 @@ def _joints_by_name(
     if missing := [joint.name for joint in joints if joint.name not in found and "finger" not in joint.name]:
         raise PartError(
             "columns",
-            f"{table.path} has no column of {', '.join(missing)}; its columns are {', '.join(table.columns)}. Name "
-            f"them: --columns {missing[0]} COLUMN ...",
+            f"{table.path} has no column of {', '.join(missing)}; its columns are {', '.join(table.columns)}.",
+            f"Name them: --columns {missing[0]} COLUMN ...",
         )
     return found
 
@@ -207,7 +209,8 @@ def _named_places(table: ForeignTable) -> dict[str, str]:
             raise PartError(
                 "columns",
                 f"{table.path}, column {column!r} has several names ({', '.join(sorted(names)[:3])}), so positions "
-                "change their meaning from row to row. Sort them, or name the columns of one order: --columns.",
+                "change their meaning from row to row. Sort them, or choose columns of one order.",
+                "Option: --columns.",
             )
         place = re.compile(rf"(?i){re.escape(match[1])}(?:joint_?)?positions?[._ \[]*0*{int(match[3])}\]?")
         for other in table.columns:
@@ -323,8 +326,8 @@ def arm_log(
     raw = np.stack([table.numbers(column).astype(np.float64) for column in columns], 1)
     named = [f"{column} {table.units.get(column, '')}".strip() for column in columns]
     values = in_si(raw, joints, job, arm=arm, columns=named, instrument=other is None)
-    text = f"{arm}: joints are {', '.join(columns)} (change: --columns {order[0]} COLUMN ...)."
-    job.found(text, given=stated.issuperset(columns))
+    option = f"--columns {order[0]} COLUMN ..."
+    job.found(f"joints are {', '.join(columns)}.", arm, option, given=stated.issuperset(columns))
     logged = track(times, values)
     if other is not None:
         return ArmLog(arm, joints=logged, names=tuple(joint.name for joint in joints), si=True)
@@ -344,12 +347,12 @@ def _pose_log(
     given = options.length_unit or named_length_unit(named)
     unit = given or length_unit(float(np.nanmax(np.abs(values[:, :3]))), _REACH, arm, "the tip's position")
     values[:, :3] *= LENGTH_UNITS[unit]
-    job.found(f"{arm}: lengths are in {unit} (change: --length-unit).", given=given is not None)
+    job.found(f"lengths are in {unit}.", arm, "--length-unit", given=given is not None)
     poses = track(times, values)
     seen = arm in options.base
-    frame = "camera, since --base is given" if seen else "arm's base (if it is the camera: --base)"
-    text = f"{arm}: the tip's pose is {', '.join(columns)}, in the frame of the {frame}."
-    job.found(text, given=seen and stated.issuperset(columns))
+    frame = "camera, since a base frame is given" if seen else "arm's base"
+    text = f"the tip pose is {', '.join(columns)}, in the frame of the {frame}."
+    job.found(text, arm, "" if seen else f"--base {arm} FILE", given=seen and stated.issuperset(columns))
     log = ArmLog(arm, poses=poses if seen else None, local_poses=None if seen else poses, si=True)
     if "jaw" not in found:
         return log

@@ -58,8 +58,9 @@ class ForeignTable:
             where = f"line {self.lines[row]}" if self.lines else f"row {row + 1}"
             raise PartError(
                 "columns",
-                f"{self.path}, column {column!r} has cells that are no numbers: {len(wrong)} of {len(values)}, the "
-                f"first in {where}: {shown(str(values[row]))}. Correct them, or name another column: --columns.",
+                f"{self.path}, column {column!r} has cells that are not numbers: {len(wrong)} of {len(values)}, the "
+                f"first in {where}: {shown(str(values[row]))}. Correct them, or choose another column.",
+                "Option: --columns.",
             ) from error
 
 
@@ -77,7 +78,7 @@ def read_foreign_table(path: Path) -> ForeignTable:
     except (OSError, ValueError, csv.Error) as error:
         kinds = ", ".join(TABLE_SUFFIXES)
         raise PartError(
-            "kinematics", f"table {path} cannot be read ({error}). Known are {kinds}. Export it again."
+            "kinematics", f"table {path} cannot be read ({error}). Supported are {kinds}. Export it again."
         ) from error
     table = columns if isinstance(columns, ForeignTable) else ForeignTable(path, columns)
     if not len(table):

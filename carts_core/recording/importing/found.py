@@ -13,6 +13,7 @@ from ...files.reading import VALUES, parse_json, read_text
 from ...settings.interchange import ImportOptions
 
 NoteKind = Literal["found", "guessed", "missing", "warning"]
+Part = Literal["images", "calibration", "kinematics", "columns", "recording"]
 
 
 def recording_name(path: Path) -> str:
@@ -30,20 +31,40 @@ def read_json(path: Path) -> Any:
 
 
 class PartError(SequenceError):
-    """Unusable part of a recording: `images`, `calibration CAMERA`, `kinematics` or `columns`."""
+    """Unusable part of a recording.
 
-    def __init__(self, part: str, text: str) -> None:
-        super().__init__(text)
-        self.part = part
+    Attributes:
+        part: the part; `recording` for the whole.
+        problem: cause, and a remedy without options of the command line.
+        about: name of the camera; empty for all.
+        remedy: further sentence with options of the command line.
+    """
+
+    def __init__(self, part: Part, problem: str, remedy: str = "", *, about: str = "") -> None:
+        super().__init__(f"{problem} {remedy}" if remedy else problem)
+        self.part: Part = part
+        self.problem, self.about, self.remedy = problem, about, remedy
 
 
 @dataclass(frozen=True)
 class Note:
-    """A line of the report."""
+    """A line of the report; `str` gives it with options of the command line."""
 
     kind: NoteKind
     text: str
-    """A sentence; notes on guesses and missing values name the option that changes them."""
+    """Sentences without options of the command line."""
+    about: str = ""
+    """Name of the camera or arm; empty for the recording."""
+    option: str = ""
+    """Option of the command line that changes a guess, such as `--units yaw UNIT`."""
+    remedy: str = ""
+    """Further sentence with options of the command line."""
+    placeholder: str = ""
+    """Field of the camera or arm that has a placeholder, such as `T_world_base`."""
+
+    def __str__(self) -> str:
+        text = f"{self.text.removesuffix('.')} (change: {self.option})." if self.option else self.text
+        return f"{self.about + ': ' if self.about else ''}{text}{' ' + self.remedy if self.remedy else ''}"
 
 
 @dataclass(frozen=True)
@@ -53,25 +74,21 @@ class Import:
     options: ImportOptions
     notes: list[Note] = field(default_factory=list)
 
-    def note(self, kind: NoteKind, text: str) -> None:
-        """Add a note to the report."""
-        self.notes.append(Note(kind, text))
-
-    def found(self, text: str, *, given: bool = True) -> None:
+    def found(self, text: str, about: str = "", option: str = "", *, given: bool = True) -> None:
         """Add a note on a value of the recording, or on a guess of a value that is not `given`."""
-        self.note("found" if given else "guessed", text)
+        self.notes.append(Note("found" if given else "guessed", text, about, option))
 
-    def guessed(self, text: str) -> None:
+    def guessed(self, text: str, about: str = "", option: str = "") -> None:
         """Add a note on a guess."""
-        self.note("guessed", text)
+        self.found(text, about, option, given=False)
 
-    def missing(self, text: str) -> None:
+    def missing(self, text: str, about: str = "", *, remedy: str = "", placeholder: str = "") -> None:
         """Add a note on a missing value."""
-        self.note("missing", text)
+        self.notes.append(Note("missing", text, about, "", remedy, placeholder))
 
-    def warning(self, text: str) -> None:
+    def warning(self, text: str, about: str = "", option: str = "", *, remedy: str = "") -> None:
         """Add a warning."""
-        self.note("warning", text)
+        self.notes.append(Note("warning", text, about, option, remedy))
 
     def with_options(self, **changes: Any) -> "Import":
         """The same import with other options."""

@@ -8,12 +8,12 @@ from ...errors import SequenceError
 from ...settings.interchange import ImportOptions
 from ...wording import closest, shown
 from ..sources import SOURCES, Source
-from .found import FoundRecording, Import, PartError
+from .found import FoundRecording, Import, Part, PartError
 from .writing import completed, write_sequence
 
 _UNFINISHED = {
-    ".bag.active": "the recorder did not close it. Run `rosbag reindex` on a copy that is called .bag, and give that.",
-    ".mcap.zstd": "it is compressed as a whole. Unpack it with `zstd -d`, and give what comes out.",
+    ".bag.active": "the recorder did not close it. Rename a copy to .bag, run `rosbag reindex` on it, and import it.",
+    ".mcap.zstd": "the whole file is compressed. Decompress it with `zstd -d`, and import the result.",
     ".db3.zstd": "it is one file of a bag. Give the folder with its metadata.yaml.",
 }
 """Suffixes of incomplete bags, which another program has to finish first."""
@@ -34,27 +34,27 @@ def detect(path: Path, name: str | None = None) -> Source:
             if source.name == name:
                 return source
         meant = closest(name, [source.name for source in SOURCES])
-        raise SequenceError(f"--source {name!r} is not known.{meant} Known are:\n{kinds}")
+        raise SequenceError(f"the format {name!r} is unknown.{meant} Supported are:\n{kinds}")
     for suffix, remedy in _UNFINISHED.items():
         if path.name.lower().endswith(suffix):
             raise SequenceError(f"{path} ends with {suffix}: {remedy}")
     for source in SOURCES:
         if source.detect(path):
             return source
-    raise SequenceError(f"{path} is no recording of a known kind. Looked for, in this order:\n{kinds}")
+    raise SequenceError(f"{path} is not a recording of a supported format. Tried, in this order:\n{kinds}")
 
 
 def find(path: Path, options: ImportOptions | None = None) -> FoundRecording:
     """Content of a recording, completed with defaults; nothing is written. `CartsError` for unusable content."""
     options = _with_places(path.absolute(), options or ImportOptions())
     source = detect(path, options.source)
+    parts: dict[str, Part] = {"images": "images", "kinematics": "kinematics"}
     for name in ("images", "kinematics", "columns", "clock", "time_offset", "frame_rate"):
         if name not in source.uses and _is_given(options, name):
-            raise PartError(
-                {"images": "images", "kinematics": "kinematics"}.get(name, "columns"),
-                f"--{name.replace('_', '-')} is not used for {source.label}: the recording has it. Leave it out, or "
-                "choose another kind: --source.",
-            )
+            what = name.replace("_", " ")
+            problem = f"the option {what} is not used for {source.label}, since the recording has this information."
+            remedy = f"Leave out {_option(name)}, or choose another format: --source."
+            raise PartError(parts.get(name, "columns"), problem, remedy)
     try:
         recording = source.read(path.absolute(), Import(options))
         _check_names(recording, options)
@@ -62,7 +62,7 @@ def find(path: Path, options: ImportOptions | None = None) -> FoundRecording:
     except OSError as error:
         named = "" if error.filename is None else f" {shown(str(error.filename))}"
         raise SequenceError(
-            f"{path} cannot be read:{named} {error.strerror or error}. Check that it was copied whole, and its rights."
+            f"{path} cannot be read:{named} {error.strerror or error}. Check that the copy is complete and readable."
         ) from error
 
 
@@ -93,19 +93,21 @@ def _check_names(recording: FoundRecording, options: ImportOptions) -> None:
         ("robot", options.robot, arms or ["PSM1"]),
         ("base", options.base, arms),
         ("calibration", options.calibration, cameras),
-        ("calibration-size", options.calibration_size, cameras),
+        ("calibration_size", options.calibration_size, cameras),
     ):
         if unknown := [name for name in given if name not in known]:
             kind = "camera" if known is cameras else "arm"
-            raise SequenceError(
-                f"--{what} {unknown[0]}: {recording.name} has no {kind} of that name. It has: "
-                f"{', '.join(known) or 'none'}. Correct the name."
-            )
+            problem = f"{recording.name} has no {kind} {unknown[0]!r}. It has: {', '.join(known) or 'none'}."
+            raise PartError("recording", problem, f"Correct {_option(what)}.")
     if not arms and (
         unused := [name for name in ("flip", "units", "angle_unit", "length_unit") if _is_given(options, name)]
     ):
-        option = f"--{unused[0].replace('_', '-')}"
-        raise SequenceError(f"{option} is not used: {recording.name} has no kinematics. Leave it out.")
+        problem = f"the option {unused[0].replace('_', ' ')} is not used, since {recording.name} has no kinematics."
+        raise PartError("recording", problem, f"Leave out {_option(unused[0])}.")
+
+
+def _option(name: str) -> str:
+    return f"--{name.replace('_', '-')}"
 
 
 def _is_given(options: ImportOptions, name: str) -> bool:

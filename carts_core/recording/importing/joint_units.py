@@ -34,30 +34,31 @@ def in_si(
     names, options = [joint.name for joint in joints], job.options
     for option, joint in [*(("flip", joint) for joint in options.flip), *(("units", joint) for joint in options.units)]:
         if joint not in (*names, "jaw"):
-            raise PartError("columns", f"--{option} {joint} is no joint. Joints are: {', '.join(names)}.")
+            problem = f"{joint} is not a joint. Joints are: {', '.join(names)}."
+            raise PartError("columns", problem, f"Correct --{option}.")
     angle, length = options.angle_unit or "rad", options.length_unit or "m"
     if columns:
         rest = [index for index, name in enumerate(names) if name not in options.units]
         own = values[:, rest], [joints[index] for index in rest], arm, [columns[index] for index in rest]
         angle = options.angle_unit or _angle_unit(*own, instrument)
         length = options.length_unit or _length_unit(*own)
-        text = f"{arm}: angles are in {angle}, lengths in {length} (change: --angle-unit, --length-unit)."
-        job.found(text, given=bool(options.angle_unit and options.length_unit))
+        given = bool(options.angle_unit and options.length_unit)
+        job.found(f"angles are in {angle}, lengths in {length}.", arm, "--angle-unit, --length-unit", given=given)
     result = values.copy()
     for index, joint in enumerate(joints):
         unit = options.units.get(joint.name, angle if joint.revolute else length)
         factors = ANGLE_UNITS if joint.revolute else LENGTH_UNITS
         if columns and not options.units and not instrument and re.search(r"(?i)gripper\.pos$", columns[index]):
             result[:, index] = joint.from_percent(2.0 * values[:, index] - 100.0)
-            job.guessed(f"{arm}: {joint.name} is 0 to 100 of its range (change: --units {joint.name} UNIT).")
+            job.guessed(f"{joint.name} is in percent of its range, from 0.", arm, f"--units {joint.name} UNIT")
         elif unit == PERCENT:
             result[:, index] = joint.from_percent(values[:, index])
         elif unit in factors:
             result[:, index] *= factors[unit]
         else:
-            raise PartError(
-                "columns", f"--units {joint.name} {unit} does not fit: give {', '.join(factors)} or {PERCENT}."
-            )
+            allowed = f"{', '.join(factors)} and {PERCENT}"
+            problem = f"the unit of {joint.name} is {unit}; allowed are {allowed}."
+            raise PartError("columns", problem, f"Correct --units {joint.name}.")
         if joint.name in options.flip:
             result[:, index] *= -1.0
     return result
@@ -67,7 +68,7 @@ def psm_joints(arm: str, names: Sequence[str], job: Import) -> list[Joint]:
     """Joints of the robot given for an arm, else of the default one; joints that it lacks have no limits."""
     robot = job.options.robot.get(arm, FoundArm.robot)
     if not robot_file(robot).is_file():
-        raise SequenceError(f"robot {robot} of {arm} is missing. Give the path of a URDF (carts robot makes one).")
+        raise SequenceError(f"robot {robot} of {arm} is missing. Give the path of a URDF; carts robot generates one.")
     known = {joint.name: joint for joint in joints_of(robot)}
     return [known.get(name, Joint(name, name != "insertion", -np.inf, np.inf)) for name in names]
 
@@ -82,22 +83,23 @@ def _angle_unit(values: np.ndarray, joints: Sequence[Joint], arm: str, columns: 
     if re.search(r"(?i)(^|[^a-z])rad(ians?)?([^a-z]|$)", text):
         return "rad"
     if not instrument and re.search(r"\.pos\b", text):
-        raise _asked(values, joints, arm, chosen, "LeRobot does not keep the unit of its motors' positions")
+        raise _unknown_unit(values, joints, arm, chosen, "LeRobot does not store the unit of motor positions")
     if all(joints[i].fits(values[:, i], FAR) or joints[i].fits(-values[:, i], FAR) for i in chosen):
         return "rad"
     if not instrument:
-        raise _asked(values, joints, arm, chosen, "as radians they are far beyond the robot's limits")
+        raise _unknown_unit(values, joints, arm, chosen, "as radians they are far beyond the limits of the robot")
     return "deg"
 
 
-def _asked(values: np.ndarray, joints: Sequence[Joint], arm: str, chosen: list[int], why: str) -> SequenceError:
+def _unknown_unit(values: np.ndarray, joints: Sequence[Joint], arm: str, chosen: list[int], why: str) -> PartError:
     worst = max(chosen, key=lambda index: float(np.nanmax(np.abs(values[:, index]))))
     joint, column = joints[worst], values[:, worst]
     return PartError(
         "columns",
         f"{arm}: the unit of the angles is not known, since {why}: {joint.name} is from {np.nanmin(column):.4g} to "
-        f"{np.nanmax(column):.4g}, and its limits are {joint.lower:.4g} to {joint.upper:.4g} rad. Give it: "
-        "--angle-unit deg, percent (-100 to 100 of the range of each joint) or rad.",
+        f"{np.nanmax(column):.4g}, and its limits are {joint.lower:.4g} to {joint.upper:.4g} rad. Give the unit: deg, "
+        "percent (-100 to 100 of the range of each joint) or rad.",
+        "Option: --angle-unit.",
     )
 
 
@@ -128,11 +130,12 @@ def length_unit(highest: float, limit: float, arm: str, what: str, orders: Seque
     if "mm" in fitting or not fitting:
         return "mm"
     listed = ", ".join(f"{unit} ({highest * LENGTH_UNITS[unit]:.3g} m)" for unit in (*fitting, "mm"))
-    also = f" Or name the columns (--columns), since {' or '.join(orders)} would fit." if orders else ""
+    also = f" Or choose other columns: {' or '.join(orders)} would fit." if orders else ""
     raise PartError(
         "columns",
-        f"{arm}: the unit of {what} is not clear: it is up to {highest:.4g}, and at most {limit:.3g} m is possible. "
-        f"Give it: --length-unit {listed}.{also}",
+        f"{arm}: the unit of {what} is ambiguous: it is up to {highest:.4g}, and at most {limit:.3g} m is possible. "
+        f"Give the unit: {listed}.{also}",
+        "Options: --length-unit, --columns." if orders else "Option: --length-unit.",
     )
 
 
@@ -145,6 +148,6 @@ def check_limits(arm: FoundArm, job: Import) -> bool:
     found = misfits([known[arm.columns[index]] for index in shared], arm.values[:, shared])
     for misfit in found:
         options = dict.fromkeys(remedy.option for remedy in misfit.remedies)
-        remedy = f" Give {' or '.join(options)}." if options else " Check the columns."
-        job.warning(f"{arm.name}: {misfit.sentence()}.{remedy}")
+        text = f"{misfit.sentence()}.{'' if options else ' Check the columns.'}"
+        job.warning(text, arm.name, remedy=f"Give {' or '.join(options)}." if options else "")
     return not found

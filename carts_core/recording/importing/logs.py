@@ -14,7 +14,7 @@ from ...model.camera import T_DVRK_OPENCV
 from ...model.psm_kinematics import CLASSIC, JOINT_NAMES, PsmGeometry, forward, inverse
 from ...wording import counted
 from .calibrations import read_base_frames
-from .found import FoundArm, Import, Track
+from .found import FoundArm, Import, PartError, Track
 from .joint_units import in_si, psm_joints
 
 SAME_CYCLE = 2e-3
@@ -88,7 +88,7 @@ def fit_base_frame(
     known = np.isfinite(joints).all(1) & np.isfinite(Ts_reference_tip).all((1, 2))
     if not known.any():
         raise CartsError(
-            "no row has both joint positions and a tip pose, so the base frame is not known from them. "
+            "no row has both joint positions and a tip pose, so they do not determine the base frame. "
             "Check that both topics were recorded at the same time."
         )
     return _mean_base(Ts_reference_tip[known] @ np.linalg.inv(forward(joints[known], geometry)))
@@ -150,13 +150,13 @@ class InstrumentCheck:
         if self.accepts(name):
             return None
         text = (
-            f"the recording does not fit {name}: with its lengths the base computed from measured_cp and measured_js "
-            f"moves by {1e3 * fit.deviation:.3f} mm (allowed is {1e3 * ACCEPTED:g} mm)."
+            f"the recording is inconsistent with {name}: with its link lengths, the base frame computed from "
+            f"measured_cp and measured_js varies by {1e3 * fit.deviation:.3f} mm ({1e3 * ACCEPTED:g} mm is allowed)."
         )
         if self.accepts(self.best):
-            return f"{text} It fits {self.best} ({1e3 * self.fits[self.best].deviation:.4f} mm): choose that one."
+            return f"{text} It is consistent with {self.best} ({1e3 * self.fits[self.best].deviation:.4f} mm)."
         return (
-            f"{text} No known instrument fits: check that joints and poses are of the same arm, in metres and radians."
+            f"{text} No known instrument fits. Check that joints and poses are of the same arm, in metres and radians."
         )
 
 
@@ -176,7 +176,9 @@ def check_instrument(
     """
     rows = int((np.isfinite(joints).all(1) & np.isfinite(Ts_reference_tip).all((1, 2))).sum())
     if rows < _FEWEST_ROWS:
-        raise CartsError(f"{rows} rows have both joints and a pose, at least {_FEWEST_ROWS} are needed. Record longer.")
+        raise CartsError(
+            f"{counted(rows, 'row')} with both joints and a pose; at least {_FEWEST_ROWS} are needed. Record longer."
+        )
     fits = {name: fit_base_frame(Ts_reference_tip, joints, geometry) for name, geometry in candidates.items()}
     return InstrumentCheck(dict(sorted(fits.items(), key=lambda item: item[1].deviation)))
 
@@ -185,6 +187,7 @@ _SAME_BASE = 1e-3
 """Distance from the identity [m], [rad] below which a base frame counts as not set in the dVRK."""
 _CHECKED_ROWS = 5000
 _FEWEST_REACHABLE = 0.5
+_ACCURACY = "; the error of set-up joints is about 5 cm unless they are registered."
 _SAME_POINT = 1e-4
 """Distance from the tip below which a point counts as the tip [m]."""
 
@@ -258,10 +261,10 @@ def arm_from_log(log: ArmLog, job: Import) -> FoundArm:
         jaw = np.interp(joints.times, log.jaw.times, log.jaw.values[:, 0])
         columns, values = (*JOINT_NAMES, "jaw"), np.column_stack([values, jaw])
         if jaw.min() < -0.1:
-            job.found(f"{log.name}: the jaw is below 0 while grasping (down to {jaw.min():.2f} rad); drawn shut.")
+            job.found(f"jaw angles below 0 (down to {jaw.min():.2f} rad, while grasping) are set to 0.", log.name)
             values[:, -1] = np.maximum(values[:, -1], 0.0)
     else:
-        job.missing(f"{log.name}: no jaw angle; the jaw is drawn shut.")
+        job.missing("no jaw angle; the jaw is drawn closed.", log.name)
     return FoundArm(log.name, columns, values, joints.times, robot, T_camera_base, base_from)
 
 
@@ -299,9 +302,7 @@ def _at_the_tip(log: ArmLog, job: Import) -> ArmLog:
     elif (both := _checked_rows(log)) is not None and not _stands_still(*both):
         inverted = np.linalg.inv(both[0])
         if _stands_still(inverted, both[1]):
-            job.warning(
-                f"{log.name}: measured_cp holds inverse transforms (the reference in the tip's frame); inverted."
-            )
+            job.warning("measured_cp has inverse transforms (the reference in the tip frame); inverted.", log.name)
             return replace(log, poses=_inverse_of(log.poses), local_poses=_inverse_of(log.local_poses))
         fits = [fit_tool_point(*both, geometry) for geometry in CANDIDATES.values()]
         point, moves = min(fits, key=lambda fit: fit[1])
@@ -309,7 +310,7 @@ def _at_the_tip(log: ArmLog, job: Import) -> ArmLog:
             return log
         x, y, z = 1e3 * point
         text = f"poses are of a point at {x:.1f}, {y:.1f}, {z:.1f} mm from the tip, along the tool's axes x, y, z"
-        job.found(f"{log.name}: {text}; they are converted to the tip (change: --tool-point).")
+        job.found(f"{text}; they are converted to the tip.", log.name, "--tool-point")
     else:
         return log
     return replace(log, poses=_moved(log.poses, -point), local_poses=_moved(log.local_poses, -point))
@@ -340,7 +341,7 @@ def _inverse_of(poses: Track | None) -> Track | None:
 def _geometry(log: ArmLog, job: Import) -> PsmGeometry:
     """Lengths of the instrument: as given, as estimated from the recording, or those of a Large Needle Driver."""
     if log.tool:
-        job.found(f"{log.name}: tool_type is {log.tool}.")
+        job.found(f"tool_type is {log.tool}.", log.name)
     given = job.options.wrist_length
     chosen = replace(CLASSIC, wrist_length=given) if given is not None else CLASSIC
     if (both := _checked_rows(log)) is None:
@@ -350,15 +351,16 @@ def _geometry(log: ArmLog, job: Import) -> PsmGeometry:
     check = check_instrument(*both, candidates)
     if check.decides:
         deviation = 1e3 * check.fits[check.best].deviation
-        job.found(f"{log.name}: joints and tip poses agree with a {check.best} (base constant to {deviation:.4f} mm).")
+        job.found(f"joints and tip poses agree with a {check.best} (base constant to {deviation:.4f} mm).", log.name)
         chosen = candidates[check.best]
     elif (warning := check.warning(name)) is not None:
-        job.warning(f"{log.name}: {warning}")
+        job.warning(warning, log.name)
     if chosen.wrist_length != CLASSIC.wrist_length and log.name not in job.options.robot:
         job.warning(
-            f"{log.name}: the shipped robot has a wrist of 9.1 mm and this instrument one of "
-            f"{1e3 * chosen.wrist_length:.1f} mm. Make its robot with carts robot, and give it with --robot "
-            f"{log.name} FILE.urdf."
+            "the shipped robot has a wrist of 9.1 mm and this instrument one of "
+            f"{1e3 * chosen.wrist_length:.1f} mm. Generate its robot with carts robot, and choose it.",
+            log.name,
+            remedy=f"Option: --robot {log.name} FILE.urdf.",
         )
     return chosen
 
@@ -371,16 +373,16 @@ def _base_frame(log: ArmLog, geometry: PsmGeometry, job: Import) -> tuple[np.nda
         if not chosen:
             known = ", ".join(frame.arm for frame in frames)
             raise SequenceError(f"{path} has no base frame of {log.name}. It has: {known}. Name another file.")
-        job.found(f"{log.name}: base frame from {path}.")
+        job.found(f"base frame from {path}.", log.name)
         return chosen[0].T_camera_base, str(path)
     if log.poses is not None and (log.joints is not None or log.local_poses is not None):
         T, what = _own_base_frame(log, geometry)
         if T is not None and np.abs(T - np.eye(4)).max() > _SAME_BASE:
-            job.found(f"{log.name}: base frame from {what}; set-up joints are off by some 5 cm unless registered.")
+            job.found(f"base frame from {what}{_ACCURACY}", log.name)
             return log.T_axes @ T, what
     if log.setup is not None:
         T = transforms(log.setup.values[len(log.setup.values) // 2][None])[0]
-        job.found(f"{log.name}: base frame from set-up joints, which are off by some 5 cm unless registered.")
+        job.found(f"base frame from set-up joints{_ACCURACY}", log.name)
         return log.T_axes @ T, "set-up joints (SUJ)"
     return None, ""
 
@@ -404,9 +406,10 @@ def _solved(log: ArmLog, T_camera_base: np.ndarray | None, geometry: PsmGeometry
     """Joint positions from poses by inverse kinematics."""
     source = log.local_poses or log.poses
     if source is None:
-        raise SequenceError(
-            f"{log.name} has neither joint positions (measured_js) nor tip poses (measured_cp, local/measured_cp). "
-            "Record one of them, or leave the arm out (--arms)."
+        raise PartError(
+            "recording",
+            f"{log.name} has neither joint positions (measured_js) nor tip poses (measured_cp, local/measured_cp).",
+            "Record one of them, or leave the arm out: --arms.",
         )
     Ts = transforms(source.values)
     if log.local_poses is None and T_camera_base is not None:
@@ -415,14 +418,16 @@ def _solved(log: ArmLog, T_camera_base: np.ndarray | None, geometry: PsmGeometry
     found = inverse(Ts, geometry)
     reached = found.reachable
     for entry in found.unreachable:
-        job.warning(f"{log.name}: poses that no joints reach, left out: {entry}.")
+        job.warning(f"unreachable poses, left out: {entry}.", log.name)
     if reached.mean() < _FEWEST_REACHABLE:
-        raise SequenceError(
-            f"{log.name}: no joint positions reach {int((~reached).sum())} of {counted(len(Ts), 'pose')} "
-            f"({found.unreachable[0].reason}). The poses are probably not in the frame of the arm's base, or of "
-            f"another unit: name the base frame's file with --base {log.name} FILE, or record local/measured_cp."
+        raise PartError(
+            "recording",
+            f"{log.name}: {int((~reached).sum())} of {counted(len(Ts), 'pose')} are unreachable "
+            f"({found.unreachable[0].reason}). They are probably in another frame than that of the arm's base, or in "
+            "another unit.",
+            f"Give the base frame with --base {log.name} FILE, or record local/measured_cp.",
         )
-    job.found(f"{log.name}: joint positions by inverse kinematics of {int(reached.sum())} poses.")
+    job.found(f"joint positions by inverse kinematics of {int(reached.sum())} poses.", log.name)
     return Track(source.times[reached], found.joints[reached])
 
 
@@ -452,11 +457,11 @@ def endoscope_motion(poses: Track | None, joints: Track | None, start: float, jo
     distance = float(np.linalg.norm(relative[:, :3, 3], axis=1).max())
     turn = float(np.degrees(Rotation.from_matrix(relative[:, :3, :3]).magnitude().max()))
     if distance <= _MOVES[0] and turn <= _MOVES[1]:
-        job.found("the endoscope (ECM) stands still.")
+        job.found("the endoscope (ECM) is static.")
         return None
     job.found(
-        f"the endoscope (ECM) moves by up to {1e3 * distance:.1f} mm and {turn:.1f} deg; a table has the cameras' "
-        "poses. Base frames hold for its pose at the first image."
+        f"the endoscope (ECM) moves by up to {1e3 * distance:.1f} mm and {turn:.1f} deg; the poses of the cameras are "
+        "written to a table. Base frames refer to its pose at the first image."
     )
-    job.guessed("the camera is taken for the ECM's tip; carts calibrate estimates its pose there and the base frames.")
+    job.guessed("the camera pose is that of the ECM's tip; carts calibrate estimates their offset and the base frames.")
     return Track(times, relative)

@@ -13,7 +13,6 @@ from pathlib import PureWindowsPath
 import numpy as np
 from jaxtyping import Float, Int
 
-from ...errors import SequenceError
 from ...settings.interchange import SECONDS, Clock
 from ...wording import counted
 from .cameras import Images
@@ -104,9 +103,9 @@ def frame_times(images: Images, ids: tuple[str, ...], job: Import) -> FrameTimes
         if video is not None and len(video) > 1:
             own = (len(video) - 1) / (video[-1] - video[0])
             if abs(own / rate - 1) > 0.01:
-                job.warning(f"{name} has {own:.4g} images/s; --frame-rate {rate:g} is used instead.")
+                job.warning(f"{name} has {own:.4g} images/s; the given frame rate of {rate:g} images/s is used.")
         job.found(f"times of the images are those of {rate:g} images/s.")
-        return replace(found, times=times, source="--frame-rate", given=True)
+        return replace(found, times=times, source="the given frame rate", given=True)
     if video is not None:
         job.found(f"times of the images are those of {name}.")
         return replace(found, times=video, source=name, nominal=True)
@@ -114,8 +113,9 @@ def frame_times(images: Images, ids: tuple[str, ...], job: Import) -> FrameTimes
 
 
 def _without_rate(found: FrameTimes, job: Import) -> FrameTimes:
-    if (rate := job.options.frame_rate) is not None:
-        job.warning(f"--frame-rate {rate:g} is not used: the images have times of their own ({found.source}).")
+    """The times, with a warning that a given frame rate is ignored."""
+    if job.options.frame_rate is not None:
+        job.warning(f"the given frame rate is not used, since the images have times ({found.source}).")
     return found
 
 
@@ -129,7 +129,7 @@ def _numbered(ids: tuple[str, ...], job: Import) -> np.ndarray:
         return np.arange(len(ids), dtype=float)
     if places[-1] != len(ids) - 1:
         missing = int(places[-1]) + 1 - len(ids)
-        job.guessed(f"{counted(missing, 'image')} missing in the numbering; the others keep their times.")
+        job.guessed(f"{counted(missing, 'number')} missing in the names of the images; the others keep their times.")
     return places
 
 
@@ -165,18 +165,19 @@ def row_seconds(
     values = rows.times
     if clock is None:
         clock = guess_clock(values, span)
-        job.guessed(f"{rows.name}: times of column {rows.time_column!r} are in {clock} (change: --clock).")
+        job.guessed(f"{rows.name}: times of column {rows.time_column!r} are in {clock}.", option="--clock")
     steps = np.diff(values.astype(np.float64))
     if (steps < 0).any():
         row = int(np.flatnonzero(steps < 0)[0]) + 1
         raise PartError(
             "columns",
             f"{rows.name}, column {rows.time_column!r}: times go back from {values[row - 1]} to {values[row]}, row "
-            f"{row + 1}. Sort the rows, or name another column: --columns time COLUMN.",
+            f"{row + 1}. Sort the rows, or choose another column.",
+            "Option: --columns time COLUMN.",
         )
     if repeated := int((steps == 0).sum()):
         job.warning(
-            f"{rows.name}: {counted(repeated, 'row')} with the time of the row before; the first of each is used."
+            f"{rows.name}: {counted(repeated, 'row')} with the time of the previous row; the first of each is used."
         )
     return np.asarray(values, np.float64) * SECONDS[clock]
 
@@ -189,8 +190,9 @@ def match_rows(frames: FrameTimes, rows: LogRows, job: Import) -> RowMatch:
     if explicit and named is None:
         raise PartError(
             "columns",
-            f"{rows.name}: column {rows.image_column!r} names no images (theirs are {frames.stems[0]} to "
-            f"{frames.stems[-1]}). Name another one: --columns frame COLUMN.",
+            f"{rows.name}: column {rows.image_column!r} has no names of images, which are {frames.stems[0]} to "
+            f"{frames.stems[-1]}. Choose another column.",
+            "Option: --columns frame COLUMN.",
         )
     span = None if frames.times is None or len(frames.times) < 2 else float(frames.times[-1] - frames.times[0])
     times = row_seconds(rows, options.clock, job, span)
@@ -214,8 +216,9 @@ def match_rows(frames: FrameTimes, rows: LogRows, job: Import) -> RowMatch:
             raise PartError(
                 "columns",
                 f"{rows.name}: column {rows.image_column!r} counts {rows.count} rows and there are "
-                f"{counted(len(frames.ids), 'image')}, so it does not match rows with images. Give the images' rate "
-                f"(--frame-rate), or confirm the column: --columns frame {rows.image_column!r}.",
+                f"{counted(len(frames.ids), 'image')}, so it does not match rows with images. Give the frame rate of "
+                "the images, or confirm the column.",
+                f"Options: --frame-rate, --columns frame {rows.image_column!r}.",
             )
         return _by_image(frames, rows, named, times, f"column {rows.image_column!r}", job, stated=explicit)
     if in_order:
@@ -224,21 +227,23 @@ def match_rows(frames: FrameTimes, rows: LogRows, job: Import) -> RowMatch:
     raise PartError(
         "columns",
         f"the recording has {counted(len(frames.ids), 'image')} and {rows.name} has {counted(rows.count, 'row')}, and "
-        f"{lacking}. Make them as many, name the column of times (--columns time COLUMN) or of the images' names "
-        "(--columns frame COLUMN), or give the images' rate (--frame-rate).",
+        f"{lacking}. Make the numbers equal, choose the column of times or of image names, or give the frame rate of "
+        "the images.",
+        "Options: --columns time COLUMN, --columns frame COLUMN, --frame-rate.",
     )
 
 
 def _by_time(frames: FrameTimes, rows: LogRows, times: np.ndarray, apart: bool, named: bool, job: Import) -> RowMatch:
     assert frames.times is not None
-    dropped = f"; column {rows.image_column!r} is not used (change: --columns frame COLUMN)" if named else ""
+    dropped = f"; column {rows.image_column!r} is not used" if named else ""
     text = f"rows are matched with images by time: column {rows.time_column!r} and {frames.source}{dropped}."
-    job.found(text, given="time" in job.options.columns)
+    option = "--columns frame COLUMN" if named else ""
+    job.found(text, option=option, given="time" in job.options.columns)
     offset = job.options.time_offset
     if offset is None:
         offset = float(times[0] - frames.times[0]) if apart else 0.0
-        text = "the clocks do not overlap: the first row is taken for the time of the first image" if apart else "0 s"
-        job.guessed(f"time offset: {text} (change: --time-offset).")
+        text = "the clocks do not overlap; the first row is assumed to be at the first image" if apart else "0 s"
+        job.guessed(f"time offset: {text}.", option="--time-offset")
     return RowMatch(times, False, frames.times, float(offset))
 
 
@@ -252,12 +257,14 @@ def _by_image(
     *,
     stated: bool,
 ) -> RowMatch:
-    job.found(f"each row belongs to one image, by {how} (change: --columns frame COLUMN, --frame-rate).", given=stated)
+    text = f"each row belongs to one image, by {how}."
+    job.found(text, option="--columns frame COLUMN, --frame-rate", given=stated)
     if unnamed := int((positions < 0).sum()):
         job.warning(f"{rows.name}: {unnamed} of {counted(len(positions), 'row')} belong to no image.")
     known = positions[positions >= 0]
     if repeated := len(known) - len(np.unique(known)):
-        job.warning(f"{rows.name}: {counted(repeated, 'row')} of an image that has a row already; the first is used.")
+        text = f"{rows.name}: {counted(repeated, 'row')} of an image that already has a row; the first is used."
+        job.warning(text)
     taken = frames.times
     if times is not None and not frames.given:
         own = np.full(len(frames.ids), np.nan)
@@ -309,8 +316,8 @@ def _numbers_to_positions(numbers: list[int | None], frames: FrameTimes, rows: L
         job.found(f"{column} {1 if shift < 0 else 0}.")
     elif shift:
         job.warning(
-            f"{column} {min(known)} and the images from {ids[0]}; its first row is taken for the first image (rename "
-            f"the images to begin with {min(known)} if it is not)."
+            f"{column} {min(known)} and the images from {ids[0]}; its first row is assumed to be the first image. If "
+            f"it is not, rename the images so that they begin with {min(known)}."
         )
     return [-1 if number is None else position.get(number + shift, -1) for number in numbers]
 
@@ -329,7 +336,8 @@ def by_rows(
     positions = {arm.name: np.asarray(arm.times, int) for arm in arms if arm.times is not None}
     keep = np.all([np.isin(np.arange(len(ids)), rows) for rows in positions.values()], axis=0) & np.ones(len(ids), bool)
     if not keep.any():
-        raise SequenceError("no frame has joint positions of all arms. Leave an arm out: --arms.")
+        problem = "no frame has joint positions of all arms."
+        raise PartError("recording", problem, "Import fewer arms: --arms.")
     if not keep.all():
         job.warning(f"{int((~keep).sum())} of {len(keep)} frames left out: no joint positions.")
     kept = np.flatnonzero(keep)

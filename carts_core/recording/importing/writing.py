@@ -3,7 +3,6 @@
 import io
 import json
 import os
-import re
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -23,7 +22,7 @@ from ...model.robot import Robot
 from ...settings.interchange import ImportOptions
 from ...wording import counted
 from .. import Sequence
-from ..kinematics_table import joints_of
+from ..kinematics_table import TableError, joints_of
 from ..matching import ORIENTATION, POSITION
 from .cameras import check_intrinsics, placed_cameras
 from .found import FoundArm, FoundCamera, FoundRecording, Import, PartError
@@ -59,14 +58,15 @@ def check_in_view(arm: FoundArm, camera: FoundCamera, job: Import) -> None:
         return
     readings = {
         "its inverse (the camera in the base's frame)": np.linalg.inv(arm.T_world_base),
-        "the other axes of the camera (--axes)": T_DVRK_OPENCV @ arm.T_world_base,
+        "the other camera axes": T_DVRK_OPENCV @ arm.T_world_base,
         "the inverse with the other axes": np.linalg.inv(T_DVRK_OPENCV @ arm.T_world_base),
         "millimetres for metres": arm.T_world_base * [1.0, 1.0, 1.0, 1e-3],  # The last row is not used.
     }
     fitting = [name for name, T in readings.items() if _in_view(tips, T, camera) >= _IN_VIEW]
     if fitting:
-        text = f"{arm.name}: the base frame from {arm.base_from} puts the tip where {camera.name} cannot see it"
-        job.warning(f"{text}; {' or '.join(fitting)} would fit. Correct the file.")
+        text = f"the base frame from {arm.base_from} puts the tip outside the view of {camera.name}"
+        remedy = "Or give the camera axes: --axes." if "the other camera axes" in fitting else ""
+        job.warning(f"{text}; {' or '.join(fitting)} would fit. Correct the file.", arm.name, remedy=remedy)
 
 
 def _in_view(tips: np.ndarray, T_camera_base: np.ndarray, camera: FoundCamera) -> float:
@@ -93,10 +93,11 @@ def check_pair(cameras: tuple[FoundCamera, ...], job: Import) -> None:
     T_right_left = right if left is None else right @ np.linalg.inv(left)
     if T_right_left[0, 3] > abs(T_right_left[1, 3]):
         distance = 1e3 * float(T_right_left[0, 3])
-        text = f"the right camera is {distance:.1f} mm at the left of the left one: left and right are swapped, or the"
-        job.warning(f"{text} calibration is the inverse (left in the right one's frame).")
+        text = f"the right camera is {distance:.1f} mm to the left of the left camera: the cameras are swapped, or the"
+        job.warning(f"{text} calibration is the inverse (left camera in the frame of the right one).")
 
 
+_ENDOSCOPE = "the endoscope"
 MAX_GAP = 0.1
 """Largest time between a frame and the rows used for it, as in the sequence format [s]."""
 FOCAL_WIDTHS = 1.2
@@ -115,7 +116,8 @@ def completed(recording: FoundRecording, options: ImportOptions) -> FoundRecordi
     if not recording.cameras:
         raise PartError(
             "images",
-            f"{recording.name}: no images were found ({recording.kind}). Name them: --images left FOLDER_OR_VIDEO.",
+            f"{recording.name}: no images were found ({recording.kind}).",
+            "Name them: --images left FOLDER_OR_VIDEO.",
         )
     if not recording.frame_ids:
         raise SequenceError(f"{recording.name}: there are no frames ({recording.kind}). Name other images.")
@@ -128,8 +130,9 @@ def completed(recording: FoundRecording, options: ImportOptions) -> FoundRecordi
     if options.time_offset is not None and all(arm.times is None for arm in recording.arms):
         raise PartError(
             "columns",
-            f"{recording.name}: --time-offset needs times, and rows are matched with images without any. Give the "
-            "images' rate (--frame-rate), or leave it out.",
+            f"{recording.name}: a time offset needs times, but rows and images are matched without times. Give the "
+            "frame rate of the images, or leave out the offset.",
+            "Options: --frame-rate, --time-offset.",
         )
     known = tuple(
         replace(arm, beyond_limits=not check_limits(arm, job)) if arm.values is not None else arm
@@ -150,7 +153,7 @@ def _frames_with_kinematics(recording: FoundRecording, job: Import) -> FoundReco
     keep = np.ones(len(wanted), bool)
     logs = [(arm.name, arm.times) for arm in recording.arms if arm.times is not None]
     if recording.motion is not None and logs:
-        logs.append(("the endoscope", recording.motion.times))
+        logs.append((_ENDOSCOPE, recording.motion.times))
     for name, times in logs:
         after = np.searchsorted(times, wanted).clip(0, len(times) - 1)
         before = np.where(times[after] > wanted, after - 1, after).clip(0)
@@ -159,7 +162,8 @@ def _frames_with_kinematics(recording: FoundRecording, job: Import) -> FoundReco
         spacing = np.diff(times)
         # A log with one row per image may have large gaps throughout.
         if len(spacing) and (long := spacing > max(MAX_GAP, 2.0 * float(np.median(spacing)))).any():
-            job.warning(f"{name}: {counted(int(long.sum()), 'gap')} of up to {spacing.max():.3g} s in the log.")
+            where, about = (" of the endoscope", "") if name == _ENDOSCOPE else ("", name)
+            job.warning(f"{counted(int(long.sum()), 'gap')} of up to {spacing.max():.3g} s in the log{where}.", about)
     if keep.all():
         return recording
     if not keep.any():
@@ -167,7 +171,8 @@ def _frames_with_kinematics(recording: FoundRecording, job: Import) -> FoundReco
         raise PartError(
             "columns",
             f"{recording.name}: no frame has joint positions within {MAX_GAP} s. Images are from {wanted[0]:.3f} to "
-            f"{wanted[-1]:.3f} s, kinematics: {spans}. Clocks or their units differ: give --time-offset or --clock.",
+            f"{wanted[-1]:.3f} s, kinematics: {spans}. The clocks or their units differ.",
+            "Give --time-offset or --clock.",
         )
     job.warning(
         f"{int((~keep).sum())} of {counted(len(keep), 'frame')} left out: no joint positions within {MAX_GAP} s."
@@ -187,8 +192,10 @@ def _with_intrinsics(camera: FoundCamera, job: Import) -> FoundCamera:
     width, height = camera.size
     focal = FOCAL_WIDTHS * width
     job.missing(
-        f"{camera.name}: no calibration; a focal length of {focal:.0f} px stands in for it. Give --calibration "
-        f"{camera.name} FILE, or let carts calibrate find it."
+        f"no calibration; a focal length of {focal:.0f} px is the placeholder.",
+        camera.name,
+        remedy=f"Give --calibration {camera.name} FILE, or estimate it with carts calibrate.",
+        placeholder="intrinsics",
     )
     return replace(camera, intrinsics=(focal, focal, width / 2, height / 2), pixel_center=0.5)
 
@@ -199,8 +206,9 @@ def _placed(arm: FoundArm, number: int, job: Import) -> FoundArm:
     T = np.eye(4)
     if arm.values is None:
         T[2, 3] = _BEHIND
-        job.missing(f"no kinematics of {arm.name}: it is kept behind the camera, and masks are all there is.")
-        return replace(arm, T_world_base=T, base_from="nothing: behind the camera")
+        text = "no kinematics; the arm is placed behind the camera, and only masks can be annotated."
+        job.missing(text, arm.name, placeholder="values")
+        return replace(arm, T_world_base=T, base_from="a placeholder behind the camera")
     tip = tips_of(replace(arm, values=np.median(arm.values, axis=0)[None]))[0]
     side = -1.0 if number % 2 == 0 else 1.0
     towards = np.array([0.6 * side, 0.25, 0.76])
@@ -208,10 +216,12 @@ def _placed(arm: FoundArm, number: int, job: Import) -> FoundArm:
     T[:3, :3] = turn[0].as_matrix()
     T[:3, 3] = [0.0, 0.0, max(_DISTANCE, 0.5 * float(np.linalg.norm(tip)))] - T[:3, :3] @ tip
     job.missing(
-        f"{arm.name}: no base frame (hand-eye calibration); it is placed before the camera as a stand-in. Give "
-        f"--base {arm.name} FILE, or place it in carts view and refine with carts calibrate."
+        "no base frame (hand-eye calibration); a pose in front of the camera is the placeholder.",
+        arm.name,
+        remedy=f"Give --base {arm.name} FILE, or place the arm in carts view and refine with carts calibrate.",
+        placeholder="T_world_base",
     )
-    return replace(arm, T_world_base=T, base_from="nothing: a stand-in")
+    return replace(arm, T_world_base=T, base_from="a placeholder in front of the camera")
 
 
 FRAMES = "frames.csv"
@@ -227,29 +237,29 @@ def write_sequence(recording: FoundRecording, folder: Path, *, overwrite: bool =
             sequence = Sequence.open(Path(trial) / "sequence.toml")
             sequence.frame(0)
             sequence.frame(len(sequence) - 1)
+        except TableError as error:
+            raise SequenceError(f"{recording.name}{_place_of(error, recording)}{error.text}") from error
         except CartsError as error:
             if trial not in str(error):
                 raise
-            raise SequenceError(_of_recording(str(error), trial, recording)) from error
+            text = str(error).replace(f"{trial}/sequence.toml", recording.name)
+            raise SequenceError(text.replace(f"{trial}/", "")) from error
     with published(folder, overwrite=overwrite) as draft:
         _write(recording, draft, folder.absolute())
         write_text(draft / MARKER, json.dumps({"format": "sequence", "source": recording.kind}))
     return folder / "sequence.toml"
 
 
-def _of_recording(text: str, trial: str, recording: FoundRecording) -> str:
-    """An error about temporary files, rephrased as one about the recording."""
-    tables = {FRAMES: "", **{_table_of(arm): f" in the log of {arm.name}" for arm in recording.arms}}
-    for table, where in tables.items():
-
-        def place(match: re.Match[str], where: str = where) -> str:
-            row = int(match[1]) - 2
-            named = f"frame {recording.frame_ids[row]!r}" if not where and row < len(recording.frame_ids) else ""
-            return f"{recording.name}: {named or f'row {row + 1}{where}'}"
-
-        text = re.sub(rf"{re.escape(f'{trial}/{table}')},? line (\d+)", place, text)
-        text = text.replace(f"{trial}/{table}", f"{recording.name}{where}")
-    return text.replace(f"{trial}/sequence.toml", recording.name).replace(f"{trial}/", "")
+def _place_of(error: TableError, recording: FoundRecording) -> str:
+    """Location of an error in the recording instead of a temporary table."""
+    arm = next((arm for arm in recording.arms if error.path.name == _table_of(arm)), None)
+    if error.row is None:
+        return "" if arm is None else f": log of {arm.name}"
+    return (
+        f": frame {recording.frame_ids[error.row]!r}"
+        if arm is None
+        else f": row {error.row + 1} in the log of {arm.name}"
+    )
 
 
 def _write(recording: FoundRecording, target: Path | OutputPath, place: Path) -> None:

@@ -53,8 +53,8 @@ class SeparateImages:
         end = [float(arm.times[-1]) for arm in arms if arm.times is not None]
         apart = not begin or self.times[0] > max(end) or self.times[-1] < min(begin)
         offset = max(begin) - float(self.times[0]) if begin and apart else 0.0
-        text = "the clocks do not overlap: images and kinematics are taken to begin together" if offset else "0 s"
-        job.guessed(f"time offset: {text} (change: --time-offset).")
+        text = "the clocks do not overlap; a common start of images and kinematics is assumed" if offset else "0 s"
+        job.guessed(f"time offset: {text}.", option="--time-offset")
         return offset
 
 
@@ -68,13 +68,14 @@ def separate_images(path: Path, topics: list[str], job: Import) -> SeparateImage
     if not files:
         return None
     if len(files) < len(given):
-        raise SequenceError("images are either all topics of the bag or all files beside it. Name one kind.")
+        raise SequenceError("some images are topics of the bag, others are files. Choose topics only or files only.")
     images = {name: find_images(place) for name, place in files.items()}
     ids = common_ids(images, path)
     first = next(iter(images.values()))
     times = frame_times(first, ids, job).times
     if times is None:
-        raise PartError("columns", f"images in {first.path} have no times. Give their number per second: --frame-rate.")
+        problem = f"images in {first.path} have no times. Give their frame rate."
+        raise PartError("columns", problem, "Option: --frame-rate.")
     return SeparateImages(cameras_of(images, job), ids, times)
 
 
@@ -133,10 +134,10 @@ def _note_names(arm: str, names: tuple[str, ...], job: Import) -> None:
     """Report joints that are in another order, or have other names."""
     order = order_of_names(names)
     if order is not None and order != tuple(range(len(JOINT_NAMES))):
-        job.found(f"{arm}: joint positions are in the order {', '.join(names)}; they are taken by name.")
+        job.found(f"joint positions are in the order {', '.join(names)}; joints are matched by name.", arm)
     elif strange_names(names):
-        text = f"{arm}: {', '.join(names)} are not joints of a PSM; positions are taken in the order"
-        job.warning(f"{text} {', '.join(JOINT_NAMES)}.")
+        text = f"{', '.join(names)} are not joints of a PSM; the order {', '.join(JOINT_NAMES)} is assumed."
+        job.warning(text, arm)
 
 
 def _role(match: re.Match[str]) -> str | None:
@@ -166,8 +167,8 @@ def _chosen_topics(bag: Bag, given: Mapping[str, str]) -> dict[str, str]:
     elif len(unknown) > 1:
         raise PartError(
             "images",
-            f"{path} has {len(topics)} image topics, whose names are of no known camera: "
-            f"{', '.join(topics)}. Choose: --images left TOPIC right TOPIC.",
+            f"{path} has {len(topics)} image topics, whose names contain neither left nor right: {', '.join(topics)}.",
+            "Choose: --images left TOPIC right TOPIC.",
         )
 
     def preference(topic: str) -> int:
@@ -182,7 +183,7 @@ def _cameras(bag: Bag, job: Import) -> tuple[tuple[FoundCamera, ...], np.ndarray
     for name, topic in topics.items():
         if not len(times[name][0]):
             raise PartError(
-                "images", f"{path}: topic {topic} has no messages. Choose another one: --images {name} TOPIC."
+                "images", f"{path}: topic {topic} has no messages.", f"Choose another one: --images {name} TOPIC."
             )
     leader = next(iter(sorted(topics, key=lambda name: (name != "left", name))), None)
     if leader is None:
@@ -195,14 +196,14 @@ def _cameras(bag: Bag, job: Import) -> tuple[tuple[FoundCamera, ...], np.ndarray
         record, stamps = times[name]
         chosen = order if name == leader else nearest(frame_times, stamps)
         if name != leader and (late := np.abs(stamps[chosen] - frame_times).max()) > 0.02:
-            job.warning(f"images of {name} are up to {late:.3f} s from those of {leader}.")
+            job.warning(f"images are up to {late:.3f} s from those of {leader}.", name)
         info = _camera_info(bag, topics[name])
         first = decode_message(bag.message(topics[name]), f"{path}, {topics[name]}")
         size = (first.shape[1], first.shape[0])
         numbers = record[chosen]
         camera = FoundCamera(name, size, path, topic=topics[name], numbers=numbers)
         cameras.append(calibration_of(camera_from_info(camera, info, job, rectified="rect" in topics[name]), job))
-        job.found(f"camera {name}: {topics[name]}, {len(record)} images, {size[0]} x {size[1]}.")
+        job.found(f"{topics[name]}, {len(record)} images, {size[0]} x {size[1]}.", name)
     return tuple(cameras), frame_times
 
 
@@ -223,7 +224,8 @@ def _read(path: Path, job: Import) -> FoundRecording:
         beside = separate_images(path, _image_topics(bag), job)
         if beside is None:
             if job.options.frame_rate is not None:
-                raise PartError("columns", "--frame-rate is not used: the images of the bag have times. Leave it out.")
+                problem = "a frame rate is not used, since the images of the bag have times. Leave it out."
+                raise PartError("columns", problem, "Option: --frame-rate.")
             cameras, frame_times = _cameras(bag, job)
             ids = tuple(f"{number:06d}" for number in range(len(frame_times)))
         else:

@@ -13,6 +13,7 @@ import numpy as np
 
 from ...errors import SequenceError
 from ...model.psm_kinematics import JOINT_NAMES
+from ...wording import counted
 from ..images import mask_remarks, read_mask, spread_files
 from ..importing.cameras import Images, cameras_of, common_ids, find_images, image_files
 from ..importing.foreign_tables import read_array, read_foreign_table
@@ -51,11 +52,12 @@ def _domain_images(path: Path, domains: list[str], folders: dict[str, str], job:
         first = found[domains[0]]
         if any(each.pattern != first.pattern or each.size != first.size for each in found.values()):
             raise SequenceError(
-                f"{path}: images of {folder} have other names or sizes in some domains. Name them alike."
+                f"{path}: names or sizes of the images of {folder} differ between domains. Make them equal."
             )
         ids = common_ids(found, path)
         if any(len(each.ids) != len(ids) for each in found.values()):
-            job.warning(f"{folder}: {len(ids)} frames are in all of {', '.join(domains)}; others are left out.")
+            text = f"{counted(len(ids), 'frame')} in all of {', '.join(domains)}; others are left out."
+            job.warning(text, camera)
         place = "{domain}" if len(domains) > 1 else domains[0]
         images[camera] = Images(path, f"{place}/{folder}/{first.pattern}", ids, first.size)
     if not images:
@@ -70,17 +72,17 @@ def _with_masks(camera: FoundCamera, folder: Path, ids: tuple[str, ...], job: Im
     masks = find_images(folder)
     shared = [frame for frame in ids if frame in set(masks.ids)]
     if not shared:
-        job.warning(f"{folder}: no mask is of a frame; they are left out.")
+        job.warning(f"masks in {folder} are left out, since none belongs to a frame.", camera.name)
         return camera
     files = [folder / masks.pattern.format(frame=frame) for frame in shared]
     try:
         for file in spread_files(files):
             read_mask(file)
     except SequenceError as error:
-        job.missing(f"{camera.name}: masks in {folder} are left out: {error}")
+        job.missing(f"masks in {folder} are left out: {error}", camera.name)
         return camera
     for text in mask_remarks(files):
-        job.found(f"{camera.name}: {text}")
+        job.found(text, camera.name)
     return replace(camera, masks=str(folder / masks.pattern), sparse_masks=len(shared) < len(ids))
 
 
@@ -100,7 +102,7 @@ def _read_cts(path: Path, job: Import) -> FoundRecording:
             values = np.stack(list(table.columns.values())[:6], 1).astype(np.float64)
             arms.append(_arm(name, values, ids, file, job))
     if not arms:
-        raise SequenceError(f"{path / _TRUTH} has no psm1_js.npy or psm2_js.npy. Copy the set again, whole.")
+        raise SequenceError(f"{path / _TRUTH} has no psm1_js.npy or psm2_js.npy. Copy the whole set again.")
     found, times = _timed(arms, ids, next(iter(images.values())), job)
     return job.recording("a set of CTS", path.name, cameras, found, ids, times, domains=_domains(domains))
 
@@ -122,7 +124,7 @@ def _timed(
 def _arm(name: str, values: np.ndarray, ids: tuple[str, ...], file: Path, job: Import) -> FoundArm:
     """Joint positions of the frames: row n is frame n if no row is missing, else rows are matched in order."""
     if values.shape[1] < 6 or not np.isfinite(values).all():
-        raise SequenceError(f"{file} does not hold six finite joint positions a row. Copy it again.")
+        raise SequenceError(f"{file} does not have six finite joint positions per row. Copy it again.")
     numbers = np.array([int(frame) for frame in ids])
     if len(values) == len(ids):
         rows = np.arange(len(ids))
@@ -145,12 +147,13 @@ def _read_ambf(path: Path, job: Import) -> FoundRecording:
         width, height = images.size
         focal = height / 2 / np.tan(_AMBF_FIELD_OF_VIEW / 2)
         camera = replace(camera, intrinsics=(focal, focal, width / 2, height / 2), pixel_center=0.5)
-        job.guessed("the camera sees 1.2 rad from top to bottom (change: --calibration camera FILE).")
+        text = f"the vertical field of view is {_AMBF_FIELD_OF_VIEW} rad."
+        job.guessed(text, camera.name, "--calibration camera FILE")
     camera = _with_masks(camera, path / "segmentations", images.ids, job)
     file = path / "kinematics.npy"
     values = read_array(file)
     if values.ndim != 2 or values.shape[1] % _AMBF_COLUMNS or values.dtype.kind not in "fiu":
-        raise SequenceError(f"{file} has the shape {values.shape}; expected are eight columns of numbers an arm.")
+        raise SequenceError(f"{file} has the shape {values.shape}; expected are eight columns of numbers per arm.")
     arms = []
     for number in range(values.shape[1] // _AMBF_COLUMNS):
         own = values[:, _AMBF_COLUMNS * number : _AMBF_COLUMNS * (number + 1)].astype(np.float64)
@@ -158,7 +161,7 @@ def _read_ambf(path: Path, job: Import) -> FoundRecording:
         chosen = job
         if np.abs(joints[:, 2]).max() > _DECIMETRES_FROM and job.options.length_unit is None:
             chosen = job.with_options(length_unit="dm")
-            job.guessed(f"PSM{number + 1}: insertion is in decimetres (change: --length-unit m).")
+            job.guessed("insertion is in decimetres.", f"PSM{number + 1}", "--length-unit m")
         arms.append(_arm(f"PSM{number + 1}", joints, images.ids, file, chosen))
     found, times = _timed(arms, images.ids, images, job)
     return job.recording("a simulated video (AMBF)", path.name, (camera,), found, images.ids, times)
@@ -181,7 +184,7 @@ def _subsets(path: Path) -> list[Path]:
 def _read_segstrong(path: Path, job: Import) -> FoundRecording:
     if not _is_subset(path):
         subsets = ", ".join(str(each.relative_to(path)) for each in _subsets(path))
-        raise SequenceError(f"{path} holds several recordings. Import one of them: {subsets}.")
+        raise SequenceError(f"{path} has several recordings. Import one of them: {subsets}.")
     folders = [each for each in _subfolders(path) if each.name != "ground_truth"]
     domains = _ordered(each.name for each in folders if image_files(each / "left"))
     images = _domain_images(path, domains, {"left": "left", "right": "right"}, job)

@@ -23,7 +23,7 @@ from ...wording import listed
 from ..importing.cameras import cameras_of, common_ids, find_images, image_files
 from ..importing.columns import order_of_names
 from ..importing.foreign_tables import read_foreign_table
-from ..importing.found import FoundArm, FoundCamera, FoundRecording, Import, Source, read_json
+from ..importing.found import FoundArm, FoundCamera, FoundRecording, Import, PartError, Source, read_json
 from ..importing.logs import ArmLog, arm_from_log, track
 from ..importing.row_matching import by_rows, frame_times
 
@@ -57,9 +57,8 @@ def _read_surgpose(path: Path, job: Import) -> FoundRecording:
     wanted = set(job.options.arms.values()) or {"PSM1", "PSM2", "PSM3"}
     names = sorted({str(arm) for row in rows.values() for arm in row} & wanted)
     if not names:
-        raise SequenceError(
-            f"{file} has no joint positions of PSM1, PSM2 or PSM3. Copy it again, or name arms: --arms."
-        )
+        problem = f"{file} has no joint positions of {', '.join(sorted(wanted))}. Copy it again, or choose other arms."
+        raise PartError("recording", problem, "Option: --arms.")
     arms = []
     for recorded in names:
         own = {frame: row[recorded] for frame, row in rows.items() if recorded in row}
@@ -67,7 +66,7 @@ def _read_surgpose(path: Path, job: Import) -> FoundRecording:
             log = track([*own], [[*map(float, values[:6])] for values in own.values()])
         except (TypeError, ValueError) as error:
             raise SequenceError(
-                f"{file}: joint positions of {recorded} are no numbers ({error}). Copy it again."
+                f"{file}: joint positions of {recorded} are not numbers ({error}). Copy it again."
             ) from error
         if log is None or log.values.shape[1] != 6:
             raise SequenceError(f"{file}: {recorded} needs six joint positions in every frame. Copy it again.")
@@ -75,11 +74,12 @@ def _read_surgpose(path: Path, job: Import) -> FoundRecording:
     times = frame_times(images["left"], ids, job).times
     if len(rows) != len(ids):
         text = f"{file.name} has {len(rows)} rows and there are {len(ids)} images."
-        job.warning(f"{text} Each row is taken for the image of its number; look at the delay.")
+        job.warning(f"{text} Each row is assigned to the image of its number. Check the delay.")
     found, kept_ids, kept = by_rows(arms, ids, job, times)
     job.warning(
-        "the kinematics of SurgPose need compensation, its base frames differ from trajectory to trajectory, and "
-        "rows of many are up to 71 frames late: estimate the delay with carts time-offset."
+        "the kinematics of SurgPose need compensation, its base frames differ between trajectories, and the rows of "
+        "many are up to 71 frames late.",
+        remedy="Estimate the delay with carts time-offset.",
     )
     numbered = [replace(camera, numbers=kept) for camera in cameras]
     return job.recording("a trajectory of SurgPose", path.name, numbered, found, kept_ids, found[0].times)
@@ -91,7 +91,9 @@ def _yaml_rows(file: Path) -> dict[int, dict]:
         return {int(frame): dict(row) for frame, row in content.items()}
     except (OSError, AttributeError, TypeError, ValueError) as error:
         text = " ".join(str(error).split())
-        raise SequenceError(f"{file} is no YAML file of frames with joints by arm ({text}). Copy it again.") from error
+        raise SequenceError(
+            f"{file} is not a YAML file of frames with joints by arm ({text}). Copy it again."
+        ) from error
 
 
 def _read_endovis(path: Path, job: Import) -> FoundRecording:
@@ -103,7 +105,7 @@ def _read_endovis(path: Path, job: Import) -> FoundRecording:
         framed = camera.size == (1920, 1080)
         shown = replace(camera, crop=_ENDOVIS_PART, size=_ENDOVIS_PART[2:]) if framed else camera
         cameras.append(_endovis_calibration(shown, path / "camera_calibration.txt", job))
-    job.missing("labels of EndoVis are of classes, not 0 and 255, and are left out.")
+    job.missing("labels of EndoVis are class numbers, not 0 and 255, and are left out.")
     return job.recording("a sequence of EndoVis", path.name, cameras, (), ids, None)
 
 
@@ -126,8 +128,10 @@ def _endovis_calibration(camera: FoundCamera, file: Path, job: Import) -> FoundC
             T[:3, :3] = Rotation.from_rotvec(values["Extrinsic-Omega"][:3]).as_matrix()
             T[:3, 3] = np.array(values["Extrinsic-T"][:3]) * 1e-3
     except (OSError, ValueError, KeyError) as error:
-        raise SequenceError(f"{file} lacks a readable {error}. Copy it again, or give --calibration.") from error
-    job.found(f"calibration of {camera.name}: from {file.name}.")
+        problem = f"{file} has no readable {error}. Copy it again, or choose another calibration."
+        remedy = f"Option: --calibration {camera.name} FILE."
+        raise PartError("calibration", problem, remedy, about=camera.name) from error
+    job.found(f"calibration from {file.name}.", camera.name)
     return replace(camera, intrinsics=(fx, fy, cx, cy), distortion=distortion, T_camera_world=T)
 
 
@@ -152,17 +156,15 @@ def _read_jigsaws(path: Path, job: Import) -> FoundRecording:
     trials = jigsaws_trials(path) if path.is_dir() else (path,)
     if len(trials) > 1:
         names = listed([trial.stem for trial in trials], _LISTED)
-        raise SequenceError(
-            f"{path} has {len(trials)} trials of JIGSAWS: {names}. Import one of them: "
-            f"carts import {shlex.quote(str(trials[0]))}"
-        )
+        problem = f"{path} has {len(trials)} trials of JIGSAWS: {names}. Import one of them."
+        raise PartError("recording", problem, f"Command: carts import {shlex.quote(str(trials[0]))}")
     if not trials:
         raise SequenceError(f"{path} has no kinematics/AllGestures/TRIAL.txt. Give the root of JIGSAWS, or a trial.")
     path = trials[0]
     try:
         rows = np.array([line.split() for line in read_text(path, TABLE).splitlines() if line.strip()], np.float64)
     except (OSError, ValueError) as error:
-        raise SequenceError(f"{path} is no table of numbers ({error}). Copy it again.") from error
+        raise SequenceError(f"{path} is not a table of numbers ({error}). Copy it again.") from error
     if rows.ndim != 2 or rows.shape[1] != _JIGSAWS_COLUMNS:
         raise SequenceError(f"{path} has the shape {rows.shape}; a trial of JIGSAWS has {_JIGSAWS_COLUMNS} columns.")
     videos = path.parents[2] / "video"
@@ -180,7 +182,7 @@ def _read_jigsaws(path: Path, job: Import) -> FoundRecording:
     for arm, first in _JIGSAWS_ARMS.items():
         R = rows[:, first + 3 : first + 12].reshape(-1, 3, 3)
         if np.abs(np.linalg.det(R) - 1).max() > 0.05:
-            raise SequenceError(f"{path}: columns {first + 4} to {first + 12} are no rotations. Copy it again.")
+            raise SequenceError(f"{path}: columns {first + 4} to {first + 12} are not rotations. Copy it again.")
         poses = track(times, np.column_stack([rows[:, first : first + 3], Rotation.from_matrix(R).as_quat()]))
         seen, jaw = arm in job.options.base, track(times, rows[:, first + 18])
         log = ArmLog(arm, None, jaw, poses if seen else None, None if seen else poses, opencv_axes=True)
@@ -267,7 +269,7 @@ def _with_extrinsics(camera: FoundCamera, file: Path, job: Import) -> FoundCamer
         R = np.array(content["R"], np.float64).reshape(3, 3)
         T = np.array(content["T"], np.float64).reshape(3)
     except (KeyError, TypeError, ValueError):
-        job.warning(f"{file} has no R and T; the right camera is placed by right.yaml alone.")
+        job.warning(f"{file} has no R and T; the pose of the right camera is from right.yaml only.", camera.name)
         return camera
     T = T * (1e-3 if np.linalg.norm(T) > 1.0 else 1.0)
     return replace(camera, T_camera_world=np.vstack([np.column_stack([R, T]), [0.0, 0.0, 0.0, 1.0]]))
@@ -320,7 +322,7 @@ def _raw(path: Path, arm: str, ids: tuple[str, ...]) -> dict[str, Any]:
                 if numbers is not None and len(numbers) >= _LENGTHS[role]:
                     rows[role].append((float(position), *map(float, numbers[: _LENGTHS[role]])))
         except (AttributeError, IndexError, KeyError, TypeError, ValueError) as error:
-            raise SequenceError(f"{file} is no kinematics of one frame ({error!r}). Copy it again.") from error
+            raise SequenceError(f"{file} is not the kinematics of a frame ({error!r}). Copy it again.") from error
     return {role: track([row[0] for row in found], [row[1:] for row in found]) for role, found in rows.items()}
 
 

@@ -70,10 +70,10 @@ def _streams(path: Path, job: Import) -> list[_Stream]:
     streams = []
     for video in videos:
         if not video.is_file():
-            raise SequenceError(f"video {video} is missing. Copy the session again, whole.")
+            raise SequenceError(f"video {video} is missing. Copy the whole session again.")
         sidecar = video.with_suffix(".json")
         if not sidecar.is_file():
-            raise SequenceError(f"{video} has no {sidecar.name} with the times of its frames. Copy it too.")
+            raise SequenceError(f"{sidecar} with the frame times of {video.name} is missing. Copy it too.")
         streams.append(_stream(video, sidecar, job))
     return streams
 
@@ -81,14 +81,14 @@ def _streams(path: Path, job: Import) -> list[_Stream]:
 def _stream(video: Path, sidecar: Path, job: Import) -> _Stream:
     content = read_json(sidecar)
     if not isinstance(content, dict):
-        raise SequenceError(f"sidecar {sidecar} holds no named values. Copy it again.")
+        raise SequenceError(f"sidecar {sidecar} is not a JSON object. Copy it again.")
     name = str(content.get("stream_name") or video.stem)
     for key, unit in _OLD_UNITS.items():
         if isinstance(stamps := content.get(key), list) and stamps:
             try:
                 times = np.array(stamps, np.float64) * unit
             except (TypeError, ValueError) as error:
-                raise SequenceError(f"sidecar {sidecar}: its times are no numbers ({error}). Copy it again.") from error
+                raise SequenceError(f"sidecar {sidecar}: times are not numbers ({error}). Copy it again.") from error
             return _checked(_Stream(video, name, np.arange(len(times)), times, "undefined", 0.0), sidecar, job)
     frames = content.get("frames")
     if not isinstance(frames, list) or not frames:
@@ -98,7 +98,7 @@ def _stream(video: Path, sidecar: Path, job: Import) -> _Stream:
         times = np.array([_frame_time(frame) for frame in frames])
     except (KeyError, TypeError, ValueError) as error:
         raise SequenceError(
-            f"sidecar {sidecar}: a frame lacks {error}. Its frames need frame_index and cpu.realtime times."
+            f"sidecar {sidecar}: a frame has no {error}. Frames need frame_index and cpu.realtime times."
         ) from error
     layout = str(content.get("side_by_side") or "undefined")
     if layout not in ("undefined", *_SIDES):
@@ -136,7 +136,7 @@ def _checked(stream: _Stream, sidecar: Path, job: Import) -> _Stream:
     good = (stream.numbers >= 0) & (stream.numbers < count) & np.isfinite(stream.times)
     if not good.any():
         raise SequenceError(
-            f"sidecar {sidecar} is of another video: no frame of it is in {stream.video}. Copy both again."
+            f"sidecar {sidecar} belongs to another video: {stream.video} has none of its frames. Copy both again."
         )
     numbers, times = stream.numbers[good], stream.times[good]
     order = np.argsort(times, kind="stable")
@@ -151,8 +151,8 @@ def _cameras(streams: list[_Stream], job: Import) -> tuple[tuple[FoundCamera, ..
         layout = stream.side_by_side
         if layout == "undefined" and width >= 3 * height:
             layout = "LR"
-            text = f"{stream.video.name} is {width} x {height}: side-by-side stereo, the left camera at the left"
-            job.guessed(f"{text} (not in its sidecar).")
+            text = f"{stream.video.name} is {width} x {height}: side-by-side stereo, the left camera on the left"
+            job.guessed(f"{text} (the sidecar does not state it).")
         if layout in _SIDES:
             half = width // 2
             for position, side in enumerate(_SIDES[layout]):
@@ -166,11 +166,11 @@ def _cameras(streams: list[_Stream], job: Import) -> tuple[tuple[FoundCamera, ..
         stream, crop, size = parts[name]
         rows = nearest(leader.times, stream.times)
         if (late := np.abs(stream.times[rows] - leader.times).max()) > _FAR:
-            job.warning(f"images of {name} are up to {late:.3f} s from those of {order[0]}.")
+            job.warning(f"images are up to {late:.3f} s from those of {order[0]}.", name)
         camera = FoundCamera(name, size, stream.video, crop=crop, numbers=stream.numbers[rows])
         cameras.append(calibration_of(camera, job))
-        where = "" if crop is None else f", its part from column {crop[0]}"
-        job.found(f"camera {name}: {stream.video.name}{where}, {len(stream.times)} frames.")
+        where = "" if crop is None else f" from column {crop[0]}"
+        job.found(f"{stream.video.name}{where}, {len(stream.times)} frames.", name)
     return tuple(cameras), leader.times
 
 
@@ -210,7 +210,7 @@ def _extracted_track(file: Path, role: str) -> Track | None:
 def _read(path: Path, job: Import) -> FoundRecording:
     streams = _streams(path, job)
     if not streams:
-        raise SequenceError(f"{path} has no videos with sidecars. Record a stream, or copy the session again, whole.")
+        raise SequenceError(f"{path} has no videos with sidecars. Record a stream, or copy the whole session again.")
     cameras, times = _cameras(streams, job)
     logs, motion = _logs(path, float(times[0]), job)
     if not logs:
@@ -223,7 +223,7 @@ def _read(path: Path, job: Import) -> FoundRecording:
     if offset is None:
         offset = -latency
         if latency:
-            job.guessed(f"time offset {offset:.4f} s: the recorder's estimated latency (change: --time-offset).")
+            job.guessed(f"time offset: {offset:.4f} s, the recorder's estimated latency.", option="--time-offset")
     ids = tuple(f"{number:06d}" for number in range(len(times)))
     kind = "a session of the dVRK's recorder"
     return job.recording(kind, path.name, cameras, arms, ids, times, time_offset=offset, motion=motion)

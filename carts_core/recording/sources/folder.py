@@ -81,7 +81,7 @@ def _images(path: Path, options: ImportOptions) -> dict[str, Images]:
         shown = ", ".join(str(place.relative_to(path)) for place in places)
         raise PartError(
             "images",
-            f"{path} has several places with images, and it is not clear which camera is which: {shown}. "
+            f"{path} has several folders or videos whose names do not identify the cameras: {shown}.",
             "Choose: --images left PLACE right PLACE.",
         )
     return {side: find_images(found[0]) for side, found in sorted(named.items())}
@@ -100,7 +100,7 @@ def _calibrations(path: Path, cameras: list[str], job: Import) -> dict[str, Path
             found[camera] = (shared or files)[0]
     found = {camera: file for camera, file in found.items() if camera not in job.options.calibration}
     for camera, file in found.items():
-        job.guessed(f"{file.name} is the calibration of {camera} (change: --calibration {camera} FILE).")
+        job.guessed(f"the calibration is {file.name}.", camera, f"--calibration {camera} FILE")
     return found
 
 
@@ -161,20 +161,20 @@ def _kinematics(path: Path, job: Import) -> list[tuple[ForeignTable, ColumnMeani
             if options.kinematics is not None or options.columns or len(found) == 1:
                 raise PartError(
                     "columns",
-                    f"{table.path} has {len(table)} rows with the columns {samples(table)}, among which six joints or "
-                    "a tip's pose are not recognized. Name them: --columns yaw COLUMN pitch COLUMN insertion COLUMN "
-                    "roll COLUMN wrist_pitch COLUMN wrist_yaw COLUMN; give the robot if it is no PSM (--robot NAME "
-                    "FILE.urdf); or leave it out (--kinematics none).",
+                    f"{table.path} has {len(table)} rows with the columns {samples(table)}, among which neither six "
+                    "joints nor a tip pose are recognized.",
+                    "Name them: --columns yaw COLUMN pitch COLUMN insertion COLUMN roll COLUMN wrist_pitch COLUMN "
+                    "wrist_yaw COLUMN. If the robot is not a PSM, give it: --robot NAME FILE.urdf. To leave the table "
+                    "out: --kinematics none.",
                 )
             continue
         named = meanings
         if (name := arm_in(table.path.stem)) and "" in meanings.arms:
             named = replace(meanings, arms={arm or name: columns for arm, columns in meanings.arms.items()})
         if taken := [arm for arm in named.arms if arm in known]:
-            job.warning(
-                f"{table.path} has joints or poses of {taken[0] or 'an arm'} too, and is not used (change: "
-                "--kinematics). Name files of other arms by the arms, as psm2.csv."
-            )
+            text = f"{table.path} also has joints or poses of {taken[0] or 'an arm'}, and is not used"
+            remedy = "To use it: --kinematics FILE."
+            job.warning(f"{text}. Name files of other arms after the arms, such as psm2.csv.", remedy=remedy)
             continue
         known |= dict.fromkeys(named.arms, table)
         chosen.append((table, named))
@@ -183,7 +183,6 @@ def _kinematics(path: Path, job: Import) -> list[tuple[ForeignTable, ColumnMeani
 
 def _frames(path: Path, images: Images, ids: tuple[str, ...], kinematics: list[Path], job: Import) -> FrameTimes:
     """Images with their times: from a table with as many rows as images, else from a video's rate."""
-    rate = job.options.frame_rate
     for file in _tables(path):
         table = None if file in kinematics else _readable(file)
         if table is None:
@@ -193,8 +192,8 @@ def _frames(path: Path, images: Images, ids: tuple[str, ...], kinematics: list[P
             job.guessed(f"times of the images are in {file.name}.")
             times = row_seconds(log_rows(table, meanings), None, job)
             found = frame_times(images, ids, Import(replace(job.options, frame_rate=None)))
-            if rate is not None:
-                job.warning(f"--frame-rate {rate:g} is not used: the images have times in {file.name}.")
+            if job.options.frame_rate is not None:
+                job.warning(f"the given frame rate is not used, since the images have times in {file.name}.")
             return replace(found, times=times, source=file.name, nominal=False)
     return frame_times(images, ids, job)
 
@@ -207,10 +206,9 @@ def _read(path: Path, job: Import) -> FoundRecording:
     for name, each in images.items():
         if lacking := [frame for frame in each.ids if frame not in shared]:
             shown = ", ".join(lacking[:5]) + (" ..." if len(lacking) > 5 else "")
-            job.warning(
-                f"{name}: {len(lacking)} of {len(each.ids)} images left out, since another camera has none of that "
-                f"frame: {shown}. To keep them, import {name} alone: --images {name} {each.path.name}."
-            )
+            text = f"{len(lacking)} of {len(each.ids)} images left out, since another camera has no image of the frame"
+            remedy = f"To keep them, import {name} alone: --images {name} {each.path.name}."
+            job.warning(f"{text}: {shown}.", name, remedy=remedy)
     found = _kinematics(path, job)
     if not found:
         _note_missing_kinematics(path, job)
@@ -234,13 +232,11 @@ def _note_missing_kinematics(path: Path, job: Import) -> None:
         return
     tables = [table for table in map(_readable, _tables(path)) if table is not None and len(table.columns) > 1]
     if not tables:
-        job.missing(f"no table of joints or poses in {path}. Name one: --kinematics FILE.")
+        job.missing(f"no table of joints or poses in {path}.", remedy="Give one: --kinematics FILE.")
         return
     seen = "; ".join(f"{table.path.name} has {', '.join([*table.columns][:12])}" for table in tables[:3])
-    job.missing(
-        f"no table in {path} has six joints or a tip's pose (x, y, z, qx, qy, qz, qw): {seen}. Name another: "
-        "--kinematics FILE."
-    )
+    text = f"no table in {path} has six joints or a tip pose (x, y, z, qx, qy, qz, qw): {seen}."
+    job.missing(text, remedy="Give another one: --kinematics FILE.")
 
 
 def _matched(
@@ -250,16 +246,16 @@ def _matched(
     arms: list[FoundArm] = []
     matches: list[RowMatch] = []
     for table, meanings in found:
-        text = f"kinematics: {table.path}, {len(table)} rows (change: --kinematics)."
-        job.found(text, given=job.options.kinematics is not None)
+        text = f"kinematics: {table.path}, {len(table)} rows."
+        job.found(text, option="--kinematics", given=job.options.kinematics is not None)
         for remark in table.remarks:
             job.found(f"{table.path.name}: {remark}.")
         try:
             match = match_rows(frames, log_rows(table, meanings), job)
-        except SequenceError as error:
+        except PartError as error:
             others = [f"{other.path.name}, {len(other)} rows" for other, _ in found if other is not table]
-            also = f" Beside it lies {'; '.join(others)}." if others else ""
-            raise PartError("columns", f"{error}{also}") from error
+            also = f" Other tables: {'; '.join(others)}." if others else ""
+            raise PartError(error.part, f"{error.problem}{also}", error.remedy) from error
         arms += _arms(table, meanings, match.rows, job)
         matches.append(match)
     first = matches[0]
@@ -267,8 +263,9 @@ def _matched(
         names = ", ".join(table.path.name for table, _ in found)
         raise PartError(
             "columns",
-            f"rows of {names} meet the images in several ways. Give them times of one clock and --time-offset, or name "
-            "one table: --kinematics FILE.",
+            f"rows of {names} match the images in different ways. Give the tables times of one clock, or choose one "
+            "table.",
+            "Options: --time-offset, --kinematics FILE.",
         )
     return tuple(arms), first
 

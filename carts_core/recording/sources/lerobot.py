@@ -52,7 +52,7 @@ def _read(path: Path, job: Import) -> FoundRecording:
         rate = float(info["fps"])
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise SequenceError(
-            f"{root / 'meta/info.json'} is no LeRobot description with features and fps ({error!r}). Copy it again."
+            f"{root / 'meta/info.json'} is not a LeRobot description with features and fps ({error!r}). Copy it again."
         ) from error
     wanted = _EPISODE.search(path.name)
     cameras = [key for key, value in features.items() if isinstance(value, dict) and value.get("dtype") == "video"]
@@ -61,7 +61,7 @@ def _read(path: Path, job: Import) -> FoundRecording:
     if not rows:
         raise SequenceError(f"{root}: episode {episode.index} has no rows. Name another one.")
     if (total := info.get("total_episodes", 1)) != 1:
-        job.found(f"episode {episode.index} of {total}; give an episode's .parquet file for another one.")
+        job.found(f"episode {episode.index} of {total}; to import another one, give its .parquet file.")
     ids = tuple(f"{number:06d}" for number in range(rows))
     arms = _arms(root, features, episode, job)
     times = _times(root, episode, rate, job)
@@ -78,14 +78,14 @@ def _times(root: Path, episode: _Episode, rate: float, job: Import) -> np.ndarra
         return even
     times = episode.table.numbers("timestamp").astype(np.float64)
     if times.shape != even.shape or not np.isfinite(times).all() or (np.diff(times) <= 0).any():
-        text = "the column timestamp does not increase and is not used; times are those of the rate"
+        text = "the column timestamp does not increase and is not used; times follow from the rate"
         job.warning(f"{text}, {rate:g} images/s.")
         return even
     times = times - times[0]
     if (late := np.abs(times - even).max()) > 0.5 / rate:
         job.warning(
             f"times of the column timestamp are up to {late:.3f} s from those of {rate:g} images/s. They are used; "
-            "row n is taken for image n of the episode."
+            "row n is assigned to image n of the episode."
         )
         return times
     # Times in single precision are no more accurate than the rate.
@@ -133,9 +133,7 @@ def _parquet(path: Path) -> ForeignTable:
     try:
         return ForeignTable(path, read_parquet(path))
     except (OSError, ValueError) as error:
-        raise SequenceError(
-            f"table {path} cannot be read ({error}). Copy it again; Git LFS pointers need a pull."
-        ) from error
+        raise SequenceError(f"table {path} cannot be read ({error}). Copy it again.") from error
 
 
 def _names(value: Any) -> list[str]:
@@ -164,8 +162,9 @@ def _arms(root: Path, features: dict[str, Any], episode: _Episode, job: Import) 
     if not meanings.arms:
         raise PartError(
             "columns",
-            f"{root}: {_STATE} has the columns {samples(table)}, among which six joints of a PSM or a tip's pose "
-            "are not recognized. Name them: --columns yaw COLUMN ..., or give the robot: --robot NAME FILE.urdf.",
+            f"{root}: {_STATE} has the columns {samples(table)}, among which neither six joints of a PSM nor a tip "
+            "pose are recognized.",
+            "Name them: --columns yaw COLUMN ..., or give the robot: --robot NAME FILE.urdf.",
         )
     times = np.arange(len(values), dtype=float)
     arms = []
@@ -187,14 +186,14 @@ def _cameras(
             raise SequenceError(f"{root} has no video {key!r}. It has: {', '.join(episode.videos) or 'none'}.")
         video, start = episode.videos[key]
         if not video.is_file():
-            raise SequenceError(f"video {video} is missing. Copy the data set again, whole.")
+            raise SequenceError(f"video {video} is missing. Copy the whole data set again.")
         images = find_images(video)
         if len(images.ids) < start + rows:
             raise SequenceError(
                 f"video {video} has {len(images.ids)} frames, but episode {episode.index} is frames {start} to "
                 f"{start + rows - 1}. Copy it again."
             )
-        job.found(f"camera {name}: {key}, {images.size[0]} x {images.size[1]}.")
+        job.found(f"{key}, {images.size[0]} x {images.size[1]}.", name)
         numbers = start + kept
         if start == 0 and len(images.ids) > rows and images.times is not None:
             # A video of this episode alone, with images that have no row.

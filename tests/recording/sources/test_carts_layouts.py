@@ -69,7 +69,7 @@ def test_a_simulated_video_has_its_camera_and_insertion_in_metres(tmp_path):
     assert frame.measured["PSM1"][6] == pytest.approx(0.4)
     assert sequence.scene.cameras[0].intrinsics[0] == pytest.approx(36 / np.tan(0.6))
     assert frame.masks is not None
-    assert any("decimetres" in note.text for note in found.notes)
+    assert any("decimetres" in str(note) for note in found.notes)
 
 
 def test_a_subset_of_segstrong_has_masks_and_no_arm_in_view(tmp_path):
@@ -79,7 +79,7 @@ def test_a_subset_of_segstrong_has_masks_and_no_arm_in_view(tmp_path):
     frame = sequence.frame(1, "blood")
     assert np.array_equal(frame.images["right"], image(1, "right"))
     assert frame.masks is not None and frame.masks["right"].sum() == 3 * SIZE[0]
-    assert any("behind the camera" in note.text for note in found.notes)
+    assert any("behind the camera" in str(note) for note in found.notes)
     assert sequence.scene.arms[0].T_world_base[2, 3] == -1.0
 
 
@@ -97,7 +97,7 @@ def test_label_images_are_no_masks_and_that_is_said(tmp_path):
     (path / "segmentations").rmdir()
     write_masks(path / "segmentations", value=31)
     found = find(path)
-    assert not found.cameras[0].masks and any("has no value above 31. Masks are 0" in note.text for note in found.notes)
+    assert not found.cameras[0].masks and any("has no value above 31. Masks are 0" in str(note) for note in found.notes)
 
 
 def test_missing_images_of_one_domain_are_left_out_in_all(tmp_path):
@@ -127,7 +127,7 @@ MUTATIONS = {
     "other names": (
         cts,
         lambda p: [f.rename(f.with_name(f"a{f.name}")) for f in (p / "smoke/images_l").iterdir()],
-        "alike",
+        "differ between domains",
     ),
     "seven columns": (ambf, save("kinematics.npy", np.zeros((4, 7))), "eight columns"),
     "a cube": (ambf, save("kinematics.npy", np.zeros((4, 8, 2))), "eight columns"),

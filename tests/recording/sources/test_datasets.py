@@ -79,7 +79,7 @@ def test_a_sequence_of_endovis_has_its_cameras_and_no_arm_in_view(tmp_path):
     left, right = sequence.scene.cameras
     assert left.intrinsics == pytest.approx((110, 110, 48, 36))
     assert np.allclose(right.T_camera_world[:3, 3], [-0.005, 0, 0])
-    assert any("behind the camera" in note.text for note in found.notes)
+    assert any("behind the camera" in str(note) for note in found.notes)
 
 
 def test_frames_of_1920_x_1080_lose_their_black_rim(tmp_path):
@@ -126,10 +126,10 @@ def rewritten(name: str, old: str, new: str) -> Callable[[Path], object]:
 
 
 MUTATIONS: dict[str, tuple[Callable[[Path], Path], Callable[[Path], object], str]] = {
-    "SurgPose, cut YAML": (surgpose, write("api_jp_data.yaml", "'0': {"), "is no YAML file"),
-    "SurgPose, a list": (surgpose, write("api_jp_data.yaml", "[1]"), "is no YAML file"),
+    "SurgPose, cut YAML": (surgpose, write("api_jp_data.yaml", "'0': {"), "is not a YAML file"),
+    "SurgPose, a list": (surgpose, write("api_jp_data.yaml", "[1]"), "is not a YAML file"),
     "SurgPose, no arms": (surgpose, write("api_jp_data.yaml", "'0': {}"), "no joint positions of"),
-    "SurgPose, texts": (surgpose, write("api_jp_data.yaml", "'0': {PSM1: [a, b, c, d, e, f]}"), "are no numbers"),
+    "SurgPose, texts": (surgpose, write("api_jp_data.yaml", "'0': {PSM1: [a, b, c, d, e, f]}"), "are not numbers"),
     "SurgPose, five joints": (
         surgpose,
         write("api_jp_data.yaml", "'0': {PSM1: [0, 0, 0, 0, 0]}"),
@@ -139,7 +139,7 @@ MUTATIONS: dict[str, tuple[Callable[[Path], Path], Callable[[Path], object], str
     "SurgPose, no right video": (surgpose, remove("regular/right_video.mp4"), "right_video.mp4"),
     "SurgPose, calibration": (surgpose, rewritten("StereoCalibrationDVRK.ini", "fc_x", "f"), "cannot be used"),
     "SurgPose, sections": (surgpose, rewritten("StereoCalibrationDVRK.ini", "Stereo", "S"), "cannot be used"),
-    "EndoVis, calibration": (endovis, rewritten("camera_calibration.txt", "Camera-1-F", "F"), "lacks a readable"),
+    "EndoVis, calibration": (endovis, rewritten("camera_calibration.txt", "Camera-1-F", "F"), "has no readable"),
     "EndoVis, no common frame": (
         endovis,
         lambda p: [f.rename(f.with_name(f"frame9{f.name[5:]}")) for f in (p / "right_frames").iterdir()],
@@ -147,9 +147,9 @@ MUTATIONS: dict[str, tuple[Callable[[Path], Path], Callable[[Path], object], str
     ),
     "EndoVis, cut image": (endovis, write("left_frames/frame000.png", b""), "damaged"),
     "JIGSAWS, other columns": (jigsaws, lambda p: p.write_text("1 2 3\n"), "has 76 columns"),
-    "JIGSAWS, ragged": (jigsaws, lambda p: p.write_text("1 2 3\n1 2\n"), "is no table of numbers"),
+    "JIGSAWS, ragged": (jigsaws, lambda p: p.write_text("1 2 3\n1 2\n"), "is not a table of numbers"),
     "JIGSAWS, empty": (jigsaws, lambda p: p.write_text(""), "76 columns"),
-    "JIGSAWS, no rotations": (jigsaws, lambda p: np.savetxt(p, np.zeros((3, 76))), "are no rotations"),
+    "JIGSAWS, no rotations": (jigsaws, lambda p: np.savetxt(p, np.zeros((3, 76))), "are not rotations"),
     "JIGSAWS, no video": (
         jigsaws,
         lambda p: [f.unlink() for f in (p.parents[2] / "video").iterdir()],
@@ -158,7 +158,7 @@ MUTATIONS: dict[str, tuple[Callable[[Path], Path], Callable[[Path], object], str
     "JIGSAWS, other frame": (
         jigsaws,
         lambda p: np.savetxt(p, np.loadtxt(p) + np.array([9.0 * (c in (38, 39, 40)) for c in range(76)])),
-        "no joint positions reach",
+        "poses are unreachable",
     ),
 }
 
@@ -174,4 +174,4 @@ def test_a_broken_recording_is_an_error_in_words(tmp_path, name):
 def test_endovis_without_a_calibration_gets_a_stand_in(tmp_path):
     path = endovis(tmp_path / "seq_1")
     (path / "camera_calibration.txt").unlink()
-    assert any("stands in for it" in note.text for note in find(path).notes)
+    assert any("is the placeholder" in str(note) for note in find(path).notes)

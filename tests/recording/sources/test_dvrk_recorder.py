@@ -108,7 +108,7 @@ def test_the_time_of_a_frame_follows_the_recorders_rule(tmp_path, realtime, late
 def test_the_estimated_latency_is_offered_as_the_time_offset(tmp_path):
     found = find(session(tmp_path / "session", latency=35.0))
     assert found.time_offset == pytest.approx(-0.035)
-    assert any(note.kind == "guessed" and "estimated latency" in note.text for note in found.notes)
+    assert any(note.kind == "guessed" and "estimated latency" in str(note) for note in found.notes)
 
 
 def test_frames_are_found_by_their_number_when_the_recorder_dropped_some(tmp_path):
@@ -120,7 +120,7 @@ def test_frames_are_found_by_their_number_when_the_recorder_dropped_some(tmp_pat
     file, found = import_recording(path, tmp_path / "out")
     frame = Sequence.open(file).frame(2)
     assert np.abs(frame.images["left"].astype(int) - image(3)).mean() < 6
-    assert any("dropped 1 frames" in note.text for note in found.notes)
+    assert any("dropped 1 frames" in str(note) for note in found.notes)
 
 
 @pytest.mark.parametrize(("key", "unit"), [("timestamps_ns", 1), ("timestamps_ms", 1e-6), ("timestamps", 1e-9)])
@@ -147,7 +147,7 @@ def test_older_sidecars_and_extracted_tables_are_read(tmp_path, key, unit):
     file, found = import_recording(folder, tmp_path / "out")
     sequence = Sequence.open(file)
     assert np.abs(sequence.frame(4).measured["PSM1"][:6] - joints_at(4 / RATE)).max() < 2e-3
-    assert any("9.1 mm wrist" in note.text for note in found.notes)
+    assert any("9.1 mm wrist" in str(note) for note in found.notes)
 
 
 def changed(change: Callable[[dict[str, Any]], object], name: str = "stereo.json") -> Callable[[Path], object]:
@@ -166,16 +166,16 @@ MUTATIONS: dict[str, tuple[Callable[[Path], object], str]] = {
     "no videos": (changed(lambda c: c.update(videos=[]), "index.json"), "no videos with sidecars"),
     "video is missing": (remove("stereo.mp4"), r"stereo\.mp4 is missing"),
     "video is cut": (cut("stereo.mp4", 200), r"stereo\.mp4"),
-    "sidecar is missing": (remove("stereo.json"), "has no stereo.json"),
+    "sidecar is missing": (remove("stereo.json"), "stereo.json with the frame times of stereo.mp4 is missing"),
     "sidecar is cut": (write("stereo.json", '{"frames": [{'), "stereo.json is not readable"),
-    "sidecar is a list": (write("stereo.json", "[1]"), "no named values"),
+    "sidecar is a list": (write("stereo.json", "[1]"), "not a JSON object"),
     "no frames": (changed(lambda c: c.update(frames=[])), 'neither "frames" nor'),
-    "frames without numbers": (changed(lambda c: c["frames"][1].pop("frame_index")), "lacks 'frame_index'"),
-    "frames without times": (changed(lambda c: c["frames"][1].pop("cpu")), "lacks 'cpu'"),
-    "empty times": (changed(lambda c: c["frames"][1]["cpu"].update(realtime={})), "lacks 'any time"),
+    "frames without numbers": (changed(lambda c: c["frames"][1].pop("frame_index")), "has no 'frame_index'"),
+    "frames without times": (changed(lambda c: c["frames"][1].pop("cpu")), "has no 'cpu'"),
+    "empty times": (changed(lambda c: c["frames"][1]["cpu"].update(realtime={})), "has no 'any time"),
     "unknown layout": (changed(lambda c: c.update(side_by_side="TB")), "side_by_side is 'TB'"),
-    "another video": (changed(lambda c: [f.update(frame_index=900) for f in c["frames"]]), "is of another video"),
-    "texts as times": (changed(lambda c: c.update(timestamps_ns=["a"])), "its times are no numbers"),
+    "another video": (changed(lambda c: [f.update(frame_index=900) for f in c["frames"]]), "belongs to another video"),
+    "texts as times": (changed(lambda c: c.update(timestamps_ns=["a"])), "times are not numbers"),
     "no bag": (lambda p: shutil.rmtree(p / "rosbag_session"), "has no kinematics: neither a bag"),
     "cut bag": (
         lambda p: [f.write_bytes(f.read_bytes()[:3000]) for f in (p / "rosbag_session").glob("*.mcap")],

@@ -124,19 +124,19 @@ def info_changed(change: Callable[[dict], object]) -> Callable[[Path], object]:
 FIRST = "data/chunk-000/episode_000000.parquet"
 VIDEO = "videos/chunk-000/observation.images.endoscope.left/episode_000000.mp4"
 MUTATIONS: dict[str, tuple[Callable[[Path], object], str]] = {
-    "info is cut": (write("meta/info.json", "{"), "no LeRobot description"),
-    "info without rate": (info_changed(lambda c: c.pop("fps")), "no LeRobot description"),
-    "info without features": (info_changed(lambda c: c.pop("features")), "no LeRobot description"),
+    "info is cut": (write("meta/info.json", "{"), "not a LeRobot description"),
+    "info without rate": (info_changed(lambda c: c.pop("fps")), "not a LeRobot description"),
+    "info without features": (info_changed(lambda c: c.pop("features")), "not a LeRobot description"),
     "no state": (info_changed(lambda c: c["features"].pop("observation.state")), "has no feature observation.state"),
     "names are too few": (info_changed(lambda c: c["features"]["observation.state"].update(names=["x"])), "1 names"),
     "no names": (info_changed(lambda c: c["features"]["observation.state"].update(names=None)), "0 names"),
     "unknown names": (
         info_changed(lambda c: c["features"]["observation.state"].update(names=[f"motor{c}" for c in "abcdefgh"])),
-        "not recognized",
+        "neither six joints of a PSM",
     ),
     "no episode": (remove(FIRST), "has no episode 0"),
     "cut table": (cut(FIRST, 100), "cannot be read"),
-    "pointer instead of a table": (write(FIRST, "version https://git-lfs"), "Git LFS pointers"),
+    "pointer instead of a table": (write(FIRST, "version https://git-lfs"), "Git LFS pointer"),
     "no rows": (lambda p: write_parquet(p / FIRST, {"observation.state": pyarrow.array([], "float32")}), "no rows"),
     "missing column": (lambda p: write_parquet(p / FIRST, {"state": [1.0]}), "has no feature observation.state"),
     "ragged rows": (lambda p: write_parquet(p / FIRST, {"observation.state": [[1.0], [1.0, 2.0]]}), "differ in length"),
@@ -148,11 +148,11 @@ MUTATIONS: dict[str, tuple[Callable[[Path], object], str]] = {
     "cut video": (cut(VIDEO, 300), r"episode_000000\.mp4"),
     "poses elsewhere": (
         lambda p: write_parquet(p / FIRST, {"observation.state": [[1.0, 2, 3, 0, 0, 0, 1, 0]] * 4}),
-        "the unit of the tip.s position is not clear",
+        "the unit of the tip.s position is ambiguous",
     ),
     "no orientation": (
         lambda p: write_parquet(p / FIRST, {"observation.state": [[0.0] * 8] * 4}),
-        "no joint positions reach 4 of 4 poses .the pose is not finite",
+        "4 of 4 poses are unreachable .the pose is not finite",
     ),
 }
 

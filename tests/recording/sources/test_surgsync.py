@@ -103,7 +103,7 @@ def test_clips_and_episodes_bring_joints_jaw_calibration_and_hand_eye(tmp_path, 
     assert left.intrinsics == pytest.approx((110, 110, 48, 36)) and left.distortion[0] == -0.1
     assert np.allclose(right.T_camera_world[:3, 3], [-0.005, 0, 0])
     assert np.allclose(sequence.scene.arms[0].T_world_base, T_CAMERA_BASE)
-    assert any("agree with a 9.1 mm wrist" in note.text for note in found.notes)
+    assert any("agree with a 9.1 mm wrist" in str(note) for note in found.notes)
     assert not [note for note in found.notes if note.kind == "missing"]
 
 
@@ -130,14 +130,14 @@ MUTATIONS: dict[str, tuple[Callable[[Path], Path], Callable[[Path], object], str
     "broken extrinsics": (episode, write("calibration/stereo_calib_params.json", "{"), "JSON"),
     "broken calibration": (episode, write("calibration/left.yaml", "a: ["), "cannot be used"),
     "cut JSON": (clip, write("kinematic/PSM1/2.json", "[{"), "2.json is not readable JSON"),
-    "empty list": (clip, write("kinematic/PSM1/2.json", "[]"), "no kinematics of one frame"),
-    "other names": (clip, write("kinematic/PSM1/2.json", '[{"a": 1}]'), "no kinematics of one"),
+    "empty list": (clip, write("kinematic/PSM1/2.json", "[]"), "not the kinematics of a frame"),
+    "other names": (clip, write("kinematic/PSM1/2.json", '[{"a": 1}]'), "not the kinematics of a frame"),
     "texts": (
         clip,
         write(
             "kinematic/PSM1/2.json", json.dumps([{"arm": {"measured_data": {"measured_js": {"position": ["a"] * 6}}}}])
         ),
-        "no kinematics of one frame",
+        "not the kinematics of a frame",
     ),
     "no files": (clip, lambda p: [f.unlink() for f in (p / "kinematic/PSM1").iterdir()], "has no kinematics of PSM1"),
     "cut image": (clip, write("image/left/0.png", b""), "damaged"),
