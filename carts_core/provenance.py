@@ -7,7 +7,7 @@ computation, and a changed input invalidates them. Truncated or altered lines ar
 import hashlib
 import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import fields, is_dataclass
+from dataclasses import dataclass, fields, is_dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar
@@ -15,8 +15,10 @@ from typing import Any, TypeVar
 import numpy as np
 import torch
 
-from .errors import OutputError
+from .errors import OutputError, SettingsError
 from .files import OutputPath, append_line, holds_file, remove_file, write_text
+from .files.paths import as_output
+from .files.reading import TABLE, parse_json, read_bytes, typed
 from .model.camera import Camera
 from .model.robot import Robot
 from .model.scene import Scene
@@ -168,3 +170,44 @@ def _encoded(value: Any) -> Any:
     if isinstance(value, list):
         return [_encoded(part) for part in value]
     return value
+
+
+RESULTS_FORMAT = "carts-results/1"
+
+
+@dataclass(frozen=True)
+class Record:
+    """Provenance of a frame's result."""
+
+    origin: Mapping[str, str]
+    """Kind of input -> its fingerprint."""
+    masks: Mapping[str, str]
+    """Camera -> fingerprint of its mask file."""
+    row: str
+    """Fingerprint of the row in the table."""
+    threads: int
+    """Number of torch threads; results do not depend on it."""
+    verdict: str = ""
+    """`good`, `doubtful` or `failed`; empty without an assessment."""
+    reason: str = ""
+    """Reason for the verdict, one sentence."""
+    probability: float | None = None
+    """Probability that the mask is wrong [1]."""
+    not_determined: Sequence[str] | None = None
+    """`ARM.JOINT` of each joint not determined by the images; None without standard deviations."""
+
+
+def read_records(path: OutputPath | Path) -> dict[str, Record]:
+    """Read records by frame; empty if the file is missing or damaged. `SettingsError` if a newer version wrote it."""
+    if not holds_file(path):
+        return {}
+    try:
+        content = parse_json(read_bytes(as_output(path).path, TABLE), finite=False)
+        if content["format"] != RESULTS_FORMAT:
+            raise SettingsError(
+                f"{path} has the format {content['format']!r}; this version knows {RESULTS_FORMAT}. Use the version "
+                "that wrote it, or name another folder with --output."
+            )
+        return typed(content["frames"], dict[str, Record])
+    except (OSError, ValueError, TypeError, KeyError):
+        return {}

@@ -10,7 +10,7 @@ from collections.abc import Sequence as Rows
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import cv2
 import msgspec
@@ -21,6 +21,7 @@ from ..export import KinematicsRow, outlined, read_kinematics_csv
 from ..export.kinematics import joint_columns, joint_units, position_values, std_values
 from ..files import BusyError, OutputPath, check_name, holds_file, locked_folder, set_aside, write_bytes, write_text
 from ..files.reading import IMAGE, VALUES, parse_json, read_bytes, typed
+from ..provenance import read_records
 from ..recording import Sequence
 from .manifest import Job
 
@@ -201,11 +202,11 @@ def write_findings(job: Job, folder: OutputPath, sequence_file: Path) -> None:
         rows = read_kinematics_csv(table, scene)
         _add_corrections(found, sequence, rows)
         cameras = table.parent.name
-        records = _records(table.parent / "results.json")
+        records = read_records(table.parent / "results.json")
         frames = [
-            FrameFinding(cameras, row.frame_id, record["verdict"], record["reason"], record["probability"])
+            FrameFinding(cameras, row.frame_id, record.verdict, record.reason, record.probability or 0.0)
             for row in rows
-            if (record := records.get(row.frame_id)) and record.get("verdict")
+            if (record := records.get(row.frame_id)) and record.verdict
         ]
         found.frames.extend(_pictured(folder, sequence, table.parent, frames))
     write_text(folder / FINDINGS_FILE, json.dumps(asdict(found)))
@@ -229,13 +230,6 @@ def _add_corrections(found: Findings, sequence: Sequence, rows: list[KinematicsR
             found.corrections.setdefault(name, []).append(round(float(moved * unit), 6))
             if np.isfinite(std):
                 found.deviations.setdefault(name, []).append(round(float(std * unit), 6))
-
-
-def _records(path: Path) -> Mapping[str, Mapping[str, Any]]:
-    try:
-        return parse_json(read_bytes(path, VALUES))["frames"]
-    except (OSError, ValueError, KeyError, TypeError):
-        return {}
 
 
 def _pictured(folder: OutputPath, sequence: Sequence, part: Path, frames: list[FrameFinding]) -> Iterator[FrameFinding]:

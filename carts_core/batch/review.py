@@ -1,6 +1,6 @@
 """Project for the review of a job: its recording with the results as corrections."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -9,9 +9,9 @@ import numpy as np
 from ..errors import CartsError
 from ..export import KinematicsRow, read_kinematics_csv
 from ..files import OutputPath, holds_file
-from ..files.reading import TABLE, VALUES, parse_json, read_bytes
+from ..files.reading import TABLE, read_bytes
 from ..project import FitVerdict, JointCorrection, Key, Project, Provenance
-from ..provenance import fingerprint
+from ..provenance import Record, fingerprint, read_records
 from ..recording import Sequence
 from .folder import kinematics_tables
 from .manifest import Job
@@ -52,25 +52,22 @@ def _edits(sequence: Sequence, table: Path) -> Iterator[tuple[Key[Any], Any]]:
     """Edits with the corrected joints and the verdict of each frame of a table."""
     order = {frame_id: index for index, frame_id in enumerate(sequence.frame_ids)}
     try:
-        records: Mapping[str, Any] = parse_json(read_bytes(table.parent / "results.json", VALUES))["frames"]
+        records = read_records(table.parent / "results.json")
         for row in read_kinematics_csv(table, sequence.scene):
             if row.source != "measured":
                 yield from _of_frame(sequence, order[row.frame_id], row, records[row.frame_id])
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+    except (OSError, ValueError, KeyError) as error:
         raise CartsError(
             f"{table.parent} holds no results that can be read: {error!r}. Run the batch again."
         ) from error
 
 
-def _of_frame(
-    sequence: Sequence, index: int, row: KinematicsRow, record: Mapping[str, Any]
-) -> Iterator[tuple[Key[Any], Any]]:
-    origin = {str(name): str(value) for name, value in record["origin"].items()}
-    made_by = Provenance.made_by_optimizer({"batch": origin}, origin["weights"])
+def _of_frame(sequence: Sequence, index: int, row: KinematicsRow, record: Record) -> Iterator[tuple[Key[Any], Any]]:
+    made_by = Provenance.made_by_optimizer({"batch": dict(record.origin)}, record.origin["weights"])
     for arm in sequence.scene.arms:
         positions = tuple(map(float, row.joint_positions[arm.name]))
         std = None if row.joint_std is None else np.asarray(row.joint_std.get(arm.name, np.nan), float)
         known = None if std is None or not np.isfinite(std).any() else tuple(std.tolist())
         yield Key.joints(index, arm.name), JointCorrection(positions, made_by, known)
-    if record.get("verdict"):
-        yield Key.verdict(index), FitVerdict(record["verdict"], record["reason"], "", float(record["probability"] or 0))
+    if record.verdict:
+        yield Key.verdict(index), FitVerdict(record.verdict, record.reason, "", record.probability or 0.0)

@@ -8,10 +8,11 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from ..console import Bar, Terminal
-from ..errors import CartsError, SettingsError
+from ..errors import CartsError
+from ..settings.ranges import Count, Range
 from ..stopping import when_stopped
 from ..wording import counted
-from .options import output_folder
+from .options import RangedOptions, output_folder
 
 if TYPE_CHECKING:
     from ..batch.manifest import Job
@@ -23,16 +24,16 @@ _NAMED = 5
 
 
 @dataclass(frozen=True)
-class Batch:
+class Batch(RangedOptions):
     """Import, calibrate, optimize, evaluate and export many recordings in parallel; rerun it to resume."""
 
     manifest: Annotated[Path, tyro.conf.Positional]
     """Manifest of recordings, cameras, domains and steps (docs: batch)."""
     output: Path | None = None
     """Folder to write to; by default `runs/batch/NAME`, after the manifest. Each job has its own folder in `jobs`."""
-    workers: int = 0
+    workers: Annotated[int, Range(0)] = 0
     """Parallel jobs; by default the number of cores."""
-    threads: int = 1
+    threads: Count = 1
     """Threads of each job. One is most efficient with more jobs than cores."""
     shard: str = "1/1"
     """Run every N-th job, starting with the I-th, as `I/N`. Shards may run on all machines that share the folder."""
@@ -44,12 +45,6 @@ class Batch:
     """Repeat finished steps; each recomputes results whose inputs have changed."""
     report_only: bool = False
     """Write the report on finished jobs without running jobs."""
-
-    def __post_init__(self) -> None:
-        if self.workers < 0:
-            raise SettingsError(f"--workers is {self.workers}; allowed is 0 (as many as there are cores) or more.")
-        if self.threads < 1:
-            raise SettingsError(f"--threads is {self.threads}; allowed is 1 or more.")
 
     def run(self) -> None:
         """Run the jobs of the shard, and write the report on all jobs; `CartsError` if a job failed."""

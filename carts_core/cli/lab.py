@@ -8,13 +8,14 @@ import tyro
 from rich.progress import TimeRemainingColumn
 
 from ..console import Bar, Terminal
-from ..errors import CartsError, SettingsError
+from ..errors import CartsError
 from ..files import output_path
 from ..settings import SynthesisConfig, TrainingConfig
+from ..settings.ranges import Count
 from ..settings.training import BaselineNetwork, BaselineTraining
 from ..stopping import when_stopped
 from ..wording import counted
-from .options import Network, check_device, output_folder
+from .options import Network, RangedOptions, check_device, output_folder
 
 if TYPE_CHECKING:
     from ..lab.baselines.networks import TrainedBaseline
@@ -46,7 +47,7 @@ class Synthesize:
 
 
 @dataclass(frozen=True)
-class Train:
+class Train(RangedOptions):
     """Train a network on synthetic images; rerun it to resume after an interruption."""
 
     output: Annotated[Path, tyro.conf.Positional] = Path("runs/train")
@@ -56,15 +57,11 @@ class Train:
     stops when validation no longer improves, after 400 steps (`--steps`), or after `--minutes` of CPU time. The weights
     are kept if no fit gets worse.
     """
-    fits: int = 8
+    fits: Count = 8
     """With `--for`: number of synthetic images on which fits are compared; half as many frames of the recording are
     added.
     """
     training: Annotated[TrainingConfig, tyro.conf.arg(name="")] = field(default_factory=TrainingConfig)
-
-    def __post_init__(self) -> None:
-        if self.fits < 1:
-            raise SettingsError(f"--fits is {self.fits}; allowed is 1 or more.")
 
     def run(self) -> None:
         """Train to the end."""

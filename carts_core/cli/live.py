@@ -9,16 +9,16 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from ..console import Terminal
-from ..errors import SettingsError
 from ..settings.live import StreamAddress
-from .options import FreeInFrames, Network, Selection, SequencePath, check_writable
+from ..settings.ranges import Count, Range
+from .options import FreeInFrames, Network, RangedOptions, Selection, SequencePath, check_writable
 
 if TYPE_CHECKING:
     from ..live import Tracked
 
 
 @dataclass(frozen=True)
-class Live:
+class Live(RangedOptions):
     """Track the arms in a stream of images and joints; late frames are dropped. Ctrl-C ends it."""
 
     sequence: SequencePath
@@ -28,9 +28,9 @@ class Live:
     on 127.0.0.1 (docs/reference/live.md)."""
     joints_port: int | None = None
     """With `camera` and `video`: port on 127.0.0.1 for joints and results."""
-    rate: float | None = None
+    rate: Annotated[float | None, Range(0, 1000, above=True)] = None
     """Replay: frame rate [1/s]; by default that of the recording."""
-    loops: int = 1
+    loops: Count = 1
     """Replay: number of repetitions."""
     output: Path | None = None
     """File for results, one JSON object per line; by default the standard output. With a socket, results are also sent
@@ -51,10 +51,7 @@ class Live:
 
     def __post_init__(self) -> None:
         StreamAddress.parse(self.source, self.joints_port)
-        if self.rate is not None and not 0 < self.rate <= 1000:
-            raise SettingsError(f"--rate is {self.rate:g}; allowed is above 0, at most 1000.")
-        if self.loops < 1:
-            raise SettingsError(f"--loops is {self.loops}; allowed is 1 or more.")
+        super().__post_init__()
         if self.output is not None:
             check_writable(self.output.parent)
 

@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 
 from ..console import Bar, Terminal, track
-from ..evaluation import Starts, camera_groups, start_positions
+from ..evaluation import Setup, camera_groups
 from ..export import KinematicsRow, read_kinematics_csv
 from ..files import remove_file
-from ..optimization import Backgrounds, FrameOptimizer, Origin, SequenceOptimizer, StopReason, sequence_checkpoint
+from ..optimization import Origin, SequenceOptimizer, StopReason, sequence_checkpoint
 from ..optimization.variables import Variables
 from ..provenance import fingerprint
 from ..recording import Sequence
@@ -39,14 +39,13 @@ from .results_folder import FrameFolder, FrameInputs, FrameResult, InputHashes
 class _Part:
     """Frames of one domain, seen by cameras that are optimized together."""
 
-    domain: str
-    cameras: tuple[str, ...]
+    setup: Setup
     output: FrameFolder
 
     @property
     def name(self) -> str:
         """Name displayed in the terminal."""
-        return f"{self.domain}, {', '.join(self.cameras)}"
+        return f"{self.setup.domain}, {', '.join(self.setup.cameras)}"
 
 
 class Optimizing:
@@ -83,12 +82,15 @@ class Optimizing:
         # Raises for unknown names of free or locked parameters.
         Variables(scene, start, self._free, self._solver.length_scale)
         folder = output_folder(asked.output, sequence.name) / domain / "+".join(cameras)
-        return _Part(domain, cameras, FrameFolder(sequence, cameras, folder, self._settings(), asked.overwrite))
+        model = asked.solving.sequence if asked.mode == "sequence" else None
+        observer, offset = self._observer, asked.start
+        what = observer.predictor, self._solver, self._free, model, offset.perturb_deg, offset.seed, observer.ignore
+        setup = Setup(sequence, domain, cameras, *what)
+        return _Part(setup, FrameFolder(sequence, cameras, folder, self._settings(), asked.overwrite))
 
     def _run(self, part: _Part) -> None:
-        frames, output, together = self._frames, part.output, self._asked.mode == "sequence"
-        sequence, scene = self._sequence, self._sequence.scene.with_cameras(part.cameras)
-        origins = self._origins(part)
+        frames, output, setup, together = self._frames, part.output, part.setup, part.setup.model is not None
+        origins = FrameInputs(setup, self._observer, json.dumps(self._settings()))
         common = origins.common
         if together:
             of_all = origins.of_all(frames)
@@ -98,8 +100,8 @@ class Optimizing:
         todo = self._to_do(part, now)
         self._report_others(part, common)
         if todo and isinstance(self._solver, SurfaceSolver):
-            known = Backgrounds.of(sequence, part.cameras, part.domain).covers(scene)
-            warned = self._observer.warnings(sequence, todo[0], part.domain, part.cameras, background=known)
+            known = setup.backgrounds.covers(self._sequence.scene.with_cameras(setup.cameras))
+            warned = self._observer.warnings(self._sequence, todo[0], setup.domain, setup.cameras, background=known)
             print_hints(self._console, *warned)
         if not together:
             self._solve_frames(todo, part, now)
@@ -110,7 +112,7 @@ class Optimizing:
             # Left behind if the process was killed after the last result.
             remove_file(output.checkpoint)
         if todo:
-            print_hints(self._console, constant_correction_hint(part.name, sequence, output.rows))
+            print_hints(self._console, constant_correction_hint(part.name, self._sequence, output.rows))
             self._console.print(
                 f"wrote masks and kinematics.csv of {counted(len(output.rows), 'frame')} to {output.folder}"
             )
@@ -140,20 +142,6 @@ class Optimizing:
             note = f"{counted(count, 'frame')} not chosen now would have to be redone: {reason}"
             self._console.print(f"{output.folder}: {note}")
 
-    def _origins(self, part: _Part) -> FrameInputs:
-        asked, sequence = self._asked, self._sequence
-        seed = (asked.start.seed,) if asked.mode == "sequence" else asked.start.seed
-
-        def start(index: int) -> dict[str, np.ndarray]:
-            frame = sequence.frame(index, part.domain, cameras=())
-            return start_positions(sequence, frame, asked.start.perturb_deg, seed)
-
-        backgrounds = Backgrounds.of(
-            sequence, part.cameras, part.domain, required=self._solver.needs_background and asked.mode == "frame"
-        )
-        settings = json.dumps(self._settings())
-        return FrameInputs(sequence, part.cameras, part.domain, self._observer, start, backgrounds.images, settings)
-
     def _kept(self, part: _Part) -> str:
         """Message on the results kept by a stopped run."""
         there = f"{part.output.folder} holds {counted(len(part.output.rows), 'frame')}"
@@ -163,27 +151,12 @@ class Optimizing:
         return f"{there}; the same command goes on from there"
 
     def _solve_frames(self, todo: list[int], part: _Part, origins: Mapping[int, InputHashes]) -> None:
-        asked, sequence, domain, cameras = self._asked, self._sequence, part.domain, part.cameras
         if not todo:
             return
-        backgrounds = Backgrounds.of(sequence, cameras, domain, required=self._solver.needs_background)
         stopped, gains, assessed = [], [], {}
         for index in track(todo, part.name, console=self._console):
-            frame = sequence.frame(index, domain, cameras)
-            optimizer = FrameOptimizer(
-                sequence.scene,
-                frame,
-                backgrounds,
-                self._observer.predictor,
-                ignore=self._observer.ignore(index),
-                start=start_positions(sequence, frame, asked.start.perturb_deg, asked.start.seed),
-                settings=self._solver,
-                free=self._free,
-                cameras=cameras,
-                live=False,
-            )
-            for _ in optimizer:
-                pass
+            frame = part.setup.frame(index)
+            optimizer = part.setup.solved(frame)
             best = optimizer.best
             assert best is not None and optimizer.stop_reason is not None
             found = assessed[frame.frame_id] = optimizer.assessment
@@ -198,33 +171,17 @@ class Optimizing:
             self._console,
             kept_start_hint(part.name, stopped),
             base_frame_hint(part.name, gains),
-            *(() if self._observer.masked else backgrounds.problems),
+            *(() if self._observer.masked else part.setup.backgrounds.problems),
             *verdict_hints(part.name, assessed),
         )
 
     def _solve_sequence(self, part: _Part, origins: Mapping[int, InputHashes], common: InputHashes) -> None:
-        asked, sequence, frames, cameras = self._asked, self._sequence, self._frames, part.cameras
-        backgrounds = Backgrounds.of(sequence, cameras, part.domain)
-        starts = Starts(sequence, part.domain, cameras, asked.start.perturb_deg, asked.start.seed)
         made_with = fingerprint(json.dumps(self._settings()), json.dumps(dict(common)))
         checkpoint = sequence_checkpoint(part.output.checkpoint, made_with)
-        optimizer = SequenceOptimizer(
-            sequence.scene,
-            starts.frame,
-            starts.times(frames),
-            self._observer.predictor,
-            settings=self._solver,
-            model=asked.solving.sequence,
-            free=self._free,
-            keyframes=self._keyframes,
-            ignore=self._observer.ignore,
-            backgrounds=backgrounds,
-            cameras=cameras,
-            checkpoint=checkpoint,
-        )
+        optimizer = part.setup.sequence_optimizer(self._frames, keyframes=self._keyframes, checkpoint=checkpoint)
         self._running = optimizer
         with Bar(console=self._console) as bar:
-            task = bar.add_task(part.name, total=len(frames))
+            task = bar.add_task(part.name, total=len(self._frames))
             for _ in optimizer:
                 bar.update(task, completed=optimizer.progress[0])
         self._running = None

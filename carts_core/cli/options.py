@@ -20,6 +20,7 @@ from ..files.reading import SETTINGS, parse_toml, read_text
 from ..settings import CALIBRATION_SETTINGS, FreeParameters, SequenceSettings, SolverName, SolverSettings, SurfaceSolver
 from ..settings import solver as named_solver
 from ..settings.optimization import Inference
+from ..settings.ranges import Range, Ranged
 from ..settings.serialization import changed, to_plain
 from ..wording import closest, counted, shown
 
@@ -194,24 +195,25 @@ class FromProject:
         return corrected_sequence(sequence, project)
 
 
+class RangedOptions(Ranged):
+    """Base of options with ranges, which messages name as on the command line."""
+
+    @classmethod
+    def label(cls, field: str) -> str:
+        """Name of an option."""
+        return f"--{field.replace('_', '-')}"
+
+
 @dataclass(frozen=True)
-class Perturbation:
+class Perturbation(RangedOptions):
     """Offset of the initial joint positions, for experiments."""
 
-    perturb_deg: float = 0.0
+    perturb_deg: Annotated[float, Range(0, 180)] = 0.0
     """Offset of every initial joint position [deg, mm]: from the true joint positions where the sequence has them, else
     from the measured ones. 0 starts at the measured positions.
     """
-    seed: int = 0
+    seed: Annotated[int, Range(0)] = 0
     """Random seed of the offset's signs, which are equal in all frames in sequence mode."""
-
-    def __post_init__(self) -> None:
-        if not 0 <= self.perturb_deg <= 180:
-            raise SettingsError(
-                f"--perturb-deg is {self.perturb_deg:g}; allowed is 0 to 180. Give a size; signs are drawn from --seed."
-            )
-        if self.seed < 0:
-            raise SettingsError(f"--seed is {self.seed}; allowed is 0 or more.")
 
 
 _ENGINES: dict[str, Inference] = {"cpu:torch": "torch", "cpu:onnx": "onnx"}

@@ -2,7 +2,7 @@
 
 import json
 from bisect import bisect_left
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from collections.abc import Sequence as Several
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
@@ -13,13 +13,21 @@ import numpy as np
 import torch
 
 from ..errors import SettingsError
+from ..evaluation import Setup
 from ..export import KinematicsRow, kinematics_csv, mask_png, read_kinematics_csv
 from ..export.kinematics import position_values, std_values
 from ..files import OutputPath, holds_file, locked_folder, remove_file, write_bytes, write_text
-from ..files.reading import TABLE, parse_json, read_bytes, typed
 from ..model.scene import Scene, SceneState
 from ..optimization import Assessment
-from ..provenance import calibration_fingerprint, code_fingerprint, fingerprint, robot_fingerprint
+from ..provenance import (
+    RESULTS_FORMAT,
+    Record,
+    calibration_fingerprint,
+    code_fingerprint,
+    fingerprint,
+    read_records,
+    robot_fingerprint,
+)
 from ..recording import Sequence
 from ..rendering import Renderer
 from ..stopping import finished_first
@@ -57,26 +65,16 @@ _CODE = (
 
 
 class FrameInputs:
-    """Fingerprints of the inputs of frames, for given cameras and a domain. No image is decoded.
+    """Fingerprints of the inputs of frames. No image is decoded, except for backgrounds.
 
     Args:
-        start: frame index -> arm -> initial joint positions of the optimization [dofs] [rad, m].
-        backgrounds: camera name -> mean background, if the camera has one.
+        settings: settings of the run as text.
     """
 
-    def __init__(
-        self,
-        sequence: Sequence,
-        cameras: tuple[str, ...],
-        domain: str | None,
-        observer: Observer,
-        start: Callable[[int], Mapping[str, np.ndarray]],
-        backgrounds: Mapping[str, np.ndarray],
-        settings: str,
-    ) -> None:
-        self._sequence, self._cameras, self._domain = sequence, sorted(cameras), domain
-        self._start, self._observer = start, observer
-        recorded = [sequence.recorded_camera(name) for name in cameras]
+    def __init__(self, setup: Setup, observer: Observer, settings: str) -> None:
+        self._setup, self._observer, self._cameras = setup, observer, sorted(setup.cameras)
+        sequence, backgrounds = setup.sequence, setup.backgrounds.images
+        recorded = [sequence.recorded_camera(name) for name in setup.cameras]
         self._common = {
             "code": code_fingerprint(_CODE),
             "weights": fingerprint(observer.weights, str(observer.predictor.device)),
@@ -93,20 +91,22 @@ class FrameInputs:
 
     def of(self, index: int) -> InputHashes:
         """Fingerprints of a frame corrected alone; `SequenceError` if an image is missing."""
-        sequence, start = self._sequence, self._start(index)
+        sequence, domain = self._setup.sequence, self._setup.domain
+        start = self._setup.frame(index, cameras=()).measured
         joints = [(name, start[name], sequence.measured[name][index]) for name in sorted(start)]
         joints += sorted(sequence.mounts(index).items())
-        images = [(name, sequence.image_fingerprint(index, name, self._domain)) for name in self._cameras]
+        images = [(name, sequence.image_fingerprint(index, name, domain)) for name in self._cameras]
         origin = {**self._common, "joints": fingerprint(joints), "images": fingerprint(images)}
         if self._observer.masked:
-            masks = self._observer.mask_inputs(sequence, index, self._cameras, self._domain)
+            masks = self._observer.mask_inputs(sequence, index, self._cameras, domain)
             origin["masks"] = fingerprint(masks)
         return origin
 
     def of_all(self, indices: Several[int]) -> InputHashes:
         """Fingerprints of frames that are corrected jointly: each depends on the inputs of all."""
         each = [self.of(index) for index in indices]
-        stamps = self._sequence.timestamps
+        sequence = self._setup.sequence
+        stamps = sequence.timestamps
         times = [None if stamps is None else float(stamps[index]) for index in indices]
         masks = {"masks": fingerprint(*(origin["masks"] for origin in each))} if self._observer.masked else {}
         return {
@@ -114,7 +114,7 @@ class FrameInputs:
             **masks,
             "joints": fingerprint(*(origin["joints"] for origin in each)),
             "images": fingerprint(*(origin["images"] for origin in each)),
-            "together": fingerprint(indices, [self._sequence.frame_ids[index] for index in indices], repr(times)),
+            "together": fingerprint(indices, [sequence.frame_ids[index] for index in indices], repr(times)),
         }
 
 
@@ -133,52 +133,11 @@ def changes(before: InputHashes, now: InputHashes) -> str | None:
     return " and ".join(_CHANGED[kind] for kind in different) or None
 
 
-_FORMAT = "carts-results/1"
-
-
-@dataclass(frozen=True)
-class Record:
-    """Provenance of a frame's result."""
-
-    origin: Mapping[str, str]
-    """Kind of input -> its fingerprint."""
-    masks: Mapping[str, str]
-    """Camera -> fingerprint of its mask file."""
-    row: str
-    """Fingerprint of the row in the table."""
-    threads: int
-    """Number of torch threads; results do not depend on it."""
-    verdict: str = ""
-    """`good`, `doubtful` or `failed`; empty without an assessment."""
-    reason: str = ""
-    """Reason for the verdict, one sentence."""
-    probability: float | None = None
-    """Probability that the mask is wrong [1]."""
-    not_determined: Several[str] | None = None
-    """`ARM.JOINT` of each joint not determined by the images; None without standard deviations."""
-
-
 def row_fingerprint(scene: Scene, row: KinematicsRow) -> str:
     """Fingerprint of a table row, with the digits written to the file."""
     values = np.concatenate([position_values(scene, row), std_values(scene, row)])
     verdict = [row.verdict] if row.verdict else []
     return fingerprint(row.frame_id, row.source, [f"{value:.9g}" for value in values], *verdict)
-
-
-def read_records(path: OutputPath) -> dict[str, Record]:
-    """Read records by frame; empty if the file is missing or damaged. `SettingsError` if a newer version wrote it."""
-    if not holds_file(path):
-        return {}
-    try:
-        content = parse_json(read_bytes(path.path, TABLE), finite=False)
-        if content["format"] != _FORMAT:
-            raise SettingsError(
-                f"{path} has the format {content['format']!r}; this version knows {_FORMAT}. Use the version that "
-                "wrote it, or name another folder with --output."
-            )
-        return typed(content["frames"], dict[str, Record])
-    except (OSError, ValueError, TypeError, KeyError):
-        return {}
 
 
 @dataclass(frozen=True)
@@ -306,7 +265,7 @@ class FrameFolder:
             known = {row.frame_id: self._records[row.frame_id] for row in self.rows if row.frame_id in self._records}
             # One line per frame.
             lines = [f"{json.dumps(frame_id)}: {json.dumps(asdict(record))}" for frame_id, record in known.items()]
-            content = f'{{"format": "{_FORMAT}", "frames": {{\n' + ",\n".join(lines) + "\n}}\n"
+            content = f'{{"format": "{RESULTS_FORMAT}", "frames": {{\n' + ",\n".join(lines) + "\n}}\n"
             write_text(self._records_file, content)
 
     def _written_before(self) -> list[str]:

@@ -7,7 +7,7 @@ from .calibration import mean_dice as mean_dice
 from .calibration import remark as remark
 from .calibration import write_calibration as write_calibration
 from .evaluate import FrameScore as FrameScore
-from .evaluate import Starts as Starts
+from .evaluate import Setup as Setup
 from .evaluate import camera_groups as camera_groups
 from .evaluate import dice as dice
 from .evaluate import evaluate as evaluate

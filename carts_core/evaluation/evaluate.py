@@ -26,6 +26,7 @@ from ..optimization import (
     SurfacePredictor,
     undetermined_joints,
 )
+from ..optimization.measurement import Ignore
 from ..recording import Frame, Sequence
 from ..rendering import Renderer
 
@@ -193,65 +194,32 @@ def evaluate(
             cameras without masks in the sequence.
     """
 
-    def filled(frame: Frame) -> Frame:
-        return frame if given is None else given.filled(frame)
-
-    def alone(scene: Scene, domain: str, group: tuple[str, ...]) -> Iterator[tuple[Frame, Joints, Estimate]]:
-        backgrounds = Backgrounds.of(sequence, group, domain, required=settings.needs_background)
-        for index in frames:
-            frame = filled(sequence.frame(index, domain, list(group)))
-            start = start_positions(sequence, frame, perturb_deg, seed)
-            ignore = None if given is None else given.ignored(index)
-            began = time.perf_counter()
-            optimizer = FrameOptimizer(
-                scene,
-                frame,
-                backgrounds,
-                networks,
-                ignore=ignore,
-                start=start,
-                settings=settings,
-                free=free,
-                live=False,
-            )
-            for _ in optimizer:
-                pass
-            yield frame, start, Estimate.best(optimizer, time.perf_counter() - began)
-
-    def in_sequence(
-        scene: Scene, domain: str, group: tuple[str, ...], model: SequenceSettings
-    ) -> Iterator[tuple[Frame, Joints, Estimate]]:
-        starts = Starts(sequence, domain, group, perturb_deg, seed)
-        optimizer = SequenceOptimizer(
-            scene,
-            starts.frame,
-            starts.times(frames),
-            networks,
-            settings=settings,
-            model=model,
-            free=free,
-            ignore=None if given is None else given.ignored,
-            backgrounds=Backgrounds.of(sequence, group, domain),
-        )
-        for _ in optimizer:
-            pass
-        for index, found in sorted(optimizer.estimates.items()):
-            frame, joints = filled(starts.frame(index)), (found.joint_positions, found.joint_std)
-            spent = found.iterations, found.seconds
-            yield (
-                frame,
-                frame.measured,
-                Estimate(found.state, *joints, *spent, found.start, assessment=found.assessment),
-            )
-
     for domain, group in product(domains, camera_groups(cameras, together)):
+        ignore = (lambda _: {}) if given is None else given.ignored
+        setup = Setup(sequence, domain, group, networks, settings, free, model, perturb_deg, seed, ignore)
         scene = sequence.scene.with_cameras(group)
         renderers = {camera: Renderer(scene, cameras=[camera]) for camera in group}
-        found = alone(scene, domain, group) if model is None else in_sequence(scene, domain, group, model)
-        for frame, start, estimate in found:
+        for frame, estimate in _estimates(setup, frames):
             share = replace(estimate, seconds=estimate.seconds / len(group))
+            scored = frame if given is None else given.filled(frame)
             for camera, renderer in renderers.items():
-                yield frame_score(sequence, frame, camera, renderer, start, share)
+                yield frame_score(sequence, scored, camera, renderer, frame.measured, share)
+
+
+def _estimates(setup: "Setup", frames: Names[int]) -> Iterator[tuple[Frame, Estimate]]:
+    """Solved frames, with their initial joint positions as `measured`."""
+    if setup.model is None:
+        _ = setup.backgrounds  # Its computation is not part of a frame's time.
+        for index in frames:
+            frame, began = setup.frame(index), time.perf_counter()
+            yield frame, Estimate.best(setup.solved(frame), time.perf_counter() - began)
+        return
+    optimizer = setup.sequence_optimizer(frames)
+    for _ in optimizer:
+        pass
+    for index, found in sorted(optimizer.estimates.items()):
+        joints, spent = (found.joint_positions, found.joint_std), (found.iterations, found.seconds)
+        yield setup.frame(index), Estimate(found.state, *joints, *spent, found.start, assessment=found.assessment)
 
 
 def frame_score(
@@ -323,22 +291,66 @@ def to_json(scores: Names[FrameScore]) -> dict[str, Any]:
 
 
 @dataclass(frozen=True)
-class Starts:
-    """Frames as input of sequence mode, with the initial joint positions as `measured`."""
+class Setup:
+    """Solver with its settings, and the recording, domain and cameras of the frames that it gets.
+
+    Initial joint positions are the `measured` ones of its frames; see `evaluate` for arguments that are not explained.
+    """
 
     sequence: Sequence
     domain: str
     cameras: tuple[str, ...]
-    perturb_deg: float
-    seed: int
-    """Seed of the perturbation, which is the same in all frames."""
+    """Names of the cameras, which are optimized jointly."""
+    networks: FeatureExtractor | SurfacePredictor
+    settings: SolverSettings
+    free: FreeParameters
+    model: SequenceSettings | None = None
+    perturb_deg: float = 0.0
+    seed: int = 0
+    ignore: Ignore = lambda _: {}
+    """Frame index -> camera name -> pixels excluded from comparison."""
 
-    def frame(self, index: int) -> Frame:
-        """Frame at an index of the sequence."""
-        frame = self.sequence.frame(index, self.domain, self.cameras)
-        return replace(frame, measured=start_positions(self.sequence, frame, self.perturb_deg, (self.seed,)))
+    def frame(self, index: int, cameras: Names[str] | None = None) -> Frame:
+        """Frame at an index of the sequence, with images of all cameras or the given ones."""
+        frame = self.sequence.frame(index, self.domain, self.cameras if cameras is None else cameras)
+        seed = self.seed if self.model is None else (self.seed,)
+        return replace(frame, measured=start_positions(self.sequence, frame, self.perturb_deg, seed))
 
-    def times(self, frames: Names[int]) -> dict[int, float | None]:
-        """Index -> time of the given frames [s]."""
+    @property
+    def backgrounds(self) -> Backgrounds:
+        """Mean backgrounds of the cameras; `SequenceError` if the solver requires one that cannot be estimated."""
+        return Backgrounds.of(self.sequence, self.cameras, self.domain, required=self.settings.needs_background)
+
+    def solved(self, frame: Frame) -> FrameOptimizer:
+        """Optimizer of a frame alone, run to its end."""
+        optimizer = FrameOptimizer(
+            self.sequence.scene,
+            frame,
+            self.backgrounds,
+            self.networks,
+            ignore=self.ignore(frame.index),
+            settings=self.settings,
+            free=self.free,
+            cameras=self.cameras,
+            live=False,
+        )
+        for _ in optimizer:
+            pass
+        return optimizer
+
+    def sequence_optimizer(self, frames: Names[int], **more: Any) -> SequenceOptimizer:
+        """Optimizer of the given frames jointly; `more` are further arguments of `SequenceOptimizer`."""
         stamps = self.sequence.timestamps
-        return {index: None if stamps is None else float(stamps[index]) for index in frames}
+        return SequenceOptimizer(
+            self.sequence.scene,
+            self.frame,
+            {index: None if stamps is None else float(stamps[index]) for index in frames},
+            self.networks,
+            settings=self.settings,
+            model=self.model,
+            free=self.free,
+            ignore=self.ignore,
+            backgrounds=self.backgrounds,
+            cameras=self.cameras,
+            **more,
+        )

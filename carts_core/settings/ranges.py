@@ -53,6 +53,11 @@ def require(condition: bool, name: str, value: object, allowed: object) -> None:
 class Ranged:
     """Base of dataclasses with `Range` annotations; None is allowed if the type includes it."""
 
+    @classmethod
+    def label(cls, field: str) -> str:
+        """Name of a field in messages."""
+        return f"{cls.__name__}.{field}"
+
     def __post_init__(self) -> None:
         """Check all ranges; `SettingsError` for a value out of range."""
         for field in fields(self):  # pyright: ignore[reportArgumentType]
@@ -60,4 +65,4 @@ class Ranged:
                 value = getattr(self, field.name)
                 if isinstance(allowed, Range) and value is not None:
                     inside = all(map(allowed.holds, value if isinstance(value, tuple) else (value,)))
-                    require(inside, f"{type(self).__name__}.{field.name}", value, allowed)
+                    require(inside, self.label(field.name), value, allowed)

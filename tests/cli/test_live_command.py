@@ -62,7 +62,7 @@ def test_a_replay_gives_a_line_for_each_frame_and_a_recording_that_can_be_review
         (["--source", "socket:port"], "folder:PATH or socket:PORT"),
         (["--source", "socket:70000"], "is not known"),
         (["--source", "camera:0"], "has no joints. Say with --joints-port"),
-        (["--rate", "0"], "--rate is 0; allowed is above 0"),
+        (["--rate", "0"], "--rate is 0.0; allowed is above 0"),
         (["--loops", "0"], "--loops is 0; allowed is 1 or more"),
     ],
 )

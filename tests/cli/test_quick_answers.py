@@ -24,7 +24,7 @@ WRONG: list[tuple[list[str], str]] = [
     (["optimize", "sequence.toml", "--seed", "many"], "--seed"),
     (["evaluate", "sequence.toml", "--solver", "newton"], "--solver"),
     (["evaluate", "sequence.toml", "--settings", "iterations=0"], "iterations is 0; allowed is 1 to 10000"),
-    (["optimize", "sequence.toml", "--perturb-deg", "-3"], "--perturb-deg is -3; allowed is 0 to 180"),
+    (["optimize", "sequence.toml", "--perturb-deg", "-3"], "--perturb-deg is -3.0; allowed is 0 to 180"),
     (["evaluate", "sequence.toml", "--perturb-deg", "nan"], "--perturb-deg is nan; allowed is 0 to 180"),
     (["render", "sequence.toml", "--seed", "-1"], "--seed is -1; allowed is 0 or more"),
     (["optimize", "sequence.toml", "--keyframes", "table.csv"], "needs --mode sequence"),
