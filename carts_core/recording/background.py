@@ -89,9 +89,8 @@ def background_of_recording(
     problem = None
     if always > _STAYS * usually:
         problem = (
-            f"camera {camera!r}: what is behind the arms is not known, since they hardly move in {len(arms)} views; "
-            "what looks like an arm in the background cannot be distinguished from one. A `background` image in the "
-            "sequence file, taken without arms, helps."
+            f"camera {camera!r}: the background behind the arms is unknown, since they hardly move in {len(arms)} "
+            "views, and may contain an arm. Add a `background` image without arms to the sequence file."
         )
     return MeanBackground(estimate, (2 * clear > used) | agree, problem)
 
@@ -110,8 +109,8 @@ def uncovered_median(
     seen = (~covers).sum(0)
     if not seen.any():
         raise SequenceError(
-            "the background cannot be estimated: the arms, as measured, cover every pixel of every frame. "
-            "Check T_camera_world and the units of the joints, or give a `background` image."
+            "the background cannot be estimated, since the arms at their measured positions cover every pixel of every "
+            "frame. Check T_camera_world and the units of the joints, or give a `background` image."
         )
     median, deviation = np.empty(images.shape[1:], np.uint8), np.empty(images.shape[1:3], np.float32)
     for top in range(0, images.shape[1], _ROWS_AT_ONCE):

@@ -55,7 +55,7 @@ class Cropped:
         left, top, width, height = self.crop
         if left + width > image.shape[1] or top + height > image.shape[0]:
             raise SequenceError(
-                f"{self.name(index)} is {image.shape[1]} x {image.shape[0]} pixels, but `crop` reaches to "
+                f"{self.name(index)} has {image.shape[1]} x {image.shape[0]} pixels, but `crop` extends to "
                 f"{left + width} x {top + height}. Correct crop = [left, top, width, height] in the sequence file."
             )
         return np.ascontiguousarray(image[top : top + height, left : left + width])
@@ -82,7 +82,7 @@ class Bag:
     def __init__(self, path: Path) -> None:
         needs_extra("rosbags", "import")
         if not path.exists():
-            raise SequenceError(f"bag {path} is missing. Put it back, or correct the path.")
+            raise SequenceError(f"bag {path} is missing. Restore it, or correct the path.")
         self.path = path
         self._lock = threading.Lock()
         self._decoder, self._limits = acquire(), Limits.of(path)
@@ -117,11 +117,11 @@ class Bag:
         except (OSError, ValueError) as error:
             if self.path.is_file() and (self.path.parent / "metadata.yaml").is_file():
                 folder = self.path.parent
-                text = f"bag {self.path} is one file of the ROS 2 bag {folder}, which describes it. Give the folder."
+                text = f"bag {self.path} is one file of the ROS 2 bag {folder}. Give the folder."
                 raise SequenceError(text) from error
             raise SequenceError(
-                f"bag {self.path} cannot be read ({error}). It is damaged, was cut off, or is no ROS bag: copy it "
-                "again, or have ROS index it anew (rosbag reindex, ros2 bag reindex)."
+                f"bag {self.path} cannot be read ({error}). It is damaged, truncated or not a ROS bag. Copy it again, "
+                "or rebuild its index (rosbag reindex, ros2 bag reindex)."
             ) from error
 
 
@@ -168,7 +168,7 @@ class BagImages:
     def _message(self, index: int) -> Any:
         message = self._bag.message(self.topic, self._times[index])
         if message is None:
-            raise SequenceError(f"{self.name(index)}: there is no message. Import the bag again.")
+            raise SequenceError(f"{self.name(index)}: the message is missing. Import the bag again.")
         return message
 
     def remarks(self) -> tuple[str, ...]:
@@ -183,7 +183,7 @@ def decode_message(message: Any, what: str) -> UInt8[np.ndarray, "height width 3
     encoding = message.encoding.lower()
     if encoding not in _ENCODINGS:
         known = ", ".join(_ENCODINGS)
-        raise SequenceError(f"{what} has the encoding {message.encoding!r}. Known are: {known}. Convert the bag.")
+        raise SequenceError(f"{what} has the encoding {message.encoding!r}. Supported are: {known}. Convert the bag.")
     channels, conversion = _ENCODINGS[encoding]
     height, width, step = int(message.height), int(message.width), int(message.step)
     data = np.asarray(message.data, np.uint8)

@@ -211,18 +211,18 @@ def read_mask(path: Path) -> Bool[np.ndarray, "height width"]:
     allowed = f"Masks are 0 (background) and {white} (instrument)"
     if image is None:
         raise SequenceError(
-            f"mask {path} has several colours. {allowed}: choose the instrument's colour, or import the labels with "
+            f"mask {path} has several colours. {allowed}. Save only the instrument, or import the labels with "
             "`carts import-masks`."
         )
     if (brightest := image.max()) < 0.5 * white:
         raise SequenceError(
-            f"mask {path} has no value above {brightest}. {allowed}: multiply a mask of 0 and 1 by {white}, choose the "
-            "instrument's label in a label image."
+            f"mask {path} has no value above {brightest}. {allowed}. Multiply a mask of 0 and 1 by {white}; of a label "
+            "image, save only the label of the instrument."
         )
     values = ", ".join(str(int(value)) for value in _flat_values(image)[:6])
     raise SequenceError(
-        f"mask {path} has areas of the values {values}. {allowed}: choose the instrument's labels, or import them with "
-        "`carts import-masks`."
+        f"mask {path} has areas of the values {values}. {allowed}. Save only the labels of the instrument, or import "
+        "all labels with `carts import-masks`."
     )
 
 
@@ -247,14 +247,14 @@ def read_labels(path: Path) -> LabelImage:
     mask = _white_part(raster, f"mask {path}")
     if grey is None and raster.indices is not None:
         grey, mask = raster.indices, None
-        remarks.append("labels are the indices of the palette")
+        remarks.append("labels are palette indices")
     elif raster.opaque is not None:
         remarks.append("the mask is the opaque part (alpha)")
     elif grey is not None and mask is not None:
         if mask.any() and grey.max() < raster.white - _NEAR:
             mask = None
         elif ((grey > 0) & (grey < raster.white)).any():
-            remarks.append(f"grey borders, of which {(raster.white + 1) // 2} and more count as instrument")
+            remarks.append(f"grey borders; values of at least {(raster.white + 1) // 2} are instrument")
     colours = raster.pixels if raster.pixels.ndim == 3 else np.repeat(raster.pixels[..., None], 3, -1)
     colours = colours if colours.dtype == np.uint8 else (colours >> 8).astype(np.uint8)
     return LabelImage(mask, grey, colours, tuple(remarks))
@@ -269,13 +269,13 @@ def mask_remarks(files: Iterable[Path]) -> tuple[str, ...]:
             found += read_labels(file).remarks
         except SequenceError:
             continue
-    return tuple(f"masks: {text} ({count} of {len(chosen)} looked at)." for text, count in Counter(found).items())
+    return tuple(f"masks: {text} ({count} of {len(chosen)} checked)." for text, count in Counter(found).items())
 
 
 def image_remarks(files: Sequence[Path]) -> tuple[str, ...]:
     """Remarks on images, from their headers; missing files are ignored."""
     traits = [each for each in map(_header, files) if each is not None]
-    found = [f"images: {text} ({len(traits)} looked at)." for text in _orientation_remarks(traits)]
+    found = [f"images: {text} ({len(traits)} checked)." for text in _orientation_remarks(traits)]
     if any(each.alpha for each in traits):
         found.append("images: transparency (alpha) is not used.")
     return tuple(found)
@@ -296,8 +296,8 @@ def bits_remark(files: Sequence[Path]) -> tuple[str, ...]:
         return ()
     bits = bits_of_files(files)
     return (
-        f"images: of 16 bits, {bits} are in use, and values are scaled from 0 to {2**bits - 1} (change: `bits` of the "
-        f"camera in the sequence file, one of {', '.join(map(str, DEPTHS))}).",
+        f"images: {bits} of 16 bits are used, and values from 0 to {2**bits - 1} are scaled to 8 bits. To change the "
+        f"bit depth, set `bits` of the camera in the sequence file to one of {', '.join(map(str, DEPTHS))}.",
     )
 
 
@@ -366,9 +366,7 @@ def read_file(path: Path) -> bytes:
     try:
         return read_bytes(path, IMAGE)
     except (FileNotFoundError, IsADirectoryError) as error:
-        raise SequenceError(
-            f"image {path} is missing. Put it back, or correct the path in the sequence file."
-        ) from error
+        raise SequenceError(f"image {path} is missing. Restore it, or correct the path.") from error
     except OSError as error:
         raise SequenceError(f"image {path} cannot be read: {error}.") from error
 
@@ -418,7 +416,7 @@ _TURNS: dict[int, Callable[[np.ndarray], np.ndarray]] = {
     7: lambda image: image.swapaxes(0, 1)[::-1, ::-1],
     8: np.rot90,
 }
-"""EXIF orientation -> operation that turns stored pixels upright."""
+"""EXIF orientation -> rotation or reflection of stored pixels to upright ones."""
 
 
 def _fewest_bits(largest: int) -> int:
@@ -434,8 +432,8 @@ def _eight_bits(
     used = needed if bits is None else bits()
     if needed > used:
         raise SequenceError(
-            f"{what} has values of {needed} bits, but the other images of its camera are taken to have {used}. Write "
-            f"`bits = {needed}` into the camera's table in the sequence file."
+            f"{what} has values of {needed} bits, but the bit depth of its camera is {used}. Set `bits = {needed}` in "
+            "the camera's table of the sequence file."
         )
     return (raster.pixels >> (used - 8)).astype(np.uint8)
 
@@ -448,9 +446,7 @@ def _white_part(raster: _Raster, what: str) -> Bool[np.ndarray, "height width"] 
     if raster.opaque is not None:
         decided = grey is not None and 0 < lit.mean() < 1 and _is_two_valued(grey, raster)
         if decided and not np.array_equal(lit & raster.opaque, raster.opaque | lit):
-            raise SequenceError(
-                f"{what} is white in other places than where it is opaque. Save it without transparency (alpha)."
-            )
+            raise SequenceError(f"white and opaque pixels of {what} differ. Save it without transparency (alpha).")
         return raster.opaque
     if grey is None:
         hues = raster.pixels[lit] / brightness[lit][:, None]
@@ -479,8 +475,8 @@ def _orientation_remarks(traits: Sequence[ImageTraits]) -> list[str]:
     """Remarks on rotated images."""
     turned = Counter(each.orientation for each in traits if each.orientation != 1)
     return [
-        f"{'' if count == len(traits) else f'{count} '}turned as EXIF orientation {orientation} says"
-        f"{', width and height change places' if orientation > 4 else ''}"
+        f"{'' if count == len(traits) else f'{count} '}rotated by EXIF orientation {orientation}"
+        f"{', which swaps width and height' if orientation > 4 else ''}"
         for orientation, count in sorted(turned.items())
     ]
 

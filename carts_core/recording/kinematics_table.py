@@ -114,7 +114,7 @@ def read_table(path: Path, delimiter: str = ",", what: str = "kinematics table")
         )
     repeated = sorted(name for name, count in Counter(header).items() if name and count > 1)
     if repeated:
-        raise SequenceError(f"{path} has several columns called {listed(map(repr, repeated))}. Rename all but one.")
+        raise SequenceError(f"{path} has several columns {listed(map(repr, repeated))}. Rename all but one.")
     if set(map(len, rows)) != {len(header)}:
         line, row = next((line, row) for line, row in zip(lines, rows, strict=True) if len(row) != len(header))
         raise SequenceError(
@@ -375,7 +375,7 @@ def take_joints(table: TomlTable, robot: Robot) -> JointColumns:
         if abs(values[name]) > largest:
             raise defaults.error(name, f"is {values[name]:g}; allowed is up to {largest:.3g} [rad or m].")
         if name in mapping:
-            raise defaults.error(name, "is given, but the joint has a column in [arms.joints] too. Remove one of them.")
+            raise defaults.error(name, "is given, but the joint also has a column in [arms.joints]. Remove one.")
     for name in robot.joint_names:
         if name not in mapping and name not in values:
             raise mapping.error(

@@ -195,7 +195,7 @@ def take_rows(section: TomlTable, frames_section: TomlTable | None) -> Rows:
                 raise section.error(key, "describes frames. Move it to [frames].")
         if not timestamp:
             raise section.error(
-                "timestamp", "is missing: with [frames], rows are matched by time. Name the column with the time [s]."
+                "timestamp", "is missing, but with [frames] rows are matched by time. Name the column of times [s]."
             )
         names, matching = None, take_matching(frames_section)
         frames = take_frame_list(frames_section)

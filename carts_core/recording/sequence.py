@@ -182,8 +182,8 @@ class Sequence:
         """Matching of frames and rows by time; `SequenceError` if rows are not matched by time."""
         if self.matching is None:
             raise SequenceError(
-                f"{self.path} has a row of joint positions for each frame, so there is no time to offset. "
-                "Describe the images' times under [frames] (docs/reference/sequence_format.md)."
+                f"{self.path} has a row of joint positions for each frame, so a time offset does not apply. Give the "
+                "times of the images under [frames] (docs/reference/sequence_format.md)."
             )
         return self.matching
 
@@ -262,8 +262,8 @@ class Sequence:
             raise SequenceError(f"{self.path}: camera {camera.name!r}: {error}") from error
         if camera.name not in self._mounts:
             return found
-        moves = f"camera {camera.name!r} moves, so what is behind the arms is another thing in every frame"
-        return replace(found, known=np.zeros_like(found.known), problem=f"{moves}, and no background is used.")
+        problem = f"camera {camera.name!r} moves, so the background differs between frames, and none is used."
+        return replace(found, known=np.zeros_like(found.known), problem=problem)
 
     def _image(self, camera: str, domain: str, index: int) -> np.ndarray:
         entry = self._camera(camera)
@@ -293,8 +293,8 @@ class Sequence:
         wanted = self._camera(camera).camera
         if (width, height) != (wanted.width, wanted.height):
             raise SequenceError(
-                f"{what} is {width} x {height} pixels, but camera {camera!r} is {wanted.width} x {wanted.height} "
-                f"({self.path}). Correct `size` and K there, or export the file in the camera's size."
+                f"{what} has {width} x {height} pixels, but camera {camera!r} has {wanted.width} x {wanted.height} "
+                f"({self.path}). Correct `size` and K there, or export the file in the size of the camera."
             )
 
     def _domain(self, domain: str | None) -> str:

@@ -34,7 +34,7 @@ def take_value(table: TomlTable, key: str, default: Any) -> Any:
     file_name, mark, pointer = value.partition("#")
     if not mark or not pointer:
         raise table.error(
-            key, f'is {shown(value)}. Write the numbers here, or "file.json#name" to take them from a file.'
+            key, f'is {shown(value)}. Write the numbers here, or "file.json#name" to read them from a file.'
         )
     path = table.path(file_name)
     try:
@@ -53,7 +53,7 @@ def take_value(table: TomlTable, key: str, default: Any) -> Any:
             raise table.error(
                 key,
                 f"points at {name!r}, which {path} does not have.{closest(name, names)} "
-                f"It has: {listed(names) or 'no names at this place'}.",
+                f"It has: {listed(names) or 'no names'}.",
             )
     return found
 
@@ -72,7 +72,7 @@ def take_camera(table: TomlTable) -> Camera:
     name = table.take("name", str)
     size = take_value(table, "size", [])
     if not (isinstance(size, list) and len(size) == 2 and all(isinstance(value, int) and value > 0 for value in size)):
-        raise table.error("size", f"is {shown(size)}. Give [width, height] in whole pixels, say size = [640, 480].")
+        raise table.error("size", f"is {shown(size)}. Give [width, height] in whole pixels, such as size = [640, 480].")
     width, height = size
     intrinsics = _take_intrinsics(table)
     distortion = take_value(table, "distortion", [])
@@ -104,13 +104,12 @@ def _take_intrinsics(table: TomlTable) -> tuple[float, float, float, float]:
         if not np.allclose(matrix, [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], atol=1e-6 * abs(fx)):
             raise table.error(
                 "K",
-                f"is {shown(K)}. It must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]: skew is not supported, "
-                "and rows must not be swapped with columns.",
+                f"is {shown(K)}, but must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], without skew and not transposed.",
             )
     center = table.take("pixel_center", float, HALF_PIXEL)
     if center not in (0.0, HALF_PIXEL):
         raise table.error(
-            "pixel_center", f"is {center!r}, but must be 0.5 (ours) or 0.0 (OpenCV, ROS, MATLAB minus 1)."
+            "pixel_center", f"is {center!r}, but must be 0.5 (carts) or 0.0 (OpenCV, ROS, MATLAB minus 1)."
         )
     return float(fx), float(fy), float(cx) + HALF_PIXEL - center, float(cy) + HALF_PIXEL - center
 
@@ -160,7 +159,7 @@ def take_camera_input(table: TomlTable, rows: Rows, domains: tuple[str, ...]) ->
             raise table.error("background", f"points at {path}, which is missing. Correct the path or remove the key.")
         background[domain] = path
     if background and motion is not None:
-        raise table.error("background", "does not go with `motion`: it would be another one in every frame. Remove it.")
+        raise table.error("background", "cannot be combined with `motion`: backgrounds of a moving camera differ.")
     table.finish()
     return CameraInput(camera, images, masks, background, motion)
 
@@ -177,8 +176,7 @@ def _by_domain(table: TomlTable, key: str, domains: tuple[str, ...], required: b
         if required and len(domains) > 1 and "{domain" not in value:
             raise table.error(
                 key,
-                f"is {value!r} for all {len(domains)} domains. Put {{domain}} into it, "
-                "or give a table with one pattern per domain.",
+                f"is {value!r} for all {len(domains)} domains. Add {{domain}}, or give each one a pattern.",
             )
         return dict.fromkeys(domains, value)
     for domain, pattern in value.items():
@@ -211,7 +209,7 @@ def _whole_images(table: TomlTable, pattern: str, frames: FrameList, domain: str
     message_time, video_frame = table.take("message_time", str, ""), table.take("video_frame", str, "")
     bits = table.take("bits", int, None)
     if bits is not None and bits not in DEPTHS:
-        raise table.error("bits", f"is {bits}. Give the bits of the images' values: {', '.join(map(str, DEPTHS))}.")
+        raise table.error("bits", f"is {bits}. Give the bit depth of the images: {', '.join(map(str, DEPTHS))}.")
     deinterlace = table.take("deinterlace", bool, True)
     if topic:
         path = _path(table, "images", pattern, domain, camera)
@@ -225,8 +223,8 @@ def _whole_images(table: TomlTable, pattern: str, frames: FrameList, domain: str
         if path.suffix.lower() not in SUFFIXES:
             raise table.error(
                 "images",
-                f"is {pattern!r}, which is the same for every frame. Put {{frame}} into it, "
-                f"or name a video ({', '.join(SUFFIXES)}).",
+                f"is {pattern!r}, which is the same for every frame. Add {{frame}}, or name a video "
+                f"({', '.join(SUFFIXES)}).",
             )
         return Video(path, numbers, deinterlace=deinterlace)
     files = frame_files(table.file.parent, pattern, key, frames, domain=domain, camera=camera)
@@ -249,7 +247,7 @@ def _masks(
 ) -> tuple[Path | None, ...]:
     key = table.name("masks")
     if not is_per_frame(pattern) and not is_glob(pattern):
-        raise table.error("masks", f"is {pattern!r}, which is the same for every frame. Put {{frame}} into it.")
+        raise table.error("masks", f"is {pattern!r}, which is the same for every frame. Add {{frame}}.")
     files = frame_files(table.file.parent, pattern, key, frames, domain=domain, camera=camera)
     if sparse and any(is_regular(file) for file in files):
         return tuple(file if is_regular(file) else None for file in files)
@@ -319,9 +317,9 @@ def read_description(path: Path, progress: Callable[[str], None] | None = None) 
 def _take_domains(root: TomlTable) -> tuple[str, ...]:
     domains = root.take("domains", list, ["regular"])
     if not domains or not all(isinstance(domain, str) and domain for domain in domains):
-        raise root.error("domains", f'is {shown(domains)}. Give names, say domains = ["regular", "smoke"].')
+        raise root.error("domains", f'is {shown(domains)}. Give names, such as domains = ["regular", "smoke"].')
     if len(set(domains)) < len(domains):
-        raise root.error("domains", f"names one twice: {', '.join(domains)}.")
+        raise root.error("domains", f"has a name twice: {', '.join(domains)}.")
     for domain in domains:
         check_file_name(root, "domains", "has", domain)
     return tuple(domains)
@@ -337,7 +335,7 @@ def _take_light(table: TomlTable) -> Light:
     table.finish()
     position = values.get("position", (0.0, 0.0, 0.0))
     if len(position) != 3 or not all(isinstance(value, int | float) and abs(value) <= FARTHEST for value in position):
-        raise table.error("position", f"must be three numbers [m] within {FARTHEST:g}, in the camera's frame.")
+        raise table.error("position", f"must be three numbers [m] of at most {FARTHEST:g}, in the camera frame.")
     for key, value in values.items():
         if key != "position" and not 0.0 <= value <= _BRIGHTEST:
             raise table.error(key, f"is {value:g}, but must be 0 to {_BRIGHTEST:g}.")
@@ -352,7 +350,7 @@ def _take_arm(
     try:
         urdf = robot_file(value) if value.startswith(SCHEME) else table.path(value)
     except RobotError as error:
-        raise table.error("robot", f"is not known: {error}") from error
+        raise table.error("robot", f"is unknown: {error}") from error
     base_link = table.take("base_link", str, None)
     if (key := (urdf.resolve(), base_link)) not in robots:
         robots[key] = Robot.load(urdf, base_link=base_link, progress=progress)
@@ -415,7 +413,7 @@ def calibrated_sequence_file(
         if old.intrinsics != new.intrinsics:
             table["K"] = dict(zip(("fx", "fy", "cx", "cy"), new.intrinsics, strict=True))
             table["pixel_center"] = HALF_PIXEL
-    heading = f"# What carts {command} found is filled in. Other comments are those of the original file."
+    heading = f"# With the results of carts {command}. Other comments are from the original file."
     return f"{heading}\n{tomlkit.dumps(document)}"
 
 

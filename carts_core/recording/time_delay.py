@@ -92,12 +92,12 @@ class TimeOffsetEstimate:
     def sentence(self) -> str:
         """Result as a sentence."""
         if self.problem:
-            return f"The delay between images and kinematics is not known: {self.problem}"
+            return f"The delay between images and kinematics is unknown: {self.problem}"
         found = f"{self.seconds:.3f} s ± {self.deviation:.3f} s"
         if self.proposed is None:
-            return f"Images and kinematics fit as they are: the motion gives {found}, now it is {self.present:.3f} s."
+            return f"The time offset of {self.present:.3f} s agrees with the motion, which gives {found}."
         return (
-            f"time_offset = {self.proposed:.3f} is proposed ({found}; now it is {self.present:.3f} s): it explains "
+            f"Proposed: time_offset = {self.proposed:.3f} ({found}) instead of {self.present:.3f} s. It explains "
             f"{100 * self.explained:.0f} % of the motion in the images instead of "
             f"{max(100 * self.explained_now, 0.0):.0f} %."
         )
@@ -127,7 +127,7 @@ def estimate_time_offset(
     assert sequence.timestamps is not None
     frames, steps = _chosen(sequence.timestamps)
     if len(steps) < _FEWEST_STEPS:
-        return _unknown(present, f"{len(steps)} steps between frames are few; at least {_FEWEST_STEPS} are needed.")
+        return _unknown(present, f"there are {len(steps)} steps between frames; at least {_FEWEST_STEPS} are needed.")
     flows = _flows(sequence, camera or sequence.scene.cameras[0].name, domain, frames, steps, progress)
     if np.sqrt((flows**2).mean()) < _STILL:
         return _unknown(present, "nothing moves in the images.")
@@ -317,12 +317,12 @@ def _problem(
     explained: float, curve: list[float], at_end: bool, deviation: float, others: tuple[float, ...]
 ) -> str | None:
     if explained < _FEWEST_EXPLAINED or explained - float(np.median(curve)) < _FEWEST_GAIN:
-        return "the motion of the arms does not explain what moves in the images. Check columns, signs and units."
+        return "the motion of the arms does not explain that in the images. Check columns, signs and units."
     if at_end:
-        return "the best one is at the end of what was tried. Give a larger range, or check the clocks."
+        return "the best delay is at the end of the search range. Give a larger range, or check the clocks."
     if others:
         listed = ", ".join(f"{offset:.2f} s" for offset in others[:3])
-        return f"other delays explain as much ({listed}), as in a periodic motion. Take a part in which it is not."
+        return f"other delays explain as much ({listed}), as for periodic motion. Use a part with other motion."
     if deviation > _MOST_DEVIATION:
-        return f"parts of the recording contradict each other (± {deviation:.2f} s)."
+        return f"the delays of parts of the recording differ (± {deviation:.2f} s). Check the clocks."
     return None

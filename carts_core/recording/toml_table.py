@@ -103,7 +103,7 @@ class TomlTable:
         for number, value in enumerate(values, start=1):
             name = TomlTable(value, self.file, f"[[{key}]] number {number}").take("name", str)
             if name in names:
-                raise self.error(f"[[{key}]]", f"has the name {name!r} twice. Every one needs a name of its own.")
+                raise self.error(f"[[{key}]]", f"has the name {name!r} twice. Names must be unique.")
             names.append(name)
             check_file_name(self, f"[[{key}]]", "has the name", name)
             table = TomlTable(value, self.file, f"[[{key}]] {name!r}", f"{key}.")
@@ -123,7 +123,7 @@ class TomlTable:
             if "\0" in value:
                 raise ValueError("it has a null character")
         except ValueError as error:
-            raise SequenceError(f"{self.file}: {shown(value)} is no path of a file: {error}.") from error
+            raise SequenceError(f"{self.file}: {shown(value)} is not a valid path: {error}.") from error
         return self.file.parent / value
 
     def finish(self) -> None:

@@ -73,9 +73,7 @@ def index_video(path: Path) -> VideoIndex:
     try:
         status = path.stat()
     except (OSError, ValueError) as error:
-        raise SequenceError(
-            f"video {path} is missing. Put it back, or correct the path in the sequence file."
-        ) from error
+        raise SequenceError(f"video {path} is missing. Restore it, or correct the path.") from error
     if not is_regular(path):
         raise SequenceError(f"video {path} is a folder, pipe or device. Name a video file.")
     try:
@@ -216,9 +214,7 @@ def _by_decoding(path: Path) -> VideoIndex:
 
 
 def _remedy(path: Path) -> str:
-    return (
-        f"Convert it, say with `ffmpeg -i {path.name} -c:v libx264 -crf 12 converted.mp4`, or into a folder of images."
-    )
+    return f"Convert it with `ffmpeg -i {path.name} -c:v libx264 -crf 12 converted.mp4`, or into a folder of images."
 
 
 SUFFIXES = (".mp4", ".m4v", ".mov", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".wmv", ".ogv")
@@ -228,7 +224,7 @@ _BOTTOM_FIRST = (3, 4)
 """FFmpeg's field orders with the bottom field first: BB and TB."""
 _ONE = 2**16
 """Fixed-point 1 in a display matrix."""
-_NOT_TURNED = "the file's display matrix turns by no right angle or scales; frames are used as stored."
+_NOT_TURNED = "the display matrix is not a rotation by a multiple of 90 deg; frames are used as stored."
 _KEPT_BYTES = 32 * 2**20
 """Memory for decoded frames, which makes stepping backwards cheap."""
 
@@ -268,8 +264,8 @@ class Video:
         """Number of the last decoded frame; None before the first after a seek."""
         if (count := self._index.count) <= max(numbers):
             raise SequenceError(
-                f"video {path} has {counted(count, 'frame')}, but frame number {max(numbers)} (counted from 0) "
-                "is asked for. Shorten the table, or give it a column with frame numbers (`video_frame`)."
+                f"video {path} has {counted(count, 'frame')}, but the sequence has frame number {max(numbers)} "
+                "(counted from 0). Shorten the table, or add a column of frame numbers (`video_frame`)."
             )
 
     def name(self, index: int) -> str:
@@ -301,19 +297,18 @@ class Video:
         found = []
         if not np.array_equal(matrix, np.eye(2)):
             mirrored = " and mirrored" if np.linalg.det(matrix) < 0 else ""
-            done = f"frames are turned by {abs(frame.rotation)} deg{mirrored}, as the file's display matrix says"
-            found.append(f"{done} (calibrations and masks must be of these)." if _is_square(matrix) else _NOT_TURNED)
+            done = f"frames are rotated by {abs(frame.rotation)} deg{mirrored}, by the display matrix of the file"
+            wanted = "Calibrations and masks must refer to rotated frames."
+            found.append(f"{done}. {wanted}" if _is_square(matrix) else _NOT_TURNED)
         if frame.interlaced_frame:
-            field = "bottom" if self._bottom_first else "top"
-            text = (
-                f"one field ({field}) of each is used, with half the rows (change: `deinterlace = false` of the camera)"
-            )
-            found.append(f"frames are interlaced; {text if self._deinterlace else 'both fields are used'}.")
+            field = f"only the {'bottom' if self._bottom_first else 'top'} field of each frame is used"
+            change = " To use both, set `deinterlace = false` for the camera." if self._deinterlace else ""
+            found.append(f"frames are interlaced; {field if self._deinterlace else 'both fields are used'}.{change}")
         aspect = None if stream is None else stream.sample_aspect_ratio
         if aspect is not None and aspect not in (0, 1):
             found.append(
-                f"pixels are not square ({aspect.numerator}:{aspect.denominator}); frames are used as stored, and the "
-                "calibration must be of stored frames."
+                f"pixels are not square ({aspect.numerator}:{aspect.denominator}); frames are used as stored, and "
+                "calibrations must refer to stored frames."
             )
         return tuple(found)
 
@@ -321,8 +316,8 @@ class Video:
         frame = self._kept.find(number) or self._decode(number)
         if frame is None or frame.is_corrupt:
             raise SequenceError(
-                f"video {self.path} ends, or is damaged, at frame number {number} (counted from 0). "
-                "Copy it again, or leave the frame out of the sequence."
+                f"video {self.path} ends or is damaged at frame number {number} (counted from 0). Copy it again, or "
+                "remove the frame from the sequence."
             )
         return frame
 

@@ -168,8 +168,8 @@ def test_a_wrong_cvat_file_is_refused_with_what_is_wrong(
     ("shape", "message"),
     [
         ('<mask label="a" left="90" top="0" width="10" height="1" rle="10"/>', "is not inside"),
-        ('<mask label="a" left="0" top="0" width="10" height="1" rle="4"/>', "do not make 10 x 1"),
-        ('<polygon label="a" points="1,nan;2,3;4,5"/>', "a point lies nowhere"),
+        ('<mask label="a" left="0" top="0" width="10" height="1" rle="4"/>', "do not sum to 10 x 1"),
+        ('<polygon label="a" points="1,nan;2,3;4,5"/>', "a point is not finite or far outside"),
     ],
 )
 def test_a_wrong_shape_of_cvat_is_left_out_and_named(
@@ -193,11 +193,11 @@ TRIANGLE = [10, 10, 40, 10, 40, 40]
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
-        ({"segmentation": {"size": [HEIGHT, WIDTH], "counts": [5, 7]}}, "the run lengths do not make 96 x 72 pixels"),
+        ({"segmentation": {"size": [HEIGHT, WIDTH], "counts": [5, 7]}}, "the run lengths do not sum to 96 x 72 pixels"),
         ({"segmentation": {"size": [9, 9], "counts": "1"}}, "a mask is 9 x 9 in an image of 96 x 72"),
         ({"segmentation": [[10, 10, 40, 10, 40]]}, "a polygon has 5 numbers, which are not x and y"),
         ({"segmentation": [[1, 2, 3, 4]]}, "a polygon has 4 numbers"),
-        ({"segmentation": [[1e300] * 6]}, "lies nowhere"),
+        ({"segmentation": [[1e300] * 6]}, "is not finite or far outside"),
         ({"segmentation": [TRIANGLE], "category_id": 9}, "category 9 is not in the file"),
         ({"segmentation": [TRIANGLE], "image_id": 8}, "image 8 is not in the file"),
         ({"keypoints": [1, 2, 2] * 3}, "3 keypoints have 2 names"),
@@ -250,7 +250,7 @@ def test_endovis_2018_has_colours_of_which_those_of_instruments_are_kept(sequenc
     assert labels == ["instrument-shaft"] and (frames[1, "right"].labels > 0).sum() == 8 * WIDTH
     image[60:] = (1, 2, 3)
     write_png(tmp_path / "seq_1" / "labels" / "frame002.png", image)
-    with pytest.raises(SequenceError, match=r"has the colour #010203, which labels.json does not know"):
+    with pytest.raises(SequenceError, match=r"has the colour #010203, which labels.json does not list"):
         all_of(tmp_path / "seq_1" / "labels", sequence, "right")
 
 
@@ -273,7 +273,7 @@ def test_an_empty_mask_says_that_nothing_is_there(sequence: Sequence, tmp_path: 
     ("values", "message"),
     [
         (np.zeros((10, 12), np.uint8), "is 12 x 10 pixels, but images of camera 'left' are 96 x 72"),
-        (np.full((HEIGHT, WIDTH, 3), (1, 2, 3), np.uint8), "has colours, and no labels.json"),
+        (np.full((HEIGHT, WIDTH, 3), (1, 2, 3), np.uint8), "have a labels.json that names them"),
     ],
 )
 def test_masks_that_do_not_fit_are_refused(
@@ -296,7 +296,7 @@ def test_a_damaged_mask_and_a_folder_without_masks_are_refused(sequence: Sequenc
     with pytest.raises(SequenceError, match=r"nothing\.txt is missing"):
         all_of(tmp_path / "nothing.txt", sequence)
     (tmp_path / "nothing.txt").write_text("no masks")
-    with pytest.raises(SequenceError, match="holds no masks or keypoints that are known"):
+    with pytest.raises(SequenceError, match="has no masks or keypoints in a supported format"):
         all_of(tmp_path / "nothing.txt", sequence)
 
 
@@ -319,7 +319,7 @@ def test_keypoints_of_surgpose_have_pixel_centres_at_a_half(sequence: Sequence, 
     }
     assert frames[0, "right"].labels is None and len(unknown) == 1
     path.write_text("- 1\n- 2\n")
-    with pytest.raises(SequenceError, match="has no keypoints as SurgPose writes them"):
+    with pytest.raises(SequenceError, match="has no keypoints in the format of SurgPose"):
         all_of(path, sequence)
 
 

@@ -150,7 +150,7 @@ def test_an_impossible_motion_is_refused_with_what_to_do(
         ('motion = { table = "ecm.csv", orientation = ["qx", "qy"] }', "Give the names of 4 columns"),
         ('motion = { table = "ecm.csv", ecm_joints = ["x", "y", "z"] }', "Give the names of 4 columns"),
         ('motion = { table = "ecm.csv", speed = 3 }', "speed is not a key of the format"),
-        ('motion = "ecm.csv"\nbackground = "regular/left/001.png"', "does not go with `motion`"),
+        ('motion = "ecm.csv"\nbackground = "regular/left/001.png"', "cannot be combined with `motion`"),
     ],
 )
 def test_a_wrong_description_of_the_motion_is_refused(moving: Path, lines: str, message: str) -> None:

@@ -52,7 +52,7 @@ def test_arms_without_a_base_frame_are_left_out_and_others_keep_their_names(tmp_
 
 def test_a_file_that_does_not_say_its_axes_is_asked_about(tmp_path):
     path = written(tmp_path, "hand_eye.json", {"base_frame": {"transform": OPENCV}})
-    with pytest.raises(SequenceError, match="which axes"):
+    with pytest.raises(SequenceError, match="states the camera axes"):
         read_base_frames(path)
     (frame,) = read_base_frames(path, "opencv")
     assert (frame.arm, frame.reference) == ("", "")

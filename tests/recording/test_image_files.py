@@ -73,5 +73,5 @@ def test_a_deep_mask_is_as_white_as_its_pixels_can_be(tmp_path, brightest: int):
 
 def test_a_mask_of_zeros_and_ones_is_noticed(tmp_path):
     cv2.imwrite(str(tmp_path / "mask.png"), np.eye(4, dtype=np.uint8))
-    with pytest.raises(SequenceError, match=r"mask .*mask.png has no value above 1. .*multiply"):
+    with pytest.raises(SequenceError, match=r"mask .*mask.png has no value above 1. .*Multiply"):
         read_mask(tmp_path / "mask.png")

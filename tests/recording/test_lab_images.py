@@ -82,7 +82,7 @@ def test_bits_in_use_are_counted_in_all_images_of_a_camera(tmp_path: Path, bits:
     (tmp_path / "2.png").write_bytes(png(deep))
     found = find_images(tmp_path)
     assert found.bits == stored
-    assert any(f"of 16 bits, {stored} are in use" in text for text in found.remarks)
+    assert any(f"{stored} of 16 bits are used" in text for text in found.remarks)
     difference = np.abs(read_image(tmp_path / "2.png").astype(int) - PICTURE)
     assert difference[1:].max() <= 1
 
@@ -189,7 +189,7 @@ def test_labels_that_were_resized_with_interpolation_are_refused(
     place.mkdir(parents=True)
     (place / "001.png").write_bytes(png(cv2.GaussianBlur((LABELS * 30).astype(np.uint8), (0, 0), 3)))
     found = read_annotations(tmp_path / "others", Sequence.open(tiny_sequence(masks=False)))
-    with pytest.raises(SequenceError, match="resize them by the nearest neighbour"):
+    with pytest.raises(SequenceError, match="Resize labels by nearest neighbour"):
         list(found.frames)
 
 
@@ -210,7 +210,7 @@ def test_what_is_changed_about_a_sequences_files_is_said_when_it_is_opened(tiny_
     lines: list[str] = []
     sequence = Sequence.open(path, progress=lines.append)
     assert {f"note: {remark}" for remark in sequence.remarks} <= set(lines)
-    assert any("left: images: of 16 bits, 12 are in use" in remark for remark in sequence.remarks)
+    assert any("left: images: 12 of 16 bits are used" in remark for remark in sequence.remarks)
     assert any("left: masks: grey borders" in remark for remark in sequence.remarks)
     assert 100 < sequence.frame(0).images["left"].mean() < 160
 
@@ -220,7 +220,7 @@ def test_a_frame_with_more_bits_than_the_others_asks_for_them(tiny_sequence: Cal
     for number in range(1, 31):
         file = path.parent / f"regular/left/{number:03d}.png"
         cv2.imwrite(str(file), read_image(file).astype(np.uint16) * (200 if number == 2 else 16))
-    with pytest.raises(SequenceError, match=r"002.png has values of 16 bits.*Write `bits = 16`"):
+    with pytest.raises(SequenceError, match=r"002.png has values of 16 bits.*Set `bits = 16`"):
         Sequence.open(path).frame(1)
     path.write_text(path.read_text().replace("[[cameras]]", "[[cameras]]\nbits = 16"))
     assert Sequence.open(path).frame(1).images["left"].mean() > 50
@@ -290,7 +290,7 @@ def test_of_interlaced_frames_one_field_is_used(tmp_path: Path) -> None:
     reader = Video(path, (0, 1, 2, 3))
     for index in (3, 0):
         assert np.abs(reader.read(index).astype(int) - bar(10 + 12 * index)).mean() < 6
-    assert "interlaced; one field (top)" in reader.remarks()[0]
+    assert "interlaced; only the top field" in reader.remarks()[0]
     whole = Video(path, (0, 1), deinterlace=False)
     assert np.abs(whole.read(1).astype(int) - woven[1]).mean() < 6 and "both fields" in whole.remarks()[0]
 

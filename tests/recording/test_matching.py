@@ -83,7 +83,7 @@ def test_another_offset_can_be_tried_without_touching_the_file(timed):
 
 
 def test_a_sequence_whose_rows_are_frames_has_no_offset(tiny_sequence):
-    with pytest.raises(SequenceError, match=r"no time to offset. Describe the images' times under \[frames\]"):
+    with pytest.raises(SequenceError, match=r"does not apply. Give the times of the images under \[frames\]"):
         Sequence.open(tiny_sequence()).with_time_offset(0.1)
 
 
@@ -159,7 +159,7 @@ def test_a_wrong_key_of_the_frames_is_named_with_the_remedy(timed, frames, parts
 
 
 def test_with_frames_of_their_own_rows_need_times_and_no_ids(timed):
-    with pytest.raises(SequenceError, match=r"\[kinematics\]: timestamp is missing: with \[frames\]"):
+    with pytest.raises(SequenceError, match=r"\[kinematics\]: timestamp is missing, but with \[frames\]"):
         Sequence.open(timed(edit=lambda text: text.replace('timestamp = "time"\n', "")))
     with pytest.raises(SequenceError, match=r"\[kinematics\]: frame_id describes frames\. Move it to \[frames\]"):
         Sequence.open(timed(edit=lambda text: text.replace("[kinematics]", '[kinematics]\nframe_id = "{frame}"')))

@@ -43,14 +43,14 @@ def test_a_delay_of_120_ms_is_found_to_10_ms_and_proposed(late: Path) -> None:
     assert abs(found.seconds - DELAY) < 0.010 and found.deviation < 0.010
     assert found.proposed == round(found.seconds, 4)
     assert found.explained > found.explained_now + 0.1
-    assert "is proposed" in found.sentence() and done[-1] == (210, 210)
+    assert "Proposed: time_offset" in found.sentence() and done[-1] == (210, 210)
 
 
 def test_kinematics_of_another_motion_give_no_delay(recording: Path, shipped_psm: Robot) -> None:
     write_log(recording.with_name("log.csv"), shipped_psm, SEED + 1, SECONDS)
     found = estimate_time_offset(Sequence.open(recording))
     assert found.proposed is None and found.problem is not None
-    assert "is not known" in found.sentence()
+    assert "is unknown" in found.sentence()
 
 
 def test_a_delay_beyond_what_is_tried_first_is_found_up_to_3_s(recording: Path, shipped_psm: Robot) -> None:
@@ -89,11 +89,11 @@ def test_few_frames_give_no_delay(recording: Path) -> None:
     (recording.parent / "times.csv").write_text("frame,timestamp\n" + "".join(f"{n},{n / 30:.4f}\n" for n in range(20)))
     recording.write_text(recording.read_text().replace('[frames]\nvideo = "left.mp4"', '[frames]\ntable = "times.csv"'))
     found = estimate_time_offset(Sequence.open(recording))
-    assert found.problem == "19 steps between frames are few; at least 60 are needed."
+    assert found.problem == "there are 19 steps between frames; at least 60 are needed."
 
 
 def test_rows_that_are_frames_have_no_delay(sample_sequence_path: Path) -> None:
-    with pytest.raises(SequenceError, match="there is no time to offset"):
+    with pytest.raises(SequenceError, match="a time offset does not apply"):
         estimate_time_offset(Sequence.open(sample_sequence_path))
 
 
@@ -108,10 +108,10 @@ def test_the_command_proposes_and_writes_where_it_is_asked_to(
 ) -> None:
     before = late.read_text()
     main(["time-offset", str(late), "-o", str(tmp_path / "shifted")])
-    assert "is proposed" in capsys.readouterr().out
+    assert "Proposed: time_offset" in capsys.readouterr().out
     assert late.read_text() == before
     shifted = Sequence.open(tmp_path / "shifted" / "sequence.toml")
     assert shifted.matching is not None and abs(shifted.matching.time_offset - DELAY) < 0.010
     main(["time-offset", str(tmp_path / "shifted" / "sequence.toml"), "-o", str(tmp_path / "again")])
-    assert "fit as they are" in capsys.readouterr().out and not (tmp_path / "again").exists()
+    assert "agrees with the motion" in capsys.readouterr().out and not (tmp_path / "again").exists()
     assert np.isfinite(shifted.measured["PSM1"]).all()

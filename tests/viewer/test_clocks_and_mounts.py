@@ -142,5 +142,5 @@ def test_a_recording_without_times_has_no_offset(tiny_sequence: Callable[..., Pa
     sequence = Sequence.open(tiny_sequence())
     desk = Desk(sequence, Project.open(sequence), OptimizerFactory(report=lambda line: None))
     assert desk.session.time_offset is None
-    with pytest.raises(CartsError, match="no time to offset"):
+    with pytest.raises(CartsError, match="a time offset does not apply"):
         desk.do(intents.SetTimeOffset(0.1))

@@ -132,7 +132,7 @@ def test_a_delay_between_video_and_log_is_proposed_taken_and_undone(tmp_path: Pa
         assert chosen("estimate-delay") is None and "Proposed." in site.document.content
         assert chosen("accept-delay") == pytest.approx(0.12, abs=0.01)
         chosen("estimate-delay")
-        assert "Images and kinematics fit as they are" in site.document.content
+        assert "agrees with the motion" in site.document.content
         assert chosen("undo") is None
 
 

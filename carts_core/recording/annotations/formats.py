@@ -17,6 +17,7 @@ from ...files.reading import VALUES, is_regular, parse_json, parse_xml, parse_ya
 from ...model.camera import HALF_PIXEL
 from ...wording import shown
 from ..images import read_labels
+from ..importing.found import MALFORMED, cause, well_formed
 
 MOST_LABELS = 255
 """Largest number of labels of a layer, whose pixels have 8 bits."""
@@ -84,7 +85,7 @@ def runs_of_text(text: str) -> list[int]:
     for character in text:
         code = ord(character) - _FIRST
         if not 0 <= code < 2 * _MORE or place > 40:
-            raise ValueError(f"the character {character!r} is no part of run lengths")
+            raise ValueError(f"the character {character!r} does not occur in run lengths")
         value |= (code & (_MORE - 1)) << place
         place += _BITS
         if not code & _MORE:
@@ -101,7 +102,7 @@ def mask_of_runs(runs: Sequence[int], height: int, width: int, *, by_columns: bo
     """Mask from alternating run lengths, beginning with background; `ValueError` if their sum is not the image size."""
     lengths = np.asarray(runs, np.int64)
     if lengths.ndim != 1 or (lengths < 0).any() or (lengths > height * width).any() or lengths.sum() != height * width:
-        raise ValueError(f"the run lengths do not make {width} x {height} pixels")
+        raise ValueError(f"the run lengths do not sum to {width} x {height} pixels")
     flat = np.repeat(np.arange(len(lengths)) % 2 == 1, lengths)
     return flat.reshape(width, height).T if by_columns else flat.reshape(height, width)
 
@@ -128,13 +129,12 @@ _FEWEST_CORNERS = 3
 
 
 _Part = tuple[str, Bool[np.ndarray, "height width"]]
-_MALFORMED = (ValueError, TypeError, KeyError, AttributeError, IndexError)
-"""Errors of values of a wrong form."""
+_EXPORT = "Export it again."
 
 
 def read_coco(path: Path, remarks: Counter[str]) -> Iterator[ForeignImage]:
     """The images of a COCO file; reasons for omitted annotations are added to `remarks`."""
-    try:
+    with well_formed(f"{path} is not a COCO file", _EXPORT):
         content = parse_json(read_text(path, VALUES))
         names = {int(entry["id"]): entry for entry in content["categories"]}
         marked: dict[int, list[dict[str, Any]]] = defaultdict(list)
@@ -144,8 +144,6 @@ def read_coco(path: Path, remarks: Counter[str]) -> Iterator[ForeignImage]:
         for absent in sorted(marked.keys() - {int(image["id"]) for image in images}):
             why = f"image {absent} is not in the file"
             remarks.update(f"{_annotation(annotation)} left out: {why}" for annotation in marked[absent])
-    except (OSError, RecursionError, *_MALFORMED) as error:
-        raise SequenceError(f"{path} is not a COCO file ({_why(error)}). Export it again.") from error
     for image in images:
         yield _coco_image(path, image, marked[int(image["id"])], names, remarks)
 
@@ -178,19 +176,17 @@ def _coco_image(
     path: Path, image: Any, marked: list[dict[str, Any]], names: dict[int, Any], remarks: Counter[str]
 ) -> ForeignImage:
     where = f"{path}: image {image.get('file_name')!r}"
-    try:
+    with well_formed(f"{where} cannot be read", _EXPORT):
         size, name = _size(image), str(image["file_name"])
         _check_shapes(len(marked))
-    except _MALFORMED as error:
-        raise SequenceError(f"{where} cannot be read ({_why(error)}). Export it again.") from error
     points: dict[str, tuple[float, float]] = {}
     usable = []
     for annotation in marked:
         try:
             points |= _coco_keypoints(annotation, _category(annotation, names))
             usable.append(annotation)
-        except _MALFORMED as error:
-            remarks[f"{_annotation(annotation)} left out: {name}: {_why(error)}"] += 1
+        except MALFORMED as error:
+            remarks[f"{_annotation(annotation)} left out: {name}: {cause(error)}"] += 1
     if len(points) > MOST_KEYPOINTS:
         raise SequenceError(f"{where} has {len(points)} keypoints; {MOST_KEYPOINTS} are allowed. Export fewer.")
 
@@ -199,8 +195,8 @@ def _coco_image(
             try:
                 mask = _coco_mask(annotation.get("segmentation"), *size)
                 label = str(_category(annotation, names)["name"])
-            except _MALFORMED as error:
-                remarks[f"{_annotation(annotation)} left out: {name}: {_why(error)}"] += 1
+            except MALFORMED as error:
+                remarks[f"{_annotation(annotation)} left out: {name}: {cause(error)}"] += 1
                 continue
             if mask is not None:
                 yield label, mask
@@ -232,7 +228,7 @@ def _coco_mask(segmentation: Any, height: int, width: int) -> Bool[np.ndarray, "
             raise ValueError(f"a polygon has {len(polygon)} numbers, which are not x and y of three or more corners")
         points = np.asarray(polygon, np.float64).reshape(-1, 2)
         if not np.isfinite(points).all() or np.abs(points).max() > 2 * _LARGEST_SIDE:
-            raise ValueError("a corner of a polygon lies nowhere")
+            raise ValueError("a corner of a polygon is not finite or far outside the image")
         mask |= mask_of_polygon(points, height, width)
     return mask
 
@@ -252,13 +248,9 @@ def _coco_keypoints(annotation: dict[str, Any], category: Any) -> dict[str, tupl
     }
 
 
-def _why(error: Exception) -> str:
-    return f"{error} is missing" if isinstance(error, KeyError) else str(error)
-
-
 def read_cvat(path: Path, remarks: Counter[str]) -> Iterator[ForeignImage]:
     """The images of a CVAT file; reasons for omitted shapes are added to `remarks`."""
-    try:
+    with well_formed(f"{path} is not a CVAT file", _EXPORT):
         root = parse_xml(read_text(path, VALUES))
         if root.tag != "annotations" or root.find("image") is None:
             raise ValueError("there is no <image> in <annotations>; export as 'CVAT for images 1.1'")
@@ -266,30 +258,26 @@ def read_cvat(path: Path, remarks: Counter[str]) -> Iterator[ForeignImage]:
         name, times = Counter(image.get("name") for image in images).most_common(1)[0]
         if times > 1:
             raise ValueError(f"it has image {shown(str(name))} {times} times")
-    except (OSError, ValueError, RecursionError) as error:
-        raise SequenceError(f"{path} is not a CVAT file ({error}). Export it again.") from error
     for image in images:
         yield _cvat_image(path, image, remarks)
 
 
 def _cvat_image(path: Path, image: Element, remarks: Counter[str]) -> ForeignImage:
     name = image.get("name", "")
-    try:
+    with well_formed(f"{path}: image {name!r} cannot be read", _EXPORT):
         size, points = _size(image.attrib), dict(_cvat_keypoints(image))
         _check_shapes(len(image))
         if len(points) > MOST_KEYPOINTS:
             raise ValueError(f"it has {len(points)} keypoints; {MOST_KEYPOINTS} are allowed")
-    except _MALFORMED as error:
-        raise SequenceError(f"{path}: image {name!r} cannot be read ({_why(error)}). Export it again.") from error
 
     def parts() -> Iterator[_Part]:
         shapes = [shape for shape in image if shape.tag in ("mask", "polygon")]
         for shape in sorted(shapes, key=lambda shape: int(shape.get("z_order", "0"))):
             try:
                 mask = _cvat_mask(shape, *size)
-            except _MALFORMED as error:
+            except MALFORMED as error:
                 label = shape.get("label", "no label")
-                remarks[f"a {shape.tag} ({label}) of {name} left out: {_why(error)}"] += 1
+                remarks[f"a {shape.tag} ({label}) of {name} left out: {cause(error)}"] += 1
                 continue
             yield shape.get("label", "instrument"), mask
 
@@ -312,7 +300,7 @@ def _cvat_points(shape: Element) -> np.ndarray:
     rows = [corner.split(",") for corner in shape.get("points", "").split(";")]
     points = np.array([[float(x), float(y)] for x, y in rows])
     if not np.isfinite(points).all() or np.abs(points).max() > 2 * _LARGEST_SIDE:
-        raise ValueError("a point lies nowhere")
+        raise ValueError("a point is not finite or far outside the image")
     return points
 
 
@@ -329,16 +317,12 @@ def _cvat_keypoints(image: Element) -> Iterator[tuple[str, tuple[float, float]]]
 def read_surgpose(path: Path, remarks: Counter[str]) -> Iterator[ForeignImage]:
     """The frames of a file of keypoints; without remarks."""
     del remarks
-    try:
+    with well_formed(f"{path} has no keypoints in the format of SurgPose", "Expected: {frame: {1: [x, y], ...}}."):
         content = parse_yaml(read_text(path, VALUES))
         if not isinstance(content, dict) or len(content) > MOST_IMAGES:
-            raise ValueError("it is no table of frames")
+            raise ValueError("it has no frames, or too many")
         frames = {int(frame): dict(points or {}) for frame, points in content.items()}
         found = [(frame, _surgpose_points(points)) for frame, points in sorted(frames.items())]
-    except (OSError, ValueError, TypeError, RecursionError) as error:
-        raise SequenceError(
-            f"{path} has no keypoints as SurgPose writes them ({error}): {{frame: {{1: [x, y], ...}}}}."
-        ) from error
     for frame, points in found:
         yield ForeignImage(f"{path.name} {frame}", keypoints=points, frame=str(frame), camera="")
 
@@ -384,7 +368,7 @@ def read_mask_folder(path: Path, remarks: Counter[str], *, confined: bool = Fals
     files = [file for file in usable if file.suffix.lower() in _SUFFIXES] or usable
     if not files:
         known = ", ".join((*_SUFFIXES, *_OTHER_SUFFIXES))
-        raise SequenceError(f"{path} has no masks ({known}). Name the folder that holds them.")
+        raise SequenceError(f"{path} has no masks ({known}). Give the folder with the masks.")
     meanings: dict[Path, Any] = {}
     for file in files:
         above = _meaning_file(file, path if confined else path.parent, confined)
@@ -422,17 +406,15 @@ def _meaning_file(file: Path, top: Path, confined: bool) -> Path | None:
 
 
 def _meaning(path: Path) -> Any:
-    try:
+    with well_formed(f"{path} cannot be read", "Correct it or remove it."):
         return parse_json(read_text(path, VALUES))
-    except (OSError, ValueError) as error:
-        raise SequenceError(f"{path} cannot be read ({error}). Correct it or remove it.") from error
 
 
 def _parts(file: Path, meaning: Any, remarks: Counter[str]) -> Iterator[_Part]:
     image = read_labels(file)
     tool = next((part.removesuffix(_TOOL) for part in file.parts[::-1] if part.endswith(_TOOL)), "")
     yield "", np.zeros(image.colours.shape[:2], bool)
-    try:
+    with well_formed(f"the meanings of the values of {file} cannot be read", "Correct them."):
         if isinstance(meaning, list):
             yield from _by_colour(image.colours, meaning, file)
             return
@@ -443,13 +425,11 @@ def _parts(file: Path, meaning: Any, remarks: Counter[str]) -> Iterator[_Part]:
                 yield tool or _INSTRUMENT, image.mask
         elif image.values is None:
             raise SequenceError(
-                f"{file} has colours, and no labels.json in its folder or above names them. Add one as "
-                'EndoVis 2018 has it: [{"name": ..., "color": [r, g, b]}, ...].'
+                f"{file} has colours, but neither its folder nor those above have a labels.json that names them. Add "
+                'one in the format of EndoVis 2018: [{"name": ..., "color": [r, g, b]}, ...].'
             )
         else:
             yield from _by_value(image.values, names, tool, file)
-    except (TypeError, KeyError, ValueError, AttributeError) as error:
-        raise SequenceError(f"what the values of {file} mean cannot be read ({error}).") from error
 
 
 def _by_colour(image: np.ndarray, meaning: list[Any], file: Path) -> Iterator[_Part]:
@@ -459,7 +439,7 @@ def _by_colour(image: np.ndarray, meaning: list[Any], file: Path) -> Iterator[_P
     code = image.astype(np.int64) @ (65536, 256, 1)
     values = [int(value) for value in np.unique(code)]
     if unknown := set(values) - known.keys():
-        raise SequenceError(f"{file} has the colour #{min(unknown):06x}, which labels.json does not know. Add it.")
+        raise SequenceError(f"{file} has the colour #{min(unknown):06x}, which labels.json does not list. Add it.")
     for value in values:
         if known[value].lower().startswith(_SCENE_PARTS):
             yield known[value], code == value
@@ -470,8 +450,8 @@ def _by_value(image: np.ndarray, names: Mapping[int, str], tool: str, file: Path
     unknown = [value for value in values if value not in names]
     if len(unknown) > _MOST_UNNAMED:
         raise SequenceError(
-            f"{file} has {len(unknown)} values without a name, {values[0]} to {values[-1]}. Labels that were resized "
-            "with interpolation have such: resize them by the nearest neighbour, or name each value in labels.json."
+            f"{file} has {len(unknown)} values without a name, {values[0]} to {values[-1]}, as after resizing with "
+            "interpolation. Resize labels by nearest neighbour, or name each value in labels.json."
         )
     for value in values:
         name = names.get(value, f"label {value}")

@@ -67,7 +67,7 @@ def read_annotations(
         images = read(place, remarks)
     else:
         raise SequenceError(
-            f"{source} holds no masks or keypoints that are known. Give a COCO file (.json), a CVAT file (.xml), "
+            f"{source} has no masks or keypoints in a supported format. Give a COCO file (.json), a CVAT file (.xml), "
             "keypoints of SurgPose (.yaml), or a folder of PNG masks."
         )
     own = any((folder / _OWN_EXPORT).is_file() for folder in (place, *list(place.parents)[:3]))
@@ -111,7 +111,7 @@ class _FrameReader:
                 done.add(at)
                 joined = []
             if found in done:
-                raise SequenceError(f"{image.name} is of a frame that came before. Name the images by their frames.")
+                raise SequenceError(f"{image.name} is of an earlier frame. Name the images by their frames.")
             at, joined = found, [*joined, image]
         if at is not None:
             yield self._joined(at, joined)
@@ -153,12 +153,12 @@ class _FrameReader:
                 if mask.shape != (camera.height, camera.width):
                     raise SequenceError(
                         f"{image.name} is {mask.shape[1]} x {mask.shape[0]} pixels, but images of camera {name!r} are "
-                        f"{camera.width} x {camera.height}. Give masks of the images' own size."
+                        f"{camera.width} x {camera.height}. Give masks of the size of the images."
                     )
                 labels = np.zeros(mask.shape, np.uint8) if labels is None else labels
                 if label and label not in self._labels:
                     if len(self._labels) == MOST_LABELS:
-                        raise SequenceError(f"there are more than {MOST_LABELS} labels, say {label!r}. Join some.")
+                        raise SequenceError(f"there are more than {MOST_LABELS} labels, such as {label!r}. Merge some.")
                     self._labels.append(label)
                 if label:
                     labels[mask] = self._labels.index(label) + 1

@@ -16,6 +16,7 @@ from ...files.decoding import decoded
 from ...files.reading import CALIBRATION, VALUES, is_regular, parse_ini, parse_json, parse_xml, parse_yaml, read_text
 from ...model.camera import DISTORTION_LENGTHS, T_DVRK_OPENCV, rigid_transform
 from ...settings.interchange import Axes
+from .found import MALFORMED, cause, read_json
 
 _MODELS = ("plumb_bob", "rational_polynomial", "radtan", "none", "")
 _PINHOLES = ("pinhole", "perspective", "")
@@ -63,14 +64,10 @@ def read_calibration(path: Path, side: str) -> Calibration:
             return _from_matlab(decoded(read_matlab, path), side)
         content = _content(path)
         if not isinstance(content, dict):
-            raise ValueError("it holds no named values")
+            raise ValueError("it has no named values")
         return _from_names(content, side)
-    except (OSError, ValueError, KeyError, TypeError, IndexError, AttributeError) as error:
-        known = isinstance(error, OSError | ValueError)
-        what = f"{error} is missing" if isinstance(error, KeyError) else f"a value has another form ({error})"
-        raise SequenceError(
-            f"calibration {path} cannot be used: {error if known else what}. Known are: {_KINDS}."
-        ) from error
+    except MALFORMED as error:
+        raise SequenceError(f"calibration {path} cannot be used: {cause(error)}. Supported are: {_KINDS}.") from error
 
 
 def calibration_from_info(info: Any) -> Calibration | None:
@@ -95,7 +92,7 @@ def check_model(model: str, camera_model: str = "") -> None:
         given = f"distortion model {model!r}" if pinhole else f"camera model {camera_model!r}"
         raise ValueError(
             f"it has the {given}; allowed are pinholes with plumb_bob or rational_polynomial (radtan in Kalibr). "
-            "Rectify the images, or calibrate them with such a model"
+            "Rectify the images, or calibrate them with an allowed model"
         )
 
 
@@ -144,7 +141,7 @@ def _from_names(content: Mapping[str, Any], side: str) -> Calibration:
     elif K is None and {"fx", "fy", "cx", "cy"} <= set(content):
         K = np.array([content[name] for name in ("fx", "fy", "cx", "cy")], np.float64)
     if K is None:
-        raise ValueError(f"none of camera_matrix, K, M1, cam0 is in it; it has {', '.join(map(str, content))}")
+        raise ValueError(f"it has none of camera_matrix, K, M1 and cam0, but {', '.join(map(str, content))}")
     found = _calibration(K, D, _size(content))
     if side == "right":
         R, T = _first(content, ("R", "R_stereo")), _first(content, ("T", "t", "T_stereo"))
@@ -152,7 +149,7 @@ def _from_names(content: Mapping[str, Any], side: str) -> Calibration:
             R = Rotation.from_rotvec(om.reshape(3)).as_matrix()
         if R is not None and T is not None and R.size == 9 and T.size == 3:
             in_mm = float(np.linalg.norm(T)) > _METRES_TO
-            remark = f"its translation of {np.linalg.norm(T):.4g} is taken as millimetres."
+            remark = f"its translation of {np.linalg.norm(T):.4g} is assumed to be in millimetres."
             found = _placed(found, R, T * 1e-3 if in_mm else T, *([remark] if in_mm else []))
     R, P = (_first(content, (name,), suffixes) for name in ("rectification_matrix", "projection_matrix"))
     return replace(found, R=_rotation(R), P=_projection(P))
@@ -169,7 +166,7 @@ def _from_kalibr(content: Mapping[str, Any]) -> Calibration:
     check_model(str(content.get("distortion_model") or ""), str(content.get("camera_model") or ""))
     intrinsics = np.array(content["intrinsics"], np.float64)
     if intrinsics.size != 4:
-        raise ValueError(f"its intrinsics have {intrinsics.size} numbers; a pinhole has fu, fv, pu, pv")
+        raise ValueError(f"its intrinsics have {intrinsics.size} numbers; those of a pinhole are fu, fv, pu, pv")
     found = _calibration(intrinsics, np.array(content.get("distortion_coeffs", ()), np.float64), _size(content))
     if "T_cn_cnm1" in content:
         found = replace(found, T_right_left=np.array(content["T_cn_cnm1"], np.float64).reshape(4, 4))
@@ -190,7 +187,7 @@ def _calibration(K: np.ndarray, D: np.ndarray | None, size: tuple[int, int] | No
     if numbers.size == 9:
         matrix = numbers.reshape(3, 3)
         if matrix[0, 2] == matrix[1, 2] == 0 and matrix[2, 0] != 0 and matrix[2, 1] != 0:
-            matrix, remarks = matrix.T, ("its matrix is transposed, with the principal point in the last row.",)
+            matrix, remarks = matrix.T, ("its matrix has the principal point in the last row, and is transposed.",)
         if np.abs(matrix[[1, 2, 2], [0, 0, 1]]).max() > 1e-6 * abs(matrix[0, 0]) or abs(matrix[2, 2] - 1) > 1e-6:
             raise ValueError(f"its matrix is {matrix.tolist()}, which is not [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]")
         if abs(matrix[0, 1]) > 1e-3 * abs(matrix[0, 0]):
@@ -314,15 +311,10 @@ def read_base_frames(path: Path, axes: Axes | None = None) -> tuple[DvrkBaseFram
     Args:
         axes: axes of the camera in the file; by default those of its format and name.
     """
-    try:
-        content = parse_json(read_text(path, VALUES))
-    except FileNotFoundError as error:
-        raise SequenceError(f"dVRK file {path} is missing. Correct the path.") from error
-    except (OSError, ValueError) as error:
-        raise SequenceError(f"dVRK file {path} is not readable JSON: {error}. Copy it again.") from error
+    content = read_json(path)
     found = _entries(content, path)
     if not found:
-        raise SequenceError(f"{path} has no base frame. Expected is {_BASE_FRAME_KINDS}.")
+        raise SequenceError(f"{path} has no base frame. Supported are: {_BASE_FRAME_KINDS}.")
     axes = axes or _axes_of(content, path)
     T = T_DVRK_OPENCV if axes == "dvrk" else np.eye(4)
     try:
@@ -373,6 +365,6 @@ def _axes_of(content: dict[str, Any], path: Path) -> Axes:
     if "dvrk" in name:
         return "dvrk"
     raise SequenceError(
-        f"{path}: neither its content nor its name states which axes the camera has (names end in -open-cv.json or "
-        "-dVRK.json). Say opencv (x right, y down) or dvrk (x left, y up)."
+        f"{path}: neither its content nor its name (-open-cv.json or -dVRK.json) states the camera axes. Give them: "
+        "opencv (x right, y down) or dvrk (x left, y up)."
     )

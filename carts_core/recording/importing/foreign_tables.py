@@ -10,12 +10,11 @@ from pathlib import Path
 import numpy as np
 
 from ...decoders import tables
-from ...errors import SequenceError
 from ...files.decoding import decoded
 from ...files.reading import TABLE, read_text
 from ...imports import needs_extra
 from ...wording import shown
-from .found import PartError
+from .found import PartError, well_formed
 
 _LONGEST_UNIT = 12
 """Longest word that is taken for a unit."""
@@ -88,10 +87,8 @@ def read_foreign_table(path: Path) -> ForeignTable:
 
 def read_array(path: Path) -> np.ndarray:
     """The array of a .npy file."""
-    try:
+    with well_formed(f"array {path} cannot be read"):
         return decoded(tables.read_arrays, path)[""]
-    except (OSError, ValueError, KeyError) as error:
-        raise SequenceError(f"array {path} cannot be read ({error}). Copy it again.") from error
 
 
 def _csv(path: Path) -> ForeignTable:

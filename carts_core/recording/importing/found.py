@@ -1,6 +1,7 @@
 """Contents of a foreign recording before a sequence file is written, and the interface of their readers."""
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -9,7 +10,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from ...errors import SequenceError
-from ...files.reading import VALUES, parse_json, read_text
+from ...files.reading import VALUES, is_regular, parse_json, read_text
 from ...settings.interchange import ImportOptions
 
 NoteKind = Literal["found", "guessed", "missing", "warning"]
@@ -22,12 +23,30 @@ def recording_name(path: Path) -> str:
     return path.name if path.is_dir() else path.stem
 
 
+MALFORMED = (OSError, RecursionError, ValueError, TypeError, KeyError, AttributeError, IndexError)
+"""Errors of files that cannot be read, and of values of a wrong form."""
+
+
+def cause(error: Exception) -> str:
+    """Cause of one of the `MALFORMED` errors, in one line."""
+    return f"{error} is missing" if isinstance(error, KeyError) else " ".join(str(error).split())
+
+
+@contextmanager
+def well_formed(requirement: str, remedy: str = "Copy it again.") -> Iterator[None]:
+    """Raise `SequenceError` for `MALFORMED` errors in the block: the violated requirement, the cause, and a remedy."""
+    try:
+        yield
+    except MALFORMED as error:
+        raise SequenceError(f"{requirement} ({cause(error)}). {remedy}") from error
+
+
 def read_json(path: Path) -> Any:
     """Content of a JSON file of a recording."""
-    try:
+    if not is_regular(path):
+        raise SequenceError(f"{path} is missing. Correct the path.")
+    with well_formed(f"{path} is not readable JSON"):
         return parse_json(read_text(path, VALUES))
-    except (OSError, ValueError) as error:
-        raise SequenceError(f"{path} is not readable JSON ({error}). Copy the recording again.") from error
 
 
 class PartError(SequenceError):

@@ -23,7 +23,7 @@ from ...wording import listed
 from ..importing.cameras import cameras_of, common_ids, find_images, image_files
 from ..importing.columns import order_of_names
 from ..importing.foreign_tables import read_foreign_table
-from ..importing.found import FoundArm, FoundCamera, FoundRecording, Import, PartError, Source, read_json
+from ..importing.found import FoundArm, FoundCamera, FoundRecording, Import, PartError, Source, read_json, well_formed
 from ..importing.logs import ArmLog, arm_from_log, track
 from ..importing.row_matching import by_rows, frame_times
 
@@ -62,18 +62,14 @@ def _read_surgpose(path: Path, job: Import) -> FoundRecording:
     arms = []
     for recorded in names:
         own = {frame: row[recorded] for frame, row in rows.items() if recorded in row}
-        try:
+        with well_formed(f"{file}: joint positions of {recorded} are not numbers"):
             log = track([*own], [[*map(float, values[:6])] for values in own.values()])
-        except (TypeError, ValueError) as error:
-            raise SequenceError(
-                f"{file}: joint positions of {recorded} are not numbers ({error}). Copy it again."
-            ) from error
         if log is None or log.values.shape[1] != 6:
             raise SequenceError(f"{file}: {recorded} needs six joint positions in every frame. Copy it again.")
         arms.append(arm_from_log(ArmLog(job.arm_name(recorded) or recorded, joints=log), job))
     times = frame_times(images["left"], ids, job).times
     if len(rows) != len(ids):
-        text = f"{file.name} has {len(rows)} rows and there are {len(ids)} images."
+        text = f"{file.name} has {len(rows)} rows, and the videos have {len(ids)} images."
         job.warning(f"{text} Each row is assigned to the image of its number. Check the delay.")
     found, kept_ids, kept = by_rows(arms, ids, job, times)
     job.warning(
@@ -86,14 +82,8 @@ def _read_surgpose(path: Path, job: Import) -> FoundRecording:
 
 
 def _yaml_rows(file: Path) -> dict[int, dict]:
-    try:
-        content = parse_yaml(read_text(file, VALUES))
-        return {int(frame): dict(row) for frame, row in content.items()}
-    except (OSError, AttributeError, TypeError, ValueError) as error:
-        text = " ".join(str(error).split())
-        raise SequenceError(
-            f"{file} is not a YAML file of frames with joints by arm ({text}). Copy it again."
-        ) from error
+    with well_formed(f"{file} is not a YAML file of frames with joints by arm"):
+        return {int(frame): dict(row) for frame, row in parse_yaml(read_text(file, VALUES)).items()}
 
 
 def _read_endovis(path: Path, job: Import) -> FoundRecording:
@@ -161,23 +151,21 @@ def _read_jigsaws(path: Path, job: Import) -> FoundRecording:
     if not trials:
         raise SequenceError(f"{path} has no kinematics/AllGestures/TRIAL.txt. Give the root of JIGSAWS, or a trial.")
     path = trials[0]
-    try:
+    with well_formed(f"{path} is not a table of numbers"):
         rows = np.array([line.split() for line in read_text(path, TABLE).splitlines() if line.strip()], np.float64)
-    except (OSError, ValueError) as error:
-        raise SequenceError(f"{path} is not a table of numbers ({error}). Copy it again.") from error
     if rows.ndim != 2 or rows.shape[1] != _JIGSAWS_COLUMNS:
         raise SequenceError(f"{path} has the shape {rows.shape}; a trial of JIGSAWS has {_JIGSAWS_COLUMNS} columns.")
     videos = path.parents[2] / "video"
     found = {side: videos / f"{path.stem}_capture{number}.avi" for number, side in ((1, "left"), (2, "right"))}
     images = {side: find_images(video) for side, video in found.items() if video.is_file()}
     if not images:
-        raise SequenceError(f"{videos} has no {path.stem}_capture1.avi. Copy the videos of the task too.")
+        raise SequenceError(f"{videos} has no {path.stem}_capture1.avi. Also copy the videos of the task.")
     cameras = cameras_of(images, job)
     ids = common_ids(images, videos)
     rate = job.options.frame_rate or _JIGSAWS_RATE
     times = np.arange(len(rows), dtype=float) / rate
     if len(rows) != len(ids):
-        job.warning(f"{path.name} has {len(rows)} rows and there are {len(ids)} images.")
+        job.warning(f"{path.name} has {len(rows)} rows, and the videos have {len(ids)} images.")
     arms: list[FoundArm] = []
     for arm, first in _JIGSAWS_ARMS.items():
         R = rows[:, first + 3 : first + 12].reshape(-1, 3, 3)
@@ -233,7 +221,7 @@ def _read_surgsync(path: Path, job: Import) -> FoundRecording:
     places = {side: path / f"video_raw/stereo_{side}.mkv" if packed else path / "image" / side for side in _SIDES}
     images = {side: find_images(place) for side, place in places.items() if place.exists()}
     if not images:
-        raise SequenceError(f"{path} has neither video_raw/stereo_left.mkv nor image/left. Copy it again, whole.")
+        raise SequenceError(f"{path} has neither video_raw/stereo_left.mkv nor image/left. Copy all of it again.")
     calibrations = {side: [path / folder / f"{side}.yaml" for folder in _CALIBRATION_FOLDERS] for side in images}
     cameras = cameras_of(
         images, job, {side: file for side, files in calibrations.items() for file in files if file.is_file()}
@@ -251,7 +239,7 @@ def _read_surgsync(path: Path, job: Import) -> FoundRecording:
         if any(found is not None for found in tracks.values()):
             arms.append(arm_from_log(ArmLog(name, **tracks), job))
     if not arms:
-        raise SequenceError(f"{path} has no kinematics of {', '.join(_ARMS)}. Copy it again, whole.")
+        raise SequenceError(f"{path} has no kinematics of {', '.join(_ARMS)}. Copy all of it again.")
     times = frame_times(next(iter(images.values())), ids, job).times
     found, kept_ids, kept = by_rows(arms, ids, job, times)
     if packed:
@@ -306,7 +294,7 @@ def _raw(path: Path, arm: str, ids: tuple[str, ...]) -> dict[str, Any]:
         if not file.is_file():
             continue
         content = read_json(file)
-        try:
+        with well_formed(f"{file} is not the kinematics of a frame"):
             top = content[0] if isinstance(content, list) else content
             body = top["arm"]
             measured = body["measured_data"]
@@ -321,8 +309,6 @@ def _raw(path: Path, arm: str, ids: tuple[str, ...]) -> dict[str, Any]:
             for role, numbers in values.items():
                 if numbers is not None and len(numbers) >= _LENGTHS[role]:
                     rows[role].append((float(position), *map(float, numbers[: _LENGTHS[role]])))
-        except (AttributeError, IndexError, KeyError, TypeError, ValueError) as error:
-            raise SequenceError(f"{file} is not the kinematics of a frame ({error!r}). Copy it again.") from error
     return {role: track([row[0] for row in found], [row[1:] for row in found]) for role, found in rows.items()}
 
 

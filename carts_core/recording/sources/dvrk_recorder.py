@@ -16,7 +16,7 @@ from ..image_sources import Bag
 from ..importing.cameras import calibration_of, find_images, side_of
 from ..importing.columns import order_of_names
 from ..importing.foreign_tables import read_foreign_table
-from ..importing.found import FoundCamera, FoundRecording, Import, Source, Track, read_json
+from ..importing.found import FoundCamera, FoundRecording, Import, Source, Track, read_json, well_formed
 from ..importing.logs import ArmLog, arm_from_log, nearest, track
 from ..video import SUFFIXES
 from .bag import read_arm_logs, read_endoscope
@@ -73,7 +73,7 @@ def _streams(path: Path, job: Import) -> list[_Stream]:
             raise SequenceError(f"video {video} is missing. Copy the whole session again.")
         sidecar = video.with_suffix(".json")
         if not sidecar.is_file():
-            raise SequenceError(f"{sidecar} with the frame times of {video.name} is missing. Copy it too.")
+            raise SequenceError(f"{sidecar} with the frame times of {video.name} is missing. Also copy the sidecar.")
         streams.append(_stream(video, sidecar, job))
     return streams
 
@@ -85,21 +85,15 @@ def _stream(video: Path, sidecar: Path, job: Import) -> _Stream:
     name = str(content.get("stream_name") or video.stem)
     for key, unit in _OLD_UNITS.items():
         if isinstance(stamps := content.get(key), list) and stamps:
-            try:
+            with well_formed(f"sidecar {sidecar}: times are not numbers"):
                 times = np.array(stamps, np.float64) * unit
-            except (TypeError, ValueError) as error:
-                raise SequenceError(f"sidecar {sidecar}: times are not numbers ({error}). Copy it again.") from error
             return _checked(_Stream(video, name, np.arange(len(times)), times, "undefined", 0.0), sidecar, job)
     frames = content.get("frames")
     if not isinstance(frames, list) or not frames:
         raise SequenceError(f'sidecar {sidecar} has neither "frames" nor "timestamps_ns". Copy it again.')
-    try:
+    with well_formed(f"sidecar {sidecar}: a frame has no frame_index or no cpu.realtime times"):
         numbers = np.array([int(frame["frame_index"]) for frame in frames])
         times = np.array([_frame_time(frame) for frame in frames])
-    except (KeyError, TypeError, ValueError) as error:
-        raise SequenceError(
-            f"sidecar {sidecar}: a frame has no {error}. Frames need frame_index and cpu.realtime times."
-        ) from error
     layout = str(content.get("side_by_side") or "undefined")
     if layout not in ("undefined", *_SIDES):
         raise SequenceError(f"sidecar {sidecar}: side_by_side is {layout!r}; known are undefined, LR and RL.")
@@ -123,7 +117,7 @@ def _frame_time(frame: dict[str, Any]) -> float:
     for value in (known("mono_source"), both, left, right, known("recorder_reception")):
         if value is not None:
             return value * 1e-9
-    raise KeyError("any time in cpu.realtime")
+    raise KeyError("cpu.realtime")
 
 
 def _checked(stream: _Stream, sidecar: Path, job: Import) -> _Stream:
@@ -216,7 +210,7 @@ def _read(path: Path, job: Import) -> FoundRecording:
     if not logs:
         raise SequenceError(
             f"{path} has no kinematics: neither a bag with /PSM1/measured_cp or measured_js nor CSV files extracted "
-            "from one (_PSM1_measured_js.csv). Copy the bag's folder too."
+            "from one (_PSM1_measured_js.csv). Also copy the folder of the bag."
         )
     arms = [arm_from_log(log, job) for log in logs]
     latency, offset = max(stream.latency for stream in streams), job.options.time_offset

@@ -13,7 +13,7 @@ from ...imports import needs_extra
 from ..importing.cameras import calibration_of, find_images, side_of
 from ..importing.columns import arm_log, guess_columns, samples
 from ..importing.foreign_tables import ForeignTable, read_parquet
-from ..importing.found import FoundArm, FoundCamera, FoundRecording, Import, PartError, Source
+from ..importing.found import FoundArm, FoundCamera, FoundRecording, Import, PartError, Source, well_formed
 from ..importing.logs import arm_from_log, nearest
 from ..importing.row_matching import by_rows
 
@@ -46,14 +46,9 @@ def _root(path: Path) -> Path:
 def _read(path: Path, job: Import) -> FoundRecording:
     needs_extra("pyarrow", "import")
     root = _root(path)
-    try:
+    with well_formed(f"{root / 'meta/info.json'} is not a LeRobot description with features and fps"):
         info = parse_json(read_text(root / "meta/info.json", VALUES))
-        features = dict(info["features"])
-        rate = float(info["fps"])
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise SequenceError(
-            f"{root / 'meta/info.json'} is not a LeRobot description with features and fps ({error!r}). Copy it again."
-        ) from error
+        features, rate = dict(info["features"]), float(info["fps"])
     wanted = _EPISODE.search(path.name)
     cameras = [key for key, value in features.items() if isinstance(value, dict) and value.get("dtype") == "video"]
     episode = _episode(root, info, cameras, int(wanted.group(1)) if wanted else 0, job)
@@ -111,7 +106,7 @@ def _episode(root: Path, info: dict[str, Any], cameras: list[str], index: int, j
 
 
 def _v3(root: Path, row: dict[str, Any], cameras: list[str], rate: float, index: int) -> _Episode:
-    try:
+    with well_formed(f"{root}: meta/episodes lacks values of episode {index}", "Copy the data set again."):
         chunk, file = int(row["data/chunk_index"]), int(row["data/file_index"])
         table = _parquet(root / f"data/chunk-{chunk:03d}/file-{file:03d}.parquet")
         own = table.columns["episode_index"] == index
@@ -122,18 +117,12 @@ def _v3(root: Path, row: dict[str, Any], cameras: list[str], rate: float, index:
                 f"chunk-{int(row[f'videos/{key}/chunk_index']):03d}/file-{int(row[f'videos/{key}/file_index']):03d}.mp4"
             )
             videos[key] = (root / f"videos/{key}/{place}", round(float(row[f"videos/{key}/from_timestamp"]) * rate))
-    except (KeyError, TypeError, ValueError) as error:
-        raise SequenceError(
-            f"{root}: meta/episodes lacks {error} of episode {index}. Copy the data set again."
-        ) from error
     return _Episode(index, table, videos)
 
 
 def _parquet(path: Path) -> ForeignTable:
-    try:
+    with well_formed(f"table {path} cannot be read"):
         return ForeignTable(path, read_parquet(path))
-    except (OSError, ValueError) as error:
-        raise SequenceError(f"table {path} cannot be read ({error}). Copy it again.") from error
 
 
 def _names(value: Any) -> list[str]:
@@ -149,10 +138,8 @@ def _arms(root: Path, features: dict[str, Any], episode: _Episode, job: Import) 
     if _STATE not in features or _STATE not in episode.table.columns:
         raise SequenceError(f"{root} has no feature {_STATE}. Its features are: {', '.join(features)}.")
     names = _names(features[_STATE].get("names"))
-    try:
+    with well_formed(f"{root}: rows of {_STATE} differ in length", "Copy the data set again."):
         values = np.array(episode.table.columns[_STATE].tolist(), np.float64)
-    except (TypeError, ValueError) as error:
-        raise SequenceError(f"{root}: rows of {_STATE} differ in length ({error}). Copy the data set again.") from error
     if values.ndim != 2 or len(names) != values.shape[1]:
         raise SequenceError(
             f"{root}: {_STATE} has {values.shape[-1]} columns and {len(names)} names in meta/info.json. Correct them."

@@ -268,7 +268,7 @@ WRONG: list[tuple[str, Any, str]] = [
     ("omni.yaml", KALIBR.replace("pinhole", "omni"), "camera model 'omni'"),
     ("mei.yaml", CAMODOCAL.replace("PINHOLE", "MEI"), "camera model 'MEI'"),
     ("opencv_fisheye.yml", opencv_yaml() + "fisheye_model: 1\n", "fisheye"),
-    ("lines.yaml", "hello", "it holds no named values"),
+    ("lines.yaml", "hello", "it has no named values"),
     ("negative.json", json.dumps({**OWN, "K": [[-700, 0, 330], [0, 705, 235], [0, 0, 1]]}), "-700 and 705 px, which"),
     ("millimetres.json", json.dumps({**OWN, "K": [[4.2, 0, 3.2], [0, 4.2, 2.4], [0, 0, 1]]}), "may be in millimetres"),
     (
@@ -317,7 +317,7 @@ def test_the_size_of_the_calibrated_images_answers_what_a_file_does_not_state(tm
 @pytest.mark.parametrize(
     ("R", "T", "message"),
     [
-        (np.eye(3), [-4.8, 0.1, 0], "translation of 4.801 is taken as millimetres"),
+        (np.eye(3), [-4.8, 0.1, 0], "translation of 4.801 is assumed to be in millimetres"),
         (np.eye(3), [0.0048, 0, 0], "swapped, or the calibration is the inverse"),
     ],
 )
