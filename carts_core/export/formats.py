@@ -1,11 +1,19 @@
-"""Export formats by name, and the export function."""
+"""Export formats by name, and kinematics formats: joint positions as CSV, NPZ or JSON, and base frames of the dVRK."""
 
 import json
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
+from typing import Any
 
-from ..files import MARKER, OutputPath, published, published_file, write_text
+import numpy as np
+from jaxtyping import Float
+
+from ..errors import CartsError
+from ..files import MARKER, OutputPath, output_stream, published, published_file, write_text
+from ..model.camera import T_DVRK_OPENCV
 from ..settings import FormatName
 from .annotation_formats import (
     write_coco,
@@ -17,16 +25,105 @@ from .annotation_formats import (
     write_yolo,
 )
 from .bop import write_bop
-from .dataset import Dataset, Monitor
-from .kinematics_files import (
-    write_dvrk,
-    write_dvrk_2_3,
-    write_dvrk_suj,
-    write_kinematics_csv,
-    write_kinematics_json,
-    write_kinematics_npz,
-)
+from .dataset import Dataset, ExportFrame, Monitor
+from .kinematics import JOINED, joint_columns, joint_units, kinematics_csv, position_values, std_values
 from .video import write_video
+
+
+def _camera_poses(dataset: Dataset, frames: Sequence[ExportFrame]) -> dict[str, Float[np.ndarray, "frames 4 4"]]:
+    """Moving camera -> T_camera_world of each frame [m]."""
+    mounts = [dataset.sequence.mounts(frame.index) for frame in frames]
+    return {
+        camera.name: np.stack([camera.T_camera_world @ one[camera.name] for one in mounts])
+        for camera in dataset.scene.cameras
+        if camera.name in dataset.sequence.moving_cameras
+    }
+
+
+def write_kinematics_csv(dataset: Dataset, path: OutputPath, monitor: Monitor) -> None:
+    """Write a CSV table for `read_kinematics_csv` and `carts export --kinematics`."""
+    write_text(path, kinematics_csv(dataset.scene, monitor.track(dataset.frames)))
+
+
+def write_kinematics_npz(dataset: Dataset, path: OutputPath, monitor: Monitor) -> None:
+    """Write a NumPy archive (NPZ) without pickled objects.
+
+    Arrays: `frame_id`, `source`, `verdict` (of the mask, empty if not assessed), `not_determined` (joints not
+    determined by the images, separated by `; `) and `index` [frames]; `column` (`ARM.JOINT`) and `unit` [columns];
+    `joint_positions` and `joint_std` [frames, columns] in the unit given by `unit`; unknown `joint_std` is NaN. If
+    cameras move, `T_camera_world` [frames, cameras, 4, 4] [m] contains their poses, and `camera` their names.
+    """
+    frames = list(monitor.track(dataset.frames))
+    moving, poses = _camera_poses(dataset, frames), {}
+    if moving:
+        poses = {"camera": np.array(list(moving)), "T_camera_world": np.stack([*moving.values()], 1)}
+    with output_stream(path) as file:
+        np.savez_compressed(
+            file,
+            frame_id=np.array([frame.frame_id for frame in frames]),
+            index=np.array([frame.index for frame in frames]),
+            source=np.array([frame.source for frame in frames]),
+            verdict=np.array([frame.verdict or "" for frame in frames]),
+            not_determined=np.array([JOINED.join(frame.undetermined(dataset.scene) or ()) for frame in frames]),
+            column=np.array(joint_columns(dataset.scene)),
+            unit=np.array(joint_units(dataset.scene)),
+            joint_positions=np.array([position_values(dataset.scene, frame) for frame in frames]),
+            joint_std=np.array([std_values(dataset.scene, frame) for frame in frames]),
+            **poses,  # pyright: ignore[reportArgumentType]
+        )
+
+
+def write_kinematics_json(dataset: Dataset, path: OutputPath, monitor: Monitor) -> None:
+    """Write JSON: the unit of every `ARM.JOINT`, then the frames with positions and standard deviations, null if
+    unknown."""
+    columns, moving = joint_columns(dataset.scene), _camera_poses(dataset, dataset.frames)
+    frames = [
+        {
+            "frame": frame.frame_id,
+            "index": frame.index,
+            "source": frame.source,
+            "verdict": frame.verdict,
+            "not_determined": frame.undetermined(dataset.scene),
+            "joint_positions": dict(zip(columns, position_values(dataset.scene, frame).tolist(), strict=True)),
+            "joint_std": {
+                column: None if math.isnan(value) else value
+                for column, value in zip(columns, std_values(dataset.scene, frame).tolist(), strict=True)
+            },
+            **({"T_camera_world": {name: Ts[place].tolist() for name, Ts in moving.items()}} if moving else {}),
+        }
+        for place, frame in enumerate(monitor.track(dataset.frames))
+    ]
+    content = {
+        "sequence": dataset.sequence.name,
+        "units": dict(zip(columns, joint_units(dataset.scene), strict=True)),
+        "frames": frames,
+    }
+    write_text(path, json.dumps(content, indent=1, ensure_ascii=False, allow_nan=False))
+
+
+def _write_base_frames(
+    entry: Callable[[str, list[list[float]]], dict[str, Any]], dataset: Dataset, path: OutputPath, monitor: Monitor
+) -> None:
+    """Write the base frames of all arms relative to the first exported camera, in dVRK axes."""
+    camera = dataset.scene.cameras[0]
+    if camera.name in dataset.sequence.moving_cameras:
+        raise CartsError(
+            f"camera {camera.name!r} moves, and a base frame of the dVRK holds for one place of it. Export the base "
+            "frames of a recording in which the endoscope stands still."
+        )
+    arms = [
+        {"name": arm.name, **entry(camera.name, (T_DVRK_OPENCV @ camera.T_camera_world @ arm.T_world_base).tolist())}
+        for arm in monitor.track(dataset.scene.arms)
+    ]
+    write_text(path, json.dumps({"arms": arms}, indent=1, ensure_ascii=False))
+
+
+write_dvrk = partial(_write_base_frames, lambda name, T: {"base_frame": {"reference_frame": name, "transform": T}})
+"""Writes base frames to be merged into a dVRK system file (version 2.4)."""
+write_dvrk_2_3 = partial(_write_base_frames, lambda name, T: {"base-frame": {"reference-frame": name, "transform": T}})
+"""Writes base frames for a dVRK console file (version 2.3 and earlier)."""
+write_dvrk_suj = partial(_write_base_frames, lambda name, T: {"measured_cp": T})
+"""Writes base frames as a fixed set-up joint file of the dVRK."""
 
 
 @dataclass(frozen=True)

@@ -1,18 +1,27 @@
-"""Atomic writing of files, never through a link, and file locks."""
+"""Atomic writing of files and folders, never through a link, and file locks.
 
+Outputs of several files are written in a hidden staging folder and renamed when complete.
+"""
+
+import ctypes
 import fcntl
 import itertools
+import json
 import os
+import re
 import secrets
+import shutil
 import stat
+import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import BinaryIO
 
 from ..errors import OutputError
-from .paths import OutputPath, as_output, explained, kind_of, opened_folder, status
+from .paths import OutputPath, as_output, explained, kind_of, open_below, opened_folder, status
 
 _FORMULA = ("=", "+", "-", "@", "\t", "\r")
 """Prefixes that spreadsheets interpret as a formula."""
@@ -260,3 +269,269 @@ def try_lock(descriptor: int) -> bool:
     except BlockingIOError:
         return False
     return True
+
+
+_MARK = "carts-unfinished.json"
+_NAME = re.compile(r"\.carts-[0-9a-f]{32}")
+_MOST_MARK_BYTES = 10_000
+
+
+@dataclass(frozen=True)
+class _Mark:
+    """Content of the mark file of a staging folder."""
+
+    output: str
+    """Name of the output."""
+    key: str | None
+    """Fingerprint of the inputs of resumable work."""
+    inode: int
+
+
+@dataclass(frozen=True)
+class Staging:
+    """A locked staging folder."""
+
+    parent: int
+    """Descriptor of the parent folder."""
+    name: str
+    descriptor: int
+    mark: _Mark
+
+    def remove(self) -> None:
+        """Remove the folder and its contents; links are removed, not followed.
+
+        The mark file is removed last, so that leftovers are found after a kill.
+        """
+        found = status(self.parent, self.name)
+        if found is None or found.st_ino != self.mark.inode:
+            return
+        for name in os.listdir(self.descriptor):
+            if name != _MARK:
+                _remove(self.descriptor, name)
+        with suppress(OSError):
+            if os.listdir(self.descriptor) == [_MARK]:
+                os.unlink(_MARK, dir_fd=self.descriptor)
+            os.rmdir(self.name, dir_fd=self.parent)
+
+    def close(self) -> None:
+        """Release the lock."""
+        os.close(self.descriptor)
+
+
+def make_staging(parent: int, output: str, key: str | None) -> Staging:
+    """Create a staging folder in an open folder; `OSError` if that fails."""
+    while True:
+        name = f".carts-{secrets.token_hex(16)}"
+        os.mkdir(name, 0o700, dir_fd=parent)
+        # Another process may remove it while it is empty and unlocked; then create another one.
+        with suppress(FileNotFoundError):
+            descriptor = open_below(parent, name)
+            if try_lock(descriptor):
+                mark = _Mark(output, key, os.fstat(descriptor).st_ino)
+                staging = Staging(parent, name, descriptor, mark)
+                try:
+                    flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
+                    with os.fdopen(os.open(_MARK, flags, 0o600, dir_fd=descriptor), "wb") as stream:
+                        stream.write(json.dumps(asdict(mark)).encode())
+                except BaseException:  # For example, if the disk is full.
+                    staging.remove()
+                    staging.close()
+                    raise
+                return staging
+            os.close(descriptor)
+
+
+def leftovers(parent: int, output: str, besides: Staging) -> Iterator[Staging]:
+    """Staging folders for the same output whose processes have ended, locked; `BusyError` if one is still running."""
+    for name in os.listdir(parent):
+        if not _NAME.fullmatch(name) or name == besides.name:
+            continue
+        try:
+            descriptor = open_below(parent, name)
+        except OSError:
+            continue
+        mark = _read_mark(descriptor)
+        if mark is None:
+            # The process was killed before marking it. Only empty folders, or those with an empty mark, are removed.
+            with suppress(OSError):
+                if try_lock(descriptor):
+                    found = status(descriptor, _MARK)
+                    if found is not None and stat.S_ISREG(found.st_mode) and found.st_size == 0:
+                        os.unlink(_MARK, dir_fd=descriptor)
+                    os.rmdir(name, dir_fd=parent)
+        elif mark.output == output:
+            if not try_lock(descriptor):
+                os.close(descriptor)
+                raise BusyError(f"another export to {output} is running. Wait for it, or name another output.")
+            yield Staging(parent, name, descriptor, mark)
+            continue
+        os.close(descriptor)
+
+
+def _remove(folder: int, name: str) -> None:
+    """Remove a file, link or folder in an open folder, ignoring errors."""
+    with suppress(OSError):
+        found = status(folder, name)
+        if found is not None and stat.S_ISDIR(found.st_mode):
+            shutil.rmtree(name, ignore_errors=True, dir_fd=folder)
+        else:
+            os.unlink(name, dir_fd=folder)
+
+
+def _read_mark(folder: int) -> _Mark | None:
+    """Read the mark in an open folder; None if there is no valid mark."""
+    own = os.fstat(folder)
+    try:
+        descriptor = os.open(_MARK, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC, dir_fd=folder)
+        with os.fdopen(descriptor, "rb") as stream:
+            mark = _Mark(**json.loads(stream.read(_MOST_MARK_BYTES)))
+    except (OSError, ValueError, TypeError, RecursionError):
+        return None
+    return mark if mark.inode == own.st_ino and own.st_uid == os.geteuid() else None
+
+
+MARKER = "export.json"
+"""File that marks a folder as an export; other folders are never replaced."""
+_OLD = "carts-replaced"
+"""Temporary name of the replaced output between two renames."""
+
+
+@contextmanager
+def published(target: OutputPath | Path, *, overwrite: bool = False, key: str | None = None) -> Iterator[OutputPath]:
+    """Context manager for an output that replaces `target` when the block ends without an exception.
+
+    The output is written in a hidden folder with a random name beside `target`. If the block fails or is interrupted,
+    that folder is removed; if the process is killed, the next call for the same target removes it.
+
+    Args:
+        target: file or folder to create; it must not be a link. An empty folder counts as absent.
+        overwrite: replace an existing file, or a folder written by an export.
+        key: fingerprint of the inputs. If given, partial output is kept if the block fails, and a later call with the
+            same key resumes from it.
+
+    Yields:
+        Path with the target's name, for a file or a folder; without `key` it does not exist yet.
+
+    Raises:
+        OutputError: the target exists and may not be replaced, another process writes it, or it cannot be written.
+    """
+    output = as_output(target)
+    with explained(output), opened_folder(output.parent, make=True) as folder:
+        staging = _take_staging(folder, output, key)
+        try:
+            _check_free(folder, output, overwrite)
+            yield replace(output, names=(*output.names[:-1], staging.name, output.name), draft=key is None)
+            _check_free(folder, output, overwrite)
+            _sync(staging.descriptor, output.name)
+            _move(staging, folder, output.name)
+            os.fsync(folder)
+            key = None
+        finally:
+            if key is None or status(staging.descriptor, output.name) is None:
+                staging.remove()
+            staging.close()
+
+
+@contextmanager
+def published_file(target: OutputPath | Path, *, overwrite: bool = False) -> Iterator[OutputPath]:
+    """Like `published`, for a single file that is written by `write_bytes` or `output_stream`."""
+    output = as_output(target)
+    with explained(output), opened_folder(output.parent, make=True) as folder:
+        _check_free(folder, output, overwrite)
+        yield output
+
+
+def _take_staging(folder: int, output: OutputPath, key: str | None) -> Staging:
+    """New staging folder, or one left over with the same key. Other leftovers are removed."""
+    taken = make_staging(folder, output.name, key)
+    try:
+        for left in leftovers(folder, output.name, taken):
+            if status(left.descriptor, _OLD) is not None and status(folder, output.name) is None:
+                # If the process was killed between the two renames of `_move`, the earlier output is here.
+                os.rename(_OLD, output.name, src_dir_fd=left.descriptor, dst_dir_fd=folder)
+            reused = key is not None and left.mark.key == key
+            needless, taken = (taken, left) if reused else (left, taken)
+            needless.remove()
+            needless.close()
+    except BaseException:
+        taken.remove()
+        taken.close()
+        raise
+    return taken
+
+
+def _check_free(folder: int, output: OutputPath, overwrite: bool) -> None:
+    found = status(folder, output.name)
+    if found is None:
+        return
+    if stat.S_ISDIR(found.st_mode):
+        if not _entries(folder, output.name):
+            return
+        with _below(folder, output.name) as inside:
+            marker = status(inside, MARKER)
+        if marker is None or not stat.S_ISREG(marker.st_mode):
+            raise OutputError(
+                f"{output} is a folder with other files ({MARKER} is not among them), and these are never replaced. "
+                "Name a new folder."
+            )
+    elif not stat.S_ISREG(found.st_mode):
+        raise OutputError(f"{output} is {kind_of(found)}, which is never replaced. Name another output.")
+    if not overwrite:
+        raise OutputError(f"{output} exists. Add --overwrite to replace it, or name another output.")
+
+
+def _entries(folder: int, name: str) -> list[str]:
+    with _below(folder, name) as descriptor:
+        return os.listdir(descriptor)
+
+
+@contextmanager
+def _below(folder: int, name: str) -> Iterator[int]:
+    descriptor = open_below(folder, name)
+    try:
+        yield descriptor
+    finally:
+        os.close(descriptor)
+
+
+def _sync(folder: int, name: str) -> None:
+    """Synchronize an output in an open folder, including its contents, to disk."""
+    found = status(folder, name)
+    if found is not None and not stat.S_ISDIR(found.st_mode):
+        _sync_file(folder, name)
+        return
+    for _, _, files, descriptor in os.fwalk(name, dir_fd=folder):
+        for file in files:
+            _sync_file(descriptor, file)
+        os.fsync(descriptor)
+
+
+def _sync_file(folder: int, name: str) -> None:
+    file = os.open(name, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC, dir_fd=folder)
+    try:
+        os.fsync(file)
+    finally:
+        os.close(file)
+
+
+def _move(staging: Staging, folder: int, name: str) -> None:
+    inside = staging.descriptor
+    found = status(folder, name)
+    if found is None or not stat.S_ISDIR(found.st_mode) or not _entries(folder, name):
+        os.replace(name, name, src_dir_fd=inside, dst_dir_fd=folder)
+    elif not _exchanged(inside, folder, name):
+        os.rename(name, _OLD, src_dir_fd=folder, dst_dir_fd=inside)
+        try:
+            os.rename(name, name, src_dir_fd=inside, dst_dir_fd=folder)
+        except OSError:
+            os.rename(_OLD, name, src_dir_fd=inside, dst_dir_fd=folder)
+            raise
+
+
+def _exchanged(one: int, other: int, name: str) -> bool:
+    """Exchange two entries of the same name in two open folders atomically, if the system supports it."""
+    if not sys.platform.startswith("linux"):
+        return False
+    exchange = 2  # RENAME_EXCHANGE of renameat2(2)
+    rename = getattr(ctypes.CDLL(None), "renameat2", None)
+    return rename is not None and rename(one, os.fsencode(name), other, os.fsencode(name), exchange) == 0

@@ -17,10 +17,9 @@ from jaxtyping import Float
 from ..model.scene import Scene, SceneState
 from ..networks.extractor import FeatureExtractor
 from ..optimization.error_model import ErrorModel, Gaussian, combined
-from ..optimization.measurement import FrameSolver, Measurement
+from ..optimization.measurement import FrameSolver, Measurement, Origin, Visit
 from ..optimization.observation import Backgrounds
 from ..optimization.predictor import SurfacePredictor, predictor_of
-from ..optimization.sequence_estimate import Origin, Visit
 from ..optimization.variables import Variables
 from ..optimization.verdict import arm_is_elsewhere
 from ..recording import Frame

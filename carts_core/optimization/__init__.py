@@ -18,6 +18,8 @@ from .frame import FrameOptimizer as FrameOptimizer
 from .frame import Iterate as Iterate
 from .frame import Progress as Progress
 from .frame_problem import propose_ignore as propose_ignore
+from .measurement import FrameEstimate as FrameEstimate
+from .measurement import Origin as Origin
 from .measurement import sequence_checkpoint as sequence_checkpoint
 from .observability import fit_words as fit_words
 from .observability import joint_words as joint_words
@@ -30,8 +32,6 @@ from .predictor import MaskPredictor as MaskPredictor
 from .predictor import NetworkPredictor as NetworkPredictor
 from .predictor import SurfacePredictor as SurfacePredictor
 from .sequence import SequenceOptimizer as SequenceOptimizer
-from .sequence_estimate import FrameEstimate as FrameEstimate
-from .sequence_estimate import Origin as Origin
 from .stages import StopReason as StopReason
 from .verdict import Assessment as Assessment
 from .verdict import DomainCheck as DomainCheck

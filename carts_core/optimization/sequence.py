@@ -19,10 +19,9 @@ from ..recording import Frame
 from ..recording.background import spread
 from ..settings import FreeParameters, SequenceSettings, SolverSettings, surface_solver
 from .error_model import ErrorModel, Gaussian, Information, Smoother, combined, remove_measurement
-from .measurement import FrameSolver, Ignore, Measurement
+from .measurement import FrameEstimate, FrameSolver, Ignore, Measurement, Origin, Visit
 from .observation import Backgrounds
 from .predictor import SurfacePredictor, predictor_of
-from .sequence_estimate import FrameEstimate, Origin, Visit
 from .variables import Variables
 from .verdict import SequenceAssessment, Verdict, assess, assess_sequence
 

@@ -7,8 +7,16 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from carts_core.batch.folder import ORDER, FrameFinding, KnownJob, known_jobs, most_urgent_first, read_jobs
-from carts_core.batch.review import review_project, sequence_file
+from carts_core.batch.folder import (
+    ORDER,
+    FrameFinding,
+    KnownJob,
+    known_jobs,
+    most_urgent_first,
+    read_jobs,
+    review_project,
+    sequence_file,
+)
 from carts_core.errors import CartsError, SettingsError
 from carts_core.files import output_path
 from carts_core.files.reading import IMAGE, read_bytes

@@ -15,8 +15,7 @@ ALLOWED = {
     "lab/benchmark/statistics.py": "reads tables of the package",
     "lab/synthesis": "reads what it wrote",
     "cli/results_folder.py": "reads what an earlier run of the same command wrote",
-    "checkpoint.py": "reads what an earlier run of the same command wrote",
-    "fingerprints.py": "reads the source of the package",
+    "provenance.py": "reads the source of the package, and what an earlier run of the same command wrote",
     "recording/importing/writing.py": "reads back the sequence that it writes",
 }
 

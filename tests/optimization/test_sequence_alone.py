@@ -9,8 +9,7 @@ import pytest
 from short_sequence import ARM, FRAMES, Truths, optimizer
 
 from carts_core.optimization import FrameOptimizer, FreeParameters, SequenceOptimizer, SequenceSettings, SurfaceSolver
-from carts_core.optimization.measurement import FrameSolver, SolvedAlone
-from carts_core.optimization.sequence_estimate import Origin
+from carts_core.optimization.measurement import FrameSolver, Origin, SolvedAlone
 from carts_core.optimization.variables import Variables
 from carts_core.optimization.verdict import Verdict
 from carts_core.recording import Frame, Sequence

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 from short_sequence import ALONE, ARM, FRAMES, Truths, optimizer
 
-from carts_core.optimization.sequence_estimate import Origin
+from carts_core.optimization.measurement import Origin
 from carts_core.optimization.verdict import Verdict
 
 

@@ -19,9 +19,8 @@ from carts_core.optimization import (
     SurfaceSolver,
 )
 from carts_core.optimization.error_model import Gaussian
-from carts_core.optimization.measurement import FrameSolver, Measurement
+from carts_core.optimization.measurement import FrameEstimate, FrameSolver, Measurement
 from carts_core.optimization.sequence import initial_correction
-from carts_core.optimization.sequence_estimate import FrameEstimate
 from carts_core.optimization.variables import Variables
 from carts_core.recording import Frame
 from carts_core.rendering import Renderer
