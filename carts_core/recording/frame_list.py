@@ -74,7 +74,7 @@ def is_per_frame(pattern: str) -> bool:
 
 
 def is_glob(pattern: str) -> bool:
-    """Whether the pattern has wildcards and stands for the sorted files that match it."""
+    """Whether the pattern has wildcards, which match files in sorted order."""
     return "*" in pattern or "?" in pattern
 
 
@@ -133,7 +133,7 @@ class FrameNames:
                 text = f"frame {frame_id!r} is already in line {lines[frame_id]}. Remove it, or renumber the frames."
                 raise table.error(f", column {self.column!r}: {text}", row)
             if fault := name_fault(frame_id):
-                text = f"the frame is called {frame_id!r}, {fault}. {allowed_names()}."
+                text = f"the frame id is {frame_id!r}, {fault}. {allowed_names()}."
                 raise table.error(f", column {self.column!r}: {text}", row)
             lines[frame_id] = line
         return ids
@@ -197,7 +197,7 @@ def _frames_of_video(section: TomlTable) -> FrameList:
     numbers = tuple(range(index.count))
     ids = tuple(expand(pattern, section.name("frame_id"), frame=FrameId(number)) for number in numbers)
     for frame_id in ids:
-        check_file_name(section, "frame_id", "makes", frame_id)
+        check_file_name(section, "frame_id", "gives", frame_id)
     return FrameList(ids, index.timestamps, numbers, f"{path} has {counted(index.count, 'frame')}")
 
 

@@ -395,8 +395,8 @@ def _raster(content: bytes, what: str, *, colour: bool) -> _Raster:
 
         indices = np.array(Image.open(io.BytesIO(content), formats=("PNG",)))
     if not traits.turned_already:
-        image = _TURNS[traits.orientation](image)
-        indices = None if indices is None else _TURNS[traits.orientation](indices)
+        image = _TO_UPRIGHT[traits.orientation](image)
+        indices = None if indices is None else _TO_UPRIGHT[traits.orientation](indices)
     opaque = None
     if image.ndim == 3:
         white = 255 if image.dtype == np.uint8 else 65535
@@ -406,7 +406,7 @@ def _raster(content: bytes, what: str, *, colour: bool) -> _Raster:
     return _Raster(np.ascontiguousarray(image), opaque, indices, traits)
 
 
-_TURNS: dict[int, Callable[[np.ndarray], np.ndarray]] = {
+_TO_UPRIGHT: dict[int, Callable[[np.ndarray], np.ndarray]] = {
     1: lambda image: image,
     2: lambda image: image[:, ::-1],
     3: lambda image: image[::-1, ::-1],
@@ -473,11 +473,11 @@ def _flat_values(grey: np.ndarray) -> np.ndarray:
 
 def _orientation_remarks(traits: Sequence[ImageTraits]) -> list[str]:
     """Remarks on rotated images."""
-    turned = Counter(each.orientation for each in traits if each.orientation != 1)
+    rotated = Counter(each.orientation for each in traits if each.orientation != 1)
     return [
         f"{'' if count == len(traits) else f'{count} '}rotated by EXIF orientation {orientation}"
         f"{', which swaps width and height' if orientation > 4 else ''}"
-        for orientation, count in sorted(turned.items())
+        for orientation, count in sorted(rotated.items())
     ]
 
 

@@ -4,10 +4,9 @@ import csv
 import io
 import math
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
-from itertools import combinations
 from operator import itemgetter
 from pathlib import Path
 
@@ -205,87 +204,6 @@ def _joints_of(urdf: Path) -> tuple[Joint, ...]:
             lower, upper = -np.inf, np.inf
         found.append(Joint(joint.get("name", ""), kind != "prismatic", lower, upper))
     return tuple(found)
-
-
-OTHER_COLUMNS = "--columns yaw COLUMN pitch COLUMN ..."
-"""Option for another order of the columns."""
-
-
-@dataclass(frozen=True)
-class Remedy:
-    """An interpretation of positions that is within the limits."""
-
-    text: str
-    """Sign, unit or order of the columns, as a noun."""
-    option: str
-    """Its option of `carts import`."""
-
-
-@dataclass(frozen=True)
-class Misfit:
-    """A joint whose positions exceed its limits, with possible remedies."""
-
-    joint: Joint
-    lowest: float
-    """Smallest position [rad], [m]."""
-    highest: float
-    remedies: tuple[Remedy, ...] = ()
-
-    def sentence(self) -> str:
-        """Description of the misfit as a sentence."""
-        text = (
-            f"{self.joint.name} is from {self.lowest:.4g} to {self.highest:.4g} {self.joint.unit}, and the robot's "
-            f"limits are {self.joint.lower:.4g} to {self.joint.upper:.4g} {self.joint.unit}"
-        )
-        return f"{text}; {' or '.join(remedy.text for remedy in self.remedies)} would fit" if self.remedies else text
-
-
-def misfits(
-    joints: Sequence[Joint], values: Float[np.ndarray, "rows joints"], share: float = _BEYOND
-) -> tuple[Misfit, ...]:
-    """Joints whose positions [rad], [m] exceed their limits."""
-    wrong = [index for index, joint in enumerate(joints) if len(values) and not joint.fits(values[:, index], share)]
-    order = _other_order(joints, values, wrong)
-    return tuple(
-        Misfit(
-            joints[index],
-            float(values[:, index].min()),
-            float(values[:, index].max()),
-            (*_remedies(joints[index], values[:, index]), *order),
-        )
-        for index in wrong
-    )
-
-
-def _remedies(joint: Joint, values: np.ndarray) -> list[Remedy]:
-    """Changes of unit or sign that would bring the joint's positions within its limits."""
-    found = [Remedy("the opposite sign", f"--flip {joint.name}")] if joint.fits(-values) else []
-    for unit, factor in joint.units.items():
-        if factor != 1.0 and joint.fits(values * factor) and not (found and unit != "deg"):
-            text = f"{unit} (read as {values.min() * factor:.3g} to {values.max() * factor:.3g} {joint.unit})"
-            found.append(Remedy(text, f"--units {joint.name} {unit}"))
-    return found
-
-
-def _other_order(joints: Sequence[Joint], values: np.ndarray, wrong: list[int]) -> list[Remedy]:
-    """Column orders that bring all positions within the limits, unless changed signs do."""
-    if not wrong or all(joints[index].fits(-values[:, index]) for index in wrong):
-        return []
-    names = [joint.name for joint in joints]
-
-    def fit(order: Sequence[int]) -> bool:
-        return all(joint.fits(values[:, place]) for joint, place in zip(joints, order, strict=True))
-
-    alphabetical = [sorted(names).index(name) for name in names]
-    if alphabetical != list(range(len(names))) and fit(alphabetical):
-        return [Remedy("the alphabetical order of the joints' names", OTHER_COLUMNS)]
-    found = []
-    for a, b in combinations(range(len(joints)), 2):
-        order = list(range(len(joints)))
-        order[a], order[b] = b, a
-        if (a in wrong or b in wrong) and fit(order):
-            found.append(Remedy(f"exchanged columns of {names[a]} and {names[b]}", OTHER_COLUMNS))
-    return found
 
 
 PLAUSIBLE = {"revolute": 4 * np.pi, "prismatic": 2.0}

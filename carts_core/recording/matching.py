@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation, Slerp
 
 from ..errors import SequenceError
@@ -13,6 +13,22 @@ from ..wording import counted
 from .frame_list import FrameList, FrameNames, list_of_rows, take_delimiter, take_frame_list, take_frame_names
 from .kinematics_table import LENGTH_UNITS, PLAUSIBLE, JointColumns, Table, read_table
 from .toml_table import TomlTable
+
+
+def neighbours(
+    times: Float[np.ndarray, " rows"], wanted: Float[np.ndarray, " wanted"]
+) -> tuple[Int[np.ndarray, " wanted"], Int[np.ndarray, " wanted"]]:
+    """Rows before and after each wanted time; both are the row at that time, or the last one outside the range."""
+    after = np.searchsorted(times, wanted).clip(0, len(times) - 1)
+    return np.where(times[after] > wanted, after - 1, after).clip(0), after
+
+
+def at_times(
+    wanted: Float[np.ndarray, " wanted"], times: Float[np.ndarray, " rows"], values: Float[np.ndarray, "rows columns"]
+) -> Float[np.ndarray, "wanted columns"]:
+    """Values interpolated linearly at other times; NaN outside the range of the rows."""
+    return np.stack([np.interp(wanted, times, column, left=np.nan, right=np.nan) for column in values.T], axis=1)
+
 
 INTERPOLATIONS = ("linear", "nearest")
 _ROUNDING = 1e-6
@@ -57,10 +73,7 @@ class Samples:
             return self.values
         assert self.times is not None and frames.timestamps is not None
         wanted = frames.timestamps + matching.time_offset
-        last = len(self.times) - 1
-        # Outside the range, both are the row at the end.
-        after = np.searchsorted(self.times, wanted).clip(0, last)
-        before = np.where(self.times[after] > wanted, after - 1, after).clip(0, last)
+        before, after = neighbours(self.times, wanted)
         to_before, to_after = np.abs(wanted - self.times[before]), np.abs(self.times[after] - wanted)
         if matching.interpolation == "nearest":
             before = after = np.where(to_before <= to_after, before, after)
@@ -79,8 +92,7 @@ class Samples:
         """Values at times of the table's clock; NaN outside its range."""
         assert self.times is not None
         if self.values.ndim == 2:
-            columns = [np.interp(times, self.times, one, left=np.nan, right=np.nan) for one in self.values.T]
-            return np.stack(columns, 1)
+            return at_times(times, self.times, self.values)
         places = np.interp(times, self.times, np.arange(len(self.times), dtype=float), left=np.nan, right=np.nan)
         Ts = self._poses_at(np.nan_to_num(places))
         Ts[np.isnan(places)] = np.nan
@@ -240,9 +252,9 @@ def _poses(section: TomlTable, table: Table) -> Float[np.ndarray, "rows 4 4"]:
     kind = section.take_choice("pose", POSES, POSES[0])
     unit = LENGTH_UNITS[section.take_choice("length_unit", ("m", "mm"), "m")]
     positions = unit * _numbers(section, "position", table, section.take("position", list, list(POSITION)), 3)
-    turns = _numbers(section, "orientation", table, section.take("orientation", list, list(ORIENTATION)), 4)
+    rotations = _numbers(section, "orientation", table, section.take("orientation", list, list(ORIENTATION)), 4)
     with np.errstate(over="ignore"):
-        lengths = np.linalg.norm(turns, axis=1)
+        lengths = np.linalg.norm(rotations, axis=1)
     if (wrong := np.flatnonzero(~(np.abs(lengths - 1.0) <= _NORM_TOLERANCE))).size:
         raise table.error(
             f": the norm of the quaternion is {lengths[wrong[0]]:.4g}, but must be 1. Name its columns as "
@@ -256,7 +268,7 @@ def _poses(section: TomlTable, table: Table) -> Float[np.ndarray, "rows 4 4"]:
             far[0],
         )
     Ts = np.tile(np.eye(4), (len(table), 1, 1))
-    Ts[:, :3, :3], Ts[:, :3, 3] = Rotation.from_quat(turns).as_matrix(), positions
+    Ts[:, :3, :3], Ts[:, :3, 3] = Rotation.from_quat(rotations).as_matrix(), positions
     return Ts if kind == POSES[0] else np.linalg.inv(Ts)
 
 

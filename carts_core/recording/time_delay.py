@@ -188,7 +188,6 @@ class _Delays:
         largest = np.quantile(np.abs(flows), 0.995, axis=0)
         self._flows = np.clip(flows, -largest, largest)
         self._blocks = np.arange(len(steps)) * _BLOCKS // len(steps)
-        self._all = np.ones(_BLOCKS, bool)
         self._bases: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
 
     def estimate(self, present: float, largest: float) -> TimeOffsetEstimate:
@@ -266,8 +265,8 @@ class _Delays:
             moved.append(last - first)
         for camera in begin.mounts:
             Ts = np.linalg.inv(begin.mounts[camera]) @ end.mounts[camera]
-            turns = np.stack([Ts[:, 2, 1], Ts[:, 0, 2], Ts[:, 1, 0]], 1)
-            moved.append(np.concatenate([Ts[:, :3, 3], _LEVER * turns], 1))
+            rotations = np.stack([Ts[:, 2, 1], Ts[:, 0, 2], Ts[:, 1, 0]], 1)
+            moved.append(np.concatenate([Ts[:, :3, 3], _LEVER * rotations], 1))
         return np.concatenate(places, 1), np.concatenate(moved, 1)
 
 

@@ -94,7 +94,7 @@ class TomlTable:
         return TomlTable(self.take(key, dict, {}), self.file, f"{place}[{self._prefix}{key}]")
 
     def take_tables(self, key: str) -> list["TomlTable"]:
-        """The array of tables `[[key]]`: at least one, each with a `name` of its own."""
+        """The array of tables `[[key]]`: at least one, each with a unique `name`."""
         values = self.take(key, list, [])
         if not values or not all(isinstance(value, dict) for value in values):
             raise self.error(f"[[{key}]]", f"is missing. Describe at least one, under a line [[{key}]].")

@@ -224,7 +224,7 @@ _BOTTOM_FIRST = (3, 4)
 """FFmpeg's field orders with the bottom field first: BB and TB."""
 _ONE = 2**16
 """Fixed-point 1 in a display matrix."""
-_NOT_TURNED = "the display matrix is not a rotation by a multiple of 90 deg; frames are used as stored."
+_NOT_SQUARE = "the display matrix is not a rotation by a multiple of 90 deg; frames are used as stored."
 _KEPT_BYTES = 32 * 2**20
 """Memory for decoded frames, which makes stepping backwards cheap."""
 
@@ -278,7 +278,7 @@ class Video:
             frame = self._frame(self._numbers[index])
             interlaced = self._deinterlace and frame.interlaced_frame
             image = _one_field(frame, bottom=self._bottom_first) if interlaced else _pixels(frame)
-            return np.ascontiguousarray(_turned(image, _display_matrix(frame)))
+            return np.ascontiguousarray(_rotated(image, _display_matrix(frame)))
 
     def fingerprint(self, index: int) -> str:
         """SHA-256 of the file, with the number of the frame and whether fields are separated."""
@@ -299,7 +299,7 @@ class Video:
             mirrored = " and mirrored" if np.linalg.det(matrix) < 0 else ""
             done = f"frames are rotated by {abs(frame.rotation)} deg{mirrored}, by the display matrix of the file"
             wanted = "Calibrations and masks must refer to rotated frames."
-            found.append(f"{done}. {wanted}" if _is_square(matrix) else _NOT_TURNED)
+            found.append(f"{done}. {wanted}" if _is_square(matrix) else _NOT_SQUARE)
         if frame.interlaced_frame:
             field = f"only the {'bottom' if self._bottom_first else 'top'} field of each frame is used"
             change = " To use both, set `deinterlace = false` for the camera." if self._deinterlace else ""
@@ -424,7 +424,7 @@ def _is_square(matrix: Float[np.ndarray, "2 2"]) -> bool:
     return np.array_equal(np.abs(matrix), np.eye(2)) or np.array_equal(np.abs(matrix), np.eye(2)[::-1])
 
 
-def _turned(image: np.ndarray, matrix: Float[np.ndarray, "2 2"]) -> np.ndarray:
+def _rotated(image: np.ndarray, matrix: Float[np.ndarray, "2 2"]) -> np.ndarray:
     if not _is_square(matrix):
         return image
     if matrix[0, 0] == 0:

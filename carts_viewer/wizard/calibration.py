@@ -33,7 +33,7 @@ from carts_viewer.start.roots import Roots
 from carts_viewer.wizard.points import Clicking
 
 FRAMES = 20
-"""Frames that take part, spread evenly."""
+"""Number of evenly spaced frames."""
 
 
 @dataclass(frozen=True)
@@ -47,9 +47,9 @@ class CalibrationProgress:
     scene: Scene | None = None
     """The scene with the calibration so far."""
     result: CalibrationResult | None = None
-    """At its end."""
+    """Result of a finished calibration."""
     error: str = ""
-    """Why it failed; empty if it did not."""
+    """Cause of a failure."""
     ended: bool = False
 
 
@@ -69,7 +69,7 @@ class CalibrationJob:
         load_networks: Callable[[], FeatureExtractor],
         report: Callable[[CalibrationProgress], None],
     ) -> None:
-        """Begin; `report` is called on the job's thread with every progress, the last one `ended`."""
+        """Start; `report` is called on the job's thread with each progress, the last one `ended`."""
         self._sequence, self._scene, self._known = sequence, scene, known
         self._load_networks = load_networks
         self._report = report
@@ -78,27 +78,25 @@ class CalibrationJob:
         self._thread.start()
 
     def cancel(self) -> None:
-        """Stop soon, without a result."""
+        """Request a stop, without a result."""
         self._cancelled.set()
 
     @property
     def cancelled(self) -> bool:
-        """Whether it was stopped, even at its end."""
+        """Whether a stop was requested."""
         return self._cancelled.is_set()
 
     def join(self, timeout: float | None = None) -> None:
-        """Wait at most `timeout` [s] until it has ended."""
+        """Wait for the end, at most `timeout` [s]."""
         self._thread.join(timeout)
 
     def _run(self) -> None:
         try:
-            result = self._calibrate()
-        except CartsError as error:
-            self._report(CalibrationProgress("", 0.0, error=str(error), ended=True))
+            progress = self._calibrate()
         except Exception as error:
-            self._report(CalibrationProgress("", 0.0, error=f"The calibration failed: {error!r}", ended=True))
-        else:
-            self._report(result)
+            text = str(error) if isinstance(error, CartsError) else f"The calibration failed: {error!r}"
+            progress = CalibrationProgress("", 0.0, error=text, ended=True)
+        self._report(progress)
 
     def _calibrate(self) -> CalibrationProgress:
         self._report(CalibrationProgress("Loading the networks", 0.0))
@@ -122,7 +120,7 @@ class CalibrationJob:
             text = f"Stage {iterate.stage + 1} of {iterate.stages}, step {iterate.index + 1}, loss {iterate.loss:.4f}"
             self._report(CalibrationProgress(text, iterate.stage / iterate.stages, iterate.scene))
         if last is None:
-            return CalibrationProgress("", 0.0, error="The calibration made no step.", ended=True)
+            return CalibrationProgress("", 0.0, error="The calibration ended without a step.", ended=True)
         result = optimizer.result()
         return CalibrationProgress("Calibrated", 1.0, result.scene, result, ended=True)
 
@@ -138,7 +136,7 @@ def as_plain(scene: Scene) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class PoseReport:
-    """Change of an arm's pose in a camera."""
+    """Change of the pose of an arm in a camera."""
 
     arm: str
     camera: str
@@ -162,8 +160,9 @@ class CalibrationReport:
     """Reason of the verdict, with a remedy."""
     poses: tuple[PoseReport, ...]
     before: tuple[float | None, ...]
-    """Residuals of the draft's points [px]; None for points that were not used."""
+    """Initial residuals of the points [px]; None for unused points."""
     after: tuple[float | None, ...]
+    """Final residuals."""
     disagreeing: tuple[int, ...]
     """Points whose residual has grown beyond the noise of clicks."""
     objection: str
@@ -171,11 +170,7 @@ class CalibrationReport:
 
 
 def report_of(result: CalibrationResult, clicking: Clicking, points: Rows[ImagePoint]) -> CalibrationReport:
-    """The figures of a calibration that began with that of the clicked points.
-
-    Raises:
-        CartsError: the points are of other arms, cameras or frames.
-    """
+    """Report of a calibration that started from the clicked points."""
     found = clicking.result
     assert found is not None
     measured = clicking.sequence.measured
@@ -204,9 +199,11 @@ def _objection(
     before, after, limits = compared.before, compared.after, compared.limits
     if compared.disagreeing and not compared.agrees:
         worst = max(compared.disagreeing, key=lambda row: after[row] / limits[row])
+        point = points[worst]
+        name = f"{point.landmark} in frame {clicking.sequence.frame_ids[point.frame]} ({point.camera})"
         return (
             f"{len(compared.disagreeing)} of {counted(len(points), 'point')} moved farther from the clicks than their "
-            f"noise explains: the {_named(clicking, points[worst])} from {before[worst]:.1f} to {after[worst]:.1f} px, "
+            f"noise explains: the {name} from {before[worst]:.1f} to {after[worst]:.1f} px, "
             f"with {limits[worst]:.1f} px allowed."
         )
     if not compared.agrees:
@@ -236,16 +233,8 @@ def _poses(result: CalibrationResult, clicking: Clicking, points: Rows[ImagePoin
     return tuple(poses)
 
 
-def _named(clicking: Clicking, point: ImagePoint) -> str:
-    return f"{point.landmark} in frame {clicking.sequence.frame_ids[point.frame]} ({point.camera})"
-
-
 def calibrated_scene(scene: Scene, calibration: Mapping[str, Any]) -> Scene:
-    """The scene with base frames, camera poses and intrinsics filled in.
-
-    Raises:
-        SettingsError: the calibration is of other arms or cameras, or not of rigid transforms.
-    """
+    """The scene with a calibration (`as_plain`); `SettingsError` if that has other arms or cameras, or is malformed."""
     try:
         arms = tuple(
             replace(arm, T_world_base=rigid_transform(calibration["arms"][arm.name], f"T_world_base of {arm.name}"))
@@ -260,23 +249,18 @@ def calibrated_scene(scene: Scene, calibration: Mapping[str, Any]) -> Scene:
             for camera in scene.cameras
         )
     except (KeyError, TypeError, ValueError) as error:
-        raise SettingsError("the calibration is of other arms or cameras. Calibrate again.") from error
+        raise SettingsError("the calibration belongs to other arms or cameras. Calibrate again.") from error
     return replace(scene, arms=arms, cameras=cameras)
 
 
 def calibrated_recording(
     recording: FoundRecording, before: Scene, calibration: Mapping[str, Any], text: str
 ) -> FoundRecording:
-    """The recording with a calibration filled in.
+    """The recording with a calibration (`as_plain`) instead of placeholders; errors as `calibrated_scene`.
 
     Args:
-        recording: as found, with placeholders.
-        before: the scene that it describes.
-        calibration: `as_plain`.
-        text: origin of the calibration.
-
-    Raises:
-        SettingsError: as `calibrated_scene`.
+        before: scene of the recording.
+        text: origin of the calibration, for the report.
     """
     scene = calibrated_scene(before, calibration)
     arms = tuple(replace(arm, T_world_base=scene.arm(arm.name).T_world_base, base_from=text) for arm in recording.arms)
@@ -292,11 +276,7 @@ def calibrated_recording(
 
 
 def target_folder(roots: Roots, source: Path, name: str) -> Path:
-    """Folder for the sequence of a recording: beside it, or in it if it is an allowed folder itself.
-
-    Raises:
-        SettingsError: the name cannot be part of a path.
-    """
+    """Folder for the sequence of a recording: beside it, or inside if the recording is a root folder."""
     if (fault := name_fault(name)) is not None:
         raise SettingsError(f"the name {name!r} cannot be used, {fault}. Choose another.")
     parent = source.parent if source not in roots.folders else source

@@ -34,10 +34,10 @@ _JPEG_QUALITY = 75
 
 @dataclass(frozen=True)
 class Curve:
-    """Values of a joint over time, drawn from the smallest to the largest one."""
+    """Values of a joint over time, scaled to their range."""
 
     points: str
-    """Of an SVG polyline."""
+    """Points of an SVG polyline."""
     color: str
     label: str
     """Name and range."""
@@ -63,11 +63,7 @@ def curves(arm: FoundArm) -> list[Curve]:
 
 
 def opened(recording: FoundRecording) -> tuple[Sequence, TemporaryDirectory[str]]:
-    """The recording as a sequence, with the temporary folder of its tables.
-
-    Raises:
-        CartsError: the files do not form a valid sequence.
-    """
+    """The recording as a sequence, with the temporary folder of its tables; `CartsError` if it is invalid."""
     folder = TemporaryDirectory(prefix="carts-import-")
     try:
         return Sequence.open(write_sequence(recording, Path(folder.name) / "sequence")), folder
@@ -77,11 +73,7 @@ def opened(recording: FoundRecording) -> tuple[Sequence, TemporaryDirectory[str]
 
 
 def previews(sequence: Sequence, camera: str) -> list[tuple[str, bytes]]:
-    """First, middle and last image of a camera: name of the frame and JPEG file.
-
-    Raises:
-        CartsError: an image is missing or damaged.
-    """
+    """First, middle and last image of a camera: id of the frame and JPEG content."""
     found = []
     for index in dict.fromkeys((0, len(sequence) // 2, len(sequence) - 1)):
         frame = sequence.frame(index, cameras=[camera])
@@ -96,7 +88,7 @@ _WHOLE: tuple[Part, str] = ("recording", "")
 
 @dataclass(frozen=True)
 class Guess:
-    """Content of a draft's files, with the problems of each part."""
+    """Content of the files of a draft, and the problems of each part."""
 
     kind: str
     """Name of the source."""
@@ -108,7 +100,7 @@ class Guess:
     """Table of the kinematics, where its columns have names."""
     meanings: ColumnMeanings | None = None
     trials: tuple[Path, ...] = ()
-    """Recordings in the folder, of which one has to be chosen."""
+    """Recordings in the folder, if one of several has to be chosen."""
 
     @property
     def columns(self) -> dict[str, str]:
@@ -134,7 +126,7 @@ def problem_of(error: CartsError) -> str:
 
 
 def guess(draft: Draft) -> Guess:
-    """Read the files of a draft; problems are in the result."""
+    """Read the files of a draft; errors become problems of the result."""
     source = Path(draft.source)
     try:
         kind = detect(source, draft.options.source).name
@@ -190,11 +182,7 @@ def _problems_of_images(source: Path, options: ImportOptions) -> dict[tuple[Part
 
 
 def estimated_delay(recording: FoundRecording) -> TimeOffsetEstimate:
-    """Time offset estimated from the motion in images and table.
-
-    Raises:
-        CartsError: the files do not form a valid sequence whose rows have times.
-    """
+    """Time offset estimated from the motion in images and table; `CartsError` if rows have no times."""
     sequence, folder = opened(recording)
     with folder:
         return estimate_time_offset(sequence)

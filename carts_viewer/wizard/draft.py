@@ -45,15 +45,15 @@ class Draft:
     """Name of the sequence; by default that of the source."""
     options: ImportOptions = field(default_factory=ImportOptions)
     points: tuple[ImagePoint, ...] = ()
-    """In the order in which they were clicked."""
+    """Clicked points, in order."""
     focal_length: bool = False
-    """Whether the focal length is solved for, too."""
+    """Whether the focal length is also estimated."""
     calibration: Mapping[str, Any] | None = None
-    """Base frames, camera poses and intrinsics by arm or camera, as `carts calibrate` found them; None before."""
+    """Refined calibration (`as_plain`); None before."""
     offered: Mapping[str, Any] | None = None
     """A calibration that contradicts the clicked points, until it is kept or discarded."""
     report: CalibrationReport | None = None
-    """Figures of the calibration that is kept or offered."""
+    """Report of the kept or offered calibration."""
 
     def to_json(self) -> str:
         """The draft as text."""
@@ -65,11 +65,7 @@ class Draft:
 
     @staticmethod
     def from_json(text: str) -> "Draft":
-        """The draft of a text.
-
-        Raises:
-            SettingsError: the text is not a draft.
-        """
+        """The draft of a text; `SettingsError` if the text is not a draft."""
         try:
             plain = parse_json(text)
             if plain.pop("format") != _FORMAT:
@@ -79,55 +75,45 @@ class Draft:
                 check_path(named)
             return draft
         except (ValueError, TypeError, KeyError, AttributeError) as error:
-            raise SettingsError(f"this import cannot be continued ({error}). Delete it and begin anew.") from error
+            raise SettingsError(f"this import cannot be continued ({error}). Delete it and start a new one.") from error
 
     def uncalibrated(self, **changes: Any) -> "Draft":
-        """The draft with other fields, and without the calibration, which is invalid for these."""
+        """The draft with other fields and without its calibration, which becomes invalid."""
         return replace(self, **{"calibration": None, "offered": None, "report": None, **changes})
 
     def with_options(self, **changes: Any) -> "Draft":
-        """The draft with other options, and without its calibration; clicked points stay."""
+        """The draft with other options and without its calibration; clicked points stay."""
         return self.uncalibrated(options=replace(self.options, **changes))
 
 
 @dataclass(frozen=True)
 class DraftSummary:
-    """A draft in a list."""
+    """List entry of a draft."""
 
     key: str
     name: str
     changed: float
-    """[s since 1970]"""
+    """Time of the last change [s since 1970]."""
 
 
 class DraftFile:
     """The file of one draft."""
 
     def __init__(self, key: str | None = None) -> None:
-        """
-        Args:
-            key: of an existing draft; None for a new one.
-
-        Raises:
-            SettingsError: there is no such draft.
-        """
+        """File of an existing draft, or of a new one if `key` is None; `SettingsError` if the draft does not exist."""
         if key is not None and key not in {draft.key for draft in drafts()}:
-            raise SettingsError("this import no longer exists. Begin a new one.")
+            raise SettingsError("this import no longer exists. Start a new one.")
         self.key = key or secrets.token_hex(8)
 
     def read(self) -> Draft:
-        """The draft; an empty one if none was saved.
-
-        Raises:
-            SettingsError: it is damaged.
-        """
+        """The draft, empty if none was saved; `SettingsError` if it is damaged."""
         path = _path(self.key)
         if not is_regular(path):
             return Draft()
         try:
             text = read_text(path, VALUES)
         except (OSError, ValueError) as error:
-            raise SettingsError(f"{path} cannot be read ({error}). Delete this import and begin anew.") from error
+            raise SettingsError(f"{path} cannot be read ({error}). Delete this import and start a new one.") from error
         return Draft.from_json(text)
 
     def write(self, draft: Draft) -> None:
@@ -149,7 +135,7 @@ def drafts() -> list[DraftSummary]:
             name = str(plain.get("name") or Path(str(plain.get("source", ""))).name)[:_LONGEST_NAME]
             found.append(DraftSummary(path.stem, name, path.stat().st_mtime))
         except (CartsError, OSError, ValueError, AttributeError):
-            found.append(DraftSummary(path.stem, "a damaged import", time.time()))
+            found.append(DraftSummary(path.stem, "damaged import", time.time()))
     return sorted(found, key=lambda draft: -draft.changed)
 
 
@@ -191,16 +177,11 @@ _MEANINGS = (*JOINT_NAMES, "jaw", "time", "frame")
 
 
 def changed(draft: Draft, name: str, value: str, guessed: Mapping[str, str]) -> Draft | None:
-    """The draft after a choice; None if the form has no such choice.
+    """The draft after a choice in the form; None for an unknown one, `SettingsError` for an invalid value.
 
     Args:
-        draft: before.
-        name: of the choice, as in `form`.
-        value: the chosen value; "" restores the guess.
-        guessed: joint -> column, as guessed.
-
-    Raises:
-        SettingsError: the value is not possible.
+        value: the chosen value; empty to restore the guess.
+        guessed: joint -> guessed column.
     """
     kind, _, which = name.partition(" ")
     options: dict[str, Any] = {}
@@ -233,10 +214,8 @@ def picked(draft: Draft, part: str, path: Path, found: Mapping[str, Path]) -> Dr
     """The draft after a file or folder was picked for one of its parts.
 
     Args:
-        draft: before.
         part: "source", "images", "images CAMERA", "calibration CAMERA", "kinematics" or "robot ARM".
-        path: the picked file or folder.
-        found: camera -> where its images were found, which are kept when another camera is added.
+        found: camera -> its images, which are kept when another camera is added.
     """
     kind, _, which = part.partition(" ")
     options = draft.options
@@ -256,7 +235,7 @@ def picked(draft: Draft, part: str, path: Path, found: Mapping[str, Path]) -> Dr
 
 
 def _columns(draft: Draft, which: str, value: str, guessed: Mapping[str, str]) -> dict[str, str]:
-    """Chosen columns. The first choice of a joint keeps the others as they were guessed."""
+    """Chosen columns; the first choice of a joint fixes the guesses of the others."""
     chosen = dict(draft.options.columns)
     joints = which in (*JOINT_NAMES, "jaw")
     if joints and not any(name in chosen for name in JOINT_NAMES):
@@ -272,10 +251,10 @@ def _number(value: str) -> float | None:
         number = float(value.replace(",", "."))
     except ValueError as error:
         raise SettingsError(
-            f"{value!r} is not a number. Type one, such as 0.12, or nothing to have it guessed."
+            f"{value!r} is not a number. Type one, such as 0.12, or leave the field empty to restore the guess."
         ) from error
     if not math.isfinite(number):
-        raise SettingsError(f"{value!r} is not a finite number.")
+        raise SettingsError(f"{value!r} is not finite. Type a finite number.")
     return number
 
 

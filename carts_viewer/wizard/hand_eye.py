@@ -63,15 +63,8 @@ class FramePicture:
         points: Rows[ImagePoint],
         wrong: frozenset[int],
     ) -> None:
-        """Show a frame.
-
-        Args:
-            index: of the frame.
-            camera: whose image.
-            scene: with a calibration to show; None without one.
-            points: all that were clicked.
-            wrong: which of these contradict the others.
-        """
+        """Show a frame of a camera, with the contours of a calibrated scene and the clicked points; `wrong` are the
+        indices of contradicting points."""
         frame = self._sequence.frame(index, cameras=[camera])
         own = self._sequence.scene.camera(camera)
         if scene is None:
@@ -106,7 +99,7 @@ def hand_eye_panel(
     folder: str,
     undoable: bool,
 ) -> str:
-    """HTML of the panel; `progress` of a running or ended calibration, `folder` of the saved sequence."""
+    """HTML of the panel."""
     report, result = draft.report, clicking.result
     deviations = {} if result is None else result.deviations
     if report is not None:
@@ -143,27 +136,18 @@ _WIDTH = 340.0
 """Width of the document at the side [px], as in `static/document.css`."""
 
 Calibrated = Callable[[Callable[[Draft], Draft]], None]
-"""Called on the site's thread with the draft after a calibration."""
+"""Receiver, on the site's thread, of the change of the draft by a calibration."""
 
 
 class HandEyeStep:
-    """Clicks in the images of a recording, and their calibration.
+    """Clicked points in the images of a recording, and calibration from them.
 
     Attributes:
         problem: the last error; empty without one.
     """
 
     def __init__(self, host: Host, recording: FoundRecording, draft: Draft, report: Calibrated) -> None:
-        """
-        Args:
-            host: the site that shows it.
-            recording: as found.
-            draft: with points from before, if there are some.
-            report: called when a calibration ends.
-
-        Raises:
-            CartsError: the recording does not make a sequence.
-        """
+        """Open the recording; `CartsError` if it is not a valid sequence. `report` receives calibration results."""
         self._host, self._recording, self._report = host, recording, report
         self.problem = ""
         self._sequence, self._folder = opened(recording)
@@ -179,7 +163,7 @@ class HandEyeStep:
         self._picture = FramePicture(host.page, self._sequence)
 
     def close(self) -> None:
-        """Stop a calibration, and remove the picture."""
+        """Stop a calibration and remove the picture."""
         if self._job is not None:
             self._job.cancel()
             self._job.join()
@@ -187,7 +171,7 @@ class HandEyeStep:
         self._folder.cleanup()
 
     def show(self, draft: Draft, *, undoable: bool) -> None:
-        """Bring picture and panel up to date."""
+        """Update picture and panel."""
         self._solve(draft)
         prompt = self.prompt(draft)
         at = prompt or (self._clicking.plan[0] if not draft.points else _prompt_of(draft.points[-1]))
@@ -198,7 +182,7 @@ class HandEyeStep:
         self._host.document.show(content, "side")
 
     def clicked(self, draft: Draft, u: float, v: float) -> Draft:
-        """The draft with the prompted point at this position; unchanged without a prompt."""
+        """The draft with the prompted point at a position relative to the image size; unchanged without a prompt."""
         prompt, self.problem = self.prompt(draft), ""
         if prompt is None or self._running() or not (0.0 <= u <= 1.0 and 0.0 <= v <= 1.0):
             return draft
@@ -213,11 +197,7 @@ class HandEyeStep:
         return draft.uncalibrated(points=(*kept, point))
 
     def chosen(self, draft: Draft, name: str, value: str) -> Draft:
-        """The draft after a choice in the panel; anything else changes nothing.
-
-        Raises:
-            SettingsError: the choice is not possible now.
-        """
+        """The draft after a choice in the panel; `SettingsError` if that is not possible now."""
         self.problem = ""
         kind, _, which = name.partition(" ")
         prompt = self.prompt(draft)
@@ -241,7 +221,7 @@ class HandEyeStep:
         return draft
 
     def _changed(self, draft: Draft, name: str, value: str) -> Draft:
-        """The draft after a choice that changes it."""
+        """The draft after one of the choices that change it."""
         if name == "focal_length":
             draft = draft.uncalibrated(focal_length=value == "1")
         elif name == "name":
@@ -257,13 +237,9 @@ class HandEyeStep:
         return draft
 
     def write(self, draft: Draft) -> Path:
-        """Write the sequence; gives its file.
-
-        Raises:
-            CartsError: it cannot be written.
-        """
+        """Write the sequence and return its file; `CartsError` if that fails."""
         if self._running():
-            raise SettingsError("the calibration still runs. Stop it, or wait for it.")
+            raise SettingsError("the calibration is still running. Stop it, or wait for its end.")
         folder = target_folder(self._host.roots, Path(draft.source), draft.name)
         count = len(draft.points)
         if draft.calibration is not None:
@@ -294,7 +270,7 @@ class HandEyeStep:
         frames = range(len(self._sequence))
         free = [frame for frame in frames if (prompt.camera, frame) not in used]
         if not free:
-            raise SettingsError("there is no other frame. Use the list below, or skip landmarks that are not visible.")
+            raise SettingsError("all frames are in use. Use the list below, or skip landmarks that are not visible.")
         other = min(free, key=lambda frame: abs(frame - prompt.frame))
         self._clicking.move_frame(prompt.camera, prompt.frame, other)
         self._wanted = None
@@ -326,7 +302,7 @@ class HandEyeStep:
     def _calibrate(self) -> None:
         if self._clicking.result is None:
             raise SettingsError(self._clicking.problem or "Click points first.")
-        self._progress = CalibrationProgress("Beginning", 0.0)
+        self._progress = CalibrationProgress("Starting", 0.0)
 
         def report(progress: CalibrationProgress) -> None:
             self._host.post(lambda: self._proceed(progress))
@@ -343,13 +319,13 @@ class HandEyeStep:
         if self._job is not None and self._job.cancelled:
             if not progress.ended:
                 return
-            # It may have ended before the stop took effect; its result is discarded all the same.
+            # The calibration may end before the stop takes effect; its result is discarded.
             progress = STOPPED if progress.result is not None else progress
         self._progress = progress
         self._report(lambda draft: draft if progress.result is None else self._calibrated(draft, progress.result))
 
     def _calibrated(self, draft: Draft, result: CalibrationResult) -> Draft:
-        """The draft with a calibration that agrees with the points, or with the offer of one that contradicts them."""
+        """The draft with the result of a calibration: applied if it agrees with the clicked points, else offered."""
         report = report_of(result, self._clicking, draft.points)
         if result.stop_reason in (StopReason.FAILED, StopReason.START_KEPT):
             text = f"The calibration from your points is unchanged, with a loss of {report.loss_before:.4f}."

@@ -1,4 +1,4 @@
-"""Points that are clicked one after the other, and the calibration that follows each of them."""
+"""Prompts for landmarks to click, and the calibration computed after each click."""
 
 from collections.abc import Sequence as Rows
 from dataclasses import dataclass, replace
@@ -34,7 +34,7 @@ class Clicking:
         sequence: the recording, with placeholder base frames.
         plan: all prompts, in order.
         result: calibration from the points; None while there are too few.
-        problem: why there is no result; empty if there is.
+        problem: cause of a missing result.
     """
 
     def __init__(self, sequence: Sequence, *, focal_length: bool = False) -> None:
@@ -50,7 +50,7 @@ class Clicking:
         return self.sequence.scene if self.result is None else self.result.scene
 
     def free_focal_length(self, free: bool) -> None:
-        """Solve for focal lengths, too, or not; takes effect with the next `solve`."""
+        """Whether the next `solve` also estimates focal lengths."""
         self._settings = replace(self._settings, focal_length=free)
 
     def next_prompt(self, points: Rows[ImagePoint], skipped: frozenset[ClickPrompt]) -> ClickPrompt | None:
@@ -118,7 +118,7 @@ def _asked(scene: Scene, arm: str) -> list[str]:
 
 
 def spread_out(places: Rows[np.ndarray] | np.ndarray, count: int) -> list[int]:
-    """Rows with positions far from each other, in order: the most typical one first, then the furthest from all."""
+    """Sorted rows with positions far from each other: the most typical one, then repeatedly the furthest one."""
     points = np.asarray(places, float)
     chosen = [int(np.linalg.norm(points - np.median(points, axis=0), axis=1).argmin())]
     while len(chosen) < min(count, len(points)):

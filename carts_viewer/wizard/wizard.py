@@ -25,7 +25,7 @@ _PURPOSES = {
     "images": ("Choose a folder of images, or a video.", SUFFIXES, True),
     "calibration": ("Choose the camera's calibration (ROS, OpenCV, Kalibr, MATLAB).", _LENSES, False),
     "kinematics": ("Choose the table of joint positions or tip poses.", _TABLES, False),
-    "robot": ("Choose the URDF of the instrument; carts robot makes one.", (".urdf",), False),
+    "robot": ("Choose the URDF of the instrument; carts robot generates one.", (".urdf",), False),
 }
 _MOST_UNDO = 200
 
@@ -75,12 +75,12 @@ class RecordingWizard:
                 return
             except (CartsError, LookupError, TypeError, ValueError) as error:
                 self._leave_hand_eye()
-                self._problem = f"The points or the calibration of this import do not fit the recording: {error}"
+                self._problem = f"The points or calibration of this import do not match the recording: {error}"
                 self._change(self._draft.uncalibrated(step=Step.CHECK))
         self._host.document.show(self._page())
 
     def choose(self, name: str, value: str) -> None:
-        """Carry out a choice."""
+        """Apply a choice."""
         self._problem = ""
         steps = {"continue": Step.HAND_EYE, "back": Step.CHECK}
         if name == "leave":
@@ -98,7 +98,7 @@ class RecordingWizard:
         self.show()
 
     def _browsed(self, name: str, value: str) -> bool:
-        """Carry out a choice in the file browser; returns whether it was one."""
+        """Apply a choice of the file browser; returns whether it is one."""
         browser = self._browser
         match name:
             case "change":
@@ -114,7 +114,7 @@ class RecordingWizard:
         return True
 
     def _check(self, name: str, value: str) -> None:
-        """Carry out a choice of the step Check."""
+        """Apply a choice of the step Check."""
         delay = self._delay
         match name:
             case "estimate-delay":
@@ -147,7 +147,7 @@ class RecordingWizard:
         self._leave_hand_eye()
 
     def _set(self, draft: Draft) -> None:
-        """Replace the draft; undo restores the present one."""
+        """Replace the draft as an undo step."""
         if draft == self._draft:
             return
         self._undo = [*self._undo, self._draft][-_MOST_UNDO:]
@@ -179,7 +179,7 @@ class RecordingWizard:
         """Open the file browser for a part of the recording."""
         kind = part.partition(" ")[0]
         if kind not in _PURPOSES:
-            raise SettingsError("this part of a recording is not known.")
+            raise SettingsError(f"a recording has no part {kind!r}.")
         purpose, suffixes, folders = _PURPOSES[kind]
 
         def wanted(entry: Entry) -> bool:
@@ -223,7 +223,7 @@ class RecordingWizard:
         self._host.document.show(render("message.html", title=title, text=text), place)
 
     def _estimate_delay(self) -> None:
-        """Compare the motion in images and table."""
+        """Estimate the delay from the motion in images and table."""
         recording = self._guessed().recording
         if recording is not None:
             self._tell("Time", "Comparing the motion in the images with the table …")
@@ -239,7 +239,7 @@ class RecordingWizard:
                 self._pictures[camera.name] = [(frame, publish(jpeg)) for frame, jpeg in images]
 
     def _enter_hand_eye(self) -> bool:
-        """Open the recording for the last step; False, with a problem, if that is not possible."""
+        """Open the recording for the last step; returns whether that succeeded."""
         if self._step is None:
             found = self._guessed()
             try:

@@ -373,7 +373,8 @@ def read_mask_folder(path: Path, remarks: Counter[str], *, confined: bool = Fals
     for file in files:
         above = _meaning_file(file, path if confined else path.parent, confined)
         if above is not None and above not in meanings:
-            meanings[above] = _meaning(above)
+            with well_formed(f"{above} cannot be read", "Correct it or remove it."):
+                meanings[above] = parse_json(read_text(above, VALUES))
         meaning = None if above is None else meanings[above]
         yield ForeignImage(
             file.relative_to(path.parent).as_posix(), lambda file=file, meaning=meaning: _parts(file, meaning, remarks)
@@ -403,11 +404,6 @@ def _meaning_file(file: Path, top: Path, confined: bool) -> Path | None:
         if folder == top:
             break
     return None
-
-
-def _meaning(path: Path) -> Any:
-    with well_formed(f"{path} cannot be read", "Correct it or remove it."):
-        return parse_json(read_text(path, VALUES))
 
 
 def _parts(file: Path, meaning: Any, remarks: Counter[str]) -> Iterator[_Part]:

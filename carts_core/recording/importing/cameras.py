@@ -1,5 +1,6 @@
 """Cameras of foreign recordings: folders of images and videos, and the calibrations that belong to them."""
 
+import os
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -202,19 +203,38 @@ class Images:
     """Remarks on changes to stored images before they are used."""
 
 
-def image_files(folder: Path) -> list[Path]:
-    """Images directly in a folder, unsorted, without hidden files (`._001.jpg` of macOS)."""
+def entries(folder: Path) -> list[Path]:
+    """Entries of a folder by name, without hidden ones (`._001.jpg` of macOS); empty if it cannot be read."""
     try:
-        files = [path for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES and path.is_file()]
-        return [path for path in files if not path.name.startswith(".")]
-    except (OSError, ValueError):  # a name that no file can have
+        return sorted(path for path in folder.iterdir() if not path.name.startswith("."))
+    except (OSError, ValueError):  # ValueError: a name that no file can have.
         return []
+
+
+def subfolders(folder: Path) -> list[Path]:
+    """Folders directly in a folder, by name."""
+    return [path for path in entries(folder) if os.path.isdir(path)]
+
+
+def files_with(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:
+    """Files with these suffixes directly in a folder, by name."""
+    return [path for path in entries(folder) if path.suffix.lower() in suffixes and os.path.isfile(path)]
+
+
+def image_files(folder: Path) -> list[Path]:
+    """Images directly in a folder, by name."""
+    return files_with(folder, IMAGE_SUFFIXES)
 
 
 def find_images(path: Path, only: str = "") -> Images:
     """Find the frames of a video, or of a folder of images whose names end with `only`."""
     if path.is_file() and path.suffix.lower() in SUFFIXES:
-        return _video(path)
+        index = index_video(path)
+        if not index.count:
+            raise SequenceError(f"video {path} has no frames. Copy it again.")
+        video = Video(path, (0,))
+        first, ids = video.read(0), tuple(f"{number:06d}" for number in range(index.count))
+        return Images(path, "", ids, (first.shape[1], first.shape[0]), index.timestamps, remarks=video.remarks())
     files = [file for file in image_files(path) if file.name.endswith(only)]
     if not files:
         kinds = ", ".join(IMAGE_SUFFIXES)
@@ -241,21 +261,8 @@ def _numbered(files: list[Path], folder: Path) -> tuple[str, tuple[str, ...]]:
         )
     ((before, after), numbers) = next(iter(kinds.items()))
     ids = tuple(sorted(numbers, key=lambda number: (int(number), number)))
-    return f"{_literal(before)}{{frame}}{_literal(after)}", ids
-
-
-def _literal(text: str) -> str:
-    return text.replace("{", "{{").replace("}", "}}")
-
-
-def _video(path: Path) -> Images:
-    index = index_video(path)
-    if not index.count:
-        raise SequenceError(f"video {path} has no frames. Copy it again.")
-    video = Video(path, (0,))
-    first = video.read(0)
-    ids = tuple(f"{number:06d}" for number in range(index.count))
-    return Images(path, "", ids, (first.shape[1], first.shape[0]), index.timestamps, remarks=video.remarks())
+    before, after = (part.replace("{", "{{").replace("}", "}}") for part in (before, after))
+    return f"{before}{{frame}}{after}", ids
 
 
 def common_ids(images: Mapping[str, Images], path: Path) -> tuple[str, ...]:

@@ -15,7 +15,6 @@ from .foreign_tables import ForeignTable
 from .found import Import, PartError, Track
 from .joint_units import in_si, length_unit, named_length_unit, psm_joints
 from .logs import ArmLog, track
-from .row_matching import LogRows
 
 _ARM = re.compile(r"(?i)(?:^|[^a-z])(psm\d?)(?![a-z])")
 _FILLER = set(
@@ -58,7 +57,9 @@ class ColumnMeanings:
     """Meanings of the columns of a table."""
 
     time: str | None
+    """Column of times."""
     frame: str | None
+    """Column of file names or numbers of images."""
     arms: dict[str, dict[str, str]]
     """Arm -> joint or part of a pose -> column."""
     stated: frozenset[str] = frozenset()
@@ -228,18 +229,6 @@ def _file_names(table: ForeignTable) -> str | None:
             if hits >= 0.9 * len(cells):
                 return column
     return None
-
-
-def log_rows(table: ForeignTable, meanings: ColumnMeanings) -> LogRows:
-    """References from the rows of a table to images."""
-    return LogRows(
-        table.path.name,
-        len(table),
-        None if meanings.time is None else table.numbers(meanings.time),
-        meanings.time or "",
-        None if meanings.frame is None else table.columns[meanings.frame],
-        meanings.frame or "",
-    )
 
 
 def samples(table: ForeignTable, most: int = 30) -> str:

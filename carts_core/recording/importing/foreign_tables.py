@@ -17,7 +17,7 @@ from ...wording import shown
 from .found import PartError, well_formed
 
 _LONGEST_UNIT = 12
-"""Longest word that is taken for a unit."""
+"""Longest word that is accepted as a unit."""
 _DATE = re.compile(r"\d{4}-\d\d-\d\d[T ]\d\d:\d\d:\d\d([.,]\d+)?(Z|[+-]\d\d:?\d\d)?")
 _LONGEST_NUMBER = 100
 """Longest numeric cell [characters]; arrays of texts allocate the longest length for each cell."""

@@ -2,13 +2,15 @@
 
 import re
 from collections.abc import Sequence
+from itertools import combinations
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
 
 from ...errors import SequenceError
 from ...model.instruments import robot_file
-from ..kinematics_table import ANGLE_UNITS, FAR, LENGTH_UNITS, OTHER_COLUMNS, PERCENT, Joint, joints_of, misfits
+from ..kinematics_table import ANGLE_UNITS, FAR, LENGTH_UNITS, PERCENT, Joint, joints_of
 from .found import FoundArm, Import, PartError
 
 _INSERTED = 0.03
@@ -64,11 +66,17 @@ def in_si(
     return result
 
 
+def urdf_of(arm: str, robot: str) -> Path:
+    """URDF of the robot of an arm, which must exist."""
+    if not (urdf := robot_file(robot)).is_file():
+        raise SequenceError(f"robot {robot} of {arm} is missing. Give the path of a URDF; carts robot generates one.")
+    return urdf
+
+
 def psm_joints(arm: str, names: Sequence[str], job: Import) -> list[Joint]:
     """Joints of the robot given for an arm, else of the default one; joints that it lacks have no limits."""
     robot = job.options.robot.get(arm, FoundArm.robot)
-    if not robot_file(robot).is_file():
-        raise SequenceError(f"robot {robot} of {arm} is missing. Give the path of a URDF; carts robot generates one.")
+    urdf_of(arm, robot)
     known = {joint.name: joint for joint in joints_of(robot)}
     return [known.get(name, Joint(name, name != "insertion", -np.inf, np.inf)) for name in names]
 
@@ -111,8 +119,7 @@ def _length_unit(values: np.ndarray, joints: Sequence[Joint], arm: str, columns:
         return unit
     highest = max(float(np.nanmax(np.abs(values[:, index]))) for index in chosen)
     limit = max(abs(joints[index].upper) for index in chosen)
-    remedies = dict.fromkeys(remedy for misfit in misfits(joints, values) for remedy in misfit.remedies)
-    orders = [remedy.text for remedy in remedies if remedy.option == OTHER_COLUMNS]
+    orders = _column_orders(joints, values, _beyond_limits(joints, values))
     return length_unit(highest, limit, arm, " ".join(joints[index].name for index in chosen), orders)
 
 
@@ -145,9 +152,53 @@ def check_limits(arm: FoundArm, job: Import) -> bool:
         return True
     known = {joint.name: joint for joint in joints_of(arm.robot)}
     shared = [index for index, name in enumerate(arm.columns) if name in known]
-    found = misfits([known[arm.columns[index]] for index in shared], arm.values[:, shared])
-    for misfit in found:
-        options = dict.fromkeys(remedy.option for remedy in misfit.remedies)
-        text = f"{misfit.sentence()}.{'' if options else ' Check the columns.'}"
-        job.warning(text, arm.name, remedy=f"Give {' or '.join(options)}." if options else "")
-    return not found
+    joints, values = [known[arm.columns[index]] for index in shared], arm.values[:, shared]
+    wrong = _beyond_limits(joints, values)
+    orders = dict.fromkeys(_column_orders(joints, values, wrong), "--columns yaw COLUMN pitch COLUMN ...")
+    for index in wrong:
+        joint, own = joints[index], values[:, index]
+        remedies = {**_other_readings(joint, own), **orders}
+        text = (
+            f"{joint.name} is from {own.min():.4g} to {own.max():.4g} {joint.unit}, and the robot's limits are "
+            f"{joint.lower:.4g} to {joint.upper:.4g} {joint.unit}"
+        )
+        text += f"; {' or '.join(remedies)} would fit." if remedies else ". Check the columns."
+        options = " or ".join(dict.fromkeys(remedies.values()))
+        job.warning(text, arm.name, remedy=f"Give {options}." if remedies else "")
+    return not wrong
+
+
+def _beyond_limits(joints: Sequence[Joint], values: Float[np.ndarray, "rows joints"]) -> list[int]:
+    """Indices of joints whose positions [rad], [m] exceed their limits."""
+    return [index for index, joint in enumerate(joints) if len(values) and not joint.fits(values[:, index])]
+
+
+def _other_readings(joint: Joint, values: Float[np.ndarray, " rows"]) -> dict[str, str]:
+    """Signs and units that bring the positions of a joint within its limits, each with its option."""
+    found = {"the opposite sign": f"--flip {joint.name}"} if joint.fits(-values) else {}
+    for unit, factor in joint.units.items():
+        if factor != 1.0 and joint.fits(values * factor) and not (found and unit != "deg"):
+            text = f"{unit} (read as {values.min() * factor:.3g} to {values.max() * factor:.3g} {joint.unit})"
+            found[text] = f"--units {joint.name} {unit}"
+    return found
+
+
+def _column_orders(joints: Sequence[Joint], values: np.ndarray, wrong: list[int]) -> list[str]:
+    """Column orders that bring all positions within the limits, unless changed signs do."""
+    if not wrong or all(joints[index].fits(-values[:, index]) for index in wrong):
+        return []
+    names = [joint.name for joint in joints]
+
+    def fit(order: Sequence[int]) -> bool:
+        return all(joint.fits(values[:, place]) for joint, place in zip(joints, order, strict=True))
+
+    alphabetical = [sorted(names).index(name) for name in names]
+    if alphabetical != list(range(len(names))) and fit(alphabetical):
+        return ["the alphabetical order of the joints' names"]
+    found = []
+    for a, b in combinations(range(len(joints)), 2):
+        order = list(range(len(joints)))
+        order[a], order[b] = b, a
+        if (a in wrong or b in wrong) and fit(order):
+            found.append(f"exchanged columns of {names[a]} and {names[b]}")
+    return found

@@ -13,6 +13,7 @@ from ...model import ecm_kinematics
 from ...model.camera import T_DVRK_OPENCV
 from ...model.psm_kinematics import CLASSIC, JOINT_NAMES, PsmGeometry, forward, inverse
 from ...wording import counted
+from ..matching import at_times, neighbours
 from .calibrations import read_base_frames
 from .found import FoundArm, Import, PartError, Track
 from .joint_units import in_si, psm_joints
@@ -33,19 +34,9 @@ def clock_offset(times: Float[np.ndarray, " rows"], other: Float[np.ndarray, " o
     return float(np.median(difference[same])) if 2 * same.sum() >= len(times) else 0.0
 
 
-def at_times(
-    wanted: Float[np.ndarray, " wanted"], times: Float[np.ndarray, " rows"], values: Float[np.ndarray, "rows columns"]
-) -> Float[np.ndarray, "wanted columns"]:
-    """Values interpolated linearly at other times; NaN outside the range of the rows."""
-    columns = [np.interp(wanted, times, column, left=np.nan, right=np.nan) for column in values.T]
-    return np.stack(columns, axis=1)
-
-
 def nearest(times: Float[np.ndarray, " rows"], other: Float[np.ndarray, " other_rows"]) -> Int[np.ndarray, " rows"]:
     """For each of `times`, the row of `other` (increasing) that is nearest to it."""
-    after = np.searchsorted(other, times).clip(1, max(len(other) - 1, 1))
-    before = after - 1
-    after = after.clip(0, len(other) - 1)
+    before, after = neighbours(other, times)
     return np.where(np.abs(times - other[before]) <= np.abs(times - other[after]), before, after)
 
 
@@ -80,11 +71,8 @@ def fit_base_frame(
     joints: Float[np.ndarray, "rows 6"],
     geometry: PsmGeometry = CLASSIC,
 ) -> BaseFrame:
-    """Base frame that fits joint positions [rad, m] to poses of the tip [m] at the same times.
-
-    Raises:
-        CartsError: no row has both.
-    """
+    """Base frame that fits joints [rad, m] to poses of the tip [m] in the same rows; `CartsError` if no row has
+    both."""
     known = np.isfinite(joints).all(1) & np.isfinite(Ts_reference_tip).all((1, 2))
     if not known.any():
         raise CartsError(

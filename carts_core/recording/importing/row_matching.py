@@ -16,6 +16,8 @@ from jaxtyping import Float, Int
 from ...settings.interchange import SECONDS, Clock
 from ...wording import counted
 from .cameras import Images
+from .columns import ColumnMeanings
+from .foreign_tables import ForeignTable
 from .found import FoundArm, Import, PartError
 
 _STAMPED_DIGITS = 13
@@ -47,21 +49,6 @@ class FrameTimes:
     """Whether the times are from the given frame rate."""
     counted: bool = False
     """Whether the ids are counted from 0, as those of a video, instead of read from names."""
-
-
-@dataclass(frozen=True, eq=False)
-class LogRows:
-    """References from the rows of a log to images."""
-
-    name: str
-    """Name of the log, for the report."""
-    count: int
-    times: np.ndarray | None = None
-    """Raw times; None without a column of times."""
-    time_column: str = ""
-    images: np.ndarray | None = None
-    """File names or numbers of images; None without such a column."""
-    image_column: str = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,86 +144,87 @@ def guess_clock(values: np.ndarray, span: float | None = None) -> Clock:
 
 
 def row_seconds(
-    rows: LogRows, clock: Clock | None, job: Import, span: float | None = None
+    table: ForeignTable, column: str | None, clock: Clock | None, job: Import, span: float | None = None
 ) -> Float[np.ndarray, " rows"] | None:
-    """Times of rows [s]; their unit is guessed if it is not given."""
-    if rows.times is None:
+    """Times of rows [s] from a column of a table; their unit is guessed if it is not given."""
+    if column is None:
         return None
-    values = rows.times
+    values = table.numbers(column)
     if clock is None:
         clock = guess_clock(values, span)
-        job.guessed(f"{rows.name}: times of column {rows.time_column!r} are in {clock}.", option="--clock")
+        job.guessed(f"{table.path.name}: times of column {column!r} are in {clock}.", option="--clock")
     steps = np.diff(values.astype(np.float64))
     if (steps < 0).any():
         row = int(np.flatnonzero(steps < 0)[0]) + 1
         raise PartError(
             "columns",
-            f"{rows.name}, column {rows.time_column!r}: times go back from {values[row - 1]} to {values[row]}, row "
+            f"{table.path.name}, column {column!r}: times go back from {values[row - 1]} to {values[row]}, row "
             f"{row + 1}. Sort the rows, or choose another column.",
             "Option: --columns time COLUMN.",
         )
     if repeated := int((steps == 0).sum()):
-        job.warning(
-            f"{rows.name}: {counted(repeated, 'row')} with the time of the previous row; the first of each is used."
-        )
+        text = f"{counted(repeated, 'row')} with the time of the previous row; the first of each is used"
+        job.warning(f"{table.path.name}: {text}.")
     return np.asarray(values, np.float64) * SECONDS[clock]
 
 
-def match_rows(frames: FrameTimes, rows: LogRows, job: Import) -> RowMatch:
-    """Match rows with images."""
-    options = job.options
+def match_rows(frames: FrameTimes, table: ForeignTable, meanings: ColumnMeanings, job: Import) -> RowMatch:
+    """Match the rows of a table with images."""
+    options, column = job.options, meanings.frame
     explicit = "frame" in options.columns
-    named = _named(frames, rows, job)
+    named = None if column is None else _named(frames, table, column, job)
     if explicit and named is None:
         raise PartError(
             "columns",
-            f"{rows.name}: column {rows.image_column!r} has no names of images, which are {frames.stems[0]} to "
+            f"{table.path.name}: column {column!r} has no names of images, which are {frames.stems[0]} to "
             f"{frames.stems[-1]}. Choose another column.",
             "Option: --columns frame COLUMN.",
         )
     span = None if frames.times is None or len(frames.times) < 2 else float(frames.times[-1] - frames.times[0])
-    times = row_seconds(rows, options.clock, job, span)
+    times = row_seconds(table, meanings.time, options.clock, job, span)
     one_each = None
     if named is not None and (named < 0).mean() <= _FEW:
         known = named[named >= 0]
         one_each = named if len(np.unique(known)) == len(known) >= 0.5 * len(frames.ids) else None
-    in_order = one_each is None and named is None and rows.count == len(frames.ids)
+    in_order = one_each is None and named is None and len(table) == len(frames.ids)
     if in_order:
-        one_each = np.arange(rows.count)
+        one_each = np.arange(len(table))
     if times is not None and frames.times is not None and not explicit:
         apart = bool(frames.times[0] > times[-1] or frames.times[-1] < times[0])
         own_clock = options.time_offset is None and not frames.given and (apart or frames.nominal)
         if not (own_clock and one_each is not None):
-            return _by_time(frames, rows, times, apart, named is not None, job)
+            return _by_time(frames, meanings, times, apart, named is not None, job)
     if explicit or named is not None:
-        assert named is not None and rows.images is not None
-        general = rows.image_column.strip().lower().replace("_", " ").replace(":", "") in _INDEX
-        counts_rows = general and rows.images.dtype.kind in "iuf" and (named < 0).mean() > _FEW
+        assert named is not None and column is not None
+        general = column.strip().lower().replace("_", " ").replace(":", "") in _INDEX
+        counts_rows = general and table.columns[column].dtype.kind in "iuf" and (named < 0).mean() > _FEW
         if not explicit and one_each is None and counts_rows:
             raise PartError(
                 "columns",
-                f"{rows.name}: column {rows.image_column!r} counts {rows.count} rows and there are "
+                f"{table.path.name}: column {column!r} counts {len(table)} rows and there are "
                 f"{counted(len(frames.ids), 'image')}, so it does not match rows with images. Give the frame rate of "
                 "the images, or confirm the column.",
-                f"Options: --frame-rate, --columns frame {rows.image_column!r}.",
+                f"Options: --frame-rate, --columns frame {column!r}.",
             )
-        return _by_image(frames, rows, named, times, f"column {rows.image_column!r}", job, stated=explicit)
+        return _by_image(frames, table, named, times, f"column {column!r}", job, stated=explicit)
     if in_order:
-        return _by_image(frames, rows, np.arange(rows.count), times, "their order", job, stated=False)
+        return _by_image(frames, table, np.arange(len(table)), times, "their order", job, stated=False)
     lacking = "the images have no times" if times is not None else "the table has no times"
     raise PartError(
         "columns",
-        f"the recording has {counted(len(frames.ids), 'image')} and {rows.name} has {counted(rows.count, 'row')}, and "
-        f"{lacking}. Make the numbers equal, choose the column of times or of image names, or give the frame rate of "
-        "the images.",
+        f"the recording has {counted(len(frames.ids), 'image')} and {table.path.name} has "
+        f"{counted(len(table), 'row')}, and {lacking}. Make the numbers equal, choose the column of times or of "
+        "image names, or give the frame rate of the images.",
         "Options: --columns time COLUMN, --columns frame COLUMN, --frame-rate.",
     )
 
 
-def _by_time(frames: FrameTimes, rows: LogRows, times: np.ndarray, apart: bool, named: bool, job: Import) -> RowMatch:
+def _by_time(
+    frames: FrameTimes, meanings: ColumnMeanings, times: np.ndarray, apart: bool, named: bool, job: Import
+) -> RowMatch:
     assert frames.times is not None
-    dropped = f"; column {rows.image_column!r} is not used" if named else ""
-    text = f"rows are matched with images by time: column {rows.time_column!r} and {frames.source}{dropped}."
+    dropped = f"; column {meanings.frame!r} is not used" if named else ""
+    text = f"rows are matched with images by time: column {meanings.time!r} and {frames.source}{dropped}."
     option = "--columns frame COLUMN" if named else ""
     job.found(text, option=option, given="time" in job.options.columns)
     offset = job.options.time_offset
@@ -249,7 +237,7 @@ def _by_time(frames: FrameTimes, rows: LogRows, times: np.ndarray, apart: bool, 
 
 def _by_image(
     frames: FrameTimes,
-    rows: LogRows,
+    table: ForeignTable,
     positions: np.ndarray,
     times: np.ndarray | None,
     how: str,
@@ -260,10 +248,10 @@ def _by_image(
     text = f"each row belongs to one image, by {how}."
     job.found(text, option="--columns frame COLUMN, --frame-rate", given=stated)
     if unnamed := int((positions < 0).sum()):
-        job.warning(f"{rows.name}: {unnamed} of {counted(len(positions), 'row')} belong to no image.")
+        job.warning(f"{table.path.name}: {unnamed} of {counted(len(positions), 'row')} belong to no image.")
     known = positions[positions >= 0]
     if repeated := len(known) - len(np.unique(known)):
-        text = f"{rows.name}: {counted(repeated, 'row')} of an image that already has a row; the first is used."
+        text = f"{table.path.name}: {counted(repeated, 'row')} of an image that already has a row; the first is used."
         job.warning(text)
     taken = frames.times
     if times is not None and not frames.given:
@@ -277,14 +265,14 @@ def _by_image(
     return RowMatch(np.where(positions >= 0, positions.astype(float), np.nan), True, taken)
 
 
-def _named(frames: FrameTimes, rows: LogRows, job: Import) -> Int[np.ndarray, " rows"] | None:
+def _named(frames: FrameTimes, table: ForeignTable, column: str, job: Import) -> Int[np.ndarray, " rows"] | None:
     """Index of each row's image, -1 for none; None if fewer than half of the rows or images are matched."""
-    if rows.images is None:
-        return None
-    by_stem = {stem: index for index, stem in enumerate(frames.stems)}
-    numbers = [_number(cell) for cell in rows.images.tolist()]
-    exact = [by_stem.get(_stem(cell), -1) if isinstance(cell, str) else -1 for cell in rows.images.tolist()]
-    named = np.array(exact if max(exact, default=-1) >= 0 else _numbers_to_positions(numbers, frames, rows, job))
+    by_stem, cells = {stem: index for index, stem in enumerate(frames.stems)}, table.columns[column].tolist()
+    exact = [by_stem.get(_stem(cell), -1) if isinstance(cell, str) else -1 for cell in cells]
+    if max(exact, default=-1) < 0:
+        where = f"{table.path.name}: column {column!r}"
+        exact = _numbers_to_positions([_number(cell) for cell in cells], frames, where, job)
+    named = np.array(exact)
     enough = 2 * (named >= 0).sum() >= min(len(frames.ids), len(named))
     return named if enough else None
 
@@ -301,7 +289,7 @@ def _number(cell: object) -> int | None:
     return int(cell) if isinstance(cell, int | float) and np.isfinite(cell) and cell == int(cell) else None
 
 
-def _numbers_to_positions(numbers: list[int | None], frames: FrameTimes, rows: LogRows, job: Import) -> list[int]:
+def _numbers_to_positions(numbers: list[int | None], frames: FrameTimes, column: str, job: Import) -> list[int]:
     ids = [int(frame) for frame in frames.ids]
     position = {number: index for index, number in enumerate(ids)}
     known = [number for number in numbers if number is not None]
@@ -311,13 +299,12 @@ def _numbers_to_positions(numbers: list[int | None], frames: FrameTimes, rows: L
         # The column counts from 0 instead of 1, or the reverse, if only then every row has an image.
         if hits > best and hits == len(known) and min(known) + other == ids[0]:
             best, shift = hits, other
-    column = f"{rows.name}: column {rows.image_column!r} counts from"
     if shift and frames.counted:
-        job.found(f"{column} {1 if shift < 0 else 0}.")
+        job.found(f"{column} counts from {1 if shift < 0 else 0}.")
     elif shift:
         job.warning(
-            f"{column} {min(known)} and the images from {ids[0]}; its first row is assumed to be the first image. If "
-            f"it is not, rename the images so that they begin with {min(known)}."
+            f"{column} counts from {min(known)} and the images from {ids[0]}; its first row is assumed to be the first "
+            f"image. If it is not, rename the images so that they begin with {min(known)}."
         )
     return [-1 if number is None else position.get(number + shift, -1) for number in numbers]
 

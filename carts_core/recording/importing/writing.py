@@ -16,17 +16,17 @@ from ...errors import CartsError, SequenceError
 from ...files import MARKER, OutputPath, file_name, published, write_bytes, write_text
 from ...html import render_page
 from ...model.camera import T_DVRK_OPENCV
-from ...model.instruments import SCHEME, robot_file
+from ...model.instruments import SCHEME
 from ...model.psm_kinematics import CLASSIC, JOINT_NAMES, forward
 from ...model.robot import Robot
 from ...settings.interchange import ImportOptions
 from ...wording import counted
 from .. import Sequence
 from ..kinematics_table import TableError, joints_of
-from ..matching import ORIENTATION, POSITION
+from ..matching import ORIENTATION, POSITION, neighbours
 from .cameras import check_intrinsics, placed_cameras
 from .found import FoundArm, FoundCamera, FoundRecording, Import, PartError
-from .joint_units import check_limits
+from .joint_units import check_limits, urdf_of
 
 _ROWS = 200
 _NEAREST, _FARTHEST = 0.01, 0.6
@@ -120,7 +120,7 @@ def completed(recording: FoundRecording, options: ImportOptions) -> FoundRecordi
             "Name them: --images left FOLDER_OR_VIDEO.",
         )
     if not recording.frame_ids:
-        raise SequenceError(f"{recording.name}: there are no frames ({recording.kind}). Name other images.")
+        raise SequenceError(f"{recording.name}: no frames were found ({recording.kind}). Choose other images.")
     job = Import(options, [*recording.notes])
     recording = _frames_with_kinematics(recording, job)
     for camera in recording.cameras:
@@ -155,8 +155,7 @@ def _frames_with_kinematics(recording: FoundRecording, job: Import) -> FoundReco
     if recording.motion is not None and logs:
         logs.append((_ENDOSCOPE, recording.motion.times))
     for name, times in logs:
-        after = np.searchsorted(times, wanted).clip(0, len(times) - 1)
-        before = np.where(times[after] > wanted, after - 1, after).clip(0)
+        before, after = neighbours(times, wanted)
         gaps = np.maximum(np.abs(wanted - times[before]), np.abs(times[after] - wanted))
         keep &= gaps <= MAX_GAP
         spacing = np.diff(times)
@@ -286,17 +285,17 @@ def _tables(recording: FoundRecording) -> dict[str, bytes]:
             if len(arm.values) != len(recording.frame_ids):
                 raise SequenceError(
                     f"{arm.name} has {len(arm.values)} rows of joint positions for {len(recording.frame_ids)} images. "
-                    "Each image needs its row: remove what is left over, or give both times."
+                    "Each image needs one row. Remove the others, or give images and rows times."
                 )
             for name, values in zip(arm.columns, arm.values.T, strict=True):
                 frame_columns[f"{arm.name}.{name}"] = [f"{value:.9f}" for value in values]
         else:
-            stream = io.BytesIO()
-            rows = np.column_stack([arm.times - start, arm.values])
-            np.savetxt(stream, rows, "%.9f", ",", header=",".join(["timestamp", *arm.columns]), comments="")
-            tables[_table_of(arm)] = stream.getvalue()
+            tables[_table_of(arm)] = _csv(arm.columns, arm.times - start, arm.values)
     if _moves(recording):
-        tables[MOTION] = _motion_table(recording, start)
+        assert recording.motion is not None
+        Ts = recording.motion.values
+        turns = Rotation.from_matrix(Ts[:, :3, :3]).as_quat()
+        tables[MOTION] = _csv((*POSITION, *ORIENTATION), recording.motion.times - start, Ts[:, :3, 3], turns)
     rows = zip(*frame_columns.values(), strict=True)
     lines = [",".join(frame_columns), *(",".join(cells) for cells in rows)]
     return {FRAMES: ("\n".join(lines) + "\n").encode(), **tables}
@@ -307,13 +306,9 @@ def _moves(recording: FoundRecording) -> bool:
     return recording.motion is not None and any(arm.times is not None for arm in recording.arms)
 
 
-def _motion_table(recording: FoundRecording, start: float) -> bytes:
-    assert recording.motion is not None
-    Ts, stream = recording.motion.values, io.BytesIO()
-    rows = np.column_stack(
-        [recording.motion.times - start, Ts[:, :3, 3], Rotation.from_matrix(Ts[:, :3, :3]).as_quat()]
-    )
-    np.savetxt(stream, rows, "%.9f", ",", header=",".join(["timestamp", *POSITION, *ORIENTATION]), comments="")
+def _csv(columns: tuple[str, ...], times: np.ndarray, *values: np.ndarray) -> bytes:
+    stream, header = io.BytesIO(), ",".join(["timestamp", *columns])
+    np.savetxt(stream, np.column_stack([times, *values]), "%.9f", ",", header=header, comments="")
     return stream.getvalue()
 
 
@@ -332,11 +327,7 @@ def _column(camera: FoundCamera) -> str:
 def _toml(recording: FoundRecording, place: Path) -> str:
     arms, cameras = [], []
     for arm in recording.arms:
-        urdf = robot_file(arm.robot).absolute()
-        if not urdf.is_file():
-            raise SequenceError(
-                f"robot {arm.robot} of {arm.name} is missing. Give the path of a URDF (carts robot makes one)."
-            )
+        urdf = urdf_of(arm.name, arm.robot)
         names = [joint.name for joint in joints_of(arm.robot)]
         known = arm.columns if arm.values is not None else ()
         columns = [name for name in known if name != "jaw" or "jaw" in names]

@@ -93,10 +93,6 @@ _INFO_TYPE = "sensor_msgs/msg/CameraInfo"
 _PREFERRED = ("rect", "compressed", "")
 
 
-def _detect(path: Path) -> bool:
-    return (path.suffix in BAG_SUFFIXES and path.is_file()) or (path / "metadata.yaml").is_file()
-
-
 def read_arm_logs(bag: Bag, job: Import) -> list[ArmLog]:
     """Logs of the arms in a bag by name; notes report joints in another order."""
     wanted: dict[str, tuple[str, str]] = {}
@@ -250,7 +246,7 @@ SOURCE = Source(
     "bag",
     "ROS 1 or ROS 2 bag",
     "a file .bag or .mcap, or a folder with metadata.yaml",
-    _detect,
+    lambda path: (path.suffix in BAG_SUFFIXES and path.is_file()) or (path / "metadata.yaml").is_file(),
     ("images", "time_offset", "frame_rate"),
     _read,
 )

@@ -15,7 +15,7 @@ from ...errors import SequenceError
 from ...model.psm_kinematics import JOINT_NAMES
 from ...wording import counted
 from ..images import mask_remarks, read_mask, spread_files
-from ..importing.cameras import Images, cameras_of, common_ids, find_images, image_files
+from ..importing.cameras import Images, cameras_of, common_ids, find_images, image_files, subfolders
 from ..importing.foreign_tables import read_array, read_foreign_table
 from ..importing.found import FoundArm, FoundCamera, FoundRecording, Import, Source
 from ..importing.joint_units import in_si, psm_joints
@@ -28,13 +28,6 @@ _AMBF_FIELD_OF_VIEW = 1.2
 """Vertical field of view of the simulated camera [rad]."""
 _DECIMETRES_FROM = 0.3
 """Insertion above which a simulation counts in decimetres [m]."""
-
-
-def _subfolders(path: Path) -> list[Path]:
-    try:
-        return sorted(each for each in path.iterdir() if each.is_dir())
-    except OSError:
-        return []
 
 
 def _ordered(names: Iterable[str]) -> list[str]:
@@ -87,7 +80,7 @@ def _with_masks(camera: FoundCamera, folder: Path, ids: tuple[str, ...], job: Im
 
 
 def _read_cts(path: Path, job: Import) -> FoundRecording:
-    domains = _ordered(each.name for each in _subfolders(path) if image_files(each / "images_l"))
+    domains = _ordered(each.name for each in subfolders(path) if image_files(each / "images_l"))
     images = _domain_images(path, domains, {"left": "images_l", "right": "images_r"}, job)
     ids = common_ids(images, path)
     cameras = [
@@ -169,7 +162,7 @@ def _read_ambf(path: Path, job: Import) -> FoundRecording:
 
 def _is_subset(path: Path) -> bool:
     return (path / "ground_truth").is_dir() and any(
-        image_files(each / "left") for each in _subfolders(path) if each.name != "ground_truth"
+        image_files(each / "left") for each in subfolders(path) if each.name != "ground_truth"
     )
 
 
@@ -177,7 +170,7 @@ def _subsets(path: Path) -> list[Path]:
     level, found = [path], []
     for _ in range(4):
         found += [each for each in level if _is_subset(each)]
-        level = [each for folder in level for each in _subfolders(folder)][:500]
+        level = [each for folder in level for each in subfolders(folder)][:500]
     return found
 
 
@@ -185,7 +178,7 @@ def _read_segstrong(path: Path, job: Import) -> FoundRecording:
     if not _is_subset(path):
         subsets = ", ".join(str(each.relative_to(path)) for each in _subsets(path))
         raise SequenceError(f"{path} has several recordings. Import one of them: {subsets}.")
-    folders = [each for each in _subfolders(path) if each.name != "ground_truth"]
+    folders = [each for each in subfolders(path) if each.name != "ground_truth"]
     domains = _ordered(each.name for each in folders if image_files(each / "left"))
     images = _domain_images(path, domains, {"left": "left", "right": "right"}, job)
     ids = common_ids(images, path)
@@ -197,7 +190,7 @@ CTS = Source(
     "cts",
     "a set of CaRTS (CTS)",
     "a folder with green_screen/psm1_js.npy and DOMAIN/images_l",
-    lambda path: any(image_files(each / "images_l") for each in _subfolders(path)) and (path / _TRUTH).is_dir(),
+    lambda path: any(image_files(each / "images_l") for each in subfolders(path)) and (path / _TRUTH).is_dir(),
     ("time_offset", "frame_rate"),
     _read_cts,
 )

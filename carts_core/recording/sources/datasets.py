@@ -53,7 +53,8 @@ def _read_surgpose(path: Path, job: Import) -> FoundRecording:
     cameras = cameras_of(images, job, dict.fromkeys(images, calibration) if calibration else {})
     ids = common_ids(images, path)
     file = min(path.rglob("api_jp_data.yaml"))
-    rows = _yaml_rows(file)
+    with well_formed(f"{file} is not a YAML file of frames with joints by arm"):
+        rows = {int(frame): dict(row) for frame, row in parse_yaml(read_text(file, VALUES)).items()}
     wanted = set(job.options.arms.values()) or {"PSM1", "PSM2", "PSM3"}
     names = sorted({str(arm) for row in rows.values() for arm in row} & wanted)
     if not names:
@@ -79,11 +80,6 @@ def _read_surgpose(path: Path, job: Import) -> FoundRecording:
     )
     numbered = [replace(camera, numbers=kept) for camera in cameras]
     return job.recording("a trajectory of SurgPose", path.name, numbered, found, kept_ids, found[0].times)
-
-
-def _yaml_rows(file: Path) -> dict[int, dict]:
-    with well_formed(f"{file} is not a YAML file of frames with joints by arm"):
-        return {int(frame): dict(row) for frame, row in parse_yaml(read_text(file, VALUES)).items()}
 
 
 def _read_endovis(path: Path, job: Import) -> FoundRecording:

@@ -13,7 +13,7 @@ import numpy as np
 
 from ...errors import SequenceError
 from ..image_sources import Bag
-from ..importing.cameras import calibration_of, find_images, side_of
+from ..importing.cameras import calibration_of, files_with, find_images, side_of
 from ..importing.columns import order_of_names
 from ..importing.foreign_tables import read_foreign_table
 from ..importing.found import FoundCamera, FoundRecording, Import, Source, Track, read_json, well_formed
@@ -49,18 +49,11 @@ def _detect(path: Path) -> bool:
         return False
     if (path / "index.json").is_file():
         return True
-    return any((video.with_suffix(".json")).is_file() for video in _videos(path))
-
-
-def _videos(path: Path) -> list[Path]:
-    try:
-        return sorted(each for each in path.iterdir() if each.suffix.lower() in SUFFIXES)
-    except OSError:
-        return []
+    return any((video.with_suffix(".json")).is_file() for video in files_with(path, SUFFIXES))
 
 
 def _streams(path: Path, job: Import) -> list[_Stream]:
-    videos = _videos(path)
+    videos = files_with(path, SUFFIXES)
     if (path / "index.json").is_file():
         index = read_json(path / "index.json")
         listed = index.get("videos") if isinstance(index, dict) else None

@@ -9,8 +9,17 @@ import numpy as np
 from ...errors import SequenceError
 from ...model.psm_kinematics import JOINT_NAMES
 from ...settings.interchange import NO_TABLE, ImportOptions
-from ..importing.cameras import Images, cameras_of, common_ids, find_images, image_files, side_of
-from ..importing.columns import ColumnMeanings, arm_in, arm_log, guess_columns, log_rows, samples
+from ..importing.cameras import (
+    Images,
+    cameras_of,
+    common_ids,
+    files_with,
+    find_images,
+    image_files,
+    side_of,
+    subfolders,
+)
+from ..importing.columns import ColumnMeanings, arm_in, arm_log, guess_columns, samples
 from ..importing.foreign_tables import TABLE_SUFFIXES, ForeignTable, read_foreign_table
 from ..importing.found import FoundArm, FoundRecording, Import, PartError, Source
 from ..importing.logs import arm_from_log
@@ -26,32 +35,17 @@ _CALIBRATION_WORDS = re.compile(
 )
 
 
-def _detect(path: Path) -> bool:
-    return path.is_dir() and (bool(_image_places(path)) and bool(_tables(path)))
-
-
 def _folders(path: Path) -> list[Path]:
     """Visible folders down to two levels below a folder, itself included."""
     found, level = [path], [path]
     for _ in range(_DEPTH):
-        try:
-            level = sorted(each for folder in level for each in folder.iterdir() if each.is_dir())
-        except OSError:
-            return found
-        level = [each for each in level if not each.name.startswith(".")][:200]
+        level = sorted(each for folder in level for each in subfolders(folder))[:200]
         found += level
     return found
 
 
 def _files(path: Path, suffixes: tuple[str, ...]) -> list[Path]:
-    found = []
-    for folder in _folders(path):
-        try:
-            wanted = [each for each in folder.iterdir() if each.suffix.lower() in suffixes and each.is_file()]
-        except OSError:
-            continue
-        found += sorted(each for each in wanted if not each.name.startswith("."))
-    return found
+    return [file for folder in _folders(path) for file in files_with(folder, suffixes)]
 
 
 def _tables(path: Path) -> list[Path]:
@@ -152,7 +146,7 @@ def _kinematics(path: Path, job: Import) -> list[tuple[ForeignTable, ColumnMeani
         if not any(meanings.arms for _, meanings in found):
             for file in _tables(path):
                 if file.suffix.lower() in (".csv", ".tsv", ".parquet"):
-                    read_foreign_table(file)  # Its error is more useful than none.
+                    read_foreign_table(file)  # Raises the error of an unreadable table.
             found = [(table, meanings) for table, meanings in found if _is_wide(table)][:1]
     known: dict[str, ForeignTable] = {}
     chosen = []
@@ -190,7 +184,7 @@ def _frames(path: Path, images: Images, ids: tuple[str, ...], kinematics: list[P
         meanings = guess_columns(table, replace(job.options, columns={}, kinematics=None))
         if meanings.time is not None and not meanings.arms and len(table) == len(ids):
             job.guessed(f"times of the images are in {file.name}.")
-            times = row_seconds(log_rows(table, meanings), None, job)
+            times = row_seconds(table, meanings.time, None, job)
             found = frame_times(images, ids, Import(replace(job.options, frame_rate=None)))
             if job.options.frame_rate is not None:
                 job.warning(f"the given frame rate is not used, since the images have times in {file.name}.")
@@ -251,7 +245,7 @@ def _matched(
         for remark in table.remarks:
             job.found(f"{table.path.name}: {remark}.")
         try:
-            match = match_rows(frames, log_rows(table, meanings), job)
+            match = match_rows(frames, table, meanings, job)
         except PartError as error:
             others = [f"{other.path.name}, {len(other)} rows" for other, _ in found if other is not table]
             also = f" Other tables: {'; '.join(others)}." if others else ""
@@ -286,7 +280,7 @@ SOURCE = Source(
     "folder",
     "images or videos with a table of kinematics",
     "a folder with images or videos and a .csv, .parquet, .npy or .npz file, two levels deep",
-    _detect,
+    lambda path: path.is_dir() and bool(_image_places(path)) and bool(_tables(path)),
     ("images", "kinematics", "columns", "clock", "time_offset", "frame_rate"),
     _read,
 )

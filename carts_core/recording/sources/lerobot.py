@@ -32,10 +32,6 @@ class _Episode:
     """Feature -> video, and the number of the episode's first frame in it."""
 
 
-def _detect(path: Path) -> bool:
-    return (_root(path) / "meta/info.json").is_file()
-
-
 def _root(path: Path) -> Path:
     """The data set's folder, also given one of its episode files."""
     if path.is_file() and _EPISODE.search(path.name):
@@ -51,7 +47,7 @@ def _read(path: Path, job: Import) -> FoundRecording:
         features, rate = dict(info["features"]), float(info["fps"])
     wanted = _EPISODE.search(path.name)
     cameras = [key for key, value in features.items() if isinstance(value, dict) and value.get("dtype") == "video"]
-    episode = _episode(root, info, cameras, int(wanted.group(1)) if wanted else 0, job)
+    episode = _episode(root, info, cameras, int(wanted.group(1)) if wanted else 0)
     rows = len(episode.table)
     if not rows:
         raise SequenceError(f"{root}: episode {episode.index} has no rows. Name another one.")
@@ -59,14 +55,14 @@ def _read(path: Path, job: Import) -> FoundRecording:
         job.found(f"episode {episode.index} of {total}; to import another one, give its .parquet file.")
     ids = tuple(f"{number:06d}" for number in range(rows))
     arms = _arms(root, features, episode, job)
-    times = _times(root, episode, rate, job)
+    times = _times(episode, rate, job)
     arms, kept_ids, kept = by_rows(arms, ids, job, times)
     found = _cameras(root, episode, kept, times, job)
     kind = f"a LeRobot data set ({info.get('codebase_version', 'unknown version')})"
     return job.recording(kind, f"{root.name}-{episode.index:06d}", found, arms, kept_ids, times[kept])
 
 
-def _times(root: Path, episode: _Episode, rate: float, job: Import) -> np.ndarray:
+def _times(episode: _Episode, rate: float, job: Import) -> np.ndarray:
     """Times of an episode's rows, which are its images [s]: from their column, else from the rate."""
     even = np.arange(len(episode.table)) / rate
     if "timestamp" not in episode.table.columns:
@@ -87,7 +83,7 @@ def _times(root: Path, episode: _Episode, rate: float, job: Import) -> np.ndarra
     return even
 
 
-def _episode(root: Path, info: dict[str, Any], cameras: list[str], index: int, job: Import) -> _Episode:
+def _episode(root: Path, info: dict[str, Any], cameras: list[str], index: int) -> _Episode:
     chunk = index // max(int(info.get("chunks_size", 1000)), 1)
     old = root / f"data/chunk-{chunk:03d}/episode_{index:06d}.parquet"
     if old.is_file():
@@ -195,7 +191,7 @@ SOURCE = Source(
     "lerobot",
     "a LeRobot data set, v2.1 or v3.0",
     "a folder with meta/info.json, or an episode's .parquet file in one",
-    _detect,
+    lambda path: (_root(path) / "meta/info.json").is_file(),
     ("images", "columns", "time_offset"),
     _read,
 )
