@@ -3,7 +3,7 @@
 import math
 from bisect import bisect_left, bisect_right
 from collections import defaultdict
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, TypeVar
@@ -328,29 +328,12 @@ def between_kept(state: ProjectState, frame: int, within: range | None = None) -
     return range(first, last + 1)
 
 
-def worst_first(
-    state: ProjectState,
-    frames: Iterable[int] | None = None,
-    badness: Callable[[Figures], float | None] | None = None,
-) -> list[int]:
-    """Frames sorted by decreasing badness of fit; those without figures come last, in order.
+def worst_first(state: ProjectState, frames: Iterable[int] | None = None) -> list[int]:
+    """Frames, by default all, sorted by decreasing badness of fit; those without a measure come last, in order.
 
-    Args:
-        frames: indices of the frames to sort, by default all.
-        badness: measure that is larger for worse fits, None if unknown. By default 1 - Dice if any frame has Dice, else
-            the probability of failure if any has a verdict, else the loss.
+    The measure is 1 - Dice if any frame has Dice, else the probability of failure if any has a verdict, else the loss.
     """
     indices = list(range(len(state.identity.frame_ids)) if frames is None else frames)
-    if badness is None:
-        judged = _badness(state, indices)
-        return sorted(indices, key=lambda index: -judged.get(index, -math.inf))
-    known = {index: figures for index in indices if (figures := state.figures(index)) is not None}
-    judged = {index: value for index, figures in known.items() if (value := badness(figures)) is not None}
-    return sorted(indices, key=lambda index: -judged.get(index, -math.inf))
-
-
-def _badness(state: ProjectState, indices: Iterable[int]) -> dict[int, float]:
-    """Badness of frames with figures, using for all the most reliable measure available."""
     dice, failure, loss = {}, {}, {}
     for index in indices:
         figures, verdict = state.figures(index), state.verdict(index)
@@ -360,7 +343,8 @@ def _badness(state: ProjectState, indices: Iterable[int]) -> dict[int, float]:
             dice[index] = 1.0 - figures.dice
         if figures is not None and figures.loss is not None:
             loss[index] = figures.loss
-    return dice or failure or loss
+    judged = dice or failure or loss
+    return sorted(indices, key=lambda index: -judged.get(index, -math.inf))
 
 
 _SOURCE_ORDER = (Source.HAND, Source.PROPAGATED, Source.OPTIMIZER, Source.MEASURED)

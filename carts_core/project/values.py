@@ -270,7 +270,7 @@ class ImportedLabels(JsonValue):
     """Names of the labels from 1."""
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "names", tuple(self.names))
+        _set(self, "names", tuple(self.names))
         if len(self.names) > 255 or not all(isinstance(name, str) and len(name) <= 1000 for name in self.names):
             raise ProjectError("imported labels must be at most 255 names of at most 1000 characters.")
 
@@ -291,7 +291,7 @@ class ImportedKeypoints(JsonValue):
             if not all(map(math.isfinite, place)):
                 raise ProjectError(f"the imported keypoint {point[0]!r} is at {place}. Give finite numbers.")
             points.append((point[0], *place))
-        object.__setattr__(self, "points", tuple(points))
+        _set(self, "points", tuple(points))
 
 
 VERDICTS = ("good", "doubtful", "failed")
@@ -321,7 +321,7 @@ class FitVerdict(JsonValue):
         for text in (self.reason, self.remedy):
             if not isinstance(text, str) or len(text) > LONGEST_TEXT:
                 raise ProjectError(f"reason and remedy must be texts of at most {LONGEST_TEXT} characters. Shorten it.")
-        object.__setattr__(self, "cameras", tuple((str(name), value) for name, value in self.cameras))
+        _set(self, "cameras", tuple((str(name), value) for name, value in self.cameras))
         for value in (self.failure, *(value for _, value in self.cameras)):
             if not (isinstance(value, float | int) and 0.0 <= value <= 1.0):
                 raise ProjectError(f"the probability of a failure is {value!r}. Give a number from 0 to 1.")

@@ -24,7 +24,6 @@ def test_the_worst_frame_comes_first_and_unknown_ones_last(project: Project) -> 
     project.record_figures({1: Figures(loss=0.1, dice=0.5), 2: Figures(loss=0.4, dice=0.9)}, project.state)
     assert worst_first(project.state) == [1, 2, 0]
     assert worst_first(project.state, [0, 2]) == [2, 0]
-    assert worst_first(project.state, badness=lambda figures: figures.loss) == [2, 1, 0]
 
 
 def test_a_frame_is_unknown_again_when_its_joint_positions_change(project: Project) -> None:

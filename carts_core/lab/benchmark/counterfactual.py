@@ -31,7 +31,7 @@ from .rooms import AlteredSequence
 
 
 def backdrop(width: int, height: int, seed: int) -> UInt8[np.ndarray, "h w 3"]:
-    """Path-traced image of tissue without instruments, stored in the cache; `CartsError` if Mitsuba is not installed."""
+    """Path-traced image of tissue without instruments, from the cache; `CartsError` if Mitsuba is not installed."""
     path = output_path(cache_dir(), "benchmark", f"backdrop_{seed}_{width}x{height}.png")
     if not holds_file(path):
         config = SynthesisConfig(seed=seed, endoscope=EndoscopeConfig(width=width, height=height))

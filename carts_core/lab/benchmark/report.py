@@ -14,31 +14,14 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
 from ...files import OutputPath, csv_cell, output_stream, write_text
-from ...html import Table, render_page
+from ...html import render_page
 from ...wording import counted
-from .hand_eye import HandEyeRun, hand_eye_table, hand_eye_targets
+from .hand_eye import HandEyeRun, hand_eye_targets
 from .measurement import BEST_OF, TOLERANCE, Measurement
 from .scope import SYNTHETIC
 from .statistics import DICE, DOMAIN_LABELS, JOINT_MAE, PAPER, SHORT_LABELS, TEXTS, Measurements, scores
-from .tables import (
-    ROWS,
-    calibration_table,
-    camera_table,
-    deviation_table,
-    error_tables,
-    family_table,
-    image_alone_table,
-    iteration_tables,
-    main_tables,
-    occlusion_table,
-    pair_table,
-    room_table,
-    sequence_table,
-    speed_table,
-    stage_table,
-    verdict_table,
-    worse_table,
-)
+from .tables import ROWS
+from .tables import sections as sections_of
 from .targets import targets
 
 matplotlib.use("Agg")
@@ -246,7 +229,7 @@ def write_report(
     """
     data = Measurements(measurements)
     verdicts = [*targets(data), *hand_eye_targets(hand_eye)]
-    sections = _sections(data, stages, hand_eye)
+    sections = sections_of(data, stages, hand_eye)
     figures = write_figures(data.compared(), folder / "figures")
     rows = [_row(measurement) for measurement in measurements]
     machines = sorted({measurement.machine for measurement in measurements})
@@ -288,27 +271,6 @@ def write_report(
     path = folder / "report.html"
     write_text(path, page)
     return path.path
-
-
-def _sections(data: Measurements, stages: dict[str, float], hand_eye: list[HandEyeRun]) -> dict[str, list[Table]]:
-    """Sections of the report: title -> tables."""
-    compared = data.compared()
-    sections: dict[str, list[Table | None]] = {
-        "Main table": [*main_tables(data), image_alone_table(compared)],
-        "Iterations": [*iteration_tables(data)],
-        "Error at the start": [*error_tables(compared)],
-        "Occlusion": [occlusion_table(data)],
-        "Several cameras": [camera_table(data)],
-        "Calibration": [calibration_table(data)],
-        "Sequence mode": [sequence_table(data)],
-        "Other rooms": [room_table(data)],
-        "Other instruments": [family_table(data)],
-        "Hand-eye calibration": [hand_eye_table(hand_eye)],
-        "Verdicts and deviations": [verdict_table(data), deviation_table(data)],
-        "Speed and safety": [speed_table(compared), pair_table(data), worse_table(data)],
-        "Stages": [stage_table(stages)],
-    }
-    return {title: [table for table in tables if table] for title, tables in sections.items()}
 
 
 def _row(measurement: Measurement) -> dict[str, object]:

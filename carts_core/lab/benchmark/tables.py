@@ -9,6 +9,7 @@ from ...html import Cell, Table
 from ...settings import DOMAINS
 from ...wording import counted
 from .conditions import OCCLUSION, SHARE
+from .hand_eye import HandEyeRun, hand_eye_table
 from .measurement import Measurement
 from .rooms import Half
 from .scope import BASELINES, FAMILY, METHODS, PAPERS_STEPS, RENDERING, ROOMS, SYNTHETIC
@@ -366,3 +367,24 @@ def deviation_table(data: Measurements) -> Table | None:
         if (known := within(runs)) is not None
     ]
     return table_of("deviations", rows)
+
+
+def sections(data: Measurements, stages: dict[str, float], hand_eye: list[HandEyeRun]) -> dict[str, list[Table]]:
+    """Sections of the report: title -> tables."""
+    compared = data.compared()
+    found: dict[str, list[Table | None]] = {
+        "Main table": [*main_tables(data), image_alone_table(compared)],
+        "Iterations": [*iteration_tables(data)],
+        "Error at the start": [*error_tables(compared)],
+        "Occlusion": [occlusion_table(data)],
+        "Several cameras": [camera_table(data)],
+        "Calibration": [calibration_table(data)],
+        "Sequence mode": [sequence_table(data)],
+        "Other rooms": [room_table(data)],
+        "Other instruments": [family_table(data)],
+        "Hand-eye calibration": [hand_eye_table(hand_eye)],
+        "Verdicts and deviations": [verdict_table(data), deviation_table(data)],
+        "Speed and safety": [speed_table(compared), pair_table(data), worse_table(data)],
+        "Stages": [stage_table(stages)],
+    }
+    return {title: [table for table in tables if table] for title, tables in found.items()}
