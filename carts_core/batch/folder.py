@@ -348,8 +348,10 @@ def sequence_file(folder: OutputPath, job: Job) -> Path:
 
 
 def review_project(folder: OutputPath, job: Job) -> Path:
-    """Project for the review of a job, created if missing. New results get a new project; old projects are kept. Raises
-    `CartsError` if a table of results cannot be read.
+    """Project for the review of a job, created if missing. New results get a new project; old projects are kept.
+
+    Raises:
+        CartsError: a table of results cannot be read.
     """
     tables = kinematics_tables(folder, job)
     try:

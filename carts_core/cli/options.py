@@ -81,8 +81,10 @@ class Selection:
 
 
 def chosen_frames(frames: str | None, positions: str | None, ids: Names[str]) -> list[int]:
-    """0-based indices selected by `--frames` (ids) or `--positions` (from 1); all frames if neither is given. Raises
-    `SettingsError` if both are given, or one is invalid or names a frame that is not in the recording.
+    """0-based indices selected by `--frames` (ids) or `--positions` (from 1); all frames if neither is given.
+
+    Raises:
+        SettingsError: both are given, or one is invalid or names a frame that is not in the recording.
     """
     if frames is not None and positions is not None:
         raise SettingsError("--frames and --positions are both given. Give one of them.")
@@ -497,8 +499,10 @@ class Observing(Network):
             )
 
     def observer(self, settings: SolverSettings, sequence: "Sequence") -> Observer:
-        """Create the observer of a sequence for a solver; `CartsError` if the solver compares image features, or
-        weights or masks cannot be used.
+        """Create the observer of a sequence for a solver.
+
+        Raises:
+            CartsError: the solver compares image features, or weights or masks cannot be used.
         """
         if self.observe != "network" and not isinstance(settings, SurfaceSolver):
             raise SettingsError(

@@ -61,8 +61,10 @@ def measured_frames(sequence: Sequence, indices: Iterable[int]) -> list[ExportFr
 
 
 def corrected_frames(sequence: Sequence, indices: Iterable[int], rows: Iterable[KinematicsRow]) -> list[ExportFrame]:
-    """Frames of `indices` that have a table row, with its joint positions; `SequenceError` if a row refers to a frame
-    that is not in the sequence, or two rows to the same frame.
+    """Frames of `indices` that have a table row, with its joint positions.
+
+    Raises:
+        SequenceError: a row refers to a frame that is not in the sequence, or two rows to the same frame.
     """
     known = set(sequence.frame_ids)
     by_id: dict[str, KinematicsRow] = {}
@@ -281,8 +283,10 @@ class Dataset:
         return self.scene.state(frame.joint_positions, mounts=self.sequence.mounts(frame.index))
 
     def views(self, monitor: Monitor) -> Iterator[View]:
-        """Yield the labelled views of all frames and cameras, one `monitor` step each; `CartsError` if a mask does not
-        have its camera's image size, or has pixels far from any arm.
+        """Yield the labelled views of all frames and cameras, one `monitor` step each.
+
+        Raises:
+            CartsError: a mask does not have its camera's image size, or has pixels far from any arm.
         """
         for number, (name, frame, camera) in enumerate(monitor.track(self.steps), start=1):
             rendered = self.renderers[camera.name].segment_links(self.state(frame))[0]
@@ -412,7 +416,9 @@ def labelled(
     mask: Bool[np.ndarray, "height width"], rendered: Int[np.ndarray, "height width"], where: str
 ) -> Int[np.ndarray, "height width"]:
     """Restrict `rendered` labels (-1 for background) to `mask`; additional pixels get the nearest rendered label.
-    Raises `CartsError` if the mask of the view `where` has another size, or there is no rendered label for its pixels.
+
+    Raises:
+        CartsError: the mask of the view `where` has another size, or there is no rendered label for its pixels.
     """
     if mask.shape != rendered.shape or mask.dtype != bool:
         raise CartsError(

@@ -91,8 +91,11 @@ def packed(message: msgspec.Struct) -> bytes:
 
 
 def receive(connection: socket.socket) -> FrameMessage | None:
-    """Receive the next message; None at the end of the stream. Raises `StreamError` if the message is too long or
-    invalid; `OSError` if the connection is broken.
+    """Receive the next message; None at the end of the stream.
+
+    Raises:
+        StreamError: the message is too long or invalid.
+        OSError: the connection is broken.
     """
     header = _exactly(connection, _LENGTH.size)
     if header is None:
@@ -122,7 +125,11 @@ def _exactly(connection: socket.socket, count: int) -> bytes | None:
 
 
 def decoded(camera: str, image: ImageMessage) -> UInt8[np.ndarray, "height width 3"]:
-    """Decode an image to RGB; `StreamError` if the image cannot be decoded, or is too large."""
+    """Decode an image to RGB.
+
+    Raises:
+        StreamError: the image cannot be decoded, or is too large.
+    """
     if image.encoding == "rgb8":
         if image.width < 1 or image.height < 1 or len(image.data) != 3 * image.width * image.height:
             raise StreamError(
@@ -157,8 +164,10 @@ class Source(Protocol):
     """Source of frames, iterated on its own thread."""
 
     def __iter__(self) -> Iterator[Moment]:
-        """Iterate over frames as they arrive, until the stream ends or `close` is called; `CartsError` if the stream
-        failed.
+        """Iterate over frames as they arrive, until the stream ends or `close` is called.
+
+        Raises:
+            CartsError: the stream failed.
         """
         ...
 
@@ -254,8 +263,10 @@ class Assembler:
         return self.undistorted(name, decoded(name, message.images[name]))
 
     def undistorted(self, name: str, image: np.ndarray) -> np.ndarray:
-        """Undistort an image for the scene's camera; `StreamError` if the size of the image differs from that of the
-        camera.
+        """Undistort an image for the scene's camera.
+
+        Raises:
+            StreamError: the size of the image differs from that of the camera.
         """
         camera = self._sequence.recorded_camera(name)
         if image.shape[:2] != (camera.height, camera.width):

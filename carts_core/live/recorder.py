@@ -88,8 +88,10 @@ class Recorder:
             self.missed += 1
 
     def close(self) -> Path | None:
-        """Finish writing; returns the sequence file, or None without frames. Raises `CartsError` if a file could not be
-        written.
+        """Finish writing; returns the sequence file, or None without frames.
+
+        Raises:
+            CartsError: a file could not be written.
         """
         self._waiting.put(None)
         self._thread.join()

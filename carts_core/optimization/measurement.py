@@ -153,7 +153,9 @@ class FrameSolver:
         cancelled: Callable[[], bool] = lambda: False,
     ) -> Measurement:
         """Find the correction, starting at the measured values; `quick` uses smaller images except in the last stages.
-        Raises `CancelledError` if `cancelled` returned True after an evaluation.
+
+        Raises:
+            CancelledError: `cancelled` returned True after an evaluation.
         """
         stages = reduced(self._cold, _QUICK_SCALE) if quick else self._cold
         start = np.zeros(len(variables))

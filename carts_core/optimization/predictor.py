@@ -159,8 +159,10 @@ class MaskPredictor:
         self.device = torch.device("cpu") if network is None else network.device
 
     def for_frame(self, frame: Frame, cameras: Sequence[str]) -> FramePredictor:
-        """Predictor of one frame; `SettingsError` if a camera has no mask of the frame and there is no network, or a
-        mask has the wrong size.
+        """Predictor of one frame.
+
+        Raises:
+            SettingsError: a camera has no mask of the frame and there is no network, or a mask has the wrong size.
         """
         network = None if self._network is None else self._network.for_frame(frame, cameras)
         given = (frame.masks or {}) if self._masks is None else self._masks(frame.index)

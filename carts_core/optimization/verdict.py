@@ -471,8 +471,10 @@ class DomainCheck:
 def check_domain(
     scene: Scene, frame: Frame, networks: FeatureExtractor | SurfacePredictor, settings: SurfaceSolver | None = None
 ) -> DomainCheck:
-    """Check whether a network suits a frame; runs two predictions. Raises `SettingsError` if an image is missing, or
-    its size differs from that of its camera.
+    """Check whether a network suits a frame; runs two predictions.
+
+    Raises:
+        SettingsError: an image is missing, or its size differs from that of its camera.
     """
     settings = settings or SurfaceSolver()
     predictor = predictor_of(networks).for_frame(frame, [camera.name for camera in scene.cameras])

@@ -33,8 +33,10 @@ _held: list[torch.library.Library] = []
 
 
 def segmentation_models() -> ModuleType:
-    """Import segmentation-models-pytorch, which requires timm and torchvision; `CartsError` if the optional
-    dependencies are not installed.
+    """Import segmentation-models-pytorch, which requires timm and torchvision.
+
+    Raises:
+        CartsError: the optional dependencies are not installed.
     """
     for module in ("segmentation_models_pytorch", "timm", "torchvision"):
         needs_extra(module, EXTRA)
@@ -196,8 +198,11 @@ def save_baseline(network: Baseline, path: OutputPath, training: dict[str, Any])
 
 
 def read_baseline(path: Path) -> TrainedBaseline:
-    """Read and check a weights file; `CartsError` if the extra is not installed; `WeightsError` if the file is missing,
-    was not written by `carts baseline`, or its tensors do not fit.
+    """Read and check a weights file.
+
+    Raises:
+        CartsError: the extra is not installed.
+        WeightsError: the file is missing, was not written by `carts baseline`, or its tensors do not fit.
     """
     try:
         check_regular(path, WEIGHTS)

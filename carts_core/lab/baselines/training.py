@@ -177,8 +177,10 @@ class TrainingFrames:
 
 
 def make_chunk(folder: OutputPath, chunk: int, seed: int) -> None:
-    """Write one file of frames, which depends only on the seed and the file's number; `OutputError` if the file cannot
-    be written.
+    """Write one file of frames, which depends only on the seed and the file's number.
+
+    Raises:
+        OutputError: the file cannot be written.
     """
     generator = SurfaceGenerator([Robot.load(shipped_robot())], IMAGES, (seed, chunk))
     images, given, masks = [], [], []
@@ -219,8 +221,11 @@ class BaselineResult:
 def prepare_frames(
     folder: OutputPath, training: BaselineTraining, say: Callable[[str], None] = lambda line: None
 ) -> TrainingFrames:
-    """Open training frames in a folder, which baselines can share; missing ones are generated. Raises `OutputError` if
-    the folder cannot be written to; `WeightsError` if the folder contains other frames.
+    """Open training frames in a folder, which baselines can share; missing ones are generated.
+
+    Raises:
+        OutputError: the folder cannot be written to.
+        WeightsError: the folder contains other frames.
     """
     with locked_folder(folder.path):
         chunks = range(-(-training.frames // CHUNK))

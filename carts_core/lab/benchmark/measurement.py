@@ -163,8 +163,10 @@ class Measurement:
 
     @staticmethod
     def from_json(line: Mapping[str, Any]) -> "Measurement":
-        """Measurement from the output of `to_json`; `KeyError`, `TypeError` or `ValueError` if the line is not a
-        measurement.
+        """Measurement from the output of `to_json`.
+
+        Raises:
+            KeyError, TypeError, ValueError: the line is not a measurement.
         """
         columns = dict(line["trace"])
         rows = [dict(zip(columns, values, strict=True)) for values in zip(*columns.values(), strict=True)]
@@ -217,8 +219,10 @@ class ResultsFile:
         return self._known.get((run, fingerprint))
 
     def append(self, measurement: Measurement, fingerprint: str, **also: str) -> None:
-        """Append a measurement, its fingerprint and informative fields, and flush them to disk; `OutputError` if the
-        file cannot be written.
+        """Append a measurement, its fingerprint and informative fields, and flush them to disk.
+
+        Raises:
+            OutputError: the file cannot be written.
         """
         entry = measurement.to_json()
         line = json.dumps({"fingerprint": fingerprint, **also, **entry}, separators=(",", ":"))

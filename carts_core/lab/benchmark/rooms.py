@@ -56,8 +56,10 @@ def made_rooms() -> list[Room]:
 
 
 def photographs(folder: Path) -> list[Room]:
-    """Rooms from the photographs in a folder; in order of name, every other one is held out. Raises `SettingsError` if
-    the folder contains no photograph.
+    """Rooms from the photographs in a folder; in order of name, every other one is held out.
+
+    Raises:
+        SettingsError: the folder contains no photograph.
     """
     paths = sorted(path for path in folder.glob("*") if path.suffix.lower() in _PHOTOGRAPHS)
     if not paths:

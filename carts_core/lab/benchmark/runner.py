@@ -130,8 +130,10 @@ class Benchmark:
         return [measurement for measurement in found if measurement is not None]
 
     def run(self, console: Console) -> None:
-        """Measure the missing runs; measurements are kept if the benchmark is stopped. Raises `CartsError` if a
-        sequence cannot be generated or read, or the results cannot be written.
+        """Measure the missing runs; measurements are kept if the benchmark is stopped.
+
+        Raises:
+            CartsError: a sequence cannot be generated or read, or the results cannot be written.
         """
         todo = {run: key for run, key in self.runs.items() if self.results.find(run, key) is None}
         if not todo:

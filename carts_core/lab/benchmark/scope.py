@@ -86,8 +86,10 @@ class Scope:
         return self.paper_iterations if run.error_deg is None else min(self.paper_iterations, PAPERS_STEPS)
 
     def with_frames(self, frames: int) -> "Scope":
-        """Copy with another number of evaluated frames; `SettingsError` if the number is below one or exceeds the
-        length of the synthetic sequence.
+        """Copy with another number of evaluated frames.
+
+        Raises:
+            SettingsError: the number is below one or exceeds the length of the synthetic sequence.
         """
         if not 1 <= frames <= self.sequence_frames:
             raise SettingsError(

@@ -69,8 +69,10 @@ class Source:
 
 
 def synthetic_source(scope: Scope, seed: int = TEST_SEED) -> Source:
-    """Source with a synthetic sequence, rendered into the cache when it is first opened; `SettingsError` if the seed is
-    that of the shipped sequence.
+    """Source with a synthetic sequence, rendered into the cache when it is first opened.
+
+    Raises:
+        SettingsError: the seed is that of the shipped sequence.
     """
     if seed == SynthesisConfig().seed:
         raise SettingsError(
@@ -152,8 +154,11 @@ def _add_frames(digest: "hashlib._Hash", sequence: Sequence, indices: Iterable[i
 
 
 def real_source(path: Path, scope: Scope, seed: int = TEST_SEED) -> Source:
-    """Source with the frames of a real sequence that have a mask in its first camera; `SequenceError` if the sequence
-    is not usable; `SettingsError` if no frame has a mask.
+    """Source with the frames of a real sequence that have a mask in its first camera.
+
+    Raises:
+        SequenceError: the sequence is not usable.
+        SettingsError: no frame has a mask.
     """
     sequence = Sequence.open(path)
     camera = sequence.scene.cameras[0]

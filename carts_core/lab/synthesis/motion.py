@@ -31,8 +31,10 @@ def measure(
     error: MeasurementError,
     rng: np.random.Generator,
 ) -> Float[np.ndarray, "frames dofs"]:
-    """Measured joint positions T_m = T + bias + drift(t) + noise(t), [rad] or [m] per joint as in `truth`;
-    `SettingsError` if the error has neither one value per joint nor one more, for the jaws that some tools lack.
+    """Measured joint positions T_m = T + bias + drift(t) + noise(t), [rad] or [m] per joint as in `truth`.
+
+    Raises:
+        SettingsError: the error has neither one value per joint nor one more, for the jaws that some tools lack.
     """
     dofs = truth.shape[-1]
     if len(error.bias) not in (dofs, dofs + 1):

@@ -85,7 +85,11 @@ def place_cameras(config: EndoscopeConfig) -> tuple[Camera, ...]:
 
 
 def load_robot(config: SynthesisConfig) -> Robot:
-    """Load the robot with finer meshes than the optimizer uses; `RobotError` if the URDF is unusable."""
+    """Load the robot with finer meshes than the optimizer uses.
+
+    Raises:
+        RobotError: the URDF is unusable.
+    """
     return Robot.load(config.robot, max_faces=config.render.robot_faces)
 
 

@@ -88,8 +88,10 @@ class Checkpoint:
 
 
 def load_checkpoint(folder: Path) -> Checkpoint | None:
-    """Read the checkpoint of a run; None if there is none yet. Raises `WeightsError` if the file exists but cannot be
-    read.
+    """Read the checkpoint of a run; None if there is none yet.
+
+    Raises:
+        WeightsError: the file exists but cannot be read.
     """
     path = folder / CHECKPOINT_FILE
     if not path.exists():

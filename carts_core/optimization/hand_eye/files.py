@@ -25,8 +25,10 @@ COLUMNS = ("frame", "camera", "arm", "landmark", "u", "v")
 
 
 def read_points(path: Path, sequence: Sequence) -> list[ImagePoint]:
-    """Read points from a CSV file with the columns `frame` (its id), `camera`, `arm`, `landmark`, `u` and `v` [px];
-    `SettingsError` if the file cannot be read, lacks a column, or names a missing frame.
+    """Read points from a CSV file with the columns `frame` (its id), `camera`, `arm`, `landmark`, `u` and `v` [px].
+
+    Raises:
+        SettingsError: the file cannot be read, lacks a column, or names a missing frame.
     """
     try:
         text = read_text(path, TABLE)
@@ -67,7 +69,10 @@ class HandEyePrior:
 
 def read_prior(sequence: Sequence) -> HandEyePrior | None:
     """Read the uncertainty of the hand-eye calibration that wrote a sequence file; None if there is none or base frames
-    changed. Raises `SettingsError` if `hand_eye.json` beside the sequence file cannot be read.
+    changed.
+
+    Raises:
+        SettingsError: `hand_eye.json` beside the sequence file cannot be read.
     """
     path = sequence.path.parent / RESULT_FILE
     if not path.is_file():
@@ -145,8 +150,10 @@ RESTING = 1e-3
 
 
 def mounts_of_points(recording: Sequence, points: Rows[ImagePoint]) -> dict[str, Float[np.ndarray, "4 4"]]:
-    """Moving camera -> T_mount_world [m] in the frames of its points; `SettingsError` if a camera has different poses
-    in these frames, or a point names a missing frame.
+    """Moving camera -> T_mount_world [m] in the frames of its points.
+
+    Raises:
+        SettingsError: a camera has different poses in these frames, or a point names a missing frame.
     """
     found: dict[str, tuple[int, np.ndarray]] = {}
     for point in points:
