@@ -3,7 +3,6 @@
 import os
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -37,29 +36,20 @@ def read_endoscope(bag: Bag, start: float, job: Import) -> Track | None:
     return None
 
 
-@dataclass(frozen=True, eq=False)
-class SeparateImages:
-    """Cameras whose images are files, and the frames that all of them have."""
-
-    cameras: tuple[FoundCamera, ...]
-    ids: tuple[str, ...]
-    times: Float[np.ndarray, " frames"]
-    """Times in the clock of the images [s]."""
-
-    def offset(self, arms: list[FoundArm], job: Import) -> float:
-        """Default time in the kinematics minus time of the images [s]: 0 for overlapping clocks, else with a common
-        start."""
-        begin = [float(arm.times[0]) for arm in arms if arm.times is not None]
-        end = [float(arm.times[-1]) for arm in arms if arm.times is not None]
-        apart = not begin or self.times[0] > max(end) or self.times[-1] < min(begin)
-        offset = max(begin) - float(self.times[0]) if begin and apart else 0.0
-        text = "the clocks do not overlap; a common start of images and kinematics is assumed" if offset else "0 s"
-        job.guessed(f"time offset: {text}.", option="--time-offset")
-        return offset
+def _guessed_offset(times: Float[np.ndarray, " frames"], arms: list[FoundArm], job: Import) -> float:
+    """Time in the kinematics minus time of image files [s]: 0 for overlapping clocks, else with a common start."""
+    logs = [arm.times for arm in arms if arm.times is not None]
+    apart = bool(logs) and (times[0] > max(log[-1] for log in logs) or times[-1] < min(log[0] for log in logs))
+    offset = float(max(log[0] for log in logs) - times[0]) if apart else 0.0
+    text = "the clocks do not overlap; a common start of images and kinematics is assumed" if offset else "0 s"
+    job.guessed(f"time offset: {text}.", option="--time-offset")
+    return offset
 
 
-def separate_images(path: Path, topics: list[str], job: Import) -> SeparateImages | None:
-    """Images given as files or folders; None if none are given or they are topics of the bag."""
+def _separate_images(
+    path: Path, topics: list[str], job: Import
+) -> tuple[tuple[FoundCamera, ...], tuple[str, ...], Float[np.ndarray, " frames"]] | None:
+    """Cameras, frame ids and times [s] of images given as files; None if none are given or they are topics."""
     given, files = job.options.images, {}
     for name, image in given.items():
         beside = [place for place in (Path(image), path.parent / image) if os.path.exists(place)]
@@ -76,7 +66,7 @@ def separate_images(path: Path, topics: list[str], job: Import) -> SeparateImage
     if times is None:
         problem = f"images in {first.path} have no times. Give their frame rate."
         raise PartError("columns", problem, "Option: --frame-rate.")
-    return SeparateImages(cameras_of(images, job), ids, times)
+    return cameras_of(images, job), ids, times
 
 
 _ARM_TOPIC = re.compile(r"^(?P<prefix>/|.*/)(?P<arm>PSM\d?)/(?P<rest>.+)$", re.IGNORECASE)
@@ -178,17 +168,16 @@ def _cameras(bag: Bag, job: Import) -> tuple[tuple[FoundCamera, ...], np.ndarray
     times = {name: bag.image_times(topic) for name, topic in topics.items()}
     for name, topic in topics.items():
         if not len(times[name][0]):
-            raise PartError(
-                "images", f"{path}: topic {topic} has no messages.", f"Choose another one: --images {name} TOPIC."
-            )
-    leader = next(iter(sorted(topics, key=lambda name: (name != "left", name))), None)
-    if leader is None:
+            problem = f"{path}: topic {topic} has no messages."
+            raise PartError("images", problem, f"Choose another one: --images {name} TOPIC.")
+    if not topics:
         return (), np.empty(0)
+    leader, *others = sorted(topics, key=lambda name: (name != "left", name))
     frame_times = times[leader][1]
     order = np.argsort(frame_times, kind="stable")
     frame_times = frame_times[order]
     cameras = []
-    for name in sorted(topics, key=lambda name: (name != leader, name)):
+    for name in (leader, *others):
         record, stamps = times[name]
         chosen = order if name == leader else nearest(frame_times, stamps)
         if name != leader and (late := np.abs(stamps[chosen] - frame_times).max()) > 0.02:
@@ -196,8 +185,7 @@ def _cameras(bag: Bag, job: Import) -> tuple[tuple[FoundCamera, ...], np.ndarray
         info = _camera_info(bag, topics[name])
         first = decode_message(bag.message(topics[name]), f"{path}, {topics[name]}")
         size = (first.shape[1], first.shape[0])
-        numbers = record[chosen]
-        camera = FoundCamera(name, size, path, topic=topics[name], numbers=numbers)
+        camera = FoundCamera(name, size, path, topic=topics[name], numbers=record[chosen])
         cameras.append(calibration_of(camera_from_info(camera, info, job, rectified="rect" in topics[name]), job))
         job.found(f"{topics[name]}, {len(record)} images, {size[0]} x {size[1]}.", name)
     return tuple(cameras), frame_times
@@ -217,7 +205,7 @@ def _read(path: Path, job: Import) -> FoundRecording:
     with Bag(path) as bag:
         if not bag.topics:
             raise SequenceError(f"bag {path} has no messages. Record again, or copy it again.")
-        beside = separate_images(path, _image_topics(bag), job)
+        beside = _separate_images(path, _image_topics(bag), job)
         if beside is None:
             if job.options.frame_rate is not None:
                 problem = "a frame rate is not used, since the images of the bag have times. Leave it out."
@@ -225,7 +213,7 @@ def _read(path: Path, job: Import) -> FoundRecording:
             cameras, frame_times = _cameras(bag, job)
             ids = tuple(f"{number:06d}" for number in range(len(frame_times)))
         else:
-            cameras, frame_times, ids = beside.cameras, beside.times, beside.ids
+            cameras, ids, frame_times = beside
         logs = read_arm_logs(bag, job)
         if not logs:
             known = ", ".join(sorted(topic for topic, _ in bag.topics))
@@ -236,7 +224,7 @@ def _read(path: Path, job: Import) -> FoundRecording:
         arms = [arm_from_log(log, job) for log in logs]
         offset = job.options.time_offset
         if offset is None:
-            offset = 0.0 if beside is None else beside.offset(arms, job)
+            offset = 0.0 if beside is None else _guessed_offset(frame_times, arms, job)
         motion = read_endoscope(bag, float(frame_times[0]) + offset, job) if len(frame_times) else None
     name, kind = recording_name(path), "a ROS bag"
     return job.recording(kind, name, cameras, arms, ids, frame_times, time_offset=offset, motion=motion)
