@@ -1,28 +1,44 @@
-"""Optimization and output of `carts optimize`."""
+"""Optimization of `carts optimize`, and its output folder: masks, kinematics, and provenance in results.json."""
 
 import hashlib
 import json
+from bisect import bisect_left
 from collections import Counter
-from collections.abc import Mapping
-from contextlib import ExitStack
+from collections.abc import Iterator, Mapping
+from collections.abc import Sequence as Several
+from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
+import torch
 
 from ..console import Bar, Terminal, track
+from ..errors import SettingsError
 from ..evaluation import Setup, camera_groups
-from ..export import KinematicsRow, read_kinematics_csv
-from ..files import remove_file
-from ..optimization import Origin, SequenceOptimizer, StopReason, sequence_checkpoint
+from ..export import KinematicsRow, kinematics_csv, mask_png, read_kinematics_csv
+from ..export.kinematics import position_values, std_values
+from ..files import OutputPath, holds_file, locked_folder, remove_file, write_bytes, write_text
+from ..model.scene import Scene, SceneState
+from ..optimization import Assessment, Origin, SequenceOptimizer, StopReason, sequence_checkpoint
 from ..optimization.variables import Variables
-from ..provenance import fingerprint
+from ..provenance import (
+    RESULTS_FORMAT,
+    Record,
+    calibration_fingerprint,
+    code_fingerprint,
+    fingerprint,
+    read_records,
+    robot_fingerprint,
+)
 from ..recording import Sequence
+from ..rendering import Renderer
 from ..settings import SurfaceSolver
 from ..settings.serialization import to_plain
-from ..stopping import when_stopped
+from ..stopping import finished_first, when_stopped
 from ..wording import counted
-from .options import RECORDING, OptimizeOptions, output_folder
+from .options import RECORDING, Observer, OptimizeOptions, check_writable, output_folder
 from .printing import (
     base_frame_hint,
     constant_correction_hint,
@@ -32,7 +48,272 @@ from .printing import (
     verdict_hints,
     verdict_line,
 )
-from .results_folder import FrameFolder, FrameInputs, FrameResult, InputHashes
+
+InputHashes = Mapping[str, str]
+"""Kind of input -> its fingerprint; the kinds are the keys of `_CHANGED`."""
+
+_CHANGED = {
+    "code": "another version of the program made them",
+    "weights": "the weights changed",
+    "settings": "the settings changed",
+    "robot": "the robot changed",
+    "calibration": "the calibration changed",
+    "joints": "the measured joint positions changed",
+    "images": "the images changed",
+    "masks": "the masks changed",
+    "background": "the background changed",
+    "together": "they were solved together with other frames",
+}
+"""Kind of input -> message if its fingerprint differs."""
+
+_CODE = (
+    "*.py",
+    "imaging/**/*.py",
+    "model/**/*.py",
+    "recording/*.py",
+    "evaluation/evaluate.py",
+    "export/kinematics.py",
+    "export/encodings.py",
+    "networks/**/*.py",
+    "optimization/**/*.py",
+    "rendering/**/*.py",
+)
+
+
+class FrameInputs:
+    """Fingerprints of the inputs of frames. No image is decoded, except for backgrounds.
+
+    Args:
+        settings: settings of the run as text.
+    """
+
+    def __init__(self, setup: Setup, observer: Observer, settings: str) -> None:
+        self._setup, self._observer, self._cameras = setup, observer, sorted(setup.cameras)
+        sequence, backgrounds = setup.sequence, setup.backgrounds.images
+        recorded = [sequence.recorded_camera(name) for name in setup.cameras]
+        self._common = {
+            "code": code_fingerprint(_CODE),
+            "weights": fingerprint(observer.weights, str(observer.predictor.device)),
+            "settings": fingerprint(settings),
+            "robot": fingerprint(*(robot_fingerprint(arm.robot) for arm in sequence.scene.arms)),
+            "calibration": calibration_fingerprint(sequence.scene, recorded),
+            "background": fingerprint([(name, backgrounds[name]) for name in sorted(backgrounds)]),
+        }
+
+    @property
+    def common(self) -> InputHashes:
+        """Fingerprints of the inputs shared by all frames."""
+        return self._common
+
+    def of(self, index: int) -> InputHashes:
+        """Fingerprints of a frame corrected alone; `SequenceError` if an image is missing."""
+        sequence, domain = self._setup.sequence, self._setup.domain
+        start = self._setup.frame(index, cameras=()).measured
+        joints = [(name, start[name], sequence.measured[name][index]) for name in sorted(start)]
+        joints += sorted(sequence.mounts(index).items())
+        images = [(name, sequence.image_fingerprint(index, name, domain)) for name in self._cameras]
+        origin = {**self._common, "joints": fingerprint(joints), "images": fingerprint(images)}
+        if self._observer.masked:
+            masks = self._observer.mask_inputs(sequence, index, self._cameras, domain)
+            origin["masks"] = fingerprint(masks)
+        return origin
+
+    def of_all(self, indices: Several[int]) -> InputHashes:
+        """Fingerprints of frames that are corrected jointly: each depends on the inputs of all."""
+        each = [self.of(index) for index in indices]
+        sequence = self._setup.sequence
+        stamps = sequence.timestamps
+        times = [None if stamps is None else float(stamps[index]) for index in indices]
+        masks = {"masks": fingerprint(*(origin["masks"] for origin in each))} if self._observer.masked else {}
+        return {
+            **self._common,
+            **masks,
+            "joints": fingerprint(*(origin["joints"] for origin in each)),
+            "images": fingerprint(*(origin["images"] for origin in each)),
+            "together": fingerprint(indices, [sequence.frame_ids[index] for index in indices], repr(times)),
+        }
+
+
+def changes(before: InputHashes, now: InputHashes) -> str | None:
+    """Description of the inputs that differ between two runs; None if the inputs recorded in both are equal."""
+    different = [kind for kind in _CHANGED if kind in now and before.get(kind) != now[kind]]
+    if "together" in different:
+        # A change of frames implies changes of joints, images and masks.
+        different = [kind for kind in different if kind not in ("joints", "images", "masks")]
+    if "calibration" in different:
+        # Masks and backgrounds are compared undistorted; the distortion belongs to the calibration.
+        different = [kind for kind in different if kind not in ("masks", "background")]
+    if "joints" in different or "images" in different:
+        # A background is computed from frames.
+        different = [kind for kind in different if kind != "background"]
+    return " and ".join(_CHANGED[kind] for kind in different) or None
+
+
+def row_fingerprint(scene: Scene, row: KinematicsRow) -> str:
+    """Fingerprint of a table row, with the digits written to the file."""
+    values = np.concatenate([position_values(scene, row), std_values(scene, row)])
+    verdict = [row.verdict] if row.verdict else []
+    return fingerprint(row.frame_id, row.source, [f"{value:.9g}" for value in values], *verdict)
+
+
+@dataclass(frozen=True)
+class FrameResult:
+    """Result of a frame."""
+
+    row: KinematicsRow
+    state: SceneState
+    origin: InputHashes
+    """Fingerprints of its inputs."""
+    assessment: Assessment | None = None
+    """Verdict on the result, where it was assessed."""
+
+
+class FrameFolder:
+    """Folder with masks, kinematics (`kinematics.csv`), settings (`settings.json`) and provenance (`results.json`).
+
+    A mask is `masks/FRAME.png`, or `masks/CAMERA/FRAME.png` with several cameras. Files are written atomically, and a
+    frame counts only if all its files were written. Nothing is created or changed before the first frame is written.
+
+    Args:
+        settings: settings of the run; a folder with results of another `sequence` is refused.
+
+    Attributes:
+        rows: rows of the kinematics table.
+        checkpoint: file with intermediate results of sequence mode.
+
+    Raises:
+        SettingsError: the folder holds results of another sequence, or cannot be written to.
+    """
+
+    def __init__(
+        self,
+        sequence: Sequence,
+        cameras: tuple[str, ...],
+        folder: OutputPath,
+        settings: dict[str, Any],
+        overwrite: bool,
+    ) -> None:
+        check_writable(folder.path)
+        self.folder = folder
+        self._order = {frame_id: index for index, frame_id in enumerate(sequence.frame_ids)}
+        self._whole_scene, self._scene = sequence.scene, sequence.scene.with_cameras(cameras)
+        masks = folder / "masks"
+        self._masks = {camera: masks / camera if len(cameras) > 1 else masks for camera in cameras}
+        self._table, self._settings_file = folder / "kinematics.csv", folder / "settings.json"
+        self._records_file = folder / "results.json"
+        self.checkpoint = folder / "checkpoint.txt"
+        self._settings, self._overwrite = settings, overwrite
+        self.rows: list[KinematicsRow] = []
+        self._records: dict[str, Record] = {}
+        self._check_settings()
+
+    @contextmanager
+    def held(self) -> Iterator[None]:
+        """Lock the folder against other processes and read existing results; errors as in the class."""
+        with locked_folder(self.folder):
+            self._check_settings()
+            self._goes_on = holds_file(self._table) and not self._overwrite
+            if self._goes_on:
+                rows = read_kinematics_csv(self._table.path, self._whole_scene)
+                known = {row.frame_id: row for row in rows if row.frame_id in self._order}
+                self.rows = sorted(known.values(), key=lambda row: self._order[row.frame_id])
+                self._records = read_records(self._records_file)
+            yield
+
+    def fault(self, frame_id: str, origin: InputHashes) -> str | None:
+        """Reason why a frame's result is outdated with respect to the given input fingerprints; None if it is up to
+        date.
+        """
+        record = self._records.get(frame_id)
+        row = self.rows[bisect_left(self.rows, self._order[frame_id], key=lambda row: self._order[row.frame_id])]
+        if record is None:
+            return "what they were made from is not known"
+        if record.row != row_fingerprint(self._scene, row):
+            return "their rows in the table were changed"
+        if changed := changes(record.origin, origin):
+            return changed
+        for camera, folder in self._masks.items():
+            path = folder / f"{frame_id}.png"
+            if not holds_file(path) or fingerprint(path.path.read_bytes()) != record.masks.get(camera):
+                return "their masks are missing or damaged"
+        return None
+
+    def others_dropped(self, chosen: Several[str]) -> int:
+        """Number of unselected frames whose results are removed when the first result is written."""
+        if not self._overwrite or not holds_file(self._table):
+            return 0
+        return len(set(self._written_before()) - set(chosen))
+
+    def write(self, results: Several[FrameResult]) -> None:
+        """Write masks and rows of frames; signals are deferred to the end."""
+        if not results:
+            return
+        with finished_first():
+            if not self._goes_on:
+                names = [masks / f"{name}.png" for name in self._written_before() for masks in self._masks.values()]
+                for path in (*names, self._table, self._records_file):
+                    remove_file(path)
+                self._goes_on = True
+            if self._settings_written() != self._settings:
+                write_text(self._settings_file, json.dumps(self._settings, indent=1))
+            for result in results:
+                frame_id, fingerprints = result.row.frame_id, {}
+                for camera, renderer in self._renderers.items():
+                    png = mask_png(renderer.segment(result.state.to("cpu"))[0] >= 0)
+                    write_bytes(self._masks[camera] / f"{frame_id}.png", png)
+                    fingerprints[camera] = fingerprint(png)
+                found = result.assessment
+                self._records[frame_id] = Record(
+                    result.origin,
+                    fingerprints,
+                    row_fingerprint(self._scene, result.row),
+                    torch.get_num_threads(),
+                    "" if found is None else found.verdict.value,
+                    "" if found is None else found.reason,
+                    None if found is None else round(found.probability, 6),
+                    result.row.undetermined(self._scene),
+                )
+            new = {result.row.frame_id: result.row for result in results}
+            rows = {row.frame_id: row for row in self.rows} | new
+            self.rows = sorted(rows.values(), key=lambda row: self._order[row.frame_id])
+            # A frame counts only if all three files list it, so that a frame interrupted by a kill is redone.
+            write_text(self._table, kinematics_csv(self._scene, self.rows))
+            known = {row.frame_id: self._records[row.frame_id] for row in self.rows if row.frame_id in self._records}
+            # One line per frame.
+            lines = [f"{json.dumps(frame_id)}: {json.dumps(asdict(record))}" for frame_id, record in known.items()]
+            content = f'{{"format": "{RESULTS_FORMAT}", "frames": {{\n' + ",\n".join(lines) + "\n}}\n"
+            write_text(self._records_file, content)
+
+    def _written_before(self) -> list[str]:
+        """Frames of this sequence with results in the folder, under any settings."""
+        if not holds_file(self._table):
+            return []
+        lines = self._table.path.read_text(encoding="utf-8", errors="replace").splitlines()
+        ids = {line.partition(",")[0] for line in lines} | set(read_records(self._records_file))
+        return [frame_id for frame_id in self._order if frame_id in ids]
+
+    @cached_property
+    def _renderers(self) -> dict[str, Renderer]:
+        return {camera: Renderer(self._scene, cameras=[camera]) for camera in self._masks}
+
+    def _check_settings(self) -> None:
+        if self._overwrite or not holds_file(self._table):
+            return
+        if self._settings_written().get("sequence") != self._settings["sequence"]:
+            raise SettingsError(
+                f"{self.folder} holds results of another sequence, or of one that is not known (see "
+                f"{self._settings_file}). Add --overwrite to replace them, or name another folder with --output."
+            )
+
+    def _settings_written(self) -> dict[str, Any]:
+        """Settings of the newest results in the folder; empty if the file is missing or damaged."""
+        if not holds_file(self._settings_file):
+            return {}
+        try:
+            settings = json.loads(self._settings_file.path.read_bytes())
+        except (ValueError, RecursionError):
+            return {}
+        return settings if isinstance(settings, dict) else {}
 
 
 @dataclass(frozen=True)

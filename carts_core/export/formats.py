@@ -16,6 +16,7 @@ from ..files import MARKER, OutputPath, output_stream, published, published_file
 from ..model.camera import T_DVRK_OPENCV
 from ..settings import FormatName
 from .annotation_formats import (
+    write_bop,
     write_coco,
     write_coco_keypoints,
     write_cvat,
@@ -24,7 +25,6 @@ from .annotation_formats import (
     write_voc,
     write_yolo,
 )
-from .bop import write_bop
 from .dataset import Dataset, ExportFrame, Monitor
 from .kinematics import JOINED, joint_columns, joint_units, kinematics_csv, position_values, std_values
 from .video import write_video

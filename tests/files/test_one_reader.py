@@ -14,7 +14,7 @@ ALLOWED = {
     "lab/benchmark/measurement.py": "reads the source of the package and the machine's description",
     "lab/benchmark/statistics.py": "reads tables of the package",
     "lab/synthesis": "reads what it wrote",
-    "cli/results_folder.py": "reads what an earlier run of the same command wrote",
+    "cli/optimizing.py": "reads what an earlier run of the same command wrote",
     "provenance.py": "reads the source of the package, and what an earlier run of the same command wrote",
     "recording/importing/writing.py": "reads back the sequence that it writes",
 }
