@@ -70,9 +70,6 @@ def background_of_recording(
         camera: name of the camera.
         states: measured state of the scene in each view.
         image: index in `states` -> image of the frame.
-
-    Raises:
-        SequenceError: the whole image is covered in every view.
     """
     # Imported here, so that reading and importing recordings need neither the renderer nor its compiler.
     from ..rendering import Renderer  # noqa: PLC0415
@@ -100,10 +97,7 @@ def uncovered_median(
 ) -> tuple[UInt8[np.ndarray, "height width 3"], Float[np.ndarray, "height width"]]:
     """Median of every pixel over the views in which it is not covered, and the median deviation from it [grey levels].
 
-    Both are 0 where a pixel is covered in every view.
-
-    Raises:
-        SequenceError: the whole image is covered in every view.
+    Both are 0 where a pixel is covered in every view; `SequenceError` if all pixels are.
     """
     images, covers = (np.stack(arrays) for arrays in zip(*views, strict=True))
     seen = (~covers).sum(0)

@@ -51,12 +51,7 @@ def expand(pattern: str, key: str, **values: object) -> str:
 
 @lru_cache(maxsize=64)
 def _check_format(pattern: str) -> None:
-    """Check that a pattern has only known placeholders, padded to a width that a file's name can have.
-
-    Raises:
-        KeyError: a placeholder is unknown, or asks for a part of a value.
-        ValueError: a format is malformed, nested or too wide.
-    """
+    """Check a pattern; `KeyError` for unknown placeholders, `ValueError` for malformed or too wide ones."""
     for _, name, form, conversion in Formatter().parse(pattern):
         if name is None:
             continue

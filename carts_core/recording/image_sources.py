@@ -1,4 +1,7 @@
-"""Image sources other than files and videos: crops of other sources, and topics of ROS bags."""
+"""Image sources other than files and videos: crops of other sources, and topics of ROS bags.
+
+Missing or damaged bags and topics raise `SequenceError`.
+"""
 
 import hashlib
 import threading
@@ -61,7 +64,7 @@ class Cropped:
         return np.ascontiguousarray(image[top : top + height, left : left + width])
 
     def fingerprint(self, index: int) -> str:
-        """Fingerprint of the uncropped image, with the rectangle. Errors as those of the source."""
+        """Fingerprint of the uncropped image, with the rectangle."""
         return f"{self.source.fingerprint(index)} {self.crop}"
 
     def remarks(self) -> tuple[str, ...]:
@@ -74,9 +77,6 @@ class Bag:
 
     Attributes:
         topics: name and message type of each topic.
-
-    Raises:
-        SequenceError: the bag is missing, damaged or of an unknown kind.
     """
 
     def __init__(self, path: Path) -> None:
@@ -96,17 +96,16 @@ class Bag:
         self.close()
 
     def rows(self, wanted: dict[str, tuple[str, str]]) -> dict[str, Any]:
-        """Logged rows of topics, as `decoders.bags.rows`; errors as of the constructor."""
+        """Logged rows of topics, as `decoders.bags.rows`."""
         return self._call(bags.rows, wanted)
 
     def image_times(self, topic: str) -> tuple[np.ndarray, np.ndarray]:
-        """Record times [ns] and header times [s] of a topic's images; errors as of the constructor."""
+        """Record times [ns] and header times [s] of a topic's images."""
         record, stamps = self._call(bags.image_times, topic)
         return record, stamps
 
     def message(self, topic: str, time: int | None = None) -> Any:
-        """The message recorded at a time [ns], or the first one; None if there is no such message. Errors as of the
-        constructor."""
+        """The message recorded at a time [ns], or the first one; None if there is no such message."""
         fields = self._call(bags.message, topic, time)
         return None if fields is None else SimpleNamespace(**fields)
 
@@ -136,9 +135,6 @@ class BagImages:
         path: ROS 1 bag, MCAP file or ROS 2 bag folder.
         topic: topic of type `sensor_msgs/Image` or `sensor_msgs/CompressedImage`.
         times: record time of every frame's message [ns].
-
-    Raises:
-        SequenceError: the bag cannot be opened, or has no such topic.
     """
 
     def __init__(self, path: Path, topic: str, times: tuple[int, ...]) -> None:

@@ -52,11 +52,8 @@ class ByteCache(Generic[T]):
         self._changed = threading.Condition()
 
     def get(self, key: Hashable, make: Callable[[], T]) -> T:
-        """The value of `key`, computed by `make` if it is not cached.
-
-        Raises:
-            Exception: what `make` raises. Nothing is cached then, and waiting threads call their own `make`.
-        """
+        """The value of `key`, computed by `make` if it is not cached; if `make` raises, nothing is cached, and waiting
+        threads call their own `make`."""
         with self._changed:
             self._changed.wait_for(lambda: key not in self._making)
             if (found := self.find(key)) is not None:
@@ -179,15 +176,8 @@ class ImageFiles:
 
 
 def read_image(path: Path, bits: Callable[[], int] | None = None) -> UInt8[np.ndarray, "height width 3"]:
-    """Read an image file as RGB, rotated according to its EXIF orientation.
-
-    Args:
-        path: path of the file.
-        bits: bit depth of a file of 16 bits; by default the depth in use.
-
-    Raises:
-        SequenceError: the file is missing, truncated or not an image, or has more bits.
-    """
+    """Read an image file as RGB, rotated by its EXIF orientation; `bits` is the bit depth of files of 16 bits, by
+    default the depth in use."""
     return _eight_bits(_decode(path, colour=True), f"image {path}", bits)
 
 
@@ -198,11 +188,7 @@ def decode_image(content: bytes, what: str) -> UInt8[np.ndarray, "height width 3
 
 def read_mask(path: Path) -> Bool[np.ndarray, "height width"]:
     """Read a mask file: instruments are white, of one colour, or opaque on transparent; values from 128 of 255 count as
-    white.
-
-    Raises:
-        SequenceError: the file is missing, truncated, not an image, or has labels instead of black and white.
-    """
+    white. Labels instead of black and white raise `SequenceError`."""
     raster = _decode(path, colour=False)
     mask = _white_part(raster, f"mask {path}")
     if mask is not None:

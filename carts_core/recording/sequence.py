@@ -113,11 +113,8 @@ class Sequence:
         return Sequence(read_description(Path(path).absolute(), progress))
 
     def with_time_offset(self, time_offset: float) -> "Sequence":
-        """The same images with joint positions at another time offset (kinematics minus image) [s].
-
-        Raises:
-            SequenceError: rows are not matched by time, or a frame has no row near enough.
-        """
+        """The same images with joint positions at another time offset (kinematics minus image) [s]; `SequenceError` if
+        rows are not matched by time, or a frame has no row near enough."""
         matching = replace(self.checked_matching(), time_offset=time_offset)
         moved = Sequence(replace(self._description, matching=matching))
         # Images and masks do not depend on it.

@@ -119,9 +119,6 @@ def estimate_time_offset(
         domain: domain of the images; the first one by default.
         largest: search range around the current offset [s]; widened to 3 s if the best offset is at its end.
         progress: called with the number of frames read, and the total.
-
-    Raises:
-        SequenceError: rows are not matched by time, or an image is not usable.
     """
     present = sequence.checked_matching().time_offset
     assert sequence.timestamps is not None

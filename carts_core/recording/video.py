@@ -1,6 +1,6 @@
 """Video files as images of a camera. Frames are found by presentation time, never by counting while seeking.
 
-Videos that cannot be decoded raise `SequenceError`.
+Videos that are missing, too short or cannot be decoded raise `SequenceError`.
 """
 
 import copy
@@ -243,9 +243,6 @@ class Video:
         path: the video file.
         numbers: number in the video, from 0 in presentation order, of each frame of the sequence.
         deinterlace: False uses both fields of frames marked as interlaced, for videos that are marked so by mistake.
-
-    Raises:
-        SequenceError: the file is missing, cannot be decoded, or is too short.
     """
 
     def __init__(self, path: Path, numbers: tuple[int, ...], *, deinterlace: bool = True) -> None:

@@ -192,21 +192,18 @@ def changed(draft: Draft, name: str, value: str, guessed: Mapping[str, str]) -> 
     elif name in _NUMBERS:
         options[name] = _number(value)
     elif kind == "calibration_size" and which:
-        others = {camera: size for camera, size in draft.options.calibration_size.items() if camera != which}
-        given = value.replace(" ", "").replace("×", "x")
-        options[kind] = {**others, which: given} if given else others
+        options[kind] = _with(draft.options.calibration_size, which, value.replace(" ", "").replace("×", "x"))
     elif kind == "flip" and which in JOINT_NAMES:
         without = tuple(joint for joint in draft.options.flip if joint != which)
         options[kind] = (*without, which) if value == "1" else without
     elif kind == "unit" and which in (*JOINT_NAMES, "jaw"):
-        rest = {joint: unit for joint, unit in draft.options.units.items() if joint != which}
-        options["units"] = {**rest, which: value} if value else rest
+        options["units"] = _with(draft.options.units, which, value)
     elif name == "no-table":
         options |= {"kinematics": NO_TABLE, "columns": {}, "flip": (), "units": {}}
     elif kind == "column" and which in _MEANINGS:
         options["columns"] = _columns(draft, which, value, guessed)
     elif name == "remove-camera":
-        options["images"] = {camera: place for camera, place in draft.options.images.items() if camera != value}
+        options["images"] = _with(draft.options.images, value, "")
     return draft.with_options(**options) if options else None
 
 
@@ -240,8 +237,13 @@ def _columns(draft: Draft, which: str, value: str, guessed: Mapping[str, str]) -
     joints = which in (*JOINT_NAMES, "jaw")
     if joints and not any(name in chosen for name in JOINT_NAMES):
         chosen = {**chosen, **{name: guessed[name] for name in (*JOINT_NAMES, "jaw") if name in guessed}}
-    chosen.pop(which, None)
-    return {**chosen, which: value} if value else chosen
+    return _with(chosen, which, value)
+
+
+def _with(entries: Mapping[str, str], key: str, value: str) -> dict[str, str]:
+    """Entries with one of them replaced, or removed if the value is empty."""
+    others = {name: entry for name, entry in entries.items() if name != key}
+    return {**others, key: value} if value else others
 
 
 def _number(value: str) -> float | None:
@@ -249,12 +251,10 @@ def _number(value: str) -> float | None:
         return None
     try:
         number = float(value.replace(",", "."))
-    except ValueError as error:
-        raise SettingsError(
-            f"{value!r} is not a number. Type one, such as 0.12, or leave the field empty to restore the guess."
-        ) from error
+    except ValueError:
+        number = math.nan
     if not math.isfinite(number):
-        raise SettingsError(f"{value!r} is not finite. Type a finite number.")
+        raise SettingsError(f"{value!r} is not a number. Type one, such as 0.12, or leave the field empty.")
     return number
 
 

@@ -205,12 +205,7 @@ def _is_number(cell: str, commas: bool = False) -> bool:
 
 
 def read_parquet(path: Path) -> dict[str, np.ndarray]:
-    """Columns of a Parquet file by name [rows]; [rows, values] if rows have equally many numbers.
-
-    Raises:
-        CartsError: the package that reads it is not installed.
-        OSError, ValueError: the file cannot be read, or is too large.
-    """
+    """Columns of a Parquet file by name [rows]; [rows, values] if rows have equally many numbers."""
     needs_extra("pyarrow", "import")
     columns = decoded(tables.read_parquet, path)
     for name, values in columns.items():

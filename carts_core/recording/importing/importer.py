@@ -117,13 +117,7 @@ def _is_given(options: ImportOptions, name: str) -> bool:
 def import_recording(
     path: Path, folder: Path, options: ImportOptions | None = None, *, overwrite: bool = False
 ) -> tuple[Path, FoundRecording]:
-    """Write a sequence file and tables into a folder for a recording, which is not copied.
-
-    Returns:
-        The sequence file, and the content of the recording.
-
-    Raises:
-        CartsError: the recording is of an unknown format, damaged or contradictory; nothing is written.
-    """
+    """Write a sequence file and tables into a folder for a recording, which is not copied; returns the file and the
+    content. `CartsError` for an unknown format and damaged or contradictory content; nothing is written then."""
     recording = find(path, options)
     return write_sequence(recording, folder, overwrite=overwrite), recording

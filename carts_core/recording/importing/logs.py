@@ -157,10 +157,7 @@ def check_instrument(
 
     Args:
         Ts_reference_tip: poses of the tip in any frame that is fixed relative to the base [m].
-        joints: joint positions at the same times [rad, m].
-
-    Raises:
-        CartsError: fewer than 20 rows have both.
+        joints: joint positions at the same times [rad, m]; at least 20 rows must have both.
     """
     rows = int((np.isfinite(joints).all(1) & np.isfinite(Ts_reference_tip).all((1, 2))).sum())
     if rows < _FEWEST_ROWS:
