@@ -16,7 +16,7 @@ from ...files.decoding import decoded
 from ...files.reading import CALIBRATION, VALUES, is_regular, parse_ini, parse_json, parse_xml, parse_yaml, read_text
 from ...model.camera import DISTORTION_LENGTHS, T_DVRK_OPENCV, rigid_transform
 from ...settings.interchange import Axes
-from .found import MALFORMED, cause, read_json
+from .found import MALFORMED, PartError, cause, read_json
 
 _MODELS = ("plumb_bob", "rational_polynomial", "radtan", "none", "")
 _PINHOLES = ("pinhole", "perspective", "")
@@ -364,7 +364,9 @@ def _axes_of(content: dict[str, Any], path: Path) -> Axes:
         return "opencv"
     if "dvrk" in name:
         return "dvrk"
-    raise SequenceError(
+    raise PartError(
+        "recording",
         f"{path}: neither its content nor its name (-open-cv.json or -dVRK.json) states the camera axes. Give them: "
-        "opencv (x right, y down) or dvrk (x left, y up)."
+        "opencv (x right, y down) or dvrk (x left, y up).",
+        "Option: --axes.",
     )
