@@ -107,13 +107,13 @@ class FrameNames:
     column: str
     pattern: str
     """Pattern that makes the id from a cell of the column."""
-    asked_by: str
+    key: str
     """Key that names the column, for errors."""
 
     def of(self, table: Table) -> tuple[str, ...]:
         """The id of every row."""
         key = f"{table.path}, column {self.column!r}"
-        cells = table.text(self.column, self.asked_by)
+        cells = table.text(self.column, self.key)
         if self.pattern == _FRAME_ALONE:
             ids = tuple(cells)
         else:
@@ -203,9 +203,9 @@ def _take_pattern(section: TomlTable) -> str:
     return pattern
 
 
-def numbers_of_frames(table: Table, column: str, asked_by: str) -> tuple[int, ...]:
+def numbers_of_frames(table: Table, column: str, key: str) -> tuple[int, ...]:
     """Video frame numbers of the rows, from a column of a table."""
-    numbers = table.numbers(column, asked_by)
+    numbers = table.numbers(column, key)
     if (wrong := np.flatnonzero((numbers < 0) | (numbers != np.round(numbers)))).size:
         text = f", column {column!r}: {numbers[wrong[0]]:g} is not a frame number. Frames of a video count from 0."
         raise table.error(text, wrong[0])

@@ -51,19 +51,19 @@ class Table:
     def __len__(self) -> int:
         return len(self.rows)
 
-    def text(self, column: str, asked_by: str) -> list[str]:
+    def text(self, column: str, key: str) -> list[str]:
         """The cells of a column."""
-        return [cell.strip() for cell in self._cells(column, asked_by)]
+        return [cell.strip() for cell in self._cells(column, key)]
 
-    def numbers(self, column: str, asked_by: str) -> Float[np.ndarray, " rows"]:
+    def numbers(self, column: str, key: str) -> Float[np.ndarray, " rows"]:
         """The values of a column."""
         try:
-            values = np.fromiter(map(float, self._cells(column, asked_by)), np.float64, len(self))
+            values = np.fromiter(map(float, self._cells(column, key)), np.float64, len(self))
         except ValueError:
             # A cell is not a number; this slower loop finds it.
-            values = np.fromiter(map(_number, self._cells(column, asked_by)), np.float64, len(self))
+            values = np.fromiter(map(_number, self._cells(column, key)), np.float64, len(self))
         if (wrong := np.flatnonzero(~np.isfinite(values))).size:
-            cell = self.text(column, asked_by)[wrong[0]]
+            cell = self.text(column, key)[wrong[0]]
             raise self.error(
                 f", column {column!r}: {shown(cell)} is not a finite number. Correct the cell, or remove the row and, "
                 "if images are numbered by row, its image.",
@@ -75,11 +75,11 @@ class Table:
         """Error about the table or one of its rows."""
         return TableError(self.path, text) if row is None else TableError(self.path, text, int(row), self.lines[row])
 
-    def _cells(self, column: str, asked_by: str) -> Iterator[str]:
+    def _cells(self, column: str, key: str) -> Iterator[str]:
         """Unparsed cells of a column."""
         if column not in self.header:
             raise self.error(
-                f" has no column {column!r}, which {asked_by} names.{closest(column, self.header)} "
+                f" has no column {column!r}, which {key} names.{closest(column, self.header)} "
                 f"Its columns are: {listed(self.header)}."
             )
         return map(itemgetter(self.header.index(column)), self.rows)

@@ -105,12 +105,12 @@ def _plan(sequence: Sequence) -> tuple[ClickPrompt, ...]:
         chosen = frames if number == 0 else [frames[row] for row in (0, -1)][:_FURTHER_FRAMES]
         for frame in dict.fromkeys(chosen):
             prompts += [
-                ClickPrompt(camera.name, frame, arm.name, name) for arm in arms for name in _asked(scene, arm.name)
+                ClickPrompt(camera.name, frame, arm.name, name) for arm in arms for name in _prompted(scene, arm.name)
             ]
     return tuple(prompts)
 
 
-def _asked(scene: Scene, arm: str) -> list[str]:
+def _prompted(scene: Scene, arm: str) -> list[str]:
     """The prompted landmarks: tip, end of the shaft, and an edge of it."""
     known = landmarks(scene.arm(arm))
     joints = [name for name, mark in known.items() if mark.kind is LandmarkKind.POINT and name != TIP]

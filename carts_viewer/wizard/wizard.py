@@ -90,7 +90,7 @@ class RecordingWizard:
         if name in steps:
             self._set(replace(self._draft, step=steps[name]))
         elif name == "undo":
-            self._take_back()
+            self._undo_step()
         elif not self._browsed(name, value):
             if self._step is not None and self._draft.step is Step.HAND_EYE:
                 return self._in_hand_eye(name, value)
@@ -162,7 +162,7 @@ class RecordingWizard:
             self._leave_hand_eye()
         self._file.write(draft)
 
-    def _take_back(self) -> None:
+    def _undo_step(self) -> None:
         if self._undo:
             before = self._undo.pop()
             self._change(before)
@@ -212,21 +212,21 @@ class RecordingWizard:
         """Content of the files, cached until the choices change."""
         if self._guess is None:
             if not self._pictures:
-                self._tell(self._draft.name, "Reading the recording …")
+                self._show_message(self._draft.name, "Reading the recording …")
             self._guess, self._pictures = guess(self._draft), {}
             if self._guess.recording is not None:
                 with suppress(CartsError):
                     self._add_pictures(self._guess)
         return self._guess
 
-    def _tell(self, title: str, text: str, place: str = "page") -> None:
+    def _show_message(self, title: str, text: str, place: str = "page") -> None:
         self._host.document.show(render("message.html", title=title, text=text), place)
 
     def _estimate_delay(self) -> None:
         """Estimate the delay from the motion in images and table."""
         recording = self._guessed().recording
         if recording is not None:
-            self._tell("Time", "Comparing the motion in the images with the table …")
+            self._show_message("Time", "Comparing the motion in the images with the table …")
             self._delay = estimated_delay(recording)
 
     def _add_pictures(self, found: Guess) -> None:
@@ -245,7 +245,7 @@ class RecordingWizard:
             try:
                 if found.recording is None or found.problems:
                     raise SettingsError(next(iter(found.problems.values()), "the recording cannot be read."))
-                self._tell("Hand-eye", "Opening the images …", "side")
+                self._show_message("Hand-eye", "Opening the images …", "side")
                 self._step = HandEyeStep(self._host, found.recording, self._draft, self._calibrated)
             except CartsError as error:
                 self._problem = problem_of(error)

@@ -76,8 +76,8 @@ def guess_columns(table: ForeignTable, options: ImportOptions) -> ColumnMeanings
             raise PartError("columns", problem, "Correct --columns.")
         if column not in table.columns:
             raise PartError("columns", f"{table.path} has no column {column!r}. It has: {', '.join(table.columns)}.")
-    spoken = {column: _words(column) for column in table.columns}
-    words = {column: text for column, text in spoken.items() if column not in _name_columns(table)}
+    split = {column: _words(column) for column in table.columns}
+    words = {column: text for column, text in split.items() if column not in _name_columns(table)}
     words |= {column: _words(name) for column, name in _named_places(table).items()}
     time = options.columns.get("time") or _first(words, _TIMES)
     if time is None and len(table.dates) == 1:
@@ -152,7 +152,7 @@ def track_of(
     return track(rows[:, 0], rows[:, 1:])
 
 
-def strange_names(names: tuple[str, ...], joints: tuple[str, ...] = JOINT_NAMES) -> bool:
+def has_unknown_names(names: tuple[str, ...], joints: tuple[str, ...] = JOINT_NAMES) -> bool:
     """Whether positions have names that match no joints."""
     return len(set(names)) > 1 and order_of_names(names, joints) is None
 

@@ -237,10 +237,10 @@ def arm_from_log(log: ArmLog, job: Import) -> FoundArm:
         assert log.joints is not None
         T_base, base_from = _base_frame(log, CLASSIC, job)
         return FoundArm(log.name, log.names, log.joints.values, log.joints.times, robot, T_base, base_from)
-    log = _at_the_tip(log if log.si else _in_si(log, job), job)
+    log = _with_tip_poses(log if log.si else _in_si(log, job), job)
     geometry = _geometry(log, job)
     T_camera_base, base_from = _base_frame(log, geometry, job)
-    joints = log.joints if log.joints is not None else _solved(log, T_camera_base, geometry, job)
+    joints = log.joints if log.joints is not None else _joints_from_poses(log, T_camera_base, geometry, job)
     columns, values = JOINT_NAMES, joints.values
     if log.jaw is not None:
         jaw = np.interp(joints.times, log.jaw.times, log.jaw.values[:, 0])
@@ -280,13 +280,13 @@ def _joints_at(poses: Track, joints: Track) -> Float[np.ndarray, "rows 6"]:
     return at_times(poses.times - clock_offset(poses.times, joints.times), joints.times, joints.values)
 
 
-def _at_the_tip(log: ArmLog, job: Import) -> ArmLog:
+def _with_tip_poses(log: ArmLog, job: Import) -> ArmLog:
     """Convert the poses of a log to those of the tip, if they refer to another point of the tool."""
     if job.options.tool_point is not None:
         point = np.array([0.0, 0.0, job.options.tool_point])
-    elif (both := _checked_rows(log)) is not None and not _stands_still(*both):
+    elif (both := _checked_rows(log)) is not None and not _is_base_constant(*both):
         inverted = np.linalg.inv(both[0])
-        if _stands_still(inverted, both[1]):
+        if _is_base_constant(inverted, both[1]):
             job.warning("measured_cp has inverse transforms (the reference in the tip frame); inverted.", log.name)
             return replace(log, poses=_inverse_of(log.poses), local_poses=_inverse_of(log.local_poses))
         fits = [fit_tool_point(*both, geometry) for geometry in CANDIDATES.values()]
@@ -298,14 +298,14 @@ def _at_the_tip(log: ArmLog, job: Import) -> ArmLog:
         job.found(f"{text}; they are converted to the tip.", log.name, "--tool-point")
     else:
         return log
-    return replace(log, poses=_moved(log.poses, -point), local_poses=_moved(log.local_poses, -point))
+    return replace(log, poses=_poses_of_point(log.poses, -point), local_poses=_poses_of_point(log.local_poses, -point))
 
 
-def _stands_still(Ts: np.ndarray, joints: np.ndarray) -> bool:
+def _is_base_constant(Ts: np.ndarray, joints: np.ndarray) -> bool:
     return any(fit_base_frame(Ts, joints, geometry).deviation <= ACCEPTED for geometry in CANDIDATES.values())
 
 
-def _moved(poses: Track | None, point: np.ndarray) -> Track | None:
+def _poses_of_point(poses: Track | None, point: np.ndarray) -> Track | None:
     """Poses of a point that is fixed to the tool [m]."""
     if poses is None:
         return None
@@ -387,7 +387,7 @@ def _own_base_frame(log: ArmLog, geometry: PsmGeometry) -> tuple[np.ndarray | No
     return (_mean_base(Ts).T_reference_base, "measured_cp and local/measured_cp") if len(Ts) else (None, "")
 
 
-def _solved(log: ArmLog, T_camera_base: np.ndarray | None, geometry: PsmGeometry, job: Import) -> Track:
+def _joints_from_poses(log: ArmLog, T_camera_base: np.ndarray | None, geometry: PsmGeometry, job: Import) -> Track:
     """Joint positions from poses by inverse kinematics."""
     source = log.local_poses or log.poses
     if source is None:

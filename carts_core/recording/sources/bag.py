@@ -14,7 +14,7 @@ from ...model import ecm_kinematics
 from ...model.psm_kinematics import JOINT_NAMES
 from ..image_sources import BAG_SUFFIXES, Bag, decode_message
 from ..importing.cameras import calibration_of, camera_from_info, cameras_of, common_ids, find_images, side_of
-from ..importing.columns import order_of_names, strange_names, track_of
+from ..importing.columns import has_unknown_names, order_of_names, track_of
 from ..importing.found import FoundArm, FoundCamera, FoundRecording, Import, PartError, Source, Track, recording_name
 from ..importing.logs import ArmLog, arm_from_log, endoscope_motion, nearest
 from ..importing.row_matching import frame_times
@@ -121,7 +121,7 @@ def _note_names(arm: str, names: tuple[str, ...], job: Import) -> None:
     order = order_of_names(names)
     if order is not None and order != tuple(range(len(JOINT_NAMES))):
         job.found(f"joint positions are in the order {', '.join(names)}; joints are matched by name.", arm)
-    elif strange_names(names):
+    elif has_unknown_names(names):
         text = f"{', '.join(names)} are not joints of a PSM; the order {', '.join(JOINT_NAMES)} is assumed."
         job.warning(text, arm)
 
