@@ -152,7 +152,9 @@ def test_the_last_iterate_is_the_one_on_edges(tiny_sequence: Callable[..., Path]
     assert short.stop_reason == "iterations" and len(short.history) == 3, "no step more than was asked for"
 
 
-@pytest.mark.parametrize("domain", ["regular", "smoke", "bleeding"])
+@pytest.mark.parametrize(
+    "domain", ["smoke", *(pytest.param(name, marks=pytest.mark.slow) for name in ("regular", "bleeding"))]
+)
 def test_edges_bring_masks_nearer_to_the_truth(domain: str) -> None:
     """On two frames of the shipped sequence, 2 degrees off."""
     sequence, extractor = Sequence.open(sample_sequence()), FeatureExtractor.load()

@@ -1,7 +1,5 @@
 """Stages of a solver, on objectives that are known in closed form and on a predictor that is always right."""
 
-import subprocess
-import sys
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 from pathlib import Path
@@ -178,15 +176,3 @@ def test_first_order_descent_takes_the_steps_of_torch(method: Literal["adam", "g
         schedule.step()
         at.clamp_(start - 0.1, start + 0.1)
         assert torch.equal(descent.step(gradient), at)
-
-
-def test_first_order_descent_imports_no_compiler() -> None:
-    code = (
-        "import sys, torch\n"
-        "from carts_core.optimization.factors import FirstOrderDescent\n"
-        "from carts_core.settings import DescentSolver\n"
-        "zero = torch.zeros(3)\n"
-        "FirstOrderDescent(DescentSolver(), zero, zero - 1, zero + 1).step(zero + 0.5)\n"
-        "sys.exit('torch._dynamo' in sys.modules)\n"
-    )
-    subprocess.run([sys.executable, "-c", code], check=True)

@@ -19,7 +19,6 @@ import pytest
 from viewer_tab import OpenViewer, decoded, place_of, run_without_end, view_of
 from waiting import PATIENCE, eventually, get
 
-from carts_core.errors import ProjectError
 from carts_core.optimization import Backgrounds
 from carts_core.project import Project
 from carts_core.recording import Sequence
@@ -66,23 +65,6 @@ def test_neither_page_nor_images_are_left_some_time_after_the_last_tab_has_left(
         eventually(lambda: page() is None and background() is None and all(image() is None for image in images))
     finally:
         gc.enable()
-
-
-def test_memory_is_returned_during_work_beside_a_page_and_without_one(
-    open_viewer: OpenViewer, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    returned: list[Phase] = []
-    app = open_viewer()
-    run_without_end(app)
-    monkeypatch.setattr(worker, "return_memory", lambda: returned.append(app.state.run.phase))
-    with RawTab(app.url), monkeypatch.context() as patch:
-        app.queue.put(intents.Run())
-        eventually(lambda: app.state.run.phase is Phase.RUNNING)
-        patch.setattr(worker, "MEMORY_KEPT_AT_WORK", 0.3)
-        eventually(lambda: returned.count(Phase.RUNNING) > 1)
-    monkeypatch.setattr(worker, "MEMORY_KEPT", 0.3)
-    before = returned.count(Phase.RUNNING)
-    eventually(lambda: returned.count(Phase.RUNNING) > before + 1)
 
 
 def test_a_run_is_ended_and_its_pose_saved_once_its_tab_does_not_come_back(
@@ -306,15 +288,6 @@ def test_a_second_viewer_of_the_same_project_saves_nothing_and_says_so(open_view
     assert not app.project.state.steps
 
 
-def test_the_shipped_sequence_has_its_project_among_the_users_data(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("CARTS_DATA", str(tmp_path / "data"))
-    storage = open_storage(Sequence.open(sample_sequence()))
-    storage.close()
-    assert storage.notice is None and storage.project.path.parent == tmp_path / "data"
-
-
 def test_without_a_place_for_a_project_nothing_is_kept_and_the_page_says_so(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -348,9 +321,3 @@ def test_a_copy_that_was_rescued_is_said_when_its_project_is_opened(open_viewer:
         (saved,) = (panel for panel in app.view.display._panels if isinstance(panel, SavedPanel))
         assert saved._notice.visible and newest.name in saved._notice.content
         assert "<b>Saved</b> in sequence.carts" in saved._text.content
-
-
-def test_a_project_of_another_sequence_is_refused(tiny_sequence: Callable[..., Path], tmp_path: Path) -> None:
-    Project.open(Sequence.open(tiny_sequence(frames=2)), tmp_path / "other.carts").close()
-    with pytest.raises(ProjectError, match="belongs to another sequence"):
-        ViewerApp.open(tiny_sequence(frames=3), project=tmp_path / "other.carts", port=0)

@@ -202,11 +202,6 @@ def test_clicks_stay_when_the_optimizer_runs_and_say_how_far_off_they_are_then(d
     assert all(np.allclose(one, other, atol=2e-3) for one, other in pairs)
 
 
-def test_a_click_in_another_camera_is_of_that_camera(desk: Desk) -> None:
-    desk.do(intents.PointAt(40.0, 30.0, "right"))
-    assert desk.state.keypoints.pins[0].camera == "right" and desk.state.camera == "left"
-
-
 def test_edits_of_a_project_that_takes_none_are_shown_until_another_frame_is(desk: Desk) -> None:
     _drag(desk, 0.1)
     other = desk.reopened(read_only=True)
@@ -308,12 +303,6 @@ def _correct(session: Session, index: int, value: float, provenance: Provenance 
     session.editor.project.apply("Correct", session.edits(frame, scene, provenance))
 
 
-def test_a_frame_starts_at_its_measured_joints(session: Session) -> None:
-    pose = _pose(session, 1)
-    assert pose.source is Source.MEASURED
-    assert session.joints(pose.scene)["PSM1"] == pytest.approx(session.sequence.measured["PSM1"][1], abs=1e-6)
-
-
 def test_a_correction_is_of_its_frame_in_every_camera_and_domain(session: Session) -> None:
     _correct(session, 1, 0.25)
     assert _first_joint(session, 1) == pytest.approx(0.25)
@@ -361,15 +350,6 @@ def test_a_copied_correction_moves_the_measured_joints_by_as_much(session: Sessi
     assert copied - measured[1] == pytest.approx([0.07, *[0.0] * 6], abs=1e-6)
     with pytest.raises(CartsError, match="Frame 002 is as measured"):
         session.copied(*frames[::-1])
-
-
-def test_a_perturbation_moves_every_joint_by_the_same_amount_and_repeats_with_its_seed(session: Session) -> None:
-    start = session.pose(session.frame(0, "regular", "left")).scene
-    first, again, other = (session.joints(session.perturbed(start, 0, 2.0, seed))["PSM1"] for seed in (5, 5, 6))
-    difference = np.abs(first - session.joints(start)["PSM1"])
-    revolute = [kind == "revolute" for kind in session.scene.arms[0].robot.joint_types]
-    assert difference == pytest.approx(np.where(revolute, np.radians(2.0), 2e-3), abs=1e-6)
-    assert np.array_equal(first, again) and not np.array_equal(first, other)
 
 
 # ---- People at the same time ----------------------------------------------------------------------------------------

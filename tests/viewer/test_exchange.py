@@ -23,7 +23,6 @@ from carts_core.project import (
     IgnoreRegion,
     ImportedLabels,
     ImportedMask,
-    JointCorrection,
     Key,
     MaskCorrection,
     Provenance,
@@ -117,41 +116,6 @@ def test_only_frames_of_the_timelines_range_are_written(desk: Desk) -> None:
     export = desk.finish().export
     assert export is not None and export.path not in (None, path)
     assert sorted(file.name for file in (export.path / "binary").iterdir())[0] == "left_002.png"  # type: ignore[operator]
-
-
-def test_masks_are_those_that_somebody_corrected_and_only_where_they_did(desk: Desk) -> None:
-    rendered = desk.renderer.arm_ids(desk.state.pose.scene, "left") >= 0
-    added, removed = np.zeros_like(rendered), rendered.copy()
-    added[2:6, 3:9] = ~rendered[2:6, 3:9]
-    removed[:, : removed.shape[1] // 2] = False
-    edit = {Key.mask_correction(0, "left"): MaskCorrection.of(added, removed)}
-    desk.session.editor.project.apply("Paint", edit)
-    folder = exported(desk, intents.Export("masks", "All")) / "binary"
-    expected = (rendered | added) & ~removed
-    assert removed.any() and np.array_equal(read_mask(folder / "left_001.png"), expected)
-    for name, index, camera in (("right_001", 0, "right"), ("left_002", 1, "left")):
-        pose = desk.session.pose(desk.session.sequence.frame(index, cameras=[])).scene
-        assert np.array_equal(read_mask(folder / f"{name}.png"), desk.renderer.arm_ids(pose, camera) >= 0)
-    coco = exported(desk, intents.Export("coco", "All", images=False)) / "annotations" / "instances_default.json"
-    views = json.loads(coco.read_text())["images"]
-    assert [(view["frame"], view["camera"]) for view in views if view.get("painted")] == [("001", "left")]
-    desk.do(intents.Refresh(), intents.ShowCamera("left"), intents.ExportMask(7))
-    _, name, content = desk.delivered[-1]
-    shown = decoded(content)
-    assert name == "tiny_001_left.png" and np.array_equal(shown > 0, expected)
-
-
-def test_kinematics_say_where_each_row_comes_from_and_how_sure_it_is(desk: Desk) -> None:
-    desk.do(intents.SetJoint("PSM1", 0, 0.2), intents.Released())
-    joints = sum(map(len, desk.session.ranges.values()))
-    known = JointCorrection((0.1,) * joints, Provenance(Source.PROPAGATED), (0.01,) * (joints - 1) + (None,))
-    desk.session.editor.project.apply("Solve", {Key.joints(1, "PSM1"): known})
-    rows = read_kinematics_csv(exported(desk, intents.Export("csv", "All")), desk.session.scene)
-    assert [row.source for row in rows] == ["edited", "propagated", "measured"]
-    assert rows[0].joint_positions["PSM1"][0] == pytest.approx(0.2, abs=1e-6)
-    assert rows[1].joint_std is not None and rows[0].joint_std is not None
-    assert rows[1].joint_std["PSM1"] == pytest.approx([0.01] * (joints - 1) + [np.nan], nan_ok=True)
-    assert np.isnan(rows[0].joint_std["PSM1"]).all()
 
 
 def test_an_export_is_of_the_project_as_it_was_when_it_began(desk: Desk) -> None:
@@ -302,21 +266,6 @@ def test_masks_of_the_recording_itself_stay_the_truth(desk: Desk) -> None:
     after = with_imported(before, desk.session.scene, desk.session.editor.view)
     assert before.masks is not None and after.masks is not None
     assert np.array_equal(after.masks["left"], before.masks["left"])
-
-
-def test_an_import_replaces_neither_what_was_painted_nor_silently_what_was_imported(plain: Desk) -> None:
-    painted = MaskCorrection.of(np.eye(72, 96, dtype=bool), np.zeros((72, 96), bool))
-    plain.session.editor.project.apply("Paint", {Key.mask_correction(0, "left"): painted})
-    bring_in(plain)
-    folder = plain.session.sequence.path.parent
-    (folder / "others").mkdir()
-    cv2.imwrite(str(folder / "others" / "001.png"), np.full((72, 96), 255, np.uint8))
-    with pytest.raises(CartsError, match="1 layer imported before would be replaced"):
-        plain.do(intents.ImportMasks("others"))
-    assert plain.saved.get(Key.imported_mask(0, "left")).mask().sum() == 900  # type: ignore[union-attr]
-    plain.do(intents.ImportMasks("others", replace=True))
-    assert plain.saved.get(Key.imported_mask(0, "left")).mask().all()  # type: ignore[union-attr]
-    assert plain.saved.get(Key.mask_correction(0, "left")) == painted
 
 
 @pytest.mark.parametrize("place", ["", "/etc", "../elsewhere", "nothing.json", "linked"])

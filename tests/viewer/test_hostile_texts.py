@@ -190,6 +190,7 @@ def check_settled(page: Tab, texts: Texts) -> None:
 
 def walk(page: Tab, texts: Texts, *, lists: bool) -> None:
     """Open every tab, folder and sheet of the viewer, and every list where that is asked for."""
+    page.bring_to_front()  # Chromium draws a page in the background once a second.
     seen: set[str] = set()
     for number in range(page.locator("[role=tab]").count()):
         page.evaluate(f"({CHOOSE})({number})")

@@ -127,10 +127,10 @@ def lives(tiny_sequence: Callable[..., Path], untrained_weights: Path) -> Lives:
 
 
 def test_nothing_that_the_page_called_saved_is_lost_to_a_kill_or_a_signal(lives: Lives) -> None:
-    for seed in range(4):
+    for seed in range(len(SIGNALS)):
         lives.live(seed, least=4)
     tally = lives.tally
-    assert tally.acknowledged >= 16 and tally.strokes > 0 and tally.whole_exports > 0, tally
+    assert tally.acknowledged >= 12 and tally.strokes > 0 and tally.whole_exports > 0, tally
 
 
 @pytest.mark.slow

@@ -40,6 +40,7 @@ def check_range(tab: Tab) -> None:
     page.keyboard.up("Shift")
     eventually(lambda: app.state.range, lambda frames: frames == (21, 24))
     assert app.state.index == 30
+    expect(page.locator(".carts-range")).to_have_text("022 – 025")
     tab.drag((left + width * 5 / 8, y - 24), (left + width * 6.5 / 8, y - 24), steps=4)
     eventually(lambda: app.state.range, lambda frames: frames == (21, 26))
     expect(page.locator(".carts-range")).to_have_text("022 – 027")

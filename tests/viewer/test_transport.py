@@ -15,8 +15,6 @@ import msgspec
 import pytest
 from viser import _messages
 from viser._messages import GuiUpdateMessage
-from viser.infra import _infra
-from viser.infra._async_message_buffer import AsyncMessageBuffer
 from websockets.datastructures import Headers
 
 import carts_viewer
@@ -24,7 +22,7 @@ from carts_core.errors import SettingsError
 from carts_core.resources import static_dir
 from carts_viewer.serving import opened_in_browser, webbrowser
 from carts_viewer.transport.guard import Guard, check_address, refusal
-from carts_viewer.transport.viser_private import LoopEvent, MessageBuffer, queue_safely
+from carts_viewer.transport.viser_private import MessageBuffer
 
 EVERYWHERE = ".".join("0000")
 
@@ -311,22 +309,6 @@ def event_loop_in_a_thread():
     loop.close()
 
 
-def test_an_event_is_set_by_its_loop_only(event_loop_in_a_thread: asyncio.AbstractEventLoop) -> None:
-    event = LoopEvent(event_loop_in_a_thread)
-    waiting = asyncio.run_coroutine_threadsafe(event.wait(), event_loop_in_a_thread)
-    event.set()
-
-    async def set_on_another_loop() -> None:
-        event.set()
-
-    other = threading.Thread(target=lambda: asyncio.run(set_on_another_loop()))
-    other.start()
-    other.join()
-    assert not event.is_set()
-    event_loop_in_a_thread.call_soon_threadsafe(event.set)
-    assert waiting.result(10) and event.is_set()
-
-
 def test_every_tab_gets_what_threads_queue_at_the_same_time(event_loop_in_a_thread: asyncio.AbstractEventLoop) -> None:
     loop, tabs, threads, messages = event_loop_in_a_thread, 8, 3, 1000
     buffer = MessageBuffer(loop, persistent_messages=True, window_duration_sec=0.0)
@@ -356,12 +338,6 @@ def test_every_tab_gets_what_threads_queue_at_the_same_time(event_loop_in_a_thre
     assert not failures
     expected = {f"{thread}-{number}" for thread in range(threads) for number in range(messages)}
     assert all(future.result(60) == expected for future in received)
-
-
-def test_servers_and_tabs_use_safe_queues(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(_infra, "AsyncMessageBuffer", AsyncMessageBuffer)
-    queue_safely()
-    assert _infra.AsyncMessageBuffer is MessageBuffer  # pyright: ignore[reportPrivateImportUsage]
 
 
 # ---- Private names of viser and websockets --------------------------------------------------------------------------

@@ -112,8 +112,8 @@ def press(locator: Locator) -> None:
 
 
 def box_of(locator: Locator) -> FloatRect:
-    """Where an element is on the screen [px]."""
-    box = locator.first.bounding_box()
+    """Where an element is on the screen [px], once it is shown."""
+    box = eventually(locator.first.bounding_box, lambda now: now is not None)
     assert box is not None
     return box
 
