@@ -72,11 +72,10 @@ def right_mask(theirs: Path, index: int = 0) -> np.ndarray:
 
 
 @pytest.mark.usefixtures("no_network")
-@pytest.mark.parametrize("mode", ["frame", "sequence"])
 def test_masks_of_a_folder_are_fitted_and_are_the_truth_where_the_recording_has_none(
-    sequence: Path, theirs: Path, capsys: pytest.CaptureFixture[str], mode: str
+    sequence: Path, theirs: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    found = scores(sequence, "--observe", "masks", "--masks", str(theirs), "--mode", mode)
+    found = scores(sequence, "--observe", "masks", "--masks", str(theirs), "--mode", "sequence")
     assert found["observed"] == "masks" and found["masks"] == str(theirs)
     assert found["mean"]["dice_before"] < 0.95 and found["mean"]["dice_after"] > 0.97
     assert "Dice is against them where the recording has no masks" in said(capsys)

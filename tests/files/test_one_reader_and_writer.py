@@ -16,7 +16,7 @@ WRITES = re.compile(
     r"\.(write_text|write_bytes|touch|mkdir|makedirs|renames?|unlink|rmdir|removedirs|symlink_to|hardlink_to|symlink)\("
     r"|\.(mkfifo|mknod|f?truncate|chmod|chown|utime|extract(all)?|tofile|to_csv|imwrite(multi)?|VideoWriter)\("
     r"|\b(rmtree|copyfile|copy2|copytree|mkstemp|mkdtemp|NamedTemporaryFile|FileStorage|flock|lockf|save_file)\("
-    r"|\b(os\.(remove|link|replace|open\((?!os\.devnull))|sqlite3\.connect|(path|part|partial)\.replace)\b"
+    r"|\b(os\.(remove\b|link\b|replace\b|open\((?!os\.devnull))|sqlite3\.connect\b|(path|part|partial)\.replace\([^,\"]*\))"
     r"|(?<!onnx)\.(save|savez(_compressed)?|savetxt|savefig|export)\((?!\s*(\)|stream|file|figures|content))"
     r"|(?<!webbrowser\.)\bopen\((?!file|stream).*[\"'][rbt]*[wax+][rbt+]*[\"']"
 )
