@@ -144,7 +144,10 @@ def test_nothing_is_lost_in_200_kills_and_signals(lives: Lives) -> None:
     assert tally.acknowledged_exports > 20 and tally.interrupted_exports > 20, tally
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, pytest.param(signal.SIGHUP, marks=pytest.mark.slow), signal.SIGINT])
+@pytest.mark.parametrize(
+    "number",
+    [signal.SIGTERM, *(pytest.param(number, marks=pytest.mark.slow) for number in (signal.SIGHUP, signal.SIGINT))],
+)
 def test_a_note_under_the_cursor_is_saved(
     tiny_sequence: Callable[..., Path], untrained_weights: Path, number: signal.Signals
 ) -> None:
