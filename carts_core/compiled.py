@@ -26,8 +26,8 @@ def compiled(function: Callable[..., Any]) -> Any:
     if _SAID not in os.environ:
         os.environ[_SAID] = "1"
         print(
-            "note: compiled functions cannot be kept, as neither the installation nor the home folder can be written "
-            "to; each start takes some seconds longer. Set NUMBA_CACHE_DIR to a folder of yours.",
+            "note: compiled functions cannot be cached, because neither the installation nor the home folder is "
+            "writable; each start takes a few seconds longer. Set NUMBA_CACHE_DIR to a writable folder.",
             file=sys.stderr,
         )
     return numba.njit(**options)(function)

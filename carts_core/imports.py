@@ -23,7 +23,7 @@ def needs_extra(module: str, extra: str) -> None:
         found = None
     if found is None:
         raise CartsError(
-            f"this needs the package {module}, which is not installed. Install it: pip install 'carts[{extra}]'"
+            f"this requires the package {module}, which is not installed. Install it: pip install 'carts[{extra}]'"
         )
 
 

@@ -206,7 +206,7 @@ def read_records(path: OutputPath | Path) -> dict[str, Record]:
         if content["format"] != RESULTS_FORMAT:
             raise SettingsError(
                 f"{path} has the format {content['format']!r}; this version knows {RESULTS_FORMAT}. Use the version "
-                "that wrote it, or name another folder with --output."
+                "that wrote it, or choose another folder with --output."
             )
         return typed(content["frames"], dict[str, Record])
     except (OSError, ValueError, TypeError, KeyError):

@@ -229,17 +229,17 @@ class ViewerApp:
             RuntimeError: no page shows the first tab.
         """
         if self.tabs.first.view is None:
-            raise RuntimeError("No page shows the first tab.")
+            raise RuntimeError("The first tab has no page.")
         return self.tabs.first.view
 
     @property
     def notice(self) -> str | None:
-        """Message about where corrections are kept, see `Storage.notice`; None without one."""
+        """Message on the storage of corrections, see `Storage.notice`; None if there is none."""
         return self._storage.notice
 
     @property
     def incident(self) -> str | None:
-        """Why corrections are not in the project's file, and the file that has them; None if they are."""
+        """Why corrections are not in the project's file, and which file contains them; None if they are in it."""
         return self.project.incident
 
     def close(self) -> None:

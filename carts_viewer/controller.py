@@ -267,7 +267,7 @@ class Controller(Handler):
     def leave(self) -> None:
         """End the run of a closed tab and save its pose. Errors as `close`."""
         if self._optimizing.active:
-            self._optimizing.end("Stopped: its tab was closed; Run starts anew from here")
+            self._optimizing.end("Stopped: its tab was closed; Run starts again from here")
 
     def close(self) -> None:
         """End the stream and save the unfinished gesture.
@@ -284,7 +284,7 @@ class Controller(Handler):
         self._context.change(busy=text)
 
     def score(self) -> None:
-        """Compare the pose with the truth, if that was not done yet; errors as `handle`."""
+        """Compare the pose with ground truth, if not done yet; errors as `handle`."""
         self._context.score()
 
     def map(self) -> None:

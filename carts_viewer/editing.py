@@ -23,7 +23,7 @@ class Person:
     number: int
     """From 1, in order of arrival."""
     chosen: str = ""
-    """Chosen name; empty without one."""
+    """Chosen name, or empty."""
     present: bool = True
     """Whether their tab is open."""
     index: int = 0
@@ -38,7 +38,7 @@ class Person:
 
 
 class People:
-    """Users of a project and their access to its history; used on the worker's thread only.
+    """Users of a project and their steps in its history; used on the worker's thread only.
 
     Attributes:
         project: the project.
@@ -104,7 +104,7 @@ class People:
             edits, figures = self.project.reverting(own)
         except ProjectError as error:
             self._reverted.add(own)
-            raise CartsError(f"{error} Undo again to revert your step before it.") from error
+            raise CartsError(f"{error} Undo again to revert your previous step.") from error
         change = self._revert(person, own, "Undo", edits, figures)
         person.undone.append(self.project.state.position)
         return change
@@ -136,8 +136,8 @@ class People:
         ]
         if others:
             raise CartsError(
-                f"Steps of other present users are in between: {', '.join(sorted(set(others)))}. Revert your own steps "
-                "with Undo, or wait until the others have left."
+                f"Steps of other active users are in between: {', '.join(sorted(set(others)))}. Revert your own steps "
+                "with Undo, or wait until they have left."
             )
         person.undone.clear()
         return project.go_to(position)
@@ -227,7 +227,7 @@ class Editor:
 
     @property
     def gesture(self) -> object:
-        """Gesture of the draft; None without one."""
+        """Gesture of the draft; None if there is no draft."""
         return self._gesture
 
     @property
@@ -254,7 +254,7 @@ class Editor:
         self._lay_draft()
 
     def drop(self) -> None:
-        """Forget the draft."""
+        """Discard the draft."""
         self._gesture, self._edits, self._view = None, {}, None
 
     def save(self, figures: dict[int, Figures] | None = None) -> None:

@@ -37,7 +37,7 @@ from carts_viewer.state import NETWORK, Observed, Pose, Target, joint_range
 class Session:
     """Frames of one sequence and its project's corrections of them.
 
-    A frame's pose is the measured one until it is corrected; neither camera nor domain touches corrections.
+    A frame's pose is the measured one until it is corrected; corrections do not depend on camera or domain.
 
     Attributes:
         scene: its arms and cameras.
@@ -187,9 +187,7 @@ class Session:
         """
         corrections = self.editor.view.joints(source.index)
         if not corrections:
-            raise CartsError(
-                f"Frame {source.frame_id} is as measured, so there is no correction to copy. Correct it first."
-            )
+            raise CartsError(f"Frame {source.frame_id} has no correction to copy. Correct it first.")
         values = {}
         for name, correction in corrections.items():
             here = np.asarray(frame.measured[name], np.float64)
@@ -272,8 +270,8 @@ class Storage:
 
     @property
     def notice(self) -> str | None:
-        """Message for the user: why edits are not kept, that they are kept in another file, or that another file holds
-        more; None without one."""
+        """Message for the user: edits are not kept, are kept in another file, or another file has further edits; None
+        if there is no message."""
         return self.project.incident or self.reason or self.hint
 
     def close(self) -> None:
@@ -314,7 +312,7 @@ def open_storage(sequence: Sequence, path: Path | None = None) -> Storage:
             raise
         scratch = tempfile.TemporaryDirectory(prefix="carts-")
         project = Project.open(sequence, Path(scratch.name) / "scratch.carts")
-        return Storage(project, f"Nothing is kept after the viewer is closed: {error}", scratch)
+        return Storage(project, f"Temporary project, deleted when the viewer is closed: {error}", scratch)
     reason = None if project.writable else f"Read-only: {project.read_only_reason}"
     return Storage(project, reason, hint=_rescued_hint(project.path))
 
@@ -325,6 +323,6 @@ def _rescued_hint(path: Path) -> str | None:
         return None
     newest, others = copies[0], f" (and {len(copies) - 1} earlier)" if len(copies) > 1 else ""
     return (
-        f"A copy of {path.name}, rescued when it was lost or damaged, is {newest}{others}. It may hold corrections "
-        f"that are not in {path.name}: open it with --project '{newest}', or delete it if it is not needed."
+        f"{newest}{others} is a rescued copy of the lost or damaged {path.name}. It may contain corrections "
+        f"that are not in {path.name}: open it with --project '{newest}', or delete it."
     )

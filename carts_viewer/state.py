@@ -29,7 +29,7 @@ from .picture.strokes import Brush
 
 
 class Against(StrEnum):
-    """The pose that the present one is compared with; the value is the label in the page."""
+    """Reference pose of a comparison; the value is the label in the page."""
 
     MEASURED = "Measured"
     BEFORE_RUN = "Before the run"
@@ -53,7 +53,7 @@ class Compare:
 
 
 def other_pose(compare: Compare, measured: SceneState, before_run: SceneState | None) -> SceneState:
-    """The pose that is compared with; the measured one if there was no run."""
+    """The reference pose; the measured one if there was no run."""
     return before_run if compare.against is Against.BEFORE_RUN and before_run is not None else measured
 
 
@@ -87,7 +87,7 @@ class JointRange:
     joint: str
     revolute: bool
     lower: float
-    """[rad] or [m]; one turn to either side without limits."""
+    """[rad] or [m]; without limits, one revolution to either side."""
     upper: float
 
     @property
@@ -108,7 +108,7 @@ def joint_range(arm: Arm, joint: int) -> JointRange:
     """Range of the joint with this index."""
     lower, upper = (float(value) for value in arm.robot.joint_limits[joint])
     revolute = arm.robot.joint_types[joint] == "revolute"
-    # A slider needs limits: without them, one turn or one metre to either side.
+    # A slider needs limits; the default is one revolution or one metre to either side.
     room = math.pi if revolute else 1.0
     return JointRange(
         arm.name,
@@ -185,9 +185,9 @@ class Preset:
 PRESETS = {
     "Default": Preset("Default settings.", lambda _: {}),
     "Quick": Preset("Smaller images: faster, less accurate.", lambda solver: {"stages": reduced(solver.stages, 0.75)}),
-    "Far off": Preset("Measured joints that are wrong by more than 3 degrees.", lambda _: {"prior_deg": 6.0}),
-    "Well calibrated": Preset("Measured joints that are right to about a degree.", lambda _: {"prior_deg": 1.0}),
-    "Smoke and haze": Preset("All haze is removed before images are compared.", lambda _: {"dehaze": 1.0}),
+    "Far off": Preset("Measured joints with errors above 3 degrees.", lambda _: {"prior_deg": 6.0}),
+    "Well calibrated": Preset("Measured joints accurate to about 1 degree.", lambda _: {"prior_deg": 1.0}),
+    "Smoke and haze": Preset("Images are dehazed before comparison.", lambda _: {"dehaze": 1.0}),
 }
 """Presets by name, the default first."""
 
@@ -384,11 +384,11 @@ class ViewState:
     solver: SolverName = SolverName.SURFACE
     """Name of the solver of `settings`."""
     settings_error: str | None = None
-    """Why the last change of a setting was not accepted."""
+    """Reason why the last change of a setting was rejected."""
     settings_field: str | None = None
     """Name of that setting."""
     time_error: str | None = None
-    """Why the time offset that is being typed cannot be used."""
+    """Reason why the typed time offset cannot be used."""
     observed: Observed = field(default_factory=Observed)
     """Target of runs."""
     every_camera: bool = True

@@ -102,7 +102,7 @@ def test_kernels_are_compiled_without_a_cache_where_none_can_be_written_and_one_
     found = subprocess.run([sys.executable, "-c", UNWRITABLE], capture_output=True, text=True, check=True)
     assert found.stdout == "42\n"
     (line,) = found.stderr.splitlines()
-    assert line.startswith("note: compiled functions cannot be kept") and "NUMBA_CACHE_DIR" in line
+    assert line.startswith("note: compiled functions cannot be cached") and "NUMBA_CACHE_DIR" in line
 
 
 def test_the_caches_have_a_place_for_a_user_without_a_home(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -35,7 +35,9 @@ Work = Callable[[Job], Outcome]
 
 def lost(job: Job) -> Outcome:
     """Outcome of a job whose worker died in every attempt."""
-    return Outcome(job.name, "failed", f"its worker died {ATTEMPTS} times; the machine may lack memory (see its log)")
+    return Outcome(
+        job.name, "failed", f"its worker process died {ATTEMPTS} times, perhaps for lack of memory; see its log"
+    )
 
 
 _THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
@@ -185,8 +187,8 @@ class Cluster:
                 client = held.enter_context(Client(address, timeout="10s"))
             except (OSError, ValueError) as error:
                 raise SettingsError(
-                    f"--scheduler {self._scheduler}: no answer ({error}). Start one with `dask scheduler`, and "
-                    "workers with `dask worker ADDRESS --nthreads 1`, or give `local`."
+                    f"--scheduler {self._scheduler}: the scheduler does not answer ({error}). Start it with `dask "
+                    "scheduler`, and workers with `dask worker ADDRESS --nthreads 1`, or use `local`."
                 ) from error
             futures = {client.submit(self._work, job, key=f"carts-{job.name}", pure=False): job for job in jobs}
             for future in as_completed(futures):

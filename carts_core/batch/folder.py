@@ -66,7 +66,7 @@ def read_state(folder: OutputPath) -> JobState:
     try:
         return _read(folder)
     except (OSError, ValueError) as error:
-        remedy = "Run the batch again: the job begins anew, and the damaged file is kept."
+        remedy = "Run the batch again: the job is restarted, and the damaged file is kept."
         return JobState("failed", error=f"{JOB_FILE} cannot be read: {error}. {remedy}")
 
 
@@ -185,7 +185,7 @@ def read_findings(folder: OutputPath) -> Findings | None:
         return None
     found = typed(parse_json(read_bytes(path.path, VALUES)), Findings)
     if any(len(rows) != 4 or {len(row) for row in rows} != {4} for rows in found.base_frames.values()):
-        raise ValueError("a base frame is no 4 x 4 matrix")
+        raise ValueError("a base frame is not a 4 x 4 matrix")
     return found
 
 
@@ -292,7 +292,7 @@ def _known(folder: OutputPath, job: Job) -> KnownJob:
     try:
         return KnownJob(job, status, state, read_findings(folder))
     except (OSError, ValueError) as error:
-        damage = f"{FINDINGS_FILE} cannot be read: {str(error)[:_LONGEST_ERROR]}. Run the batch again to make it anew."
+        damage = f"{FINDINGS_FILE} cannot be read: {str(error)[:_LONGEST_ERROR]}. Run the batch again to recreate it."
         return KnownJob(job, status, state, None, damage)
 
 
@@ -329,10 +329,10 @@ def read_jobs(folder: Path) -> list[Job]:
         for job in jobs:
             check_name(job.name, f"a job of {folder}")
             if not job.recording.is_absolute():
-                raise ValueError(f"the recording {str(job.recording)!r} is no absolute path")
+                raise ValueError(f"the recording {str(job.recording)!r} is not an absolute path")
     except (OSError, ValueError) as error:
         raise SettingsError(
-            f"{folder} is no batch that can be read: {error}. Name the folder that carts batch has written to."
+            f"{folder} is not a readable batch: {error}. Give the output folder of carts batch."
         ) from error
     return jobs
 
@@ -378,9 +378,7 @@ def _edits(sequence: Sequence, table: Path) -> Iterator[tuple[Key[Any], Any]]:
             if row.source != "measured":
                 yield from _of_frame(sequence, order[row.frame_id], row, records[row.frame_id])
     except (OSError, ValueError, KeyError) as error:
-        raise CartsError(
-            f"{table.parent} holds no results that can be read: {error!r}. Run the batch again."
-        ) from error
+        raise CartsError(f"{table.parent} holds no readable results: {error!r}. Run the batch again.") from error
 
 
 def _of_frame(sequence: Sequence, index: int, row: KinematicsRow, record: Record) -> Iterator[tuple[Key[Any], Any]]:

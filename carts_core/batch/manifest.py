@@ -59,7 +59,7 @@ def read_manifest(path: Path, output: Path | None = None) -> list[Job]:
         raise SettingsError(f"manifest {path} has no [[jobs]]. Add at least one, with recordings and steps.")
     strangers = set(content) - {"format", "jobs"}
     if strangers:
-        raise SettingsError(f"manifest {path} has {listed(sorted(strangers))}; allowed are format and [[jobs]].")
+        raise SettingsError(f"manifest {path} has {listed(sorted(strangers))}; allowed: format and [[jobs]].")
     found = [
         job for number, table in enumerate(tables, 1) for job in _jobs(path, output, f"{path}, jobs {number}", table)
     ]
@@ -69,7 +69,7 @@ def read_manifest(path: Path, output: Path | None = None) -> list[Job]:
 
 def _jobs(manifest: Path, output: Path | None, where: str, table: dict[str, Any]) -> Iterator[Job]:
     if strangers := set(table) - _KEYS:
-        raise SettingsError(f"{where} has {listed(sorted(strangers))}; allowed are {listed(sorted(_KEYS))}.")
+        raise SettingsError(f"{where} has {listed(sorted(strangers))}; allowed: {listed(sorted(_KEYS))}.")
     steps = _steps(where, _texts(where, table, "steps", None))
     options = _options(where, table.get("options", {}), steps)
     recordings = _recordings(manifest, output, where, _texts(where, table, "recordings", None))
@@ -82,25 +82,25 @@ def _texts(where: str, table: dict[str, Any], key: str, default: tuple[str, ...]
     value = table.get(key, default)
     if isinstance(value, (list, tuple)) and value and all(isinstance(text, str) for text in value):
         return tuple(dict.fromkeys(value))
-    raise SettingsError(f"{where}: {key} is {shown(value)}; give a list of at least one text.")
+    raise SettingsError(f"{where}: {key} is {shown(value)}; give a list of at least one string.")
 
 
 def _steps(where: str, given: tuple[str, ...]) -> tuple[Step, ...]:
     steps: tuple[Step, ...] = tuple(step for step in STEPS if step in given)
     if unknown := [step for step in given if step not in STEPS]:
-        raise SettingsError(f"{where}: step {unknown[0]!r} is not known; allowed are {', '.join(STEPS)}.")
+        raise SettingsError(f"{where}: step {unknown[0]!r} is unknown; allowed: {', '.join(STEPS)}.")
     if steps != given:
         raise SettingsError(
-            f"{where}: steps are {', '.join(given)}; they run in the order {', '.join(steps)}. Write so."
+            f"{where}: steps are {', '.join(given)}; write them in the order in which they run: {', '.join(steps)}."
         )
     return steps
 
 
 def _options(where: str, given: Any, steps: tuple[Step, ...]) -> dict[str, tuple[str, ...]]:
     if not isinstance(given, dict):
-        raise SettingsError(f"{where}: options is {shown(given)}; give a table with a list of texts for each step.")
+        raise SettingsError(f"{where}: options is {shown(given)}; give a table with a list of strings per step.")
     if strangers := [name for name in given if name not in steps]:
-        raise SettingsError(f"{where}: options of {strangers[0]!r}, which is none of its steps ({', '.join(steps)}).")
+        raise SettingsError(f"{where}: options given for {strangers[0]!r}; its steps are {', '.join(steps)}.")
     return {step: _texts(f"{where}, options", given, step, None) for step in given}
 
 
@@ -112,7 +112,7 @@ def _recordings(manifest: Path, output: Path | None, where: str, patterns: tuple
         if output is not None and glob.has_magic(pattern):
             matched = [path for path in matched if not Path(path).resolve().is_relative_to(output.resolve())]
         if not matched:
-            raise SettingsError(f"{where}: recording {pattern!r} matches nothing in {folder}. Correct or remove it.")
+            raise SettingsError(f"{where}: recording {pattern!r} matches no file in {folder}. Correct or remove it.")
         found += map(Path, matched)
     return list(dict.fromkeys(found))
 
@@ -127,5 +127,5 @@ def shard(jobs: list[Job], text: str) -> list[Job]:
     """Shard `i/n` of the jobs: every n-th job from the i-th on, 1 <= i <= n; all shards contain every job once."""
     first, _, count = text.partition("/")
     if not (first.isdecimal() and count.isdecimal() and 1 <= int(first) <= int(count)):
-        raise SettingsError(f"--shard {text!r} is not readable. Give I/N, from 1/N to N/N, such as 2/8.")
+        raise SettingsError(f"--shard {text!r} is invalid. Give I/N with 1 <= I <= N, such as 2/8.")
     return jobs[int(first) - 1 :: int(count)]

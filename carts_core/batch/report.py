@@ -84,7 +84,7 @@ def _verdict_table(known: Sequence[KnownJob]) -> Table | None:
     total = {verdict: sum(counts[verdict] for _, counts in rows) for verdict in _VERDICTS}
     return Table.of(
         "Reliability of the results",
-        "Frames by verdict, from their images alone, without ground truth.",
+        "Frames by verdict; verdicts use the images only, no ground truth.",
         [
             {
                 "job": name,
@@ -136,7 +136,7 @@ def _drifts(known: Sequence[KnownJob]) -> list[dict[str, object]]:
 def _drift_table(drifts: list[dict[str, object]]) -> Table | None:
     return Table.of(
         "Drift of base frames",
-        "Change of each arm's base frame in a camera since the job before, in the manifest's order.",
+        "Change of each arm's base frame in a camera since the previous job of the manifest.",
         [
             {
                 "base frame": str(row["base_frame"]),
@@ -182,7 +182,7 @@ def _joint_table(joints: Mapping[str, _Values]) -> Table | None:
         "deviation": "deviation",
         "median_size": "median size",
         "largest_size": "largest",
-        "median_reported": "median reported deviation",
+        "median_reported": "median standard deviation",
     }
     rows = []
     for name, values in joints.items():
@@ -208,4 +208,4 @@ def _joint_figure(folder: OutputPath, joints: Mapping[str, _Values]) -> tuple[st
     axes.grid(axis="y", alpha=0.3)
     with output_stream(folder / "joints.png") as stream:
         figure.savefig(stream, format="png", dpi=110)
-    return "Corrections of each joint: median, quartiles, and 1.5 times their distance.", "joints.png"
+    return "Corrections of each joint: median, quartiles, and whiskers at 1.5 interquartile ranges.", "joints.png"

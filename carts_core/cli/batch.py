@@ -65,13 +65,13 @@ class Batch(RangedOptions):
         if len(chosen) == len(jobs):
             console.print(f"wrote {write_batch_report(folder, f'CaRTS batch {self.manifest.stem}', jobs)}")
         else:
-            console.print("this was one shard; --report-only writes the report once all are done")
-        console.print(f"look at frames of any job: carts view {folder}")
+            console.print("one shard is done; when all are, write the report with --report-only")
+        console.print(f"to inspect the results: carts view {folder}")
         if failed:
-            lines = {name: (error.strip() or "no reason is known").splitlines()[-1] for name, error in failed.items()}
+            lines = {name: (error.strip() or "unknown cause").splitlines()[-1] for name, error in failed.items()}
             named = "".join(f"\n  {name}: {line}" for name, line in list(lines.items())[:_NAMED])
             raise CartsError(
-                f"{len(failed)} of {counted(len(chosen), 'job')} failed; the same command tries them again. Their logs "
+                f"{len(failed)} of {counted(len(chosen), 'job')} failed; rerun the command to retry. Their logs "
                 f"are in {folder / 'jobs'}.{named}"
             )
 
@@ -93,10 +93,10 @@ class Batch(RangedOptions):
 
             engine = Cluster(work, self.scheduler, workers, self.threads)
         if self.project == "beside" and (those := sum(with_project(job) is not None for job in jobs)):
-            counts_of = f"{those} of {counted(len(jobs), 'job')} evaluated or exported as the project beside corrects"
-            console.print(f"{counts_of}; the logs have the counts; --project none for recordings as measured")
+            counts_of = f"{those} of {counted(len(jobs), 'job')} use the corrections of the project beside"
+            console.print(f"{counts_of}; see the logs for counts; --project none uses the measured joints")
         failed, counts = {}, Counter()
-        kept = f"{folder} holds what is done; the same command goes on from there"
+        kept = f"{folder} holds the finished jobs; rerun the command to resume"
         with when_stopped(kept), Bar(console=console) as bar:
             task = bar.add_task("jobs", total=len(jobs))
             for outcome in engine.run(jobs):
@@ -104,7 +104,7 @@ class Batch(RangedOptions):
                 bar.update(task, advance=1, description=f"jobs, {counts['failed']} failed")
                 if outcome.status == "failed":
                     failed[outcome.job] = outcome.error
-        words = {"done": "done", "known": "already there", "busy": "left to another process", "failed": "failed"}
+        words = {"done": "done", "known": "already there", "busy": "run by another process", "failed": "failed"}
         console.print(", ".join(f"{counts[status]} {words[status]}" for status in words if counts[status]))
         return failed
 

@@ -99,7 +99,7 @@ def check_options(jobs: Sequence[Job]) -> None:
     for step, options in sorted(called):
         for option in options:
             if option.partition("=")[0] in _GIVEN:
-                raise SettingsError(f"options of {step}: {option} is set by the batch itself. Leave it out.")
+                raise SettingsError(f"options of {step}: {option} is set by the batch. Leave it out.")
         _parsed(step, ["recording", *(["output"] if step == "export" else []), *options])
 
 
@@ -110,7 +110,7 @@ def _parsed(step: Step, arguments: list[str]) -> Any:
             return tyro.cli(_COMMANDS[step], prog=f"carts {step}", args=arguments)
     except SystemExit as end:
         raise SettingsError(
-            f"options of {step}: `carts {step} {' '.join(arguments)}` is no command.\n{said.getvalue()}"
+            f"options of {step}: `carts {step} {' '.join(arguments)}` is not a valid command.\n{said.getvalue()}"
         ) from end
 
 
@@ -196,8 +196,8 @@ def _table(job: Job, folder: OutputPath) -> Path | None:
     found = kinematics_tables(folder, job)
     if len(found) > 1:
         raise SettingsError(
-            f"job {job.name}: {len(found)} cameras worked alone, and an export holds one table. Name a camera for each "
-            "job, or add --together to the options."
+            f"job {job.name}: {len(found)} cameras were solved separately, and an export holds one table. Give one "
+            "camera per job, or add --together to the options."
         )
     return found[0] if found else None
 

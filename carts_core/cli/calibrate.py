@@ -75,26 +75,26 @@ class HandEye:
             write_text(folder / RESULT_FILE, json.dumps(content, indent=1))
             write_text(folder / MARKER, json.dumps({"format": "hand-eye", "sequence": str(self.sequence)}, indent=1))
         _print(console, sequence, points, result)
-        console.print(f"wrote {output}. Refine it over the recording: carts calibrate {output}/sequence.toml")
+        console.print(f"wrote {output}. To refine it on the whole recording: carts calibrate {output}/sequence.toml")
 
 
 def _print(console: Console, sequence: "Sequence", points: "Points[ImagePoint]", result: "HandEyeResult") -> None:
     used = len(result.distances) - len(result.contradicting)
-    console.print(f"{used} points agree to {result.error:.1f} px")
+    console.print(f"{used} points, residual {result.error:.1f} px")
     for (arm, camera), deviation in result.deviations.items():
         console.print(
-            f"{arm} before {camera}: known to {deviation.sideways_mm:.1f} mm sideways, {deviation.depth_mm:.1f} mm in "
-            f"depth and {deviation.rotation_deg:.1f} deg"
+            f"{arm} in {camera}: standard deviation {deviation.sideways_mm:.1f} mm lateral, {deviation.depth_mm:.1f} "
+            f"mm in depth and {deviation.rotation_deg:.1f} deg"
         )
     for camera, deviation in result.focal_deviation.items():
         focal = result.scene.camera(camera).intrinsics[0]
-        console.print(f"{camera}: focal length {focal:.0f} px, known to {100 * deviation:.0f} %")
+        console.print(f"{camera}: focal length {focal:.0f} px, standard deviation {100 * deviation:.0f} %")
     for (arm, camera), more in result.missing.items():
-        console.print(f"{arm} before {camera} stays as it was: {more} more points are needed")
+        console.print(f"{arm} in {camera} is not calibrated: {more} more points are needed")
     for index in result.contradicting:
         point = points[index]
         where = f"{point.arm} {point.landmark} in frame {sequence.frame_ids[point.frame]}, camera {point.camera}"
-        console.print(f"row {index + 2} ({where}) contradicts the others: {result.distances[index]:.0f} px off")
+        console.print(f"row {index + 2} ({where}) is an outlier: residual {result.distances[index]:.0f} px")
 
 
 @dataclass(frozen=True)
@@ -137,7 +137,7 @@ class TimeOffset:
         if found.proposed is None:
             return
         if self.output is None:
-            console.print(f"Write it under [frames] in {self.sequence}, or name a folder with -o.")
+            console.print(f"Set it under [frames] in {self.sequence}, or give an output folder with -o.")
             return
         with published(self.output, overwrite=self.overwrite) as folder:
             text = calibrated_sequence_file(
@@ -225,7 +225,7 @@ class Calibrate:
             if text is not None and not self.beyond_hand_eye:
                 raise SettingsError(
                     f"{text[0].upper()}{text[1:]} Nothing was written. Check the clicked points, the joints and the "
-                    "masks, or write it all the same with --beyond-hand-eye."
+                    "masks, or use --beyond-hand-eye to write it anyway."
                 )
             residuals = frame_residuals(sequence, frames, result)
             named = [sequence.frame_ids[index] for index in indices]
@@ -233,9 +233,9 @@ class Calibrate:
             write_text(folder / MARKER, json.dumps(self._summary(observer.weights, named, cameras), indent=1))
         for camera in cameras:
             if (means := mean_dice(residuals, camera)) is not None:
-                console.print(f"{camera}: mean Dice of these frames {means[0]:.4f} before, {means[1]:.4f} after")
+                console.print(f"{camera}: mean Dice {means[0]:.4f} before, {means[1]:.4f} after")
         print_hints(console, self.network.caution)
-        console.print(f"wrote {output}: sequence.toml, calibration.json and README.md, the report")
+        console.print(f"wrote {output}: sequence.toml, calibration.json and the report README.md")
         print_hints(console, calibration_hint(result.assessment, result.stop_reason), remark(sequence.scene, result))
 
     def _summary(self, weights: str, frames: list[str], cameras: list[str]) -> dict:
@@ -262,9 +262,9 @@ def frame_indices(frames: str | None, positions: str | None, sequence: "Sequence
         return Selection(frames, positions).frame_indices(sequence)
     count = frames.removeprefix(_SPREAD)
     if not (count.isdecimal() and int(count) >= 1):
-        raise SettingsError(f"--frames {frames!r} names no frame. Give how many, at least 1, as in `spread:20`.")
+        raise SettingsError(f"--frames {frames!r} selects no frame. Give a number of at least 1, such as `spread:20`.")
     if positions is not None:
-        raise SettingsError("--frames and --positions are both given. Give one of them.")
+        raise SettingsError("--frames and --positions are mutually exclusive. Give one of them.")
     from ..recording import spread
 
     return spread(len(sequence), int(count))

@@ -36,17 +36,17 @@ from .view import View
 def settings_reference() -> str:
     """All settings of a settings file, with defaults and meanings."""
     parts = [
-        "Settings of `--settings FILE`, in the tables [solver] and [sequence]; --print-settings writes them all.",
+        "Settings in the tables [solver] and [sequence] of `--settings FILE`; --print-settings writes all of them.",
         *(described(kind) for kind in (SurfaceSolver, DescentSolver, SequenceSettings)),
-        "Stages, each a table of [[solver.stages]] with its name under `stage`:",
+        "Stages: tables [[solver.stages]] whose key `stage` is the stage's name:",
         *(described(kind) for kind in get_args(Stage)),
     ]
     return "\n\n".join(parts)
 
 
 _DESCRIPTION = (
-    "Correct a surgical robot's kinematics from its endoscope image. `carts --version` tells which version this is. "
-    "After a command, --help-all also lists every setting of the solvers, and --print-settings writes them as a file "
+    "Correct a surgical robot's kinematics from its endoscope image. `carts --version` prints the version. "
+    "COMMAND --help-all also lists every setting of the solvers; COMMAND --print-settings prints a file "
     "for --settings."
 )
 
@@ -105,7 +105,7 @@ def main(arguments: list[str] | None = None) -> None:
             if print_settings:
                 if not hasattr(command, "solving"):
                     named = "`carts optimize`, `carts evaluate` and `carts calibrate`"
-                    raise SettingsError(f"--print-settings is for {named}.")
+                    raise SettingsError(f"--print-settings is available for {named}.")
                 print(command.solving.printed())
                 return
         if not isinstance(command, _AT_ONCE):

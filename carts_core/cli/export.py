@@ -47,7 +47,7 @@ class Render:
         folder = output_folder(self.output, sequence.name, "render")
         frames = self.select.frame_indices(sequence)
         sequence = self.source.corrected(sequence, frames, console)
-        with locked_folder(folder), when_stopped(f"the pictures in {folder} are whole, some are missing"):
+        with locked_folder(folder), when_stopped(f"the pictures in {folder} are complete files; others are missing"):
             for domain in self.select.domain_names(sequence):
                 for camera in self.select.camera_names(sequence.scene):
                     renderer = Renderer(sequence.scene, cameras=[camera])
@@ -102,7 +102,7 @@ class Export:
         sequence = Sequence.open(self.sequence, progress=console.print)
         domains = self.select.domain_names(sequence)
         if len(domains) > 1:
-            raise SettingsError(f"--domain: {len(domains)} domains were given; an export holds one. Name one.")
+            raise SettingsError(f"--domain: {len(domains)} domains were given; an export holds one. Give one.")
         cameras = self.select.camera_names(sequence.scene)
         sequence, frames = self._frames(sequence, cameras, console)
         dataset = Dataset(
@@ -121,7 +121,7 @@ class Export:
                 path = export(dataset, self.format, self.output, overwrite=self.overwrite, monitor=monitor)
         if FORMATS[self.format].images and self.images != "none" and dataset.remade_cameras:
             cameras_named = ", ".join(dataset.remade_cameras)
-            reason = "they are undistorted, cropped, turned, or of a video or a bag, and labels fit no recorded file"
+            reason = "they are undistorted, cropped, rotated, or from a video or bag, so labels match no recorded file"
             console.print(f"images of {cameras_named} are written as PNG: {reason}", soft_wrap=True)
         console.print(f"wrote {path}")
 
@@ -134,9 +134,9 @@ class Export:
         indices = self.select.frame_indices(sequence)
         if self.kinematics is not None:
             if self.source.named:
-                raise SettingsError("--kinematics and --project are both given. Give one of them.")
+                raise SettingsError("--kinematics and --project are mutually exclusive. Give one of them.")
             if (beside := self.source.path(sequence.path)) is not None:
-                console.print(f"{beside} is left out, since --kinematics is given", soft_wrap=True)
+                console.print(f"{beside} is not used, since --kinematics is given", soft_wrap=True)
             return sequence, corrected_frames(sequence, indices, read_kinematics_csv(self.kinematics, sequence.scene))
         project = self.source.read(sequence)
         if project is None:

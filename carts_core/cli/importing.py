@@ -105,4 +105,4 @@ class ImportMasks:
             report = import_annotations(project, found, source=self.source.name, replace=self.replace)
             console.print(report.sentence())
             if report.changed:
-                console.print(f"saved in {project.path}; undone by one step in carts view")
+                console.print(f"saved in {project.path}; one undo step in carts view")

@@ -37,7 +37,7 @@ class Synthesize:
 
         with Bar() as bar:
             task = bar.add_task("synthesizing", total=None)
-            with when_stopped("frames that were made are kept beside the output; the same command goes on from there"):
+            with when_stopped("finished frames are kept beside the output; rerun the command to resume"):
                 path = synthesize(
                     self.synthesis,
                     self.output,
@@ -101,7 +101,7 @@ class Train(RangedOptions):
                 said = progress.validation
                 console.print(f"step {progress.step}: {gain(progress.first, said)}", soft_wrap=True)
 
-            bar.update(task, description="making images to measure with")
+            bar.update(task, description="making validation images")
             result = train(config, self.output, report)
 
             def compare(text: str, done: int, total: int) -> None:
@@ -110,17 +110,17 @@ class Train(RangedOptions):
             found = offer(config, result, compare, made=self.fits, own=max(1, self.fits // 2))
         console.print(f"report:  {result.report}")
         if result.first is not None:
-            console.print(f"kept, the best: {gain(result.first, result.validation)}", soft_wrap=True)
+            console.print(f"best weights: {gain(result.first, result.validation)}", soft_wrap=True)
         if result.validation.get("step") == 0:
-            console.print("No step gained anything, so the weights are those of the start.")
+            console.print("No step improved the validation, so the initial weights were kept.")
         for line in found.lines:
             console.print(line, soft_wrap=True)
         if found.worse:
-            console.print(f"not offered, since worse: {'; '.join(found.worse)}", soft_wrap=True)
-            console.print(f"The weights are in {found.weights}. Go on with the network as it was.", soft_wrap=True)
+            console.print(f"rejected, because worse: {'; '.join(found.worse)}", soft_wrap=True)
+            console.print(f"The weights are in {found.weights}. Keep using the previous network.", soft_wrap=True)
             return
         console.print(f"weights: {found.weights}")
-        console.print(f"Use: carts optimize {recording} --weights {found.weights}", soft_wrap=True)
+        console.print(f"To use them: carts optimize {recording} --weights {found.weights}", soft_wrap=True)
 
 
 @dataclass(frozen=True)
@@ -145,10 +145,10 @@ class Baseline:
         def say(line: str) -> None:
             console.print(line, soft_wrap=True)
 
-        with when_stopped(f"{self.output} holds what was trained; the same command goes on from there"):
+        with when_stopped(f"{self.output} holds the state of the training; rerun the command to resume"):
             frames = prepare_frames(output_path(self.frames), self.training, say)
             result = train_baseline(self.network, self.training, frames, self.output, say)
-        say(f"weights: {result.weights}\n{result.steps} steps, Dice {result.dice:.3f} on frames not learned from")
+        say(f"weights: {result.weights}\n{result.steps} steps, Dice {result.dice:.3f} on validation frames")
 
 
 @dataclass(frozen=True)
@@ -205,10 +205,12 @@ class Bench:
         results = ResultsFile(folder / "measurements.jsonl")
         benchmark = Benchmark(scope, sources, extractor, results, runs, baselines)
         if results.unreadable:
-            console.print(f"{results.path}: {counted(results.unreadable, 'torn line')} left out and measured again")
+            console.print(
+                f"{results.path}: {counted(results.unreadable, 'torn line')} ignored; those runs are measured again"
+            )
         stages, hand_eye = folder / "stages.json", folder / "hand_eye.json"
         if not self.report_only:
-            with when_stopped(f"{results.path} holds what was measured; the same command goes on from there"):
+            with when_stopped(f"{results.path} holds the finished measurements; rerun the command to resume"):
                 benchmark.run(console)
                 measure_stages(stages, extractor)
                 measure_hand_eye(hand_eye, extractor, scope.hand_eye_starts, console.print)
@@ -238,8 +240,8 @@ class Bench:
             trained = read_baseline(path)
             if trained.row in found:
                 raise CartsError(
-                    f"--baselines names two files of the row {trained.row}; {path} is the second. Give one of each "
-                    "network and augmentation, and the other in a run of its own."
+                    f"--baselines gives two files for the row {trained.row}; {path} is the second. Give one per "
+                    "network and augmentation, and the other in a separate run."
                 )
             found[trained.row] = trained
         return found

@@ -99,9 +99,11 @@ class Live(RangedOptions):
             finally:
                 console.print(str(statistics))
                 if not statistics.tracked:
-                    console.print("No frame was complete: it takes joints of every arm and an image of every camera.")
+                    console.print(
+                        "No frame was complete: a frame needs joints of every arm and an image of every camera."
+                    )
                 if recorder is not None and (path := recorder.close()) is not None:
-                    console.print(f"wrote {path}. Look at it: carts view {path}")
+                    console.print(f"wrote {path}. To inspect it: carts view {path}")
 
     def _lines(self) -> "list[Callable]":
         """Functions that each write a result as a line of JSON."""

@@ -69,7 +69,7 @@ class Evaluate:
         if self.json == STANDARD_OUTPUT:
             pass
         elif self.json is not None and self.json.is_dir():
-            raise SettingsError(f"--json {self.json} is a folder. Name a file.")
+            raise SettingsError(f"--json {self.json} is a folder. Give a file.")
         elif self.json is not None:
             check_writable(self.json.parent)
         if self.mode == "sequence":
@@ -121,7 +121,7 @@ class Evaluate:
                 verdict_line(where, [score.verdict for score in seen], [score.not_determined for score in seen]),
             )
         if any(score.verdict not in (None, "good") for score in scores):
-            print_hints(console, "The reasons of verdicts are in --json.")
+            print_hints(console, "--json FILE also writes the reasons of verdicts.")
         required = self.solving.chosen.needs_background
         for group in [] if observer.masked else camera_groups(cameras, self.together):
             for domain in domains:

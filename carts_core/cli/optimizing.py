@@ -53,7 +53,7 @@ InputHashes = Mapping[str, str]
 """Kind of input -> its fingerprint; the kinds are the keys of `_CHANGED`."""
 
 _CHANGED = {
-    "code": "another version of the program made them",
+    "code": "another version of the program wrote them",
     "weights": "the weights changed",
     "settings": "the settings changed",
     "robot": "the robot changed",
@@ -227,9 +227,9 @@ class FrameFolder:
         record = self._records.get(frame_id)
         row = self.rows[bisect_left(self.rows, self._order[frame_id], key=lambda row: self._order[row.frame_id])]
         if record is None:
-            return "what they were made from is not known"
+            return "their inputs are unknown"
         if record.row != row_fingerprint(self._scene, row):
-            return "their rows in the table were changed"
+            return "their rows in the table have changed"
         if changed := changes(record.origin, origin):
             return changed
         for camera, folder in self._masks.items():
@@ -301,8 +301,8 @@ class FrameFolder:
             return
         if self._settings_written().get("sequence") != self._settings["sequence"]:
             raise SettingsError(
-                f"{self.folder} holds results of another sequence, or of one that is not known (see "
-                f"{self._settings_file}). Add --overwrite to replace them, or name another folder with --output."
+                f"{self.folder} holds results of another or an unknown sequence (see "
+                f"{self._settings_file}). Add --overwrite to replace them, or choose another folder with --output."
             )
 
     def _settings_written(self) -> dict[str, Any]:
@@ -406,7 +406,7 @@ class Optimizing:
         reasons = Counter(fault for fault in faults.values() if fault)
         total, kept = counted(len(now), "frame"), sum(fault is None for fault in faults.values())
         if kept:
-            self._console.print(f"{output.folder}: {kept} of {total} already there")
+            self._console.print(f"{output.folder}: {kept} of {total} already done")
         for reason, count in reasons.items():
             self._console.print(f"{output.folder}: {count} of {total} redone: {reason}")
         return [index for index in now if index not in faults or faults[index]]
@@ -415,12 +415,12 @@ class Optimizing:
         """Report outdated results of frames that were not selected."""
         output, chosen = part.output, [self._sequence.frame_ids[index] for index in self._frames]
         if dropped := output.others_dropped(chosen):
-            note = f"--overwrite starts over: results of {counted(dropped, 'other frame')} are removed"
+            note = f"--overwrite removes the results of {counted(dropped, 'other frame')}"
             self._console.print(f"{output.folder}: {note}")
         others = [row.frame_id for row in output.rows if row.frame_id not in chosen]
         reasons = Counter(fault for frame_id in others if (fault := output.fault(frame_id, common)))
         for reason, count in reasons.items():
-            note = f"{counted(count, 'frame')} not chosen now would have to be redone: {reason}"
+            note = f"{counted(count, 'frame')} outside of this run are outdated: {reason}"
             self._console.print(f"{output.folder}: {note}")
 
     def _kept(self, part: _Part) -> str:
@@ -429,7 +429,7 @@ class Optimizing:
         if self._running is not None:
             done, total = self._running.progress
             there = f"{done} of {counted(total, 'frame')} are solved and kept in {part.output.checkpoint}"
-        return f"{there}; the same command goes on from there"
+        return f"{there}; rerun the command to resume"
 
     def _solve_frames(self, todo: list[int], part: _Part, origins: Mapping[int, InputHashes]) -> None:
         if not todo:
@@ -475,7 +475,7 @@ class Optimizing:
         part.output.write(found)
         checkpoint.remove()
         if checkpoint.recalled:
-            self._console.print("went on from where an earlier run was stopped")
+            self._console.print("resumed an earlier run")
         else:
             self._console.print(f"{optimizer.frames_per_second:.1f} frames/s")
         assessed = {estimate.frame_id: estimate.assessment for estimate in optimizer.estimates.values()}

@@ -87,19 +87,19 @@ def chosen_frames(frames: str | None, positions: str | None, ids: Names[str]) ->
         SettingsError: both are given, or one is invalid or names a frame that is not in the recording.
     """
     if frames is not None and positions is not None:
-        raise SettingsError("--frames and --positions are both given. Give one of them.")
+        raise SettingsError("--frames and --positions are mutually exclusive. Give one of them.")
     if positions is not None:
         numbers = [str(position) for position in range(1, len(ids) + 1)]
-        return _chosen("--positions", positions, numbers, "Positions count from 1, as in the page; there are")
+        return _chosen("--positions", positions, numbers, "Positions count from 1, as in the viewer; they are")
     text = ALL if frames is None else frames
     try:
-        return _chosen("--frames", text, ids, "Frames are named as in the recording and the page:")
+        return _chosen("--frames", text, ids, "Frames have the names of the recording, as in the viewer:")
     except SettingsError as error:
         numbers = re.fullmatch(r"\d+(-\d+)?(,\d+(-\d+)?)*", text) and [int(one) for one in re.findall(r"\d+", text)]
         if not numbers or max(numbers) >= len(ids):
             raise
         today = re.sub(r"\d+", lambda number: ids[int(number[0])], text)
-        raise SettingsError(f"{error} Earlier versions counted from 0; then this was --frames {today}.") from None
+        raise SettingsError(f"{error} Earlier versions counted from 0; the equivalent is --frames {today}.") from None
 
 
 def _chosen(option: str, text: str, names: Names[str], known: str) -> list[int]:
@@ -154,7 +154,7 @@ class FromProject:
         if not path.is_file():
             if self.project is None:
                 return None
-            raise SettingsError(f"--project {self.project} is missing. Name a project file, or `{NO_PROJECT}`.")
+            raise SettingsError(f"--project {self.project} is missing. Give a project file, or `{NO_PROJECT}`.")
         return path
 
     def read(self, sequence: "Sequence") -> "ProjectState | None":
@@ -169,7 +169,7 @@ class FromProject:
             with Project.open(sequence, path, read_only=True) as project:
                 return project.state
         except ProjectError as error:
-            raise ProjectError(f"{error} Or leave it out: --project {NO_PROJECT}.") from error
+            raise ProjectError(f"{error} To ignore it: --project {NO_PROJECT}.") from error
 
     def sentence(self, sequence: "Sequence", project: "ProjectState | None", frames: Names[int]) -> str | None:
         """Sentence on the project in use and the review states of the selected frames; None without a project."""
@@ -178,8 +178,8 @@ class FromProject:
         states = Counter(project.review(index).state.value for index in frames)
         counts = ", ".join(f"{count} {state}" for state, count in states.most_common())
         return (
-            f"as corrected in {self.path(sequence.path)}: {counts} of {counted(len(frames), 'frame')}; "
-            f"--project {NO_PROJECT} for the recording as measured"
+            f"corrections of {self.path(sequence.path)}: {counts} of {counted(len(frames), 'frame')}; "
+            f"--project {NO_PROJECT} uses the measured joints"
         )
 
     def corrected(self, sequence: "Sequence", frames: Names[int], console: "Console") -> "Sequence":
@@ -276,7 +276,7 @@ def check_writable(folder: Path) -> None:
     """Check in advance that a folder can be written to or created; `SettingsError` otherwise."""
     there = next(path for path in (folder, *folder.absolute().parents) if path.exists())
     if not (there.is_dir() and os.access(there, os.W_OK)):
-        raise SettingsError(f"{folder} cannot be made or written to, because of {there}. Name another folder.")
+        raise SettingsError(f"{folder} cannot be created or written, because of {there}. Give another folder.")
 
 
 SequencePath = Annotated[Path, tyro.conf.Positional]
@@ -322,7 +322,9 @@ class SolverOptions:
     def check_surface(self, what: str) -> None:
         """Check that the solver is `surface`, which `what` requires because it estimates standard deviations."""
         if not isinstance(self.chosen, SurfaceSolver):
-            raise SettingsError(f"{what} needs the solver surface; given is --solver {self.solver}. Leave it out.")
+            raise SettingsError(
+                f"{what} requires --solver surface, but --solver {self.solver} was given. Leave one of them out."
+            )
 
     def printed(self) -> str:
         """All settings as a settings file."""
@@ -354,7 +356,7 @@ def _table(given: tuple[str, ...], name: str) -> dict[str, Any]:
     """Table `name` of all --settings merged; later values take precedence."""
     found: dict[str, Any] = {}
     for text in given:
-        remedy = "Give a file as --print-settings writes, or `NAME=VALUE`."
+        remedy = "Give a file in the format of --print-settings, or `NAME=VALUE`."
         try:
             single = "=" in text and not Path(text).exists()
             content = parse_toml(_of_solver(text) if single else read_text(Path(text), SETTINGS))
@@ -365,9 +367,7 @@ def _table(given: tuple[str, ...], name: str) -> dict[str, Any]:
         strangers = set(content) - {"solver", "sequence", "free"}
         if strangers or not all(isinstance(table, dict) for table in content.values()):
             wrong = ", ".join(sorted(strangers)) or "values outside tables"
-            raise SettingsError(
-                f"--settings {text} has {wrong}; allowed are the tables [solver], [sequence] and [free]."
-            )
+            raise SettingsError(f"--settings {text} has {wrong}; allowed: the tables [solver], [sequence] and [free].")
         found.update(content.get(name, {}))
     return found
 
@@ -434,7 +434,7 @@ class Observer:
                 raise SettingsError(
                     f"{len(without)} of {counted(len(frames), 'frame')} have no {self._origin} of camera "
                     f"{camera!r}; the first is frame {sequence.frame_ids[without[0]]}. Choose "
-                    "others with --frames and --camera, or leave them to the network with --observe both."
+                    "others with --frames and --camera, or use the network for them with --observe both."
                 )
 
     @property
@@ -461,7 +461,7 @@ class Observer:
                 return []
             return [
                 f"Frame {sequence.frame_ids[index]} has no {self._origin} of camera {', '.join(without)}, so all "
-                f"cameras that look together ({', '.join(cameras)}) are left to the network there, masks or not. "
+                f"cameras fitted together ({', '.join(cameras)}) use the network there, even those with masks. "
                 "Leave that camera out with --camera, or give it masks."
             ]
         from ..optimization import check_domain
@@ -488,14 +488,14 @@ class Observing(Network):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.masks != RECORDING and self.observe == "network":
-            raise SettingsError(f"--masks {self.masks} needs --observe masks or both. Add it, or leave both out.")
+            raise SettingsError(f"--masks {self.masks} needs --observe masks or both. Add it, or leave --masks out.")
         if self.masks in (RECORDING, *LAYERS):
             return
         named = self._layer[0] or Path(self.masks)
         if not named.exists():
             raise SettingsError(
-                f"--masks {self.masks} is missing. Give {RECORDING}, {', '.join(LAYERS)}, those of another project as "
-                "in other.carts:painted, or a file or folder of masks."
+                f"--masks {self.masks} is missing. Give {RECORDING}, {', '.join(LAYERS)}, a layer of another project, "
+                "such as other.carts:painted, or a file or folder of masks."
             )
 
     def observer(self, settings: SolverSettings, sequence: "Sequence") -> Observer:
@@ -506,8 +506,8 @@ class Observing(Network):
         """
         if self.observe != "network" and not isinstance(settings, SurfaceSolver):
             raise SettingsError(
-                f"--observe {self.observe} needs the solver surface, occluded or none; the one given compares features "
-                "of images. Leave out --solver or --observe."
+                f"--observe {self.observe} requires the solver surface, occluded or none; the given one compares image "
+                "features. Leave out --solver or --observe."
             )
         if self.observe == "masks" and self.weights:
             raise SettingsError("--observe masks loads no network, but --weights was given. Leave one of them out.")
@@ -562,8 +562,8 @@ class Observing(Network):
         """Remark that Dice scores refer to the fitted masks; None if no masks are fitted."""
         if self.observe == "network":
             return None
-        against = "the masks that were fitted" if self.masks == RECORDING else "them where the recording has no masks"
-        return f"Dice is against {against}, so it says how well they fit and not how right they are."
+        against = "the fitted masks" if self.masks == RECORDING else "the fitted masks where the recording has none"
+        return f"Dice is against {against}, so it measures agreement with them, not accuracy."
 
 
 @dataclass(frozen=True)
@@ -592,6 +592,8 @@ class OptimizeOptions:
 
     def __post_init__(self) -> None:
         if self.keyframes is not None and self.mode != "sequence":
-            raise SettingsError(f"--keyframes {self.keyframes} needs --mode sequence. Add it, or leave both out.")
+            raise SettingsError(
+                f"--keyframes {self.keyframes} requires --mode sequence. Add it, or leave --keyframes out."
+            )
         if self.mode == "sequence":
             self.solving.check_surface("--mode sequence")

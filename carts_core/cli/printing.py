@@ -30,8 +30,8 @@ def kept_start_hint(where: str, stopped: Sequence[str]) -> str | None:
     if not kept:
         return None
     return (
-        f"{where}: the start was kept in {kept} of {counted(len(stopped), 'run')}: there it fits the image as well as "
-        "the optimized values."
+        f"{where}: {kept} of {counted(len(stopped), 'run')} kept the initial values, because they fit the image as "
+        "well as the optimized values."
     )
 
 
@@ -66,7 +66,7 @@ def sequence_hint(where: str, found: SequenceAssessment | None) -> str | None:
     """Reason why a sequence is doubtful or failed; None if it is good or was not assessed."""
     if found is None or found.verdict is Verdict.GOOD:
         return None
-    kept = " Its failed frames keep the measured values." if found.verdict is Verdict.FAILED else ""
+    kept = " Failed frames keep the measured values." if found.verdict is Verdict.FAILED else ""
     return f"{where}: the sequence is {found.verdict.value}.{kept} {found.reason} {found.remedy}"
 
 
@@ -74,7 +74,7 @@ def calibration_hint(found: Assessment | None, stopped: StopReason) -> str | Non
     """Verdict on a calibration; None if it was not assessed."""
     if found is None:
         return None
-    kept = " The calibration is kept as it was." if stopped in (StopReason.FAILED, StopReason.START_KEPT) else ""
+    kept = " The calibration was not changed." if stopped in (StopReason.FAILED, StopReason.START_KEPT) else ""
     return f"Verdict: {found.verdict.value}. {found.reason}{kept} {found.remedy}".rstrip()
 
 
@@ -86,8 +86,8 @@ def base_frame_hint(where: str, gains: Sequence[float | None]) -> str | None:
     if not known or np.mean(known) < BASE_FRAME_GAIN:
         return None
     return (
-        f"{where}: base frames or the camera's pose are probably wrong. Free base frames would reduce the remaining "
-        f"difference between image and rendering by {100 * np.mean(known):.0f} %, which joints cannot. Try "
+        f"{where}: base frames or the camera pose are probably wrong. Free base frames would reduce the remaining "
+        f"difference between image and rendering, which joints cannot reduce, by {100 * np.mean(known):.0f} %. Run "
         "`carts calibrate`, or add --base-frames."
     )
 
@@ -122,14 +122,15 @@ def constant_correction_hint(where: str, sequence: recording.Sequence, rows: Seq
     names, units = joint_columns(scene), np.where(prismatic, "mm", "deg")
     found = ", ".join(f"{names[joint]} {typical[joint]:+.1f} {units[joint]}" for joint in constant)
     return (
-        f"{where}: corrections are large and much the same in all frames: {found}. Joints make up alike for wrong "
-        "intrinsics, base frames and joint zeros, so check these before you rely on joint positions. Masks fit anyway."
+        f"{where}: corrections are large and nearly constant over the frames: {found}. Joints also compensate for "
+        "wrong intrinsics, base frames and joint zeros; check these before you rely on joint positions. Masks are "
+        "unaffected."
     )
 
 
 def score_table(scores: list[FrameScore], title: str) -> Table:
     """Table of means per domain and camera, as `carts evaluate` prints it."""
-    table = Table(title=title, caption="MAE, std: of measured revolute joints. s: wall time per frame.")
+    table = Table(title=title, caption="MAE, std: over the measured revolute joints. s: wall time per frame.")
     for column in (
         "domain",
         "camera",

@@ -37,9 +37,9 @@ class Robots:
             )
         console.print(table)
         console.print(
-            'Use: robot = "builtin:NAME". NAME is for the classic arm (shaft 416.2 mm), NAME_si for Si (467.0 mm). '
-            "dVRK: last digits of the model numbers, 400... and 420.... Wrist: from the pitch axis to the yaw axis; "
-            "tip: from there to its end. Instruments with 6 joints have no jaws.",
+            'Use: robot = "builtin:NAME". NAME: classic arm (shaft 416.2 mm). NAME_si: Si (467.0 mm). '
+            "dVRK: last digits of the model numbers 400... and 420.... Wrist: pitch axis to yaw axis; "
+            "tip: yaw axis to tip. Instruments with 6 joints have no jaws.",
             soft_wrap=True,
         )
         if self.pictures is not None:
@@ -52,7 +52,7 @@ class Robots:
         from ..model.robot import Robot
         from ..rendering.portrait import portrait
 
-        with locked_folder(folder), when_stopped(f"the pictures in {folder} are whole, some are missing"):
+        with locked_folder(folder), when_stopped(f"the pictures in {folder} are complete files; others are missing"):
             for name in track(names, "pictures", console=console):
                 write_bytes(folder / f"{name}.png", image_png(portrait(Robot.load(SCHEME + name))))
         console.print(f"wrote {folder}")
@@ -86,7 +86,7 @@ class RobotCommand:
             return
         output = self.output or Path(f"psm_{self.instrument}.urdf")
         if output.exists() and not self.overwrite:
-            raise RobotError(f"{output} exists. Add --overwrite to replace it, or name another file with -o.")
+            raise RobotError(f"{output} exists. Add --overwrite to replace it, or choose another file with -o.")
         with TemporaryDirectory() as folder:
             trial = Path(folder) / output.name
             write_text(trial, dvrk_urdf(self.model, self.instrument, trial.parent))

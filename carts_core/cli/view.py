@@ -62,7 +62,7 @@ class View:
             serve(self.sequence, project=self.project, folders=self.root, **options)
             return
         if self.project is not None:
-            raise SettingsError("--project is of a sequence, and none is named. Name its sequence file, too.")
+            raise SettingsError("--project requires a sequence. Give its sequence file, too.")
         batch = None if self.sequence is None else self.sequence.resolve()
         roots = self.root or (Path(), *([self.sequence] if self.sequence is not None else []))
         serve_site(roots, batch=batch, **options)

@@ -56,15 +56,15 @@ def mesh_parts(
     content = read_bytes(path, MESH)
     # A binary STL has a header of 84 bytes and 50 bytes per triangle.
     if kind == "stl" and len(content) > 84 + 50 * MOST_FACES and not content.startswith(b"solid"):
-        raise RobotError(f"mesh {path} has more than {MOST_FACES:,} triangles. Export a simpler one.")
+        raise RobotError(f"mesh {path} has more than {MOST_FACES:,} triangles. Export a simpler mesh.")
     loaded = trimesh.load_scene(io.BytesIO(content), file_type=kind, resolver=_BesideTheMesh(str(path)))
     if sum(len(getattr(part, "faces", ())) for part in loaded.geometry.values()) > MOST_FACES:
-        raise RobotError(f"mesh {path} has more than {MOST_FACES:,} triangles. Export a simpler one.")
+        raise RobotError(f"mesh {path} has more than {MOST_FACES:,} triangles. Export a simpler mesh.")
     if len(loaded.graph.nodes_geometry) > MOST_PARTS:
         raise RobotError(f"mesh {path} has more than {MOST_PARTS:,} parts. Export it as one mesh.")
     meshes = [part for part in loaded.dump() if isinstance(part, trimesh.Trimesh) and len(part.faces)]
     if sum(len(mesh.faces) for mesh in meshes) > MOST_FACES:
-        raise RobotError(f"mesh {path} has more than {MOST_FACES:,} triangles. Export a simpler one.")
+        raise RobotError(f"mesh {path} has more than {MOST_FACES:,} triangles. Export a simpler mesh.")
     return [(np.asarray(mesh.vertices), np.asarray(mesh.faces), mesh_color(mesh)) for mesh in meshes]
 
 

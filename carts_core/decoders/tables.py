@@ -83,16 +83,18 @@ def read_matlab(path: Path) -> dict[str, Any]:
 
     content = read_bytes(path, CALIBRATION)
     if content.startswith(b"MATLAB 7.3"):
-        raise ValueError("it is a MATLAB file of version 7.3; save it with save(FILE, NAME, '-v7')")
+        raise ValueError("it is a MATLAB 7.3 file; save it with save(FILE, NAME, '-v7')")
     try:
         variables = loadmat(io.BytesIO(content), simplify_cells=True)
     except MemoryError:
         raise
     except Exception as error:  # scipy's readers raise many kinds of errors
-        raise ValueError(f"it is no MATLAB file of version 5 ({error})") from error
+        raise ValueError(f"it is not a MATLAB 5 file ({error})") from error
     names = [_name_of_object(name, value) for name, value in variables.items()]
     if name := next(filter(None, names), ""):
-        raise ValueError(f"{name} is an object of MATLAB; save a struct of it: s = toStruct({name}); save(FILE, 's')")
+        raise ValueError(
+            f"{name} is a MATLAB object; convert it to a struct before saving: s = toStruct({name}); save(FILE, 's')"
+        )
     return {name: value for name, value in variables.items() if not name.startswith("__")}
 
 
@@ -113,4 +115,4 @@ def check_size(rows: int, columns: int = 1) -> None:
     limits = (rows * columns, MOST_CELLS, "values"), (rows, MOST_ROWS, "rows"), (columns, MOST_COLUMNS, "columns")
     for count, most, what in limits:
         if count > most:
-            raise ValueError(f"it has {count:,} {what}; at most {most:,} are read")
+            raise ValueError(f"it has {count:,} {what}; the limit is {most:,}")

@@ -118,8 +118,8 @@ def beyond_prior(before: Scene, result: CalibrationResult, known: Mapping[str, F
         angle, way = pose_distance(before.arm(arm).T_world_base, result.scene.arm(arm).T_world_base)
         turn, shift = (np.sqrt(np.trace(known[arm][part, part])) for part in (slice(3), slice(3, 6)))
         said.append(
-            f"the base frame of {arm} moves by {angle:.1f} deg and {way:.1f} mm, where its hand-eye calibration is "
-            f"known to {np.degrees(turn):.1f} deg and {1e3 * shift:.1f} mm"
+            f"the base frame of {arm} moves by {angle:.1f} deg and {way:.1f} mm, but its hand-eye calibration has "
+            f"standard deviations of {np.degrees(turn):.1f} deg and {1e3 * shift:.1f} mm"
         )
     return f"{'; '.join(said)}." if said else None
 
@@ -127,12 +127,12 @@ def beyond_prior(before: Scene, result: CalibrationResult, known: Mapping[str, F
 def remark(before: Scene, result: CalibrationResult) -> str | None:
     """Warning about the use of a calibration; None if only intrinsics changed."""
     if not any(unknown.change for unknown in result.unknowns):
-        return "The start was kept: no other calibration fits these frames better."
+        return "The initial calibration was kept: no other fits these frames better."
     if not moved_frames(before, result.scene):
         return None
     return (
-        "Images hardly distinguish a wrong base frame from a constant joint offset, and not at all for an arm at rest. "
-        "The new calibration fits these joint readings, and includes their offsets."
+        "Images hardly distinguish a wrong base frame from a constant joint offset; for an arm at rest, they cannot. "
+        "The new calibration therefore absorbs the offsets of these joint readings."
     )
 
 

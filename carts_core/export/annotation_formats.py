@@ -320,7 +320,7 @@ def write_yolo(dataset: Dataset, folder: OutputPath, monitor: Monitor) -> None:
                 lines.append(f"{category.id - 1} {numbers}\n")
         write_text(folder / "labels" / f"{stem}.txt", "".join(lines))
     names = json.dumps([category.name for category in dataset.categories], ensure_ascii=False)  # JSON is valid YAML
-    text = f"# Not split: both name all images.\ntrain: images\nval: images\nnames: {names}\n"
+    text = f"# Not split: both contain all images.\ntrain: images\nval: images\nnames: {names}\n"
     write_text(folder / "data.yaml", text)
 
 

@@ -72,7 +72,7 @@ def corrected_frames(sequence: Sequence, indices: Iterable[int], rows: Iterable[
         if row.frame_id not in known:
             raise SequenceError(
                 f"the kinematics are of frame {row.frame_id!r}, which {sequence.path} does not have. "
-                "Give the table that was made from this sequence."
+                "Give the table of this sequence."
             )
         if row.frame_id in by_id:
             raise SequenceError(f"the kinematics have frame {row.frame_id!r} twice. Remove one of the rows.")
@@ -229,7 +229,7 @@ class Dataset:
         known = {camera.name for camera in self.sequence.scene.cameras}
         if unknown := {camera for frame in self.frames for camera in frame.masks} - known:
             raise SettingsError(
-                f"there are masks for cameras {', '.join(sorted(unknown))}, which {self.sequence.path} does not have. "
+                f"masks were given for cameras {', '.join(sorted(unknown))}, which {self.sequence.path} does not have. "
                 f"Its cameras are: {', '.join(sorted(known))}."
             )
         if self.frame_rate is not None and not 0.1 <= self.frame_rate <= 1000.0:
@@ -429,8 +429,8 @@ def labelled(
         return np.full_like(rendered, -1)
     if (rendered < 0).all():
         raise CartsError(
-            f"{where}: the mask has {counted(int(mask.sum()), 'pixel')}, but no arm is in view there, so it is not "
-            "known whose they are. Correct the joint positions of this frame, clear its mask, or leave it out."
+            f"{where}: the mask has {counted(int(mask.sum()), 'pixel')}, but no arm is in view there, so its arm is "
+            "unknown. Correct the joint positions of this frame, clear its mask, or leave the frame out."
         )
     rows, columns = _nearest(rendered >= 0)
     return np.where(mask, rendered[rows, columns], -1)
@@ -459,10 +459,14 @@ def painted_links(
         CartsError: the labels of the view `where` have another size, or contain a class that no link has.
     """
     if painted.shape != link_ids.shape:
-        raise CartsError(f"{where}: painted classes are {painted.shape}, the camera's images are {link_ids.shape}.")
+        raise CartsError(
+            f"{where}: painted classes have shape {painted.shape}, but the camera's images have {link_ids.shape}."
+        )
     numbers = np.unique(painted[painted > 0])
     if unknown := set(numbers.tolist()) - set(classes.tolist()):
-        raise CartsError(f"{where}: a pixel was painted as class {min(unknown)}, which no link of the scene has.")
+        raise CartsError(
+            f"{where}: a pixel has the painted class {min(unknown)}, but no link of the scene has this class."
+        )
     found = link_ids.copy()
     for number in numbers:
         own = np.isin(rendered, np.flatnonzero(classes == number))

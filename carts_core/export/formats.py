@@ -108,8 +108,8 @@ def _write_base_frames(
     camera = dataset.scene.cameras[0]
     if camera.name in dataset.sequence.moving_cameras:
         raise CartsError(
-            f"camera {camera.name!r} moves, and a base frame of the dVRK holds for one place of it. Export the base "
-            "frames of a recording in which the endoscope stands still."
+            f"camera {camera.name!r} moves, but a dVRK base frame is valid for one camera pose only. Export the base "
+            "frames of a recording with a stationary endoscope."
         )
     arms = [
         {"name": arm.name, **entry(camera.name, (T_DVRK_OPENCV @ camera.T_camera_world @ arm.T_world_base).tolist())}

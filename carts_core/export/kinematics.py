@@ -106,7 +106,7 @@ def _read(path: Path, scene: Scene) -> list[KinematicsRow]:
         with_std = numbers == _header(scene, True)
         if not with_std and numbers != _header(scene, False):
             found, wanted = ", ".join(header), ", ".join(_header(scene, False))
-            raise SequenceError(f"{path} has columns {shortened(found, 1000)}; expected are {wanted}. Remove it.")
+            raise SequenceError(f"{path} has columns {shortened(found, 1000)}; expected: {wanted}. Remove the file.")
         rows = []
         for line, cells in enumerate(table, start=2):
             try:
@@ -114,7 +114,7 @@ def _read(path: Path, scene: Scene) -> list[KinematicsRow]:
             except ValueError:
                 values = np.empty(0)
             if len(cells) != len(header) or len(values) != len(numbers) - 2:
-                raise SequenceError(f"{path}, line {line}: not {len(numbers) - 2} numbers. Remove the line.")
+                raise SequenceError(f"{path}, line {line}: expected {len(numbers) - 2} numbers. Remove the line.")
             if not np.isfinite(values[: len(joint_columns(scene))]).all():
                 raise SequenceError(f"{path}, line {line}: a joint position is not finite. Remove the line.")
             positions, std = np.split(values, [len(joint_columns(scene))])

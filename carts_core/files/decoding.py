@@ -156,7 +156,7 @@ class Decoder:
             self.close()
             raise
         if reply is None:
-            raise ValueError("its decoder cannot be started")
+            raise ValueError("its decoder process cannot be started")
         kind, *values = reply
         if kind == "result":
             return values[0]
@@ -198,7 +198,7 @@ class Decoder:
             raise DecodingLimitError(f"decoding it takes longer than {limits.seconds:.0f} s")
         if -status in (signal.SIGKILL, signal.SIGABRT):
             raise _needs_memory(limits)
-        raise ValueError(f"its decoder ended with status {status}: it is damaged, or made to do harm")
+        raise ValueError(f"its decoder process ended with status {status}; the file is damaged or malicious")
 
     def start(self) -> None:
         """Start the child unless it is running."""

@@ -40,9 +40,9 @@ def name_fault(text: str, most_bytes: int = NAME_BYTES) -> str | None:
     if not text:
         return "which is empty"
     if text.startswith("."):
-        return "which begins with a dot"
+        return "which starts with a dot"
     if found := _REFUSED.search(text):
-        what = f"{found[0]!r}, as if it were a path" if found[0] in "/\\" else f"the control character {found[0]!r}"
+        what = f"the path separator {found[0]!r}" if found[0] in "/\\" else f"the control character {found[0]!r}"
         return f"which contains {what}"
     if (length := len(text.encode())) > most_bytes:
         return f"which is {length} bytes long"
@@ -52,8 +52,8 @@ def name_fault(text: str, most_bytes: int = NAME_BYTES) -> str | None:
 def allowed_names(most_bytes: int = NAME_BYTES) -> str:
     """Description of the names allowed by `name_fault`, for error messages."""
     return (
-        f"A name is part of file names, so it has 1 to {most_bytes} bytes, no / or \\, no control characters, and no "
-        "dot at its beginning. Rename it"
+        f"Names are used in file names: 1 to {most_bytes} bytes, without / or \\, control characters, or a leading "
+        "dot. Rename it"
     )
 
 
@@ -161,7 +161,7 @@ def explained(path: object) -> Iterator[None]:
     except OSError as error:
         raise OutputError(
             f"{path} cannot be written ({error.strerror or error}). "
-            "Nothing was changed there. Make room, or name a folder you may write to."
+            "Nothing was changed there. Free disk space, or choose a writable folder."
         ) from error
 
 
@@ -223,8 +223,8 @@ def _step(folder: int, name: str, path: Path, make: bool) -> int:
             raise
         found = status(folder, name)
         raise OutputError(
-            f"{path} is {kind_of(found) if found else 'gone'}, where a folder is needed; what is written is never led "
-            "elsewhere by a link. Nothing was changed there. Remove it, or name another output."
+            f"{path} is {kind_of(found) if found else 'missing'}, but must be a folder; links are never followed when "
+            "writing. Nothing was changed there. Remove it, or choose another output."
         ) from error
 
 

@@ -127,9 +127,9 @@ def size_problem(content: bytes) -> str | None:
     if size is None:
         return "cannot be decoded; it must be a JPEG, PNG, TIFF, BMP, WebP or PPM image"
     if size == _FAR_TOO_LARGE:
-        return f"is far too large; at most {LARGEST_IMAGE // 10**6} million pixels are read"
+        return f"is too large; the limit is {LARGEST_IMAGE // 10**6} million pixels"
     if content.startswith(PNG) and content[24:25] == b"\x10" and 2 * size[0] * size[1] > LARGEST_IMAGE:
-        return f"is {size[0]} x {size[1]} pixels of 16 bits; at most {LARGEST_IMAGE // 2 // 10**6} million are read"
+        return f"is {size[0]} x {size[1]} pixels of 16 bits; the limit is {LARGEST_IMAGE // 2 // 10**6} million pixels"
     return pixels_problem(*size)
 
 
@@ -138,7 +138,7 @@ def pixels_problem(width: int, height: int) -> str | None:
     if width < 1 or height < 1:
         return f"is {width} x {height} pixels"
     if width * height > LARGEST_IMAGE:
-        return f"is {width} x {height} pixels; at most {LARGEST_IMAGE // 10**6} million pixels are read"
+        return f"is {width} x {height} pixels; the limit is {LARGEST_IMAGE // 10**6} million pixels"
     return None
 
 
@@ -226,7 +226,7 @@ _POINTER = b"version https://git-lfs"
 """First bytes of a Git LFS pointer, the placeholder of a file that was not fetched."""
 _LARGEST_POINTER = 1024
 """Largest size of a pointer [bytes]."""
-_POINTER_TEXT = "it is a Git LFS pointer, and its content was not fetched; run `git lfs pull` in its repository"
+_POINTER_TEXT = "it is a Git LFS pointer without its content; run `git lfs pull` in its repository"
 BAG = Kind("ROS bag", 1024 * GIB)
 VIDEO = Kind("video", 1024 * GIB)
 CACHED = Kind("cached mesh", 256 * MIB)
@@ -261,13 +261,13 @@ def open_regular(path: Path, kind: Kind) -> BufferedReader:
     try:
         descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC | os.O_NOCTTY)
     except ValueError as error:  # The name contains a null character.
-        raise RefusedFileError(f"no file can have this name ({error})") from error
+        raise RefusedFileError(f"this is not a valid file name ({error})") from error
     try:
         status = os.fstat(descriptor)
         if stat.S_ISDIR(status.st_mode):
             raise IsADirectoryError(f"{path} is a folder")
         if not stat.S_ISREG(status.st_mode):
-            raise RefusedFileError("it is no regular file but a pipe, socket or device; only files are read")
+            raise RefusedFileError("it is a pipe, socket or device, not a regular file")
         if status.st_size > kind.limit:
             raise _too_large(kind, f"has {status.st_size / MIB:.0f} MiB")
         if status.st_size <= _LARGEST_POINTER and os.pread(descriptor, len(_POINTER), 0) == _POINTER:
@@ -309,7 +309,7 @@ def parse_toml(text: str) -> dict[str, Any]:
     """Parse TOML to dictionaries and lists; `ValueError` if it is invalid or exceeds the limits of this module."""
     # The parser's time and memory grow quadratically with the parts of a key, so long keys are refused first.
     if _LONG_KEY.search(text):
-        raise ValueError(f"a key has more than {LARGEST_DEPTH} parts")
+        raise ValueError(f"a dotted key has more than {LARGEST_DEPTH} parts")
     try:
         values = tomllib.loads(text)
     except RecursionError as error:
@@ -330,7 +330,7 @@ def parse_json(text: str | bytes, *, finite: bool = True) -> Any:
     """
     parts = text.count("[") + text.count("{") if isinstance(text, str) else text.count(b"[") + text.count(b"{")
     if parts > MOST_JSON_PARTS:
-        raise ValueError(f"it has more than {MOST_JSON_PARTS:,} lists and objects")
+        raise ValueError(f"it has more than {MOST_JSON_PARTS:,} arrays and objects")
     try:
         with uncollected():
             values = json.loads(text)
@@ -358,11 +358,11 @@ def parse_yaml(text: str) -> Any:
         for count, event in enumerate(yaml.parse(text, Loader=parser)):
             depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
             if isinstance(event, yaml.DocumentStartEvent) and event.tags:
-                raise ValueError("it has %TAG directives, which are not read")
+                raise ValueError("it has %TAG directives, which are not supported")
             if isinstance(event, yaml.AliasEvent):
-                raise ValueError(f"it has the alias *{event.anchor}, and aliases are not read; write the value out")
+                raise ValueError(f"it has the alias *{event.anchor}; aliases are not supported, so write the value out")
             if depth > LARGEST_DEPTH:
-                raise ValueError(f"it is nested more than {LARGEST_DEPTH} levels deep")
+                raise ValueError(f"it is nested more than {LARGEST_DEPTH} deep")
             if count > MOST_YAML_EVENTS:
                 raise ValueError(f"it has more than {MOST_YAML_EVENTS:,} values")
         values = yaml.load(text, Loader=_plain_yaml(parser))
@@ -404,7 +404,7 @@ def parse_xml(text: str) -> ElementTree.Element:
     try:
         return ElementTree.fromstring(text)
     except ElementTree.ParseError as error:
-        raise ValueError(f"it is no XML ({error})") from error
+        raise ValueError(f"it is not XML ({error})") from error
 
 
 def parse_ini(text: str) -> configparser.ConfigParser:
@@ -472,9 +472,9 @@ def _check_values(root: Any) -> None:
             elif isinstance(value, list):
                 deeper += value
             elif isinstance(value, int) and abs(value) > LARGEST_WHOLE_NUMBER:
-                raise ValueError("a whole number has more than 64 bits")
+                raise ValueError("an integer has more than 64 bits")
             elif isinstance(value, str) and not value.isascii() and _SURROGATE.search(value):
-                raise ValueError("a text has half of a surrogate pair, which is no character")
+                raise ValueError("a string has an unpaired surrogate")
         if not deeper:
             return
         level = deeper
@@ -482,4 +482,4 @@ def _check_values(root: Any) -> None:
 
 
 def _too_large(kind: Kind, what: str) -> RefusedFileError:
-    return RefusedFileError(f"it {what}; a {kind.name} may have {kind.limit // MIB} MiB at most")
+    return RefusedFileError(f"it {what}; the limit for a {kind.name} is {kind.limit // MIB} MiB")

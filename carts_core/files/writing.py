@@ -115,7 +115,7 @@ def output_stream(path: OutputPath | Path) -> Iterator[BinaryIO]:
             return
         found = status(folder, output.name)
         if found is not None and not (stat.S_ISREG(found.st_mode) or stat.S_ISLNK(found.st_mode)):
-            text = f"{output} is {kind_of(found)}, where a file is to be. Remove it, or name another output."
+            text = f"{output} is {kind_of(found)}, but must be a file. Remove it, or choose another output."
             raise OutputError(text)
         descriptor, temporary = _new_file(folder)
         try:
@@ -205,8 +205,8 @@ def check_own(folder: int, output: OutputPath) -> None:
     found = status(folder, output.name)
     if found is None or (stat.S_ISREG(found.st_mode) and found.st_nlink == 1):
         return
-    what = "a file with a second name (a hard link)" if stat.S_ISREG(found.st_mode) else kind_of(found)
-    raise OutputError(f"{output} is {what}, which is not written into. Remove it, or name another output.")
+    what = "a file with a second hard link" if stat.S_ISREG(found.st_mode) else kind_of(found)
+    raise OutputError(f"{output} is {what}, which is never overwritten. Remove it, or choose another output.")
 
 
 def _new_file(folder: int) -> tuple[int, str | None]:
@@ -254,7 +254,7 @@ def locked_folder(path: OutputPath | Path, *, wait: bool = False) -> Iterator[No
     with explained(output), opened_folder(output, make=True) as folder:
         while not try_lock(folder):
             if not wait:
-                text = f"another process is writing to {output}. Wait until it has ended, or name another output."
+                text = f"another process is writing to {output}. Wait until it has finished, or choose another output."
                 raise BusyError(text)
             time.sleep(_PAUSE)
         yield
@@ -362,7 +362,7 @@ def leftovers(parent: int, output: str, besides: Staging) -> Iterator[Staging]:
         elif mark.output == output:
             if not try_lock(descriptor):
                 os.close(descriptor)
-                raise BusyError(f"another export to {output} is running. Wait for it, or name another output.")
+                raise BusyError(f"another export to {output} is running. Wait for it, or choose another output.")
             yield Staging(parent, name, descriptor, mark)
             continue
         os.close(descriptor)
@@ -471,13 +471,12 @@ def _check_free(folder: int, output: OutputPath, overwrite: bool) -> None:
             marker = status(inside, MARKER)
         if marker is None or not stat.S_ISREG(marker.st_mode):
             raise OutputError(
-                f"{output} is a folder with other files ({MARKER} is not among them), and these are never replaced. "
-                "Name a new folder."
+                f"{output} is a folder without {MARKER}, and other folders are never replaced. Choose a new folder."
             )
     elif not stat.S_ISREG(found.st_mode):
-        raise OutputError(f"{output} is {kind_of(found)}, which is never replaced. Name another output.")
+        raise OutputError(f"{output} is {kind_of(found)}, which is never replaced. Choose another output.")
     if not overwrite:
-        raise OutputError(f"{output} exists. Add --overwrite to replace it, or name another output.")
+        raise OutputError(f"{output} exists. Add --overwrite to replace it, or choose another output.")
 
 
 def _entries(folder: int, name: str) -> list[str]:

@@ -95,7 +95,7 @@ def stacked_images(
     resized = []
     for camera in scene.cameras:
         if camera.name not in images:
-            raise SettingsError(f"no {what} of camera {camera.name!r} was given; given are: {', '.join(images)}.")
+            raise SettingsError(f"the {what} of camera {camera.name!r} is missing; given: {', '.join(images)}.")
         image = images[camera.name]
         _check_shape(image, (camera.height, camera.width, 3), f"{what} of camera {camera.name!r}")
         resized.append(cv2.resize(image, size, interpolation=cv2.INTER_AREA))

@@ -64,7 +64,8 @@ class LiveStatistics:
         seconds = max((self.ended or time.monotonic()) - self.began, 1e-9)
         verdicts = ", ".join(f"{count} {verdict}" for verdict, count in self.verdicts.items())
         text = (
-            f"{self.tracked} of {self.arrived} frames ({self.dropped} dropped), {self.tracked / seconds:.1f} a second: "
+            f"{self.tracked} of {self.arrived} frames ({self.dropped} dropped), {self.tracked / seconds:.1f} per "
+            "second: "
         )
         if not self.ages:
             return text + verdicts

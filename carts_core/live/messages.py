@@ -102,14 +102,14 @@ def receive(connection: socket.socket) -> FrameMessage | None:
         return None
     (length,) = _LENGTH.unpack(header)
     if length > LARGEST:
-        raise StreamError(f"a message of {length} bytes was announced; {LARGEST} are allowed. Send smaller images.")
+        raise StreamError(f"a message has {length} bytes; the limit is {LARGEST}. Send smaller images.")
     content = _exactly(connection, length)
     if content is None:
-        raise StreamError("the connection ended within a message.")
+        raise StreamError("the connection was closed within a message.")
     try:
         return _decoder.decode(content)
     except (msgspec.MsgspecError, ValueError, RecursionError) as error:  # ValueError: not UTF-8
-        raise StreamError(f"a message cannot be read: {error}. docs/reference/live.md describes them.") from error
+        raise StreamError(f"a message cannot be read: {error}. docs/reference/live.md describes the format.") from error
 
 
 def _exactly(connection: socket.socket, count: int) -> bytes | None:
@@ -133,7 +133,8 @@ def decoded(camera: str, image: ImageMessage) -> UInt8[np.ndarray, "height width
     if image.encoding == "rgb8":
         if image.width < 1 or image.height < 1 or len(image.data) != 3 * image.width * image.height:
             raise StreamError(
-                f"image of {camera}: {len(image.data)} bytes are not {image.width} x {image.height} pixels of rgb8."
+                f"image of {camera}: {len(image.data)} bytes do not match {image.width} x {image.height} pixels of "
+                "rgb8."
             )
         return np.frombuffer(image.data, np.uint8).reshape(image.height, image.width, 3)
     from ..recording.images import decode_image  # noqa: PLC0415 - clients send, and never decode
@@ -212,7 +213,7 @@ class Assembler:
                 time.
         """
         if not math.isfinite(message.time):
-            raise StreamError(f"a message has the time {message.time}; give seconds.")
+            raise StreamError(f"a message has the time {message.time}. Give a finite time in seconds.")
         with self._changing:
             self._take_joints(message)
             self._take_poses(message)
@@ -241,7 +242,7 @@ class Assembler:
                 largest = PLAUSIBLE[robot.joint_types[names.index(joint)]] if joint in names else -1.0
                 if not abs(value) <= largest:
                     raise StreamError(
-                        f"{name}: joint {joint!r} at {value}; its joints are {', '.join(names)}, in rad or m, at most "
+                        f"{name}: joint {joint!r} is {value}; its joints are {', '.join(names)}, in rad or m, at most "
                         f"{PLAUSIBLE['revolute']:.3g} rad and {PLAUSIBLE['prismatic']:.3g} m."
                     )
                 self._joints[name][names.index(joint)] = value
@@ -259,7 +260,9 @@ class Assembler:
 
     def _image(self, name: str, message: FrameMessage) -> np.ndarray:
         if name not in message.images:
-            raise StreamError(f"a frame has no image of camera {name!r}. Send one of each: {', '.join(self._cameras)}.")
+            raise StreamError(
+                f"a frame has no image of camera {name!r}. Send one per camera: {', '.join(self._cameras)}."
+            )
         return self.undistorted(name, decoded(name, message.images[name]))
 
     def undistorted(self, name: str, image: np.ndarray) -> np.ndarray:

@@ -28,17 +28,17 @@ from .tracker import LiveVerdict
 
 _WAITING = 32
 """Largest number of frames waiting for the disk; further ones are not recorded."""
-_AGAIN = "Fit the frame again, which takes longer than was left live."
+_AGAIN = "Fit the frame again; live tracking had too little time."
 _VERDICTS = {
     LiveVerdict.GOOD: FitVerdict("good", "Fitted live."),
     LiveVerdict.DOUBTFUL: FitVerdict(
         "doubtful",
-        "The image did not fit during live tracking, so joints are predicted from the frames before.",
+        "The fit failed during live tracking; joints are predicted from earlier frames.",
         _AGAIN,
         0.5,
     ),
     LiveVerdict.LOST: FitVerdict(
-        "failed", "The arms were lost during live tracking, so joints are as measured.", _AGAIN, 1.0
+        "failed", "The arms were lost during live tracking; joints are as measured.", _AGAIN, 1.0
     ),
 }
 """Recorded verdicts; the probabilities are not calibrated, and serve only to sort the worst frames first."""
@@ -67,7 +67,7 @@ class Recorder:
 
     def __init__(self, sequence: Sequence, cameras: tuple[str, ...], folder: Path, provenance: Provenance) -> None:
         if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-            raise OutputError(f"--record {folder} is there already. Name a new folder.")
+            raise OutputError(f"--record {folder} exists. Choose a new folder.")
         self._scene, self._provenance, self._folder = sequence.scene.with_cameras(cameras), provenance, folder
         self._output = output_path(folder)
         self._sequence = sequence

@@ -73,7 +73,9 @@ class StreamServer:
         try:
             self._listener = socket.create_server((HOST, port))
         except OSError as error:
-            raise SettingsError(f"port {port} of {HOST} cannot be used: {error}. Give another, or 0.") from error
+            raise SettingsError(
+                f"port {port} of {HOST} cannot be used: {error}. Choose another, or 0 for a free one."
+            ) from error
         self.port: int = self._listener.getsockname()[1]
         threading.Thread(target=self._accept, name="carts-live-accept", daemon=True).start()
 
@@ -112,7 +114,7 @@ class StreamServer:
                 if not full:
                     self._clients[connection] = client
             if full:
-                text = f"{_CLIENTS} clients are connected. Close one, or try again."
+                text = f"{_CLIENTS} clients are connected, which is the limit. Close one and try again."
                 with connection, suppress(OSError):
                     connection.sendall(packed(ErrorMessage(text)))
                 continue
@@ -213,7 +215,7 @@ class Replay(_Closable):
         if rate is not None:
             self._times = np.arange(count) / rate
         elif sequence.timestamps is None:
-            raise SettingsError(f"{sequence.name} has no times. Give its images per second (--rate).")
+            raise SettingsError(f"{sequence.name} has no times. Give its frame rate (--rate).")
         else:
             self._times = sequence.timestamps - sequence.timestamps[0]
         last_gap = self._times[-1] - self._times[-2] if count > 1 else 1.0
@@ -252,7 +254,7 @@ class Camera(_Closable):
         self._capture = cv2.VideoCapture(device)
         if not self._capture.isOpened():
             raise SettingsError(
-                f"OpenCV cannot open {device!r} as a camera or video. Give a device's number or a file."
+                f"OpenCV cannot open {device!r} as a camera or video. Give a device number or a video file."
             )
         # A device sets its own rate; a file is throttled to its frame rate.
         rate = self._capture.get(cv2.CAP_PROP_FPS) if isinstance(device, str) else 0.0
@@ -294,7 +296,7 @@ class Folder(_Closable):
     def __init__(self, assembler: Assembler, cameras: tuple[str, ...], folder: Path) -> None:
         super().__init__()
         if not folder.is_dir():
-            raise SettingsError(f"{folder} is no folder. Name the one that images are written to.")
+            raise SettingsError(f"{folder} is not a folder. Give the folder to which images are written.")
         self._assembler, self._cameras, self._folder = assembler, cameras, folder
         self._left_out = 0
 
@@ -317,15 +319,17 @@ class Folder(_Closable):
     def _leave_out(self, error: StreamError) -> None:
         self._left_out += 1
         if self._left_out <= _NAMED:
-            further = " Further ones are not named." if self._left_out == _NAMED else ""
-            _log.warning("A frame is left out: %s%s", error, further)
+            further = " Further frames are not reported." if self._left_out == _NAMED else ""
+            _log.warning("A frame is skipped: %s%s", error, further)
 
     def _message(self, name: str) -> FrameMessage:
         path = self._folder / f"{name}.json"
         try:
             message = msgspec.json.decode(read_bytes(path, VALUES), type=FrameMessage)
         except (OSError, msgspec.MsgspecError, RecursionError) as error:
-            raise StreamError(f"{path} cannot be read: {error}. docs/reference/live.md describes it.") from error
+            raise StreamError(
+                f"{path} cannot be read: {error}. docs/reference/live.md describes the format."
+            ) from error
         images = {camera: self._image(name, camera) for camera in self._cameras}
         return msgspec.structs.replace(message, images=images, id=message.id or name)
 
@@ -334,7 +338,7 @@ class Folder(_Closable):
         found = [path for stem in stems for suffix in _SUFFIXES if (path := self._folder / f"{stem}{suffix}").exists()]
         if not found:
             images = " or ".join(f"{stem}.png" for stem in stems)
-            raise StreamError(f"{self._folder} has {name}.json and no image {images}. Write the JSON file last.")
+            raise StreamError(f"{self._folder} has {name}.json but no image {images}. Write the JSON file last.")
         try:
             image = read_image(found[0])
         except SequenceError as error:

@@ -58,16 +58,16 @@ def rigid_transform(value: ArrayLike, what: str) -> Float[np.ndarray, "4 4"]:
         deviation = np.abs(rotation.T @ rotation - np.eye(3)).max()
     if not deviation <= RIGID_TOLERANCE:
         raise SettingsError(
-            f"{what} is not rigid: R^T R is off the identity by {deviation:.2g}, allowed is {RIGID_TOLERANCE:g}. "
-            "Its upper left 3x3 block must be a rotation, written with at least 5 digits and without scale."
+            f"{what} is not rigid: R^T R deviates from the identity by {deviation:.2g} (limit {RIGID_TOLERANCE:g}). "
+            "Its upper left 3x3 block must be a rotation without scale, given with at least 5 digits."
         )
     if np.linalg.det(rotation) < 0:
         raise SettingsError(
-            f"{what} mirrors: the determinant of its rotation is -1, it must be +1. "
-            "Check the axes; the camera has x right, y down, z forward."
+            f"{what} is a reflection: the determinant of its rotation is -1, but must be +1. "
+            "Check the axes: camera x right, y down, z forward."
         )
     if np.abs(matrix[3] - (0, 0, 0, 1)).max() > LAST_ROW_TOLERANCE:
-        raise SettingsError(f"the last row of {what} is {matrix[3].tolist()}, it must be [0, 0, 0, 1].")
+        raise SettingsError(f"the last row of {what} is {matrix[3].tolist()}, but must be [0, 0, 0, 1].")
     if np.abs(matrix[:3, 3]).max() > FARTHEST:
         raise SettingsError(f"the translation of {what} is {matrix[:3, 3].tolist()}. Give it in metres.")
     matrix[3] = (0, 0, 0, 1)
@@ -93,18 +93,20 @@ def implausible_intrinsics(
         return f"focal lengths of {fx:g} and {fy:g} px, which must be positive"
     low, high = (share * max(width, height) for share in FOCAL_RANGE)
     if not (low <= fx <= high and low <= fy <= high):
-        unit = "; it may be in millimetres, which are divided by the size of a pixel" if max(fx, fy) < low else ""
-        return f"focal lengths of {fx:g} and {fy:g} px for {size}; usual are {low:.0f} to {high:.0f}{unit}"
+        unit = "; if they are in millimetres, divide them by the pixel size" if max(fx, fy) < low else ""
+        return f"focal lengths of {fx:g} and {fy:g} px for {size}; the usual range is {low:.0f} to {high:.0f}{unit}"
     if not SQUARE_RANGE[0] <= fx / fy <= SQUARE_RANGE[1]:
         return (
-            f"focal lengths of {fx:g} and {fy:g} px, which differ by {abs(fx / fy - 1):.0%}; pixels would be no squares"
+            f"focal lengths of {fx:g} and {fy:g} px, which differ by {abs(fx / fy - 1):.0%}; pixels would not be square"
         )
     for what, value, side in (("cx", cx, width), ("cy", cy, height)):
         if not CENTRE_RANGE[0] * side <= value <= CENTRE_RANGE[1] * side:
             place = "outside of" if not 0 <= value <= side else "near the edge of"
             return f"the principal point {cx:g}, {cy:g} px, {place} {size} ({what})"
     if distortion and _folds(width, height, intrinsics, distortion):
-        return f"distortion {list(distortion)} that maps two places of {size} onto one; the model may be another one"
+        return (
+            f"distortion {list(distortion)} that maps two positions in {size} to one; the distortion model may be wrong"
+        )
     return None
 
 
@@ -146,7 +148,7 @@ class Camera:
         if self.width < 1 or self.height < 1:
             raise SettingsError(f"the image size is {self.width} x {self.height}. Both must be at least 1 pixel.")
         if (problem := pixels_problem(self.width, self.height)) is not None:
-            raise SettingsError(f"the image {problem}. Reduce the images.")
+            raise SettingsError(f"the image {problem}. Use smaller images.")
         if len(self.intrinsics) != 4 or not np.isfinite(self.intrinsics).all():
             raise SettingsError(f"the intrinsics are {self.intrinsics}. Give four finite numbers fx, fy, cx, cy [px].")
         if min(self.intrinsics[:2]) <= 0:
@@ -181,7 +183,7 @@ class Camera:
         if image.shape[:2] != (self.height, self.width):
             raise SettingsError(
                 f"camera {self.name!r} is {self.width} x {self.height} but the image is "
-                f"{image.shape[1]} x {image.shape[0]}. Undistortion needs images of the camera's own size."
+                f"{image.shape[1]} x {image.shape[0]}. Undistortion requires images of the camera's size."
             )
         if not any(self.distortion):
             return image

@@ -53,7 +53,7 @@ def list_instruments(model: Path) -> dict[str, Instrument]:
     table = model / _TABLE
     if not table.is_file():
         raise RobotError(
-            f"{model} is not a checkout of dvrk_model: {_TABLE} is missing in it. Give the folder that holds "
+            f"{model} is not a checkout of dvrk_model: {_TABLE} is missing. Give the folder that contains "
             "`urdf` and `meshes` (https://github.com/jhu-dvrk/dvrk_model)."
         )
     try:
@@ -69,7 +69,9 @@ def list_instruments(model: Path) -> dict[str, Instrument]:
             for number, entry in entries.items()
         }
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        raise RobotError(f"{table} is not a table of instruments ({error!r}). Check out dvrk_model again.") from error
+        raise RobotError(
+            f"{table} is not a table of instruments ({error!r}). Repeat the checkout of dvrk_model."
+        ) from error
 
 
 def choose_instrument(model: Path, number: str) -> Instrument:
@@ -81,15 +83,15 @@ def choose_instrument(model: Path, number: str) -> Instrument:
     instruments = list_instruments(model)
     if number not in instruments:
         raise RobotError(
-            f"instrument {number!r} is not in {model / _TABLE}. It names: {', '.join(sorted(instruments))}. "
-            "Numbers have six digits: 400... for the classic arm, 420... for Si."
+            f"instrument {number!r} is not in {model / _TABLE}. It contains: {', '.join(sorted(instruments))}. "
+            "Numbers have six digits and begin with 400 (classic arm) or 420 (Si)."
         )
     chosen = instruments[number]
     if not chosen.has_tip:
         others = ", ".join(f"{key} ({other.name})" for key, other in instruments.items() if other.has_tip)
         raise RobotError(
-            f"instrument {number} ({chosen.name}) has no shape in {model}: its tip is drawn as boxes of 5 mm, which no "
-            f"image shows. With a shape are: {others}."
+            f"instrument {number} ({chosen.name}) has no tip meshes in {model}, only boxes of 5 mm, which match no "
+            f"image. Instruments with meshes: {others}."
         )
     return chosen
 
@@ -128,7 +130,7 @@ def _expanded(model: Path, chosen: Instrument) -> str:
         return decoded(expanded, arm, {PACKAGE: str(model.resolve())}, options)
     except (OSError, ValueError, RobotError) as error:
         raise RobotError(
-            f"{arm} cannot be expanded for instrument {chosen.number} ({error}). Check out dvrk_model again, whole."
+            f"{arm} cannot be expanded for instrument {chosen.number} ({error}). Repeat the checkout of dvrk_model."
         ) from error
 
 
@@ -137,7 +139,7 @@ def _keep_what_is_seen(root: ElementTree.Element) -> None:
     joints = {_link(joint, "child"): joint for joint in root.findall("joint")}
     if _FIRST_SEEN not in joints:
         raise RobotError(
-            f"the model has no link {_FIRST_SEEN!r}, which the instrument begins with. Use dvrk_model 2.5."
+            f"the model has no link {_FIRST_SEEN!r}, the first link of the instrument. Use dvrk_model 2.5."
         )
     for link in root.findall("link"):
         name = link.get("name", "")
@@ -177,11 +179,11 @@ def _relocate_meshes(root: ElementTree.Element, model: Path, folder: Path) -> No
         mesh.set("filename", Path(os.path.relpath(path, folder.resolve())).as_posix())
     if pointers:
         raise RobotError(
-            f"{counted(len(pointers), 'file')} in {model} hold Git LFS pointers and no meshes: {', '.join(pointers)}. "
+            f"{counted(len(pointers), 'file')} in {model} are Git LFS pointers without meshes: {', '.join(pointers)}. "
             f"Fetch them: git -C {model} lfs pull."
         )
     if missing:
-        raise RobotError(f"{model} lacks meshes of this instrument: {', '.join(missing)}. Check it out again, whole.")
+        raise RobotError(f"{model} lacks meshes of this instrument: {', '.join(missing)}. Repeat the checkout.")
 
 
 def _is_pointer(path: Path) -> bool:

@@ -169,21 +169,21 @@ def landmarks(arm: Arm) -> Mapping[str, Landmark]:
     found: dict[str, Landmark] = {}
     if tips:
         middle = tuple((point.link, point.position) for point in tips)
-        hint = "The end of the instrument; between the two tips where the jaws are open."
+        hint = "The end of the instrument; with open jaws, the midpoint between their tips."
         found[TIP] = Landmark(TIP, LandmarkKind.POINT, hint, middle)
     for place, point in enumerate(joints):
         hint = "The centre of this joint."
         if place == 0:
-            hint = "The centre of the joint about which the jaws turn."
+            hint = "The centre of the joint about which the jaws rotate."
         elif point is joints[-1]:
             hint = "The centre of the joint at which the shaft ends."
         found[point.name] = Landmark(point.name, LandmarkKind.POINT, hint, ((point.link, point.position),))
     if (shaft := _shaft(arm)) is not None:
         link, start, end, radius = shaft
         line = ((link, start), (link, end))
-        hint = "Any place on the outline of the shaft, on either side."
+        hint = "Any point on either outline of the shaft."
         found[SHAFT_EDGE] = Landmark(SHAFT_EDGE, LandmarkKind.EDGE, hint, line, radius)
-        hint = "Any place in the middle between the two outlines of the shaft."
+        hint = "Any point midway between the two outlines of the shaft."
         found[SHAFT_MIDDLE] = Landmark(SHAFT_MIDDLE, LandmarkKind.AXIS, hint, line)
     return found
 

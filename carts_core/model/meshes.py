@@ -74,12 +74,12 @@ def read_mesh(path: Path, scale: np.ndarray, named: str) -> list[tuple[trimesh.T
         RobotError: the file is missing or cannot be read, it has no or too many triangles, or coordinates are not
             finite or too large.
     """
-    allowed = f"Allowed are {', '.join(FORMATS).upper()} files."
+    allowed = f"Allowed: {', '.join(FORMATS).upper()} files."
     if not is_regular(path):
-        raise RobotError(f"mesh {path} is missing; {named}. Put the file there, or correct the path in the URDF.")
+        raise RobotError(f"mesh {path} is missing; {named}. Add the file, or correct the path in the URDF.")
     kind = path.suffix.lower().removeprefix(".")
     if kind not in FORMATS:
-        raise RobotError(f"mesh {path} is of an unknown kind, {shown(path.suffix)}. {allowed}")
+        raise RobotError(f"mesh {path} has an unknown format, {shown(path.suffix)}. {allowed}")
     limits = Limits.of(path.parent if kind == "gltf" else path)  # glTF stores its arrays in a separate file.
     try:
         parts = called(mesh_parts, path, kind, limits=limits)
@@ -89,7 +89,7 @@ def read_mesh(path: Path, scale: np.ndarray, named: str) -> list[tuple[trimesh.T
         raise RobotError(f"mesh {path} cannot be read ({error}). {allowed}") from error
     scale = scale * collada_asset(path)[0]
     if not parts:
-        raise RobotError(f"mesh {path} holds no triangles. Export it again as a triangle mesh.")
+        raise RobotError(f"mesh {path} has no triangles. Export it again as a triangle mesh.")
     meshes = []
     for vertices, faces, color in parts:
         mesh = trimesh.Trimesh(vertices, faces, process=False)
@@ -112,13 +112,14 @@ def check_mesh(mesh: trimesh.Trimesh, name: str, farthest: float = FARTHEST) -> 
     """
     vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
     if vertices.ndim != 2 or vertices.shape[1] != 3 or faces.ndim != 2 or faces.shape[1] != 3:
-        raise RobotError(f"{name} is not one of triangles in space. Export it again.")
+        raise RobotError(f"{name} is not a 3D triangle mesh. Export it again.")
     if not np.isfinite(vertices).all() or np.abs(vertices).max(initial=0.0) > farthest:
         raise RobotError(
-            f"{name} has coordinates beyond {FARTHEST:g} m, or not finite. Give it in metres, or scale it in the URDF."
+            f"{name} has coordinates that are not finite or exceed {FARTHEST:g} m. Give it in metres, or scale it in "
+            "the URDF."
         )
     if faces.min(initial=0) < 0 or faces.max(initial=0) >= len(vertices):
-        raise RobotError(f"{name} has triangles of vertices that it does not have. Export it again.")
+        raise RobotError(f"{name} has triangles with invalid vertex indices. Export it again.")
 
 
 SHARP_EDGE = np.deg2rad(38.0)
@@ -212,7 +213,7 @@ def _geometry(geometry: yourdfpy.Geometry, folder: Path) -> list[tuple[trimesh.T
     if geometry.mesh is None:
         return []
     scale = np.ones(3) if geometry.mesh.scale is None else np.ones(3) * np.asarray(geometry.mesh.scale)
-    named = f"the URDF in {folder} names it as {shown(geometry.mesh.filename)}"
+    named = f"the URDF in {folder} refers to it as {shown(geometry.mesh.filename)}"
     return read_mesh(mesh_path(folder, geometry.mesh.filename), scale, named)
 
 
@@ -237,7 +238,7 @@ def simplify(
         mesh = trimesh.Trimesh(vertices, faces)
         mesh.update_faces(mesh.nondegenerate_faces())
     if not len(mesh.faces):
-        raise DecimationError("all its triangles are without area")
+        raise DecimationError("all its triangles have zero area")
     smooth = trimesh.graph.smooth_shade(mesh, angle=SHARP_EDGE)
     normals = np.array(smooth.vertex_normals)
     if not np.isfinite(normals).all():
@@ -260,7 +261,7 @@ class Decimation:
         if self.deviation == 0.0:
             return f"{self.after} triangles, as in the files"
         return (
-            f"{self.after} of {self.before} triangles are kept, which moves no surface by more than "
+            f"{self.after} of {self.before} triangles are kept; the surface moves by at most "
             f"{self.deviation * 1e3:.2f} mm"
         )
 
@@ -283,7 +284,7 @@ def build_link_meshes(
     """
     before = sum(len(mesh.faces) for _, mesh, _ in parts)
     if before > MOST_FACES:
-        raise RobotError(f"the meshes have more than {MOST_FACES:,} triangles together. Export simpler ones.")
+        raise RobotError(f"the meshes have more than {MOST_FACES:,} triangles together. Export simpler meshes.")
     bound = tolerance if before > max_faces else None
     moved = [0.0] * len(parts)
     if before > MOST_KEPT * max_faces:
@@ -300,7 +301,7 @@ def build_link_meshes(
                 vertices, normals, faces, deviation = found.result()
             except DecimationError as error:
                 raise RobotError(
-                    f"mesh {number} of {len(parts)}, with {len(mesh.faces)} triangles, is not usable: {error}. "
+                    f"mesh {number} of {len(parts)}, with {len(mesh.faces)} triangles, cannot be used: {error}. "
                     "Export it again as a clean triangle mesh."
                 ) from error
             progress(f"mesh {number}/{len(parts)}: {len(mesh.faces)} -> {len(faces)} triangles")

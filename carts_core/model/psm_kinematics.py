@@ -57,12 +57,14 @@ class PsmGeometry:
             ("wrist_length", self.wrist_length, 0.1),
         ):
             if not 0.0 <= value <= highest:
-                raise SettingsError(f"{name} is {value:g} m; allowed is 0 to {highest:g} m. Give metres.")
+                raise SettingsError(f"{name} is {value:g} m; allowed: 0 to {highest:g} m. Give metres.")
         if len(self.limits) != len(JOINT_NAMES) or any(low > high for low, high in self.limits):
-            raise SettingsError(f"limits are {self.limits}. Give (lower, upper) for each of {', '.join(JOINT_NAMES)}.")
+            raise SettingsError(
+                f"limits are {self.limits}. Give a pair (lower, upper) for each of {', '.join(JOINT_NAMES)}."
+            )
         if any(abs(value) >= np.pi / 2 for index in (1, 4) for value in self.limits[index]):
             raise SettingsError(
-                "limits of pitch and wrist_pitch must be within 90 degrees: beyond, a pose is ambiguous."
+                "limits of pitch and wrist_pitch must be within 90 degrees, since poses beyond are ambiguous."
             )
 
 
@@ -174,7 +176,7 @@ def inverse(
         (~finite, "the pose is not finite"),
         (
             finite & ~solvable,
-            "the tip is on the wrist's yaw axis through the remote centre, where joints are arbitrary",
+            "the tip lies on the wrist's yaw axis through the remote centre, where joint positions are not unique",
         ),
     ]
     for index, (name, (low, high)) in enumerate(zip(JOINT_NAMES, geometry.limits, strict=True)):
@@ -259,7 +261,7 @@ def _roll_turns(roll: np.ndarray, limits: tuple[float, float], continuous: bool,
 def _beyond(name: str, values: np.ndarray, low: float, high: float) -> str:
     worst = values[np.argmax(np.maximum(low - values, values - high))]
     unit = "m" if name == "insertion" else "rad"
-    return f"{name} would be {worst:.4g} {unit}, allowed is {low:g} to {high:g} {unit}"
+    return f"{name} would be {worst:.4g} {unit}; allowed: {low:g} to {high:g} {unit}"
 
 
 def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:

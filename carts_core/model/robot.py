@@ -87,7 +87,7 @@ class Kinematics:
         children = {joint.child for joint in joints.values()}
         self.base_link = base_link or next(link for link in links if link not in children)
         if self.base_link not in links:
-            raise RobotError(f"{source}: no link is called {self.base_link!r}. The links are: {', '.join(links)}.")
+            raise RobotError(f"{source}: there is no link {self.base_link!r}. The links are: {', '.join(links)}.")
         chain = pytorch_kinematics.build_chain_from_urdf(_skeleton(urdf_text)).to(dtype=torch.float64)
         self._chains = {torch.device("cpu"): chain}
         self._frame_index = {name: int(chain.get_frame_indices(name)[0]) for name in links}
@@ -98,7 +98,7 @@ class Kinematics:
         probes = torch.stack([torch.zeros(len(self.joint_names)), torch.full((len(self.joint_names),), 0.1)]).double()
         Ts_root_base = self._Ts_root(probes)[self._frame_index[self.base_link]]
         if not torch.allclose(Ts_root_base[0], Ts_root_base[1]):
-            raise RobotError(f"{source}: base link {self.base_link!r} moves with a joint; name one that does not.")
+            raise RobotError(f"{source}: base link {self.base_link!r} moves with a joint. Choose a fixed link.")
         return torch.linalg.inv(Ts_root_base[0])
 
     def _Ts_root(self, joint_positions: Float[Tensor, "n dofs"]) -> Float[Tensor, "links n 4 4"]:
@@ -124,7 +124,7 @@ class Kinematics:
             )
         for name in link_names:
             if name not in self._frame_index:
-                raise RobotError(f"the robot has no link {shown(name)}. Its links are: {listed(self._frame_index)}.")
+                raise RobotError(f"the robot has no link {shown(name)}. Its links: {listed(self._frame_index)}.")
         batch = joint_positions.shape[:-1]
         Ts_root = self._Ts_root(joint_positions.reshape(-1, dofs).double())
         index = torch.tensor([self._frame_index[name] for name in link_names], device=joint_positions.device)
@@ -180,11 +180,11 @@ def parsed_urdf(text: str, source: Path) -> Element:
             range.
     """
     if "<!DOCTYPE" in text or "<!ENTITY" in text:
-        raise RobotError(f"robot {source} declares a document type or entities, which no URDF needs. Remove them.")
-    if text.count("<") > 2 * _MOST_ELEMENTS:
         raise RobotError(
-            f"robot {source} has more than {_MOST_ELEMENTS:,} elements. Export it without what is not drawn."
+            f"robot {source} declares a document type or entities, which are not allowed in a URDF. Remove them."
         )
+    if text.count("<") > 2 * _MOST_ELEMENTS:
+        raise RobotError(f"robot {source} has more than {_MOST_ELEMENTS:,} elements. Export only the visual model.")
     try:
         root = ElementTree.fromstring(text)
     except (ElementTree.ParseError, ValueError, RecursionError) as error:
@@ -218,19 +218,21 @@ def _check_elements(root: Element, source: Path) -> None:
         if not level:
             break
     if level or count > _MOST_ELEMENTS:
-        raise RobotError(f"robot {source} is nested more than {_DEEPEST} deep or has more than {_MOST_ELEMENTS} parts.")
+        raise RobotError(
+            f"robot {source} is nested more than {_DEEPEST} deep or has more than {_MOST_ELEMENTS} elements."
+        )
 
 
 def _check_tree(root: Element, source: Path) -> None:
     """Check that names are unique, and that the joints connect all links to one tree."""
     links, joints = root.findall("link"), root.findall("joint")
     if not 1 <= len(links) <= _MOST_LINKS or len(joints) > _MOST_LINKS:
-        raise RobotError(f"robot {source} has {len(links)} links; allowed are 1 to {_MOST_LINKS}.")
+        raise RobotError(f"robot {source} has {len(links)} links; allowed: 1 to {_MOST_LINKS}.")
     for kind, elements in (("link", links), ("joint", joints)):
         counts = Counter(element.get("name", "") for element in elements)
         if wrong := [name for name, count in counts.items() if count > 1 or not name]:
             raise RobotError(
-                f"robot {source}: every {kind} needs a name of its own, but {listed(map(repr, wrong))} is not one."
+                f"robot {source}: every {kind} needs a unique name; missing or repeated: {listed(map(repr, wrong))}."
             )
     parents: dict[str, str] = {}
     names = {link.get("name") for link in links}
@@ -242,7 +244,7 @@ def _check_tree(root: Element, source: Path) -> None:
     roots = [name for link in links if (name := link.get("name", "")) not in parents]
     if len(roots) != 1:
         found = "no link without a parent" if not roots else f"several links without a parent: {listed(roots)}"
-        raise RobotError(f"robot {source} has {found}. Joints must make one tree of all its links.")
+        raise RobotError(f"robot {source} has {found}. Its joints must connect all links to one tree.")
     # There are as many joints as links below the root, and each link reaches the root, so there is no loop.
     for start in parents:
         link = start
@@ -258,7 +260,7 @@ def _link_of(joint: Element, role: str, names: set[str | None], source: Path) ->
     name = None if element is None else element.get("link")
     if name is None or name not in names:
         raise RobotError(
-            f"robot {source}: joint {joint.get('name')!r} names the {role} link {name!r}, which is not there. "
+            f"robot {source}: joint {joint.get('name')!r} names the {role} link {name!r}, which does not exist. "
             f"The links are: {listed(sorted(filter(None, names)))}."
         )
     return name
@@ -274,36 +276,40 @@ def _check_mimics(joints: list[Element], source: Path) -> None:
             _number(mimic, "multiplier", source, _LARGEST_FACTOR)
             _number(mimic, "offset", source)
             if mimic.get("joint") not in moving:
-                raise RobotError(f"robot {source}: joint {name!r} mimics {mimic.get('joint')!r}, which does not move.")
+                raise RobotError(
+                    f"robot {source}: joint {name!r} mimics {mimic.get('joint')!r}, which is not a movable joint."
+                )
             mimic = moving[mimic.get("joint")]
         else:
-            raise RobotError(f"robot {source}: joint {name!r} mimics, in the end, itself. Name a joint that moves.")
+            raise RobotError(
+                f"robot {source}: joint {name!r} mimics itself, directly or indirectly. Let it mimic a movable joint."
+            )
 
 
 def _check_joint(joint: Element, source: Path) -> None:
     name, kind = joint.get("name"), joint.get("type")
     if kind not in _TYPES:
-        raise RobotError(f"robot {source}: joint {name!r} is of type {kind!r}; allowed are {', '.join(_TYPES)}.")
+        raise RobotError(f"robot {source}: joint {name!r} is of type {kind!r}; allowed: {', '.join(_TYPES)}.")
     if (axis := joint.find("axis")) is not None and (values := _vector(axis, "xyz", 3, source)):
         if kind != "fixed" and math.hypot(*values) < _SHORTEST_AXIS:
-            raise RobotError(f"robot {source}: the axis of joint {name!r} has no direction: {axis.get('xyz')!r}.")
+            raise RobotError(f"robot {source}: the axis of joint {name!r} has zero length: {axis.get('xyz')!r}.")
     if (limit := joint.find("limit")) is not None:
         lower, upper = (_number(limit, key, source, math.inf) for key in ("lower", "upper"))
         if kind in ("revolute", "prismatic") and (lower or 0.0) > (upper or 0.0):
-            raise RobotError(f"robot {source}: joint {name!r} has the lower limit {lower} above the upper one {upper}.")
+            raise RobotError(f"robot {source}: joint {name!r} has a lower limit {lower} above its upper limit {upper}.")
 
 
 def _check_geometry(geometry: Element, source: Path) -> None:
     for shape in geometry:
         if shape.tag == "mesh":
             if not shape.get("filename"):
-                raise RobotError(f'robot {source}: a <mesh> has no file name. Give one, say filename="link.stl".')
+                raise RobotError(f'robot {source}: a <mesh> has no file name. Give one, such as filename="link.stl".')
             scale = _floats(shape, "scale", source)
             if scale and (
                 len(scale) not in (1, 3)
                 or not 1 / _LARGEST_FACTOR <= min(map(abs, scale)) <= max(map(abs, scale)) <= _LARGEST_FACTOR
             ):
-                raise _wrong(shape, "scale", source, "one or three factors other than 0, within a million")
+                raise _wrong(shape, "scale", source, "one or three nonzero factors of at most a million")
         for key, count in (("size", 3), ("radius", 1), ("length", 1)):
             _vector(shape, key, count, source, smallest=1 / _LARGEST_FACTOR)
 
@@ -435,7 +441,9 @@ class Robot:
         except Exception as error:  # the URDF parser raises many types
             raise RobotError(f"robot {urdf} is not a readable URDF ({error}). Check it with a URDF viewer.") from error
         if not kinematics.joint_names:
-            raise RobotError(f"robot {model.robot.name} ({urdf}) has no joint that moves. Name a robot that has one.")
+            raise RobotError(
+                f"robot {model.robot.name} ({urdf}) has no movable joint. Use a robot with movable joints."
+            )
         link_names = tuple(link.name for link in model.robot.links if link.visuals)
         limits = max_faces, tolerance
         meshes, decimation = mesh_cache.kept(
@@ -443,7 +451,7 @@ class Robot:
             lambda: _prepared_meshes(model, kinematics, urdf, link_names, limits, report),
         )
         if not meshes:
-            raise RobotError(f"robot {urdf} has no visual mesh, so there is nothing to render. Add <visual> elements.")
+            raise RobotError(f"robot {urdf} has no visual mesh to render. Add <visual> elements.")
         remarks = _remarks(_mesh_files(model, urdf))
         if decimation.before > MOST_KEPT * max_faces:
             remarks = (*remarks, f"{decimation}.")
@@ -505,7 +513,7 @@ def _remarks(files: Iterable[Path]) -> tuple[str, ...]:
             found.setdefault(f"scaled by the unit of the COLLADA file, {metres:g} m", []).append(file.name)
         if axis not in ("", "Z_UP"):
             text = (
-                f"up axis {axis} of the COLLADA file is not applied, as in RViz; turn the mesh by the URDF's <origin>"
+                f"up axis {axis} of the COLLADA file is ignored, as in RViz; rotate the mesh with the URDF's <origin>"
             )
             found.setdefault(text, []).append(file.name)
     return tuple(f"{listed(names, 3)}: {text}." for text, names in found.items())

@@ -101,7 +101,7 @@ class Scene:
             if arm.name == name:
                 return arm
         known = [arm.name for arm in self.arms]
-        raise RobotError(f"no arm is called {name!r}. The arms are: {', '.join(known)}.{closest(name, known)}")
+        raise RobotError(f"there is no arm {name!r}. The arms are: {', '.join(known)}.{closest(name, known)}")
 
     def camera(self, name: str) -> Camera:
         """Look up a camera by name.
@@ -113,7 +113,7 @@ class Scene:
             if camera.name == name:
                 return camera
         known = [camera.name for camera in self.cameras]
-        raise RobotError(f"no camera is called {name!r}. The cameras are: {', '.join(known)}.{closest(name, known)}")
+        raise RobotError(f"there is no camera {name!r}. The cameras are: {', '.join(known)}.{closest(name, known)}")
 
     def with_cameras(self, names: Sequence[str] | None) -> "Scene":
         """The scene with these cameras only (all of them for None), in this order."""
@@ -156,7 +156,9 @@ class Scene:
         values = []
         for arm in self.arms:
             if arm.name not in joint_positions:
-                raise RobotError(f"no joint positions for arm {arm.name!r}; given are: {', '.join(joint_positions)}.")
+                raise RobotError(
+                    f"joint positions of arm {arm.name!r} are missing; given: {', '.join(joint_positions)}."
+                )
             value = torch.as_tensor(np.asarray(joint_positions[arm.name]), dtype=torch.float32, device=device)
             if value.shape[-1] != len(arm.robot.joint_names):
                 raise RobotError(

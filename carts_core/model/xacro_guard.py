@@ -76,11 +76,11 @@ def expanded(path: Path, packages: dict[str, str], arguments: dict[str, str]) ->
         if not isinstance(content, str):
             return content  # Already parsed.
         if _DECLARES.search(content):
-            raise RobotError(f"{filename or 'the model'} declares a document type or entities, which no model needs")
+            raise RobotError(f"{filename or 'the model'} declares a document type or entities, which are not allowed")
         return minidom.parseString(content)
 
     def refused(text: str, context: Any) -> str:
-        raise RobotError(f"$(eval {text}) is not evaluated; write ${{...}}")
+        raise RobotError(f"$(eval {text}) is not supported; write ${{...}}")
 
     def evaluate(text: str, symbols: Mapping[str, Any], local: Any = None) -> Any:
         return Expression(symbols, xacro.abs_filename_spec).value(text)
@@ -113,9 +113,9 @@ class Expression:
     def _of(self, node: ast.expr) -> Any:
         result = self._calculated(node)
         if isinstance(result, int) and abs(result) > _LARGEST:
-            raise RobotError("a whole number in an expression has more than 64 bits")
+            raise RobotError("an integer in an expression has more than 64 bits")
         if isinstance(result, str | list) and len(result) > _LONGEST:
-            raise RobotError(f"a text in an expression is longer than {_LONGEST} characters")
+            raise RobotError(f"a string in an expression is longer than {_LONGEST} characters")
         return result
 
     def _calculated(self, node: ast.expr) -> Any:
@@ -143,13 +143,13 @@ class Expression:
             case ast.Call(func=function, args=arguments, keywords=[]):
                 result = self._call(function, arguments)
             case _:
-                raise RobotError(f"the expression {ast.unparse(node)!r} is not one that is calculated")
+                raise RobotError(f"the expression {ast.unparse(node)!r} is not supported")
         return result
 
     def _symbol(self, name: str) -> Any:
         value = self._symbols[name]
         if not isinstance(value, str | bool | int | float | list | tuple | Mapping | None):
-            raise RobotError(f"{name!r} is no property with a value")
+            raise RobotError(f"{name!r} is not a property with a value")
         return value
 
     def _entry(self, value: ast.expr, name: str) -> Any:
@@ -157,7 +157,7 @@ class Expression:
             return getattr(math, name)
         entries = self._of(value)
         if not isinstance(entries, Mapping):
-            raise RobotError(f"{ast.unparse(value)!r} has no entries, so {name!r} is none of them")
+            raise RobotError(f"{ast.unparse(value)!r} has no entries, so it has no {name!r}")
         return entries[name]
 
     def _first(self, values: list[ast.expr], wanted: bool) -> Any:
@@ -185,7 +185,7 @@ class Expression:
                 return ""
             case ast.Attribute(value=value, attr=name) if name in _OF_TEXTS:
                 return getattr(str(self._of(value)), name)(*values)
-        raise RobotError(f"the function {ast.unparse(function)!r} is not one that a model may call")
+        raise RobotError(f"the function {ast.unparse(function)!r} is not allowed in a model")
 
 
 def _binary(op: ast.operator, left: Any, right: Any) -> Any:

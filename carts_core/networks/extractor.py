@@ -136,7 +136,11 @@ def surface_engine(
         return "torch", None
     absent = [name for name in ("onnxruntime", "onnx") if find_spec(name) is None]
     if device.type != "cpu" or absent:
-        fault = f"{' and '.join(absent)} is not installed" if absent else f"it needs a CPU, and the device is {device}"
+        fault = (
+            f"{' and '.join(absent)} {'is' if len(absent) == 1 else 'are'} not installed"
+            if absent
+            else f"it needs a CPU, and the device is {device}"
+        )
         return _without(wanted, fault)
     try:
         found = OnnxSurface(network, sha256)
@@ -160,7 +164,7 @@ def full_precision(device: torch.device) -> AbstractContextManager[None]:
 def _without(wanted: Inference, fault: str) -> tuple[Engine, None]:
     if wanted == "onnx":
         raise SettingsError(
-            f"ONNX Runtime is not possible: {fault}. Give --device cpu or cpu:torch; in Python inference='auto' or "
+            f"ONNX Runtime cannot be used: {fault}. Use --device cpu or cpu:torch; in Python inference='auto' or "
             "'torch'."
         )
     return "torch", None
@@ -297,7 +301,7 @@ class FeatureExtractor:
             if found.network.kind in read:
                 raise WeightsError(
                     f"weights files {read[found.network.kind][0]} and {path} both hold a {found.network.kind} network; "
-                    "give one of each kind at most."
+                    "give at most one of each kind."
                 )
             read[found.network.kind] = (path, found)
         kinds: tuple[type[UNet], ...] = (FeatureNetwork, SurfaceNetwork)

@@ -80,7 +80,7 @@ class UNet(nn.Module):
         stride = self.architecture.stride
         if x.ndim != 4 or x.shape[1] != channels or x.shape[2] % stride or x.shape[3] % stride:
             raise SettingsError(
-                f"the {self.kind} network got a tensor of shape {tuple(x.shape)}. Give [batch, {channels}, height, "
+                f"the input of the {self.kind} network has shape {tuple(x.shape)}. Give [batch, {channels}, height, "
                 f"width] with height and width multiples of {stride}; pad or crop the image."
             )
 

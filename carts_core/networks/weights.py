@@ -47,7 +47,7 @@ _NETWORKS: dict[str, Callable[[Architecture], UNet]] = {
 }
 _TYPES = (torch.float32, torch.float64, torch.float16, torch.bfloat16, torch.int64)
 _LARGEST_SIDE = 4096
-_REMEDY = "Train weights with `carts train`, or reinstall carts to get the shipped ones back."
+_REMEDY = "Train weights with `carts train`, or reinstall carts to restore the shipped ones."
 
 
 @dataclass(frozen=True)
@@ -96,7 +96,7 @@ def read_weights(path: Path) -> Weights:
     network = _filled(path, make_network, architecture, shapes)
     if len(working_size) != 2 or any(not 0 < n <= _LARGEST_SIDE or n % architecture.stride for n in working_size):
         raise WeightsError(
-            f"weights file {path} gives the working size {working_size}; allowed are two positive multiples of "
+            f"weights file {path} has the working size {working_size}; allowed: two positive multiples of "
             f"{architecture.stride}. {_REMEDY}"
         )
     return Weights(network.eval(), working_size, training, hashlib.sha256(read_bytes(path, WEIGHTS)).hexdigest())
@@ -115,8 +115,8 @@ def _header(path: Path) -> tuple[dict[str, str], dict[str, tuple[int, ...]]]:
         raise _unreadable(path, error) from error
     if metadata.get("format") not in _NETWORKS or metadata.get("version") != VERSION:
         raise WeightsError(
-            f"weights file {path} says format {metadata.get('format')!r}, version {metadata.get('version')!r}; allowed "
-            f"is {' or '.join(map(repr, _NETWORKS))}, version {VERSION!r}. {_REMEDY}"
+            f"weights file {path} has format {metadata.get('format')!r}, version {metadata.get('version')!r}; allowed: "
+            f"{' or '.join(map(repr, _NETWORKS))}, version {VERSION!r}. {_REMEDY}"
         )
     return metadata, shapes
 
@@ -128,10 +128,10 @@ def _described(path: Path, metadata: Mapping[str, str]) -> tuple[Architecture, t
         working_size = tuple(int(n) for n in parse_json(metadata["working_size"]))
         training = parse_json(metadata["training"], finite=False)
         if not isinstance(training, dict):
-            raise TypeError("the training settings are no table")
+            raise TypeError("the training settings are not a table")
     except (KeyError, ValueError, TypeError, AttributeError, OverflowError, SettingsError) as error:
         raise WeightsError(
-            f"weights file {path} has unreadable metadata ({shortened(str(error))}). Allowed are an architecture with "
+            f"weights file {path} has unreadable metadata ({shortened(str(error))}). Required: an architecture with "
             "widths, encoder_convolutions and decoder_convolutions, a working size and the training settings. "
             f"{_REMEDY}"
         ) from error
@@ -171,6 +171,5 @@ def _filled(
 
 def _unreadable(path: Path, error: Exception) -> WeightsError:
     return WeightsError(
-        f"weights file {path} is not a readable safetensors file ({shortened(str(error))}). Allowed is what "
-        f"`carts train` writes. {_REMEDY}"
+        f"weights file {path} is not a readable safetensors file of `carts train` ({shortened(str(error))}). {_REMEDY}"
     )

@@ -187,11 +187,11 @@ class CalibrationOptimizer:
     ) -> None:
         self.settings = settings = surface_solver(settings, "a calibration")
         if not frames:
-            raise SettingsError("no frame was given. A calibration needs at least 1, and 20 or more are better.")
+            raise SettingsError("no frame was given. A calibration needs at least 1 frame; 20 or more are recommended.")
         if not 1e-3 <= joint_prior_deg <= 360:
-            raise SettingsError(f"joint_prior_deg is {joint_prior_deg!r}; allowed is 0.001 to 360 deg.")
+            raise SettingsError(f"joint_prior_deg is {joint_prior_deg!r}; allowed: 0.001 to 360 deg.")
         if free.joints_only:
-            raise SettingsError("nothing of the calibration is free. Free base frames, extrinsics or intrinsics.")
+            raise SettingsError("no calibration parameter is free. Free base frames, extrinsics or intrinsics.")
         self._whole_scene, self._scene = scene, scene.with_cameras(cameras)
         # Moving cameras make both cameras and base frames observable.
         still = frames[0].mounts
@@ -283,7 +283,7 @@ class CalibrationOptimizer:
     def result(self) -> CalibrationResult:
         """Result at the best iterate of the finest descent reached; `SettingsError` before the first step."""
         if self.best is None or self._problem.present is None:
-            raise SettingsError("no step was made yet. Call `step` first.")
+            raise SettingsError("no step was made. Call `step` first.")
         offsets = self.best.offsets
         evaluation = self._problem.evaluate(offsets, self._problem.present)
         assert evaluation.hessian is not None

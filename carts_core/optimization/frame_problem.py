@@ -231,7 +231,7 @@ class FrameProblem:
     @property
     def observation(self) -> Observation:
         """The last observation."""
-        assert self._observation is not None, "a solver begins with Observe"
+        assert self._observation is not None, "the first stage must be Observe"
         return self._observation
 
     @observation.setter

@@ -71,7 +71,7 @@ def fit_keypoints(
         RobotError: a pin names an arm or a camera that does not exist.
     """
     if not pins:
-        raise SettingsError("there is no pin. Say of at least one keypoint where it is in the image.")
+        raise SettingsError("no keypoint is placed. Place at least one keypoint in the image.")
     settings = settings or KeypointSettings()
     arms = tuple(dict.fromkeys(pin.keypoint.arm for pin in pins))
     variables = Variables(scene, start.map(torch.Tensor.double), FreeParameters(arms=arms), settings.length_scale)
@@ -99,7 +99,9 @@ def fit_keypoints(
 
     origin = torch.zeros(len(variables), dtype=torch.float64)
     if not residuals(origin).isfinite().all():
-        raise SettingsError("a keypoint is behind its camera. Move the arm before the camera by its sliders first.")
+        raise SettingsError(
+            "a keypoint is behind its camera. First move the arm in front of the camera with its sliders."
+        )
     fit = least_squares(
         lambda offsets: residuals(torch.from_numpy(offsets)).numpy(),
         origin.numpy(),

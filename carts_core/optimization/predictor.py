@@ -171,14 +171,14 @@ class MaskPredictor:
             return network
         if missing:
             raise SettingsError(
-                f"frame {frame.frame_id} has no {self._origin} of camera {missing[0]!r} to be fitted. Give one, leave "
-                "the frame or camera out, or observe both, masks and the network."
+                f"frame {frame.frame_id} has no {self._origin} of camera {missing[0]!r} to fit. Give one, leave out "
+                "the frame or camera, or observe both masks and the network."
             )
         for name in cameras:
             if given[name].shape != frame.images[name].shape[:2]:
                 raise SettingsError(
                     f"the mask of camera {name!r} in frame {frame.frame_id} has shape {given[name].shape}, its image "
-                    f"{frame.images[name].shape[:2]}. Give a mask in the size of the image."
+                    f"{frame.images[name].shape[:2]}. Give a mask of the image's size."
                 )
         masks = tuple(np.asarray(given[name], np.float32) for name in cameras)
         return _FrameMasks(masks, network, self.device)

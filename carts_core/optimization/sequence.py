@@ -37,12 +37,12 @@ def visiting_gaps(times: Mapping[int, float | None], model: SequenceSettings) ->
         SettingsError: there are no frames, only some have times, or times do not increase.
     """
     if not times:
-        raise SettingsError("there are no frames to correct. Choose at least one.")
+        raise SettingsError("no frame was given. Choose at least one.")
     without = [index for index, seconds in sorted(times.items()) if seconds is None]
     if 0 < len(without) < len(times):
         raise SettingsError(
             f"{len(without)} of {len(times)} frames have no time; the first is frame {without[0]}. Give all frames "
-            "times, or none."
+            "times, or none of them."
         )
     known = {
         index: index * model.frame_seconds if seconds is None else seconds for index, seconds in sorted(times.items())
@@ -50,8 +50,8 @@ def visiting_gaps(times: Mapping[int, float | None], model: SequenceSettings) ->
     for (a, before), (b, after) in pairwise(known.items()):
         if not before < after:
             raise SettingsError(
-                f"frame {b} was taken at {after:g} s and frame {a} at {before:g} s. Times must increase; correct them "
-                "in the sequence."
+                f"frame {b} has the time {after:g} s, after frame {a} at {before:g} s. Times must increase; correct "
+                "them in the sequence."
             )
     order = list(known) if model.direction == "forward" else list(reversed(known))
     return {index: abs(known[index] - known[previous]) for previous, index in pairwise([order[0], *order])}

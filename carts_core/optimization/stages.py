@@ -236,7 +236,7 @@ def run_stages(stages: Sequence[Stage], fit: Fit) -> Iterator[Point]:
 @singledispatch
 def run_stage(stage: object, fit: Fit) -> Iterator[Point]:
     """Run one stage; yields each evaluated point."""
-    raise TypeError(f"{stage!r} is no stage")
+    raise TypeError(f"{stage!r} is not a stage")
 
 
 @run_stage.register
@@ -297,7 +297,7 @@ def run_silhouette_search(stage: SilhouetteSearch, fit: Fit) -> Iterator[Point]:
 @run_stage.register
 def run_align_edges(stage: AlignEdges, fit: Fit) -> Iterator[Point]:
     """Align outlines with image edges, from the best point of the last descent."""
-    assert fit.reached is not None, "AlignEdges follows a Descend"
+    assert fit.reached is not None, "AlignEdges must follow a Descend stage"
     if _one_frame(fit).predictor.masked:
         # The descent is one step beyond the best point, and that step would not be evaluated before the end.
         fit.offsets = fit.reached.offsets

@@ -71,7 +71,7 @@ class Variables:
             if free.intrinsics:
                 self._add("intrinsics", index, camera.name, ("fx", "fy", "cx", "cy"))
         if not self.names:
-            raise SettingsError("nothing is free to be optimized. Free the joints, a base frame or a camera.")
+            raise SettingsError("no parameter is free. Free the joints, a base frame or a camera.")
         count, bounded = len(self.names), len(lower)
         device = start.T_world_base.device
         infinite = [float("inf")] * (count - bounded)
@@ -87,7 +87,7 @@ class Variables:
         known |= {f"{arm.name}/{j}" for arm in scene.arms for j in arm.robot.joint_names}
         for joint in free.locked_joints:
             if joint not in known:
-                raise SettingsError(f"locked joint {joint!r} does not exist. Known are: {', '.join(sorted(known))}.")
+                raise SettingsError(f"locked joint {joint!r} does not exist. Joints: {', '.join(sorted(known))}.")
 
     def _add(self, kind: str, index: int, owner: str, names: tuple[str, ...], columns: tuple[int, ...] = ()) -> None:
         self._blocks.append(_Block(kind, index, columns, len(self.names), len(names)))

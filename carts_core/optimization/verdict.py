@@ -321,11 +321,11 @@ def _assessed(found: Evidence, doubtful_from: float, contradicts: str, supports:
         reason = f"{contradicts} the {subject}: " + _weakest(found)
         return Assessment(Verdict.FAILED, reason, _REMEDY_FAILED, probability, found)
     if arm_is_elsewhere(found):
-        reason = "An arm is out of view where it was fitted, and something that looks like an arm is elsewhere."
+        reason = "An arm was fitted out of view, but an arm is detected elsewhere in the image."
     elif probability >= doubtful_from:
-        reason = f"{supports} the {subject} only in part: " + _weakest(found)
+        reason = f"{supports} the {subject} only partly: " + _weakest(found)
     elif found.parts_predicted < _PART_UNSEEN:
-        reason = "The wrist or the jaws of an arm are not predicted where they were fitted, so only the shaft is."
+        reason = "Only the shaft of an arm is predicted at its fitted pose, not its wrist or jaws."
     else:
         return Assessment(Verdict.GOOD, f"{supports} the {subject}.", "", probability, found)
     return Assessment(Verdict.DOUBTFUL, reason, _REMEDY, max(probability, _POSSIBLE), found)
@@ -352,17 +352,17 @@ _MOST, _MORE = 0.5, 2.0
 _NOTHING_THERE: tuple[tuple[Callable[[Evidence], bool], str, str], ...] = (
     (
         lambda found: found.start_area < OUT_OF_VIEW,
-        "No arm is in view: as measured, the arms lie outside of the image or behind the camera.",
+        "No arm is in view: at the measured joints, the arms are outside of the image or behind the camera.",
         "Check T_camera_world, T_world_base and the units of the joints, or leave the frame out.",
     ),
     (
         lambda found: found.masked and found.area > max(_MOST, _MORE * found.start_area),
-        "The given mask covers most of the image, which the arms as measured do not.",
-        "Check that the mask is white on the arms and black elsewhere, not the other way round, without transparency.",
+        "The given mask covers most of the image, but the arms at the measured joints do not.",
+        "Check that the mask is white on the arms and black elsewhere, not inverted, and has no transparency.",
     ),
     (
         lambda found: found.masked and found.predicted < _UNSEEN and found.agreement < _AT_RANDOM,
-        "The given mask shows nothing where the arms should be.",
+        "The given mask is empty at the expected position of the arms.",
         "Check that it belongs to this frame and is white on the arms and black elsewhere, or leave the frame out.",
     ),
     (
@@ -371,47 +371,46 @@ _NOTHING_THERE: tuple[tuple[Callable[[Evidence], bool], str, str], ...] = (
             and found.agreement < _AT_RANDOM
             and (found.changed is None or found.changed < _UNSEEN)
         ),
-        "Nothing that looks like an arm is seen where the arms should be.",
-        "Check that the image shows them (not black, not covered) and that it belongs to these kinematics.",
+        "No arm is detected at the expected position of the arms.",
+        "Check that the image shows the arms (not black or occluded) and matches these kinematics.",
     ),
     (
         lambda found: found.still_in_view < HAS_LEFT,
-        "An arm that was in view at the start has left the image.",
-        "See that the image, or the mask that is fitted, shows all arms; set the arm roughly by hand and run again, or "
+        "An arm that was in view initially has left the image.",
+        "Check that the image, or the fitted mask, shows all arms; move the arm roughly by hand and run again, or "
         "check T_camera_world and T_world_base.",
     ),
     (
         lambda found: found.changed is not None and found.changed < _UNSEEN,
-        "The image does not differ from the empty background where the arms should be.",
-        "Check that the image shows the arms and belongs to these kinematics, or leave the frame out.",
+        "The image equals the empty background at the expected position of the arms.",
+        "Check that the image shows the arms and matches these kinematics, or leave the frame out.",
     ),
 )
 
 _REMEDY = (
-    "Look at the overlay. Run the optimizer if it has not run, set the arm by hand, or fit the frame together with its "
-    "neighbours (sequence mode; Solve in the page) if that is not done."
+    "Inspect the overlay. Run the optimizer if it has not run, move the arm by hand, or fit the frame with its "
+    "neighbours (sequence mode; Solve in the viewer) if not done yet."
 )
 _REMEDY_FAILED = (
-    "Run the optimizer, or if it has run, set the arm roughly by hand and run again, check the calibration, or name an "
+    "Run the optimizer. If it has run, move the arm roughly by hand and run again, check the calibration, or give an "
     "image of the empty scene in the recording's file (background)."
 )
 
 _CALIBRATION_REMEDY = (
-    "Check that robot, camera and joints are those of the images, start from a pose that is nearer, or give masks "
-    "(--observe masks)."
+    "Check that robot, camera and joints match the images, start from a closer pose, or give masks (--observe masks)."
 )
 
 
 def _weakest(found: Evidence) -> str:
     """Text on the strongest evidence against a fit."""
     if found.masked:
-        return "what is rendered and the given mask differ."
+        return "the rendering and the given mask differ."
     against = {
-        "what the network predicts lies elsewhere.": found.agreement,
-        "the network, which is shown the fit as a hint, predicts something else without it.": found.unconditioned,
+        "the network's prediction lies elsewhere.": found.agreement,
+        "the network predicts otherwise without the fit as its prior.": found.unconditioned,
     }
     if found.overlap_with_change is not None:
-        against["what differs from the empty background lies elsewhere."] = found.overlap_with_change
+        against["the difference from the empty background lies elsewhere."] = found.overlap_with_change
     return min(against, key=lambda reason: against[reason])
 
 
@@ -425,12 +424,14 @@ RECOGNIZED, _ELSEWHERE = 0.95, 0.05
 """Minimum overlap for a rendering of a robot in the training domain, and share of an image above which false
 predictions are harmful [1]."""
 
-UNKNOWN_ROBOT_REMEDY = "Give masks (--observe masks, or both), or train for this recording (`carts train`, --weights)."
+UNKNOWN_ROBOT_REMEDY = (
+    "Give masks (--observe masks, or both), or train a network for this recording (`carts train`, --weights)."
+)
 
 
 def overlap_below_usual(overlap: float) -> str:
     """Text on an overlap below `RECOGNIZED`, rounded down."""
-    return f"an overlap of {math.floor(1000 * overlap) / 1000:.3f} only ({RECOGNIZED} or more is usual)"
+    return f"an overlap of only {math.floor(1000 * overlap) / 1000:.3f} ({RECOGNIZED} or more is usual)"
 
 
 @dataclass(frozen=True)
@@ -453,16 +454,17 @@ class DomainCheck:
         found = []
         if self.recognized is None:
             place = "Check T_camera_world, T_world_base and the units of the joints."
-            found.append(f"{where}: no arm is in view as measured. {place}")
+            found.append(f"{where}: no arm is in view at the measured joints. {place}")
         elif self.recognized < RECOGNIZED:
             found.append(
-                f"{where}: the network recognizes a rendering of these arms with "
-                f"{overlap_below_usual(self.recognized)}, so it may not know this robot at this distance. {remedy}"
+                f"{where}: the network's prediction on a rendering of these arms has "
+                f"{overlap_below_usual(self.recognized)}, so this robot or distance may be outside its training data. "
+                f"{remedy}"
             )
         if self.elsewhere > _ELSEWHERE and not background:
             found.append(
-                f"{where}: the network takes {100 * self.elsewhere:.0f} % of the image for arms where none can be, and "
-                f"the empty background is not known. {remedy}"
+                f"{where}: the network predicts arms in {100 * self.elsewhere:.0f} % of the image, far from the "
+                f"measured ones, and no empty background is given. {remedy}"
             )
         return found
 
@@ -539,7 +541,7 @@ def assess_sequence(frames: Sequence[Assessment]) -> SequenceAssessment:
     else:
         return SequenceAssessment(Verdict.GOOD, "The images support the fit.", "", probability, named)
     (reason, remedy), _ = against.most_common(1)[0]
-    summary = f"{share} of {len(frames)} frames are not to be relied on, most of them for this: {reason}"
+    summary = f"{share} of {len(frames)} frames are unreliable. Most frequent reason: {reason}"
     return SequenceAssessment(verdict, summary, remedy, probability, named)
 
 
@@ -549,7 +551,7 @@ def without_knowledge(found: Assessment, known: Sequence[DomainCheck]) -> Assess
     if found.verdict is not Verdict.DOUBTFUL or not recognized or float(np.median(recognized)) >= RECOGNIZED:
         return found
     reason = (
-        f"{found.reason.rstrip('.')}, and the network recognizes a rendering of these arms with "
+        f"{found.reason.rstrip('.')}, and the network's prediction on a rendering of these arms has "
         f"{overlap_below_usual(float(np.median(recognized)))}."
     )
     return replace(found, verdict=Verdict.FAILED, reason=reason, remedy=UNKNOWN_ROBOT_REMEDY)

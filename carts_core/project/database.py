@@ -86,10 +86,10 @@ def check_seal(connection: sqlite3.Connection, total: int) -> Seal:
     projects = connection.execute("SELECT identity, position, created FROM project").fetchmany(2)
     seals = connection.execute("SELECT nonce, total, digest FROM seal").fetchmany(2)
     if len(projects) != 1 or len(seals) != 1:
-        raise ProjectError("it has no identity of its own")
+        raise ProjectError("it has no identity")
     (identity, position, created), (nonce, *_) = projects[0], seals[0]
     if not isinstance(nonce, bytes) or len(nonce) != NONCE_BYTES:
-        raise ProjectError("its own number was changed")
+        raise ProjectError("its nonce was changed")
     found = Seal.of(nonce, identity, created, total)
     expected = found.row(position)
     if seals[0][2] != expected[2] or seals[0] != expected:
@@ -269,8 +269,8 @@ def check_version(connection: sqlite3.Connection, path: Path) -> None:
     found = version(connection)
     if found > len(MIGRATIONS):
         raise ProjectError(
-            f"project {path} has schema {found}, made by a newer version of carts; this one knows schemas up to "
-            f"{len(MIGRATIONS)}. Nothing was changed. Update carts to open it."
+            f"project {path} has schema {found}, written by a newer version of carts; this version supports schemas "
+            f"up to {len(MIGRATIONS)}. Nothing was changed. Update carts to open it."
         )
 
 
@@ -282,7 +282,7 @@ def check_schema(connection: sqlite3.Connection) -> None:
     theirs = frozenset(connection.execute("SELECT type, name, tbl_name, sql FROM sqlite_schema").fetchmany(1000))
     if theirs != ours:
         odd = sorted({f"{kind} {name!r}" for kind, name, _, _ in theirs ^ ours if isinstance(kind, str)})
-        raise DamagedProject(f"its tables are not those of a project of carts ({', '.join(odd)[:300]})")
+        raise DamagedProject(f"its tables are not those of a CaRTS project ({', '.join(odd)[:300]})")
 
 
 def version(connection: sqlite3.Connection) -> int:
@@ -292,7 +292,7 @@ def version(connection: sqlite3.Connection) -> int:
 
 def not_a_project(path: Path) -> ProjectError:
     """Error for a file that is not a project."""
-    return ProjectError(f"{path} is not a project of carts; nothing was changed. Name another file.")
+    return ProjectError(f"{path} is not a CaRTS project; nothing was changed. Choose another file.")
 
 
 @contextmanager
@@ -342,11 +342,11 @@ def errors_explained(path: Path) -> Iterator[None]:
 
 def _advice(code: str) -> str:
     if code.startswith(("SQLITE_FULL", "SQLITE_IOERR")):
-        return "Nothing of this was saved, all that was saved before is safe. Free space on the disk, then try again."
+        return "This change was not saved; earlier changes are safe. Free disk space and try again."
     if code.startswith(("SQLITE_READONLY", "SQLITE_CANTOPEN", "SQLITE_PERM")):
-        return "Name a file in a folder that you may write to, or open the project read-only."
+        return "Choose a file in a writable folder, or open the project read-only."
     if code.startswith("SQLITE_NOTADB"):
-        return "It is not a project; nothing was changed. Name another file."
+        return "It is not a project; nothing was changed. Choose another file."
     if code.startswith("SQLITE_BUSY"):
-        return "Another program holds it. Close that, then try again."
-    return "Nothing of this was saved. If it stays so, the file may be damaged: keep a copy of it."
+        return "Another program has it open. Close that program and try again."
+    return "This change was not saved. If the error persists, the file may be damaged: keep a copy of it."

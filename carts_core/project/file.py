@@ -48,13 +48,13 @@ def check_files(path: Path) -> bool:
     log = _is_there(beside(path, LOG))
     if _is_there(beside(path, JOURNAL)):
         raise ProjectError(
-            f"{beside(path, JOURNAL)} lies beside the project, and carts makes no such file. Nothing was changed. If "
-            "another program changed the project, let it finish; else move that file away."
+            f"{beside(path, JOURNAL)} is beside the project, but carts does not create such files. Nothing was "
+            "changed. If another program changed the project, let it finish; otherwise move that file away."
         )
     if log and not there:
         raise ProjectError(
-            f"{beside(path, LOG)} is there without its project {path.name}, which was moved or deleted. Nothing was "
-            "changed. Move the project back beside it, or move that file away to begin a new project."
+            f"{beside(path, LOG)} exists without its project {path.name}, which was moved or deleted. Nothing was "
+            "changed. Move the project back beside it, or move that file away to create a new project."
         )
     return there
 
@@ -85,15 +85,15 @@ def _check(found: os.stat_result, path: Path) -> None:
     if stat.S_ISREG(found.st_mode) and found.st_nlink <= 1:
         return
     kinds = {
-        stat.S_IFREG: f"one of {found.st_nlink} names of a file (hard links)",
+        stat.S_IFREG: f"a file with {found.st_nlink} hard links",
         stat.S_IFLNK: "a link",
         stat.S_IFDIR: "a folder",
         stat.S_IFIFO: "a pipe",
     }
     raise ProjectError(
-        f"{path} is {kinds.get(stat.S_IFMT(found.st_mode), 'a device or socket')}. A project and the files beside it "
-        "must be regular files with one name, so that nothing else is written to; nothing was changed. Move it away, "
-        "or copy the project to a file of its own."
+        f"{path} is {kinds.get(stat.S_IFMT(found.st_mode), 'a device or socket')}. A project and its companion files "
+        "must be regular files with a single hard link; nothing was changed. Move it away, "
+        "or copy the project to a new file."
     )
 
 
@@ -232,7 +232,7 @@ class Copy:
 def read_files(path: Path) -> Content:
     """Read a consistent snapshot of project and log; `ProjectError` if it is missing, too large, or keeps changing."""
     if not check_files(path):
-        raise ProjectError(f"there is no project {path}. Name an existing one, or open it for writing to begin one.")
+        raise ProjectError(f"there is no project {path}. Choose an existing one, or open it for writing to create one.")
     for _ in range(_TRIES):
         descriptor = open_regular(path)
         try:
@@ -253,7 +253,7 @@ def read_files(path: Path) -> Content:
         # A writer appends to the log, and checkpoints it into the file when it is full or closed.
         if (before.st_size, before.st_mtime_ns) == (after.st_size, after.st_mtime_ns):
             return Content(main, log)
-    raise ProjectError(f"project {path} is being changed all the time. Try again when that has ended.")
+    raise ProjectError(f"project {path} is changing continuously. Try again later.")
 
 
 def open_copy(content: Content, path: Path) -> Copy:
@@ -299,7 +299,9 @@ def check_copy(copy: Copy) -> None:
 def _content(descriptor: int, path: Path) -> bytes:
     size = os.fstat(descriptor).st_size
     if size > LARGEST:
-        raise ProjectError(f"{path} has {size / 2**20:.0f} MiB; a project may have {LARGEST // 2**20}. Name another.")
+        raise ProjectError(
+            f"{path} has {size / 2**20:.0f} MiB; the limit is {LARGEST // 2**20} MiB. Choose another file."
+        )
     parts = []
     while len(part := os.pread(descriptor, 1 << 26, sum(map(len, parts)))):
         parts.append(part)
@@ -484,7 +486,7 @@ class ProjectFile:
                 raise LostFile("was replaced by another file")
             raise LostFile("was moved" if os.fstat(self._descriptor).st_nlink else "was deleted")
         if log and not _lies_at(self._log_path, self._open_log()):
-            raise LostFile("has lost the file beside it that holds its newest edits (-wal)")
+            raise LostFile("has lost its log (-wal), which holds the newest edits")
 
     def _check_content(self) -> None:
         """Verify the content on disk."""
@@ -495,13 +497,13 @@ class ProjectFile:
                 verify(copy.connection)
                 if copy.connection.execute("SELECT nonce, total, digest FROM seal").fetchone() == self._seal:
                     return
-        raise LostFile("was changed by something else, and does not hold what was saved in it")
+        raise LostFile("was changed by another program and lacks saved edits")
 
     def _check_since(self, *, committed: bool) -> None:
         """Check that no other process changed the file or truncated its log during a transaction."""
         self._check_names()
         if _look(self._descriptor) != self._left[0]:
-            raise LostFile("was changed by something else while an edit was being saved")
+            raise LostFile("was changed by another program while an edit was being saved")
         if not committed:
             return
         written = self._headers(self._end)
@@ -509,7 +511,7 @@ class ProjectFile:
         headers = self._headers(end)
         salts, pages = headers[0][16:24], headers[1][4:8]
         if (self._end and written != self._written) or end <= self._end or headers[1][8:16] != salts or not any(pages):
-            raise LostFile("lost an edit, or what was before it in its log (-wal), while that was being saved")
+            raise LostFile("lost an edit, or earlier content of its log (-wal), during a write")
         self._end, self._written = end, headers
 
     def _headers(self, end: int) -> tuple[bytes, bytes]:

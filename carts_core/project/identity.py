@@ -74,7 +74,7 @@ class SequenceIdentity:
             return f"{counted(len(self.frame_ids), 'frame')} against {len(other.frame_ids)}"
         for index, (own, others) in enumerate(zip(self.frame_ids, other.frame_ids, strict=True)):
             if own != others:
-                return f"frame number {index} is called {own!r} against {others!r}"
+                return f"the name of frame number {index} is {own!r} against {others!r}"
         if self.arms != other.arms:
             return f"arms {_list(self.arms)} against {_list(other.arms)}"
         if self.cameras != other.cameras:

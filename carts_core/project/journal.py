@@ -52,7 +52,7 @@ def load(connection: sqlite3.Connection) -> tuple[ProjectState, Seal]:
     """
     row = connection.execute("SELECT identity, position FROM project").fetchone()
     if row is None:
-        raise DamagedProject("it does not say which sequence it belongs to")
+        raise DamagedProject("its sequence is unknown")
     text, position = _typed(row[0], str), _typed(row[1], int)
     identity = SequenceIdentity.from_json(text)
     total, steps, exports = 0, [], []
@@ -75,7 +75,7 @@ def load(connection: sqlite3.Connection) -> tuple[ProjectState, Seal]:
     seal = check_seal(connection, total)
     steps.sort(key=lambda step: step.number)
     if [step.number for step in steps] != list(range(1, len(steps) + 1)) or not 0 <= position <= len(steps):
-        raise DamagedProject("its history has gaps")
+        raise DamagedProject("steps of its history are missing")
     decoded: dict[Key[Any], Entry | None] = {}
     for (kind, frame, name), (step, stored) in newest.items():
         key = Key(Kind(kind), frame, name)
@@ -174,5 +174,5 @@ def _record(time: Any, format: Any, path: Any, frames: Any, settings: Any) -> Ex
 
 def _typed(value: Any, kind: type) -> Any:
     if not isinstance(value, kind):
-        raise DamagedProject(f"it has a {type(value).__name__} where a {kind.__name__} belongs")
+        raise DamagedProject(f"it has a {type(value).__name__} instead of a {kind.__name__}")
     return value

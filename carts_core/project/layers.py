@@ -23,7 +23,7 @@ class Layer:
 
     def __post_init__(self) -> None:
         if not self.png.startswith(_HEADER) or len(self.png) < len(_HEADER) + 8:
-            raise ProjectError("a painted layer is not a PNG image. Make it with `of`.")
+            raise ProjectError("a painted layer is not a PNG image. Create it with `of`.")
 
     @property
     def size(self) -> tuple[int, int]:
@@ -53,8 +53,8 @@ class MaskCorrection(Layer):
         added, removed = np.asarray(added, bool), np.asarray(removed, bool)
         if added.shape != removed.shape or added.ndim != 2 or (added & removed).any():
             raise ProjectError(
-                f"pixels added (shape {added.shape}) and removed ({removed.shape}) must be two masks of one size "
-                "that share no pixel. A later stroke takes its pixels out of the other mask."
+                f"pixels added (shape {added.shape}) and removed ({removed.shape}) must be disjoint masks "
+                "of the same size. A later stroke removes its pixels from the other mask."
             )
         return cls(_png(added * _ADDED + removed * _REMOVED))
 
@@ -121,7 +121,7 @@ def _decoded(png: bytes, size: tuple[int, int]) -> UInt8[np.ndarray, "height wid
     """Cached decoder, since overlay, scores and panels read a layer several times per stroke."""
     image = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_GRAYSCALE)
     if image is None or image.shape[::-1] != size:
-        raise ProjectError("a painted layer is damaged. Undo to before it was painted, or paint it anew.")
+        raise ProjectError("a painted layer is damaged. Undo to a step before it was painted, or repaint it.")
     image = image.astype(np.uint8, copy=False)
     image.flags.writeable = False
     return image

@@ -71,10 +71,10 @@ def file_masks(source: Path, recording: Recording) -> GivenMasks:
         (frame.frame, frame.camera): ImportedMask.of(frame.labels) for frame in found.frames if frame.labels is not None
     }
     if not layers:
-        there = f" Its images are called {', '.join(map(repr, found.unknown[:3]))}." if found.unknown else ""
+        there = f" Its images are named {', '.join(map(repr, found.unknown[:3]))}." if found.unknown else ""
         raise ProjectError(
-            f"no mask in {source} belongs to a frame.{there} Frames are called "
-            f"{', '.join(map(repr, recording.frame_ids[:3]))}, ...; name the images by them."
+            f"no mask in {source} matches a frame.{there} Frames are named "
+            f"{', '.join(map(repr, recording.frame_ids[:3]))}, ...; name the images accordingly."
         )
     cameras = [camera.name for camera in recording.scene.cameras]
     return _labelled(f"mask in {source}", cameras, lambda i, c: layers.get((i, c)), found.label_names)
@@ -148,9 +148,9 @@ class ImportReport:
         labels = f" ({listed(self.labels)})" if self.masks and self.labels else ""
         text = f"Imported {' and '.join(parts)} from {self.kind}{labels}."
         if not self.changed:
-            text = f"The project has these {' and '.join(parts)} already; nothing was changed."
+            text = f"The project already has these {' and '.join(parts)}; nothing was changed."
         if self.unknown:
-            text += f" {counted(len(self.unknown), 'image')} of no frame left out, say {self.unknown[0]}."
+            text += f" {counted(len(self.unknown), 'image')} without a frame skipped, such as {self.unknown[0]}."
         if self.remarks:
             more = f"; and {len(self.remarks) - _SHOWN} more" if len(self.remarks) > _SHOWN else ""
             text += f" Remarks: {'; '.join(self.remarks[:_SHOWN])}{more}."
@@ -176,9 +176,9 @@ def import_annotations(
     unknown = tuple(annotations.unknown)
     if not edits:
         left = f"{listed(annotations.remarks, 3)}. " if annotations.remarks else ""
-        there = left + f"Its images are called {listed([repr(name) for name in unknown[:3]])}. " if unknown else left
+        there = left + f"Its images are named {listed([repr(name) for name in unknown[:3]])}. " if unknown else left
         raise ProjectError(
-            f"nothing in {source} belongs to a frame. {there}Frames are called "
+            f"nothing in {source} matches a frame. {there}Frames are named "
             f"{listed(list(state.identity.frame_ids[:3]))}, ...; cameras {listed(state.identity.cameras)}."
         )
     others = [key for key, value in edits.items() if state.get(key) not in (None, value)]
@@ -186,8 +186,8 @@ def import_annotations(
     if others and not replace:
         first = state.identity.frame_ids[others[0].frame]
         raise ProjectError(
-            f"{counted(len(others), 'layer')} imported before would be replaced, the first in frame {first}, camera "
-            f"{others[0].name}. Say so (Replace, or --replace), or undo that import."
+            f"{counted(len(others), 'earlier import')} would be replaced, the first in frame {first}, camera "
+            f"{others[0].name}. Allow it with Replace (--replace), or undo that import."
         )
     change = project.apply(f"Import from {source}"[:200], edits)
     labels = edits[Key.imported_labels()].names
@@ -209,7 +209,7 @@ def _edits(state: ProjectState, annotations: "Annotations") -> tuple[dict[Key[An
             numbers = np.zeros(256, np.uint8)
             for number, name in enumerate(annotations.label_names, start=1):
                 if names.index(name) > 254:
-                    raise ProjectError("the project has more than 255 labels then. Join some of them.")
+                    raise ProjectError("the project would have more than 255 labels. Merge some of them.")
                 numbers[number] = names.index(name) + 1
             edits[Key.imported_mask(found.frame, found.camera)] = ImportedMask.of(numbers[found.labels])
             masks += 1

@@ -141,7 +141,7 @@ class Project:
                 return None
             title = " ".join(name.encode("utf-8", "replace").decode().split())
             if not title:
-                raise ProjectError("a step's name is empty. Give one.")
+                raise ProjectError("a step has an empty name. Give a name.")
             # Names of arms, joints and frames, which are part of step names, may be long.
             title = title if len(title) <= LONGEST_NAME else f"{title[: LONGEST_NAME - 1]}…"
             step = Step(state.position + 1, title, time.time())
@@ -192,13 +192,13 @@ class Project:
         with self._edit:
             state = self.state
             if not 1 <= number <= state.position:
-                raise ProjectError(f"no step {number} is done; {counted(state.position, 'step')} are.")
+                raise ProjectError(f"step {number} is not done; {counted(state.position, 'step')} are.")
             memory = self._writer().memory
             edits, later = journal.before(memory, number, state.position)
             if later is not None:
                 raise ProjectError(
-                    f"step {number} ({state.steps[number - 1].name}) cannot be taken back alone: step {later} "
-                    f"({state.steps[later - 1].name}) has changed the same since. Take that back first."
+                    f"step {number} ({state.steps[number - 1].name}) cannot be reverted alone: step {later} "
+                    f"({state.steps[later - 1].name}) has changed the same values since. Revert that one first."
                 )
             _, entries = journal.move(memory, state.position, number - 1)
             verdicts, figures = state.regained(state.with_entries(entries), edits)

@@ -35,7 +35,7 @@ _TYPES: dict[str, tuple[Any, ...]] = {
 }
 """Table -> types of a row's values."""
 _LISTED = 5
-_LOST_STEP = "A step whose name was lost to damage"
+_LOST_STEP = "Step (name lost)"
 
 
 @dataclass
@@ -50,8 +50,8 @@ class Rescued:
     def text(self) -> str:
         """Report as a clause."""
         named = ", ".join(self.lost[:_LISTED]) + (" and more" if len(self.lost) > _LISTED else "")
-        missing = f"{len(self.lost)} could not ({named})" if self.lost else "what is missing left no trace"
-        return f"{counted(self.kept, 'row')} of it could be read, {missing}"
+        missing = f"{len(self.lost)} could not be read ({named})" if self.lost else "missing rows are unknown"
+        return f"{counted(self.kept, 'row')} could be read; {missing}"
 
 
 def rescue(copy: Copy, identity: SequenceIdentity) -> Rescued | None:
@@ -190,7 +190,7 @@ class Store:
             except LostFile as lost:
                 self._rescue(str(lost))
         else:
-            raise ProjectError(f"project {self.path} is lost again and again. {self.incident}")
+            raise ProjectError(f"project {self.path} is lost repeatedly. {self.incident}")
         with database.transaction(self.memory) as memory:
             for statement, rows in statements:
                 memory.executemany(statement, rows)
@@ -247,7 +247,8 @@ class Store:
         else:
             failed = (
                 f"NOT SAVED: project {lost} {what} while it was open, and its edits could not be saved elsewhere "
-                f"either ({failure}). They are in memory. Make room, or make the folder writable: it is tried again."
+                f"either ({failure}). They are in memory. Free disk space, or make the folder writable; saving is "
+                "retried."
             )
             if failed != self.incident:
                 _log.error("%s", failed)
@@ -255,7 +256,7 @@ class Store:
             raise ProjectError(failed)
         self.path = self._file.path
         self.incident = (
-            f"Project {lost} {what} while it was open. Every edit was saved to {self.path}, and edits go on being "
+            f"Project {lost} {what} while it was open. Every edit was saved to {self.path}; further edits are "
             f"saved there. To open it again: --project '{self.path}'."
         )
         _log.error("%s", self.incident)
@@ -289,7 +290,7 @@ def open_or_begin(path: Path, identity: SequenceIdentity) -> tuple[ProjectState,
         _begin(path, identity)
     file = ProjectFile.locked(path)
     if file is None:
-        reason = f"It is open for writing elsewhere ({holder(path)}). Close it there, then open it again."
+        reason = f"It is open for writing elsewhere ({holder(path)}). Close it there and open it again."
         return read_project(path, identity), reason
     try:
         memory, state, seal = _load(path, identity, keep_what_is_left=True)
@@ -328,8 +329,7 @@ def _load(
         copy = open_copy(content, path)
     except sqlite3.Error as error:
         raise database.DamagedProject(
-            f"project {path} is damaged: {error}. It was not changed. Nothing of it can be read. Go back to a copy of "
-            "it."
+            f"project {path} is damaged: {error}. The file was not changed and cannot be read. Restore a backup copy."
         ) from error
     try:
         state, seal = _checked(copy)
@@ -339,7 +339,7 @@ def _load(
         copy.connection.close()
         raise ProjectError(
             f"project {path} belongs to another sequence ({state.identity.name!r}, not {identity.name!r}): "
-            f"{difference}. Nothing was changed. Open it with its own sequence, or name another project file."
+            f"{difference}. Nothing was changed. Open it with its sequence, or choose another project file."
         )
     return copy.connection, state, seal
 
@@ -360,13 +360,13 @@ def _damaged(
     reason = (
         str(error).rstrip(".") if isinstance(error, ProjectError | sqlite3.Error) else f"unreadable values ({error})"
     )
-    begin = f"project {path} is damaged: {reason}. It was not changed."
+    begin = f"project {path} is damaged: {reason}. The file was not changed."
     if not keep_what_is_left or identity is None:
-        return database.DamagedProject(f"{begin} Open it for writing to have what can be read of it rescued.")
+        return database.DamagedProject(f"{begin} Open it for writing to rescue its readable content.")
     rescued = rescue(copy, identity)
     copy.connection.close()
     if rescued is None:
-        return database.DamagedProject(f"{begin} Nothing of it can be read. Go back to a copy of it.")
+        return database.DamagedProject(f"{begin} It cannot be read. Restore a backup copy.")
     when = time.time()
     with suppress(OSError, OverflowError, ValueError):
         # Named by the file's modification time, so that another attempt finds the same rescued file.
@@ -377,9 +377,9 @@ def _damaged(
         new = write_new(target, file_content(rescued.connection))
     rescued.connection.close()
     if not new and not target.exists():
-        return database.DamagedProject(f"{begin} {rescued.text}, but {target} could not be written. Make room for it.")
-    was = "is now" if new else "was rescued before and is"
+        return database.DamagedProject(f"{begin} {rescued.text}, but {target} could not be written. Free disk space.")
+    was = "is now" if new else "was rescued earlier and is"
     return database.DamagedProject(
-        f"{begin} {rescued.text}; that {was} in {target}. Go back to a copy of the project, or go on with what was "
-        f"rescued: --project '{target}'."
+        f"{begin} {rescued.text}; that {was} in {target}. Restore a backup copy, or continue with the "
+        f"rescued file: --project '{target}'."
     )

@@ -52,10 +52,10 @@ class Provenance:
         try:
             used = None if self.settings is None else json.loads(self.settings)
         except ValueError as error:
-            raise ProjectError(f"settings are not JSON ({error}). Give what json.dumps writes.") from error
+            raise ProjectError(f"settings are not valid JSON ({error}). Give the output of json.dumps.") from error
         masks_alone = isinstance(used, dict) and used.get("observe") == "masks"
         if self.source is Source.OPTIMIZER and (self.settings is None or not (self.weights_sha256 or masks_alone)):
-            raise ProjectError("an optimizer's value needs its settings and the hash of its weights. Give both.")
+            raise ProjectError("a value of an optimizer requires its settings and the hash of its weights. Give both.")
         if self.weights_sha256 is not None and not re.fullmatch("[0-9a-f]{64}", self.weights_sha256):
             raise ProjectError(f"{self.weights_sha256!r} is not a SHA-256 hash. Give 64 hexadecimal digits.")
 
@@ -196,7 +196,7 @@ class Review(JsonValue):
     def __post_init__(self) -> None:
         _set(self, "state", _choice(ReviewState, self.state, "review state"))
         if not isinstance(self.note, str) or len(self.note) > LONGEST_NOTE:
-            raise ProjectError(f"a note must be text of at most {LONGEST_NOTE} characters. Shorten it.")
+            raise ProjectError(f"a note must have at most {LONGEST_NOTE} characters. Shorten it.")
 
 
 @dataclass(frozen=True)
@@ -272,7 +272,7 @@ class ImportedLabels(JsonValue):
     def __post_init__(self) -> None:
         _set(self, "names", tuple(self.names))
         if len(self.names) > 255 or not all(isinstance(name, str) and len(name) <= 1000 for name in self.names):
-            raise ProjectError("imported labels must be at most 255 names of at most 1000 characters.")
+            raise ProjectError("imported labels: at most 255 names of at most 1000 characters are allowed.")
 
 
 @dataclass(frozen=True)
@@ -320,7 +320,7 @@ class FitVerdict(JsonValue):
             raise ProjectError(f"a verdict is {self.verdict!r}, but must be one of: {', '.join(VERDICTS)}.")
         for text in (self.reason, self.remedy):
             if not isinstance(text, str) or len(text) > LONGEST_TEXT:
-                raise ProjectError(f"reason and remedy must be texts of at most {LONGEST_TEXT} characters. Shorten it.")
+                raise ProjectError(f"reason and remedy must have at most {LONGEST_TEXT} characters. Shorten them.")
         _set(self, "cameras", tuple((str(name), value) for name, value in self.cameras))
         for value in (self.failure, *(value for _, value in self.cameras)):
             if not (isinstance(value, float | int) and 0.0 <= value <= 1.0):
@@ -482,7 +482,7 @@ def check_edit(identity: SequenceIdentity, key: Key[Any], value: object) -> None
     if key.kind in _OF_FRAME and not 0 <= key.frame < frames:
         raise ProjectError(f"the sequence has no frame number {key.frame}; its frames are 0 to {frames - 1}.")
     if key.kind not in _OF_FRAME and key.frame != WHOLE_PROJECT:
-        raise ProjectError(f"{key.kind} holds for all frames, so it has no frame {key.frame}.")
+        raise ProjectError(f"{key.kind} applies to all frames, so no frame can be given ({key.frame}).")
     if key.kind in _OF_NOBODY:
         known = [""]
     else:
@@ -505,4 +505,4 @@ def _check_value(identity: SequenceIdentity, key: Key[Any], value: object) -> No
         )
     if isinstance(value, Layer) and value.size != identity.cameras[key.name]:
         given, wanted = (" x ".join(map(str, size)) for size in (value.size, identity.cameras[key.name]))
-        raise ProjectError(f"the layer is {given} pixels, but images of camera {key.name!r} are {wanted}.")
+        raise ProjectError(f"the layer has {given} pixels, but images of camera {key.name!r} have {wanted}.")

@@ -25,7 +25,7 @@ def main() -> None:
     around = scene.state({"arm": np.array([[0.0], [-step], [step]]) * np.ones(len(robot.joint_names))})
     renderer = Renderer(scene)
     rendering = renderer.surface(around, 2 * step)
-    assert rendering.jacobian, "what is not seen compiles nothing"
+    assert rendering.jacobian, "an invisible scene compiles nothing"
     renderer.outline(around.map(lambda values: values[0]), renderer.tangents(around, 2 * step))
     image, pixel, samples = (np.zeros(shape, np.float32) for shape in ((1, 2, 2, 6), (2, 1), 3))
     nearest_edges(image, np.zeros(1, np.int64), pixel, pixel, samples, samples)

@@ -26,7 +26,7 @@ _MEAN, _DEVIATION = (123.675, 116.28, 103.53), (58.395, 57.12, 57.375)
 _INSIDE, _OUTSIDE, _CORNERS, _PADDING = 1.0, 0.0, (2.0, 3.0), -1.0
 """SAM's point labels: foreground, background, corners of a box, padding."""
 _REMEDY = (
-    "Give two ONNX files, the encoder first, as Segment Anything's export_onnx_model.py and samexporter write them."
+    "Give two ONNX files, the encoder first, as written by Segment Anything's export_onnx_model.py or samexporter."
 )
 _KNOWN = {"point_coords", "point_labels", "mask_input", "has_mask_input", "orig_im_size"}
 """Decoder inputs that are not outputs of the encoder."""
@@ -68,7 +68,8 @@ class OnnxSegmenter:
             or not isinstance(shape[2], int)
         ):
             raise WeightsError(
-                f"{encoder} takes {_listed(images)}; an encoder takes one image [1, 3, side, side]. {_REMEDY}"
+                f"{encoder} has the inputs {_listed(images)}; an encoder has one, an image [1, 3, side, side]. "
+                f"{_REMEDY}"
             )
         names = {given.name for given in second.get_inputs()}
         offered = {found.name for found in first.get_outputs()}
@@ -77,11 +78,12 @@ class OnnxSegmenter:
         # A single unmatched decoder input is matched with the encoder's single output, whatever its name.
         if missing or len(foreign) > 1 or (foreign and len(offered) != 1):
             raise WeightsError(
-                f"{decoder} takes {_listed(second.get_inputs())}, and {encoder} makes {', '.join(sorted(offered))}; a "
-                f"decoder takes what its encoder makes, point_coords and point_labels. {_REMEDY}"
+                f"{decoder} has the inputs {_listed(second.get_inputs())}, and {encoder} the outputs "
+                f"{', '.join(sorted(offered))}; a decoder's inputs are its encoder's outputs, point_coords and "
+                f"point_labels. {_REMEDY}"
             )
         if "masks" not in {found.name for found in second.get_outputs()}:
-            raise WeightsError(f"{decoder} makes {_listed(second.get_outputs())}, and no masks. {_REMEDY}")
+            raise WeightsError(f"{decoder} has the outputs {_listed(second.get_outputs())}, but no masks. {_REMEDY}")
         return OnnxSegmenter(first, second, shape[2], decoder.stem)
 
     def segment(self, image: UInt8[np.ndarray, "height width 3"], prompt: Prompt) -> Bool[np.ndarray, "height width"]:
@@ -178,14 +180,14 @@ def _session(path: Path) -> "InferenceSession":
         raise WeightsError(f"segmenter file {path} cannot be read ({shortened(str(error))}). {_REMEDY}") from error
     if content[:2] == b"PK" or content[:1] == b"\x80":
         raise WeightsError(
-            f"segmenter file {path} is a PyTorch file, whose code may run when it is loaded. Export it as ONNX. "
+            f"segmenter file {path} is a PyTorch file, which could execute code on loading. Export it as ONNX. "
             f"{_REMEDY}"
         )
     try:
         return inference_session(content, fold=False)
     except RuntimeError as error:
         raise WeightsError(
-            f"segmenter file {path} is no ONNX graph that can be run ({shortened(str(error), 300)}). {_REMEDY}"
+            f"segmenter file {path} is not an executable ONNX graph ({shortened(str(error), 300)}). {_REMEDY}"
         ) from error
 
 

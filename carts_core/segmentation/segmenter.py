@@ -35,14 +35,16 @@ class Prompt:
 
     def __post_init__(self) -> None:
         if not self.inside and self.box is None:
-            raise SettingsError("a prompt needs a point on the thing, or a box around it.")
+            raise SettingsError("a prompt needs a point on the object, or a box around it.")
         if len(self.inside) + len(self.outside) > MOST_POINTS:
-            raise SettingsError(f"a prompt has at most {MOST_POINTS} points. Begin another one.")
+            raise SettingsError(f"a prompt has at most {MOST_POINTS} points. Start another prompt.")
         numbers = [value for place in (*self.inside, *self.outside, self.box or ()) for value in place]
         if not np.isfinite(numbers).all():
-            raise SettingsError("a place of a prompt is not finite.")
+            raise SettingsError("a position of a prompt is not finite.")
         if self.box is not None and not (self.box[0] < self.box[2] and self.box[1] < self.box[3]):
-            raise SettingsError(f"the box {self.box} is empty. Give left, top, right and lower end.")
+            raise SettingsError(
+                f"the box {self.box} is empty. Give left, top, right and bottom with left < right and top < bottom."
+            )
 
 
 class Segmenter(Protocol):

@@ -68,16 +68,18 @@ class ImportOptions:
     def __post_init__(self) -> None:
         for camera, size in self.calibration_size.items():
             if not re.fullmatch(r"[1-9]\d{0,5}[xX][1-9]\d{0,5}", size):
-                raise SettingsError(f"calibration_size of {camera} is {size!r}; give width and height, as 640x480.")
+                raise SettingsError(
+                    f"calibration_size of {camera} is {size!r}; give width and height, such as 640x480."
+                )
         for name, value in (("time_offset", self.time_offset), ("frame_rate", self.frame_rate)):
             if value is not None and not math.isfinite(value):
                 raise SettingsError(f"{name} is {value}; give a finite number.")
         if self.frame_rate is not None and not 0.01 <= self.frame_rate <= 1000:
-            raise SettingsError(f"frame_rate is {self.frame_rate:g}; allowed is 0.01 to 1000 frames per second.")
+            raise SettingsError(f"frame_rate is {self.frame_rate:g}; allowed: 0.01 to 1000 frames per second.")
         for joint, unit in self.units.items():
             if unit not in (*get_args(AngleUnit), *get_args(LengthUnit)):
                 allowed = ", ".join((*get_args(AngleUnit), *get_args(LengthUnit)))
-                raise SettingsError(f"the unit of {joint} is {unit!r}; allowed is {allowed}.")
+                raise SettingsError(f"the unit of {joint} is {unit!r}; allowed: {allowed}.")
 
 
 FormatName = Literal[

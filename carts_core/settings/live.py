@@ -51,12 +51,12 @@ class StreamAddress:
             "socket": place.isdecimal() and int(place) < _PORTS,
         }
         if not fits.get(kind, False):
-            raise SettingsError(f"--source {text!r} is not known. Give {KNOWN}.")
+            raise SettingsError(f"--source {text!r} is unknown. Give {KNOWN}.")
         if joints_port is not None and not 0 <= joints_port < _PORTS:
-            raise SettingsError(f"--joints-port is {joints_port}; allowed is 0 to {_PORTS - 1}.")
+            raise SettingsError(f"--joints-port is {joints_port}; allowed: 0 to {_PORTS - 1}.")
         address = cls(StreamKind(kind), place, joints_port)
         if address.kind in (StreamKind.CAMERA, StreamKind.VIDEO) and joints_port is None:
-            raise SettingsError(f"--source {text} has no joints. Say with --joints-port on which port they come.")
+            raise SettingsError(f"--source {text} has no joints. Give the port that receives them with --joints-port.")
         return address
 
     def __str__(self) -> str:

@@ -232,8 +232,8 @@ def surface_solver(settings: SolverSettings | None, what: str) -> SurfaceSolver:
     if settings is None or isinstance(settings, SurfaceSolver):
         return settings or SurfaceSolver()
     raise SettingsError(
-        f"{what} was given a solver for the loss {settings.loss.value!r}; it needs the solver `surface`. "
-        "Leave it at its default, or optimize each frame alone."
+        f"{what} requires the solver `surface`, not one for the loss {settings.loss.value!r}. "
+        "Use the default solver, or optimize each frame alone."
     )
 
 

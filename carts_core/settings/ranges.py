@@ -47,7 +47,7 @@ NotNegative = Annotated[float, Range(0)]
 def require(condition: bool, name: str, value: object, allowed: object) -> None:
     """Check a setting; `SettingsError` if the condition is false."""
     if not condition:
-        raise SettingsError(f"{name} is {value!r}; allowed is {allowed}. Change it, or leave it at its default.")
+        raise SettingsError(f"{name} is {value!r}; allowed: {allowed}. Change it, or use the default.")
 
 
 class Ranged:

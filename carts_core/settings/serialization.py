@@ -66,9 +66,7 @@ def changed(base: _Settings, table: Mapping[str, Any], where: str) -> _Settings:
     values: dict[str, Any] = {}
     for name, value in table.items():
         if name not in types:
-            raise SettingsError(
-                f"{where} has no setting {name!r}.{closest(name, types)} Its settings are: {', '.join(types)}."
-            )
+            raise SettingsError(f"{where} has no setting {name!r}.{closest(name, types)} Settings: {', '.join(types)}.")
         present = getattr(base, name)
         of_stages = name in ("stages", "then") or (
             isinstance(present, tuple) and any(type(one) in get_args(Stage) for one in present)
@@ -84,12 +82,12 @@ def _like(value: Any, present: Any, where: str) -> Any:
     if isinstance(present, StrEnum) and isinstance(value, str):
         kind = type(present)
         if value not in set(kind):
-            raise SettingsError(f"{where} is {value!r}; allowed is {', '.join(kind)}.")
+            raise SettingsError(f"{where} is {value!r}; allowed: {', '.join(kind)}.")
         return kind(value)
     if isinstance(present, tuple) and isinstance(value, list):
         return tuple(value)
     if type(value) is not type(present):
-        raise SettingsError(f"{where} is {value!r}; it must be a value such as {to_plain(present)!r}.")
+        raise SettingsError(f"{where} is {value!r}; give a value such as {to_plain(present)!r}.")
     return value
 
 
@@ -103,9 +101,9 @@ def _stage(table: Mapping[str, Any], where: str) -> Stage:
     rest = dict(table)
     name = rest.pop("stage", None)
     if name not in _STAGES:
-        raise SettingsError(f"{where} has the stage {name!r}; allowed is {', '.join(_STAGES)}.")
+        raise SettingsError(f"{where} has the stage {name!r}; allowed: {', '.join(_STAGES)}.")
     if name == "Descend" and "blur" not in rest:
-        raise SettingsError(f"{where} (Descend) needs a blur [px], for instance 1.6.")
+        raise SettingsError(f"{where} (Descend) requires a blur [px], such as 1.6.")
     kind = _STAGES[name]
     required: dict[str, Any] = {"blur": 1.0, "then": ()}
     base = kind(**{field.name: required[field.name] for field in fields(kind) if field.default is MISSING})

@@ -175,7 +175,7 @@ class SynthesisConfig(Ranged):
         unknown = [name for name in self.domains if name not in DOMAINS]
         if unknown or not self.domains:
             raise SettingsError(
-                f"SynthesisConfig.domains is {self.domains}; name at least one of: {', '.join(DOMAINS)}."
+                f"SynthesisConfig.domains is {self.domains}; give at least one of: {', '.join(DOMAINS)}."
             )
 
     def rng(self, *purpose: str | int) -> np.random.Generator:

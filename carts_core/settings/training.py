@@ -140,8 +140,8 @@ class AppearanceRanges(Ranged):
                 raise SettingsError(f"{name} is {value}; give two values with 0 <= lower <= upper.")
         if self.brightness[0] < DARKEST_BRIGHTNESS:
             raise SettingsError(
-                f"brightness starts at {self.brightness[0]}, below {DARKEST_BRIGHTNESS}. Low light is a domain that is "
-                "evaluated and must not be trained on; raise the lower value."
+                f"brightness starts at {self.brightness[0]}, below {DARKEST_BRIGHTNESS}. Low light is an evaluation "
+                "domain and must not be trained on; increase the lower value."
             )
         if self.gamma[0] == 0 or self.jpeg_quality[1] > 100:
             raise SettingsError("gamma must be positive and jpeg_quality at most 100; correct the range.")
@@ -189,7 +189,7 @@ class ImageSettings(Ranged):
         if self.field_width < self.width:
             raise SettingsError(f"field_width is {self.field_width}; give at least the width, {self.width}.")
         if not 0 <= self.coverage[0] < self.coverage[1] <= 1:
-            raise SettingsError(f"coverage is {self.coverage}; give two shares, the lower one first.")
+            raise SettingsError(f"coverage is {self.coverage}; give two fractions, the lower one first.")
 
 
 NetworkName = Literal["feature", "surface"]
@@ -211,7 +211,7 @@ class TrainingConfig(Ranged):
     """Optimizer steps."""
     minutes: Annotated[float | None, Range(0, unit="min", above=True)] = None
     """Processor time for training, per thread of the training process [min]; a run that would take longer has fewer
-    steps. On a busy machine a run takes longer and learns as much."""
+    steps. Machine load does not change the number of steps."""
     batch_size: Count = 8
     """Samples per step: a pair of an observed and a hybrid image, or one observed image."""
     reuse: Count = 2
@@ -254,7 +254,7 @@ class TrainingConfig(Ranged):
     def __post_init__(self) -> None:
         super().__post_init__()
         if not self.robots:
-            raise SettingsError("no robot to train on; give at least one URDF file.")
+            raise SettingsError("no robot was given; give at least one URDF file.")
         stride = self.architecture.stride
         if self.images.width % stride or self.images.height % stride:
             raise SettingsError(
@@ -298,9 +298,11 @@ class BaselineNetwork:
 
     def __post_init__(self) -> None:
         if self.encoder and not _ENCODER.fullmatch(self.encoder):
-            raise SettingsError(f"encoder is {self.encoder!r}; give a name of timm's list, such as hrnet_w48.")
+            raise SettingsError(f"encoder is {self.encoder!r}; give the name of a timm model, such as hrnet_w48.")
         if self.width is not None and (self.name != "swin" or not 12 <= self.width <= _LARGEST or self.width % 12):
-            raise SettingsError(f"width is {self.width}; give a multiple of 12 up to {_LARGEST}, and for swin only.")
+            raise SettingsError(
+                f"width is {self.width}; give a multiple of 12 up to {_LARGEST}; only swin has a width."
+            )
         if len(self.decoder) != 5 or any(not 1 <= channels <= _LARGEST for channels in self.decoder):
             raise SettingsError(f"decoder is {self.decoder}; give five channel counts of 1 to {_LARGEST}.")
         if len(self.size) != 2 or any(not 32 <= side <= 4096 or side % 32 for side in self.size):

@@ -50,7 +50,7 @@ class BrowsingHandler(Handler):
         if not again and (index, domain, camera) == (state.index, state.domain, state.camera):
             return
         if (index, domain) != (state.index, state.domain) or (camera != state.camera and not state.every_camera):
-            self._context.end_run("Stopped: another image is shown")
+            self._context.end_run("Stopped: another image was selected")
         frame = self._session.frame(index, domain, camera)
         if index != state.index:
             context.leave_frame()
@@ -87,7 +87,9 @@ class BrowsingHandler(Handler):
                 raise
             # Half-typed numbers are often far off, so no error is shown before the field is left.
             now = f"{sequence.matching.time_offset:g} s"
-            text = f"With {seconds:g} s there are no joint positions near some frames in time, so it stays at {now}."
+            text = (
+                f"With {seconds:g} s, some frames have no joint positions near their times; the offset remains {now}."
+            )
             _log.info("%s %s", text, error)
             self._context.change(time_error=text)
             return

@@ -20,14 +20,14 @@ class OpenRun(Protocol):
     """The run of the optimizer on the shown frame."""
 
     def end(self, reason: str | None) -> None:
-        """End the run, if there is one, and save its pose; `reason` is text for the user."""
+        """End the run, if any, and save its pose; `reason` is text for the user."""
 
     def forget(self) -> None:
         """Forget the start of the run, since another frame is shown."""
 
 
 class Context:
-    """The state, which handlers replace, and the edits that they make; used on the worker's thread alone.
+    """State that handlers replace, and edits that they make; used on the worker's thread only.
 
     Attributes:
         state: what the page shows.
@@ -67,7 +67,7 @@ class Context:
     def set_pose(
         self, name: str, scene: SceneState, *, gesture: object = None, source: Source = Source.HAND, pins: bool = False
     ) -> None:
-        """Give the shown frame another pose; no run may be open.
+        """Set the pose of the shown frame; no run may be open.
 
         Args:
             name: of the step in the history.
@@ -132,7 +132,7 @@ class Context:
         self._loss = None
 
     def refresh(self, maps: Maps | None = None) -> None:
-        """Bring the state up to date with the project; a pose that is the same keeps its scores and maps."""
+        """Update the state from the project; an unchanged pose keeps its scores and maps."""
         before = self.state
         if not self.session.matched(self.state.frame):
             frame = self.session.frame(self.state.index, self.state.domain, self.state.camera)
@@ -157,7 +157,7 @@ class Context:
         return state.mask_correction, *others
 
     def score(self) -> None:
-        """Compare the pose with the truth, unless that was done; the project keeps the first figures."""
+        """Compare the pose with ground truth, unless already done; the project keeps the first figures."""
         state = self.state
         if state.scores is not None:
             return
@@ -196,7 +196,7 @@ def finite(value: float) -> float:
         CartsError: it is not finite.
     """
     if not math.isfinite(value):
-        raise CartsError(f"{value} is not a number that a control can be set to.")
+        raise CartsError(f"{value} is not a valid value of a control.")
     return float(value)
 
 
@@ -218,7 +218,7 @@ def one_of(asked: str | None, now: str, known: Collection[str], what: str) -> st
     if asked is None:
         return now
     if asked not in known:
-        raise CartsError(f"There is no {what} called {asked!r}; this sequence has: {', '.join(known)}.")
+        raise CartsError(f"There is no {what} {asked!r}; this sequence has: {', '.join(known)}.")
     return asked
 
 

@@ -101,10 +101,10 @@ class ExportingHandler(Handler):
 
     def _on_Export(self, intent: intents.Export) -> None:
         if self._job is not None:
-            raise CartsError("An export is running already. Wait, or cancel it first.")
+            raise CartsError("An export is already running. Wait, or cancel it first.")
         if intent.format not in FORMATS or intent.frames not in FRAME_CHOICES or intent.parts not in PARTS_CHOICES:
-            raise SettingsError(f"There is no export of {intent.frames!r} as {intent.format!r} by {intent.parts!r}.")
-        self._context.end_run("Stopped: frames are exported")
+            raise SettingsError(f"Unsupported export: {intent.frames!r} as {intent.format!r} by {intent.parts!r}.")
+        self._context.end_run("Stopped: an export was started")
         self._context.save()
         make, count = self._dataset(intent)
         target = free_path(self._session.editor.project.path, _STEMS.get(intent.format, intent.format), intent)
@@ -131,7 +131,7 @@ class ExportingHandler(Handler):
         if not chosen:
             where = "" if intent.range is None else ", in the timeline's range"
             raise SettingsError(
-                f"No frame is in this choice ({intent.frames.lower()}{where}). Review frames, or choose others."
+                f"No frames to export ({intent.frames.lower()}{where}). Review frames, or choose others."
             )
         cameras = [state.camera] if intent.shown_camera else [camera.name for camera in session.scene.cameras]
         scene = calibrated_scene(session.scene, view).with_cameras(cameras)
@@ -202,8 +202,8 @@ def zipped(path: Path) -> tuple[str, bytes]:
     size = sum(file.stat().st_size for file in files)
     if size > LARGEST:
         raise CartsError(
-            f"{path} has {size / 2**20:.0f} MiB, more than the {LARGEST // 2**20} MiB that can be downloaded. "
-            "Copy it from there."
+            f"{path} has {size / 2**20:.0f} MiB; the limit for downloads is {LARGEST // 2**20} MiB. "
+            "Copy it from that path."
         )
     if path.is_file():
         return path.name, path.read_bytes()
@@ -220,7 +220,7 @@ _NAMED = 6
 
 
 def export_warnings(project: ProjectState, frames: Sequence[int], cameras: Collection[str]) -> list[str]:
-    """Warnings about the frames of an export, by their indices, and the cameras that are exported."""
+    """Warnings about an export, for frame indices and exported cameras."""
     found: list[str] = []
     # An hour has 100,000 frames, of which few have a record.
     recorded = [index for index in frames if index in project.records]
@@ -232,7 +232,7 @@ def export_warnings(project: ProjectState, frames: Sequence[int], cameras: Colle
         those = [i for i in recorded if (known := project.verdict(i)) is not None and known.verdict == verdict]
         found += _line(project, those, f"of these frames {text}")
     partly = [i for i in recorded if not _seen_by_all(project, i, cameras)]
-    return found + _line(project, partly, "of these frames were fitted to fewer cameras than are exported")
+    return found + _line(project, partly, "of these frames were fitted to fewer cameras than exported")
 
 
 def _seen_by_all(project: ProjectState, frame: int, cameras: Collection[str]) -> bool:
@@ -330,7 +330,7 @@ class ImportingHandler(Handler):
         session = self._session
         place = intent.place.strip()[:_LONGEST]
         if not place:
-            raise CartsError("Type the path of the masks: a COCO or CVAT file, or a folder of PNG masks.")
+            raise CartsError("Give the path of the masks: a COCO or CVAT file, or a folder of PNG masks.")
         # Resolved, so that links to the folder do not matter.
         path = session.roots.checked(session.sequence.path.parent.resolve() / Path(place))
         found = read_annotations(path, session.sequence, intent.camera, confined=True)

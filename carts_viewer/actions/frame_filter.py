@@ -15,7 +15,7 @@ SOLVED = "solved together"
 
 @dataclass(frozen=True)
 class FrameFilter:
-    """Conditions on frames, all of which have to hold."""
+    """Conditions on frames; a frame must meet all of them."""
 
     review: str = ANY
     """A result of `review_name`, or `UNJUDGED`."""
@@ -30,7 +30,7 @@ class FrameFilter:
 
     @property
     def empty(self) -> bool:
-        """Whether every frame is found."""
+        """Whether the filter has no conditions and therefore matches every frame."""
         return self == FrameFilter()
 
 

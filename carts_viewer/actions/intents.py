@@ -37,7 +37,7 @@ class Latest(Intent):
 
 
 class Refresh(Latest):
-    """Bring all widgets up to date."""
+    """Update all widgets."""
 
 
 class Drawn(Latest):
@@ -55,7 +55,7 @@ class SetName(Latest):
 
 
 class DismissError(Latest):
-    """Take the error message off the page."""
+    """Remove the error message from the page."""
 
 
 class ShowFrame(Latest):
@@ -65,7 +65,7 @@ class ShowFrame(Latest):
 
 
 class MoveFrame(Intent):
-    """Show the frame that is `by` frames further."""
+    """Move the shown frame by `by` frames."""
 
     by: int
 
@@ -89,13 +89,13 @@ class SetTimeOffset(Latest):
 
 
 class ShowDomain(Latest):
-    """Show the images of this domain; joints stay as they are."""
+    """Show the images of this domain; joints do not change."""
 
     domain: str
 
 
 class ShowCamera(Latest):
-    """Look through this camera; joints stay as they are."""
+    """Show this camera; joints do not change."""
 
     camera: str
 
@@ -113,13 +113,13 @@ class SetReach(Latest):
 
 
 class SetRange(Latest):
-    """Choose the part of the sequence from the first to the last of these frames (0-based); None: all of it."""
+    """Set the range to these first and last frames (0-based); None: the whole sequence."""
 
     frames: tuple[int, int] | None
 
 
 class MarkRange(Intent):
-    """Begin, or end, the chosen part of the sequence at the shown frame."""
+    """Set the start or the end of the range to the shown frame."""
 
     end: bool = False
 
@@ -131,7 +131,7 @@ class CompareWith(Latest):
 
 
 class SetSwipe(Latest):
-    """Show the other pose up to this share of the picture's width, 0..1."""
+    """Set the share of the picture's width that shows the other pose, 0..1."""
 
     share: float
 
@@ -155,7 +155,7 @@ class SetOpacity(Latest):
 
 
 class SetJoint(Intent):
-    """Put one joint to a value [rad or m]."""
+    """Set one joint [rad or m]."""
 
     keyed_by = ("arm", "joint")
     arm: str
@@ -164,13 +164,13 @@ class SetJoint(Intent):
 
 
 class BackToMeasured(Intent):
-    """Forget this frame's corrections of one arm, or of all of them."""
+    """Reset this frame's joints of one arm, or of all arms, to the measured values."""
 
     arm: str | None = None
 
 
 class Perturb(Intent):
-    """Move every joint by this many degrees or millimetres, with random signs from the seed."""
+    """Offset every joint by this many degrees or millimetres, with random signs from the seed."""
 
     degrees: float
     seed: int
@@ -220,7 +220,7 @@ class RunOrPause(Optimizing):
 
 
 class Step(Optimizing):
-    """Do one iteration."""
+    """Perform one iteration."""
 
 
 class Reset(Optimizing):
@@ -247,7 +247,7 @@ class ResetSettings(Optimizing):
 
 
 class SetFreeJoint(Optimizing):
-    """Let the optimizer move one joint, or not."""
+    """Set whether the optimizer may move one joint."""
 
     keyed_by = ("arm", "joint")
     arm: str
@@ -256,7 +256,7 @@ class SetFreeJoint(Optimizing):
 
 
 class SetFreeGroup(Optimizing):
-    """Let the optimizer move base frames, extrinsics or intrinsics (`group`), or not."""
+    """Set whether the optimizer may move base frames, extrinsics or intrinsics (`group`)."""
 
     keyed_by = ("group",)
     group: str
@@ -264,13 +264,13 @@ class SetFreeGroup(Optimizing):
 
 
 class SetCameras(Optimizing, Latest):
-    """Optimize in all cameras, or in the shown one."""
+    """Fit all cameras, or only the shown one."""
 
     every: bool
 
 
 class SetObserved(Optimizing, Latest):
-    """Have runs fit predictions of the network, masks or both."""
+    """Set the target of runs: predictions of the network, masks or both."""
 
     what: str
     """One of `choices.Observe`."""
@@ -372,7 +372,7 @@ class ShowWorse(Intent):
     """Show the next worst frame that is neither accepted nor rejected."""
 
     step: int = 1
-    """1 to the next better one, -1 to the next worse one."""
+    """1: the next better one; -1: the next worse one."""
 
 
 class CopyCorrection(Intent):
@@ -457,7 +457,7 @@ class OptimizeFrames(Jobs):
     """Run the optimizer on many frames, each alone, from its present pose."""
 
     frames: Frames = "unreviewed"
-    """Those that the filter finds, those without a review, those in the chosen range, or all."""
+    """Frames that match the filter, frames without a review, frames in the range, or all frames."""
 
 
 class Calibrate(Jobs):
@@ -494,7 +494,7 @@ class AnswerJobs(Jobs):
 
 
 class CancelJob(Jobs):
-    """Stop a job, or take it out of the queue."""
+    """Stop a job, or remove it from the queue."""
 
     number: int
 
@@ -528,9 +528,9 @@ class Export(Exporting):
     parts: Parts = "arms"
     """Granularity of the categories."""
     images: bool = False
-    """Copy the images beside their labels; otherwise labels name those of the recording, where the format allows it."""
+    """Copy the images beside their labels; otherwise labels refer to the recording's images, where the format allows it."""
     shown_camera: bool = False
-    """Only the camera that is shown, not all."""
+    """Only the shown camera."""
     range: tuple[int, int] | None = None
     """First and last frame, both exported; None for the whole sequence."""
 
@@ -546,7 +546,7 @@ class Download(Exporting):
 
 
 class ImportMasks(Intent):
-    """Import masks and keypoints of a file or folder into the project, as one step of undo."""
+    """Import masks and keypoints of a file or folder into the project, as one undo step."""
 
     place: str
     """Path of the file or folder; relative to the sequence's folder, or absolute in an allowed one."""
@@ -565,13 +565,13 @@ class SetFilter(Intent):
 
 
 class ShowFound(Intent):
-    """Show the next frame that was found, or with -1 the one before."""
+    """Show the next frame found, or with -1 the previous one."""
 
     step: int = 1
 
 
 class ReviewFound(Intent):
-    """Set the review state of all frames found, as one step of undo; notes stay."""
+    """Set the review state of all frames found, as one undo step; notes stay."""
 
     state: ReviewState
 

@@ -42,7 +42,7 @@ _CHOICES = "index frame domain camera pose settings free solver observed every_c
 
 @dataclass(frozen=True, eq=False)
 class JobRequester:
-    """User who has requested a job, and the state of their tab then."""
+    """User who requested a job, and the state of their tab at that time."""
 
     person: Person
     state: ViewState
@@ -113,7 +113,7 @@ class JobsHandler(Handler):
 
     def _on_Adapt(self, intent: intents.Adapt) -> None:
         if not self._context.session.editor.project.writable:
-            raise CartsError("The project is read-only here, so no network can be kept beside it.")
+            raise CartsError("The project is read-only, so adapted networks cannot be stored beside it.")
         self._queue("adapt", {**msgspec.structs.asdict(intent), "folder": self._networks.next_number()})
 
     def _on_UseNetwork(self, intent: intents.UseNetwork) -> None:
@@ -131,7 +131,7 @@ class JobsHandler(Handler):
             if job.state is JobState.ASKED and intent.accepted:
                 self._list.accept(job.number, self._safe_options(job))
             elif job.state is JobState.ASKED:
-                self._end(job, JobState.CANCELLED, "Discarded; it did not run.")
+                self._end(job, JobState.CANCELLED, "Discarded before it ran.")
         self._publish()
 
     def _on_CancelJob(self, intent: intents.CancelJob) -> None:
@@ -245,7 +245,7 @@ class JobsHandler(Handler):
         elif job.kind == "export":
             export = state.export
             if export is None:
-                self._end(job, JobState.CANCELLED, "Cancelled; its files are removed.")
+                self._end(job, JobState.CANCELLED, "Cancelled; its files were removed.")
             elif export.path is not None:
                 self._end(job, JobState.DONE, f"{export.frames} frames in {export.path}")
             else:
@@ -311,7 +311,7 @@ class JobsHandler(Handler):
         else:
             frames = frames_in(view, UNREVIEWED)
         if not frames:
-            raise CartsError("There is no such frame. Choose others.")
+            raise CartsError("No frames were selected. Choose other frames.")
         return frames
 
     @property

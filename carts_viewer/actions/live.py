@@ -49,7 +49,7 @@ class LiveRun:
 
     @property
     def port(self) -> int | None:
-        """Port that receives joints or frames; None without one."""
+        """Port that receives joints or frames; None if not used."""
         return None if self._stream.server is None else self._stream.server.port
 
     def take(self) -> Tracked | None:
@@ -144,7 +144,7 @@ class LiveHandler(Handler):
             return True
         if isinstance(intent, intents.Play) and intent.on is False:
             return True
-        raise CartsError("A live stream is shown, which cannot be edited. Press Stop (Live) first.")
+        raise CartsError("A live stream cannot be edited. Press Stop (Live) first.")
 
     def wait_time(self) -> float | None:
         """Time until the next check for a result [s]; None without a stream."""
@@ -165,7 +165,7 @@ class LiveHandler(Handler):
             self._show_result(run, tracked)
         elif over:
             error = run.error
-            self.stop("The stream has ended." if error is None else "Ended by an error.")
+            self.stop("The stream has ended." if error is None else "The stream was ended by an error.")
             if error is not None:
                 raise error
 
@@ -233,7 +233,7 @@ class LiveHandler(Handler):
         """
         project = self._session.editor.project
         if not project.writable:
-            raise CartsError("This project cannot be written, so nothing is recorded beside it. Untick Record.")
+            raise CartsError("This project is read-only, so the stream cannot be recorded beside it. Untick Record.")
         return project.path.with_name(f"{project.path.stem}_live_{time.strftime('%Y%m%d_%H%M%S')}")
 
     def _show_result(self, run: LiveRun, tracked: Tracked) -> None:

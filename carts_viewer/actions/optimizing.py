@@ -19,9 +19,9 @@ from carts_viewer.state import NETWORK, PRESETS, Curves, Maps, Observed, Phase, 
 _REASONS = {
     "iterations": "Done: the best iteration is the result",
     "not optimized": "Evaluated only: this solver does not optimize",
-    "converged": "Ended: no step lowers the loss any more",
+    "converged": "Ended: no step reduces the loss further",
     "failed": "Ended: the image contradicts the result",
-    "start kept": "The start is kept: the result fits hardly better",
+    "start kept": "Initial pose kept: the result hardly fits better",
     "cancelled": "Cancelled",
 }
 
@@ -50,7 +50,7 @@ class OptimizingHandler(Handler):
         return 0.0 if self._context.state.run.phase is Phase.RUNNING else None
 
     def advance(self) -> None:
-        """Do an iteration, if one is due."""
+        """Perform an iteration, if one is due."""
         if self._context.state.run.phase is Phase.RUNNING:
             self._iterate()
 
@@ -87,7 +87,7 @@ class OptimizingHandler(Handler):
             run = self._make((state.camera,))
             iterate = run.optimizer.step()
         except CartsError:
-            # Without weights, for example, there is no map, and trying again with every picture would not help.
+            # Without weights, for example, there is no map; it is not retried with every picture.
             self._context.change(layer=Layer.MASK)
             raise
         self._context.change(maps=None if iterate is None else Maps(iterate, run.cameras, of_run=False), busy=None)
@@ -134,7 +134,7 @@ class OptimizingHandler(Handler):
             # Half-typed numbers are often out of range, so no error is shown yet; Run refuses them.
             self._context.change(settings_error=str(error), settings_field=intent.name)
             return
-        self.end("Settings changed; Run starts anew from here")
+        self.end("Settings changed; Run starts again from here")
         self._context.change(settings=settings, solver=solver, settings_error=None, settings_field=None, maps=None)
 
     def _on_ResetSettings(self, intent: intents.ResetSettings) -> None:
@@ -145,7 +145,7 @@ class OptimizingHandler(Handler):
         settings = named_solver(state.solver)
         if isinstance(settings, SurfaceSolver):
             settings = replace(settings, **preset.changes(settings))
-        self.end("Settings changed; Run starts anew from here")
+        self.end("Settings changed; Run starts again from here")
         self._context.change(settings=settings, settings_error=None, settings_field=None, maps=None)
 
     def _on_SetFreeJoint(self, intent: intents.SetFreeJoint) -> None:
@@ -155,16 +155,16 @@ class OptimizingHandler(Handler):
 
     def _on_SetFreeGroup(self, intent: intents.SetFreeGroup) -> None:
         if intent.group not in ("base_frames", "extrinsics", "intrinsics"):
-            raise SettingsError(f"There is no group of parameters called {intent.group!r}.")
+            raise SettingsError(f"There is no group of parameters {intent.group!r}.")
         self._set_free(**{intent.group: intent.on})
 
     def _on_SetCameras(self, intent: intents.SetCameras) -> None:
-        self.end("Cameras changed; Run starts anew from here")
+        self.end("Cameras changed; Run starts again from here")
         self._context.change(every_camera=intent.every)
 
     def _on_SetObserved(self, intent: intents.SetObserved) -> None:
         observed = Observed(intent.what, intent.masks)  # type: ignore[arg-type]
-        self.end("The target was changed; Run starts anew from here")
+        self.end("The target was changed; Run starts again from here")
         self._context.change(observed=observed, maps=None)
 
     # ---- The run ---------------------------------------------------------------------------------------------------
@@ -198,7 +198,7 @@ class OptimizingHandler(Handler):
         self._context.change(run=run, playing=False, error=None, busy=None, unfamiliar=self._network_warnings())
 
     def _network_warnings(self) -> tuple[str, ...]:
-        """Warnings about the network that the run relies on."""
+        """Warnings about the network of the run."""
         state = self._context.state
         if self._target.observed.what != "network" or not isinstance(state.settings, SurfaceSolver):
             return ()
@@ -249,7 +249,7 @@ class OptimizingHandler(Handler):
         return found
 
     def _on_Assess(self, intent: intents.Assess) -> None:
-        self.end("Stopped: the fit was checked")
+        self.end("Stopped: the fit is checked")
         self._optimizers.report("comparing with the images")
         state = self._context.state
         target = self._session.target(state.observed)
@@ -273,7 +273,7 @@ class OptimizingHandler(Handler):
         self._context.edit("Optimize", edits, gesture=run, loss=float(iterate.loss), maps=maps)
 
     def _set_free(self, **changes: Any) -> None:
-        self.end("Free parameters changed; Run starts anew from here")
+        self.end("Free parameters changed; Run starts again from here")
         self._context.change(free=replace(self._context.state.free, **changes), maps=None)
 
     def _set(self, **changes: Any) -> None:

@@ -116,7 +116,7 @@ class DraggingHandler(Handler):
         self._point = self._context.renderer.pick(state.pose.scene, intent.camera, intent.start, _REACH)
         if self._point is None:
             raise CartsError(
-                "There is no arm under the pointer. Press where the overlay shows a link, hold Ctrl, and drag it."
+                "There is no arm under the pointer. Hold Ctrl, press on a link in the overlay, and drag it."
             )
 
 

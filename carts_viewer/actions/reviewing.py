@@ -51,15 +51,15 @@ class AnnotatingHandler(Handler):
     # ---- History ---------------------------------------------------------------------------------------------------
 
     def _on_Undo(self, intent: intents.Undo) -> None:
-        self._finish("Stopped by undo")
+        self._finish("Stopped: undo")
         self._changed(self._session.editor.undo())
 
     def _on_Redo(self, intent: intents.Redo) -> None:
-        self._finish("Stopped by redo")
+        self._finish("Stopped: redo")
         self._changed(self._session.editor.redo())
 
     def _on_GoToStep(self, intent: intents.GoToStep) -> None:
-        self._finish("Stopped by undo")
+        self._finish("Stopped: undo")
         self._changed(self._session.editor.go_to(intent.position))
 
     def _finish(self, reason: str) -> None:
@@ -140,7 +140,7 @@ class AnnotatingHandler(Handler):
         index = state.index + (1 if intent.step > 0 else -1)
         if not 0 <= index < len(self._session.sequence):
             side = "after" if intent.step > 0 else "before"
-            raise CartsError(f"There is no frame {side} frame {state.frame.frame_id} to copy from.")
+            raise CartsError(f"There is no frame {side} frame {state.frame.frame_id}.")
         source = self._session.sequence.frame(index, cameras=[])
         scene = self._session.copied(state.frame, source)
         self._context.end_run("Stopped: the pose was changed by hand")
@@ -239,5 +239,5 @@ class FindingHandler(Handler):
     def _found(self) -> list[int]:
         frames = found(self._context.session.editor.view, self._context.state.filter)
         if not frames:
-            raise CartsError("No frame meets the conditions. Loosen or clear them.")
+            raise CartsError("No frame meets the conditions. Relax or clear them.")
         return frames

@@ -53,7 +53,7 @@ class PropagatingHandler(Handler):
             self._report(running=False, text=reason)
 
     def finish(self) -> None:
-        """Stop, and save the frames that are solved. Errors as `advance`."""
+        """Stop, and save the solved frames. Errors as `advance`."""
         if self._run is not None:
             self._run.cancel()
             for _ in self._work:
@@ -68,20 +68,20 @@ class PropagatingHandler(Handler):
             CartsError: there is nothing to solve, or it could not be saved.
         """
         if self._run is not None:
-            raise CartsError("Frames are being solved already. Wait, or stop solving first.")
+            raise CartsError("Frames are already being solved. Wait, or stop solving first.")
         project = self._session.editor.project
         if not project.writable:
             raise ProjectError(f"Solved frames could not be saved: {project.read_only_reason}")
-        self._context.end_run("Stopped: many frames are solved together")
+        self._context.end_run("Stopped: solving was started")
         self._context.save()
         view = self._session.editor.view
         everything = range(len(self._session.sequence))
         if part is not None and (part.start not in everything or part.stop - 1 not in everything or not part):
-            raise CartsError("The chosen range lies outside of the sequence. Choose another one in the timeline.")
+            raise CartsError("The range lies outside of the sequence. Select another range in the timeline.")
         if part is not None and not whole and at not in part:
             raise CartsError(
-                "Solving between keyframes keeps to the range in the timeline, and the shown frame lies outside of it. "
-                "Show one of its frames, or choose no range (× in the timeline)."
+                "Solving between keyframes is limited to the timeline's range, but the shown frame lies outside of it. "
+                "Show a frame of the range, or remove the range (× in the timeline)."
             )
         frames = (part or everything) if whole else between_kept(view, at, part)
         kept = [frame for frame in view.kept_frames if frame in frames]
@@ -90,7 +90,7 @@ class PropagatingHandler(Handler):
                 "There is no keyframe yet. Correct a frame by hand, accept one, or solve all frames without any."
             )
         if len(kept) == len(frames):
-            raise CartsError("Every frame there is a keyframe or accepted, so there is nothing to solve.")
+            raise CartsError("All of these frames are keyframes or accepted, so there is nothing to solve.")
         self._before = view
         former = self._context.state.solve
         self._context.change(playing=False, error=None, solve=SolveState(frames, text="Preparing"))
@@ -173,7 +173,7 @@ class PropagatingHandler(Handler):
         if now.records.get(WHOLE_PROJECT) is not self._before.records.get(WHOLE_PROJECT):
             self.drop("Stopped: the calibration was changed")
             raise CartsError(
-                "The calibration was changed meanwhile, so the solved frames do not fit. Solve them again."
+                "The calibration was changed meanwhile, so the solved frames are outdated. Solve them again."
             )
 
     def _save(self, run: SequenceRun, outcomes: Mapping[int, Outcome]) -> str:
@@ -197,29 +197,31 @@ class PropagatingHandler(Handler):
         self._report(listed=tuple(sorted(listed, key=lambda frame: frame.index)))
         count = len(figures) + len(self._held)
         if not count:
-            return "Stopped before a frame was solved"
+            return "Stopped before the first frame was solved"
         if figures:
             first, last = (self._session.sequence.frame_ids[index] for index in (min(figures), max(figures)))
             self._session.editor.apply(f"Solve {len(figures)} frames, {first} to {last}", edits, figures)
             self._context.refresh()
         solved = f"{counted(len(figures), 'frame')} solved, one step of undo"
         text = f"{'Stopped: ' if run.cancelled else ''}{solved}"
-        return f"{text}; {len(self._held)} kept as they were, because they would fit worse" if self._held else text
+        return f"{text}; {len(self._held)} unchanged, because they would fit worse" if self._held else text
 
     def _on_TakeSolved(self, intent: intents.TakeSolved) -> None:
         now = self._session.editor.view
         taken = {i: outcome for i, outcome in self._held.items() if intent.index is None or i == intent.index}
         taken = {i: outcome for i, outcome in taken.items() if now.joints(i) == self._before.joints(i)}
         if not taken:
-            raise CartsError("There is nothing to take: the frame was changed meanwhile, or its list was closed.")
-        self._context.end_run("Stopped: solved frames are taken")
+            raise CartsError(
+                "There is no solved pose to take: the frame was changed meanwhile, or the list was closed."
+            )
+        self._context.end_run("Stopped: solved poses were taken")
         self._context.save()
         edits: dict[Key[Any], Any] = {}
         for index, outcome in taken.items():
             edits.update(outcome.edits)
             del self._held[index]
         figures = {index: outcome.figures for index, outcome in taken.items()}
-        self._session.editor.apply(f"Take {len(taken)} solved frames", edits, figures)
+        self._session.editor.apply(f"Take {len(taken)} solved poses", edits, figures)
         listed = self._context.state.solve.listed if self._context.state.solve else ()
         self._report(listed=tuple(replace(f, taken=f.taken or f.index in taken) for f in listed))
         self._context.refresh()

@@ -1,6 +1,6 @@
 """Files beside a recording that the viewer reads: which content this user has accepted, and damaged files.
 
-Recordings are shared and copied, so a file beside one may be of another user. Each decision is a file in `decisions/`
+Recordings are shared and copied, so their files may be from another user. Each decision is a file in `decisions/`
 of the user's data folder, named by the SHA-256 digest of the content that was accepted or refused.
 """
 
@@ -36,7 +36,7 @@ class Decisions:
             return None
 
     def make(self, content: bytes, accepted: bool) -> None:
-        """Accept or refuse content."""
+        """Record the acceptance or refusal of content."""
         digest = _digest(content)
         self._made[digest] = accepted
         with suppress(CartsError):
@@ -71,7 +71,7 @@ def damage(path: Path, what: str, error: Exception, effect: str, *, writable: bo
     Returns:
         Cause, effect and new name, as text for the user.
     """
-    kept = "The file was left as it is"
+    kept = "The file was not changed"
     if writable:
         try:
             kept = f"The damaged file is kept as {set_aside(path).name}"

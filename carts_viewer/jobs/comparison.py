@@ -36,13 +36,13 @@ class Fit:
         """Text on why this fit is worse than another one of the same frame; None otherwise."""
         if other.dice is not None and self.dice is not None:
             # If the truth is known, only Dice counts.
-            return f"Dice {self.dice:.3f}, was {other.dice:.3f}" if self.dice < other.dice - _WORSE_DICE else None
+            return f"Dice {self.dice:.3f}, before {other.dice:.3f}" if self.dice < other.dice - _WORSE_DICE else None
         if VERDICTS.index(self.verdict.verdict) > VERDICTS.index(other.verdict.verdict):
-            return f"{self.verdict.verdict}, was {other.verdict.verdict}"
+            return f"{self.verdict.verdict}, before {other.verdict.verdict}"
         if self.verdict.failure > other.verdict.failure + _WORSE_FAILURE:
-            return f"probably wrong by {self.verdict.failure:.0%}, was {other.verdict.failure:.0%}"
+            return f"probability of failure {self.verdict.failure:.0%}, before {other.verdict.failure:.0%}"
         if self.loss > _WORSE_LOSS * other.loss:
-            return f"loss {self.loss:.3g}, was {other.loss:.3g}"
+            return f"loss {self.loss:.3g}, before {other.loss:.3g}"
         return None
 
 
@@ -143,7 +143,7 @@ class Comparison:
         return replace(fit, dice=min(known, default=None))
 
     def own_run(self, index: int, state: ViewState) -> Iterator[tuple[Fit, Edits, str | None] | None]:
-        """Run on one frame alone: yields None after each step, then its fit, edits and how it is worse.
+        """Run on one frame alone; yields None after each step, then the fit, its edits, and why it is worse.
 
         Raises:
             CartsError: an image, the weights or a setting is not usable.

@@ -105,7 +105,7 @@ def read_options(kind: str, values: Mapping[str, Any], frames: int) -> Options:
         ValueError: there is no such kind of job, or a value is missing or of another type.
     """
     if kind not in _KINDS:
-        raise ValueError(f"there is no job of the kind {kind!r}")
+        raise ValueError(f"unknown kind of job: {kind!r}")
     options, last = typed(values, _KINDS[kind]), frames - 1
     match options:
         case SolveOptions():
@@ -143,11 +143,11 @@ def job_title(options: Options, frame_ids: Sequence[str]) -> str:
         case SolveOptions():
             return "Solve between keyframes" + (f", {between}" if between else "")
         case OptimizeOptions(frames=frames):
-            return f"Optimize {len(frames)} frames, each alone"
+            return f"Optimize {len(frames)} frames individually"
         case CalibrateOptions(frames=frames):
             return f"Calibrate on {frames} frames"
         case AdaptOptions(minutes=minutes):
-            return f"Adapt the network to this recording, {minutes} minutes of processor time at most"
+            return f"Adapt the network to this recording, at most {minutes} minutes of processor time"
         case ExportOptions():
             label = FORMATS[options.format].label if options.format in FORMATS else options.format
             return f"Export {options.frames.lower()[:40]} as {label}" + (f", {between}" if between else "")
@@ -286,7 +286,7 @@ class JobList:
         """
         job = next((job for job in self.jobs if job.number == number), None)
         if job is None:
-            raise CartsError(f"There is no job {number} any more.")
+            raise CartsError(f"Job {number} no longer exists.")
         return job
 
     def _own(self, job: Job) -> Job:
@@ -321,9 +321,7 @@ class JobList:
         except FileNotFoundError:
             return []
         except (OSError, ValueError) as error:
-            self.problem = damage(
-                self._path.path, "list of jobs", error, "A new list was started, and none of its jobs runs"
-            )
+            self.problem = damage(self._path.path, "list of jobs", error, "A new list was started; no job is running")
             return []
 
     def _job(self, row: _Row) -> Job:
@@ -341,7 +339,7 @@ class JobList:
             return replace(job, state=JobState.WAITING if self.is_own(job) else JobState.ASKED)
         if job.state is not JobState.RUNNING:
             return job
-        text = "The viewer ended while it ran. Saved results are kept; start it again for the rest."
+        text = "The viewer ended while the job ran. Saved results are kept; start it again to continue."
         return _changed(job, text, {"state": JobState.FAILED, "text": text, "ended": time.time()})
 
 

@@ -53,7 +53,7 @@ class Networks:
             if remembered != STARTED and not optimizers.given_surface():
                 self._resume(remembered)
         except (OSError, CartsError) as error:
-            self.problem = f"The network {remembered!r}, which was chosen last, cannot be used: {error}."
+            self.problem = f"The last chosen network {remembered!r} cannot be used: {error}."
 
     def look(self) -> None:
         """Update `names`."""
@@ -76,7 +76,7 @@ class Networks:
         """
         self.look()
         if name not in self.names:
-            raise CartsError(f"There is no network {name!r}. There are: {', '.join(self.names)}.")
+            raise CartsError(f"There is no network {name!r}. Available: {', '.join(self.names)}.")
         self.asked = "" if name == STARTED or self._decisions.find(self._weights(name)) else name
         if not self.asked:
             self._run(name)
@@ -97,7 +97,7 @@ class Networks:
             self.use(name)
 
     def trained(self, number: int) -> None:
-        """Accept the weights of a training that this viewer has run, if it has made any."""
+        """Accept the weights of a training that this viewer has run, if any."""
         with suppress(OSError, CartsError):
             self._decisions.make(self._weights(_ADAPTED.format(number)), True)
 
@@ -143,6 +143,6 @@ class Networks:
         except FileNotFoundError:
             return STARTED
         except (OSError, ValueError) as error:
-            effect = "The network that the viewer was started with is used"
+            effect = "The viewer's initial network is used"
             self.problem = damage(self._file.path, "choice of a network", error, effect, writable=self._kept)
             return STARTED

@@ -102,7 +102,9 @@ class ActiveRun:
         if found is None:
             return None
         kept = (
-            " The start was kept." if self.optimizer.stop_reason in (StopReason.FAILED, StopReason.START_KEPT) else ""
+            " The initial pose was kept."
+            if self.optimizer.stop_reason in (StopReason.FAILED, StopReason.START_KEPT)
+            else ""
         )
         return FitVerdict(found.verdict.value, f"{found.reason}{kept}", found.remedy, found.probability)
 
@@ -139,7 +141,7 @@ class SequenceRun:
         """Progress, as text for the user."""
         done, total = self.optimizer.progress
         if done == 0:
-            return "Solving single frames for a first estimate of the kinematic error"
+            return "Solving single frames to initialize the kinematic error"
         if done == total:
             return f"All {total} frames estimated; revising inconsistent ones and assessing the fit"
         if done < 2 < total:
@@ -284,7 +286,7 @@ class OptimizerFactory:
         self.report("Preparing the frame")
         if task.target.observed.what != "network" and not isinstance(task.settings, SurfaceSolver):
             raise SettingsError(
-                "The chosen solver compares features of images, so it cannot fit masks. Choose the solver Surface "
+                "The chosen solver compares image features and cannot fit masks. Choose the solver Surface "
                 "maps, or fit the network's predictions."
             )
         return self._frame_optimizer(task, predictor)

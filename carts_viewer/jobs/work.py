@@ -65,12 +65,12 @@ def optimize_frames(context: Context, comparison: Comparison, frames: Sequence[i
         name = context.session.sequence.frame_ids[index]
         session = context.session
         if index in session.editor.view.kept_frames:
-            yield Progress(place + 1, len(frames), f"{name} is kept as it is", f"{name}: kept, not touched")
+            yield Progress(place + 1, len(frames), f"{name} is kept", f"{name}: kept, not changed")
             continue
         yield Progress(place, len(frames), f"Frame {name}")
         target = session.target(context.state.observed)
         if not target.seen(session.sequence, index, context.state.domain, cameras):
-            yield Progress(place + 1, len(frames), f"Frame {name} has no mask", f"{name}: no mask to fit, not touched")
+            yield Progress(place + 1, len(frames), f"Frame {name} has no mask", f"{name}: no mask to fit, not changed")
             continue
         steps = comparison.own_run(index, context.state)
         while (outcome := next(steps)) is None:
@@ -78,7 +78,7 @@ def optimize_frames(context: Context, comparison: Comparison, frames: Sequence[i
         fit, edits, remark = outcome
         if remark is not None:
             worse += 1
-            yield Progress(place + 1, len(frames), f"Frame {name}", f"{name}: not taken, it would be worse ({remark})")
+            yield Progress(place + 1, len(frames), f"Frame {name}", f"{name}: discarded, worse than before ({remark})")
             continue
         context.save()
         changes = {**edits, Key.verdict(index): fit.verdict}
@@ -86,7 +86,7 @@ def optimize_frames(context: Context, comparison: Comparison, frames: Sequence[i
         context.refresh()
         taken += 1
         yield Progress(place + 1, len(frames), f"Frame {name}", f"{name}: {fit.verdict.verdict}, loss {fit.loss:.3g}")
-    text = f"{taken} frames optimized" + (f", {worse} not taken because they would be worse" if worse else "")
+    text = f"{taken} frames optimized" + (f", {worse} discarded because they were worse" if worse else "")
     yield Progress(len(frames), len(frames), text)
 
 
@@ -115,7 +115,7 @@ def calibrate(context: Context, optimizers: OptimizerFactory, count: int) -> Gen
     )
     most = CALIBRATION_SETTINGS.iterations
     while (iterate := optimizer.step()) is not None:
-        text = f"Stage {iterate.stage + 1} of {iterate.stages}, loss {iterate.loss:.4f}; {most} iterations at most"
+        text = f"Stage {iterate.stage + 1} of {iterate.stages}, loss {iterate.loss:.4f}; at most {most} iterations"
         yield Progress(iterate.index, most, text, text)
     result = optimizer.result()
     for change in result.unknowns:
@@ -130,12 +130,12 @@ def calibrate(context: Context, optimizers: OptimizerFactory, count: int) -> Gen
         yield Progress(most, most, f"Nothing was changed. {verdict}")
         return
     if session.editor.view.records.get(WHOLE_PROJECT) is not before.records.get(WHOLE_PROJECT):
-        raise CartsError("The calibration was changed meanwhile, so this one does not fit. Start it again.")
+        raise CartsError("The calibration was changed meanwhile, so this result is outdated. Start it again.")
     context.save()
     accepted, solved = (_count(session.editor.view, states) for states in ({_ACCEPTED}, {_ACCEPTED, _OPTIMIZED}))
     session.editor.apply(f"Calibrate on {len(indices)} frames", edits)
     context.refresh()
-    again = " All masks have moved: run or solve fitted frames again." if solved else ""
+    again = " All masks have changed: run or solve fitted frames again." if solved else ""
     again += f" Unreviewed now, though accepted before: {accepted}." if accepted else ""
     done = f"Calibrated on {len(indices)} frames, one step of undo.{_moved(scene, result.scene)}"
     yield Progress(most, most, f"{done} {verdict}{again}")
@@ -209,7 +209,7 @@ def _outcome(folder: Path) -> str:
         worse, gain = "; ".join(report["worse"]), str(report["gain"])
     except (OSError, ValueError, TypeError, KeyError):
         return ""
-    return f"not offered, since worse: {worse}" if worse else gain
+    return f"rejected, because worse: {worse}" if worse else gain
 
 
 class _Training:

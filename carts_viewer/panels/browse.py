@@ -37,7 +37,7 @@ class BrowsePanel:
         self._count = len(sequence)
         stamps = sequence.timestamps
         self._began = 0.0 if stamps is None else float(stamps[0])
-        # Kept while those of a newer pose are computed, or the line would jump.
+        # Kept while those of a newer pose are computed, so that the line does not jump.
         self._scores = Scores()
         with gui.add_folder("Sequence"):
             # A slider needs two ends even for a sequence of a single frame.
@@ -57,7 +57,7 @@ class BrowsePanel:
                 offset or 0.0,
                 step=0.005,
                 visible=offset is not None,
-                hint="Clock of the kinematics minus clock of the images. Reduce it if the overlay runs ahead.",
+                hint="Kinematics clock minus image clock. Reduce it if the overlay leads the image.",
             )
             if sequence.remarks:
                 lines = "".join(f"<li>{escaped(remark)}</li>" for remark in sequence.remarks)

@@ -16,8 +16,8 @@ _DVRK = ("dvrk", "dvrk-2.3", "dvrk-suj")
 _WITHOUT_PARTS = ("masks", "coco-keypoints", "bop", "csv", "npz", "json", *_DVRK, "video")
 """Formats that have no categories, or always both kinds."""
 _WRITTEN = (
-    "Masks, keypoints and poses are those of the arms rendered at the present joint positions; masks include "
-    "painted corrections. The recording's own masks are not written."
+    "Masks, keypoints and poses are those of the arms at the current joint positions; masks include "
+    "painted corrections. The recording's own masks are not exported."
 )
 _NOT_KEPT = "This project is temporary: download its exports before the viewer is closed."
 
@@ -133,7 +133,7 @@ class ImportPanel:
         return intents.ImportMasks(str(self._place.value), camera, bool(self._replace.value))
 
     def show(self, state: ViewState) -> None:
-        """Bring the text up to date."""
+        """Update the text."""
         there = state.project.get(Key.imported_labels()) is not None
         content = "Nothing was imported yet."
         if there:

@@ -24,15 +24,19 @@ class LivePanel:
             self._source = gui.add_dropdown(
                 "Source",
                 [_REPLAY, _SOCKET, _CAMERA],
-                hint="This recording as it was recorded, messages of another program, or a camera of this machine",
+                hint="Replay of this recording, messages of another program, or a camera of this machine",
             )
             self._device = gui.add_number("Device", 0, min=0, max=63, step=1, hint="Number of the camera, from 0")
             self._port = gui.add_number(
                 "Port", _PORT, min=1024, max=65535, step=1, hint="Port of 127.0.0.1 that receives messages"
             )
-            self._repeat = gui.add_checkbox("Repeat", False, hint="Begin again when the recording ends")
+            self._repeat = gui.add_checkbox("Repeat", False, hint="Restart when the recording ends")
             self._rate = gui.add_number(
-                "Images per second", _RATE, min=0.1, max=1000, hint="Of this recording, whose images have no times"
+                "Images per second",
+                _RATE,
+                min=0.1,
+                max=1000,
+                hint=("Frame rate of this recording, whose images have no times"),
             )
             self._record = gui.add_checkbox(
                 "Record", False, hint="Keep images, joints and corrections in a new folder beside the project"
@@ -75,7 +79,7 @@ def live_text(live: LiveState) -> str:
     reason = {
         "good": "The arms are tracked.",
         "doubtful": "The image does not support the fit; the prediction from earlier frames is shown.",
-        "lost": "The arms are not found; the measured joints with the last known correction are shown.",
+        "lost": "The arms are not found; the measured joints with the last correction are shown.",
     }[live.verdict]
     style = {"good": "good", "doubtful": "doubtful", "lost": "failed"}[live.verdict]
     age = f"{1000.0 * live.age:.0f} ms after the frame"
@@ -83,7 +87,7 @@ def live_text(live: LiveState) -> str:
 
 
 _MEANING = (
-    "Rating of the fit by the images. Good: the mask is reliable. Doubtful: inspect it. Failed: do not use it. "
+    "Agreement of the fit with the images. Good: the mask is reliable. Doubtful: inspect it. Failed: do not use it. "
     "Undetermined joints stay near their measured values; their standard deviations are under Values."
 )
 
@@ -100,7 +104,7 @@ class FitPanel:
             "Check the fit",
             intents.Assess(),
             icon=viser.Icon.STETHOSCOPE,
-            hint="Compare the arms in their present pose with the images of all cameras, without moving them",
+            hint="Compare the arms at their current pose with the images of all cameras, without moving them",
         )
 
     def show(self, state: ViewState) -> None:
@@ -110,7 +114,7 @@ class FitPanel:
             self._text.content = live_text(state.live)
             return
         running = state.run.phase is Phase.RUNNING or state.solving
-        # It stays where it is, so that nothing below it moves under the pointer.
+        # It keeps its place, so that elements below it do not move under the pointer.
         self._check.visible = True
         self._check.disabled = running or state.verdict is not None
         self._check.label = "Check the fit" if state.verdict is None else "The fit is checked"
@@ -150,9 +154,7 @@ def fit_text(
         chips.append(f'<span class="carts-key">{mark}{escaped(name)}{said}{dice}</span>')
     line = f'<div class="carts-cameras">{"".join(chips)}</div>' if len(chips) > 1 or cameras else ""
     if scores and line:
-        line += (
-            "<small>Dice: overlap of the rendered arms with the mask that came with the recording, as a check.</small>"
-        )
+        line += "<small>Dice: overlap of the rendered arms with the recording's mask, as a check.</small>"
     if verdict is None:
         name = "running" if running else "not checked"
         if busy is not None:

@@ -93,7 +93,7 @@ def shortcuts() -> list[Shortcut]:
         Shortcut("M", "Paint on the mask or on the ignore region", intents.SetTarget(), "shift"),
         Shortcut("[", "Smaller brush", intents.ScaleBrush(1 / _GROWTH)),
         Shortcut("]", "Larger brush", intents.ScaleBrush(_GROWTH)),
-        Shortcut("escape", "Drop the polygon, or deselect the tool", intents.SetTool(Tool.OFF)),
+        Shortcut("escape", "Discard the polygon, or deselect the tool", intents.SetTool(Tool.OFF)),
         Shortcut("V", "Endoscope view or 3D view", "view"),
         *(
             Shortcut(str(number), f"Overlay: {layer.lower()}", intents.ShowLayer(layer))
@@ -126,7 +126,7 @@ def key_groups() -> list[tuple[str, list[tuple[str, str]]]]:
         name = next(name for name in order if any(word in shortcut.label for word in _GROUPS[name]))
         groups[name].append((shortcut.key, shortcut.label))
     groups["View"].append((",", "Loupe: pixels, coordinates, colour; hold, or press to toggle"))
-    groups["View"].append((".", "Hold: the measured pose, or the one compared with"))
+    groups["View"].append((".", "Hold: the measured pose, or the compared one"))
     groups["View"].append(("?", "This sheet"))
     groups["View"].append(("Ctrl+K", "Find any action by name"))
     return list(groups.items())
@@ -138,7 +138,7 @@ def key_table() -> str:
     rows += [
         *(f"| **{key}** | {text} |" for key, text in _POINTER),
         "| **,** | Loupe: pixels, coordinates, colour; hold, or press to toggle |",
-        "| **.** (held) | The measured pose, or the one compared with |",
+        "| **.** (held) | The measured pose, or the compared one |",
         "| **?** | All keys on one sheet |",
     ]
     return "\n".join(["| Key | What it does |", "|---|---|", *rows])
@@ -153,7 +153,7 @@ def with_keys(text: str) -> str:
     before, begin, rest = text.partition(_BEGIN)
     _, end, after = rest.partition(_END)
     if not (begin and end):
-        raise ValueError(f"the text has no lines {_BEGIN!r} and {_END!r} that say where the table of keys belongs.")
+        raise ValueError(f"the text lacks the lines {_BEGIN!r} and {_END!r} around the table of keys.")
     return f"{before}{begin}\n{key_table()}\n{end}{after}"
 
 
@@ -171,12 +171,12 @@ HINTS = {
     "Frame": "Number of the shown frame, from 1; N and B go to the next and the previous one",
     "Play": "Play the sequence, or the range in the timeline, in a loop (space)",
     "Frames/s": "Playback rate [frames/s]",
-    "Domain": "Variant of the images to show and optimize; joint positions are the same in all",
-    "Camera": "Active camera, for painting and for exports of one camera; a click on its image selects it, too",
+    "Domain": "Variant of the images to show and optimize; all have the same joint positions",
+    "Camera": "Active camera, for painting and exports of one camera; also selected by a click on its image",
     # Overlay
     "Layer": "Layer over the image (number keys)",
     "Opacity %": "Opacity of the overlay: 0 is invisible, 100 hides the image below [%]",
-    "Swipe %": "Share of the image that shows the other pose, from the left [% of the width]",
+    "Swipe %": "Left share of the image that shows the other pose [% of the width]",
     # Paint
     "Off": "No tool: dragging pans the image (Esc)",
     "Brush": "Paint with a round brush; Shift erases (Shift+B)",
@@ -186,67 +186,67 @@ HINTS = {
     "Prompt": "Segment the object at a click or in a box; Shift or Alt removes (Shift+T)",
     "Polygon": "Fill a polygon: click its corners; Enter or a double click closes it (Shift+P)",
     "Mask": "Correct the mask; Dice and exports use the corrected mask",
-    "Ignore region": "Mark pixels that the optimizer leaves out",
+    "Ignore region": "Mark pixels that the optimizer ignores",
     "Size [px]": "Diameter of the brush, in pixels of the image ([ and ])",
     "Clear": "Remove all paint of this layer in this frame and camera",
     # Joints
-    "Perturb all joints": "Move every measured joint by the amount below, up or down at random (P)",
+    "Perturb all joints": "Offset every measured joint by the amount below, with random signs (P)",
     "By [°, mm]": "Size of the offset: degrees for revolute joints, millimetres for prismatic ones",
     "Seed": "Seed of the random signs; the same number gives the same signs",
-    "Back to measured": "Forget all corrections of this frame's joints (M)",
-    "All back to measured": "Forget all corrections of this frame's joints (M)",
+    "Back to measured": "Reset this frame's joints to the measured values (M)",
+    "All back to measured": "Reset this frame's joints to the measured values (M)",
     # Optimize
     "Run": "Fit the arms to this frame's images from their present pose; clicked keypoints do not constrain it (R)",
     "Pause": "Pause the run; Continue resumes it (R)",
     "Step": "A single iteration (T)",
     "Reset": "Reset to the start of the run (X)",
-    "Solver": "Objective and optimizer; the default is the most accurate",
+    "Solver": "Objective and solver; the default is the most accurate",
     "Cameras": "Cameras whose images are fitted",
-    "Advanced settings": "All numbers of the chosen solver, with unit and meaning",
+    "Advanced settings": "All settings of the chosen solver, with unit and meaning",
     "Reset to preset": "Reset all settings to those of the chosen preset",
-    "Close": "Close this window; settings stay",
-    "Base frames": "Let runs and calibrations move the bases of the arms",
-    "Camera pose": "Let runs and calibrations move the cameras",
-    "Camera intrinsics": "Let runs and calibrations change focal length and principal point [px]",
+    "Close": "Close this window; settings are kept",
+    "Base frames": "Allow runs and calibrations to move the bases of the arms",
+    "Camera pose": "Allow runs and calibrations to move the cameras",
+    "Camera intrinsics": "Allow runs and calibrations to change focal length and principal point [px]",
     # Review
     "Accept + next": "Accept this frame, and go to the next unreviewed one (G)",
     "Accept": "Accept this frame; solving does not change it",
     "Needs work": "Mark this frame for later (F)",
     "Reject": "Mark this frame as unusable; exports can exclude it (J)",
-    "Note": "Remark on this frame; saved when you leave the field",
+    "Note": "Note on this frame; saved when you leave the field",
     "Previous worst": "Go to the previous frame in the order from worst to best (Shift+L)",
     "Next worst": "Go to the next frame, from worst to best, that is neither accepted nor rejected; frames "
     "without a verdict come last, in order (L)",
     "Next unreviewed": "Go to the next frame without a review (Y)",
-    "Solve between": "Fit the frames between the kept ones around this frame together (Shift+K)",
-    "Solve all": "Fit all frames, or those in the timeline's range, together; kept frames do not change",
-    "Begin at": "End of the sequence at which solving begins",
+    "Solve between": "Jointly fit the frames between the kept ones around this frame (Shift+K)",
+    "Solve all": "Jointly fit all frames, or those in the timeline's range; kept frames do not change",
+    "Begin at": "End of the sequence where solving starts",
     "Take solved pose": "Use the solved pose of this frame, although it fits worse",
     "Take all": "Use the solved poses of all listed frames, although they fit worse",
     "Discard all": "Keep the previous poses of the listed frames, and close the list",
     "Stop and keep": "Stop solving, and keep the frames that are done",
     "Keypoint": "Point of the arm that the next Shift+click places",
     "Show keypoints": "Mark the keypoints of the arms in the images, with their names (H)",
-    "Clear clicks": "Remove the clicked points; the arm keeps its pose",
-    "Import masks": "Read masks or keypoints into a layer of this project; one step of undo",
+    "Clear clicks": "Remove the placed keypoints; the arm keeps its pose",
+    "Import masks": "Import masks or keypoints into a layer of this project; one undo step",
     # Find
     "Review": "Frames in this review state",
     "Corrected": "Frames in which this arm's joints were corrected",
     "Note text": "Frames whose note contains this text",
     "Previous": "Previous frame found",
     "Next": "Next frame found",
-    "Accept all": "Accept all frames found, as one step of undo",
-    "Reject all": "Reject all frames found, as one step of undo",
-    "Reset all": "Clear the review of all frames found, as one step of undo",
+    "Accept all": "Accept all frames found, as one undo step",
+    "Reject all": "Reject all frames found, as one undo step",
+    "Reset all": "Clear the review of all frames found, as one undo step",
     # Jobs
-    "Run jobs": "Run the jobs that another user, or another computer, has queued",
+    "Run jobs": "Run the jobs queued by another user or on another computer",
     "Discard jobs": "Cancel these jobs without running them",
-    "Accept network": "Use these weights now, and whenever they are chosen again",
+    "Accept network": "Use these weights now and in the future",
     "Refuse network": "Do not use these weights",
     "Which frames": "Frames of the job",
-    "Optimize each alone": "Run on each of these frames from its present pose; worse results are discarded",
-    "Calibrate": "Fit base frames, or what is ticked under Free parameters, to these frames together. All masks "
-    "move with it, so accepted frames become unreviewed; one step of undo",
+    "Optimize each alone": "Run on each of these frames from its current pose; worse results are discarded",
+    "Calibrate": "Jointly fit base frames, or the parameters ticked under Free parameters, to these frames. All masks "
+    "change, so accepted frames become unreviewed; one undo step",
     "Job": "Job for the buttons and the log below",
     "Cancel": "Stop this job, or remove it from the queue; saved results are kept",
     "Start again": "Queue this job again; a job on many frames continues where it stopped",
@@ -258,10 +258,10 @@ HINTS = {
     "Format": "File format",
     "Frames": "Frames to write, by review state",
     "Only the range": "Restrict them to the timeline's range",
-    "Category per": "Objects with a category of their own",
-    "Copy images": "Copy the images beside their labels; otherwise labels name those of the recording",
+    "Category per": "Objects with separate categories",
+    "Copy images": "Copy the images beside their labels; otherwise labels refer to the recording's images",
     "Export": "Write into a new folder beside the project, as a job",
-    "Cancel export": "Stop, and remove its files",
+    "Cancel export": "Cancel the export and remove its files",
     "Download it": "Send the last export to this browser",
     "Export mask": "Download this frame's mask of the shown camera as PNG",
 }

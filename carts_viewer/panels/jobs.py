@@ -67,20 +67,20 @@ class JobsPanel:
                 min=1,
                 max=LONGEST_TRAINING,
                 step=1,
-                hint="Limit of processor time; training ends earlier without further gain",
+                hint="Limit of processor time; training stops earlier without improvement",
             )
             page.button(
                 "Adapt the network",
                 lambda _: intents.Adapt(int(self._minutes.value)),
                 icon=viser.Icon.SCHOOL,
-                hint="Train it for the robots, cameras, distances and empty backgrounds of this recording",
+                hint="Train it for this recording's robots, cameras, distances and backgrounds",
             )
             gui.add_html(
-                '<p class="carts-caption"><b>Optimize each alone</b> is Run on every frame by itself; to fit '
-                "neighbouring frames together, see Review, <b>Solve</b>. <b>Calibrate</b> fits the poses of the "
-                "arms' bases (base frames), or what is ticked under Free parameters, to frames of the whole sequence. "
-                "All masks move with it: solve again afterwards; accepted frames have to be accepted again. Solving "
-                "and exports are queued here, too.</p>"
+                '<p class="carts-caption"><b>Optimize each alone</b> runs on every frame individually; to fit '
+                "neighbouring frames jointly, see Review, <b>Solve</b>. <b>Calibrate</b> fits the poses of the arms' "
+                "bases (base frames), or the parameters ticked under Free parameters, to frames of the whole "
+                "sequence. All masks change: solve again afterwards, and accept frames again. Solving and exports "
+                "are also queued here.</p>"
             )
         self._network = gui.add_dropdown("Network", [STARTED], visible=False, hint="Used in all tabs; saved")
         self._newest = page.button(
@@ -107,7 +107,7 @@ class JobsPanel:
         page.on_input(self._chosen, lambda _: intents.Refresh())
 
     def show(self, state: ViewState) -> None:
-        """Bring the list up to date; a new job is selected."""
+        """Update the list; a new job is selected."""
         self._show_networks(state)
         self._show_question(self._asked, jobs_question(state), self._run, self._discard)
         self._show_question(self._asked_network, network_question(state), self._accept, self._refuse)
@@ -167,7 +167,7 @@ def jobs_question(state: ViewState) -> str:
         return ""
     shown = "; ".join(titles[:_LISTED]) + (f"; and {len(titles) - _LISTED} more" if len(titles) > _LISTED else "")
     return (
-        f"Jobs in the list beside this project were not queued by you on this computer, so they do not run: {shown}. "
+        f"Jobs in the list beside this project were not queued by you on this computer and are not run: {shown}. "
         "Run or discard them."
     )
 

@@ -18,7 +18,7 @@ _STEP = 0.05
 
 
 class JointsPanel:
-    """One tab per arm with its joints, and the buttons that concern all arms."""
+    """One tab per arm with its joints, and buttons for all arms."""
 
     def __init__(self, page: PanelPage, session: Session, state: ViewState) -> None:
         gui = page.gui
@@ -97,7 +97,7 @@ class JointsPanel:
                 lambda shown, joint=joint, limits=limits: intents.SetJoint(arm, joint, limits.from_shown(shown)),
             )
         if len(self._session.scene.arms) > 1:
-            hint = f"Forget the corrections of {arm} in this frame"
+            hint = f"Reset {arm} in this frame to the measured joints"
             page.button(f"{arm} back to measured", intents.BackToMeasured(arm), icon=viser.Icon.HISTORY, hint=hint)
 
     @staticmethod
@@ -138,7 +138,7 @@ _UNUSUAL = (
 """Corrections that count as rare: twice the deviation that the solver expects of measured joints [deg] and [mm]."""
 _EXPLAINED = (
     f"± is one standard deviation. <span class='carts-unsure'>Amber ±</span> (above {_UNSURE:g}° or mm): the images "
-    "hardly show this joint. Its value is a guess; the mask hardly depends on it.<br>"
+    "hardly determine this joint. Its value is a guess, but hardly affects the mask.<br>"
     f"<span class='carts-unsure'>Amber change</span>: more than {_UNUSUAL[0]:.0f}° or {_UNUSUAL[1]:.0f} mm, which is "
     "rare in real arms. Smaller changes are usual."
 )
@@ -208,8 +208,8 @@ class KeypointsPanel:
         with gui.add_folder("Keypoints"):
             gui.add_html(
                 '<p class="carts-caption"><b>Shift+click</b> places the chosen keypoint in the image; <b>Shift+'
-                "drag</b> moves it. The arm follows at once. A run starts from this pose; clicks do not constrain "
-                "it.</p>"
+                "drag</b> moves it. The arm follows immediately. A run starts from this pose; keypoints do not "
+                "constrain it.</p>"
             )
             options = [_NEAREST, *self._labels.values()]
             self._chosen = gui.add_dropdown("Keypoint", options)

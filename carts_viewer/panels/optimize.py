@@ -24,11 +24,11 @@ from carts_viewer.transport.document import escaped
 SOLVER_LABELS = {
     SolverName.SURFACE: "Surface maps (default)",
     SolverName.OCCLUDED: "Surface maps, with occluders",
-    SolverName.ACS: "ACS, per attended area",
+    SolverName.ACS: "ACS, normalized by attended area",
     SolverName.PAPER: "ACS as in the paper",
     SolverName.ACS_REFERENCE: "ACS as in the paper's code",
     SolverName.L1: "L1 on predictions",
-    SolverName.NONE: "None: compare only",
+    SolverName.NONE: "None (compare only)",
 }
 """Labels of the solvers."""
 OBSERVED = {"Network predictions": "network", "Masks": "masks", "Masks and network": "both"}
@@ -37,11 +37,11 @@ MASKS = {"Recording": "recording", "Imported": "imported", "Painted": "painted"}
 """Labels of the masks that a run fits."""
 UNDETERMINED = "Not determined by this image"
 """Label of unknowns that the image does not determine."""
-_CONSEQUENCE = "The mask hardly depends on these, so it can be right although their values are guesses."
+_CONSEQUENCE = "The mask hardly depends on these, so it can be correct although their values are guesses."
 _RUN = "Press Run to fit the arm to this frame."
 _BEFORE_RUN = {
-    ReviewState.ACCEPTED: "This frame is accepted. Run would fit it again; if it moves, it has to be accepted again.",
-    ReviewState.REJECTED: "This frame is rejected. Run would still fit it.",
+    ReviewState.ACCEPTED: "This frame is accepted. Run fits it again; if its pose changes, it must be accepted again.",
+    ReviewState.REJECTED: "This frame is rejected. Run still fits it.",
     ReviewState.OPTIMIZED: "This frame has been fitted. Run continues from its pose.",
 }
 """Status before a run, by review state."""
@@ -72,7 +72,7 @@ class OptimizePanel:
             "Mask source",
             list(MASKS),
             visible=False,
-            hint="Imported: under Review, Import. Painted: rendered masks corrected with a brush.",
+            hint="Imported: see Review, Import. Painted: rendered masks corrected with the brush.",
         )
         cameras = [camera.name for camera in session.scene.cameras]
         self._cameras = gui.add_dropdown("Cameras", ["All cameras", "Shown camera"], visible=len(cameras) > 1)
@@ -179,7 +179,7 @@ class SettingsPanel:
             )
             close = gui.add_button("Close", icon=viser.Icon.X, color="gray")
             page.row(reset, close, weights=(2, 1))
-            self._folder = gui.add_folder("Of the chosen solver")
+            self._folder = gui.add_folder("Settings of the chosen solver")
             with self._folder:
                 for example in (SurfaceSolver(), DescentSolver()):
                     self._add(page, example, type(state.settings))
@@ -238,7 +238,7 @@ class FreePanel:
             for arm in session.scene.arms:
                 gui.add_html(f'<p class="carts-caption"><b>{escaped(arm.name)}</b> joints</p>')
                 for joint in arm.robot.joint_names:
-                    hint = f"Let the optimizer move this joint of {arm.name}"
+                    hint = f"Allow the optimizer to move this joint of {arm.name}"
                     box = gui.add_checkbox(humanized(joint), is_free(state, arm.name, joint), hint=hint)
                     self._joints[arm.name, joint] = box
                     page.on_input(box, lambda on, arm=arm.name, joint=joint: intents.SetFreeJoint(arm, joint, bool(on)))
@@ -291,7 +291,7 @@ _QUANTITIES = (("Loss", "1", _TEAL), ("Dice", "1", _BLUE), ("Joint error", "°",
 
 
 class CurvesPanel:
-    """Small charts, one per quantity; the pointer reads values off, markers show stages and the result."""
+    """Small charts, one per quantity; values appear at the pointer, markers show stages and the result."""
 
     def __init__(self, gui: viser.GuiApi) -> None:
         self._shown: tuple[Curves | None, bool] = (None, False)
@@ -318,10 +318,10 @@ class CurvesPanel:
 def note(curves: Curves, outdated: bool) -> str:
     """Note on the curves."""
     if outdated:
-        return "Outdated: the pose, the image or a setting was changed since the run."
+        return "Outdated: the pose, the image or a setting has changed since the run."
     if curves.comparable:
-        return "○ start of a stage · ● result. At the end all losses are recomputed and comparable."
-    return "○ start of a stage; during a run, losses are comparable within a stage only."
+        return "○ start of a stage · ● result. After a run, all losses are recomputed and comparable."
+    return "○ start of a stage; during a run, losses are comparable only within a stage."
 
 
 class _Chart:

@@ -54,7 +54,7 @@ class PaintPanel:
             self._class = gui.add_dropdown(
                 "Class",
                 list(self._classes),
-                hint="Painted class: a part of an arm (layer Parts), or any arm. Pixels of any arm belong to the arm "
+                hint="Painted class: a part of an arm (layer Parts), or any arm. Pixels of Any arm belong to the arm "
                 "nearest to them in the overlay, also in an export with a category per arm",
             )
             self._size = gui.add_slider("Size [px]", *DIAMETERS, 1, state.brush.diameter)
@@ -65,7 +65,7 @@ class PaintPanel:
         page.call("setBrush", self._sent)
 
     def show(self, state: ViewState) -> None:
-        """Bring the widgets, and the pages' scripts, up to date."""
+        """Update the widgets and the page's scripts."""
         brush = state.brush
         for tool, button in self._tools.items():
             _press(button, tool is brush.tool)

@@ -28,10 +28,10 @@ class SavedPanel:
         page.row(self._undo, self._redo)
 
     def show(self, state: ViewState) -> None:
-        """Bring the line and the buttons up to date."""
+        """Update the line and the buttons."""
         path = self._storage.project.path
         asked = jobs_question(state) or network_question(state)
-        decide = "Jobs or a network of another user wait for your decision: see Jobs." if asked else None
+        decide = "Jobs or a network of another user need your confirmation: see Jobs." if asked else None
         notice = " ".join(filter(None, (self._storage.notice, *state.problems, decide))) or None
         if notice != self._noticed:
             self._noticed = notice
@@ -58,12 +58,12 @@ class HistoryPanel:
         gui = page.gui
         self._positions: dict[str, int] = {}
         with gui.add_folder("History"):
-            self._steps = gui.add_dropdown("Go to", ["As measured"], hint="All steps; choose one to go back or forth")
+            self._steps = gui.add_dropdown("Go to", ["As measured"], hint="All steps; select one to undo or redo to it")
             page.columns([self._steps], 1, narrow_labels=True)
         page.on_input(self._steps, lambda label: intents.GoToStep(self._positions[label]))
 
     def show(self, state: ViewState) -> None:
-        """Bring the list up to date."""
+        """Update the list."""
         project = state.project
         first = max(project.position - _LISTED // 2, 0)
         positions = {"Start": 0} | {
@@ -71,7 +71,7 @@ class HistoryPanel:
             for step in project.steps[first : first + _LISTED]
         }
         if positions != self._positions:
-            # Before the widget offers them, so that every choice is known.
+            # Before the widget offers them, so that every option has an entry.
             self._positions = positions
             self._steps.options = tuple(positions)
         write(self._steps, next(label for label, number in positions.items() if number == project.position))
@@ -87,12 +87,12 @@ class PeoplePanel:
             self._name = gui.add_text(
                 "Your name",
                 state.name,
-                hint=f"Precedes your steps in the history; up to {LONGEST_NAME} characters",
+                hint=f"Shown before your steps in the history; up to {LONGEST_NAME} characters",
             )
             page.columns([self._name], 1, narrow_labels=True)
             self._others = gui.add_html("")
             link = gui.add_button(
-                "Copy link", icon=viser.Icon.LINK, color="gray", hint="Opens this frame, camera and domain"
+                "Copy link", icon=viser.Icon.LINK, color="gray", hint="Copies a link to this frame, camera and domain"
             )
         page.on_input(self._name, lambda name: intents.SetName(str(name)))
 
@@ -101,7 +101,7 @@ class PeoplePanel:
             page.call("copyLink")
 
     def show(self, state: ViewState) -> None:
-        """Bring name and list up to date."""
+        """Update name and list."""
         if not self._waits(intents.SetName):
             write(self._name, state.name)
         ids = state.project.identity.frame_ids
@@ -125,7 +125,7 @@ class MessagePanel:
         self._dismiss = page.button("Dismiss", intents.DismissError(), icon=viser.Icon.X, color="red", visible=False)
 
     def show(self, state: ViewState) -> None:
-        """Bring the message up to date."""
+        """Update the message."""
         if state.error == self._shown:
             return
         self._shown = state.error

@@ -112,7 +112,7 @@ class FindPanel:
                 "fit": gui.add_dropdown(
                     "Fit",
                     [ANY, *VERDICTS, NOT_CHECKED],
-                    hint="Frames with this verdict on the fit",
+                    hint="Frames with this verdict",
                 ),
                 "arm": gui.add_dropdown("Corrected", [ANY, *(arm.name for arm in session.scene.arms)]),
                 "dice": gui.add_number(
@@ -121,7 +121,7 @@ class FindPanel:
                     min=0.0,
                     max=1.0,
                     step=0.01,
-                    hint="Frames that overlap the true mask by less, 0 to 1; 1 shows all frames",
+                    hint="Frames with a lower Dice (0 to 1); 1 shows all frames",
                 ),
                 "note": gui.add_text("Note text", ""),
             }
@@ -148,7 +148,7 @@ class FindPanel:
         for button in self._bulk:
             button.disabled = not frames
         if state.filter.empty:
-            self._list.content = '<p class="carts-caption">Choose conditions on frames.</p>'
+            self._list.content = '<p class="carts-caption">Set conditions to find frames.</p>'
             return
         links = " ".join(f'<a href="#" data-frame="{i}">{escaped(self._ids[i])}</a>' for i in frames[:_LISTED])
         more = " …" if len(frames) > _LISTED else ""

@@ -24,7 +24,7 @@ class CalibrationHint:
             f"Calibrate on {frames} frames",
             intents.Calibrate(frames),
             visible=False,
-            hint="A job, and one step of undo; the page remains usable. Jobs, Calibrate has other numbers of frames.",
+            hint="A job, and one undo step; the page remains usable. For other numbers of frames, see Jobs, Calibrate.",
         )
         self._watched: int | None = None
 
@@ -69,22 +69,22 @@ def calibration_line(gain: float | None) -> str:
         return ""
     return (
         '<p class="carts-caption">The calibration may be wrong: with other poses of the arms\' bases (base frames) or '
-        f"of the camera, the remaining residual would be {100 * gain:.0f} % smaller. A good mask can be accepted "
-        "nevertheless. For better masks and joint values, <b>calibrate</b> and then run or solve again, before you "
-        "accept frames: a calibration moves all masks, so accepted frames become unreviewed.</p>"
+        f"of the camera, the residual would be {100 * gain:.0f} % smaller. Good masks can still be "
+        "accepted. For better masks and joint positions, <b>calibrate</b> and then run or solve again, before you "
+        "accept frames: a calibration changes all masks, so accepted frames become unreviewed.</p>"
     )
 
 
 _LONGEST_LIST = 200
 _MEANING = (
-    "Solving fits neighbouring frames together; <b>Run</b> fits one alone. Frames that you accepted, moved by hand or "
-    "marked as keyframes do not change."
+    "Solving fits neighbouring frames jointly; <b>Run</b> fits a single frame. Frames that you accepted, moved by "
+    "hand or marked as keyframes do not change."
 )
 _DIRECTIONS: dict[str, Direction] = {"First frame": "forward", "Last frame": "backward"}
 
 
 class KeyframesPanel:
-    """Marks keyframes and solves between them, with progress and a way to stop."""
+    """Marks keyframes and solves between them, with progress and a stop button."""
 
     def __init__(self, page: PanelPage, session: Session) -> None:
         gui = page.gui
@@ -94,7 +94,9 @@ class KeyframesPanel:
         self._index = 0
         with gui.add_folder("Keyframes"):
             self._held = gui.add_checkbox(
-                "Keyframe", False, hint="Solving does not change it. Frames that you moved or accepted are kept, too."
+                "Keyframe",
+                False,
+                hint=("Solving does not change this frame. Frames that you moved or accepted are also kept."),
             )
             self._text = gui.add_html("")
             self._between = page.button(
@@ -169,7 +171,7 @@ class KeyframesPanel:
         count = sum(frame not in kept for frame in frames)
         self._solvable = state.index in state.part and bool(kept) and count > 0
         if state.index not in state.part:
-            return f"{name} keeps to the range, and this frame lies outside of it"
+            return f"{name} is limited to the range, but this frame lies outside of it"
         if not kept:
             return f"{name} needs a kept frame; none is kept {'yet' if state.range is None else 'in the range'}"
         where = f"{name}, {escaped(self._ids[frames[0]])} to {escaped(self._ids[frames[-1]])}"

@@ -36,7 +36,7 @@ _MOST_COLUMNS = 4000
 
 
 class Traces:
-    """Values of every frame, brought up to date as the project changes."""
+    """Values of every frame, updated as the project changes."""
 
     def __init__(self, session: Session) -> None:
         frames = len(session.sequence)

@@ -55,7 +55,7 @@ class PageDisplay:
         new_pose = old is None or state.pose is not old.pose or state.camera != old.camera
         if new_frame or new_pose or old is None or _picture(state) != _picture(old):
             overlays = self._overlays(state, self._seen(state))
-            # Together, or a new frame would be seen for a moment under the old frame's overlay.
+            # Sent together, so that a new frame never appears under the old frame's overlay.
             with self._page.atomic():
                 if new_frame:
                     self._scene_view.show_frame(state.frame.images[state.camera], camera)
@@ -132,7 +132,7 @@ class PageDisplay:
             self._page.call("painted", new[own])
 
     def show_panels(self, state: ViewState) -> None:
-        """Bring every widget up to date."""
+        """Update every widget."""
         for panel in self._panels:
             panel.show(state)
 

@@ -48,7 +48,7 @@ class BatchPage:
         self._closed = threading.Event()
 
     def show(self) -> None:
-        """Bring the document up to date, now and as long as jobs run."""
+        """Update the document, now and as long as jobs run."""
         known = most_urgent_first(known_jobs(self._batch, self._jobs))
         counts = Counter(entry.status for entry in known)
         content = render(

@@ -50,7 +50,7 @@ class Roots:
         """
         for folder in folders:
             if not folder.is_dir():
-                raise SettingsError(f"--root {folder} is not a folder. Give folders that hold recordings.")
+                raise SettingsError(f"--root {folder} is not a folder. Give folders that contain recordings.")
         # A named root may be a link; links below it are not followed.
         self.folders = tuple(dict.fromkeys(folder.resolve() for folder in folders))
 
@@ -63,20 +63,24 @@ class Roots:
         path = Path(text)
         root = next((root for root in self.folders if path == root or path.is_relative_to(root)), None)
         if "\x00" in str(text) or not path.is_absolute() or ".." in path.parts or root is None:
-            raise SettingsError(f"{text} is outside of the allowed folders. Start carts view with --root for another.")
+            raise SettingsError(
+                f"{text} is outside of the allowed folders. Restart carts view with --root FOLDER to allow it."
+            )
         step = root
         try:
             for part in path.relative_to(root).parts:
                 step = step / part
                 if part.startswith("."):
-                    raise SettingsError(f"{step} is hidden. Choose another, or start carts view with --root {step}.")
+                    raise SettingsError(
+                        f"{step} is hidden. Choose another folder, or restart carts view with --root {step}."
+                    )
                 mode = os.lstat(step).st_mode
                 if stat.S_ISLNK(mode):
                     raise SettingsError(f"{step} is a link, and links are not followed. Choose the folder itself.")
                 if not (stat.S_ISDIR(mode) or stat.S_ISREG(mode)):
-                    raise SettingsError(f"{step} is neither a folder nor a file. Choose another.")
+                    raise SettingsError(f"{step} is neither a folder nor a file. Choose another path.")
         except OSError as error:
-            raise SettingsError(f"{step} cannot be opened ({error.strerror}). Choose another.") from error
+            raise SettingsError(f"{step} cannot be opened ({error.strerror}). Choose another path.") from error
         return path
 
     def entries(self, folder: Path) -> list[Entry]:
@@ -97,7 +101,7 @@ class Roots:
                         path = Path(folder) / each.name
                         found.append(Entry(each.name, path, is_folder, known.st_size, known.st_mtime))
         except OSError as error:
-            raise SettingsError(f"{folder} cannot be opened ({error.strerror}). Choose another.") from error
+            raise SettingsError(f"{folder} cannot be opened ({error.strerror}). Choose another path.") from error
         return sorted(found, key=lambda entry: (not entry.is_folder, entry.name.casefold()))
 
     def parent(self, folder: Path) -> Path | None:

@@ -35,7 +35,7 @@ _Count = Annotated[int, msgspec.Meta(ge=0)]
 
 @dataclass(frozen=True)
 class RecentProject:
-    """A sequence that was opened."""
+    """Recently opened sequence."""
 
     sequence: str
     """Path of its file."""
@@ -44,11 +44,11 @@ class RecentProject:
     """Path of its project."""
     frames: _Count
     reviewed: _Count
-    """Frames that a person has accepted or rejected."""
+    """Number of accepted or rejected frames."""
     corrected: _Count
-    """Frames whose joints differ from the measured ones."""
+    """Number of frames with corrected joints."""
     changed: Annotated[float, msgspec.Meta(ge=0, le=1e11)]
-    """When the project was changed or left last [s since 1970]."""
+    """Time of the last change or use of the project [s since 1970]."""
 
     @property
     def thumbnail(self) -> Path:
@@ -57,7 +57,7 @@ class RecentProject:
 
 
 def recent_projects() -> list[RecentProject]:
-    """Projects with existing sequence files, the newest first; empty if the list cannot be read."""
+    """Projects with existing sequence files, newest first; empty if the list cannot be read."""
     try:
         return [each for each in _read() if is_regular(Path(each.sequence))]
     except (OSError, ValueError):
@@ -115,7 +115,7 @@ def _numbers(state: ProjectState) -> tuple[int, int]:
 
 
 def _changed(path: Path) -> float:
-    """When a file was changed last [s since 1970]; 0 where there is none."""
+    """Modification time of a file [s since 1970]; 0 if it does not exist."""
     try:
         return path.stat().st_mtime
     except OSError:
@@ -131,7 +131,7 @@ def thumbnail(project: RecentProject) -> bytes | None:
 
 
 def remember(app: ViewerApp) -> None:
-    """Put the sequence of a viewer, open or closed, at the head of the list."""
+    """Move the sequence of a viewer, open or closed, to the head of the list."""
     reviewed, corrected = _numbers(app.project.state)
     entry = RecentProject(
         sequence=str(app.sequence.path),
@@ -147,7 +147,7 @@ def remember(app: ViewerApp) -> None:
 
 
 def forget(sequence: str) -> None:
-    """Take a sequence off the list; its files stay."""
+    """Remove a sequence from the list; its files are kept."""
     _write(each for each in recent_projects() if each.sequence != sequence)
 
 
@@ -246,14 +246,14 @@ class StartPage:
 
 @cache
 def _first_image(path: Path) -> bytes:
-    """The first image of a sequence, small."""
+    """Thumbnail of a sequence's first image."""
     sequence = Sequence.open(path)
     frame = sequence.frame(0, cameras=[sequence.scene.cameras[0].name])
     return small_jpeg(next(iter(frame.images.values())), width=_WIDTH)
 
 
 def _ago(seconds: float) -> str:
-    """Time since a moment, as text."""
+    """Elapsed time as text."""
     minutes = max(time.time() - seconds, 0.0) / 60
     if minutes < 2:
         return "just now"

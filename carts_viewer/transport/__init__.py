@@ -1,1 +1,1 @@
-"""Communication with tabs, and all use of private parts of viser and websockets."""
+"""Communication with tabs, and all use of private APIs of viser and websockets."""

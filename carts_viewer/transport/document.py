@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 class Document:
-    """A document over the page in all tabs; empty at first."""
+    """HTML document over the page in all tabs; initially empty."""
 
     def __init__(self, page: Page) -> None:
         self.page = page

@@ -36,7 +36,7 @@ class Theme(Event):
 
 
 class Trace(Event):
-    """A curve of the timeline is requested."""
+    """A curve of the timeline was requested."""
 
     name: _Text
     first: int
@@ -52,14 +52,14 @@ class Pressed(Event):
 
 
 class Pointed(Event):
-    """A keypoint is placed in the image of a camera, by its index."""
+    """A keypoint was placed in the image of a camera, by its index."""
 
     camera: int
     at: _Point
 
 
 class Dragged(Event):
-    """A link is dragged."""
+    """A link was dragged."""
 
     gesture: float
     """Identifier of the gesture; constant while the pointer is down."""

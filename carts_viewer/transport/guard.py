@@ -1,4 +1,4 @@
-"""Access to the viewer: which requests are answered, and which messages of a tab are accepted."""
+"""Access control of the viewer: filters of requests and of tab messages."""
 
 import contextlib
 import http
@@ -30,7 +30,7 @@ _ELSEWHERE = "192.0.2.1"
 def check_address(host: str, port: int) -> None:
     """Raise `SettingsError` unless `host` is an address of this computer and `port` a port."""
     if not 0 <= port <= 65535:
-        raise SettingsError(f"The viewer was asked to use port {port}. Ports go from 1 to 65535; 0 picks a free one.")
+        raise SettingsError(f"Port {port} is invalid. Give 1 to 65535, or 0 for a free port.")
     try:
         if not host:
             raise OSError("it is empty")
@@ -72,14 +72,14 @@ class Guard:
         """
         hosts = headers.get_all("Host")
         if len(hosts) != 1 or not self._is_ours(_hostname(hosts[0])):
-            return f"The viewer answers by its own address only, and was asked for {', '.join(hosts)!r}."
+            return f"Requests for {', '.join(hosts)!r} are refused. Use the viewer's own address."
         for origin in headers.get_all("Origin"):
             if origin != f"http://{hosts[0]}":
-                return f"The viewer answers its own page only, and this request came from {origin!r}."
+                return f"Requests from {origin!r} are refused. Only the viewer's own page is allowed."
         if _from_another_page(target, headers):
-            return "The viewer's files are for its own page only. Open the page itself."
+            return "The viewer's files are available to its own page only. Open the page instead."
         if self.token is not None and not (self._has_token(target) or self._has_cookie(headers)):
-            return "Open the address that the viewer printed when it started, with the token at its end."
+            return "A token is required. Open the address that the viewer printed, with the token at its end."
         return None
 
     def cookie(self, target: str, headers: Headers) -> str | None:
@@ -113,7 +113,7 @@ class Guard:
 
 
 def _any_equal(given: Iterable[str], secret: str) -> bool:
-    """Whether one of these equals the secret, compared in constant time."""
+    """Whether a value equals the secret; compares in constant time."""
     return any([secrets.compare_digest(value.encode("utf-8", "replace"), secret.encode()) for value in given])
 
 
@@ -275,7 +275,7 @@ def gated(
                     return data
                 if not getattr(self, "warned", False):
                     self.warned = True
-                    _log.warning("A tab sent a message that the viewer does not take: %.200r", reason)
+                    _log.warning("Refused a message of a tab: %.200r", reason)
 
     def serve(*arguments: Any, process_request: Any = None, **options: Any) -> Any:
         def guarded(connection: Any, request: Request) -> Any:

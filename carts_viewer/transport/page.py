@@ -140,7 +140,7 @@ def _parts() -> tuple[str, str]:
     text = index.read_text(encoding="utf-8")
     if any(text.count(part) != 1 for part in (_TITLE, _LOADER, _CLIENT)):
         raise CartsError(
-            f"{index} is not the page of viser 1.1. Install the pinned version: pip install 'viser~=1.1.1'"
+            f"{index} is not the page of viser 1.1. Install the supported version: pip install 'viser~=1.1.1'"
         )
     # The client's own script element gets the nonce of the one that unpacks it.
     text = text.replace(_CLIENT, f'{_CLIENT}e.nonce=document.querySelector("script[data-p]").nonce;')

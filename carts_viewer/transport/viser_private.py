@@ -1,4 +1,4 @@
-"""Private parts of viser that the viewer uses.
+"""Private viser APIs used by the viewer.
 
 No other module uses them. viser is pinned to one minor version, tests/viewer/test_transport.py names every
 attribute that is used, and the browser tests drive them all.

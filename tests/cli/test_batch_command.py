@@ -179,7 +179,7 @@ def test_a_wrong_manifest_is_reported_and_nothing_is_made(
     path = manifest(sequence, further='[[jobs]]\nrecordings = ["nowhere"]\nsteps = ["optimize"]\n')
     with pytest.raises(SystemExit):
         main(["batch", str(path), "--output", str(tmp_path / "batch")])
-    assert "matches nothing" in capsys.readouterr().err and not (tmp_path / "batch").exists()
+    assert "matches no file" in capsys.readouterr().err and not (tmp_path / "batch").exists()
 
 
 def _killed_now_and_then(command: list[str | Path], every: float, seed: int) -> int:
@@ -248,7 +248,7 @@ def test_a_stopped_batch_goes_on_and_comes_to_the_same_end(sequence: Path, tmp_p
     process.send_signal(signal.SIGTERM)
     _, errors = process.communicate(timeout=120)
     assert process.returncode in (0, 128 + signal.SIGTERM)
-    assert process.returncode == 0 or "holds what is done; the same command goes on from there" in errors
+    assert process.returncode == 0 or "holds the finished jobs; rerun the command to resume" in errors
     finished = run(path, "--output", tmp_path / "stopped", "--workers", "1")
     assert finished.returncode == 0 and "already there" in finished.stdout
     assert results(tmp_path / "stopped") == results(tmp_path / "whole")

@@ -53,7 +53,7 @@ def test_a_calibration_that_moved_nothing_says_so(
     main(["calibrate", str(sequence), "--output", str(tmp_path / "out"), *QUICK[:3], "iterations=1"])
     page = (tmp_path / "out" / "README.md").read_text()
     for text in (page, " ".join(capsys.readouterr().out.split())):
-        assert "The start was kept" in text and CAUTION not in text
+        assert "The initial calibration was kept" in text and CAUTION not in text
     assert "what moved" not in page
 
 
@@ -73,11 +73,11 @@ def test_intrinsics_and_joints_are_free_on_request(sequence: Path, tmp_path: Pat
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--frames", "spread:0"], "names no frame"),
+        (["--frames", "spread:0"], "selects no frame"),
         (["--frames", "7"], "--frames 7: there is no '7'"),
-        (["--no-base-frames", "--no-extrinsics"], "nothing of the calibration is free"),
+        (["--no-base-frames", "--no-extrinsics"], "no calibration parameter is free"),
         (["--settings", "prior_deg=0"], "prior_deg is 0"),
-        (["--camera", "third"], "no camera is called 'third'"),
+        (["--camera", "third"], "there is no camera 'third'"),
         (["--domain", "fog"], "no domain 'fog'"),
     ],
 )

@@ -67,7 +67,7 @@ def test_a_start_that_was_kept_is_told(
 ) -> None:
     output = ["--output", str(tmp_path / "out")] if command == "optimize" else ["--json", str(tmp_path / "out.json")]
     main([command, sequence, "--frames", "001", "--perturb-deg", "0.001", *output])
-    assert "left: the start was kept in 1 of 1 run" in " ".join(capsys.readouterr().out.split())
+    assert "left: 1 of 1 run kept the initial values" in " ".join(capsys.readouterr().out.split())
     if command == "evaluate":
         (score,) = json.loads((tmp_path / "out.json").read_text())["frames"]
         assert score["stopped"] == "start kept"
@@ -81,7 +81,7 @@ def test_optimize_writes_masks_and_kinematics_and_resumes(
     folder = tmp_path / "out" / "regular" / "left"
     first = (folder / "masks" / "001.png").stat().st_mtime_ns
     main(command)
-    assert "2 of 3 frames already there" in " ".join(capsys.readouterr().out.split())
+    assert "2 of 3 frames already done" in " ".join(capsys.readouterr().out.split())
     assert (folder / "masks" / "001.png").stat().st_mtime_ns == first
     with (folder / "kinematics.csv").open() as file:
         rows = list(csv.DictReader(file))
@@ -110,7 +110,7 @@ def test_cameras_that_look_together_share_a_table_and_have_masks_of_their_own(
     assert (one > 0).any() and (other > 0).any() and (one != other).any()
 
     main(command)
-    assert "2 of 2 frames already there" in " ".join(capsys.readouterr().out.split())
+    assert "2 of 2 frames already done" in " ".join(capsys.readouterr().out.split())
     files[3].unlink()
     main(command)
     assert files[3].is_file(), "a frame without one of its masks is done again"
@@ -147,11 +147,11 @@ def test_optimize_in_sequence_mode_keeps_keyframes_and_writes_deviations(
     assert [float(rows[1][name]) for name in columns[2:]] == [float(value) for value in values]
     assert float(rows[1]["PSM1.yaw.std"]) == 0
     main([*command, "--keyframes", str(given)])
-    assert "3 of 3 frames already there" in " ".join(capsys.readouterr().out.split())
+    assert "3 of 3 frames already done" in " ".join(capsys.readouterr().out.split())
 
     with pytest.raises(SystemExit) as stop:
         main(["optimize", sequence, *output, "--keyframes", str(given)])
-    assert stop.value.code == BAD_INPUT and "needs --mode sequence" in capsys.readouterr().err
+    assert stop.value.code == BAD_INPUT and "requires --mode sequence" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("solver", ["acs", "l1"])
@@ -176,19 +176,19 @@ def test_all_settings_are_printed_as_a_file_and_explained_on_request(
     assert "prior_deg = 2.5: Expected error of a joint position" in text and "RandomRestart: " in text
     with pytest.raises(SystemExit):
         main(["render", sequence, "--print-settings"])
-    assert "--print-settings is for" in capsys.readouterr().err
+    assert "--print-settings is available for" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--arms", "PSM9"], "no arm is called 'PSM9'"),
+        (["--arms", "PSM9"], "there is no arm 'PSM9'"),
         (["--locked-joints", "elbow"], "locked joint 'elbow' does not exist"),
-        (["--extrinsics", "--settings", 'free.locked_cameras=["third"]'], "no camera is called 'third'"),
-        (["--no-joints"], "nothing is free"),
+        (["--extrinsics", "--settings", 'free.locked_cameras=["third"]'], "there is no camera 'third'"),
+        (["--no-joints"], "no parameter is free"),
         (["--domain", "regular", "fog"], "domain 'fog' is not in"),
         (["--mode", "sequence", "--keyframes", "nowhere.csv"], "nowhere.csv is not a readable kinematics table"),
-        (["--mode", "sequence", "--solver", "acs"], "needs the solver surface"),
+        (["--mode", "sequence", "--solver", "acs"], "requires --solver surface"),
     ],
 )
 def test_an_optimization_that_cannot_be_done_leaves_nothing_behind(
@@ -213,7 +213,7 @@ def test_results_are_replaced_by_frames_and_not_by_an_error(
         main([*command, "--domain", "smoke", "--overwrite", "--arms", "PSM9"])
     with pytest.raises(SystemExit):
         main([*command[:1], str(another), *command[2:], "--domain", "all"])
-    assert "smoke/left holds results of another sequence" in " ".join(capsys.readouterr().err.split())
+    assert "smoke/left holds results of another or an unknown sequence" in " ".join(capsys.readouterr().err.split())
     assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before
     assert not (tmp_path / "out" / "regular").exists(), "the first domain is not begun if the second is refused"
 
@@ -232,10 +232,10 @@ def test_render_writes_a_picture_per_frame(sequence: str, tmp_path: Path, style:
     [
         (["evaluate", "nowhere.toml"], "nowhere.toml"),
         (["evaluate", "SEQUENCE", "--domain", "fog"], "domain 'fog' is not in"),
-        (["evaluate", "SEQUENCE", "--camera", "third"], "no camera is called 'third'. The cameras are: left"),
+        (["evaluate", "SEQUENCE", "--camera", "third"], "there is no camera 'third'. The cameras are: left"),
         (
             ["evaluate", "SEQUENCE", "--arms", "psm1"],
-            "no arm is called 'psm1'. The arms are: PSM1. Did you mean 'PSM1'?",
+            "there is no arm 'psm1'. The arms are: PSM1. Did you mean 'PSM1'?",
         ),
         (["evaluate", "SEQUENCE", "--camera", "lfet"], "Did you mean 'left'?"),
         (["evaluate", "SEQUENCE", "--frames", "7"], "--frames 7: there is no '7'"),
@@ -320,10 +320,10 @@ def test_frames_are_chosen_by_id_and_by_position_counted_from_1(
         ("-1", None, "there is no '1'. Did you mean '001'"),
         ("3:", None, "there is no '3:'"),
         ("001-002,010-001", None, "001 comes before 010. Give 001-010"),
-        ("0-1,3", None, r"Earlier versions counted from 0; then this was --frames 001-002,a-2\."),
-        (None, "0-2", "there is no '0'. Positions count from 1, as in the page; there are 1 to 5"),
+        ("0-1,3", None, r"Earlier versions counted from 0; the equivalent is --frames 001-002,a-2\."),
+        (None, "0-2", "there is no '0'. Positions count from 1, as in the viewer; they are 1 to 5"),
         (None, "6", "there is no '6'"),
-        ("001", "1", "both given"),
+        ("001", "1", "mutually exclusive"),
     ],
 )
 def test_frames_that_mean_nothing_are_refused(frames: str | None, positions: str | None, message: str) -> None:

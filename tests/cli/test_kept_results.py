@@ -113,7 +113,7 @@ def test_frames_whose_inputs_changed_are_redone_and_it_is_said_why(optimize: Out
     ):
         change(tmp_path)
         assert printed in optimize(), change.__name__
-    assert "3 of 3 frames already there" in optimize()
+    assert "3 of 3 frames already done" in optimize()
 
 
 def test_kept_results_are_recognized_without_decoding_images(
@@ -122,7 +122,7 @@ def test_kept_results_are_recognized_without_decoding_images(
     replaced(tmp_path / "sequence.toml", 'name = "left"', 'name = "left"\nbackground = "regular/left/001.png"')
     optimize()
     monkeypatch.setattr(ImageFiles, "read", lambda source, index: pytest.fail(f"{source.name(index)} was decoded"))
-    assert "3 of 3 frames already there" in optimize()
+    assert "3 of 3 frames already done" in optimize()
 
 
 def time_offset_changed(folder: Path) -> None:
@@ -146,10 +146,10 @@ def test_another_time_offset_has_all_frames_redone(optimize: Outcome, sequence: 
             writer.writeheader()
             writer.writerows(table)
     optimize()
-    assert "3 of 3 frames already there" in optimize()
+    assert "3 of 3 frames already done" in optimize()
     time_offset_changed(tmp_path)
     assert "3 of 3 frames redone: the measured joint positions changed" in optimize()
-    assert "3 of 3 frames already there" in optimize()
+    assert "3 of 3 frames already done" in optimize()
 
 
 def test_other_settings_have_the_chosen_frames_redone_and_the_others_are_told(
@@ -160,11 +160,11 @@ def test_other_settings_have_the_chosen_frames_redone_and_the_others_are_told(
     before = (folder / "masks" / "003.png").read_bytes()
     printed = optimize("--perturb-deg", "2", "--frames", "001-002")
     assert "2 of 2 frames redone: the settings changed" in printed
-    assert "1 frame not chosen now would have to be redone: the settings changed" in printed
+    assert "1 frame outside of this run are outdated: the settings changed" in printed
     assert (folder / "masks" / "003.png").read_bytes() == before
     assert json.loads((folder / "settings.json").read_text())["perturb_deg"] == 2
     printed = optimize("--perturb-deg", "2")
-    assert "2 of 3 frames already there" in printed and "1 of 3 frames redone: the settings changed" in printed
+    assert "2 of 3 frames already done" in printed and "1 of 3 frames redone: the settings changed" in printed
 
 
 def test_other_weights_have_all_frames_redone(optimize: Outcome, tmp_path: Path) -> None:
@@ -188,7 +188,7 @@ def test_in_sequence_mode_one_changed_image_has_all_frames_redone(
     main([*command, "--frames", "001-002"])
     printed = re.sub(r"\s+", " ", capsys.readouterr().out)
     assert "2 of 2 frames redone: " in printed and "they were solved together with other frames" in printed
-    assert "1 frame not chosen now would have to be redone: they were solved together with other frames" in printed
+    assert "1 frame outside of this run are outdated: they were solved together with other frames" in printed
 
 
 def emptied(path: Path) -> None:
@@ -210,7 +210,7 @@ def test_a_damaged_mask_is_made_again(optimize: Outcome, tmp_path: Path) -> None
     for damage in (emptied, cut_off, altered, Path.unlink):
         damage(mask)
         printed = optimize()
-        assert "2 of 3 frames already there" in printed, damage.__name__
+        assert "2 of 3 frames already done" in printed, damage.__name__
         assert "1 of 3 frames redone: their masks are missing or damaged" in printed, damage.__name__
         assert mask.read_bytes() == before, damage.__name__
 
@@ -220,17 +220,17 @@ def test_a_row_that_was_altered_and_results_of_unknown_origin_are_redone(optimiz
     folder = tmp_path / "out" / "regular" / "left"
     before = (folder / "kinematics.csv").read_bytes()
     replaced(folder / "kinematics.csv", "002,optimized,0.", "002,optimized,1.")
-    assert "1 of 3 frames redone: their rows in the table were changed" in optimize()
+    assert "1 of 3 frames redone: their rows in the table have changed" in optimize()
     assert (folder / "kinematics.csv").read_bytes() == before
     for content in ("", "[]", '{"format": "carts-results/1", "frames": {"001": {}}}'):
         (folder / "results.json").write_text(content)
-        assert "3 of 3 frames redone: what they were made from is not known" in optimize()
+        assert "3 of 3 frames redone: their inputs are unknown" in optimize()
 
 
 def test_overwriting_some_frames_removes_the_others_and_says_so(optimize: Outcome, tmp_path: Path) -> None:
     optimize()
     printed = optimize("--overwrite", "--frames", "001")
-    assert "--overwrite starts over: results of 2 other frames are removed" in printed
+    assert "--overwrite removes the results of 2 other frames" in printed
     folder = tmp_path / "out" / "regular" / "left"
     assert [path.name for path in (folder / "masks").iterdir()] == ["001.png"]
     assert list(json.loads((folder / "results.json").read_text())["frames"]) == ["001"]

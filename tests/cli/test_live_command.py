@@ -58,7 +58,7 @@ def test_a_replay_gives_a_line_for_each_frame_and_a_recording_that_can_be_review
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--source", "replay:3"], "--source 'replay:3' is not known"),
+        (["--source", "replay:3"], "--source 'replay:3' is unknown"),
         (["--source", "socket:port"], "folder:PATH or socket:PORT"),
         (["--source", "socket:70000"], "is not known"),
         (["--source", "camera:0"], "has no joints. Say with --joints-port"),
@@ -81,7 +81,7 @@ def test_a_folder_that_holds_something_is_not_recorded_into(
     (tmp_path / "full" / "note.txt").write_text("mine")
     with pytest.raises(SystemExit):
         main(["live", str(sequence), "--quiet", "--record", str(tmp_path / "full")])
-    assert "is there already. Name a new folder" in re.sub(r"\s+", " ", capsys.readouterr().err)
+    assert "exists. Choose a new folder" in re.sub(r"\s+", " ", capsys.readouterr().err)
     assert [path.name for path in (tmp_path / "full").iterdir()] == ["note.txt"]
 
 

@@ -11,7 +11,7 @@ import pytest
 from carts_core.cli.command_line import BAD_INPUT, main
 from carts_core.networks.extractor import FeatureExtractor
 
-CAUTION = "Dice is against the masks that were fitted"
+CAUTION = "Dice is against the fitted masks"
 
 
 @pytest.fixture
@@ -62,7 +62,7 @@ def test_frames_whose_mask_has_changed_are_optimized_again(
     command += ["--settings", "iterations=2"]
     main(command)
     main(command)
-    assert "2 of 2 frames already there" in " ".join(capsys.readouterr().out.split())
+    assert "2 of 2 frames already done" in " ".join(capsys.readouterr().out.split())
     mask = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)
     assert mask is not None
     mask[:40] = 0
@@ -94,13 +94,13 @@ def test_masks_of_some_cameras_are_said_to_be_unused_where_all_look_together(
     path.write_text(text[: text.rindex("masks = ")] + text[text.index("\n", text.rindex("masks = ")) + 1 :])
     main(["optimize", str(path), "--observe", "both", "--together", "--output", str(tmp_path / "out"),
           "--settings", "iterations=1"])  # fmt: skip
-    assert "has no mask of camera right, so all cameras that look together" in " ".join(capsys.readouterr().out.split())
+    assert "has no mask of camera right, so all cameras fitted together" in " ".join(capsys.readouterr().out.split())
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--observe", "masks", "--solver", "acs"], "--observe masks needs the solver surface"),
+        (["--observe", "masks", "--solver", "acs"], "--observe masks requires the solver surface"),
         (["--observe", "masks", "--weights", "x.safetensors"], "loads no network, but --weights was given"),
         (["--settings", "free.locked_camera=left"], "locked_camera"),
     ],

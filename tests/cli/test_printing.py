@@ -26,7 +26,7 @@ def test_frames_that_say_nothing_or_little_give_no_hint() -> None:
 def test_kept_starts_are_counted() -> None:
     assert kept_start_hint("left", ["converged", "warm"]) is None
     hint = kept_start_hint("left", ["start kept", "converged", "start kept"])
-    assert hint is not None and hint.startswith("left: the start was kept in 2 of 3 runs")
+    assert hint is not None and hint.startswith("left: 2 of 3 runs kept the initial values")
 
 
 JOINTS = ("yaw", "pitch", "insertion")

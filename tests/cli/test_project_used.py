@@ -60,7 +60,7 @@ def test_the_project_beside_a_recording_is_what_is_exported(
 ) -> None:
     main(["export", str(corrected), str(tmp_path / "out"), "--format", "masks"])
     text = said(capsys)
-    assert "sequence.carts: 1 accepted, 1 untouched of 2 frames; --project none for the recording as measured" in text
+    assert "sequence.carts: 1 accepted, 1 untouched of 2 frames; --project none uses the measured joints" in text
     wanted = true_mask(corrected, "001")
     wanted[:5, :5] = True
     assert agreement(written_mask(tmp_path / "out" / "binary" / "left_001.png"), wanted) > 0.999
@@ -69,7 +69,7 @@ def test_the_project_beside_a_recording_is_what_is_exported(
     assert [(view["source"], view["review"]) for view in views] == [("edited", "accepted"), ("edited", "untouched")]
 
     main(["export", str(corrected), str(tmp_path / "as_measured"), "--format", "masks", "--project", "none"])
-    assert "as corrected" not in said(capsys)
+    assert "corrections of" not in said(capsys)
     assert (
         agreement(written_mask(tmp_path / "as_measured" / "binary" / "left_002.png"), true_mask(corrected, "002"))
         < 0.95
@@ -82,7 +82,7 @@ def test_kinematics_that_are_given_are_exported_and_the_project_is_named_as_left
     main(["export", str(corrected), str(tmp_path / "table"), "--format", "csv", "--project", "none"])
     command = ["export", str(corrected), str(tmp_path / "again"), "--format", "csv"]
     main([*command, "--kinematics", str(tmp_path / "table.csv")])
-    assert "sequence.carts is left out, since --kinematics is given" in said(capsys)
+    assert "sequence.carts is not used, since --kinematics is given" in said(capsys)
     assert (tmp_path / "again.csv").read_bytes() == (tmp_path / "table.csv").read_bytes()
 
 
@@ -140,7 +140,7 @@ def test_a_batch_exports_the_project_beside_a_recording_that_it_does_not_correct
     ("command", "message"),
     [
         (["export", "SEQUENCE", "OUT", "--format", "csv", "--project", "gone.carts"], "gone.carts is missing"),
-        (["render", "SEQUENCE", "--project", "other.carts"], "Or leave it out: --project none."),
+        (["render", "SEQUENCE", "--project", "other.carts"], "To ignore it: --project none."),
     ],
 )
 def test_a_project_that_cannot_be_used_is_named(

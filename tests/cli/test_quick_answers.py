@@ -32,7 +32,7 @@ WRONG: list[tuple[list[str], str]] = [
     (["evaluate", "sequence.toml", "--json", "/dev/null/scores.json"], "/dev/null cannot be made or written to"),
     (
         ["evaluate", "sequence.toml", "--mode", "sequence", "--solver", "acs"],
-        "--mode sequence needs the solver surface; given is --solver acs",
+        "--mode sequence requires --solver surface, but --solver acs was given",
     ),
     (["calibrate", "sequence.toml", "--settings", "loss=l1"], "has no setting 'loss'"),
     (["synthesize", "out", "--motion.frames", "0"], "MotionConfig.frames is 0"),

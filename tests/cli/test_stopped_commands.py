@@ -96,12 +96,14 @@ def test_a_stopped_optimization_keeps_what_it_says_and_ends_as_if_it_had_not_bee
     stopped = [*command, str(tmp_path / "stopped")]
     status, printed = run(stopped, number=number, sign=sign)
     assert status == 128 + number, printed
-    assert f"stopped by {number.name}; " in printed and "the same command goes on from there" in printed
+    assert f"stopped by {number.name}; " in printed and "rerun the command to resume" in printed
     said = re.search(r"(\d+) (?:frame|of \d+ frames)", printed)
     assert (said and mode == "sequence") or int(said[1]) == check_results(folder) >= 1  # pyright: ignore
     assert run(stopped, number=signal.SIGKILL, sign=sign)[0] == -signal.SIGKILL
     status, printed = run(stopped)
-    assert status == 0 and ("already there" in printed if mode == "frame" else "went on from where" in printed), printed
+    assert status == 0 and ("already there" in printed if mode == "frame" else "resumed an earlier run" in printed), (
+        printed
+    )
     assert contents(tmp_path / "stopped") == contents(tmp_path / "whole")
 
 

@@ -85,7 +85,7 @@ def test_an_export_of_no_frames_is_refused(sequence: Sequence) -> None:
 
 def test_masks_of_an_unknown_camera_are_refused(dataset: Dataset) -> None:
     frame = replace(dataset.frames[0], masks={"middle": np.zeros((127, 161), bool)})
-    with pytest.raises(SettingsError, match=r"masks for cameras middle, which .* does not have"):
+    with pytest.raises(SettingsError, match=r"masks were given for cameras middle, which .* does not have"):
         replace(dataset, frames=(frame,))
 
 
@@ -131,7 +131,7 @@ def test_a_painted_class_belongs_to_its_part_whatever_is_rendered_there(dataset:
 def test_a_painted_class_that_no_link_has_is_refused(dataset: Dataset) -> None:
     painted = np.full((127, 161), 99, np.uint8)
     frame = replace(dataset.frames[0], part_labels={CAMERA: painted})
-    with pytest.raises(CartsError, match="painted as class 99"):
+    with pytest.raises(CartsError, match="painted class 99"):
         all_views(replace(dataset, frames=(frame,)))
 
 

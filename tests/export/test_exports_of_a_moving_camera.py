@@ -49,5 +49,5 @@ def test_kinematics_say_where_the_camera_was(dataset: Dataset, tmp_path: Path) -
 
 @pytest.mark.parametrize("kind", ["dvrk", "dvrk-2.3", "dvrk-suj"])
 def test_the_dvrk_gets_no_fixed_base_frame_of_a_moving_camera(dataset: Dataset, tmp_path: Path, kind) -> None:
-    with pytest.raises(CartsError, match="moves, and a base frame of the dVRK holds for one place"):
+    with pytest.raises(CartsError, match="moves, but a dVRK base frame is valid for one camera pose"):
         export(dataset, kind, tmp_path / "out.json")

@@ -102,7 +102,7 @@ def test_a_table_of_something_else_is_refused(dataset: Dataset, tmp_path: Path, 
 def test_a_row_that_is_cut_off_is_refused(dataset: Dataset, tmp_path: Path) -> None:
     path = tmp_path / "table.csv"
     path.write_text(kinematics_csv(dataset.scene, dataset.frames).rstrip()[:-30], encoding="utf-8")
-    with pytest.raises(SequenceError, match=r"line 4: not \d+ numbers"):
+    with pytest.raises(SequenceError, match=r"line 4: expected \d+ numbers"):
         read_kinematics_csv(path, dataset.scene)
 
 

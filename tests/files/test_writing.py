@@ -87,7 +87,7 @@ def test_what_is_planted_below_an_output_folder_is_not_followed(tmp_path: Path, 
         try:
             write()
         except OutputError as error:
-            assert "Remove it" in str(error) or "Name a" in str(error), error
+            assert "Remove it" in str(error) or "Choose a" in str(error), error
         except FileNotFoundError:
             pass
         assert contents(home) == before
@@ -129,7 +129,7 @@ def test_a_folder_is_locked_for_others_until_the_block_ends(tmp_path: Path) -> N
 
 def test_a_disk_that_refuses_is_told_in_words(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
-    with pytest.raises(OutputError, match=r"cannot be written \(Not a directory\).*name a folder you may write to"):
+    with pytest.raises(OutputError, match=r"cannot be written \(Not a directory\).*choose a writable folder"):
         write_text(tmp_path / "file" / "out", "new")
 
 

@@ -184,16 +184,19 @@ def test_an_image_and_joints_make_a_frame_and_joints_stay(
     ("values", "message"),
     [
         ({"joints": {"PSM9": {}}}, "there is no arm 'PSM9'; the arms are PSM1"),
-        ({"joints": {"PSM1": {"elbow": 0.0}}}, "joint 'elbow' at 0.0; its joints are"),
-        ({"joints": {"PSM1": {"yaw": float("nan")}}}, "joint 'yaw' at nan"),
-        ({"joints": {"PSM1": {"yaw": 1e300}}}, "joint 'yaw' at 1e\\+300; .* at most 12.6 rad"),
-        ({"joints": {"PSM1": {"insertion": 141.0}}}, "joint 'insertion' at 141.0; .* and 2 m"),
+        ({"joints": {"PSM1": {"elbow": 0.0}}}, "joint 'elbow' is 0.0; its joints are"),
+        ({"joints": {"PSM1": {"yaw": float("nan")}}}, "joint 'yaw' is nan"),
+        ({"joints": {"PSM1": {"yaw": 1e300}}}, "joint 'yaw' is 1e\\+300; .* at most 12.6 rad"),
+        ({"joints": {"PSM1": {"insertion": 141.0}}}, "joint 'insertion' is 141.0; .* and 2 m"),
         ({"camera_poses": {"left": [[1.0]]}}, "camera_poses of 'left' has shape"),
         ({"camera_poses": {"left": (2 * np.eye(4)).tolist()}}, "camera_poses of 'left' is not rigid"),
         ({"camera_poses": {"up": np.eye(4).tolist()}}, "the cameras are left"),
         ({"joints": JOINTS, "images": {"right": ImageMessage(b"")}}, "has no image of camera 'left'"),
         ({"joints": JOINTS, "images": {"left": ImageMessage(b"no image")}}, "cannot be decoded"),
-        ({"joints": JOINTS, "images": {"left": ImageMessage(b"123", "rgb8", 2, 1)}}, "3 bytes are not 2 x 1 pixels"),
+        (
+            {"joints": JOINTS, "images": {"left": ImageMessage(b"123", "rgb8", 2, 1)}},
+            "3 bytes do not match 2 x 1 pixels",
+        ),
         ({"joints": JOINTS, "images": {"left": ImageMessage(b"123", "rgb8", 1, 1)}}, "the camera has 160 x 128"),
     ],
 )
@@ -244,7 +247,7 @@ def test_every_client_of_the_socket_gets_every_result(sequence: Sequence, assemb
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        (struct.pack(">I", LARGEST + 1), "67108865 bytes was announced; 67108864 are allowed"),
+        (struct.pack(">I", LARGEST + 1), "67108865 bytes; the limit is 67108864"),
         (struct.pack(">I", 3) + b"abc", "a message cannot be read"),
         (packed(FrameMessage(0.0, {"PSM9": {}})), "there is no arm 'PSM9'"),
         (struct.pack(">I", 2) + msgspec.msgpack.encode({"a": 1})[:2], "a message cannot be read"),
@@ -349,7 +352,7 @@ def test_a_broken_connection_ends_without_an_error_for_others(assembler: Assembl
     one, other = socket.socketpair()
     other.sendall(struct.pack(">I", 10) + b"abc")
     other.close()
-    with pytest.raises(StreamError, match="ended within a message"):
+    with pytest.raises(StreamError, match="closed within a message"):
         receive(one)
 
 
@@ -380,7 +383,7 @@ def test_a_folder_that_fills_is_followed_from_name_to_name(
     thread.join()
     assert [frame.frame_id for frame in found] == ["000", "001", "002"]
     np.testing.assert_array_equal(found[-1].images["left"], sequence.frame(2).images["left"])
-    with pytest.raises(SettingsError, match="is no folder"):
+    with pytest.raises(SettingsError, match="is not a folder"):
         Folder(assembler, ("left",), tmp_path / "002.json")
 
 
@@ -401,7 +404,7 @@ def test_what_cannot_be_used_in_a_folder_is_left_out(
     assert next(iter(source)).frame.frame_id == "003"
     thread.join()
     said = [record.getMessage() for record in caplog.records]
-    assert len(said) == 3 and all(text.startswith("A frame is left out: ") for text in said)
+    assert len(said) == 3 and all(text.startswith("A frame is skipped: ") for text in said)
     assert "no image 000.left.png or 000.png" in said[0] and "PSM9" in said[2]
 
 

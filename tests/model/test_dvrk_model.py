@@ -54,8 +54,8 @@ def test_without_an_instrument_the_command_lists_those_of_the_tree(model, capsys
 @pytest.mark.parametrize(
     ("number", "message"),
     [
-        ("400001", r"drawn as boxes of 5 mm.*With a shape are: 400093 \(Prograsp Forceps\), 420093"),
-        ("123456", r"is not in .*It names: 400001, 400093, 420093"),
+        ("400001", r"only boxes of 5 mm.*Instruments with meshes: 400093 \(Prograsp Forceps\), 420093"),
+        ("123456", r"is not in .*It contains: 400001, 400093, 420093"),
     ],
 )
 def test_instruments_without_a_shape_and_unknown_ones_are_refused_in_words(model, number, message):
@@ -113,7 +113,7 @@ def test_another_folder_and_broken_macros_are_refused(model, tmp_path):
         dvrk_urdf(model, "400093", model)
     code = "[().__class__.__base__ for _ in [1]]"
     (model / "urdf/Classic/PSM1.urdf.xacro").write_text(f'{XACRO}<link name="${{{code}}}"/></robot>')
-    with pytest.raises(RobotError, match="is not one that is calculated"):
+    with pytest.raises(RobotError, match="is not supported"):
         dvrk_urdf(model, "400093", model)
     (model / "urdf/Classic/PSM1.urdf.xacro").write_text(f'{XACRO}<link name="world"/></robot>')
     with pytest.raises(RobotError, match="has no link 'roll_link'"):
@@ -122,7 +122,7 @@ def test_another_folder_and_broken_macros_are_refused(model, tmp_path):
 
 def test_a_missing_extra_is_said_with_the_command_that_installs_it(monkeypatch):
     monkeypatch.setattr(extras, "find_spec", lambda name: None)
-    with pytest.raises(CartsError, match=r"needs the package xacrodoc, .*: pip install 'carts\[import\]'"):
+    with pytest.raises(CartsError, match=r"requires the package xacrodoc, .*: pip install 'carts\[import\]'"):
         needs_extra("xacrodoc", "import")
 
 

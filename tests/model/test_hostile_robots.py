@@ -51,24 +51,24 @@ def test_the_right_robot_loads(urdf: Path):
     ("before", "after", "part"),
     [
         ('lower="-1"', 'lower="nan"', "<limit lower='nan'>"),
-        ('lower="-1"', 'lower="2"', "lower limit 2.0 above the upper one 1.0"),
-        ('xyz="0 0 1"', 'xyz="0 0 0"', "axis of joint 'yaw' has no direction"),
+        ('lower="-1"', 'lower="2"', "lower limit 2.0 above its upper limit 1.0"),
+        ('xyz="0 0 1"', 'xyz="0 0 0"', "axis of joint 'yaw' has zero length"),
         ('xyz="0 0 1"', 'xyz="0 1"', "<axis xyz='0 1'>"),
         ('xyz="0 0 0.1"', 'xyz="nan 0 0"', "<origin xyz='nan 0 0'>"),
         ('rpy="0 0 0"', 'rpy="inf 0 0"', "<origin rpy='inf 0 0'>"),
         ('scale="1 1 1"', 'scale="0 0 0"', "<mesh scale='0 0 0'>"),
         ('scale="1 1 1"', 'scale="nan 1 1"', "<mesh scale='nan 1 1'>"),
         ('scale="1 1 1"', 'scale="1e30 1e30 1e30"', "<mesh scale='1e30 1e30 1e30'>"),
-        ('scale="1 1 1"', 'scale="1e5 1e5 1e5"', "coordinates beyond 100 m"),
+        ('scale="1 1 1"', 'scale="1e5 1e5 1e5"', "exceed 100 m"),
         ('radius="0.01"', 'radius="-1"', "<sphere radius='-1'>"),
-        ('<parent link="base"/>', '<parent link="none"/>', "parent link 'none', which is not there"),
+        ('<parent link="base"/>', '<parent link="none"/>', "parent link 'none', which does not exist"),
         ('<parent link="base"/>', "", "parent link None"),
         ('<parent link="base"/>', '<parent link="tip"/>', "several links without a parent|loop"),
-        ('<link name="tip">', '<link name="base">', "every link needs a name of its own, but 'base'"),
+        ('<link name="tip">', '<link name="base">', "every link needs a unique name; missing or repeated: 'base'"),
         ("</robot>", '<link name="lone"/></robot>', "several links without a parent: base, lone"),
-        ('type="revolute"', 'type="floating"', "is of type 'floating'; allowed are"),
-        ("<axis", '<mimic joint="yaw"/><axis', "mimics, in the end, itself"),
-        ("<axis", '<mimic joint="none"/><axis', "mimics 'none', which does not move"),
+        ('type="revolute"', 'type="floating"', "is of type 'floating'; allowed:"),
+        ("<axis", '<mimic joint="yaw"/><axis', "mimics itself"),
+        ("<axis", '<mimic joint="none"/><axis', "mimics 'none', which is not a movable joint"),
         ('<robot name="two">', '<!DOCTYPE r [<!ENTITY a "b">]><robot name="two">', "entities"),
         ('<robot name="two">', "<robot>", "must be <robot name"),
         (
@@ -100,7 +100,7 @@ def test_a_huge_limit_means_none(urdf: Path):
 def test_a_mesh_without_area_is_refused(urdf: Path):
     line = np.array([[0, 0, 0], [0.1, 0, 0], [0.2, 0, 0]])
     trimesh.Trimesh(line, [[0, 1, 2]], process=False).export(urdf.parent / "ball.stl")
-    assert "without area" in refusal(urdf)
+    assert "zero area" in refusal(urdf)
 
 
 def test_a_mesh_that_names_a_device_as_its_material_is_not_followed(urdf: Path):

@@ -69,8 +69,8 @@ def test_a_pose_that_no_joints_reach_is_said_with_its_row_and_reason_and_not_cla
     said = [str(entry) for entry in found.unreachable]
     assert said == [
         "row 4: the pose is not finite",
-        "row 1: insertion would be 0.3 m, allowed is 0 to 0.24 m",
-        "row 3: wrist_pitch would be 1.5 rad, allowed is -1.396 to 1.396 rad",
+        "row 1: insertion would be 0.3 m; allowed: 0 to 0.24 m",
+        "row 3: wrist_pitch would be 1.5 rad; allowed: -1.396 to 1.396 rad",
     ]
 
 
@@ -78,7 +78,7 @@ def test_many_unreachable_rows_are_said_in_one_line():
     joints = random_joints(CLASSIC, 9)
     joints[:, 2] = 0.5
     (entry,) = inverse(forward(joints), continuous=False).unreachable
-    assert str(entry) == "rows 0, 1, 2, 3, 4 and 4 more: insertion would be 0.5 m, allowed is 0 to 0.24 m"
+    assert str(entry) == "rows 0, 1, 2, 3, 4 and 4 more: insertion would be 0.5 m; allowed: 0 to 0.24 m"
 
 
 def test_an_unreachable_row_does_not_break_the_roll_of_the_others():
@@ -92,7 +92,7 @@ def test_an_unreachable_row_does_not_break_the_roll_of_the_others():
 
 
 def test_impossible_geometries_and_shapes_are_refused_in_words():
-    with pytest.raises(SettingsError, match=r"shaft_length is 416 m; allowed is 0 to 1 m. Give metres"):
+    with pytest.raises(SettingsError, match=r"shaft_length is 416 m; allowed: 0 to 1 m. Give metres"):
         replace(CLASSIC, shaft_length=416.0)
     with pytest.raises(SettingsError, match="within 90 degrees"):
         replace(CLASSIC, limits=((-1.6, 1.6), (-0.9, 0.9), (0, 0.24), (-4.5, 4.5), (-1.7, 1.7), (-1.5, 1.5)))

@@ -73,7 +73,7 @@ def test_truncated_weights_are_refused(small_weights: Path):
 def test_safetensors_of_another_program_are_refused_with_what_is_allowed(tmp_path: Path):
     path = tmp_path / "other.safetensors"
     save_file({"x": torch.zeros(3)}, path)
-    with pytest.raises(WeightsError, match=f"format None.*allowed is '{FORMAT}' or .*, version '{VERSION}'"):
+    with pytest.raises(WeightsError, match=f"format None.*allowed: '{FORMAT}' or .*, version '{VERSION}'"):
         FeatureExtractor.load(path)
 
 

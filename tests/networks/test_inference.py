@@ -103,7 +103,7 @@ def test_another_networks_graph_is_not_used(weights: Path, cache: Path) -> None:
     (own,) = set(cache.glob("surface-*.onnx")) - {other}
     own.write_bytes(content)
     assert FeatureExtractor.load(weights, inference="auto").engine == "torch"
-    with pytest.raises(SettingsError, match=r"not possible: (its surface maps differ|ONNX Runtime cannot run)"):
+    with pytest.raises(SettingsError, match=r"cannot be used: (its surface maps differ|ONNX Runtime cannot run)"):
         FeatureExtractor.load(weights, inference="onnx")
 
 
@@ -131,7 +131,7 @@ def test_where_onnx_runtime_is_missing_torch_runs_and_asking_for_it_is_an_error(
 ) -> None:
     monkeypatch.setattr("carts_core.networks.extractor.find_spec", lambda name: None)
     assert FeatureExtractor.load(weights, inference="auto").engine == "torch"
-    with pytest.raises(SettingsError, match="onnxruntime and onnx is not installed"):
+    with pytest.raises(SettingsError, match="onnxruntime and onnx are not installed"):
         FeatureExtractor.load(weights, inference="onnx")
 
 

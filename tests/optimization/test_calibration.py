@@ -309,10 +309,13 @@ def test_the_best_calibration_is_kept_when_it_is_cancelled(
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"free": FreeParameters()}, "nothing of the calibration is free"),
-        ({"settings": DescentSolver()}, "needs the solver `surface`"),
+        ({"free": FreeParameters()}, "no calibration parameter is free"),
+        ({"settings": DescentSolver()}, "requires the solver `surface`"),
         ({"joint_prior_deg": 0.0}, "joint_prior_deg is 0.0"),
-        ({"free": FreeParameters(joints=False, extrinsics=True, locked_cameras=("left", "right"))}, "nothing is free"),
+        (
+            {"free": FreeParameters(joints=False, extrinsics=True, locked_cameras=("left", "right"))},
+            "no parameter is free",
+        ),
     ],
 )
 def test_what_makes_no_calibration_is_refused(
@@ -327,7 +330,7 @@ def test_no_frame_and_unknown_cameras_are_refused(
 ) -> None:
     with pytest.raises(SettingsError, match="no frame was given"):
         CalibrationOptimizer(sequence.scene, [], predictor)
-    with pytest.raises(RobotError, match="no camera is called 'third'"):
+    with pytest.raises(RobotError, match="there is no camera 'third'"):
         CalibrationOptimizer(sequence.scene, frames, predictor, free=replace(CALIBRATION, locked_cameras=("third",)))
     optimizer = CalibrationOptimizer(sequence.scene, frames, predictor)
     with pytest.raises(SettingsError, match="no step was made"):

@@ -179,7 +179,7 @@ def test_an_image_of_another_size_is_named(sequence: Sequence, extractor: Featur
 
 def test_a_missing_image_is_named(sequence: Sequence, extractor: FeatureExtractor) -> None:
     frame = sequence.frame(0, cameras=["left"])
-    with pytest.raises(SettingsError, match="no image of camera 'right' was given; given are: left"):
+    with pytest.raises(SettingsError, match="image of camera 'right' is missing; given: left"):
         optimizer_of(sequence, extractor, frame=frame)
 
 

@@ -80,12 +80,12 @@ def test_calibration_and_the_start_stay_as_they_are(tiny: TinyScene) -> None:
 
 def test_what_cannot_be_solved_is_refused_with_the_reason(tiny: TinyScene) -> None:
     start = _perturbed(tiny, 2.0, 0)
-    with pytest.raises(SettingsError, match="there is no pin"):
+    with pytest.raises(SettingsError, match="no keypoint is placed"):
         fit_keypoints(tiny.scene, start, [])
     behind = replace(start, T_camera_world=torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0])) @ start.T_camera_world)
     with pytest.raises(SettingsError, match="behind its camera"):
         fit_keypoints(tiny.scene, behind, _pins(tiny))
-    with pytest.raises(RobotError, match="no camera is called 'top'"):
+    with pytest.raises(RobotError, match="there is no camera 'top'"):
         fit_keypoints(tiny.scene, start, [replace(_pins(tiny)[0], camera="top")])
     with pytest.raises(SettingsError, match="prior_deg is 0"):
         KeypointSettings(prior_deg=0)

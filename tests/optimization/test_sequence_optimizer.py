@@ -259,7 +259,7 @@ def test_locked_joints_stay_measured_and_have_no_deviation(truths: Truths) -> No
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"settings": DescentSolver()}, "given a solver for the loss 'acs'; it needs the solver `surface`"),
+        ({"settings": DescentSolver()}, "requires the solver `surface`, not one for the loss 'acs'"),
         ({"keyframes": {9: {ARM: np.zeros(7)}}}, "keyframe 9 is not among the frames"),
     ],
 )
@@ -269,14 +269,14 @@ def test_settings_that_do_not_fit_are_refused(truths: Truths, arguments: dict, m
 
 
 def test_a_keyframe_needs_every_arm(truths: Truths) -> None:
-    with pytest.raises(RobotError, match="no joint positions for arm 'PSM1'"):
+    with pytest.raises(RobotError, match="joint positions of arm 'PSM1' are missing"):
         optimizer(truths, keyframes={0: {}})
 
 
 @pytest.mark.parametrize(
     ("times", "message"),
     [
-        ({}, "no frames to correct"),
+        ({}, "no frame was given"),
         ({0: 1.0, 1: 1.0}, "Times must increase"),
         ({0: 5.0, 1: None}, "1 of 2 frames have no time; the first is frame 1. Give all frames times, or none"),
     ],
@@ -290,7 +290,7 @@ def test_frames_and_times_that_do_not_fit_are_refused(truths: Truths, times: dic
     ("name", "value"), [("drift_seconds", 0.0), ("measurement_noise", 1e3), ("direction", "sideways")]
 )
 def test_settings_out_of_range_are_named(name: str, value: object) -> None:
-    with pytest.raises(SettingsError, match=f"{name} is {value!r}; allowed is"):
+    with pytest.raises(SettingsError, match=f"{name} is {value!r}; allowed:"):
         SequenceSettings(**{name: value})  # pyright: ignore[reportArgumentType]
 
 

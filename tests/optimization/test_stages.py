@@ -83,7 +83,7 @@ def test_a_descent_never_passes_a_joint_limit(variables: Variables) -> None:
 
 
 def test_what_is_no_stage_is_refused(variables: Variables) -> None:
-    with pytest.raises(TypeError, match="is no stage"):
+    with pytest.raises(TypeError, match="is not a stage"):
         run_stage("dance", Fit(bowl(variables, 1.0), torch.zeros_like(variables.lower), 60))
 
 

@@ -228,7 +228,7 @@ def test_further_factors_are_added_to_the_objective(sequence: Sequence, predicto
 
 
 def test_a_descent_of_features_refuses_further_factors(sequence: Sequence, predictor: PerfectPredictor) -> None:
-    with pytest.raises(SettingsError, match="takes no further factors"):
+    with pytest.raises(SettingsError, match="does not support further factors"):
         FrameOptimizer(
             sequence.scene,
             sequence.frame(0),

@@ -80,7 +80,7 @@ def test_a_start_outside_the_limits_may_stay(scene: Scene) -> None:
 
 
 def test_nothing_free_is_an_error(scene: Scene) -> None:
-    with pytest.raises(SettingsError, match="nothing is free"):
+    with pytest.raises(SettingsError, match="no parameter is free"):
         vector(scene, FreeParameters(joints=False))
 
 
@@ -90,5 +90,5 @@ def test_an_unknown_locked_joint_lists_the_joints(scene: Scene) -> None:
 
 
 def test_an_unknown_arm_lists_the_arms(scene: Scene) -> None:
-    with pytest.raises(RobotError, match=r"no arm is called 'PSM9'. The arms are: PSM1"):
+    with pytest.raises(RobotError, match=r"there is no arm 'PSM9'. The arms are: PSM1"):
         vector(scene, FreeParameters(arms=("PSM9",)))

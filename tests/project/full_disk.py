@@ -46,7 +46,7 @@ def refused(action):
     try:
         action()
     except ProjectError as error:
-        assert "Nothing of this was saved" in str(error) and "Free space" in str(error), error
+        assert "This change was not saved" in str(error) and "Free disk space" in str(error), error
         assert visible(project.state) == before
         return True
     return False
@@ -78,14 +78,14 @@ if how == "tmpfs":
         Project(IDENTITY, path)
         raise SystemExit("opened for writing on a full disk")
     except ProjectError as error:
-        assert "Free space" in str(error), error
+        assert "Free disk space" in str(error), error
     with Project(IDENTITY, path, read_only=True) as reader:
         assert visible(reader.state) == kept
     try:
         Project(IDENTITY, folder / "other.carts")
         raise SystemExit("began a project on a full disk")
     except ProjectError as error:
-        assert "Free space" in str(error), error
+        assert "Free disk space" in str(error), error
     assert path.read_bytes() == before
     assert not list(folder.glob("other*")), os.listdir(folder)
     free()

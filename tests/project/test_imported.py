@@ -69,10 +69,10 @@ def test_what_was_imported_before_is_replaced_only_where_that_was_said(sequence:
     with Project.open(sequence) as project:
         bring_in(project, sequence, write_masks(tmp_path / "first", 10))
         again = bring_in(project, sequence, tmp_path / "first")
-        assert not again.changed and "already; nothing was changed" in again.sentence()
+        assert not again.changed and "nothing was changed" in again.sentence()
         other = write_masks(tmp_path / "second", 20, frames=(2, 3))
         before = project.state
-        with pytest.raises(ProjectError, match="1 layer imported before would be replaced, the first in frame 002"):
+        with pytest.raises(ProjectError, match="1 earlier import would be replaced, the first in frame 002"):
             bring_in(project, sequence, other)
         assert project.state is before
         bring_in(project, sequence, other, replace=True)
@@ -94,7 +94,7 @@ def test_labels_of_a_second_source_get_numbers_of_their_own(sequence: Sequence, 
 def test_masks_of_no_frame_change_nothing(sequence: Sequence, tmp_path: Path) -> None:
     folder = write_masks(tmp_path / "theirs", 10, frames=(77,))
     with Project.open(sequence) as project:
-        with pytest.raises(ProjectError, match=r"belongs to a frame. Its images are called 'theirs/077.png'.*001, 002"):
+        with pytest.raises(ProjectError, match=r"matches a frame. Its images are named 'theirs/077.png'.*001, 002"):
             bring_in(project, sequence, folder)
         assert not project.history()
 

@@ -157,8 +157,8 @@ def test_listeners_hear_of_every_save_after_it_is_done_and_cannot_spoil_it(proje
         (Key.joints(0, "PSM2"), JOINTS, "arm 'PSM2' has 2 joints .yaw, pitch., but 3 joint positions were given"),
         (Key.joints(0, "PSM1"), ACCEPTED, "joints must be a JointCorrection, not a Review"),
         (Key.intrinsics("right"), None, "no camera 'right' for intrinsics; there are: left"),
-        (Key.ignore_region(0, "left"), IgnoreRegion.of(np.ones((4, 4), bool)), "4 x 4 pixels, .* 'left' are 8 x 6"),
-        (replace(Key.base_frame("PSM1"), frame=0), None, "holds for all frames"),
+        (Key.ignore_region(0, "left"), IgnoreRegion.of(np.ones((4, 4), bool)), "4 x 4 pixels, .* 'left' have 8 x 6"),
+        (replace(Key.base_frame("PSM1"), frame=0), None, "applies to all frames"),
     ],
 )
 def test_an_edit_that_does_not_fit_the_sequence_is_refused_whole(
@@ -197,7 +197,7 @@ def test_impossible_values_cannot_be_made(make) -> None:
 
 @pytest.mark.parametrize("name", ["", "  \n"])
 def test_a_step_needs_a_name(project: Project, name: str) -> None:
-    with pytest.raises(ProjectError, match="name is empty"):
+    with pytest.raises(ProjectError, match="an empty name"):
         project.apply(name, {Key.review(0): ACCEPTED})
 
 
@@ -253,7 +253,7 @@ def test_one_step_is_taken_back_and_later_ones_stay(project: Project) -> None:
 def test_a_step_whose_values_were_changed_since_is_not_taken_back(project: Project) -> None:
     project.apply("Accept", {Key.review(1): ACCEPTED})
     project.apply("Reject", {Key.review(1): Review(ReviewState.REJECTED)})
-    with pytest.raises(ProjectError, match=r"step 1 \(Accept\) cannot be taken back alone: step 2 \(Reject\)"):
+    with pytest.raises(ProjectError, match=r"step 1 \(Accept\) cannot be reverted alone: step 2 \(Reject\)"):
         project.reverting(1)
-    with pytest.raises(ProjectError, match="no step 3 is done; 2 steps are"):
+    with pytest.raises(ProjectError, match="step 3 is not done; 2 steps are"):
         project.reverting(3)

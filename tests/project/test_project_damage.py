@@ -206,6 +206,6 @@ def test_a_journal_that_names_another_file_deletes_nothing(project_path: Path) -
     victim = project_path.with_name("victim")
     victim.write_text("precious")
     project_path.with_name("small.carts-journal").write_bytes(b"\xd9\xd5\x05\xf9\x20\xa1\x63\xd7" + bytes(504))
-    with pytest.raises(ProjectError, match="carts makes no such file"):
+    with pytest.raises(ProjectError, match="carts does not create such files"):
         Project(IDENTITY, project_path)
     assert victim.read_text() == "precious"

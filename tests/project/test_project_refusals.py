@@ -42,7 +42,7 @@ def test_a_read_only_folder_is_an_error_and_can_be_opened_read_only(ordinary_use
     before = path.read_bytes()
     ordinary_user_folder.chmod(0o555)
     for name in ("small.carts", "new.carts"):
-        with pytest.raises(ProjectError, match=r"Name a file in a folder that you may write to, or open .* read-only"):
+        with pytest.raises(ProjectError, match=r"Choose a file in a writable folder, or open .* read-only"):
             Project(IDENTITY, path.with_name(name))
     with Project(IDENTITY, path, read_only=True) as reader:
         assert reader.state.review(0) == ACCEPTED
@@ -55,7 +55,7 @@ def test_a_file_that_may_not_be_written_is_an_error_when_it_is_opened(ordinary_u
     path = ordinary_user_folder / "small.carts"
     Project(IDENTITY, path).close()
     path.chmod(0o444)
-    with pytest.raises(ProjectError, match=r"Permission denied. Name a file in a folder that you may write to"):
+    with pytest.raises(ProjectError, match=r"Permission denied. Choose a file in a writable folder"):
         Project(IDENTITY, path)
 
 
@@ -70,7 +70,7 @@ def test_a_project_of_a_newer_schema_is_refused_and_left_alone(project_path: Pat
     Project(IDENTITY, project_path).close()
     edit_file(project_path, "CREATE TABLE news (x); PRAGMA user_version = 99")
     before = project_path.read_bytes()
-    with pytest.raises(ProjectError, match=r"has schema 99, made by a newer version of carts.* Update carts"):
+    with pytest.raises(ProjectError, match=r"has schema 99, written by a newer version of carts.* Update carts"):
         Project(IDENTITY, project_path, read_only=read_only)
     assert project_path.read_bytes() == before
 
@@ -83,7 +83,7 @@ def test_a_file_that_is_no_project_is_refused_and_left_alone(project_path: Path,
         edit_file(project_path, "CREATE TABLE precious (x)")
     before = project_path.read_bytes()
     for read_only in (False, True):
-        with pytest.raises(ProjectError, match=r"not a project.* nothing was changed. Name another file"):
+        with pytest.raises(ProjectError, match=r"not a .*project.* nothing was changed. Choose another file"):
             Project(IDENTITY, project_path, read_only=read_only)
     assert project_path.read_bytes() == before
 
@@ -92,7 +92,7 @@ def test_a_file_that_is_no_project_is_refused_and_left_alone(project_path: Path,
     ("changed", "difference"),
     [
         ({"frame_ids": ("001", "002")}, "3 frames against 2"),
-        ({"frame_ids": ("001", "002", "004")}, "frame number 2 is called '003' against '004'"),
+        ({"frame_ids": ("001", "002", "004")}, "the name of frame number 2 is '003' against '004'"),
         ({"arms": {"PSM1": ("yaw",)}}, "arms PSM1 .yaw pitch insertion., PSM2 .yaw pitch. against PSM1 .yaw."),
         ({"cameras": {"left": (8, 4)}}, "cameras left .8 6. against left .8 4."),
         ({"kinematics_sha256": "1" * 64}, "the kinematics tables differ"),
@@ -130,7 +130,7 @@ def test_a_damaged_project_is_a_clear_error(project_path: Path, damage: str) -> 
         project.apply("Accept", {Key.review(0): ACCEPTED, Key.joints(0, "PSM2"): joints})
     edit_file(project_path, damage)
     damaged = project_path.read_bytes()
-    with pytest.raises(ProjectError, match=r"small\.carts is damaged: .* It was not changed. .* Go back to a copy of"):
+    with pytest.raises(ProjectError, match=r"small\.carts is damaged: .* not changed.* Restore a backup"):
         Project(IDENTITY, project_path)
     assert project_path.read_bytes() == damaged
 
@@ -140,5 +140,5 @@ def test_a_file_that_was_cut_off_is_a_clear_error(project_path: Path) -> None:
         for number in range(20):
             project.apply("Note", {Key.review(0): Review(note=f"{number} " + "long " * 1000)})
     project_path.write_bytes(project_path.read_bytes()[:8192])
-    with pytest.raises(ProjectError, match=r"is damaged: .*It was not changed"):
+    with pytest.raises(ProjectError, match=r"is damaged: .*not changed"):
         Project(IDENTITY, project_path)

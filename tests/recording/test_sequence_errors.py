@@ -69,13 +69,19 @@ def error_of(path: Path, kind: type[Exception] = SequenceError) -> str:
         (line("size", "size = [96, 72]\npixel_center = 1.0"), ["pixel_center is 1.0", "0.5", "0.0"]),
         (line("size", "size = [96, 72]\ndistortion = [0.1]"), ["'left'", "there are 1 distortion coefficients"]),
         (line("size", 'size = [96, 72]\ndistortion = ["a"]'), ["distortion is ['a']", "k1 k2 p1 p2"]),
-        (line("T_camera_world", f"T_camera_world = {MIRRORED}"), ["'left': T_camera_world mirrors", "must be +1"]),
+        (
+            line("T_camera_world", f"T_camera_world = {MIRRORED}"),
+            ["'left': T_camera_world is a reflection", "must be +1"],
+        ),
         (line("T_camera_world", "T_camera_world = [[1, 2], [3, 4]]"), ["T_camera_world has shape (2, 2)"]),
         (
             line("T_camera_world", f"T_camera_world = {np.diag([1.01, 1, 1, 1]).tolist()}"),
-            ["T_camera_world is not rigid", "allowed is 0.001"],
+            ["T_camera_world is not rigid", "limit 0.001"],
         ),
-        (line("robot", f'robot = "builtin:psm_lnd"\nT_world_base = {MIRRORED}'), ["'PSM1': T_world_base mirrors"]),
+        (
+            line("robot", f'robot = "builtin:psm_lnd"\nT_world_base = {MIRRORED}'),
+            ["'PSM1': T_world_base is a reflection"],
+        ),
         (line("images", 'image = "{frame}.png"'), ["'left': images is missing", "Is 'image' a misspelling"]),
         (line("images", 'images = "left.png"'), ["images is 'left.png'", "Add {frame}"]),
         (line("images", 'images = "{fram}.png"'), ["unknown placeholder 'fram'", "Did you mean 'frame'"]),
@@ -202,7 +208,7 @@ def test_a_missing_robot_and_a_wrong_base_link_are_named(tiny_sequence):
     message = error_of(tiny_sequence(edit=line("robot", 'robot = "none.urdf"')), RobotError)
     assert "none.urdf is missing" in message
     message = error_of(tiny_sequence(edit=line("robot", 'robot = "builtin:psm_lnd"\nbase_link = "none"')), RobotError)
-    assert "no link is called 'none'" in message
+    assert "there is no link 'none'" in message
 
 
 def test_an_image_that_vanishes_after_opening_is_named(tiny_sequence):
@@ -263,5 +269,5 @@ def test_a_name_that_cannot_be_part_of_a_file_name_is_refused_where_it_enters(
         "frame": ('frame_id = "{frame:03d}"', f'frame_id = "{name}{{frame}}"'),
     }[what]
     path = tiny_sequence(edit=lambda text: text.replace(before, after))
-    with pytest.raises(SequenceError, match=r"which (begins|contains|is 2\d\d bytes).* A name is part of"):
+    with pytest.raises(SequenceError, match=r"which (starts|contains|is 2\d\d bytes).* Names are used in"):
         Sequence.open(path)

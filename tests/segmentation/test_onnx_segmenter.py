@@ -123,7 +123,7 @@ def test_files_of_pytorch_are_refused_before_anything_of_them_is_run(model: tupl
 def test_the_command_refuses_such_files_before_it_opens_anything(model: tuple[Path, Path], tmp_path: Path) -> None:
     text = tmp_path / "text.onnx"
     text.write_text("no graph")
-    with pytest.raises(WeightsError, match="no ONNX graph"):
+    with pytest.raises(WeightsError, match="not an executable ONNX graph"):
         View(tmp_path / "none.toml", segmenter=(text, model[1])).run()
 
 
@@ -131,13 +131,13 @@ def test_what_is_no_encoder_or_no_decoder_is_refused_with_what_it_takes(
     model: tuple[Path, Path], tmp_path: Path
 ) -> None:
     encoder, decoder = model
-    with pytest.raises(WeightsError, match=r"an encoder takes one image .*Give two ONNX files, the encoder first"):
+    with pytest.raises(WeightsError, match=r"an encoder has one, an image .*Give two ONNX files, the encoder first"):
         OnnxSegmenter.load(decoder, encoder)
-    with pytest.raises(WeightsError, match=r"takes image .*point_coords and point_labels"):
+    with pytest.raises(WeightsError, match=r"inputs image .*point_coords and point_labels"):
         OnnxSegmenter.load(encoder, encoder)
     with pytest.raises(WeightsError, match="cannot be read"):
         OnnxSegmenter.load(tmp_path / "none.onnx", decoder)
     text = tmp_path / "text.onnx"
     text.write_text("no graph")
-    with pytest.raises(WeightsError, match="no ONNX graph"):
+    with pytest.raises(WeightsError, match="not an executable ONNX graph"):
         OnnxSegmenter.load(text, decoder)

@@ -44,25 +44,25 @@ def test_single_settings_need_no_file() -> None:
     options = SolverOptions(settings=("iterations=7", "prior_deg = 4", "sequence.direction=backward"))
     assert options.chosen == SurfaceSolver(iterations=7, prior_deg=4.0)
     assert options.sequence.direction == "backward"
-    with pytest.raises(SettingsError, match="iterations is 0; allowed is 1 to 10000"):
+    with pytest.raises(SettingsError, match="iterations is 0; allowed: 1 to 10000"):
         SolverOptions(settings=("iterations=0",))
 
 
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("[solver]\npriors = 1", r"\[solver\] has no setting 'priors'\. .*Its settings are: .*prior_deg"),
-        ("[solver]\nprior_deg = 'wide'", r"\[solver\]\.prior_deg is 'wide'; it must be a value such as 2\.5"),
-        ("[solver]\nprior_deg = 1e9", "prior_deg is .*; allowed is 0.001 to 360 deg"),
-        ("[solver]\nprior_deg = nan", "prior_deg is nan; allowed is"),
-        ("[[solver.stages]]\nstage = 'SilhouetteSearch'\nenough = -1.0", "enough is -1.0; allowed is 0 to 1000 px"),
-        ("[[solver.stages]]\nstage = 'RandomRestart'\nscale = 0.0\nthen = []", "scale is 0.0; allowed is 0.1 to 8"),
-        ("[[solver.stages]]\nstage = 'Dance'", "has the stage 'Dance'; allowed is Observe, Descend"),
-        ("[[solver.stages]]\nstage = 'Descend'", "needs a blur"),
-        ("[[solver.stages]]\nstage = 'Descend'\nblur = 2.0\nspeed = 1", "has no setting 'speed'.*are: blur"),
+        ("[solver]\npriors = 1", r"\[solver\] has no setting 'priors'\. .*Settings: .*prior_deg"),
+        ("[solver]\nprior_deg = 'wide'", r"\[solver\]\.prior_deg is 'wide'; give a value such as 2\.5"),
+        ("[solver]\nprior_deg = 1e9", "prior_deg is .*; allowed: 0.001 to 360 deg"),
+        ("[solver]\nprior_deg = nan", "prior_deg is nan; allowed:"),
+        ("[[solver.stages]]\nstage = 'SilhouetteSearch'\nenough = -1.0", "enough is -1.0; allowed: 0 to 1000 px"),
+        ("[[solver.stages]]\nstage = 'RandomRestart'\nscale = 0.0\nthen = []", "scale is 0.0; allowed: 0.1 to 8"),
+        ("[[solver.stages]]\nstage = 'Dance'", "has the stage 'Dance'; allowed: Observe, Descend"),
+        ("[[solver.stages]]\nstage = 'Descend'", "requires a blur"),
+        ("[[solver.stages]]\nstage = 'Descend'\nblur = 2.0\nspeed = 1", "has no setting 'speed'.*Settings: blur"),
         ("[solver]\nstages = 3", "must be a list of tables"),
-        ("[slover]\nprior_deg = 1", "has slover; allowed are the tables"),
-        ("prior_deg = 1", "has prior_deg; allowed are the tables"),
+        ("[slover]\nprior_deg = 1", "has slover; allowed: the tables"),
+        ("prior_deg = 1", "has prior_deg; allowed: the tables"),
         ("[solver", "is not TOML"),
     ],
 )
@@ -74,14 +74,14 @@ def test_a_wrong_settings_file_is_told_in_words(text: str, message: str, tmp_pat
 
 
 def test_a_solver_of_another_name_is_refused() -> None:
-    with pytest.raises(SettingsError, match="solver is 'magic'; allowed is surface"):
+    with pytest.raises(SettingsError, match="solver is 'magic'; allowed: surface"):
         solver("magic")
 
 
 def test_stages_of_another_solver_are_refused() -> None:
-    with pytest.raises(SettingsError, match=r"stages is .*; allowed is stages of the surface solver"):
+    with pytest.raises(SettingsError, match=r"stages is .*; allowed: stages of the surface solver"):
         SurfaceSolver(stages=(FirstOrder(),))
-    with pytest.raises(SettingsError, match=r"stages is .*; allowed is one or more FirstOrder"):
+    with pytest.raises(SettingsError, match=r"stages is .*; allowed: one or more FirstOrder"):
         DescentSolver(stages=(Observe(),))
 
 
@@ -90,7 +90,7 @@ def test_stages_of_another_solver_are_refused() -> None:
     [("iterations", 0), ("learning_rate", -1.0), ("method", "magic"), ("loss", "l7"), ("length_scale", 0.0)],
 )
 def test_a_setting_out_of_range_says_what_is_allowed(name: str, value: object) -> None:
-    with pytest.raises(SettingsError, match=f"{name} is .*; allowed is "):
+    with pytest.raises(SettingsError, match=f"{name} is .*; allowed: "):
         DescentSolver(**{name: value})  # pyright: ignore[reportArgumentType]
 
 
@@ -112,12 +112,12 @@ def test_nested_stages_keep_their_kind() -> None:
 @pytest.mark.parametrize(
     ("make", "text"),
     [
-        (lambda: EndoscopeConfig(distance=20.0), "EndoscopeConfig.distance is 20.0; allowed is 0.05 to 10"),
+        (lambda: EndoscopeConfig(distance=20.0), "EndoscopeConfig.distance is 20.0; allowed: 0.05 to 10"),
         (lambda: MotionConfig(frames=0), "MotionConfig.frames is 0"),
-        (lambda: SensorConfig(jpeg_quality=101), "jpeg_quality is 101; allowed is 1 to 100"),
+        (lambda: SensorConfig(jpeg_quality=101), "jpeg_quality is 101; allowed: 1 to 100"),
         (lambda: DomainConfig(blood_coverage=1.5), "DomainConfig.blood_coverage is 1.5"),
-        (lambda: SynthesisConfig(domains=("fog",)), "name at least one of: regular, low_brightness"),
-        (lambda: SynthesisConfig(domains=()), "name at least one of"),
+        (lambda: SynthesisConfig(domains=("fog",)), "give at least one of: regular, low_brightness"),
+        (lambda: SynthesisConfig(domains=()), "give at least one of"),
         (lambda: SynthesisConfig(seed=-1), "SynthesisConfig.seed is -1"),
         (lambda: MotionConfig(jaw_range=(0.5, 0.1)), "MotionConfig.jaw_range"),
         (lambda: MotionConfig(reach=(0.01, -0.01, 0.0)), "MotionConfig.reach"),

@@ -294,7 +294,7 @@ def test_without_a_place_for_a_project_nothing_is_kept_and_the_page_says_so(
     (tmp_path / "file").touch()
     monkeypatch.setenv("CARTS_DATA", str(tmp_path / "file" / "data"))
     storage = open_storage(Sequence.open(sample_sequence()))
-    assert "Nothing is kept" in (storage.notice or "") and storage.project.writable
+    assert "Temporary project" in (storage.notice or "") and storage.project.writable
     path = storage.project.path
     storage.close()
     assert not path.parent.exists()
@@ -311,7 +311,7 @@ def test_a_copy_that_was_rescued_is_said_when_its_project_is_opened(open_viewer:
 
     app = open_viewer(frames=1, prepare=rescued)
     newest = app.project.path.with_name("sequence.rescued-20260102-120000-2.carts")
-    assert f"rescued when it was lost or damaged, is {newest} (and 1 earlier)" in (app.notice or "")
+    assert f"{newest} (and 1 earlier) is a rescued copy" in (app.notice or "")
     assert f"--project '{newest}'" in (app.notice or "")
     app.queue.put(intents.SetJoint("PSM1", 0, 0.1))
     app.queue.put(intents.Released())

@@ -250,7 +250,7 @@ def test_playing_goes_round_in_the_range_and_solving_and_jobs_keep_to_it(desk: D
         seen.append(desk.state.index)
     assert seen == [1, 2, 1, 2]
     desk.do(intents.Play(False), intents.OptimizeFrames("range"))
-    assert desk.state.jobs[-1].title == "Optimize 2 frames, each alone"
+    assert desk.state.jobs[-1].title == "Optimize 2 frames individually"
     desk.do(intents.CancelJob(1), intents.SetSetting("solver", "surface"), intents.Solve(whole=True))
     assert desk.state.jobs[-1].title == "Solve frames 002 to 003"
     desk.finish()

@@ -348,7 +348,7 @@ def test_a_copied_correction_moves_the_measured_joints_by_as_much(session: Sessi
     frames = [session.sequence.frame(index) for index in (1, 0)]
     copied = session.joints(session.copied(*frames))["PSM1"]
     assert copied - measured[1] == pytest.approx([0.07, *[0.0] * 6], abs=1e-6)
-    with pytest.raises(CartsError, match="Frame 002 is as measured"):
+    with pytest.raises(CartsError, match="Frame 002 has no correction"):
         session.copied(*frames[::-1])
 
 

@@ -344,7 +344,7 @@ def test_training_that_is_cancelled_goes_on_in_its_folder_and_its_network_is_use
     at_desk.do(intents.RepeatJob(1))
     job = ended(at_desk)
     assert job.state is JobState.DONE and job.options == AdaptOptions(1, 1)
-    assert "Dice" in job.text and "of the error is left" in job.text
+    assert "Dice" in job.text and "remaining error" in job.text
     at_desk.do(intents.RepeatJob(2), intents.CancelJob(3))
     assert at_desk.state.jobs[-1].options == AdaptOptions(1, 2)
     # The network is offered, and used when it is chosen.
@@ -391,7 +391,7 @@ def test_a_program_that_ends_while_it_trains_does_not_hang(tiny_sequence: Callab
 def test_training_that_fails_says_why(at_desk: Desk, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(work, "OPTIONS", ("--steps", "0"))
     at_desk.do(intents.Adapt(1))
-    with pytest.raises(CartsError, match="steps is 0; allowed is 1 or more"):
+    with pytest.raises(CartsError, match="steps is 0; allowed: 1 or more"):
         ended(at_desk)
     assert at_desk.state.jobs[0].state is JobState.FAILED and at_desk.state.networks == (STARTED,)
 
@@ -406,5 +406,5 @@ def test_a_run_says_what_the_network_does_not_know_once_and_what_helps(
     at_desk.factory.use(None)
     at_desk.factory._unfamiliar.clear()
     state = at_desk.do(intents.Reset(), intents.Step())
-    assert "may not know this robot" in state.unfamiliar[0]
+    assert "this robot or distance" in state.unfamiliar[0]
     assert at_desk.do(intents.Reset(), intents.SetObserved("masks", "recording"), intents.Step()).unfamiliar == ()

@@ -47,7 +47,7 @@ def test_a_replay_is_followed_recorded_and_cannot_be_edited(app: ViewerApp, open
     assert tab.state.streaming
     joints = tab.state.pose.scene.joint_positions
     tab.place_in_viewer.put(intents.Perturb(3.0, seed=0))
-    expect(tab.page.get_by_text("A live stream is shown, which cannot be edited").first).to_be_visible()
+    expect(tab.page.get_by_text("A live stream cannot be edited").first).to_be_visible()
     eventually(lambda: tab.state.pose.scene.joint_positions, lambda now: now is not joints)
     assert not tab.state.project.position
     # The next frame may take the scores away between two looks at them.

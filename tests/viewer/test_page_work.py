@@ -228,7 +228,7 @@ def test_a_range_is_what_is_solved_exported_and_queued(open_tab: OpenTab) -> Non
     between, whole = (
         tab.page.get_by_role("button", name=name, exact=True) for name in ("Solve between", "Solve range")
     )
-    expect(tab.page.get_by_text("keeps to the range, and this frame lies outside of it")).to_be_visible()
+    expect(tab.page.get_by_text("is limited to the range, but this frame lies outside of it")).to_be_visible()
     expect(between).to_be_disabled()
     expect(whole).to_be_enabled()
     tab.put(intents.Solve())
@@ -272,18 +272,18 @@ def test_jobs_of_another_user_are_asked_for_and_jobs_and_choices_survive_the_ser
 
     tab = open_tab(prepare=plant, frames=6, width=160, height=120)
     app = tab.app
-    expect(tab.page.get_by_text("wait for your decision")).to_be_visible()
+    expect(tab.page.get_by_text("need your confirmation")).to_be_visible()
     assert [job.state for job in app.state.jobs] == [JobState.ASKED]
     tab.open("Jobs")
-    expect(tab.page.get_by_text("so they do not run: Export all as")).to_be_visible()
+    expect(tab.page.get_by_text("and are not run: Export all as")).to_be_visible()
     tab.button("Run jobs")
     eventually(lambda: app.state.jobs[0].state, lambda state: state is JobState.DONE, 60)
-    expect(tab.page.get_by_text("wait for your decision")).to_have_count(0)
+    expect(tab.page.get_by_text("need your confirmation")).to_have_count(0)
     expect(tab.page.get_by_role("button", name="Run jobs")).to_have_count(0)
     run_without_end(app)
     tab.button("Optimize each alone")
     running = tab.page.locator(".carts-jobs li.running")
-    expect(running).to_contain_text("Optimize 6 frames, each alone")
+    expect(running).to_contain_text("Optimize 6 frames individually")
     tab.press("n")
     eventually(lambda: app.state.index, lambda index: index == 1)
     tab.button("Cancel")

@@ -172,7 +172,7 @@ def test_an_error_of_something_else_does_not_cost_what_is_solved(desk: Desk) -> 
     ("before", "message"),
     [
         ((), "no keyframe yet"),
-        ((intents.SetSetting("solver", "acs"), intents.HoldKeyframe(True)), "needs the solver"),
+        ((intents.SetSetting("solver", "acs"), intents.HoldKeyframe(True)), "requires the solver"),
     ],
 )
 def test_what_cannot_be_solved_is_refused_with_the_reason(
@@ -230,7 +230,7 @@ def test_a_suspicion_against_base_frames_is_said_when_frames_were_solved_until_t
     desk.advance()
     assert said() == "", "not before the end"
     desk.finish()
-    assert "remaining residual would be 40 % smaller" in said()
+    assert "residual would be 40 % smaller" in said()
     moved = desk.session.scene.arms[0].T_world_base.copy()
     moved[0, 3] += 0.01
     corrected = CorrectedTransform(tuple(map(tuple, moved.tolist())), Provenance(Source.HAND))

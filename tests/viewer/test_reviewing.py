@@ -204,10 +204,10 @@ GOOD, DOUBTFUL = FitVerdict("good", "", "", 0.02), FitVerdict("doubtful", "In pa
     ("after", "before", "worse"),
     [
         (Fit(GOOD, 0.02), Fit(DOUBTFUL, 0.06), None),
-        (Fit(DOUBTFUL, 0.02), Fit(GOOD, 0.06), "doubtful, was good"),
-        (Fit(FitVerdict("good", "", "", 0.09), 0.02), Fit(GOOD, 0.02), "probably wrong by 9%, was 2%"),
-        (Fit(GOOD, 0.03), Fit(GOOD, 0.02), "loss 0.03, was 0.02"),
-        (Fit(GOOD, 0.02, 0.564), Fit(DOUBTFUL, 0.06, 0.701), "Dice 0.564, was 0.701"),
+        (Fit(DOUBTFUL, 0.02), Fit(GOOD, 0.06), "doubtful, before good"),
+        (Fit(FitVerdict("good", "", "", 0.09), 0.02), Fit(GOOD, 0.02), "probability of failure 9%, before 2%"),
+        (Fit(GOOD, 0.03), Fit(GOOD, 0.02), "loss 0.03, before 0.02"),
+        (Fit(GOOD, 0.02, 0.564), Fit(DOUBTFUL, 0.06, 0.701), "Dice 0.564, before 0.701"),
         (Fit(DOUBTFUL, 0.09, 0.95), Fit(GOOD, 0.02, 0.90), None),
     ],
 )
@@ -235,9 +235,9 @@ def test_a_verdict_is_read_with_reason_remedy_and_cameras() -> None:
 
 
 def test_losses_are_only_said_to_compare_when_they_do() -> None:
-    assert "comparable within a stage only" in note(Curves(loss=(1.0,)), False)
+    assert "comparable only within a stage" in note(Curves(loss=(1.0,)), False)
     ended = note(Curves(loss=(1.0,), comparable=True), False)
-    assert "● result" in ended and "within a stage only" not in ended
+    assert "● result" in ended and "only within a stage" not in ended
     assert "changed since" in note(Curves(loss=(1.0,), comparable=True), True)
 
 
@@ -312,6 +312,6 @@ def test_frames_that_failed_or_were_fitted_to_one_camera_are_named_before_an_exp
         "2 of 3 frames are not accepted",
         "1 of these frames failed: 002",
         "1 of these frames are doubtful: 003",
-        "1 of these frames were fitted to fewer cameras than are exported: 001",
+        "1 of these frames were fitted to fewer cameras than exported: 001",
     ]
     assert export_warnings(desk.saved, [0], ["left"]) == ["1 of 1 frames is not accepted"]

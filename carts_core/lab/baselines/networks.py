@@ -152,15 +152,15 @@ def _made(settings: BaselineNetwork, make: Any) -> Any:
 
     if not timm.is_model(settings.timm_encoder):
         raise SettingsError(
-            f"timm {timm.__version__} knows no encoder {settings.timm_encoder!r}. Give a name of its list, such as "
+            f"timm {timm.__version__} has no encoder {settings.timm_encoder!r}. Give the name of a timm model, such as "
             "hrnet_w18_small, hrnet_w48, swin_tiny_patch4_window7_224 or resnet34."
         )
     try:
         return make()
     except (ValueError, RuntimeError, TypeError, KeyError, AssertionError) as error:
         raise SettingsError(
-            f"the encoder {settings.timm_encoder!r} cannot be the {settings.name} baseline of {settings.size} px "
-            f"({error}). Choose one of the {settings.name} family."
+            f"the encoder {settings.timm_encoder!r} does not suit the {settings.name} baseline with {settings.size} px "
+            f"({error}). Choose an encoder of the {settings.name} family."
         ) from error
 
 
@@ -209,11 +209,11 @@ def read_baseline(path: Path) -> TrainedBaseline:
         with safe_open(path, framework="pt") as file:
             metadata = file.metadata() or {}
             if (metadata.get("format"), metadata.get("version")) != (FORMAT, _VERSION):
-                raise ValueError(f"it says format {metadata.get('format')!r}; wanted is {FORMAT!r}")
+                raise ValueError(f"its format is {metadata.get('format')!r}; expected: {FORMAT!r}")
             values, training = parse_json(metadata["network"]), parse_json(metadata["training"], finite=False)
             tables = isinstance(values, dict) and isinstance(training, dict)
             if not tables or not isinstance(training["augmentation"], str):
-                raise TypeError("its description is no table")
+                raise TypeError("its description is not a table")
             unet = Architecture.from_json(values.pop("unet"))
             width, height = values.pop("size")
             decoder = tuple(int(n) for n in values.pop("decoder"))
@@ -225,7 +225,7 @@ def read_baseline(path: Path) -> TrainedBaseline:
     except (FileNotFoundError, IsADirectoryError) as error:
         raise WeightsError(f"weights file {path} is missing. {_REMEDY}") from error
     except (SafetensorError, SettingsError, OSError, KeyError, ValueError, TypeError, RuntimeError) as error:
-        raise WeightsError(f"weights file {path} holds no baseline ({shortened(str(error))}). {_REMEDY}") from error
+        raise WeightsError(f"weights file {path} is not a baseline ({shortened(str(error))}). {_REMEDY}") from error
     digest = hashlib.sha256(read_bytes(path, WEIGHTS)).hexdigest()
     return TrainedBaseline(network.eval().requires_grad_(False), training, digest)
 
@@ -242,7 +242,7 @@ def start_from(network: Baseline, path: Path) -> int:
         if not isinstance(trained, FeatureNetwork) or trained.architecture != network.body.architecture:
             raise WeightsError(
                 f"weights file {path} holds a {trained.kind} network of {trained.architecture}. Give a feature network "
-                f"of {network.body.architecture}, or ask for a U-Net like that."
+                f"of {network.body.architecture}, or choose a U-Net of that architecture."
             )
         network.body.load_state_dict(trained.state_dict())
         return len(trained.state_dict())
@@ -263,8 +263,8 @@ def start_from(network: Baseline, path: Path) -> int:
     }
     if not fitting:
         raise WeightsError(
-            f"weights file {path} has no tensor of the encoder {network.settings.timm_encoder!r}. Give timm's "
-            "weights of exactly this model."
+            f"weights file {path} has no tensors of the encoder {network.settings.timm_encoder!r}. Give timm's "
+            "weights of this model."
         )
     network.load_state_dict({**own, **fitting})
     return len(fitting)

@@ -157,11 +157,11 @@ class TrainingFrames:
                 check_regular(path, WEIGHTS)
                 with safe_open(path, framework="pt") as file:
                     if (file.metadata() or {}).get("settings") != _SETTINGS:
-                        raise ValueError("its frames were made with other settings")
+                        raise ValueError("its frames were generated with other settings")
                     parts.append([file.get_tensor(name) for name in ("images", "given", "masks")])
             except (SafetensorError, OSError, ValueError) as error:
                 raise WeightsError(
-                    f"training frames {path} cannot be read ({error}). Delete the file to have them made again."
+                    f"training frames {path} cannot be read ({error}). Delete the file to regenerate them."
                 ) from error
         self._images, self._given, self._masks = (torch.cat(part) for part in zip(*parts, strict=True))
 
@@ -258,7 +258,7 @@ def train_baseline(
         OutputError: `output` cannot be written to, or another process trains there.
     """
     if network.size != SIZE:
-        raise SettingsError(f"size is {network.size}, but training frames have {SIZE} px. Leave it as it is.")
+        raise SettingsError(f"size is {network.size}, but training frames have {SIZE} px. Use the default size.")
     torch.set_num_threads(training.threads)
     with locked_folder(output):
         run = _Run(network, training, frames, output)

@@ -146,7 +146,7 @@ def crossed(recording: Recording, index: int, camera: str, seed: int = 0) -> Fra
     """
     frame, scene = recording.frame(index, "regular", [camera]), recording.scene.with_cameras([camera])
     if len(scene.arms) != 2 or not frame.truth:
-        raise SettingsError(f"{CROSSING} need a recording of two arms with known joints; this one has no such.")
+        raise SettingsError(f"{CROSSING} requires a recording of two arms with known joints; this is not one.")
     rng = np.random.default_rng((seed, index))
     truth = _crossing_joints(scene, dict(frame.truth), rng)
     with_error = {name: truth[name] + frame.measured[name] - frame.truth[name] for name in truth}
@@ -186,7 +186,7 @@ def _crossing_joints(scene: Scene, around: dict[str, np.ndarray], rng: np.random
         ]
         if _HIDDEN[0] <= float((1.0 - seen / np.array(whole)).max()) <= _HIDDEN[1]:
             return drawn
-    raise SettingsError(f"none of {_DRAWS} draws makes these arms cross in camera {scene.cameras[0].name!r}.")
+    raise SettingsError(f"in {_DRAWS} random draws, these arms never cross in camera {scene.cameras[0].name!r}.")
 
 
 NO_ARM = "no arm"
@@ -231,4 +231,4 @@ def misled(recording: Recording, kind: str, index: int, camera: str) -> Frame:
         case "another instrument":
             # The joints of different instruments cannot be compared.
             return replace(frame, truth=None)
-    raise AssertionError(f"no such wrong input: {kind}")
+    raise AssertionError(f"unknown kind of wrong input: {kind}")

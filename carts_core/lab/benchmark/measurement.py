@@ -204,7 +204,7 @@ class ResultsFile:
             lines = read_bytes(path.path, TABLE).splitlines() if path.path.exists() else []
         except OSError as error:
             raise CartsError(
-                f"{path} cannot be read ({error.strerror or error}). Name another output folder."
+                f"{path} cannot be read ({error.strerror or error}). Choose another output folder."
             ) from error
         for line in lines:
             try:
@@ -311,8 +311,8 @@ def optimizer_figures(sequence: Sequence, iterations: int) -> dict[str, float]:
         "ACS iteration, median": 1e3 * statistics.median(seconds),
         "ACS iteration, 95th percentile": 1e3 * float(np.percentile(seconds, 95)),
         "Gauss-Newton iteration, median": 1e3 * statistics.median(steps),
-        "drawing outlines to edges": 1e3 * edges,
-        f"Gauss-Newton, a whole frame ({counted(len(steps), 'step')})": milliseconds(
+        "alignment of outlines with edges": 1e3 * edges,
+        f"Gauss-Newton, complete frame ({counted(len(steps), 'step')})": milliseconds(
             lambda: list(optimizer(SurfaceSolver())), 5
         ),
     }

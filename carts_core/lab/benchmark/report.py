@@ -99,7 +99,9 @@ def _convergence(data: Measurements) -> Figure | None:
     by_time.xaxis.set_major_formatter("{x:g}")
     by_time.xaxis.set_minor_formatter(NullFormatter())
     loss.set(
-        title="loss by iteration, where it fell", xlabel="iteration", ylabel="share of the loss's fall still to come"
+        title="loss by iteration, runs with a decreasing loss",
+        xlabel="iteration",
+        ylabel=("remaining share of the loss decrease"),
     )
     _finish(figure.axes)
     return figure
@@ -145,8 +147,8 @@ def _errors(data: Measurements) -> Figure | None:
             _with_bars(axes, known, color, "o-", SHORT_LABELS[method])
         points = [(float(error), scale * mean, scale * std) for error, (mean, std) in PAPER[table]["S-Reg"].items()]
         _with_bars(axes, points, "#777", "x--", "paper's own numbers (S-Reg)")
-    dice_axes.set(title="Dice", xlabel="error of every joint at the start [deg]", ylabel="Dice")
-    mae_axes.set(title="joint MAE", xlabel="error of every joint at the start [deg]", ylabel="MAE [deg]")
+    dice_axes.set(title="Dice", xlabel="initial error of every joint [deg]", ylabel="Dice")
+    mae_axes.set(title="joint MAE", xlabel="initial error of every joint [deg]", ylabel="MAE [deg]")
     mae_axes.axline((0, 0), slope=1, color="#bbb", lw=1, ls=":", label="no change")
     _finish(figure.axes)
     return figure
@@ -183,7 +185,7 @@ def _scatter(data: Measurements) -> Figure | None:
             limits = axes.get_xlim(), axes.get_ylim()
             axes.axline((0.9, 0.89), slope=1, color="#999", lw=1, ls="--")
             axes.set(xlim=limits[0], ylim=limits[1])
-        axes.set(title=f"{source} frames", xlabel="Dice at the start", ylabel=f"{value.heading} after")
+        axes.set(title=f"{source} frames", xlabel="initial Dice", ylabel=f"{value.heading} after")
     _finish(grid[: len(panels)])
     return figure
 
@@ -234,8 +236,9 @@ def write_report(
     rows = [_row(measurement) for measurement in measurements]
     machines = sorted({measurement.machine for measurement in measurements})
     warnings = {
-        "Not everything has been measured yet; run the same command again to resume.": len(rows) < facts.planned,
-        "Runs come from more than one machine or number of threads, so seconds do not compare.": len(machines) > 1,
+        "The benchmark is incomplete; rerun the command to resume.": len(rows) < facts.planned,
+        "Runs come from different machines or numbers of threads, so their times are not comparable.": len(machines)
+        > 1,
     }
     document = {
         "format": "carts-benchmark/1",

@@ -63,7 +63,7 @@ def photographs(folder: Path) -> list[Room]:
     """
     paths = sorted(path for path in folder.glob("*") if path.suffix.lower() in _PHOTOGRAPHS)
     if not paths:
-        raise SettingsError(f"{folder} holds no photograph. Give a folder with {', '.join(_PHOTOGRAPHS)} files.")
+        raise SettingsError(f"{folder} has no photographs. Give a folder with {', '.join(_PHOTOGRAPHS)} files.")
     halves: tuple[Half, Half] = ("tuning", "held-out")
     return [Room(path.stem, halves[index % 2], partial(_photograph, path)) for index, path in enumerate(paths)]
 

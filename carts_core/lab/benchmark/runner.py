@@ -148,7 +148,7 @@ class Benchmark:
             while todo:
                 run = next(iter(todo))
                 group = self._group(run)
-                error = "" if run.error_deg is None else f", {run.error_deg:g} deg off"
+                error = "" if run.error_deg is None else f", {run.error_deg:g} deg error"
                 which = f"frame {run.frame}" if len(group) == 1 else counted(len(group), "frame")
                 description = f"{run.source}, {run.domain}, {which}: {run.method}{error}"
                 bar.update(task, description=description)

@@ -76,7 +76,7 @@ def synthetic_source(scope: Scope, seed: int = TEST_SEED) -> Source:
     """
     if seed == SynthesisConfig().seed:
         raise SettingsError(
-            f"--seed {seed} is the shipped sequence's, on which settings were chosen. Any other seed will do; "
+            f"--seed {seed} is the shipped sequence's, on which settings were tuned. Use any other seed; "
             f"the default is {TEST_SEED}."
         )
     frames = scope.sequence_frames
@@ -164,7 +164,9 @@ def real_source(path: Path, scope: Scope, seed: int = TEST_SEED) -> Source:
     camera = sequence.scene.cameras[0]
     masked = _masked(sequence, camera.name)
     if not masked:
-        raise SettingsError(f"{path} has no masks for camera {camera.name!r}, so nothing can be scored. Give `masks`.")
+        raise SettingsError(
+            f"{path} has no masks for camera {camera.name!r}, so results cannot be scored. Give `masks`."
+        )
     frames = [masked[place] for place in spread(len(masked), scope.frames)]
     consecutive = masked[: scope.consecutive]
     hashed = *frames, *consecutive, *spread(len(sequence), scope.calibration_frames)

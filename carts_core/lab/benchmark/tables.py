@@ -90,7 +90,7 @@ def error_tables(data: Measurements) -> list[Table]:
     tables = []
     for source in data.sources():
         errors = sorted({run.run.error_deg for run in data.of(source=source) if run.run.error_deg is not None})
-        origin = "the true" if source == SYNTHETIC else "the measured (the truth is not known)"
+        origin = "the true" if source == SYNTHETIC else "the measured values (ground truth is unknown)"
         mae = "Mean absolute error of measured revolute joints [deg]"
         for figure, name, unit, theirs in (
             (DICE, "Dice", "Dice in percent", "dice_by_error"),
@@ -173,7 +173,7 @@ def worse_table(data: Measurements) -> Table | None:
             "frame": str(m.run.frame),
             "method": METHODS[m.run.method].label,
             "error at the start": begun(m.run.error_deg),
-            "Dice at the start": DICE.text([m.start]),
+            "initial Dice": DICE.text([m.start]),
             "Dice": DICE.text([m.final]),
         }
         for m in data.default_solver()
@@ -271,7 +271,7 @@ def room_table(data: Measurements) -> Table | None:
     """Scores in other rooms: the default solver on single frames and on sequences, and ACS."""
 
     def worse(runs: Sequence[Measurement]) -> Cell:
-        return Cell(DICE.text(scores(runs)), f"made worse: {sum(m.made_worse for m in runs)} of {len(runs)}")
+        return Cell(DICE.text(scores(runs)), f"worse than initially: {sum(m.made_worse for m in runs)} of {len(runs)}")
 
     rows = []
     for source, half in product(data.sources(ROOMS), get_args(Half)):
@@ -308,7 +308,7 @@ def image_alone_table(data: Measurements) -> Table | None:
                 {
                     "frames": source,
                     "domain": DOMAIN_LABELS[domain],
-                    "best network that sees the image alone": label,
+                    "best image-only network": label,
                     "its Dice": f"{known[best]:.1f}",
                     "ours": f"{ours[domain]:.1f}",
                     "who wins": f"{winner}, by {abs(ahead):.1f}",
@@ -346,8 +346,8 @@ def verdict_table(data: Measurements) -> Table | None:
                 "runs": str(len(runs)),
                 "wrong": str(len(wrong(runs))),
                 "good": str(len(good)),
-                "good though wrong": str(len(wrong(good))),
-                "good though made worse": str(sum(run.made_worse for run in good)),
+                "good, but wrong": str(len(wrong(good))),
+                "good, but worse than initially": str(sum(run.made_worse for run in good)),
                 "area under the ROC": NOTHING if known is None else f"{known:.3f}",
             }
         )
@@ -375,7 +375,7 @@ def sections(data: Measurements, stages: dict[str, float], hand_eye: list[HandEy
     found: dict[str, list[Table | None]] = {
         "Main table": [*main_tables(data), image_alone_table(compared)],
         "Iterations": [*iteration_tables(data)],
-        "Error at the start": [*error_tables(compared)],
+        "Initial error": [*error_tables(compared)],
         "Occlusion": [occlusion_table(data)],
         "Several cameras": [camera_table(data)],
         "Calibration": [calibration_table(data)],
@@ -383,7 +383,7 @@ def sections(data: Measurements, stages: dict[str, float], hand_eye: list[HandEy
         "Other rooms": [room_table(data)],
         "Other instruments": [family_table(data)],
         "Hand-eye calibration": [hand_eye_table(hand_eye)],
-        "Verdicts and deviations": [verdict_table(data), deviation_table(data)],
+        "Verdicts and standard deviations": [verdict_table(data), deviation_table(data)],
         "Speed and safety": [speed_table(compared), pair_table(data), worse_table(data)],
         "Stages": [stage_table(stages)],
     }

@@ -112,8 +112,8 @@ def _speed(data: Measurements) -> Iterator[Target]:
         "speedup",
         _median(pair.ratio for pair in found),
         f"median over {counted(len(found), 'pair')} of runs in which the paper's setting gained at least {GAINED} "
-        f"Dice: time to the Dice of its best of {PAPERS_STEPS}; {sum(pair.ours is None for pair in found)} never reach "
-        "it and count as 0",
+        f"Dice: time to its best Dice in {PAPERS_STEPS} iterations; {sum(pair.ours is None for pair in found)} never "
+        "reach it and count as 0",
     )
     counts = [steps_to_final(m) for m in data.of(method="ours", error_deg=2.0)]
     yield target_of("iterations", _median(counts), f"median over {counted(len(counts), 'run')}", near=NEAR_FINAL)
@@ -155,7 +155,7 @@ def _synthetic(data: Measurements) -> Iterator[Target]:
     for (method, label), error in product(_MODES.items(), (1, 2, 3)):
         finals = [m.final for m in data.of(source=SYNTHETIC, method=method, error_deg=error)]
         visible, every = VISIBLE_MAE.values(finals), JOINT_MAE.values(finals)
-        basis = f"mean over {counted(len(visible), 'run')}" if visible else "which joints are visible is not reported"
+        basis = f"mean over {counted(len(visible), 'run')}" if visible else "visibility of joints is not reported"
         basis += f"; all measured joints: {mean(every):.2f}°" if every else ""
         yield target_of(f"joint_error_{error}", _mean(visible), basis, mode=label)
     recovered = [m.final.dice >= _RECOVERED for m in data.of(source=SYNTHETIC, method="ours", error_deg=5.0)]
@@ -194,8 +194,8 @@ def _safety(data: Measurements) -> Iterator[Target]:
         f"{len(worse)} of {counted(len(runs), 'run')} lost more than 0.01 Dice; {from_truth} of them started at the "
         f"true joints, {sum(m.run.domain == OCCLUSION for m in worse)} had occluders",
     )
-    labels = {"ours": "nothing said", "ours_given": "occluder given", "ours_proposed": "mask proposed"}
-    alone, texts = [], ["nothing said of the occluder, the worse of synthetic and real frames"]
+    labels = {"ours": "occluder unknown", "ours_given": "occluder given", "ours_proposed": "mask proposed"}
+    alone, texts = [], ["occluder unknown, the worse of synthetic and real frames"]
     for source in (SYNTHETIC, REAL):
         means = {
             method: mean(m.final.dice for m in runs)
@@ -216,7 +216,7 @@ def _safety(data: Measurements) -> Iterator[Target]:
 def _rooms(data: Measurements, source: str) -> Iterator[Target]:
     """Targets of the held-out rooms of one camera."""
     alone, acs = (data.in_rooms(source, "held-out", method) for method in ("ours", "acs"))
-    camera, basis = source.removeprefix(ROOMS).strip(), f"{counted(len(alone), 'run')} in the rooms that are held out"
+    camera, basis = source.removeprefix(ROOMS).strip(), f"{counted(len(alone), 'run')} on held-out backgrounds"
     beside = {(m.run.domain, m.run.frame): m.final.dice for m in acs}
     reference = f"ACS, our schedule: {mean(beside.values()):.3f}" if beside else ""
     yield target_of("room_dice", _mean(m.final.dice for m in alone), basis, reference=reference, camera=camera)

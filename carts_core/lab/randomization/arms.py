@@ -318,7 +318,9 @@ class RecordedPlacements:
         for geometry in geometries:
             names = self._names.get(geometry.robot.urdf)
             if names is None:
-                raise SettingsError(f"robot {geometry.robot.urdf} is none of the recording's. Leave out `robots`.")
+                raise SettingsError(
+                    f"robot {geometry.robot.urdf} is not one of the recording's robots. Leave out `robots`."
+                )
             free = [name for name in names if name not in taken] or names
             taken.append(free[int(rng.integers(len(free)))])
             placements.append(self._placement(rng, taken[-1], geometry, camera.T_camera_world))

@@ -55,7 +55,7 @@ class Photographs:
         paths = sorted(path for path in folder.rglob("*") if path.suffix.lower() in _SUFFIXES)
         if not paths:
             raise SettingsError(
-                f"{folder} holds no photograph. Give a folder with at least one image file ({', '.join(_SUFFIXES)})."
+                f"{folder} has no photographs. Give a folder with at least one image file ({', '.join(_SUFFIXES)})."
             )
         self._images = [_read(path) for path in paths]
 
@@ -99,7 +99,7 @@ def _read(path: Path) -> np.ndarray:
     except (OSError, cv2.error):
         image = None
     if image is None:
-        raise SettingsError(f"photograph {path} cannot be read. Give a readable image file, or take it out.")
+        raise SettingsError(f"photograph {path} cannot be read. Replace or remove it.")
     scale = _LARGEST / max(image.shape[:2])
     if scale < 1:
         image = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)

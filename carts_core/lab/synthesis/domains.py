@@ -337,4 +337,4 @@ class Conditions:
                 return self._smoke.haze(view.light, view.surface.position, view.lens, view.lamp, view.time)
             case "background_change" if view.other_light is not None:
                 return view.other_light
-        raise AssertionError(f"no light for domain {domain}")
+        raise AssertionError(f"no lighting for domain {domain}")

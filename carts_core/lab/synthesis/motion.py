@@ -108,8 +108,8 @@ def random_motion(draw: Callable[[np.random.Generator], Motion], config: Synthes
             reasons[str(rejected)] += 1
     why = ", ".join(f"{reason} ({count})" for reason, count in reasons.most_common())
     raise SettingsError(
-        f"none of {_ATTEMPTS} random motions fits the settings: {why}. "
-        "Make motion.reach or motion.wrist_range smaller, or take another seed."
+        f"none of {_ATTEMPTS} random motions satisfies the settings: {why}. "
+        "Reduce motion.reach or motion.wrist_range, or use another seed."
     )
 
 
@@ -159,7 +159,7 @@ def _draw(
     motion = config.motion
     targets = np.asarray(WORK_POINTS[number]) + _spline(config, rng, np.asarray(motion.reach))
     if not in_view(targets, camera):
-        raise Rejected("a tip leaves the picture")
+        raise Rejected("a tip leaves the image")
     joints = np.zeros((motion.frames, len(arm.robot.joint_names)))
     joints[:, 2] = 0.14
     joints[:, 3:6] = _wrist_middle(arm, number, config, rng) + _spline(config, rng, np.full(3, motion.wrist_range))
@@ -169,7 +169,7 @@ def _draw(
     lowest, highest = arm.robot.joint_limits.numpy()[:6].T
     margin = _LIMIT_MARGIN * (highest - lowest)
     if (joints[:, :6] < lowest + margin).any() or (joints[:, :6] > highest - margin).any():
-        raise Rejected("a joint comes too near to its limit")
+        raise Rejected("a joint is too close to its limit")
     return joints
 
 
@@ -295,10 +295,12 @@ def plan_arm(
         # In the middle of the motion, the tip is at the work point.
         tip = _tips(robot, tip_link, torch.from_numpy(joints[len(joints) // 2])).numpy()
         if np.linalg.norm(tip) < 1e-9:
-            raise SettingsError(f"the tip {tip_link!r} of {robot.urdf} lies in its base. Name another --tip-link.")
+            raise SettingsError(
+                f"the tip {tip_link!r} of {robot.urdf} coincides with its base. Give another --tip-link."
+            )
         arm = _placed(robot, tip, camera, rng, scale)
         if not in_view((tips @ arm.T_world_base[:3, :3].T + arm.T_world_base[:3, 3]) / scale, camera):
-            raise Rejected("the tip leaves the picture")
+            raise Rejected("the tip leaves the image")
         seen = [points / scale for points in clouds(arm, joints, body)]
         check_clearance([seen], tissues, camera, config.motion.clearance)
         return arm, joints

@@ -68,7 +68,7 @@ def synthesize(config: SynthesisConfig, output: OutputPath | Path | str, progres
     target = output if isinstance(output, OutputPath) else Path(output)
     output = Path(output)
     if os.path.lexists(output) and (output.is_symlink() or not output.is_dir() or any(output.iterdir())):
-        raise SettingsError(f"{output} exists already. Name a folder that does not exist, or remove this one first.")
+        raise SettingsError(f"{output} exists. Choose a new folder, or remove this one.")
     with published(target, key=hashlib.sha256(repr(config).encode()).hexdigest()) as work:
         _write_sequence(config, work, output, progress or (lambda what, done, total: None))
     return output / "sequence.toml"
@@ -85,8 +85,8 @@ def _write_sequence(config: SynthesisConfig, work: OutputPath, output: Path, rep
     robot, error = load_robot(config), config.error
     if is_instrument(robot) and scale != 1.0:
         raise SettingsError(
-            f"EndoscopeConfig.distance is {endoscope.distance} m, but the robot is a surgical instrument. Give at "
-            f"most {INSTRUMENT_DISTANCE} m for these; other robots may be further away."
+            f"EndoscopeConfig.distance is {endoscope.distance} m, but the robot is a surgical instrument. The limit "
+            f"for instruments is {INSTRUMENT_DISTANCE} m; other robots may be farther away."
         )
     tissue, other = _grow_tissues(config)
     if is_instrument(robot):

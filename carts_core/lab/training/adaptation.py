@@ -84,10 +84,10 @@ class Judgement:
         was, now, moved = self.before, self.after, self.tips_moved
         pixels, steady = "of the pixels", _EDGES * was.edges <= now.edges <= was.edges
         checks = {
-            f"masks of made images (Dice {was.dice:.3f} -> {now.dice:.3f})": now.dice < was.dice - _DICE,
-            f"parts of made images ({was.made_parts:.3f} -> {now.made_parts:.3f} {pixels})": now.made_parts
+            f"masks of synthetic images (Dice {was.dice:.3f} -> {now.dice:.3f})": now.dice < was.dice - _DICE,
+            f"parts of synthetic images ({was.made_parts:.3f} -> {now.made_parts:.3f} {pixels})": now.made_parts
             < was.made_parts - _PARTS,
-            f"tips of made images ({was.made_tips:.1f} -> {now.made_tips:.1f} px)": now.made_tips
+            f"tips of synthetic images ({was.made_tips:.1f} -> {now.made_tips:.1f} px)": now.made_tips
             > was.made_tips + _TIPS,
             f"verdicts of the recording ({was.good} -> {now.good} good)": now.good < was.good,
             f"parts of the recording ({was.parts:.3f} -> {now.parts:.3f} {pixels})": now.parts < was.parts - _PARTS,
@@ -100,7 +100,7 @@ class Judgement:
         """Summary of the metrics before and after."""
         was, now = self.before, self.after
         return [
-            f"fits of made images: Dice {was.dice:.3f} -> {now.dice:.3f}, parts {was.made_parts:.3f} -> "
+            f"fits of synthetic images: Dice {was.dice:.3f} -> {now.dice:.3f}, parts {was.made_parts:.3f} -> "
             f"{now.made_parts:.3f}, tips {was.made_tips:.1f} -> {now.made_tips:.1f} px",
             f"fits of {len(was.tips)} frames of the recording: {was.good} -> {now.good} good, parts {was.parts:.3f} -> "
             f"{now.parts:.3f}, edges {was.edges:.2f} -> {now.edges:.2f}, tips moved by {self.tips_moved:.1f} px",
@@ -331,11 +331,11 @@ def _write_backgrounds(sequence: Sequence, output: Path) -> int:
 def gain(before: dict[str, float], now: dict[str, float]) -> str:
     """Summary of a run's progress from two validations of the surface network."""
     share = (1 - now["dice"]) / (1 - before["dice"]) if before["dice"] < 1 else np.nan
-    dice = f"Dice {before['dice']:.3f} -> {now['dice']:.3f}, {share:.0%} of the error is left"
+    dice = f"Dice {before['dice']:.3f} -> {now['dice']:.3f}, remaining error {share:.0%}"
     parts = ", ".join(f"{part} {before[f'dice_{part}']:.3f} -> {now[f'dice_{part}']:.3f}" for part in PARTS)
     tips = f"tips {before['tip_error']:.1f} -> {now['tip_error']:.1f} px"
     normals = f"normals {before['normal_error_deg']:.1f} -> {now['normal_error_deg']:.1f} deg"
-    return f"made images of this recording: {dice}; {parts}; {tips}; {normals}"
+    return f"synthetic images of this recording: {dice}; {parts}; {tips}; {normals}"
 
 
 def offer(config: TrainingConfig, result: TrainingResult, progress: Progress, made: int, own: int) -> Offer:
@@ -346,7 +346,7 @@ def offer(config: TrainingConfig, result: TrainingResult, progress: Progress, ma
     assert config.start is not None
     aside = output_path(result.weights.parent, REFUSED)
     if not result.weights.is_file():
-        return Offer(aside.path, [f"the weights were refused before; see report/{FITS}"], [])
+        return Offer(aside.path, [f"the weights were rejected before; see report/{FITS}"], [])
     judgement = judge(config, config.start, result.weights, made=made, own=own, progress=progress)
     worse = judgement.worse()
     gained = "" if result.first is None else gain(result.first, result.validation)

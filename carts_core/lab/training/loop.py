@@ -105,7 +105,7 @@ def load_checkpoint(folder: Path) -> Checkpoint | None:
         return Checkpoint(int(metadata["step"]), metadata["config"], history, tensors)
     except (SafetensorError, OSError, KeyError, ValueError, TypeError) as error:
         raise WeightsError(
-            f"checkpoint {path} cannot be read ({error}). Allowed is what `carts train` writes. Delete the file to "
+            f"checkpoint {path} is not a readable checkpoint of `carts train` ({error}). Delete the file to "
             "start this run again."
         ) from error
 
@@ -159,8 +159,8 @@ class TrainingLoop:
         if changed:
             details = ", ".join(f"{name} was {before.get(name)} and is {now[name]}" for name in changed)
             raise SettingsError(
-                f"{self._output} holds a run with other settings: {details}. Give the same settings to go on with it, "
-                "or another output folder to start anew."
+                f"{self._output} holds a run with other settings: {details}. Give the same settings to resume it, "
+                "or choose another output folder."
             )
         checkpoint.restore(self._modules, self._optimizer)
         self.step, self.history = checkpoint.step, checkpoint.history

@@ -43,7 +43,7 @@ def grow(larger: Network, trained: nn.Module) -> Network:
     for name in old_layers:
         if name not in new_layers:
             raise SettingsError(
-                f"layer {name} of the weights has no counterpart; ask for as many convolutions or more."
+                f"layer {name} of the weights has no counterpart; configure at least as many convolutions."
             )
     before: nn.BatchNorm2d | None = None
     with torch.no_grad():
@@ -97,8 +97,8 @@ def _pass_through(layer: nn.BatchNorm2d, before: nn.BatchNorm2d) -> None:
 def _put(name: str, own: Tensor, theirs: Tensor) -> None:
     if own.ndim != theirs.ndim or any(size < needed for size, needed in zip(own.shape, theirs.shape, strict=True)):
         raise SettingsError(
-            f"layer {name} of the weights has shape {tuple(theirs.shape)} and does not fit into {tuple(own.shape)}. "
-            "Ask for an architecture that is as large or larger everywhere."
+            f"layer {name} of the weights has shape {tuple(theirs.shape)} and cannot be embedded in "
+            f"{tuple(own.shape)}. Configure an architecture at least as large in every layer."
         )
     own[tuple(slice(size) for size in theirs.shape)] = theirs
 
@@ -296,8 +296,8 @@ class _Run:
     def kept(self) -> str:
         """Terminal message on the files of a stopped run."""
         if self.loop.step == 0:
-            return f"no step was made; weights in {self.output}, if there are any, are those of the start"
-        return f"{self.output} holds {counted(self.loop.step, 'step')}; the same command goes on from there"
+            return f"no step was made; any weights in {self.output} are the initial ones"
+        return f"{self.output} holds {counted(self.loop.step, 'step')}; rerun the command to resume"
 
     def _averaged(self) -> UNet:
         network = self.average.module
@@ -351,7 +351,7 @@ def _first_network(config: TrainingConfig) -> UNet:
         return grow(fresh, network)
     except SettingsError as error:
         raise SettingsError(
-            f"{config.start} holds a network of {network.architecture}, which does not grow into "
+            f"{config.start} holds a network of {network.architecture}, which cannot be extended to "
             f"{config.architecture}: {error}"
         ) from error
 

@@ -63,9 +63,7 @@ def builtin_urdf(name: str) -> Path:
         return shipped_robot()
     if name not in builtin_names():
         meant = closest(SCHEME + name, [SCHEME + known for known in builtin_names()])
-        raise RobotError(
-            f"there is no robot {shown(SCHEME + name)}.{meant} `carts robots` lists those that are built in."
-        )
+        raise RobotError(f"there is no robot {shown(SCHEME + name)}.{meant} `carts robots` lists the built-in robots.")
     folder = cache_dir() / "instruments" / name
     try:
         return _written(name, folder)

@@ -38,19 +38,21 @@ def read_points(path: Path, sequence: Sequence) -> list[ImagePoint]:
     except (OSError, ValueError, csv.Error) as error:
         raise SettingsError(f"{path} cannot be read ({error}). Give a CSV file in UTF-8.") from error
     if not rows:
-        raise SettingsError(f"{path} has no points. Give a row per point with {', '.join(COLUMNS)}.")
+        raise SettingsError(f"{path} has no points. Give one row per point, with {', '.join(COLUMNS)}.")
     if missing := [column for column in COLUMNS if column not in rows[0]]:
-        raise SettingsError(f"{path} has no column {missing[0]!r}. It needs {', '.join(COLUMNS)}.")
+        raise SettingsError(f"{path} has no column {missing[0]!r}. Required: {', '.join(COLUMNS)}.")
     position = {name: index for index, name in enumerate(sequence.frame_ids)}
     points = []
     for number, row in enumerate(rows, start=2):
         if row["frame"] not in position:
             first, last = sequence.frame_ids[0], sequence.frame_ids[-1]
-            raise SettingsError(f"{path}, line {number}: no frame {row['frame']!r}; frames are {first} to {last}.")
+            raise SettingsError(
+                f"{path}, line {number}: there is no frame {row['frame']!r}; frames are {first} to {last}."
+            )
         try:
             pixel = (float(row["u"]), float(row["v"]))
         except (TypeError, ValueError) as error:
-            raise SettingsError(f"{path}, line {number}: u and v must be numbers of pixels ({error}).") from error
+            raise SettingsError(f"{path}, line {number}: u and v must be numbers in pixels ({error}).") from error
         if not all(map(math.isfinite, pixel)):
             raise SettingsError(f"{path}, line {number}: u and v are {pixel[0]} and {pixel[1]}. Give finite numbers.")
         points.append(ImagePoint(position[row["frame"]], row["camera"], row["arm"], row["landmark"], pixel))
@@ -87,9 +89,11 @@ def read_prior(sequence: Sequence) -> HandEyePrior | None:
         fits = all(T.shape == (4, 4) and covariances[name].shape == (6, 6) for name, T in known.items())
         fits = fits and all(np.linalg.eigvalsh(covariance)[0] > 0 for covariance in covariances.values())
     except (OSError, ValueError, KeyError, TypeError, AttributeError, np.linalg.LinAlgError) as error:
-        raise SettingsError(f"{path} cannot be read ({error}). Run carts hand-eye again, or remove it.") from error
+        raise SettingsError(
+            f"{path} cannot be read ({error}). Run carts hand-eye again, or remove the file."
+        ) from error
     if not fits:
-        raise SettingsError(f"{path} has no covariances of base frames. Run carts hand-eye again, or remove it.")
+        raise SettingsError(f"{path} has no covariances of base frames. Run carts hand-eye again, or remove the file.")
     now = {arm.name: arm.T_world_base for arm in sequence.scene.arms}
     if not all(name in now and np.allclose(now[name], T, atol=1e-6) for name, T in known.items()):
         return None
@@ -164,8 +168,8 @@ def mounts_of_points(recording: Sequence, points: Rows[ImagePoint]) -> dict[str,
             if not np.allclose(T, first, atol=RESTING):
                 ids = recording.frame_ids
                 raise SettingsError(
-                    f"camera {camera!r} moves between frames {ids[frame]!r} and {ids[point.frame]!r}, which have "
-                    "points. Click in frames in which it stands still, and refine with carts calibrate."
+                    f"camera {camera!r} moves between frames {ids[frame]!r} and {ids[point.frame]!r}, both of which "
+                    "have points. Click points in frames with a stationary camera, and refine with carts calibrate."
                 )
     return {camera: T for camera, (_, T) in found.items()}
 

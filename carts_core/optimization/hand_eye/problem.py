@@ -106,7 +106,9 @@ def views_of(
         if not 0 <= point.frame < frames:
             raise SettingsError(f"there is no frame {point.frame}; frames are 0 to {frames - 1}.")
         if not np.isfinite(point.pixel).all():
-            raise SettingsError(f"the {point.landmark} in frame {point.frame} is at {point.pixel}. Give two numbers.")
+            raise SettingsError(
+                f"the {point.landmark} in frame {point.frame} is at {point.pixel}. Give two finite numbers [px]."
+            )
         grouped.setdefault((camera, arm), []).append(row)
     views = []
     for (camera, arm), rows in sorted(grouped.items()):
@@ -244,9 +246,9 @@ class HandEyeProblem:
                 for (camera, arm), more in self.missing.items()
             ]
             raise SettingsError(
-                f"{'; '.join(parts)}. Edges of the shaft do not count; click tip and wrist, in several frames."
+                f"{'; '.join(parts)}. Shaft edges are not counted. Click tip and wrist in several frames."
                 if parts
-                else "there is no point. Click tip, wrist and shaft of an arm in 3 to 6 frames."
+                else "there are no points. Click tip, wrist and shaft of an arm in 3 to 6 frames."
             )
         self._arms = list(self._T_world_base)
         self._cameras = [view.camera for view in self.views]
@@ -260,8 +262,8 @@ class HandEyeProblem:
         known = sum(2 if point else 1 for view in self.views for point in view.is_point)
         if known < len(self.origin):
             raise SettingsError(
-                f"{counted(len(self.origin), 'value')} are to be found and the points give {known}. Click more points, "
-                "also in other frames, or keep the focal length."
+                f"{counted(len(self.origin), 'unknown')} cannot be determined from {known} measurements. Click more "
+                "points, also in other frames, or fix the focal length."
             )
 
     def _find_beginning(self, views: list[View], free: set[int]) -> None:
@@ -283,8 +285,8 @@ class HandEyeProblem:
                 poses.append((0.0, beside))
             if not poses:
                 raise SettingsError(
-                    f"no pose of {self.scene.arms[view.arm].name} before {self.scene.cameras[view.camera].name} fits "
-                    "its points. They lie on each other or on a line: click others, in other frames."
+                    f"no pose of {self.scene.arms[view.arm].name} in {self.scene.cameras[view.camera].name} fits "
+                    "its points, which coincide or are collinear. Click other points, in other frames."
                 )
             T_camera_base = min((self._refined(view, T) for _, T in poses), key=lambda entry: entry[0])[1]
             if not known:

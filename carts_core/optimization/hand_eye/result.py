@@ -87,7 +87,7 @@ def result_of(problem: HandEyeProblem, fit: OptimizeResult, count: int) -> HandE
     scale = np.sqrt(np.maximum(np.diag(information), 1e-300))
     values, vectors = np.linalg.eigh(information / np.outer(scale, scale))
     if values[0] < _SINGULAR:
-        raise SettingsError("the points leave a direction open. Click others, in frames where the arm is elsewhere.")
+        raise SettingsError("the points do not determine all unknowns. Click points in frames with other arm poses.")
     covariance = excess * ((vectors / values) @ vectors.T / np.outer(scale, scale))
     names = [camera.name for camera in problem.scene.cameras]
     arms = [arm.name for arm in problem.scene.arms]

@@ -40,7 +40,7 @@ def test_photographs_fill_the_image_and_every_other_one_is_held_out(tmp_path: Pa
 
 
 def test_a_folder_without_photographs_is_an_error_that_says_what_to_give(tmp_path: Path) -> None:
-    with pytest.raises(SettingsError, match=r"holds no photograph. Give a folder with .*\.png"):
+    with pytest.raises(SettingsError, match=r"has no photographs. Give a folder with .*\.png"):
         photographs(tmp_path)
 
 

@@ -76,7 +76,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_the_page_has_all_sections_and_every_link_leads_somewhere(folder: Path) -> None:
     page = _Page((folder / "report.html").read_text())
     assert not page.open
-    assert {"targets", "figures", "main-table", "iterations", "error-at-the-start", "stages", "method"} <= page.ids
+    assert {"targets", "figures", "main-table", "iterations", "initial-error", "stages", "method"} <= page.ids
     assert {"figures/domains.svg", "figures/convergence.svg", "figures/errors.svg", "figures/scatter.svg"} <= set(
         page.links
     )
@@ -86,7 +86,7 @@ def test_the_page_has_all_sections_and_every_link_leads_somewhere(folder: Path) 
 
 def test_the_page_says_what_is_missing_and_escapes_what_it_is_given(folder: Path) -> None:
     text = (folder / "report.html").read_text()
-    assert "Not everything has been measured yet" in text
+    assert "The benchmark is incomplete" in text
     assert "seed 5 &lt;b&gt;" in text
     assert "$" not in text
 

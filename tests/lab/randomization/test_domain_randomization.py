@@ -69,10 +69,10 @@ def test_with_a_perfect_model_the_hybrid_shows_what_is_observed(shipped_psm: Rob
         (AppearanceRanges, {"blur": (-1, 1)}, "blur"),
         (AppearanceRanges, {"jpeg_quality": (50, 120)}, "jpeg_quality"),
         (ImageSettings, {"width": 100}, "give positive multiples of 16"),
-        (ImageSettings, {"two_arms": 1.5}, "two_arms is 1.5; allowed is 0 to 1"),
-        (ImageSettings, {"things": -0.1}, "things is -0.1; allowed is 0 to 1"),
-        (ImageSettings, {"absent": 2}, "absent is 2; allowed is 0 to 1"),
-        (ImageSettings, {"coverage": (0.5, 0.1)}, "give two shares"),
+        (ImageSettings, {"two_arms": 1.5}, "two_arms is 1.5; allowed: 0 to 1"),
+        (ImageSettings, {"things": -0.1}, "things is -0.1; allowed: 0 to 1"),
+        (ImageSettings, {"absent": 2}, "absent is 2; allowed: 0 to 1"),
+        (ImageSettings, {"coverage": (0.5, 0.1)}, "give two fractions"),
         (ImageSettings, {"field_width": 64}, "give at least the width"),
     ],
 )
@@ -101,7 +101,7 @@ def photographs(tmp_path: Path) -> Path:
     (tmp_path / "deeper").mkdir()
     for name, color in (("green.png", (30, 200, 40)), ("deeper/dark.jpg", (4, 4, 4))):
         cv2.imwrite(str(tmp_path / name), np.full((90, 120, 3), color, np.uint8))
-    (tmp_path / "notes.txt").write_text("no photograph")
+    (tmp_path / "notes.txt").write_text("no photographs")
     return tmp_path
 
 
@@ -126,7 +126,7 @@ def test_photographs_become_backgrounds(photographs: Path, shipped_psm: Robot):
 def test_a_folder_without_readable_photographs_is_refused(tmp_path: Path, content: bytes | None):
     if content is not None:
         (tmp_path / "broken.jpg").write_bytes(content)
-    with pytest.raises(SettingsError, match=r"Give a (folder with at least one image|readable image) file"):
+    with pytest.raises(SettingsError, match=r"(Give a folder with at least one image file|Replace or remove it)"):
         Photographs(tmp_path)
 
 

@@ -65,7 +65,7 @@ def test_joints_of_each_kind_have_errors_of_their_own(tmp_path: Path) -> None:
 
 
 def test_an_instrument_is_not_looked_at_from_a_metre_away(tmp_path: Path) -> None:
-    with pytest.raises(SettingsError, match=r"surgical instrument\. Give at most 0\.3 m"):
+    with pytest.raises(SettingsError, match=r"surgical instrument\. The limit for instruments is 0\.3 m"):
         synthesize(_config(SynthesisConfig().robot), tmp_path / "sequence")
 
 

@@ -70,7 +70,9 @@ def test_a_plan_keeps_within_limits_touches_nothing_and_stays_in_view(
 
 def test_a_motion_that_cannot_be_done_says_why(arms: tuple[Arm, ...], camera: Camera, flat_tissue: Tissue) -> None:
     config = SynthesisConfig(motion=MotionConfig(frames=8, reach=(0.1, 0.1, 0.001)))
-    with pytest.raises(SettingsError, match=r"none of \d+ random motions fits.*a tip leaves the picture.*motion.reach"):
+    with pytest.raises(
+        SettingsError, match=r"none of \d+ random motions satisfies.*a tip leaves the image.*motion.reach"
+    ):
         plan_motion(arms, [flat_tissue], camera, config)
 
 

@@ -59,5 +59,5 @@ def test_a_robot_that_is_not_a_psm_is_no_instrument(tmp_path, shipped_psm: Robot
 def test_a_robot_that_cannot_move_is_refused(tmp_path) -> None:
     urdf = tmp_path / "stiff.urdf"
     urdf.write_text(ARM_URDF.replace('type="revolute"', 'type="fixed"'))
-    with pytest.raises(RobotError, match="no joint that moves"):
+    with pytest.raises(RobotError, match="no movable joint"):
         load_robot(SynthesisConfig(robot=urdf))

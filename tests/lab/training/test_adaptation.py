@@ -86,7 +86,7 @@ def test_arms_are_placed_at_the_distance_of_the_recording_and_in_the_image(far_a
 
 
 def test_a_robot_that_is_not_of_the_recording_is_refused(far_away: Path):
-    with pytest.raises(SettingsError, match="none of the recording's"):
+    with pytest.raises(SettingsError, match="not one of the recording's"):
         RecordedPlacements(far_away)(
             np.random.default_rng(0), (RobotGeometry(Robot.load("builtin:psm_lnd")),), (48, 32), 80
         )
@@ -139,7 +139,7 @@ def test_a_run_ends_when_it_no_longer_gains_and_leaves_its_best_weights(
 def test_what_is_left_of_the_error_is_said():
     rest = {**dict.fromkeys(("dice_shaft", "dice_wrist", "dice_jaws"), 0.7), "tip_error": 2.0}
     text = gain({"dice": 0.8, "normal_error_deg": 20.0, **rest}, {"dice": 0.9, "normal_error_deg": 10.0, **rest})
-    assert "Dice 0.800 -> 0.900, 50% of the error is left" in text and "tips 2.0 -> 2.0 px" in text
+    assert "Dice 0.800 -> 0.900, remaining error 50%" in text and "tips 2.0 -> 2.0 px" in text
 
 
 FIGURES = {"dice": 0.8, "dice_given": 0.5, "part_accuracy": 0.9, "normal_error_deg": 20.0, "tip_error": 2.7}
@@ -199,9 +199,9 @@ def _judgement(moved: float = 0.0, **now: float) -> Judgement:
     [
         (_judgement(), []),
         (_judgement(dice=0.98, made_tips=2.0, edges=2.2, moved=5.0), []),
-        (_judgement(dice=0.98, made_tips=10.9), ["tips of made images (2.7 -> 10.9 px)"]),
-        (_judgement(dice=0.96), ["masks of made images (Dice 0.970 -> 0.960)"]),
-        (_judgement(made_parts=0.9), ["parts of made images (0.950 -> 0.900 of the pixels)"]),
+        (_judgement(dice=0.98, made_tips=10.9), ["tips of synthetic images (2.7 -> 10.9 px)"]),
+        (_judgement(dice=0.96), ["masks of synthetic images (Dice 0.970 -> 0.960)"]),
+        (_judgement(made_parts=0.9), ["parts of synthetic images (0.950 -> 0.900 of the pixels)"]),
         (_judgement(good=3), ["verdicts of the recording (4 -> 3 good)"]),
         (_judgement(parts=0.1), ["parts of the recording (0.700 -> 0.100 of the pixels)"]),
         (_judgement(edges=1.5), ["edges of the recording (2.00 -> 1.50)"]),
@@ -223,8 +223,8 @@ def test_weights_are_offered_only_where_nothing_is_worse(
     said = " ".join(capsys.readouterr().out.split())
     assert (tmp_path / "run" / "surface.safetensors").is_file() == (tips == 2.0)
     assert (tmp_path / "run" / "refused.safetensors").is_file() == (tips == 10.9)
-    assert ("Use: carts optimize" in said) == (tips == 2.0)
-    assert ("not offered, since worse: tips of made images (2.7 -> 10.9 px)" in said) == (tips == 10.9)
+    assert ("To use them: carts optimize" in said) == (tips == 2.0)
+    assert ("rejected, because worse: tips of synthetic images (2.7 -> 10.9 px)" in said) == (tips == 10.9)
 
 
 def test_made_images_to_judge_by_are_whole_and_always_the_same(tmp_path: Path):

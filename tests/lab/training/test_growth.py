@@ -49,8 +49,8 @@ def test_a_grown_network_says_the_same_and_can_learn_everywhere(trained: Surface
 @pytest.mark.parametrize(
     ("smaller", "message"),
     [
-        (replace(SMALL, widths=(4, 5, 8)), "does not fit into"),
-        (replace(SMALL, encoder_convolutions=(1, 1, 1)), "as many convolutions or more"),
+        (replace(SMALL, widths=(4, 5, 8)), "cannot be embedded in"),
+        (replace(SMALL, encoder_convolutions=(1, 1, 1)), "at least as many convolutions"),
     ],
 )
 def test_a_network_does_not_grow_into_a_smaller_one(trained: SurfaceNetwork, smaller: Architecture, message: str):

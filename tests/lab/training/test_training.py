@@ -141,7 +141,7 @@ def test_fine_tuning_takes_the_architecture_of_the_weights(tmp_path: Path, small
     [
         (
             {"widths": (4, 6), "encoder_convolutions": (1, 1), "decoder_convolutions": (1,)},
-            "as many convolutions or more",
+            "at least as many convolutions",
         ),
         ({"local_mean": False}, "local_mean differs"),
     ],
@@ -233,7 +233,7 @@ def test_the_learning_rate_rises_and_then_falls_to_a_hundredth():
 def test_settings_out_of_range_are_refused(changes: dict):
     (name,) = changes
     with pytest.raises(
-        SettingsError, match="no robot to train on; give" if name == "robots" else f"{name} is .*; (allowed is|give) "
+        SettingsError, match="no robot was given; give" if name == "robots" else f"{name} is .*; (allowed:|give) "
     ):
         small_config(**changes)
 
