@@ -488,7 +488,7 @@ class Observing(Network):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.masks != RECORDING and self.observe == "network":
-            raise SettingsError(f"--masks {self.masks} needs --observe masks or both. Add it, or leave --masks out.")
+            raise SettingsError(f"--masks {self.masks} requires --observe masks or both. Add it, or leave --masks out.")
         if self.masks in (RECORDING, *LAYERS):
             return
         named = self._layer[0] or Path(self.masks)

@@ -108,7 +108,7 @@ def joint_words(undetermined: Sequence[str] | None) -> str:
     """Number of undetermined joints as text; empty if no standard deviation is known."""
     if undetermined is None:
         return ""
-    return f"{counted(len(undetermined), 'joint')} undetermined" if undetermined else "all joints determined"
+    return f"{counted(len(undetermined), 'joint')} not determined" if undetermined else "all joints determined"
 
 
 def uncertainty(

@@ -528,7 +528,7 @@ class Export(Exporting):
     parts: Parts = "arms"
     """Granularity of the categories."""
     images: bool = False
-    """Copy the images beside their labels; otherwise labels refer to the recording's images, where the format allows it."""
+    """Copy the images beside their labels; else labels refer to the recording's images, if the format allows it."""
     shown_camera: bool = False
     """Only the shown camera."""
     range: tuple[int, int] | None = None

@@ -60,10 +60,10 @@ def test_a_replay_gives_a_line_for_each_frame_and_a_recording_that_can_be_review
     [
         (["--source", "replay:3"], "--source 'replay:3' is unknown"),
         (["--source", "socket:port"], "folder:PATH or socket:PORT"),
-        (["--source", "socket:70000"], "is not known"),
-        (["--source", "camera:0"], "has no joints. Say with --joints-port"),
-        (["--rate", "0"], "--rate is 0.0; allowed is above 0"),
-        (["--loops", "0"], "--loops is 0; allowed is 1 or more"),
+        (["--source", "socket:70000"], "is unknown"),
+        (["--source", "camera:0"], "has no joints. Give the port"),
+        (["--rate", "0"], "--rate is 0.0; allowed: above 0"),
+        (["--loops", "0"], "--loops is 0; allowed: 1 or more"),
     ],
 )
 def test_a_wrong_option_is_reported(

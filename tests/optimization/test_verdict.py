@@ -360,7 +360,7 @@ def test_verdicts_on_masks_are_counted_with_the_joints_that_are_not_determined()
     joints = [["PSM1.roll", "PSM1.jaw"], None, ["PSM1.roll", "PSM1.jaw"], [], None]
     said = verdict_line("left", ["good", "failed", "good", "good", None], joints)
     assert said == (
-        "left: mask good, 2 joints undetermined in 2 of 4 runs; mask good, all joints determined in 1 of 4 runs; "
+        "left: mask good, 2 joints not determined in 2 of 4 runs; mask good, all joints determined in 1 of 4 runs; "
         "mask failed in 1 of 4 runs."
     )
 
