@@ -1,8 +1,8 @@
-"""The paper's own setting beside the default one, on the same frame from the same start: loss, steps and time.
+"""Compare the paper's setting with the default solver on one frame from the same start: loss, steps and time.
 
 python examples/02_the_papers_loss.py [--iterations 20] [--picture paper.png]
 
-The loss of the paper compares features of the image with features of a rendered image (ACS) and is descended by Adam.
+The loss of the paper compares features of the image with features of a rendered image (ACS) and is minimized by Adam.
 The default compares which part of the arm covers each pixel, and is solved by damped Gauss-Newton steps.
 """
 

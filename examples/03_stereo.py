@@ -1,8 +1,8 @@
-"""Optimize with two cameras: a second view reduces the uncertainty of one image, above all in depth.
+"""Optimize with two cameras: a second view reduces the uncertainty, especially in depth.
 
 python examples/03_stereo.py [--sequence stereo/sequence.toml] [--picture stereo.png]
 
-Without a recording of your own a small stereo pair is synthesized first, which needs `pip install 'carts[synthesis]'`.
+Without --sequence, a small stereo pair is synthesized first, which requires `pip install 'carts[synthesis]'`.
 """
 
 import tempfile

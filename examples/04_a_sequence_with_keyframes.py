@@ -1,4 +1,4 @@
-"""Correct several frames together with a keyframe, which stays as given; the others follow it.
+"""Correct several frames jointly with a keyframe, which is held fixed and constrains the others.
 
 python examples/04_a_sequence_with_keyframes.py [--frames 4] [--picture sequence.png]
 """

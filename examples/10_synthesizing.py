@@ -2,8 +2,8 @@
 
 python examples/10_synthesizing.py [OUTPUT] [--frames 1] [--seed 12] [--picture synthesized.png]
 
-Needs `pip install 'carts[synthesis]'`. The sizes here are small, so that it takes seconds; the shipped
-sequence was made with the defaults of `carts synthesize`.
+Requires `pip install 'carts[synthesis]'`. The sizes are small, so that it takes seconds; the shipped
+sequence was generated with the defaults of `carts synthesize`.
 """
 
 import tempfile
