@@ -128,5 +128,5 @@ def test_points_clicked_while_the_camera_moves_are_refused_and_others_are_used_w
     assert np.allclose(there.cameras[0].T_camera_world, moving.scene.cameras[0].T_camera_world @ mounts["left"])
     back = moved_cameras(there, mounts, back=True)
     assert np.allclose(back.cameras[0].T_camera_world, moving.scene.cameras[0].T_camera_world)
-    with pytest.raises(SettingsError, match=r"moves between frames '002' and '004'.*stationary endoscope"):
+    with pytest.raises(SettingsError, match=r"moves between frames '002' and '004'.*stationary camera"):
         mounts_of_points(moving, [*points, replace(points[0], frame=3)])

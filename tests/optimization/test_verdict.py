@@ -321,7 +321,7 @@ def test_a_doubtful_calibration_fails_where_the_network_does_not_know_the_robot(
     assert found.verdict is Verdict.FAILED and "The edges do not agree, and the network's prediction" in found.reason
     assert "overlap of only 0.90" in found.reason and "--observe masks" in found.remedy
     hardly = without_knowledge(doubtful, [replace(stranger, recognized=0.9499)])
-    assert "an overlap of 0.949 only (0.95 or more is usual)" in hardly.reason
+    assert "an overlap of only 0.949 (0.95 or more is usual)" in hardly.reason
     assert without_knowledge(doubtful, [friend, friend, stranger]) == doubtful
     assert without_knowledge(doubtful, [unseen]) == doubtful and without_knowledge(doubtful, []) == doubtful
     good = assess_calibration([RIGHT] * 5)

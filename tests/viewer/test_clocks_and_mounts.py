@@ -125,7 +125,7 @@ def test_an_offset_without_joint_positions_is_told_without_an_alarm_and_changes_
     assert not desk.saved.steps and desk.do(intents.SetTimeOffset(0.01)).time_error is None
     state = desk.do(intents.SetTimeOffset(17.0), intents.Released())
     assert "the offset remains 0.01 s" in (state.error or "") and state.time_error is None
-    with pytest.raises(CartsError, match="not a number"):
+    with pytest.raises(CartsError, match="not a valid value"):
         desk.do(intents.SetTimeOffset(float("nan")))
 
 

@@ -91,7 +91,7 @@ def test_a_value_that_is_no_number_is_refused(desk: Desk, value: float) -> None:
         intents.SetSpeed(value),
         intents.Perturb(value, 0),
     ):
-        with pytest.raises(CartsError, match="not a number"):
+        with pytest.raises(CartsError, match="not a valid value"):
             desk.do(intent)
     assert desk.joint() == before
 

@@ -401,7 +401,7 @@ def test_what_somebody_else_has_changed_since_is_not_taken_back(people: People) 
     people.apply(ann, "Accept", {Key.review(1): ACCEPTED})
     people.apply(ann, "Accept", {Key.review(0): ACCEPTED})
     people.apply(bob, "Reject", {Key.review(0): REJECTED})
-    with pytest.raises(CartsError, match=r"step 3 \(Tab 2: Reject\) has changed the same since.*Undo again"):
+    with pytest.raises(CartsError, match=r"step 3 \(Tab 2: Reject\) has changed the same values since.*Undo again"):
         people.undo(ann)
     assert _reviews(people)[:2] == ["rejected", "accepted"]
     people.undo(ann)

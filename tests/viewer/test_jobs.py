@@ -73,7 +73,7 @@ def test_a_job_that_waits_or_runs_can_be_cancelled_and_started_again(desk: Desk)
         desk.do(intents.RepeatJob(3))
     desk.do(intents.CancelJob(3), intents.ForgetJobs())
     assert desk.state.jobs == ()
-    with pytest.raises(CartsError, match="no job 7"):
+    with pytest.raises(CartsError, match="Job 7 no longer exists"):
         desk.do(intents.CancelJob(7))
 
 

@@ -95,7 +95,7 @@ def test_a_port_in_use_and_a_source_that_the_page_does_not_open_are_refused(app:
             (f"socket:{taken.getsockname()[1]}", "cannot be used"),
             ("folder:/etc", "carts live"),
             ("camera:0", "--joints-port"),
-            ("carrier pigeon", "is not known"),
+            ("carrier pigeon", "is unknown"),
         ):
             app.queue.put(intents.StartLive(source))
             eventually(lambda: app.state.error or "", lambda error, words=words: words in error, SECONDS)
