@@ -32,10 +32,11 @@ from ..process import inference_threads
 from ..provenance import fingerprint
 from ..resources import shipped_weights
 from ..settings.optimization import Engine, Inference
-from .network import FeatureNetwork, SurfaceNetwork, UNet
+from .network import FeatureNetwork
+from .surface import AnySurfaceNetwork, SurfaceNetwork, UNetSurface
 from .weights import Weights, read_weights
 
-_VERSION = 1
+_VERSION = 2
 """Version of the exported graph, part of its file name."""
 _OPSET = 17
 _AXES = {0: "cameras", 2: "height", 3: "width"}
@@ -44,7 +45,7 @@ _AXES = {0: "cameras", 2: "height", 3: "width"}
 class _Maps(nn.Module):
     """Module to export: predicts a surface map from an image and a prior surface map."""
 
-    def __init__(self, network: SurfaceNetwork) -> None:
+    def __init__(self, network: AnySurfaceNetwork) -> None:
         super().__init__()
         self.network = network
 
@@ -62,7 +63,7 @@ class OnnxSurface:
         RuntimeError: torch cannot export the network, or ONNX Runtime cannot load it.
     """
 
-    def __init__(self, network: SurfaceNetwork, sha256: str) -> None:
+    def __init__(self, network: AnySurfaceNetwork, sha256: str) -> None:
         path = cache_dir() / f"surface-{sha256[:32]}-{_VERSION}.onnx"
         try:
             self._session = inference_session(read_bytes(path, WEIGHTS), inference_threads())
@@ -90,10 +91,10 @@ class OnnxSurface:
         return torch.from_numpy(maps)
 
 
-def _exported(network: SurfaceNetwork) -> bytes:
+def _exported(network: AnySurfaceNetwork) -> bytes:
     """Export the network as an ONNX graph for images of any size."""
     side = 2 * network.architecture.stride
-    example = torch.rand(1, 3, side, side), torch.rand(1, network.inputs - 3, side, side)
+    example = torch.rand(1, 3, side, side), torch.rand(1, SURFACE_CHANNELS, side, side)
     stream, names = io.BytesIO(), ["images", "given", "maps"]
     logging.getLogger("torch.onnx").setLevel(logging.ERROR)
     with warnings.catch_warnings():
@@ -125,7 +126,7 @@ Surface = Callable[[Tensor, Tensor], Tensor]
 
 
 def surface_engine(
-    network: SurfaceNetwork, sha256: str, device: torch.device, wanted: Inference
+    network: AnySurfaceNetwork, sha256: str, device: torch.device, wanted: Inference
 ) -> "tuple[Engine, OnnxSurface | None]":
     """Select the inference engine of the surface network.
 
@@ -170,7 +171,7 @@ def _without(wanted: Inference, fault: str) -> tuple[Engine, None]:
     return "torch", None
 
 
-def _probe(network: SurfaceNetwork) -> tuple[Tensor, Tensor]:
+def _probe(network: AnySurfaceNetwork) -> tuple[Tensor, Tensor]:
     """Fixed test image and prior surface map."""
     height, width = (strides * network.architecture.stride for strides in _PROBE)
     chance = torch.Generator().manual_seed(0)
@@ -179,12 +180,12 @@ def _probe(network: SurfaceNetwork) -> tuple[Tensor, Tensor]:
 
 
 @torch.no_grad()
-def _difference(network: SurfaceNetwork, other: Surface) -> float:
+def _difference(network: AnySurfaceNetwork, other: Surface) -> float:
     images, given = _probe(network)
     return float((network(images, given).map() - other(images, given)).abs().max())
 
 
-def _remembered(network: SurfaceNetwork, sha256: str, other: Surface) -> Engine:
+def _remembered(network: AnySurfaceNetwork, sha256: str, other: Surface) -> Engine:
     """Faster engine, from a timing that is stored on this machine."""
     versions = [version(name) for name in ("torch", "onnxruntime")]
     machine = platform.node(), platform.processor(), torch.get_num_threads(), inference_threads()
@@ -211,7 +212,7 @@ def _read(path: Path) -> Engine | None:
 
 
 @torch.no_grad()
-def _times(network: SurfaceNetwork, other: Surface) -> dict[Engine, float]:
+def _times(network: AnySurfaceNetwork, other: Surface) -> dict[Engine, float]:
     """Shortest of several alternating timings of each engine [s]."""
     images, given = _probe(network)
     engines: dict[Engine, Callable[[], Tensor]] = {
@@ -265,7 +266,7 @@ class FeatureExtractor:
         self.device = torch.device(device)
         self.weights = {"feature": features, "surface": surface}
         feature_network, surface_network = features.network, surface.network
-        assert isinstance(feature_network, FeatureNetwork) and isinstance(surface_network, SurfaceNetwork)
+        assert isinstance(feature_network, FeatureNetwork) and isinstance(surface_network, SurfaceNetwork | UNetSurface)
         self._features = feature_network.to(self.device).folded()
         self._surface = surface_network.to(self.device).folded()
         self.sha256 = hashlib.sha256((features.sha256 + surface.sha256).encode()).hexdigest()
@@ -304,10 +305,9 @@ class FeatureExtractor:
                     "give at most one of each kind."
                 )
             read[found.network.kind] = (path, found)
-        kinds: tuple[type[UNet], ...] = (FeatureNetwork, SurfaceNetwork)
-        for network, path in zip(kinds, shipped_weights(), strict=True):
-            if network.kind not in read:
-                read[network.kind] = (path, read_weights(path))
+        for kind, path in zip((FeatureNetwork.kind, SurfaceNetwork.kind), shipped_weights(), strict=True):
+            if kind not in read:
+                read[kind] = (path, read_weights(path))
         return FeatureExtractor(read["feature"][1], read["surface"][1], device, inference)
 
     def features(self, images: Float[Tensor, "batch 3 h w"]) -> Float[Tensor, "batch channels h w"]:

@@ -1,13 +1,8 @@
-"""Feature network and surface network.
-
-The feature network is a small U-Net; ACS compares the features of its last layer before the 1x1 head. The surface
-network predicts a surface map from an image and the surface map of a prior pose.
-"""
+"""Feature network: a small U-Net; ACS compares the features of its last layer before the 1x1 head."""
 
 import copy
-from dataclasses import dataclass
 from itertools import pairwise
-from typing import ClassVar, Self, TypeVar
+from typing import Any, ClassVar, Self, TypeVar
 
 import torch
 from jaxtyping import Float
@@ -16,7 +11,6 @@ from torch.nn import functional
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from ..errors import SettingsError
-from ..model.parts import PARTS, SURFACE_CHANNELS
 from ..settings import Architecture
 from ..threads import one_thread
 
@@ -29,11 +23,40 @@ _CONTRAST_SMOOTHINGS = 5
 Network = TypeVar("Network", bound=nn.Module)
 
 
-class UNet(nn.Module):
-    """U-Net of convolution, batch norm and ReLU; skip connections are added, at half the cost of concatenation."""
+class ImageNetwork(nn.Module):
+    """Base of the networks: checks of inputs, and a folded copy for inference."""
 
     kind: ClassVar[str]
     """Name of the network in weights files."""
+    architecture: Any
+    """`Architecture` or `SurfaceArchitecture`."""
+
+    def check_input(self, x: Tensor, channels: int) -> None:
+        """Check the number of channels, and that the size is divisible by the stride.
+
+        Raises:
+            SettingsError: one of them is wrong.
+        """
+        stride = self.architecture.stride
+        if x.ndim != 4 or x.shape[1] != channels or x.shape[2] % stride or x.shape[3] % stride:
+            raise SettingsError(
+                f"the input of the {self.kind} network has shape {tuple(x.shape)}. Give [batch, {channels}, height, "
+                f"width] with height and width multiples of {stride}; pad or crop the image."
+            )
+
+    def folded(self) -> Self:
+        """Frozen copy for inference: batch norms folded into the convolutions, channels-last, no gradients."""
+        folded = copy.deepcopy(self).eval()
+        for block in folded.modules():
+            if isinstance(block, nn.Sequential):
+                _fold(block)
+        return channels_last(folded).requires_grad_(False)
+
+
+class UNet(ImageNetwork):
+    """U-Net of convolution, batch norm and ReLU; skip connections are added, at half the cost of concatenation."""
+
+    architecture: Architecture
 
     def __init__(self, architecture: Architecture, inputs: int) -> None:
         super().__init__()
@@ -70,26 +93,6 @@ class UNet(nn.Module):
         self.check_input(images, 3)
         block = self.architecture.stride if self.architecture.local_mean else None
         return standardize(images, block, self.architecture.local_contrast)
-
-    def check_input(self, x: Tensor, channels: int) -> None:
-        """Check the number of channels, and that the size is divisible by the stride.
-
-        Raises:
-            SettingsError: one of them is wrong.
-        """
-        stride = self.architecture.stride
-        if x.ndim != 4 or x.shape[1] != channels or x.shape[2] % stride or x.shape[3] % stride:
-            raise SettingsError(
-                f"the input of the {self.kind} network has shape {tuple(x.shape)}. Give [batch, {channels}, height, "
-                f"width] with height and width multiples of {stride}; pad or crop the image."
-            )
-
-    def folded(self) -> Self:
-        """Frozen copy for inference: batch norms folded into the convolutions, channels-last, no gradients."""
-        folded = copy.deepcopy(self).eval()
-        for block in (*folded.encoder, *folded.decoder):
-            _fold(block)
-        return channels_last(folded).requires_grad_(False)
 
 
 class FeatureNetwork(UNet):
@@ -176,62 +179,8 @@ def _block(inputs: int, outputs: int, convolutions: int) -> nn.Sequential:
     return nn.Sequential(*layers)
 
 
-def _fold(block: nn.Module) -> None:
-    assert isinstance(block, nn.Sequential)
-    layers = list(block)
-    for index in range(0, len(layers), 3):
-        convolution, norm = layers[index], layers[index + 1]
-        assert isinstance(convolution, nn.Conv2d) and isinstance(norm, nn.BatchNorm2d)
-        block[index] = fuse_conv_bn_eval(convolution, norm)
-        block[index + 1] = nn.Identity()
-
-
-_HIDDEN = 24
-
-
-@dataclass(frozen=True)
-class SurfaceLogits:
-    """Predicted surface map with coverage as logits; see `carts_core.model.parts`."""
-
-    coverage: Float[Tensor, "batch parts+1 h w"]
-    """Log odds of background and of each part."""
-    normals: Float[Tensor, "batch 3 h w"]
-    """Mean unit normals times coverage."""
-
-    @one_thread()
-    def map(self) -> Float[Tensor, "batch 6 h w"]:
-        """Surface map, with coverage as probabilities."""
-        return torch.cat([self.coverage.softmax(1)[:, 1:], self.normals], 1)
-
-
-class SurfaceNetwork(UNet):
-    """Surface network: a U-Net on a standardised image and the surface map of the measured kinematics.
-
-    The measured kinematics have errors of a few degrees but provide prior poses, which the network corrects.
-    """
-
-    kind = "surface"
-
-    def __init__(self, architecture: Architecture | None = None) -> None:
-        super().__init__(architecture or Architecture(), 3 + SURFACE_CHANNELS)
-        fine, coarse = self.architecture.widths[:2]
-        self.coarse = nn.Conv2d(coarse, _HIDDEN, 3, padding=1)
-        self.fine = nn.Conv2d(fine, _HIDDEN, 1)
-        self.out = nn.Conv2d(_HIDDEN, len(PARTS) + 1 + 3, 1)
-
-    def forward(self, images: Float[Tensor, "batch 3 h w"], given: Float[Tensor, "batch 6 h w"]) -> SurfaceLogits:
-        """Predict surface maps of images.
-
-        Args:
-            images: RGB in [0, 1]; h and w are multiples of `architecture.stride`.
-            given: surface maps of the prior poses; zero without prior.
-
-        Raises:
-            SettingsError: the number of channels or the size is not allowed.
-        """
-        fine, coarse = self.decoded(torch.cat([self.standardized(images), given], 1))
-        grown = functional.interpolate(self.coarse(coarse), scale_factor=2, mode="bilinear", align_corners=False)
-        hidden = (grown + self.fine(fine)).relu()
-        with one_thread():
-            out = self.out(hidden)
-        return SurfaceLogits(out[:, : len(PARTS) + 1], out[:, len(PARTS) + 1 :])
+def _fold(block: nn.Sequential) -> None:
+    for index, (layer, norm) in enumerate(pairwise(list(block))):
+        if isinstance(layer, nn.Conv2d) and isinstance(norm, nn.BatchNorm2d):
+            block[index] = fuse_conv_bn_eval(layer, norm)
+            block[index + 1] = nn.Identity()

@@ -8,6 +8,7 @@ import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import torch
 from safetensors import SafetensorError, safe_open
@@ -17,9 +18,10 @@ from torch import Tensor
 from ..errors import SettingsError, WeightsError
 from ..files import write_bytes
 from ..files.reading import WEIGHTS, check_regular, parse_json, read_bytes
-from ..settings import Architecture
+from ..settings import Architecture, SurfaceArchitecture
 from ..wording import shortened
-from .network import FeatureNetwork, SurfaceNetwork, UNet
+from .network import FeatureNetwork, ImageNetwork
+from .surface import SurfaceNetwork, UNetSurface
 
 _LENGTH = 8
 """Size of the header's length field and alignment of the tensors [bytes]."""
@@ -40,11 +42,12 @@ def tensor_bytes(tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> 
     return len(text).to_bytes(_LENGTH, "little") + text + content[end:]
 
 
-VERSION = "1"
-
-_NETWORKS: dict[str, Callable[[Architecture], UNet]] = {
-    f"carts-{network.kind}-network": network for network in (FeatureNetwork, SurfaceNetwork)
+_NETWORKS: dict[tuple[str, str], tuple[type[Architecture | SurfaceArchitecture], Callable[[Any], ImageNetwork]]] = {
+    ("carts-feature-network", "1"): (Architecture, FeatureNetwork),
+    ("carts-surface-network", "1"): (Architecture, UNetSurface),
+    ("carts-surface-network", "2"): (SurfaceArchitecture, SurfaceNetwork),
 }
+"""Format and version -> architecture and network."""
 _TYPES = (torch.float32, torch.float64, torch.float16, torch.bfloat16, torch.int64)
 _LARGEST_SIDE = 4096
 _REMEDY = "Train weights with `carts train`, or reinstall carts to restore the shipped ones."
@@ -54,7 +57,7 @@ _REMEDY = "Train weights with `carts train`, or reinstall carts to restore the s
 class Weights:
     """Contents of a weights file."""
 
-    network: UNet
+    network: ImageNetwork
     """The trained network, in evaluation mode, not folded."""
     working_size: tuple[int, int]
     """Width and height [px] of the images that it was trained for."""
@@ -64,7 +67,7 @@ class Weights:
     """Fingerprint of the file."""
 
 
-def save_weights(network: UNet, path: Path, training: dict, working_size: tuple[int, int]) -> None:
+def save_weights(network: ImageNetwork, path: Path, training: dict, working_size: tuple[int, ...]) -> None:
     """Write a weights file atomically.
 
     Args:
@@ -74,7 +77,7 @@ def save_weights(network: UNet, path: Path, training: dict, working_size: tuple[
     """
     metadata = {
         "format": f"carts-{network.kind}-network",
-        "version": VERSION,
+        "version": "2" if isinstance(network, SurfaceNetwork) else "1",
         "architecture": network.architecture.to_json(),
         "working_size": json.dumps(working_size),
         "training": json.dumps(training),
@@ -91,8 +94,8 @@ def read_weights(path: Path) -> Weights:
             fit the architecture it names.
     """
     metadata, shapes = _header(path)
-    make_network = _NETWORKS[metadata["format"]]
-    architecture, working_size, training = _described(path, metadata)
+    kind, make_network = _NETWORKS[metadata["format"], metadata["version"]]
+    architecture, working_size, training = _described(path, metadata, kind)
     network = _filled(path, make_network, architecture, shapes)
     if len(working_size) != 2 or any(not 0 < n <= _LARGEST_SIDE or n % architecture.stride for n in working_size):
         raise WeightsError(
@@ -113,37 +116,39 @@ def _header(path: Path) -> tuple[dict[str, str], dict[str, tuple[int, ...]]]:
         raise WeightsError(f"weights file {path} is missing. {_REMEDY}") from error
     except (SafetensorError, OSError, ValueError) as error:
         raise _unreadable(path, error) from error
-    if metadata.get("format") not in _NETWORKS or metadata.get("version") != VERSION:
+    if (metadata.get("format"), metadata.get("version")) not in _NETWORKS:
+        allowed = " or ".join(f"{name!r}, version {version!r}" for name, version in _NETWORKS)
         raise WeightsError(
             f"weights file {path} has format {metadata.get('format')!r}, version {metadata.get('version')!r}; allowed: "
-            f"{' or '.join(map(repr, _NETWORKS))}, version {VERSION!r}. {_REMEDY}"
+            f"{allowed}. {_REMEDY}"
         )
     return metadata, shapes
 
 
-def _described(path: Path, metadata: Mapping[str, str]) -> tuple[Architecture, tuple[int, ...], dict]:
+def _described(
+    path: Path, metadata: Mapping[str, str], kind: type[Architecture | SurfaceArchitecture]
+) -> tuple[Architecture | SurfaceArchitecture, tuple[int, ...], dict]:
     """Parse architecture, working size [px] and training settings from the metadata."""
     try:
-        architecture = Architecture.from_json(metadata["architecture"])
+        architecture = kind.from_json(metadata["architecture"])
         working_size = tuple(int(n) for n in parse_json(metadata["working_size"]))
         training = parse_json(metadata["training"], finite=False)
         if not isinstance(training, dict):
             raise TypeError("the training settings are not a table")
     except (KeyError, ValueError, TypeError, AttributeError, OverflowError, SettingsError) as error:
         raise WeightsError(
-            f"weights file {path} has unreadable metadata ({shortened(str(error))}). Required: an architecture with "
-            "widths, encoder_convolutions and decoder_convolutions, a working size and the training settings. "
-            f"{_REMEDY}"
+            f"weights file {path} has unreadable metadata ({shortened(str(error))}). Required: an architecture "
+            f"(widths and numbers of convolutions), a working size and the training settings. {_REMEDY}"
         ) from error
     return architecture, working_size, training
 
 
 def _filled(
     path: Path,
-    make_network: Callable[[Architecture], UNet],
-    architecture: Architecture,
+    make_network: Callable[[Any], ImageNetwork],
+    architecture: Architecture | SurfaceArchitecture,
     shapes: Mapping[str, tuple[int, ...]],
-) -> UNet:
+) -> ImageNetwork:
     """Network with the tensors of the file."""
     # Created without memory, so that nothing is allocated for an architecture that does not fit the file.
     with torch.device("meta"):
@@ -152,7 +157,7 @@ def _filled(
         differing = [name for name in sorted(wanted.keys() | shapes.keys()) if wanted.get(name) != shapes.get(name)]
         first = differing[0]
         raise WeightsError(
-            f"weights file {path} does not fit its architecture of widths {architecture.widths}: {shortened(first)} is "
+            f"weights file {path} does not fit its architecture {architecture}: {shortened(first)} is "
             f"{shapes.get(first, 'missing')}, but should be {wanted.get(first, 'absent')}. {_REMEDY}"
         )
     try:

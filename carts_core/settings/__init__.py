@@ -43,5 +43,6 @@ from .training import Architecture as Architecture
 from .training import ImageSettings as ImageSettings
 from .training import NetworkName as NetworkName
 from .training import ObjectiveWeights as ObjectiveWeights
+from .training import SurfaceArchitecture as SurfaceArchitecture
 from .training import SurfaceWeights as SurfaceWeights
 from .training import TrainingConfig as TrainingConfig

@@ -4,7 +4,7 @@ import json
 import re
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 from ..errors import SettingsError
 from ..files.reading import parse_json
@@ -99,6 +99,46 @@ class Architecture:
         )
 
 
+@dataclass(frozen=True)
+class SurfaceArchitecture:
+    """Architecture of the surface network, stored in the weights file: widths of what surrounds the pretrained encoder.
+
+    Multiples of 16 are fastest in ONNX Runtime.
+    """
+
+    decoder: tuple[int, ...] = (16, 32, 48, 64)
+    """Channels of the decoder at strides 2, 4, 8 and 16."""
+    convolutions: tuple[int, ...] = (1, 1, 1, 1)
+    """3x3 convolutions of the decoder at strides 2, 4, 8 and 16."""
+    conditioning: tuple[int, ...] = (16, 32, 48)
+    """Channels of the prior surface map at strides 2, 4 and 8."""
+
+    stride: ClassVar[int] = 16
+    """Width and height of an input must be multiples of this [px]."""
+
+    def __post_init__(self) -> None:
+        widths = (*self.decoder, *self.conditioning)
+        if (len(self.decoder), len(self.convolutions), len(self.conditioning)) != (4, 4, 3) or any(
+            not 1 <= width <= _MOST_CHANNELS for width in widths
+        ):
+            raise SettingsError(
+                f"decoder is {self.decoder} and conditioning {self.conditioning}; give four and three channel counts "
+                f"of 1 to {_MOST_CHANNELS}."
+            )
+        if any(not 1 <= count <= _MOST_CONVOLUTIONS for count in self.convolutions):
+            raise SettingsError(f"convolutions are {self.convolutions}; give four counts of 1 to {_MOST_CONVOLUTIONS}.")
+
+    def to_json(self) -> str:
+        """Encode as one line of JSON; the inverse of `from_json`."""
+        return json.dumps(asdict(self))
+
+    @staticmethod
+    def from_json(text: str) -> "SurfaceArchitecture":
+        """Decode the result of `to_json`. Errors as `Architecture.from_json`."""
+        values = parse_json(text)
+        return SurfaceArchitecture(**{name: tuple(int(n) for n in counts) for name, counts in values.items()})
+
+
 Interval = Annotated[tuple[float, float], Range(0)]
 """Lower and upper bound."""
 
@@ -165,6 +205,14 @@ class ImageSettings(Ranged):
     """Share of pairs whose mean background is that of the observed image."""
     occluded: Share = 0.4
     """Share of observed images with occluded arms; the occluded surface remains the label."""
+    blood: Share = 0.0
+    """Share of observed images with blood on background and arms."""
+    crossing: Share = 0.5
+    """Share of the pairs of arms that cross in the image."""
+    chains: Share = 0.0
+    """Share of scenes with a random serial robot instead of `robots`, .3 to 2 m from the camera."""
+    enlarged: Share = 0.0
+    """Share of images at up to twice the working size, as used for the last look at an image."""
     things: Share = 0.35
     """Share of observed images with objects (rods, plates, cables) behind the arms."""
     absent: Share = 0.1
@@ -206,7 +254,7 @@ class TrainingConfig(Ranged):
     """URDF files of the robots in the training images, or `builtin:NAME`."""
     start: Path | None = None
     """Weights file to start from, for fine-tuning; by default random weights. The architecture is that of these
-    weights, unless a larger one is given."""
+    weights."""
     steps: Count = 4000
     """Optimizer steps."""
     minutes: Annotated[float | None, Range(0, unit="min", above=True)] = None
@@ -217,8 +265,15 @@ class TrainingConfig(Ranged):
     reuse: Count = 2
     """Number of uses of each sample; repeats are mirrored at random. Generating a sample costs about as much as a
     training step."""
+    cache: Path | None = None
+    """Folder of training images of the surface network, made before the first step unless it holds them; by default
+    images are made during training."""
+    cached: Count = 60_000
+    """Number of images in `cache`."""
     learning_rate: Positive = 3e-3
     """Peak learning rate of AdamW; it rises for `warmup` steps and then falls along a cosine to a hundredth."""
+    encoder_rate: Share = 0.3
+    """Learning rate of the surface network's pretrained encoder, relative to `learning_rate` [1]."""
     weight_decay: NotNegative = 1e-4
     """Weight decay of AdamW."""
     warmup: Annotated[int, Range(0)] = 100
@@ -249,13 +304,17 @@ class TrainingConfig(Ranged):
     surface_objective: SurfaceWeights = field(default_factory=SurfaceWeights)
     """Weights of the surface network's loss terms."""
     architecture: Architecture = field(default_factory=Architecture)
-    """Architecture of the network."""
+    """Architecture of the feature network."""
+    surface_architecture: SurfaceArchitecture = field(default_factory=SurfaceArchitecture)
+    """Architecture of the surface network."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if not self.robots:
             raise SettingsError("no robot was given; give at least one URDF file.")
-        stride = self.architecture.stride
+        if self.cache is not None and self.network != "surface":
+            raise SettingsError("a cache of images serves the surface network only; leave `cache` out.")
+        stride = (self.architecture if self.network == "feature" else self.surface_architecture).stride
         if self.images.width % stride or self.images.height % stride:
             raise SettingsError(
                 f"training images of {self.images.width}x{self.images.height} px do not fit the network; give "

@@ -12,7 +12,7 @@ from jaxtyping import Bool
 from carts_core.errors import SettingsError, WeightsError
 from carts_core.model.scene import Scene, SceneState
 from carts_core.networks import FeatureExtractor
-from carts_core.networks.network import SurfaceNetwork
+from carts_core.networks.surface import SurfaceNetwork
 from carts_core.networks.weights import read_weights
 from carts_core.optimization import (
     Assessment,

@@ -12,7 +12,7 @@ import torch
 from carts_core.errors import SettingsError
 from carts_core.networks import FeatureExtractor
 from carts_core.networks.extractor import TOLERANCE, OnnxSurface, _times
-from carts_core.networks.network import SurfaceNetwork
+from carts_core.networks.surface import UNetSurface
 from carts_core.networks.weights import save_weights
 from carts_core.settings import Architecture
 
@@ -26,7 +26,7 @@ def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 @pytest.fixture
 def weights(small_architecture: Architecture, tmp_path: Path) -> Path:
     torch.manual_seed(3)
-    network = SurfaceNetwork(small_architecture)
+    network = UNetSurface(small_architecture)
     with torch.no_grad():
         for _ in range(5):
             network(torch.rand(4, 3, 32, 48), torch.rand(4, 6, 32, 48))

@@ -11,8 +11,8 @@ from jaxtyping import Float, Int
 
 from ...errors import SettingsError
 from ...model.camera import Camera
-from ...model.parts import link_parts
-from ...model.robot import Robot
+from ...model.parts import PARTS, link_parts
+from ...model.robot import SLENDER, Robot
 from ...model.scene import Arm, Light, Scene
 from ...recording import Sequence as SequenceFile
 from ...rendering import Renderer
@@ -56,6 +56,8 @@ class RobotGeometry(Body):
     Attributes:
         part_link: link of each part.
         part_class: index into `carts_core.model.parts.PARTS` of each part.
+        vertex_part: part of each vertex.
+        instrument: whether the longest part is slender, as a shaft is.
     """
 
     def __init__(self, robot: Robot) -> None:
@@ -68,12 +70,14 @@ class RobotGeometry(Body):
         faces = [mesh.faces + start for mesh, start in zip(meshes, starts[:-1], strict=True)]
         self.faces = np.concatenate(faces).astype(np.int32)
         self.face_part = np.repeat(np.arange(len(meshes)), [len(mesh.faces) for mesh in meshes]).astype(np.int32)
-        self._vertex_part = np.repeat(np.arange(len(meshes)), counts)
+        self.vertex_part = np.repeat(np.arange(len(meshes)), counts)
         self._vertex_link = np.repeat([mesh.link for mesh in meshes], counts)
         self.part_link = np.array([mesh.link for mesh in meshes])
         self.part_class = link_parts(robot)[self.part_link]
         extents = [np.ptp(mesh.vertices, axis=0).max() for mesh in meshes]
         self.shaft = int(np.argmax(extents))
+        longest = np.sort(np.ptp(meshes[self.shaft].vertices, axis=0))
+        self.instrument = bool(longest[-2] < SLENDER * longest[-1])
         self.shaft_axis, self.shaft_end = self._shaft_line()
 
     def _shaft_line(self) -> tuple[np.ndarray, np.ndarray]:
@@ -88,7 +92,7 @@ class RobotGeometry(Body):
         if others.any():
             tip = posed[others].mean(0)
         else:
-            tip = posed[np.argmax(((posed - posed[self._vertex_part == self.shaft].mean(0)) ** 2).sum(1))]
+            tip = posed[np.argmax(((posed - posed[self.vertex_part == self.shaft].mean(0)) ** 2).sum(1))]
         tip = np.linalg.inv(Ts[shaft_link])[:3] @ np.append(tip, 1.0)
         if axis @ (centre - tip) < 0:
             axis = -axis
@@ -116,6 +120,14 @@ FOCAL_LENGTH = (0.7, 2.0)
 """Range of the focal length, in image widths [1], from whole to enlarged endoscope images."""
 OUTSIDE = 0.12
 """Largest distance of a wrist outside the image, relative to the image size [1]."""
+ROBOT_DEPTH = (0.3, 2.0)
+"""The same for robots that are no instruments [m]."""
+_TIP_AIMED = 0.25
+"""Share of instruments placed by a point of their jaws, so that of long jaws only the tips are in view."""
+_CROSSED = 0.05
+"""Distance from the wrist within which arms cross [m]."""
+_STIFF = 0.3
+"""Joint errors of other robots relative to those of instruments [1]."""
 ELEVATION = (-20.0, 60.0)
 """Range of the angle between shaft and image plane [deg]; positive if the shaft extends towards the camera."""
 
@@ -197,26 +209,65 @@ def random_intrinsics(rng: np.random.Generator, width: int, height: int, field: 
 
 
 def random_placement(
-    rng: np.random.Generator, geometry: RobotGeometry, intrinsics: Intrinsics, width: int, height: int
+    rng: np.random.Generator,
+    geometry: RobotGeometry,
+    intrinsics: Intrinsics,
+    width: int,
+    height: int,
+    near: Float[np.ndarray, "3"] | None = None,
 ) -> Placement:
-    """Random placement with the wrist in or near the image and the shaft crossing a random border."""
+    """Random placement: an instrument with its wrist or tip in or near the image and its shaft crossing a border, or
+    another robot with any of its links in the image.
+
+    Args:
+        near: point of another arm [m], in front of or behind which the arm is placed so that both cross.
+    """
     joints = _random_joints(rng, geometry)
     Ts_base_link = geometry.link_transforms(joints)
     T_base_shaft = Ts_base_link[geometry.part_link[geometry.shaft]]
     wrist = T_base_shaft[:3, :3] @ geometry.shaft_end + T_base_shaft[:3, 3]
     axis = T_base_shaft[:3, :3] @ geometry.shaft_axis
     fx, fy, cx, cy = intrinsics
-    depth = float(np.exp(rng.uniform(*np.log(DEPTH))))
+    instrument = geometry.instrument
+    depth = float(np.exp(rng.uniform(*np.log(DEPTH if instrument else ROBOT_DEPTH))))
     u = rng.uniform(-OUTSIDE, 1 + OUTSIDE) * width
     v = rng.uniform(-OUTSIDE, 1 + OUTSIDE) * height
     target = np.array([(u - cx) / fx * depth, (v - cy) / fy * depth, depth])
-    azimuth = rng.uniform(0, 2 * np.pi)
-    elevation = np.deg2rad(rng.uniform(*ELEVATION))
-    direction = np.array([np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), -np.sin(elevation)])
-    R = _frame(direction, rng.normal(size=3)) @ _frame(axis, rng.normal(size=3)).T
+    aimed = wrist
+    if near is not None or not instrument or rng.random() < _TIP_AIMED:
+        aimed = _some_point(rng, geometry, Ts_base_link, wrist, jaws=instrument and near is None)
+    if near is not None:
+        target = near * np.exp(rng.normal(0, 0.06)) + rng.normal(0, 0.006, 3)
+    if instrument:
+        azimuth, elevation = rng.uniform(0, 2 * np.pi), np.deg2rad(rng.uniform(*ELEVATION))
+        flat = np.cos(elevation)
+        direction = np.array([np.cos(azimuth) * flat, np.sin(azimuth) * flat, -np.sin(elevation)])
+        R = _frame(direction, rng.normal(size=3)) @ _frame(axis, rng.normal(size=3)).T
+    else:
+        # The base is upright, or hangs from a ceiling.
+        tilt, roll = np.deg2rad(rng.uniform(-15, 70)), rng.normal(0, 0.15) + np.pi * (rng.random() < 0.1)
+        level = np.array([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])
+        R = turned(np.array([0, 0, roll])) @ turned(np.array([tilt, 0, 0])) @ level
+        R = R @ turned(np.array([0, 0, rng.uniform(-np.pi, np.pi)]))
     T = np.eye(4)
-    T[:3, :3], T[:3, 3] = R, target - R @ wrist
+    T[:3, :3], T[:3, 3] = R, target - R @ aimed
     return Placement(joints, T)
+
+
+def _some_point(
+    rng: np.random.Generator, geometry: RobotGeometry, Ts_base_link: np.ndarray, wrist: np.ndarray, *, jaws: bool
+) -> Float[np.ndarray, "3"]:
+    """Random vertex in the base frame [m]: of the jaws, or of what is within `_CROSSED` of an instrument's wrist."""
+    posed = geometry.posed(Ts_base_link).vertices.astype(float)
+    if jaws:
+        chosen = geometry.part_class[geometry.vertex_part] == PARTS.index("jaws")
+    elif geometry.instrument:
+        chosen = np.linalg.norm(posed - wrist, axis=1) < _CROSSED
+    else:
+        # Parts count equally, whatever their number of vertices.
+        chosen = geometry.vertex_part == rng.integers(len(geometry.part_link))
+    points = posed[chosen] if chosen.any() else posed
+    return points[rng.integers(len(points))]
 
 
 def perturbed(rng: np.random.Generator, geometry: RobotGeometry, placement: Placement, scale: float) -> Placement:
@@ -227,7 +278,7 @@ def perturbed(rng: np.random.Generator, geometry: RobotGeometry, placement: Plac
     joints = placement.joint_positions.copy()
     for index, kind in enumerate(geometry.robot.joint_types):
         if kind == "revolute":
-            joints[index] += rng.normal(0, np.deg2rad(3.0) * scale)
+            joints[index] += rng.normal(0, np.deg2rad(3.0) * scale) * (1.0 if geometry.instrument else _STIFF)
     # The arm rotates about its wrist, so that the error in the image does not grow with the arm's length.
     shaft_link = geometry.part_link[geometry.shaft]
     T_camera_shaft = placement.T_camera_base @ geometry.link_transforms(placement.joint_positions)[shaft_link]

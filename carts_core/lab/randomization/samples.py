@@ -25,6 +25,8 @@ from .arms import (
     random_variant,
 )
 from .backgrounds import Photographs, random_background
+from .blood import bleed
+from .chains import random_chain
 from .clutter import add_clutter, add_things, cast_shadow, contact_shadow, occlude
 from .shading import GBuffer, photograph, render_gbuffer, shade, tone
 
@@ -109,7 +111,9 @@ class Observer:
         variant, made = self._variants.get((arms, place), (None, -1))
         if variant is None or made != generation:
             rng = np.random.default_rng((*self._seed, _SCENES, arms, place, generation))
-            variant = random_variant(rng, self._robots, arms, settings.width, settings.height)
+            chain = rng.random() < settings.chains
+            robots = [random_chain(rng)] if chain else self._robots
+            variant = random_variant(rng, robots, 1 if chain else arms, settings.width, settings.height)
         self._variants[arms, place] = variant, generation
         return variant
 
@@ -119,16 +123,32 @@ class Observer:
         size = settings.width, settings.height
         tries = 0
         while True:
+            field = settings.field_width
+            if rng.random() < settings.enlarged:
+                field = round(field * float(rng.uniform(1.0, 2.0)))
             if self._recorded is not None:
-                intrinsics, placements = self._recorded(rng, variant.geometries, size, settings.field_width)
+                intrinsics, placements = self._recorded(rng, variant.geometries, size, field)
             else:
-                intrinsics = random_intrinsics(rng, *size, settings.field_width)
-                placements = [random_placement(rng, geometry, intrinsics, *size) for geometry in variant.geometries]
+                intrinsics = random_intrinsics(rng, *size, field)
+                placements = self._placed(variant, intrinsics, size)
             view = look(variant.geometries, placements, intrinsics, size)
             share = len(view.rows) / (settings.width * settings.height)
             tries += 1
             if settings.coverage[0] <= share <= settings.coverage[1] or tries == _TRIES:
                 return intrinsics, placements, view
+
+    def _placed(self, variant: Variant, intrinsics: Intrinsics, size: tuple[int, int]) -> list[Placement]:
+        """Random placements; the second arm often crosses the first."""
+        rng, geometries = self.rng, variant.geometries
+        placements = [random_placement(rng, geometries[0], intrinsics, *size)]
+        for geometry in geometries[1:]:
+            near = None
+            if rng.random() < self.settings.crossing:
+                view = look(geometries[:1], placements[:1], intrinsics, size)
+                if len(view.points):
+                    near = view.points[rng.integers(len(view.points))].astype(float)
+            placements.append(random_placement(rng, geometry, intrinsics, *size, near))
+        return placements
 
     def _without_some(self, placements: list[Placement]) -> list[Placement]:
         """Placements with one or all of the arms moved behind the camera."""
@@ -166,6 +186,8 @@ class Observer:
         composed = background * (1 - coverage[..., None]) + arms
         if rng.random() < self.settings.occluded:
             composed = occlude(rng, composed, coverage)
+        if rng.random() < self.settings.blood:
+            composed = bleed(rng, composed, coverage)
         return photograph(np.random.default_rng(camera_seed), composed, self.settings.appearance)
 
 
@@ -310,8 +332,18 @@ class SurfaceGenerator:
 
     def __call__(self, number: int | None = None) -> SurfaceSample:
         """Surface sample of a number, from 0; by default the next one."""
-        seen, rng = self._observer(number), self._observer.rng
+        return self.samples(number, 1)[0]
+
+    def samples(self, number: int | None, priors: int) -> list[SurfaceSample]:
+        """Samples of one image with `priors` different prior surface maps."""
+        seen = self._observer(number)
         size = self._observer.settings.width, self._observer.settings.height
+        image, surface = to_uint8(seen.image), _surface(seen.variant.geometries, seen.fine, size)
+        return [SurfaceSample(image, self._prior(seen, size), surface) for _ in range(priors)]
+
+    def _prior(self, seen: Observation, size: tuple[int, int]) -> np.ndarray:
+        """Prior surface map from erroneous kinematics, or zeros."""
+        rng = self._observer.rng
         # Small errors are frequent, so that the network learns to be accurate.
         scale = _LARGEST_ERROR * float(rng.random()) ** 1.5
         given = [
@@ -319,9 +351,7 @@ class SurfaceGenerator:
             for geometry, placement in zip(seen.variant.rendered, seen.claimed, strict=True)
         ]
         wrong = _surface(seen.variant.rendered, look(seen.variant.rendered, given, seen.intrinsics, size), size)
-        if rng.random() < _UNKNOWN:
-            wrong = np.zeros_like(wrong)
-        return SurfaceSample(to_uint8(seen.image), wrong, _surface(seen.variant.geometries, seen.fine, size))
+        return np.zeros_like(wrong) if rng.random() < _UNKNOWN else wrong
 
 
 def _surface(geometries: Sequence[RobotGeometry], view: GBuffer, size: tuple[int, int]) -> np.ndarray:

@@ -17,7 +17,9 @@ from torch.utils.data import DataLoader, Dataset, get_worker_info
 
 from ...settings import TrainingConfig
 from ...stopping import end_with_parent
-from .tasks import Batch, task_of
+from ..randomization import SurfaceSample
+from .cache import ImageCache, augmented, shards
+from .tasks import Batch, SurfaceTask, task_of
 
 VALIDATION_STREAM = 1
 _TRAINING_STREAM = 0
@@ -69,11 +71,36 @@ class _Samples(Dataset):
     def _share_processor(self) -> None:
         if self._alone or get_worker_info() is None:
             return
-        # One thread per process, since the processes occupy all cores. Lower priority than the training process.
-        torch.set_num_threads(1)
-        cv2.setNumThreads(1)
-        os.nice(_NICENESS)
+        share_processor()
         self._alone = True
+
+
+class _CachedSamples(Dataset):
+    """Samples drawn from a cache by number: an image, one of its priors, mirrored and with other colours at random."""
+
+    def __init__(self, config: TrainingConfig, shards: int) -> None:
+        self._config, self._shards = config, shards
+        self._cache: ImageCache | None = None
+
+    def __getitem__(self, number: int) -> Batch:
+        config = self._config
+        if self._cache is None:
+            assert config.cache is not None
+            self._cache = ImageCache(config.cache, self._shards)
+            if get_worker_info() is not None:
+                share_processor()
+        rng = np.random.default_rng((config.seed, _TRAINING_STREAM, number))
+        image, truth, priors = self._cache[int(rng.integers(len(self._cache)))]
+        sample = SurfaceSample(augmented(rng, image), priors[rng.integers(len(priors))], truth)
+        task = SurfaceTask()
+        return task.tensors(task.flipped(sample, bool(rng.integers(2)), bool(rng.integers(2))))
+
+
+def share_processor() -> None:
+    """One thread and a lower priority than the training process, since the processes occupy all cores."""
+    torch.set_num_threads(1)
+    cv2.setNumThreads(1)
+    os.nice(_NICENESS)
 
 
 def _outlive_signals(closing: Event, parent: int, worker: int) -> None:
@@ -100,7 +127,7 @@ def training_batches(config: TrainingConfig, first_step: int) -> Iterator[Iterat
     spawning = multiprocessing.get_context("spawn")
     closing = spawning.Event()
     loader = DataLoader(
-        _Samples(config),
+        _Samples(config) if config.cache is None else _CachedSamples(config, shards(config.cached)),
         batch_size=config.batch_size,
         sampler=count(first_step * config.batch_size),
         num_workers=config.workers,

@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import torch
 from safetensors import SafetensorError, safe_open
@@ -18,6 +18,7 @@ from torch import Tensor, nn
 from ...errors import SettingsError, WeightsError
 from ...files import output_path, write_bytes
 from ...files.reading import WEIGHTS, check_regular, parse_json
+from ...networks.surface import SurfaceNetwork
 from ...networks.weights import tensor_bytes
 from ...settings import TrainingConfig
 from ...settings.training import BaselineTraining
@@ -141,7 +142,7 @@ class TrainingLoop:
         self._output, self._network, self._settings, self._config_json = output, network, settings, config_json
         self._modules = {"network": network, **(further or {})}
         self._optimizer = torch.optim.AdamW(
-            network.parameters(), settings.learning_rate, weight_decay=settings.weight_decay
+            _groups(network, settings), settings.learning_rate, weight_decay=settings.weight_decay
         )
         self.step = 0
         """Number of completed steps."""
@@ -209,7 +210,8 @@ class TrainingLoop:
         self, batch: Batch, loss_of: Callable[[Batch], tuple[Tensor, dict[str, Tensor]]]
     ) -> dict[str, float]:
         for group in self._optimizer.param_groups:
-            group["lr"] = self._settings.learning_rate * schedule(self.step, self._settings.warmup, self.planned)
+            rate = self._settings.learning_rate * schedule(self.step, self._settings.warmup, self.planned)
+            group["lr"] = rate * group["factor"]
         self._network.train()
         loss, terms = loss_of(batch)
         self._optimizer.zero_grad(set_to_none=True)
@@ -249,6 +251,16 @@ class TrainingLoop:
     def _checkpoint(self) -> None:
         save_checkpoint(self._output, self._modules, self._optimizer, self.step, self._config_json, self.history)
         self._saved = self.step
+
+
+def _groups(network: nn.Module, settings: TrainingConfig | BaselineTraining) -> list[dict[str, Any]]:
+    """Parameters with the factor of their learning rate: a pretrained encoder learns more slowly."""
+    if not (isinstance(network, SurfaceNetwork) and isinstance(settings, TrainingConfig)):
+        return [{"params": list(network.parameters()), "factor": 1.0}]
+    encoder = list(network.encoder.parameters())
+    known = set(map(id, encoder))
+    others = [parameter for parameter in network.parameters() if id(parameter) not in known]
+    return [{"params": others, "factor": 1.0}, {"params": encoder, "factor": settings.encoder_rate}]
 
 
 def schedule(step: int, warmup: int, steps: int) -> float:

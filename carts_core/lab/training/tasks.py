@@ -12,7 +12,8 @@ from torch.nn import functional
 
 from ...model.parts import COVERAGE, NORMALS, PARTS
 from ...model.robot import Robot
-from ...networks.network import FeatureNetwork, SurfaceNetwork
+from ...networks.network import FeatureNetwork
+from ...networks.surface import AnySurfaceNetwork, SurfaceNetwork
 from ...settings import NetworkName, TrainingConfig
 from ..randomization import SURFACE_UNIT, PairGenerator, SurfaceGenerator, SurfaceSample, TrainingPair
 
@@ -232,7 +233,7 @@ class SurfaceTask:
 
     def network(self, config: TrainingConfig) -> SurfaceNetwork:
         """Network with random weights."""
-        return SurfaceNetwork(config.architecture)
+        return SurfaceNetwork(config.surface_architecture)
 
     def generator(self, config: TrainingConfig, stream: Sequence[int]) -> SurfaceGenerator:
         """Generator of samples by number, from 0."""
@@ -348,7 +349,7 @@ def _floats(batch: Batch) -> tuple[Tensor, Tensor, Tensor]:
     return images, given.float() / SURFACE_UNIT, surface.float() / SURFACE_UNIT
 
 
-def _seen(network: SurfaceNetwork, images: Tensor, given: Tensor) -> Tensor:
+def _seen(network: AnySurfaceNetwork, images: Tensor, given: Tensor) -> Tensor:
     """Predicted surface maps of many images, on the images' device; the network may be on another device."""
     device = next(network.parameters()).device
     parts = zip(images.split(_AT_ONCE), given.split(_AT_ONCE), strict=True)

@@ -10,97 +10,22 @@ import matplotlib
 import numpy as np
 import torch
 from matplotlib.figure import Figure
-from torch import Tensor, nn
+from torch import Tensor
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from ...errors import SettingsError
 from ...files import OutputPath, locked_folder, output_path, output_stream, write_text
 from ...html import render_page
-from ...networks.network import Network, UNet, channels_last
+from ...networks.network import ImageNetwork, channels_last
+from ...networks.surface import SurfaceNetwork
 from ...networks.weights import read_weights, save_weights
-from ...settings import Architecture, TrainingConfig
+from ...settings import TrainingConfig
 from ...stopping import when_stopped
 from ...wording import counted
+from .cache import make_cache
 from .loader import training_batches, validation_set
 from .loop import History, TrainingLoop
 from .tasks import Batch, task_of
-
-
-def grow(larger: Network, trained: nn.Module) -> Network:
-    """Copy the weights of a trained network into a larger one of the same kind, preserving its output.
-
-    New channels keep their random weights, but trained channels ignore them; new convolutions at the end of a block are
-    the identity on trained channels.
-
-    Args:
-        larger: newly created network; changed in place and returned.
-        trained: network with at most as many channels, and at most as many convolutions per block.
-
-    Raises:
-        SettingsError: a layer of `trained` is larger than its counterpart in `larger`, or has none.
-    """
-    old_layers, new_layers = dict(trained.named_modules()), dict(larger.named_modules())
-    for name in old_layers:
-        if name not in new_layers:
-            raise SettingsError(
-                f"layer {name} of the weights has no counterpart; configure at least as many convolutions."
-            )
-    before: nn.BatchNorm2d | None = None
-    with torch.no_grad():
-        for name, layer in new_layers.items():
-            old = old_layers.get(name)
-            if isinstance(layer, nn.Conv2d):
-                assert old is None or isinstance(old, nn.Conv2d)
-                _embed_convolution(name, layer, old, before)
-            elif isinstance(layer, nn.BatchNorm2d):
-                if old is None:
-                    assert before is not None
-                    _pass_through(layer, before)
-                else:
-                    assert isinstance(old, nn.BatchNorm2d)
-                    for own, theirs in zip(layer.state_dict().values(), old.state_dict().values(), strict=True):
-                        _put(name, own, theirs)
-                    before = old
-    return larger
-
-
-def _embed_convolution(name: str, layer: nn.Conv2d, old: nn.Conv2d | None, before: nn.BatchNorm2d | None) -> None:
-    if old is None:
-        assert before is not None
-        kept = before.num_features
-        layer.weight[:kept] = 0
-        middle = layer.kernel_size[0] // 2
-        layer.weight[range(kept), range(kept), middle, middle] = 1
-        return
-    layer.weight[: old.out_channels] = 0
-    _put(name, layer.weight, old.weight)
-    if layer.bias is not None and old.bias is not None:
-        _put(name, layer.bias, old.bias)
-
-
-def _pass_through(layer: nn.BatchNorm2d, before: nn.BatchNorm2d) -> None:
-    """Set a batch norm to the identity on ReLU outputs of `before`, whose inputs are assumed normally distributed."""
-    kept = before.num_features
-    shift, scale = before.bias, before.weight.abs().clamp(min=1e-6)
-    ratio = shift / scale
-    share, density = (
-        0.5 * (1 + torch.erf(ratio / math.sqrt(2))),
-        torch.exp(-ratio.square() / 2) / math.sqrt(2 * math.pi),
-    )
-    mean = shift * share + scale * density
-    variance = ((shift.square() + scale.square()) * share + shift * scale * density - mean.square()).clamp(min=1e-4)
-    assert layer.running_mean is not None and layer.running_var is not None
-    layer.running_mean[:kept], layer.running_var[:kept] = mean, variance
-    layer.bias[:kept], layer.weight[:kept] = mean, (variance + layer.eps).sqrt()
-
-
-def _put(name: str, own: Tensor, theirs: Tensor) -> None:
-    if own.ndim != theirs.ndim or any(size < needed for size, needed in zip(own.shape, theirs.shape, strict=True)):
-        raise SettingsError(
-            f"layer {name} of the weights has shape {tuple(theirs.shape)} and cannot be embedded in "
-            f"{tuple(own.shape)}. Configure an architecture at least as large in every layer."
-        )
-    own[tuple(slice(size) for size in theirs.shape)] = theirs
 
 
 @dataclass(frozen=True)
@@ -201,7 +126,17 @@ def _predictions(examples: Panels) -> Figure:
 
 _LOG_EVERY = 10
 _EXAMPLES = 6
-_MAY_CHANGE = ("steps", "minutes", "workers", "threads", "device", "validation_every", "checkpoint_every", "patience")
+_MAY_CHANGE = (
+    "steps",
+    "minutes",
+    "workers",
+    "threads",
+    "device",
+    "validation_every",
+    "checkpoint_every",
+    "patience",
+    "cached",
+)
 
 
 def train(
@@ -220,7 +155,7 @@ def train(
     """
     torch.set_num_threads(config.threads)
     with locked_folder(output):
-        run = _Run(_as_large_as_start(config), output)
+        run = _Run(config, output)
         try:
             with when_stopped(run.kept):
                 return run.finish(progress or (lambda event: None))
@@ -233,9 +168,10 @@ class _Run:
     """Training run: training loop, exponential moving average of the weights, and validations of that average."""
 
     def __init__(self, config: TrainingConfig, output: Path) -> None:
-        self.config, self.output, self.task = config, output, task_of(config.network)
         torch.manual_seed(config.seed)
         self.network = channels_last(_first_network(config).to(config.device))
+        config = _with_architecture(config, self.network)
+        self.config, self.output, self.task = config, output, task_of(config.network)
         self.average = AveragedModel(self.network, multi_avg_fn=get_ema_multi_avg_fn(config.average), use_buffers=True)
         self.loop = TrainingLoop(
             output, self.network, config, config_json(config), _MAY_CHANGE, {"average": self.average}
@@ -282,6 +218,8 @@ class _Run:
             reached = means["loss"], seconds_per_step, validation, self.history.first
             progress(TrainingProgress(self.loop.step, self.loop.planned, *reached))
 
+        if self.config.cache is not None:
+            make_cache(self.config.cache, self.config)
         with training_batches(self.config, self.loop.step) as batches:
             self.loop.run(
                 batches,
@@ -299,9 +237,9 @@ class _Run:
             return f"no step was made; any weights in {self.output} are the initial ones"
         return f"{self.output} holds {counted(self.loop.step, 'step')}; rerun the command to resume"
 
-    def _averaged(self) -> UNet:
+    def _averaged(self) -> ImageNetwork:
         network = self.average.module
-        assert isinstance(network, UNet)
+        assert isinstance(network, ImageNetwork)
         return network
 
     def _score(self, entry: dict[str, float]) -> float:
@@ -327,40 +265,29 @@ class _Run:
 
     def _save(self, validation: dict[str, float]) -> None:
         training = {"step": self.loop.step, "validation": validation, "config": json.loads(config_json(self.config))}
-        field = self.config.images.field_width
         # The camera's image is 4:3, as of an endoscope; training images are crops of it.
-        save_weights(self._averaged(), weights_file(self.config, self.output), training, (field, field * 3 // 4))
+        field, stride = self.config.images.field_width, self._averaged().architecture.stride
+        size = tuple(stride * max(round(side / stride), 1) for side in (field, 0.75 * field))
+        save_weights(self._averaged(), weights_file(self.config, self.output), training, size)
 
 
-def _first_network(config: TrainingConfig) -> UNet:
-    fresh = task_of(config.network).network(config)
-    assert isinstance(fresh, UNet)
+def _first_network(config: TrainingConfig) -> ImageNetwork:
     if config.start is None:
-        return fresh
+        return task_of(config.network).network(config)
     network = read_weights(config.start).network
     if network.kind != config.network:
         raise SettingsError(
             f"{config.start} holds a {network.kind} network, but a {config.network} network is to be trained. Give "
             "weights of that kind, or start from random weights."
         )
-    if network.architecture == config.architecture:
-        return network
-    try:
-        if network.architecture.local_mean != config.architecture.local_mean:
-            raise SettingsError("local_mean differs.")
-        return grow(fresh, network)
-    except SettingsError as error:
-        raise SettingsError(
-            f"{config.start} holds a network of {network.architecture}, which cannot be extended to "
-            f"{config.architecture}: {error}"
-        ) from error
+    return network
 
 
-def _as_large_as_start(config: TrainingConfig) -> TrainingConfig:
-    """Settings with the architecture of the initial weights, unless another one was set."""
-    if config.start is None or config.architecture != Architecture():
-        return config
-    return replace(config, architecture=read_weights(config.start).network.architecture)
+def _with_architecture(config: TrainingConfig, network: ImageNetwork) -> TrainingConfig:
+    """Settings with the architecture of the initial weights."""
+    if isinstance(network, SurfaceNetwork):
+        return replace(config, surface_architecture=network.architecture)
+    return replace(config, architecture=network.architecture)
 
 
 def weights_file(config: TrainingConfig, output: Path) -> Path:
@@ -373,6 +300,7 @@ def config_json(config: TrainingConfig) -> str:
     settings = asdict(config)
     settings["start"] = config.start.name if config.start else None
     settings["robots"] = [path.name for path in config.robots]
+    settings["cache"] = config.cache.name if config.cache else None
     folder = config.images.photographs
     settings["images"]["photographs"] = folder.name if folder else None
     recording = config.images.recording

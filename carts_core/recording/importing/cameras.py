@@ -261,7 +261,7 @@ def _numbered(files: list[Path], folder: Path) -> tuple[str, tuple[str, ...]]:
         )
     ((before, after), numbers) = next(iter(kinds.items()))
     ids = tuple(sorted(numbers, key=lambda number: (int(number), number)))
-    before, after = (part.replace("{", "{{").replace("}", "}}") for part in (before, after))
+    before, after = (text.replace("{", "{{").replace("}", "}}") for text in (before, after))
     return f"{before}{{frame}}{after}", ids
 
 

@@ -53,7 +53,7 @@ def test_the_same_seed_makes_the_same_pairs_and_another_seed_others(shipped_psm:
 
 def test_with_a_perfect_model_the_hybrid_shows_what_is_observed(shipped_psm: Robot, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(arms, "PERFECT_MODEL", 1.0)
-    settings = ImageSettings(same_kinematics=1.0, same_background=1.0, two_arms=0.0)
+    settings = ImageSettings(same_kinematics=1.0, same_background=1.0, two_arms=0.0, absent=0.0)
     pair = PairGenerator([shipped_psm], settings, seed=11)()
     overlap = (pair.observed_classes > 0) & (pair.hybrid_classes > 0)
     union = (pair.observed_classes > 0) | (pair.hybrid_classes > 0)

@@ -1,0 +1,144 @@
+"""Training images of the surface network on disk: made once, by several processes, and read in random order.
+
+A shard is a safetensors file of compressed samples: an image (PNG), its true surface map, and several prior surface
+maps from different kinematic errors.
+"""
+
+import multiprocessing
+import os
+import zlib
+from collections.abc import Callable
+from contextlib import ExitStack
+from functools import partial
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from safetensors import SafetensorError, safe_open
+
+from ...errors import WeightsError
+from ...files import output_path, write_bytes
+from ...model.parts import SURFACE_CHANNELS
+from ...model.robot import Robot
+from ...networks.weights import tensor_bytes
+from ...settings import TrainingConfig
+from ..randomization import SurfaceGenerator, SurfaceSample
+
+SHARD = 250
+"""Images per shard."""
+PRIORS = 3
+"""Prior surface maps per image."""
+_NICENESS = 5
+_CONTRAST, _EXPOSURE, _TINT, _GREY = (0.7, 1.2), (0.8, 1.2), 0.06, 0.1
+
+
+class ImageCache:
+    """Samples of the shards in a folder.
+
+    Raises:
+        WeightsError: a shard cannot be read.
+    """
+
+    def __init__(self, folder: Path, shards: int) -> None:
+        self._files = []
+        for index in range(shards):
+            path = _path(folder, index)
+            try:
+                self._files.append(safe_open(path, framework="pt"))
+            except (SafetensorError, OSError) as error:
+                raise WeightsError(
+                    f"shard {path} cannot be read ({error}). Delete it, and it is made again."
+                ) from error
+        self._offsets = [file.get_tensor("offsets").numpy() for file in self._files]
+
+    def __len__(self) -> int:
+        return SHARD * len(self._files)
+
+    def __getitem__(self, number: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Image uint8 [h, w, 3], true surface map and prior surface maps, int8 [h, w, 6] and [priors, h, w, 6]."""
+        shard, index = divmod(number, SHARD)
+        offsets, values = self._offsets[shard], self._files[shard].get_slice("samples")
+        first = index * (2 + PRIORS)
+        parts = [
+            values[int(offsets[first + k]) : int(offsets[first + k + 1])].numpy().tobytes() for k in range(2 + PRIORS)
+        ]
+        image = cv2.imdecode(np.frombuffer(parts[0], np.uint8), cv2.IMREAD_COLOR)
+        assert image is not None
+        shape = *image.shape[:2], SURFACE_CHANNELS
+        truth, *priors = (np.frombuffer(zlib.decompress(part), np.int8).reshape(shape) for part in parts[1:])
+        return image, truth, np.stack(priors)
+
+
+def make_cache(
+    folder: Path, config: TrainingConfig, progress: Callable[[int, int], None] = lambda done, total: None
+) -> None:
+    """Make the missing shards of a folder with `config.workers` processes.
+
+    Args:
+        progress: called with the numbers of finished and of all images.
+    """
+    wanted = shards(config.cached)
+    missing = [index for index in range(wanted) if not _path(folder, index).exists()]
+    progress((wanted - len(missing)) * SHARD, wanted * SHARD)
+    make = partial(_make, folder, config)
+    with ExitStack() as stack:
+        if missing and config.workers:
+            pool = stack.enter_context(multiprocessing.get_context("spawn").Pool(config.workers, _prepare))
+            made = pool.imap_unordered(make, missing)
+        else:
+            made = map(make, missing)
+        for done, _ in enumerate(made, start=wanted - len(missing) + 1):
+            progress(done * SHARD, wanted * SHARD)
+
+
+def shards(images: int) -> int:
+    """Number of shards of a number of images."""
+    return -(-images // SHARD)
+
+
+def _path(folder: Path, index: int) -> Path:
+    return folder / f"images-{index:05d}.safetensors"
+
+
+def _prepare() -> None:
+    torch.set_num_threads(1)
+    cv2.setNumThreads(1)
+    os.nice(_NICENESS)
+
+
+_ROBOTS: dict[Path, Robot] = {}
+
+
+def _make(folder: Path, config: TrainingConfig, index: int) -> None:
+    for path in config.robots:
+        if path not in _ROBOTS:
+            _ROBOTS[path] = Robot.load(path)
+    generator = SurfaceGenerator([_ROBOTS[path] for path in config.robots], config.images, (config.seed, 2, index))
+    parts: list[bytes] = []
+    for number in range(SHARD):
+        samples = generator.samples(number, PRIORS)
+        parts += _encoded(samples)
+    offsets = np.cumsum([0, *map(len, parts)])
+    tensors = {
+        "samples": torch.frombuffer(bytearray(b"".join(parts)), dtype=torch.uint8),
+        "offsets": torch.from_numpy(offsets),
+    }
+    write_bytes(output_path(folder, _path(folder, index).name), tensor_bytes(tensors, {}))
+
+
+def augmented(rng: np.random.Generator, image: np.ndarray) -> np.ndarray:
+    """Image uint8 with other contrast, exposure and white balance; sometimes grey."""
+    values = image.astype(np.float32)
+    mean = values.mean((0, 1), keepdims=True)
+    values = mean + (values - mean) * np.float32(rng.uniform(*_CONTRAST))
+    values *= (rng.uniform(*_EXPOSURE) * np.clip(rng.normal(1, _TINT, 3), 0.8, 1.2)).astype(np.float32)
+    if rng.random() < _GREY:
+        values = np.repeat(values.mean(2, keepdims=True), 3, 2)
+    return np.clip(values + 0.5, 0, 255).astype(np.uint8)
+
+
+def _encoded(samples: list[SurfaceSample]) -> list[bytes]:
+    image = cv2.imencode(".png", samples[0].observed, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1].tobytes()
+    maps = [samples[0].surface, *(sample.given for sample in samples)]
+    return [image, *(zlib.compress(np.ascontiguousarray(each).tobytes(), 1) for each in maps)]

@@ -1,0 +1,186 @@
+"""Surface network: a pretrained encoder, conditioned on the surface map of the measured kinematics, and a decoder.
+
+The encoder is EfficientNet-Lite0 up to stride 16, trained on ImageNet; its batch norms are folded into the
+convolutions. The measured kinematics have errors of a few degrees but provide a prior pose, which the network corrects.
+"""
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn import functional
+
+from ..model.parts import COVERAGE, PARTS, SURFACE_CHANNELS
+from ..settings import Architecture, SurfaceArchitecture
+from ..threads import one_thread
+from .network import ImageNetwork, UNet
+
+_CLASSES = len(PARTS) + 1
+_OUTPUTS = _CLASSES + 3
+_PRIOR = 3.0
+"""Initial log odds of a pixel that the prior surface map assigns to a class."""
+
+
+@dataclass(frozen=True)
+class SurfaceLogits:
+    """Predicted surface map with coverage as logits; see `carts_core.model.parts`."""
+
+    coverage: Float[Tensor, "batch parts+1 h w"]
+    """Log odds of background and of each part."""
+    normals: Float[Tensor, "batch 3 h w"]
+    """Mean unit normals times coverage."""
+
+    @one_thread()
+    def map(self) -> Float[Tensor, "batch 6 h w"]:
+        """Surface map, with coverage as probabilities."""
+        return torch.cat([self.coverage.softmax(1)[:, 1:], self.normals], 1)
+
+
+STAGES = ((1, 16, 1, 1, 3), (6, 24, 2, 2, 3), (6, 40, 2, 2, 5), (6, 80, 3, 2, 3), (6, 112, 3, 1, 5))
+"""Expansion, channels, blocks, stride of the first block and kernel size of each stage of EfficientNet-Lite0 (Tan and
+Le 2019, without squeeze-and-excitation) up to stride 16."""
+STEM = 32
+"""Channels of the stem, at stride 2."""
+
+
+class InvertedResidual(nn.Module):
+    """Block of EfficientNet-Lite: expansion, depthwise convolution and projection."""
+
+    def __init__(self, inputs: int, outputs: int, expansion: int, kernel: int, stride: int) -> None:
+        super().__init__()
+        middle = inputs * expansion
+        self.expand = nn.Conv2d(inputs, middle, 1) if expansion > 1 else None
+        self.depthwise = nn.Conv2d(middle, middle, kernel, stride, kernel // 2, groups=middle)
+        self.project = nn.Conv2d(middle, outputs, 1)
+        self._skips = inputs == outputs and stride == 1
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Features of the next block."""
+        y = x if self.expand is None else functional.relu6(self.expand(x))
+        y = self.project(functional.relu6(self.depthwise(y)))
+        return x + y if self._skips else y
+
+
+class Encoder(nn.Module):
+    """EfficientNet-Lite0 up to stride 16, with folded batch norms."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.stem = nn.Conv2d(3, STEM, 3, 2, 1)
+        self.stages = nn.ModuleList()
+        inputs = STEM
+        for expansion, outputs, blocks, stride, kernel in STAGES:
+            stage = nn.Sequential()
+            for block in range(blocks):
+                first = block == 0
+                stage.append(
+                    InvertedResidual(inputs if first else outputs, outputs, expansion, kernel, stride if first else 1)
+                )
+            self.stages.append(stage)
+            inputs = outputs
+
+
+class SurfaceNetwork(ImageNetwork):
+    """Surface network on the pretrained encoder."""
+
+    kind: ClassVar[str] = "surface"
+    architecture: SurfaceArchitecture
+
+    def __init__(self, architecture: SurfaceArchitecture | None = None) -> None:
+        super().__init__()
+        self.architecture = architecture or SurfaceArchitecture()
+        at2, at4, at8, at16 = self.architecture.decoder
+        prior2, prior4, prior8 = self.architecture.conditioning
+        of2, of4, of8, _, of16 = (stage[1] for stage in STAGES)
+        self.encoder = Encoder()
+        self.prior = nn.ModuleList(
+            _strided(*pair) for pair in ((SURFACE_CHANNELS, prior2), (prior2, prior4), (prior4, prior8))
+        )
+        self.conditioning = nn.ModuleList([nn.Conv2d(prior4, of4, 1), nn.Conv2d(prior8, of8, 1)])
+        for layer in self.conditioning.parameters():
+            nn.init.zeros_(layer)  # The pretrained encoder starts unconditioned.
+        widths = ((at16, of16, 0), (at8, of8, prior8), (at4, of4, prior4), (at2, of2, prior2))
+        self.skips = nn.ModuleList(nn.Conv2d(features, width, 1, bias=False) for width, features, _ in widths)
+        self.priors = nn.ModuleList(nn.Conv2d(prior, width, 1, bias=False) for width, _, prior in widths[1:])
+        self.reduce = nn.ModuleList(nn.Conv2d(*pair, 1, bias=False) for pair in ((at16, at8), (at8, at4), (at4, at2)))
+        counts = reversed(self.architecture.convolutions)
+        self.decoder = nn.ModuleList(_refining(width, n) for (width, _, _), n in zip(widths, counts, strict=True))
+        # Four pixels per position at stride 2.
+        self.out = nn.Conv2d(at2, 4 * _OUTPUTS, 1)
+        self.gain = nn.Parameter(torch.tensor([_PRIOR] * _CLASSES + [1.0] * 3).view(1, _OUTPUTS, 1, 1))
+
+    def forward(self, images: Float[Tensor, "batch 3 h w"], given: Float[Tensor, "batch 6 h w"]) -> SurfaceLogits:
+        """Predict surface maps of images.
+
+        Args:
+            images: RGB in [0, 1]; h and w are multiples of `architecture.stride`.
+            given: surface maps of the prior poses; zero without prior.
+
+        Raises:
+            SettingsError: the number of channels or the size is not allowed.
+        """
+        self.check_input(images, 3)
+        stage2, stage4, stage8, *deep = self.encoder.stages
+        prior2 = self.prior[0](given)
+        prior4 = self.prior[1](prior2)
+        prior8 = self.prior[2](prior4)
+        at2 = stage2(functional.relu6(self.encoder.stem(2 * images - 1)))
+        at4 = stage4(at2) + self.conditioning[0](prior4)
+        at8 = x = stage8(at4) + self.conditioning[1](prior8)
+        for stage in deep:
+            x = stage(x)
+        x = self.decoder[0](self.skips[0](x))
+        for level, (features, prior) in enumerate(((at8, prior8), (at4, prior4), (at2, prior2))):
+            grown = functional.interpolate(self.reduce[level](x), scale_factor=2, mode="bilinear", align_corners=False)
+            x = self.decoder[level + 1](grown + self.skips[level + 1](features) + self.priors[level](prior))
+        with one_thread():
+            empty = 1 - given[:, COVERAGE].sum(1, keepdim=True)
+            out = functional.pixel_shuffle(self.out(x), 2) + self.gain * torch.cat([empty, given], 1)
+        return SurfaceLogits(out[:, :_CLASSES], out[:, _CLASSES:])
+
+
+def _strided(inputs: int, outputs: int) -> nn.Sequential:
+    """Convolution of stride 2."""
+    convolution = nn.Conv2d(inputs, outputs, 3, 2, 1, bias=False)
+    return nn.Sequential(convolution, nn.BatchNorm2d(outputs), nn.ReLU(inplace=True))
+
+
+def _refining(channels: int, convolutions: int) -> nn.Sequential:
+    layers: list[nn.Module] = []
+    for _ in range(convolutions):
+        convolution = nn.Conv2d(channels, channels, 3, padding=1, bias=False)
+        layers += [convolution, nn.BatchNorm2d(channels), nn.ReLU(inplace=True)]
+    return nn.Sequential(*layers)
+
+
+_HIDDEN = 24
+
+
+class UNetSurface(UNet):
+    """Surface network of earlier versions, whose weights are still read: a U-Net on a standardised image and the prior
+    surface map.
+    """
+
+    kind: ClassVar[str] = "surface"
+
+    def __init__(self, architecture: Architecture | None = None) -> None:
+        super().__init__(architecture or Architecture(), 3 + SURFACE_CHANNELS)
+        fine, coarse = self.architecture.widths[:2]
+        self.coarse = nn.Conv2d(coarse, _HIDDEN, 3, padding=1)
+        self.fine = nn.Conv2d(fine, _HIDDEN, 1)
+        self.out = nn.Conv2d(_HIDDEN, _OUTPUTS, 1)
+
+    def forward(self, images: Float[Tensor, "batch 3 h w"], given: Float[Tensor, "batch 6 h w"]) -> SurfaceLogits:
+        """Predict surface maps of images. Arguments and errors as `SurfaceNetwork.forward`."""
+        fine, coarse = self.decoded(torch.cat([self.standardized(images), given], 1))
+        grown = functional.interpolate(self.coarse(coarse), scale_factor=2, mode="bilinear", align_corners=False)
+        hidden = (grown + self.fine(fine)).relu()
+        with one_thread():
+            out = self.out(hidden)
+        return SurfaceLogits(out[:, :_CLASSES], out[:, _CLASSES:])
+
+
+AnySurfaceNetwork = SurfaceNetwork | UNetSurface
+"""A surface network of this version or of earlier ones."""

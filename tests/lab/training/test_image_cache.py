@@ -1,0 +1,79 @@
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from carts_core.errors import SettingsError, WeightsError
+from carts_core.lab.randomization import SurfaceGenerator
+from carts_core.lab.training import cache
+from carts_core.lab.training.cache import ImageCache, augmented, make_cache
+from carts_core.lab.training.loader import training_batches
+from carts_core.lab.training.training import train
+from carts_core.model.robot import Robot
+from carts_core.settings import ImageSettings, SurfaceArchitecture, TrainingConfig
+
+SMALL = SurfaceArchitecture(decoder=(4, 4, 4, 4), conditioning=(4, 4, 4))
+
+
+@pytest.fixture(autouse=True)
+def small_shards(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cache, "SHARD", 4)
+
+
+def config(folder: Path, **changes) -> TrainingConfig:
+    images = ImageSettings(width=64, height=48, field_width=80, things=0.0, absent=0.0)
+    values: dict[str, Any] = {"network": "surface", "images": images, "surface_architecture": SMALL, "cache": folder}
+    values |= {"batch_size": 4, "steps": 12, "warmup": 2, "workers": 0, "threads": 1, "validation_samples": 2}
+    return TrainingConfig(**{**values, "cached": 8, **changes})
+
+
+def test_a_cache_holds_what_the_generator_makes_and_is_made_once(tmp_path: Path, shipped_psm: Robot):
+    settings, progress = config(tmp_path), []
+    make_cache(tmp_path, settings, lambda done, total: progress.append((done, total)))
+    assert progress == [(0, 8), (4, 8), (8, 8)]
+    kept = ImageCache(tmp_path, 2)
+    assert len(kept) == 8
+    generator = SurfaceGenerator([shipped_psm], settings.images, (settings.seed, 2, 1))
+    for number in (5, 4):
+        samples = generator.samples(number - 4, cache.PRIORS)
+        image, truth, priors = kept[number]
+        np.testing.assert_array_equal(image, samples[0].observed)
+        np.testing.assert_array_equal(truth, samples[0].surface)
+        np.testing.assert_array_equal(priors, [sample.given for sample in samples])
+    before = {path: path.stat().st_mtime_ns for path in tmp_path.iterdir()}
+    (tmp_path / "images-00001.safetensors").unlink()
+    make_cache(tmp_path, settings)
+    after = {path: path.stat().st_mtime_ns for path in tmp_path.iterdir()}
+    assert after.keys() == before.keys() and sum(after[path] != before[path] for path in after) == 1
+
+
+def test_a_damaged_shard_is_named_with_the_remedy(tmp_path: Path):
+    (tmp_path / "images-00000.safetensors").write_bytes(b"half a file")
+    with pytest.raises(WeightsError, match=r"images-00000.* cannot be read .*Delete it"):
+        ImageCache(tmp_path, 1)
+
+
+def test_a_surface_network_learns_from_a_cache_and_goes_on_with_the_same_batches(tmp_path: Path):
+    settings = config(tmp_path / "images")
+    losses: list[float] = []
+    train(settings, tmp_path / "run", lambda event: losses.append(event.loss))
+    assert losses[-1] < losses[0]
+    with training_batches(settings, 0) as first, training_batches(settings, 3) as later:
+        for _ in range(3):
+            next(first)
+        for one, same in zip(next(first), next(later), strict=True):
+            assert one.shape[0] == 4 and one.equal(same)
+
+
+def test_a_cache_is_refused_for_the_feature_network(tmp_path: Path):
+    with pytest.raises(SettingsError, match="surface network only"):
+        config(tmp_path, network="feature")
+
+
+def test_other_colours_leave_shapes_alone():
+    image = np.zeros((40, 60, 3), np.uint8)
+    image[10:30, 20:40] = 200, 120, 60
+    for seed in range(5):
+        changed = augmented(np.random.default_rng(seed), image).astype(int).sum(2)
+        assert len(np.unique(changed)) == 2 and (changed[10:30, 20:40] > changed[0, 0]).all()
