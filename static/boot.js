@@ -23,7 +23,7 @@
   }
 
   // viser's client runs `Function(source)()` for a RunJavascriptMessage, which would need `unsafe-eval` in the policy. The
-  // server sends the name of a function and its arguments as JSON instead (`call` in tab_page.py). Any other source does
+  // server sends the name of a function and its arguments as JSON instead (`call` in transport/page.py). Any other source does
   // nothing: viser's sorter of Gaussian splats, which is not used here, prepares some when it is loaded.
   const inert = () => inert;
   const receive = (source) => {

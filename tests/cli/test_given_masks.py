@@ -146,7 +146,7 @@ def test_what_does_not_go_together_or_is_not_there_is_refused(
     sequence: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     command, masks = ("evaluate", str(sequence)), ("--observe", "masks")
-    assert "--masks painted needs --observe masks or both" in refusal(capsys, *command, "--masks", "painted")
+    assert "--masks painted requires --observe masks or both" in refusal(capsys, *command, "--masks", "painted")
     absent = f"{tmp_path / 'x.carts'}:painted"
     assert f"--masks {absent} is missing" in refusal(capsys, *command, *masks, "--masks", absent)
     missing = str(tmp_path / "missing")

@@ -5,6 +5,7 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
+from ...files import output_path, write_text
 from ...model.robot import Robot
 
 _REACH = (0.25, 1.3)
@@ -18,9 +19,9 @@ _LIMIT = 2.6
 def random_chain(rng: np.random.Generator) -> Robot:
     """Random serial robot with a gripper or a plain tool."""
     with TemporaryDirectory(prefix="carts-chain-") as folder:
-        path = Path(folder) / "chain.urdf"
-        path.write_text(_urdf(rng), encoding="utf-8")
-        return Robot.load(path)
+        path = output_path(Path(folder), "chain.urdf")
+        write_text(path, _urdf(rng))
+        return Robot.load(path.path)
 
 
 def _urdf(rng: np.random.Generator) -> str:

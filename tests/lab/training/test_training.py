@@ -142,7 +142,7 @@ def test_weights_of_another_network_are_refused(tmp_path: Path, small_weights: P
 
 def test_a_broken_checkpoint_is_named_with_the_remedy(tmp_path: Path):
     (tmp_path / CHECKPOINT_FILE).write_bytes(b"half a file")
-    with pytest.raises(WeightsError, match=r"checkpoint\.safetensors cannot be read.*Delete the file"):
+    with pytest.raises(WeightsError, match=r"checkpoint\.safetensors is not a readable checkpoint.*Delete the file"):
         train(small_config(), tmp_path)
 
 

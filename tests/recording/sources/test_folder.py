@@ -237,8 +237,8 @@ MUTATIONS: dict[str, tuple[Callable[[Path], object], dict, str]] = {
     "wrong column": (lambda folder: None, {"columns": {"yaw": "q9"}}, "has no column 'q9'. It has: image"),
     "fisheye": (rewrite("left.yaml", "plumb_bob", "equidistant"), {}, "distortion model 'equidistant'"),
     "broken YAML": (rewrite("left.yaml", "{rows", "{{{{rows"), {}, "cannot be used"),
-    "nested lists": (write("left.yaml", "camera_matrix: " + "[" * 50_000), {}, "levels deep"),
-    "nested dashes": (write("left.yaml", "camera_matrix:\n  " + "- " * 50_000), {}, "levels deep"),
+    "nested lists": (write("left.yaml", "camera_matrix: " + "[" * 50_000), {}, "nested more than 32 deep"),
+    "nested dashes": (write("left.yaml", "camera_matrix:\n  " + "- " * 50_000), {}, "nested more than 32 deep"),
     "no matrix": (rewrite("left.yaml", "data:", "values:"), {}, "cannot be used"),
     "other size": (rewrite("left.yaml", "image_height: 72", "image_height: 20"), {}, "another aspect ratio"),
     "missing folder": (
