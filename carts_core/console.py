@@ -67,7 +67,7 @@ class Terminal(Console):
 
 
 class PlainColumn(TextColumn):
-    """A column of a progress bar without markup."""
+    """Progress-bar column whose text is not parsed as markup."""
 
     def render(self, task: Task) -> Text:
         """Text of a task."""

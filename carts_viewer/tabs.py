@@ -49,7 +49,7 @@ class IntentQueue(Generic[T]):
         self._woken = False
 
     def put(self, tab: T, intent: Intent) -> None:
-        """Add an intent, in place of a waiting one of the same tab and key."""
+        """Add an intent; it replaces a pending one with the same tab and key."""
         with self._changed:
             key = object() if intent.key is None else (tab, intent.key)
             # Removed first, so that the newest version is queued behind earlier requests.

@@ -279,7 +279,7 @@ def open_regular(path: Path, kind: Kind) -> BufferedReader:
 
 
 def check_regular(path: Path, kind: Kind) -> None:
-    """Check a file like `open_regular`, for a library that opens it by its path."""
+    """Apply the checks of `open_regular` to a file that a library opens by its path."""
     open_regular(path, kind).close()
 
 

@@ -118,7 +118,7 @@ class _Recovery:
     """Thumbnail of its frame."""
     measurement: Future[Measurement]
     dropped: threading.Event
-    """Set to cancel it."""
+    """Event that cancels the attempt when set."""
 
 
 class LiveTracker:

@@ -21,7 +21,7 @@ from .layers import IgnoreRegion, ImportedMask, Layer, MaskCorrection, PartLabel
 _Choice = TypeVar("_Choice", bound=StrEnum)
 
 LONGEST_NOTE = 10_000
-"""Largest length of a note [characters]."""
+"""Maximum length of a note [characters]."""
 
 
 class Source(StrEnum):

@@ -48,7 +48,7 @@ class Prompt:
 
 
 class Segmenter(Protocol):
-    """Protocol of segmenters, which segment the object of a prompt."""
+    """Protocol of promptable segmenters."""
 
     def segment(self, image: UInt8[np.ndarray, "height width 3"], prompt: Prompt) -> Bool[np.ndarray, "height width"]:
         """Mask of the object.

@@ -551,13 +551,13 @@ class ImportMasks(Intent):
     place: str
     """Path of the file or folder; relative to the sequence's folder, or absolute in an allowed one."""
     camera: str | None = None
-    """Camera of the masks; None: by the names of the files."""
+    """Camera of the masks; None to infer it from the file names."""
     replace: bool = False
     """Whether layers that were imported before may be replaced."""
 
 
 class SetFilter(Intent):
-    """Change one condition; `FrameFilter` has their names."""
+    """Set one condition of the frame filter, named as in `FrameFilter`."""
 
     keyed_by = ("name",)
     name: str

@@ -90,7 +90,7 @@ class ReviewPanel:
 
 
 def _dot(name: str) -> str:
-    """Swatch of a `review_name`."""
+    """HTML colour swatch of a review state, named as by `review_name`."""
     return f'<span class="carts-swatch" style="background: {_COLORS[name]}"></span>'
 
 
