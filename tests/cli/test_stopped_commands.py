@@ -101,7 +101,7 @@ def test_a_stopped_optimization_keeps_what_it_says_and_ends_as_if_it_had_not_bee
     assert (said and mode == "sequence") or int(said[1]) == check_results(folder) >= 1  # pyright: ignore
     assert run(stopped, number=signal.SIGKILL, sign=sign)[0] == -signal.SIGKILL
     status, printed = run(stopped)
-    assert status == 0 and ("already there" in printed if mode == "frame" else "resumed an earlier run" in printed), (
+    assert status == 0 and ("already done" in printed if mode == "frame" else "resumed an earlier run" in printed), (
         printed
     )
     assert contents(tmp_path / "stopped") == contents(tmp_path / "whole")
