@@ -409,11 +409,20 @@
   let grabbed = false;
   let pressing = false; // whether a button of the mouse is down
   // A drag takes the focus from a field; its release is reported with the drag's, or it would end the drag early.
+  let pending = null; // timer of a release that is not reported yet
   const letGo = () => {
     if (!grabbed) return;
     grabbed = false;
-    setTimeout(() => { if (pressing) grabbed = true; else report("Released"); }, HELD_BACK);
+    clearTimeout(pending);
+    pending = setTimeout(() => { pending = null; if (pressing) grabbed = true; else report("Released"); }, HELD_BACK);
   };
+  // Typing into a field begins another edit, which the release of the previous control must not end.
+  window.addEventListener("beforeinput", () => {
+    if (pending === null) return;
+    clearTimeout(pending);
+    pending = null;
+    report("Released");
+  }, { capture: true });
   window.addEventListener("pointerdown", (event) => {
     pressing = true;
     grabbed ||= event.target instanceof Element && event.target.closest(".mantine-Slider-root") !== null;
