@@ -130,6 +130,7 @@
       /** Invalidate the curve after a change of its values. */
       forget() { asked = ""; },
       loaded: () => [...pictures.keys()],
+      idle: () => !loading.size && !waiting.length,
       curve: () => curve,
     },
     setTrace(message) { curve = message; drawAgain(); },

@@ -13,6 +13,7 @@
   const [PICTURES, CURVE] = [38, 36]; // heights of the parts omitted in low windows [px]
   const TALL = 560; // least height of a window that shows them [px]
   const LEAST = 8; // visible frames at the largest zoom
+  const CONFIRMED_WITHIN = 1000; // time after which the server's range is taken even if it is not the reported one [ms]
   const GRIP = 7; // distance within which an end of the range can be grabbed [px]
 
   let strip = null;
@@ -161,9 +162,17 @@
   }
 
   let rangeTimer = null;
+  let unconfirmed = null; // timer while the server's range may be older than the reported one
   function mark(first, last) {
     range = [Math.min(first, last), Math.max(first, last)];
     rangeTimer ??= setTimeout(tellRange, 40);
+  }
+
+  /** Take over the server's range, except during a drag and until the server has answered the latest report. */
+  function takeRange() {
+    if (dragging === "range" || unconfirmed !== null) return;
+    range = shown.range;
+    dirty = true;
   }
 
   /** Report a changed range: at once on release, so that it cannot override later changes. */
@@ -172,6 +181,8 @@
     clearTimeout(rangeTimer);
     rangeTimer = null;
     window.carts.report("SetRange", { frames: range });
+    clearTimeout(unconfirmed);
+    unconfirmed = setTimeout(() => { unconfirmed = null; takeRange(); }, CONFIRMED_WITHIN);
   }
 
   function move(event) {
@@ -368,7 +379,11 @@
   document.addEventListener("carts-page", ({ detail }) => {
     dirty = true;
     shown = detail;
-    if (dragging !== "range") range = detail.range;
+    if (unconfirmed !== null && String(range) === String(detail.range)) {
+      clearTimeout(unconfirmed);
+      unconfirmed = null;
+    }
+    takeRange();
     if (detail.frame === here) return;
     here = detail.frame;
     const count = view[1] - view[0];

@@ -102,6 +102,7 @@ def test_the_timeline_shows_status_thumbnails_a_curve_and_a_range(open_viewer: O
     assert shown[0] < 30 < shown[1]
     # Zoomed in, those in view alone are asked for, and no picture twice.
     for first in (20, 40):
+        wait_in(page, "carts.lanes.idle()")
         asked.clear()
         page.evaluate(f"carts.showFrames({first}, 8)")
         loaded = f"carts.lanes.loaded().map((at) => +at.match(/[0-9]+(?=.jpg)/)).filter((at) => at >= {first})"
