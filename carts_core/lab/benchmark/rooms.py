@@ -2,6 +2,7 @@
 
 import dataclasses
 import zlib
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable
 from collections.abc import Sequence as Items
 from dataclasses import dataclass
@@ -292,7 +293,7 @@ _GAIN, _NOISE = 0.03, 1.5
 """Largest relative change of brightness between frames [1], and sensor noise [grey levels]."""
 
 
-class AlteredSequence:
+class AlteredSequence(ABC):
     """Base class of sequences whose images are altered in memory and that define their own domains."""
 
     def __init__(self, sequence: Sequence) -> None:
@@ -303,13 +304,13 @@ class AlteredSequence:
     def __len__(self) -> int:
         return len(self._sequence)
 
+    @abstractmethod
     def frame(self, index: int, domain: str | None = None, cameras: Iterable[str] | None = None) -> Frame:
         """Frame with its images in a domain, by default the first one."""
-        raise NotImplementedError
 
+    @abstractmethod
     def mean_background(self, camera: str, domain: str | None = None) -> MeanBackground:
         """Mean background and the pixels where it is known."""
-        raise NotImplementedError
 
     def background(self, camera: str, domain: str | None = None) -> UInt8[np.ndarray, "h w 3"]:
         """Mean background in a domain."""
