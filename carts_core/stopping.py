@@ -179,7 +179,7 @@ def finished_first() -> Iterator[None]:
 
 
 @contextmanager
-def when_stopped(what_is_kept: Callable[[], str] | str) -> Iterator[None]:
+def message_if_stopped(what_is_kept: Callable[[], str] | str) -> Iterator[None]:
     """Attach a note on the partial results to `Stopped`, which the command prints."""
     try:
         yield

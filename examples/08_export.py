@@ -10,7 +10,7 @@ import numpy as np
 import tyro
 from pycocotools.coco import COCO
 
-from carts_core.export import Dataset, ExportFrame, Monitor, export
+from carts_core.export import Dataset, ExportFrame, ExportProgress, export
 from carts_core.networks import FeatureExtractor
 from carts_core.optimization import FrameOptimizer
 from carts_core.process import tune_process
@@ -33,8 +33,8 @@ def main(frames: int = 2, output: Path = Path("exported"), picture: Path = Path(
     sequence, extractor = Sequence.open(sample_sequence()), FeatureExtractor.load()
     rows = tuple(corrected(sequence, index, extractor) for index in range(frames))
     dataset = Dataset(sequence, rows, sequence.scene, sequence.domains[0])
-    monitor = Monitor(lambda done, total: print(f"{done} of {total} views"))
-    folder = export(dataset, "coco", output / "coco", overwrite=True, monitor=monitor)
+    progress = ExportProgress(lambda done, total: print(f"{done} of {total} views"))
+    folder = export(dataset, "coco", output / "coco", overwrite=True, progress=progress)
     table = export(dataset, "csv", output / "kinematics.csv", overwrite=True)
     print(f"wrote {folder} and {table}")
 

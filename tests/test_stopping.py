@@ -13,14 +13,14 @@ import pytest
 from processes import command, descendants, eventually
 
 from carts_core.rendering.rasterizer import rasterize
-from carts_core.stopping import Stopped, exit_status, finished_first, message, stopped_by_signals, when_stopped
+from carts_core.stopping import Stopped, exit_status, finished_first, message, message_if_stopped, stopped_by_signals
 
 SIGNALS = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP]
 
 
 @pytest.mark.parametrize("number", SIGNALS)
 def test_each_signal_stops_with_the_status_that_shells_have_for_it(number: signal.Signals) -> None:
-    with pytest.raises(Stopped) as stop, stopped_by_signals(), when_stopped("2 of 3 frames are kept"):
+    with pytest.raises(Stopped) as stop, stopped_by_signals(), message_if_stopped("2 of 3 frames are kept"):
         os.kill(os.getpid(), number)
     assert exit_status(stop.value) == 128 + number
     by = "interrupted" if number == signal.SIGINT else f"stopped by {number.name}"

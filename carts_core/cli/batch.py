@@ -10,7 +10,7 @@ import tyro
 from ..console import Bar, Terminal
 from ..errors import CartsError
 from ..settings.ranges import Count, Range
-from ..stopping import when_stopped
+from ..stopping import message_if_stopped
 from ..wording import counted
 from .options import RangedOptions, output_folder
 
@@ -80,7 +80,7 @@ class Batch(RangedOptions):
         import os
 
         from ..batch.engines import Pool
-        from ..imports import needs_extra
+        from ..package_imports import require_package
         from .batch_job import BatchWork, with_project
 
         work = BatchWork(folder, self.again, _inference(folder), self.project)
@@ -88,7 +88,7 @@ class Batch(RangedOptions):
         if self.scheduler is None:
             engine = Pool(work, workers, self.threads)
         else:
-            needs_extra("distributed", "cluster")
+            require_package("distributed", "cluster")
             from ..batch.engines import Cluster
 
             engine = Cluster(work, self.scheduler, workers, self.threads)
@@ -97,7 +97,7 @@ class Batch(RangedOptions):
             console.print(f"{counts_of}; see the logs for counts; --project none uses the measured joints")
         failed, counts = {}, Counter()
         kept = f"{folder} holds the finished jobs; rerun the command to resume"
-        with when_stopped(kept), Bar(console=console) as bar:
+        with message_if_stopped(kept), Bar(console=console) as bar:
             task = bar.add_task("jobs", total=len(jobs))
             for outcome in engine.run(jobs):
                 counts[outcome.status] += 1

@@ -12,7 +12,7 @@ from ..console import Bar, Terminal
 from ..errors import SettingsError
 from ..settings import CALIBRATION, FreeParameters
 from ..settings.serialization import to_plain
-from ..stopping import when_stopped
+from ..stopping import message_if_stopped
 from .options import CalibrationOptions, Observing, Selection, SequencePath, output_folder
 
 if TYPE_CHECKING:
@@ -201,7 +201,10 @@ class Calibrate:
         known_cameras = [name for name in cameras if prior is not None and name not in prior.free_cameras]
         free = replace(self.free, locked_cameras=tuple(dict.fromkeys((*self.free.locked_cameras, *known_cameras))))
         observer.check(sequence, indices, cameras, [self.domain])
-        with when_stopped(f"nothing was written to {output}"), published(output, overwrite=self.overwrite) as folder:
+        with (
+            message_if_stopped(f"nothing was written to {output}"),
+            published(output, overwrite=self.overwrite) as folder,
+        ):
             frames = [observer.completed(sequence.frame(index, self.domain, cameras)) for index in indices]
             domain = self.domain or sequence.domains[0]
             backgrounds = None if observer.masked else Backgrounds.of(sequence, cameras, domain)

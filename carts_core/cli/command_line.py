@@ -16,7 +16,7 @@ import tyro
 
 from ..console import Terminal, log_to_stderr
 from ..errors import CartsError, SettingsError
-from ..imports import uncollected
+from ..package_imports import gc_paused
 from ..settings import DescentSolver, SequenceSettings, SurfaceSolver
 from ..settings.serialization import described
 from ..settings.stages import Stage
@@ -111,7 +111,7 @@ def main(arguments: list[str] | None = None) -> None:
         if not isinstance(command, _AT_ONCE):
             # Imports may take seconds on a busy machine.
             Terminal(stderr=True).print(f"carts {arguments[0]}: starting", style="dim")
-        with uncollected():
+        with gc_paused():
             from ..process import tune_process
 
         log_to_stderr()

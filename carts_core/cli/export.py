@@ -9,7 +9,7 @@ import tyro
 from ..console import Bar, Terminal, track
 from ..errors import SettingsError
 from ..settings import FormatName, Images, Parts
-from ..stopping import when_stopped
+from ..stopping import message_if_stopped
 from ..wording import counted
 from .options import FromProject, Perturbation, Selection, SequencePath, output_folder
 
@@ -47,7 +47,10 @@ class Render:
         folder = output_folder(self.output, sequence.name, "render")
         frames = self.select.frame_indices(sequence)
         sequence = self.source.corrected(sequence, frames, console)
-        with locked_folder(folder), when_stopped(f"the pictures in {folder} are complete files; others are missing"):
+        with (
+            locked_folder(folder),
+            message_if_stopped(f"the pictures in {folder} are complete files; others are missing"),
+        ):
             for domain in self.select.domain_names(sequence):
                 for camera in self.select.camera_names(sequence.scene):
                     renderer = Renderer(sequence.scene, cameras=[camera])
@@ -95,7 +98,7 @@ class Export:
 
     def run(self) -> None:
         """Write the export; no files are left after Ctrl-C or an error."""
-        from ..export import FORMATS, Dataset, Monitor, export
+        from ..export import FORMATS, Dataset, ExportProgress, export
         from ..recording import Sequence
 
         console = Terminal()
@@ -116,9 +119,9 @@ class Export:
         )
         with Bar(console=console) as bar:
             task = bar.add_task(f"{self.format}, {counted(len(frames), 'frame')}", total=None)
-            monitor = Monitor(lambda done, total: bar.update(task, completed=done, total=total))
-            with when_stopped(f"nothing was written to {self.output}"):
-                path = export(dataset, self.format, self.output, overwrite=self.overwrite, monitor=monitor)
+            progress = ExportProgress(lambda done, total: bar.update(task, completed=done, total=total))
+            with message_if_stopped(f"nothing was written to {self.output}"):
+                path = export(dataset, self.format, self.output, overwrite=self.overwrite, progress=progress)
         if FORMATS[self.format].images and self.images != "none" and dataset.remade_cameras:
             cameras_named = ", ".join(dataset.remade_cameras)
             reason = "they are undistorted, cropped, rotated, or from a video or bag, so labels match no recorded file"

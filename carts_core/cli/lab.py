@@ -13,7 +13,7 @@ from ..files import output_path
 from ..settings import SynthesisConfig, TrainingConfig
 from ..settings.ranges import Count
 from ..settings.training import BaselineNetwork, BaselineTraining
-from ..stopping import when_stopped
+from ..stopping import message_if_stopped
 from ..wording import counted
 from .options import Network, RangedOptions, check_device, output_folder
 
@@ -37,7 +37,7 @@ class Synthesize:
 
         with Bar() as bar:
             task = bar.add_task("synthesizing", total=None)
-            with when_stopped("finished frames are kept beside the output; rerun the command to resume"):
+            with message_if_stopped("finished frames are kept beside the output; rerun the command to resume"):
                 path = synthesize(
                     self.synthesis,
                     self.output,
@@ -145,7 +145,7 @@ class Baseline:
         def say(line: str) -> None:
             console.print(line, soft_wrap=True)
 
-        with when_stopped(f"{self.output} holds the state of the training; rerun the command to resume"):
+        with message_if_stopped(f"{self.output} holds the state of the training; rerun the command to resume"):
             frames = prepare_frames(output_path(self.frames), self.training, say)
             result = train_baseline(self.network, self.training, frames, self.output, say)
         say(f"weights: {result.weights}\n{result.steps} steps, Dice {result.dice:.3f} on validation frames")
@@ -210,7 +210,7 @@ class Bench:
             )
         stages, hand_eye = folder / "stages.json", folder / "hand_eye.json"
         if not self.report_only:
-            with when_stopped(f"{results.path} holds the finished measurements; rerun the command to resume"):
+            with message_if_stopped(f"{results.path} holds the finished measurements; rerun the command to resume"):
                 benchmark.run(console)
                 measure_stages(stages, extractor)
                 measure_hand_eye(hand_eye, extractor, scope.hand_eye_starts, console.print)

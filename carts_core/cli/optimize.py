@@ -9,7 +9,7 @@ import tyro
 
 from ..console import Terminal, track
 from ..errors import SettingsError
-from ..stopping import when_stopped
+from ..stopping import message_if_stopped
 from ..wording import counted
 from .options import (
     FreeInFrames,
@@ -108,7 +108,7 @@ class Evaluate:
             given=observer.given,
         )
         total = len(frames) * len(cameras) * len(domains)
-        with when_stopped("nothing was written"):
+        with message_if_stopped("nothing was written"):
             scores = list(track(found, "optimizing", total=total, console=console))
         console.print(score_table(scores, f"{sequence.name}: {counted(len(frames), 'frame')}, means"))
         print_hints(console, self.network.caution)

@@ -36,7 +36,7 @@ from ..recording import Sequence
 from ..rendering import Renderer
 from ..settings import SurfaceSolver
 from ..settings.serialization import to_plain
-from ..stopping import finished_first, when_stopped
+from ..stopping import finished_first, message_if_stopped
 from ..wording import counted
 from .options import RECORDING, Observer, OptimizeOptions, check_writable, output_folder
 from .printing import (
@@ -353,7 +353,7 @@ class Optimizing:
             for part in parts:
                 held.enter_context(part.output.held())
             for part in parts:
-                with when_stopped(lambda part=part: self._kept(part)):
+                with message_if_stopped(lambda part=part: self._kept(part)):
                     self._run(part)
 
     def _part(self, domain: str, cameras: tuple[str, ...]) -> _Part:

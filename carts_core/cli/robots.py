@@ -10,7 +10,7 @@ from rich.table import Column, Table
 
 from ..console import Terminal, track
 from ..errors import RobotError
-from ..stopping import when_stopped
+from ..stopping import message_if_stopped
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,10 @@ class Robots:
         from ..model.robot import Robot
         from ..rendering.portrait import portrait
 
-        with locked_folder(folder), when_stopped(f"the pictures in {folder} are complete files; others are missing"):
+        with (
+            locked_folder(folder),
+            message_if_stopped(f"the pictures in {folder} are complete files; others are missing"),
+        ):
             for name in track(names, "pictures", console=console):
                 write_bytes(folder / f"{name}.png", image_png(portrait(Robot.load(SCHEME + name))))
         console.print(f"wrote {folder}")

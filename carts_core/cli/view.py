@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import tyro
 
 from ..errors import SettingsError
-from ..imports import uncollected
+from ..package_imports import gc_paused
 from .options import Network
 
 
@@ -38,7 +38,7 @@ class View:
 
     def run(self) -> None:
         """Serve until Ctrl-C."""
-        with uncollected():
+        with gc_paused():
             from carts_viewer.serving import serve, serve_site
 
             from ..batch.folder import is_batch

@@ -6,7 +6,7 @@ from ..settings import Parts as Parts
 from .dataset import Dataset as Dataset
 from .dataset import ExportCancelled as ExportCancelled
 from .dataset import ExportFrame as ExportFrame
-from .dataset import Monitor as Monitor
+from .dataset import ExportProgress as ExportProgress
 from .dataset import corrected_frames as corrected_frames
 from .dataset import measured_frames as measured_frames
 from .dataset import project_frame as project_frame

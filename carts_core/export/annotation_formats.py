@@ -25,15 +25,15 @@ from ..model.keypoints import Keypoint, keypoints, project_keypoints
 from ..model.scene import Arm, SceneState
 from ..rendering.rasterizer import link_transforms, rasterize, vertices_in_camera
 from ..settings import Parts
-from .dataset import Category, Dataset, Monitor, View
+from .dataset import Category, Dataset, ExportProgress, View
 from .encodings import bounding_box, coco_rle, label_png, mask_png, polygons, row_runs
 
 _KINDS: tuple[Parts, ...] = ("arms", "parts", "links")
 
 
-def write_masks(dataset: Dataset, folder: OutputPath, monitor: Monitor) -> None:
+def write_masks(dataset: Dataset, folder: OutputPath, progress: ExportProgress) -> None:
     """Write PNG masks into `binary`, `arms`, `parts` and `links`; `labels.json` maps pixel values to categories."""
-    for view in dataset.views(monitor):
+    for view in dataset.views(progress):
         if dataset.images == "copied":
             dataset.write_image_as(view, folder / "images", view.name)
         write_bytes(folder / "binary" / f"{view.name}.png", mask_png(view.link_ids >= 0))
@@ -48,7 +48,7 @@ def write_masks(dataset: Dataset, folder: OutputPath, monitor: Monitor) -> None:
 Annotation = dict[str, Any]
 
 
-def write_coco(dataset: Dataset, folder: OutputPath, monitor: Monitor) -> None:
+def write_coco(dataset: Dataset, folder: OutputPath, progress: ExportProgress) -> None:
     """Write the dataset in COCO format, with lossless masks."""
 
     def annotations(view: View) -> Iterable[Annotation]:
@@ -56,7 +56,7 @@ def write_coco(dataset: Dataset, folder: OutputPath, monitor: Monitor) -> None:
             yield mask_annotation(view, category.id, mask)
 
     categories = [{"id": c.id, "name": c.name, "supercategory": c.arm} for c in dataset.categories]
-    write_annotations(dataset, folder, monitor, "instances", categories, annotations)
+    write_annotations(dataset, folder, progress, "instances", categories, annotations)
 
 
 def mask_annotation(view: View, category_id: int, mask: Bool[ndarray, "height width"]) -> Annotation:
@@ -74,7 +74,7 @@ def mask_annotation(view: View, category_id: int, mask: Bool[ndarray, "height wi
 def write_annotations(
     dataset: Dataset,
     folder: OutputPath,
-    monitor: Monitor,
+    progress: ExportProgress,
     kind: str,
     categories: list[dict[str, Any]],
     annotate: Callable[[View], Iterable[Annotation]],
@@ -87,7 +87,7 @@ def write_annotations(
         annotate: returns the annotations of a view, without ids.
     """
     images, annotations = [], []
-    for view in dataset.views(monitor):
+    for view in dataset.views(progress):
         images.append(
             {
                 "id": view.id,
@@ -116,7 +116,7 @@ _OUTSIDE, _HIDDEN, _VISIBLE = 0, 1, 2
 """Visibility flags of COCO: not labelled, labelled but not visible, labelled and visible."""
 
 
-def write_coco_keypoints(dataset: Dataset, folder: OutputPath, monitor: Monitor) -> None:
+def write_coco_keypoints(dataset: Dataset, folder: OutputPath, progress: ExportProgress) -> None:
     """Write keypoints, mask and box of every arm in COCO format, with one category per arm."""
     points = {arm.name: keypoints(arm) for arm in dataset.scene.arms}
 
@@ -126,7 +126,7 @@ def write_coco_keypoints(dataset: Dataset, folder: OutputPath, monitor: Monitor)
 
     categories = [_category(category, points[category.arm]) for category in dataset.arms]
     # CVAT and Datumaro expect "person" in the name for any kind of object.
-    write_annotations(dataset, folder, monitor, "person_keypoints", categories, annotations)
+    write_annotations(dataset, folder, progress, "person_keypoints", categories, annotations)
 
 
 def _category(category: Category, points: tuple[Keypoint, ...]) -> dict[str, Any]:
@@ -179,7 +179,7 @@ def _xml(root: ElementTree.Element) -> bytes:
     return ElementTree.tostring(root, encoding="utf-8")
 
 
-def write_cvat(dataset: Dataset, folder: OutputPath, monitor: Monitor) -> None:
+def write_cvat(dataset: Dataset, folder: OutputPath, progress: ExportProgress) -> None:
     """Write the dataset in CVAT format, with lossless masks."""
     labels = [{"name": category.name, "type": "mask", "attributes": ""} for category in dataset.categories]
     task = {
@@ -189,7 +189,7 @@ def write_cvat(dataset: Dataset, folder: OutputPath, monitor: Monitor) -> None:
         "labels": {"label": labels},
     }
     root = _element("annotations", {"version": "1.1", "meta": {"task": task}})
-    for view in dataset.views(monitor):
+    for view in dataset.views(progress):
         size = {"width": str(view.camera.width), "height": str(view.camera.height)}
         name = dataset.write_image(view, folder / "images")
         image = ElementTree.SubElement(root, "image", {"id": str(view.id - 1), "name": name, **size})
@@ -206,10 +206,10 @@ _IMAGE = 2
 """Datumaro's media type of still images."""
 
 
-def write_datumaro(dataset: Dataset, folder: OutputPath, monitor: Monitor) -> None:
+def write_datumaro(dataset: Dataset, folder: OutputPath, progress: ExportProgress) -> None:
     """Write the dataset in Datumaro format, with lossless masks."""
     items = []
-    for view in dataset.views(monitor):
+    for view in dataset.views(progress):
         file = dataset.write_image(view, folder / "images" / "default")
         annotations = [
             {
@@ -239,11 +239,11 @@ _MOST_CATEGORIES = 254
 """Largest number of categories; 0 is the background and 255 is VOC's void."""
 
 
-def write_voc(dataset: Dataset, folder: OutputPath, monitor: Monitor) -> None:
+def write_voc(dataset: Dataset, folder: OutputPath, progress: ExportProgress) -> None:
     """Write the dataset in Pascal VOC format, with lossless label images; images keep their file format."""
     if len(dataset.categories) > _MOST_CATEGORIES:
         raise CartsError(f"Pascal VOC holds {_MOST_CATEGORIES} categories, not {len(dataset.categories)}. Export COCO.")
-    for view in dataset.views(monitor):
+    for view in dataset.views(progress):
         stem = dataset.stems[view.id - 1]
         file = dataset.write_image_as(view, folder / "JPEGImages", stem)
         objects = np.zeros(view.link_ids.shape, np.uint8)
@@ -307,9 +307,9 @@ truncation (Ultralytics).
 """
 
 
-def write_yolo(dataset: Dataset, folder: OutputPath, monitor: Monitor) -> None:
+def write_yolo(dataset: Dataset, folder: OutputPath, progress: ExportProgress) -> None:
     """Write the dataset in YOLO format; each connected visible region of an arm is an object."""
-    for view in dataset.views(monitor):
+    for view in dataset.views(progress):
         stem = dataset.stems[view.id - 1]
         dataset.write_image_as(view, folder / "images", stem)
         size = (view.camera.width, view.camera.height)
@@ -342,7 +342,7 @@ class _Object:
     """Mesh in the link frame [mm]."""
 
 
-def write_bop(dataset: Dataset, folder: OutputPath, monitor: Monitor) -> None:
+def write_bop(dataset: Dataset, folder: OutputPath, progress: ExportProgress) -> None:
     """Write the dataset in BOP format: 6D poses and masks of all links in the camera's field of view, and models.
 
     There is one scene per camera (`test/000001` etc.). Each link of an arm is an object, since BOP objects are rigid.
@@ -354,7 +354,7 @@ def write_bop(dataset: Dataset, folder: OutputPath, monitor: Monitor) -> None:
     folders = {
         camera.name: folder / "test" / f"{number:06d}" for number, camera in enumerate(dataset.scene.cameras, start=1)
     }
-    for view in dataset.views(monitor):
+    for view in dataset.views(progress):
         place, image = folders[view.camera.name], str(view.frame.index)
         scene = scenes[view.camera.name]
         scene["scene_camera"][image] = _bop_camera(dataset, view)

@@ -151,7 +151,7 @@ class ExportCancelled(CartsError):
 
 
 @dataclass(frozen=True)
-class Monitor:
+class ExportProgress:
     """Progress and cancellation of an export."""
 
     progress: Callable[[int, int], None] | None = None
@@ -282,13 +282,13 @@ class Dataset:
         """The scene at a frame's joint positions and camera poses."""
         return self.scene.state(frame.joint_positions, mounts=self.sequence.mounts(frame.index))
 
-    def views(self, monitor: Monitor) -> Iterator[View]:
-        """Yield the labelled views of all frames and cameras, one `monitor` step each.
+    def views(self, progress: ExportProgress) -> Iterator[View]:
+        """Yield the labelled views of all frames and cameras, one `progress` step each.
 
         Raises:
             CartsError: a mask does not have its camera's image size, or has pixels far from any arm.
         """
-        for number, (name, frame, camera) in enumerate(monitor.track(self.steps), start=1):
+        for number, (name, frame, camera) in enumerate(progress.track(self.steps), start=1):
             rendered = self.renderers[camera.name].segment_links(self.state(frame))[0]
             mask, painted = frame.masks.get(camera.name), frame.part_labels.get(camera.name)
             where, link_ids = f"frame {frame.frame_id}, camera {camera.name}", rendered

@@ -25,7 +25,7 @@ from .annotation_formats import (
     write_voc,
     write_yolo,
 )
-from .dataset import Dataset, ExportFrame, Monitor
+from .dataset import Dataset, ExportFrame, ExportProgress
 from .kinematics import JOINED, joint_columns, joint_units, kinematics_csv, position_values, std_values
 from .video import write_video
 
@@ -40,12 +40,12 @@ def _camera_poses(dataset: Dataset, frames: Sequence[ExportFrame]) -> dict[str, 
     }
 
 
-def write_kinematics_csv(dataset: Dataset, path: OutputPath, monitor: Monitor) -> None:
+def write_kinematics_csv(dataset: Dataset, path: OutputPath, progress: ExportProgress) -> None:
     """Write a CSV table for `read_kinematics_csv` and `carts export --kinematics`."""
-    write_text(path, kinematics_csv(dataset.scene, monitor.track(dataset.frames)))
+    write_text(path, kinematics_csv(dataset.scene, progress.track(dataset.frames)))
 
 
-def write_kinematics_npz(dataset: Dataset, path: OutputPath, monitor: Monitor) -> None:
+def write_kinematics_npz(dataset: Dataset, path: OutputPath, progress: ExportProgress) -> None:
     """Write a NumPy archive (NPZ) without pickled objects.
 
     Arrays: `frame_id`, `source`, `verdict` (of the mask, empty if not assessed), `not_determined` (joints not
@@ -53,7 +53,7 @@ def write_kinematics_npz(dataset: Dataset, path: OutputPath, monitor: Monitor) -
     `joint_positions` and `joint_std` [frames, columns] in the unit given by `unit`; unknown `joint_std` is NaN. If
     cameras move, `T_camera_world` [frames, cameras, 4, 4] [m] contains their poses, and `camera` their names.
     """
-    frames = list(monitor.track(dataset.frames))
+    frames = list(progress.track(dataset.frames))
     moving, poses = _camera_poses(dataset, frames), {}
     if moving:
         poses = {"camera": np.array(list(moving)), "T_camera_world": np.stack([*moving.values()], 1)}
@@ -73,7 +73,7 @@ def write_kinematics_npz(dataset: Dataset, path: OutputPath, monitor: Monitor) -
         )
 
 
-def write_kinematics_json(dataset: Dataset, path: OutputPath, monitor: Monitor) -> None:
+def write_kinematics_json(dataset: Dataset, path: OutputPath, progress: ExportProgress) -> None:
     """Write JSON: the unit of every `ARM.JOINT`, then the frames with positions and standard deviations, null if
     unknown."""
     columns, moving = joint_columns(dataset.scene), _camera_poses(dataset, dataset.frames)
@@ -91,7 +91,7 @@ def write_kinematics_json(dataset: Dataset, path: OutputPath, monitor: Monitor) 
             },
             **({"T_camera_world": {name: Ts[place].tolist() for name, Ts in moving.items()}} if moving else {}),
         }
-        for place, frame in enumerate(monitor.track(dataset.frames))
+        for place, frame in enumerate(progress.track(dataset.frames))
     ]
     content = {
         "sequence": dataset.sequence.name,
@@ -102,7 +102,10 @@ def write_kinematics_json(dataset: Dataset, path: OutputPath, monitor: Monitor) 
 
 
 def _write_base_frames(
-    entry: Callable[[str, list[list[float]]], dict[str, Any]], dataset: Dataset, path: OutputPath, monitor: Monitor
+    entry: Callable[[str, list[list[float]]], dict[str, Any]],
+    dataset: Dataset,
+    path: OutputPath,
+    progress: ExportProgress,
 ) -> None:
     """Write the base frames of all arms relative to the first exported camera, in dVRK axes."""
     camera = dataset.scene.cameras[0]
@@ -113,7 +116,7 @@ def _write_base_frames(
         )
     arms = [
         {"name": arm.name, **entry(camera.name, (T_DVRK_OPENCV @ camera.T_camera_world @ arm.T_world_base).tolist())}
-        for arm in monitor.track(dataset.scene.arms)
+        for arm in progress.track(dataset.scene.arms)
     ]
     write_text(path, json.dumps({"arms": arms}, indent=1, ensure_ascii=False))
 
@@ -132,7 +135,7 @@ class ExportFormat:
 
     label: str
     """Label of the format."""
-    write: Callable[[Dataset, OutputPath, Monitor], None]
+    write: Callable[[Dataset, OutputPath, ExportProgress], None]
     """Function that writes the file or folder."""
     suffix: str = ""
     """Suffix of the file; empty for a folder."""
@@ -165,7 +168,7 @@ def export(
     output: OutputPath | Path,
     *,
     overwrite: bool = False,
-    monitor: Monitor | None = None,
+    progress: ExportProgress | None = None,
 ) -> Path:
     """Write a dataset in a format; the output is replaced atomically.
 
@@ -174,13 +177,13 @@ def export(
         name: one of `FORMATS`.
         output: folder or file to create. A file gets the format's suffix if it has another one.
         overwrite: replace a file, or a folder written by an export.
-        monitor: progress and cancellation.
+        progress: progress and cancellation.
 
     Returns:
         Path of the output.
 
     Raises:
-        ExportCancelled: cancelled by the monitor.
+        ExportCancelled: cancelled by the progress.
         CartsError: the output exists or cannot be written, or required data is missing.
     """
     chosen = FORMATS[name]
@@ -188,10 +191,10 @@ def export(
         if Path(output).suffix.lower() != chosen.suffix:
             output = output.parent / (output.name + chosen.suffix)
         with published_file(output, overwrite=overwrite) as path:
-            chosen.write(dataset, path, monitor or Monitor())
+            chosen.write(dataset, path, progress or ExportProgress())
         return Path(output)
     with published(output, overwrite=overwrite) as path:
-        chosen.write(dataset, path, monitor or Monitor())
+        chosen.write(dataset, path, progress or ExportProgress())
         write_text(path / MARKER, _summary(dataset, name))
     return Path(output)
 

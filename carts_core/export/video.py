@@ -12,7 +12,7 @@ from jaxtyping import Bool, UInt8
 from ..files import OutputPath, output_stream, unique_file_names
 from ..model.scene import SceneState
 from ..rendering import Renderer
-from .dataset import Dataset, Monitor, View
+from .dataset import Dataset, ExportProgress, View
 
 _CONTOUR = (80, 255, 120)
 
@@ -50,7 +50,7 @@ _OPACITY = 0.5
 _QUALITY = {"crf": "18", "preset": "medium"}
 
 
-def write_video(dataset: Dataset, folder: OutputPath, monitor: Monitor) -> None:
+def write_video(dataset: Dataset, folder: OutputPath, progress: ExportProgress) -> None:
     """Write `CAMERA.mp4` for every camera."""
     rate = Fraction(frame_rate(dataset)).limit_denominator(1001)
     cameras = dataset.scene.cameras
@@ -65,7 +65,7 @@ def write_video(dataset: Dataset, folder: OutputPath, monitor: Monitor) -> None:
             stream.width, stream.height = camera.width + camera.width % 2, camera.height + camera.height % 2
             stream.pix_fmt = "yuv420p"
             streams[camera.name] = container, stream
-        for view in dataset.views(monitor):
+        for view in dataset.views(progress):
             container, stream = streams[view.camera.name]
             picture = av.VideoFrame.from_ndarray(_padded(_picture(dataset, view)), format="rgb24")
             container.mux(stream.encode(picture))

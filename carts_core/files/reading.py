@@ -24,7 +24,7 @@ from xml.etree import ElementTree
 import msgspec
 
 from ..errors import CartsError
-from ..imports import needs_extra, uncollected
+from ..package_imports import gc_paused, require_package
 from ..wording import shortened
 
 PNG = b"\x89PNG\r\n\x1a\n"
@@ -332,7 +332,7 @@ def parse_json(text: str | bytes, *, finite: bool = True) -> Any:
     if parts > MOST_JSON_PARTS:
         raise ValueError(f"it has more than {MOST_JSON_PARTS:,} arrays and objects")
     try:
-        with uncollected():
+        with gc_paused():
             values = json.loads(text)
             _check_values(values)
             if finite and not all_finite(values):
@@ -349,7 +349,7 @@ def parse_yaml(text: str) -> Any:
         ValueError: it is not YAML, has aliases or merge keys, or exceeds the limits of this module.
         CartsError: the YAML package is not installed.
     """
-    needs_extra("yaml", "import")
+    require_package("yaml", "import")
     import yaml  # noqa: PLC0415
 
     parser: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)

@@ -59,7 +59,7 @@ class Window:
             and self.top + self.height >= other.top + other.height
         )
 
-    def common(self, other: "Window") -> "Window | None":
+    def intersection(self, other: "Window") -> "Window | None":
         """Intersection with another window; None if it is empty."""
         left, top = max(self.left, other.left), max(self.top, other.top)
         right = min(self.left + self.width, other.left + other.width)

@@ -14,7 +14,7 @@ from xml.etree import ElementTree
 from ..errors import RobotError
 from ..files.decoding import decoded
 from ..files.reading import CALIBRATION, MESH, LfsPointerError, open_regular, parse_yaml, read_text
-from ..imports import needs_extra
+from ..package_imports import require_package
 from ..wording import counted
 from .meshes import mesh_path
 from .psm_kinematics import CLASSIC, SI
@@ -123,7 +123,7 @@ def dvrk_urdf(model: Path, number: str, folder: Path) -> str:
 
 
 def _expanded(model: Path, chosen: Instrument) -> str:
-    needs_extra("xacrodoc", "import")
+    require_package("xacrodoc", "import")
     arm = model / "urdf" / chosen.generation / "PSM1.urdf.xacro"
     options = {"instrument": chosen.number, "show_rcm": "false", "is_virtual": "true"}
     try:

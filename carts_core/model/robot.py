@@ -18,13 +18,13 @@ from torch import Tensor
 
 from ..errors import RobotError
 from ..files.reading import ROBOT, is_regular, read_text
-from ..imports import deferred
+from ..package_imports import deferred_import
 from ..wording import listed, shown
 from . import mesh_cache
 from .instruments import robot_file
 from .meshes import MOST_KEPT, Decimation, LinkMesh, build_link_meshes, collada_asset, load_visual, mesh_path
 
-with deferred("matplotlib", "pyplot"):  # needed only to plot its solvers; 0.2 s
+with deferred_import("matplotlib", "pyplot"):  # needed only to plot its solvers; 0.2 s
     import pytorch_kinematics
 
 NO_LIMIT = 1e3

@@ -33,7 +33,7 @@ from .hand_eye.result import PoseDeviation
 from .observation import Backgrounds
 from .predictor import SurfacePredictor, predictor_of
 from .stages import Fit, Point, StopReason, run_stages
-from .variables import APART, Variables
+from .variables import DIFFERENCE_SPAN, Variables
 from .verdict import Assessment, Verdict, assess_calibration, check_domain, without_knowledge, worse_in
 
 
@@ -367,7 +367,7 @@ class CalibrationOptimizer:
                 Ts = (around.T_camera_world[:, index] @ around.T_world_base[:, number]).double().cpu().numpy()
                 turns = Rotation.from_matrix(Ts[:, :3, :3] @ Ts[0, :3, :3].T).as_rotvec()
                 below, above = np.split(np.hstack([turns, Ts[:, :3] @ middle])[1:], 2)
-                J = (above - below).T / APART
+                J = (above - below).T / DIFFERENCE_SPAN
                 found[arm.name, camera.name] = PoseDeviation.of(J @ covariance @ J.T)
         return found
 

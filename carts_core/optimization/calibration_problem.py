@@ -216,10 +216,10 @@ class CalibrationProblem:
         evaluations = [part.evaluate(offsets, part.own, stage, gradient=gradient) for part in self._parts]
         models, outlines = [], []
         for evaluation, part in zip(evaluations, self._parts, strict=True):
-            if evaluation.hessian is not None and evaluation.common is not None:
+            if evaluation.hessian is not None and evaluation.outline_gradient is not None:
                 own = len(part.own)
                 models.append(eliminate(evaluation.gradient, evaluation.hessian, own))
-                outlines.append(eliminate(evaluation.common, evaluation.hessian, own).gradient)
+                outlines.append(eliminate(evaluation.outline_gradient, evaluation.hessian, own).gradient)
         combined = self._combined(offsets, evaluations, models, outlines)
         self._losses = combined.frame_losses
         # The solver, and with it the frames' own unknowns, steps from the best point so far.

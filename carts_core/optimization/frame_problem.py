@@ -304,11 +304,13 @@ class FrameProblem:
     def uncertainty_after(self, offsets: Float[Tensor, " n"], evaluation: Evaluation) -> Uncertainty | None:
         """Standard deviations at the end of a fit, from a nearby evaluation with a gradient."""
         known = evaluation.uncertainty
-        if evaluation.hessian is None or evaluation.common is None or known is None:
+        if evaluation.hessian is None or evaluation.outline_gradient is None or known is None:
             return None
         start_share = 0.0 if self.predictor.masked else self.settings.start_share
         moved = offsets - self.prior.mean
-        later = uncertainty_after(self.variables, self.prior, evaluation.hessian, evaluation.common, moved, start_share)
+        later = uncertainty_after(
+            self.variables, self.prior, evaluation.hessian, evaluation.outline_gradient, moved, start_share
+        )
         return known.rescaled(later)
 
     @torch.no_grad()
@@ -317,13 +319,13 @@ class FrameProblem:
         model."""
         factor = self.factor(stage)
         others = reduce(add, (other.linearize(offsets) for other in self._other_factors))
-        slope, hessian, common, known = torch.zeros_like(offsets), None, None, None
+        slope, hessian, outline_gradient, known = torch.zeros_like(offsets), None, None, None
         if gradient:
             surface = factor.linearize(offsets)
             compared, total = surface.comparison, others + surface
             slope, hessian = total.gradient, total.hessian
-            common = self.settings.outline_error * surface.outline
-            known = uncertainty(self.variables, self.prior, hessian, common)
+            outline_gradient = self.settings.outline_error * surface.outline
+            known = uncertainty(self.variables, self.prior, hessian, outline_gradient)
         else:
             compared = factor.compare(offsets)
         shown, final = factor, compared
@@ -339,7 +341,7 @@ class FrameProblem:
             stage_loss=self._loss(factor, compared),
             gradient=slope,
             hessian=hessian,
-            common=common,
+            outline_gradient=outline_gradient,
             uncertainty=known,
             image=paste(final.rendering.image, empty[:, None].repeat(1, 3, 1, 1)),
             silhouette=paste(coverage, empty.clone()),

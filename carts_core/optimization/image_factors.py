@@ -38,7 +38,7 @@ from ..settings.stages import AlignEdges, Descend
 from ..threads import one_thread, total
 from .factors import Linearization, bounded_step
 from .observation import Observation
-from .variables import APART, Variables
+from .variables import DIFFERENCE_SPAN, Variables
 
 _REDUCTIONS = (1, 2, 4, 8)
 """Allowed reductions of the observed images in a factor [1]."""
@@ -120,7 +120,7 @@ class SurfaceFactor:
     def linearize(self, offsets: Float[Tensor, " n"]) -> "SurfaceLinearization":
         """The quadratic model around a point, and the comparison there."""
         around: SceneState = self._variables.around(offsets)
-        rendering = self.renderer.surface(around, APART, 1 + kernel_radius(self._blur))
+        rendering = self.renderer.surface(around, DIFFERENCE_SPAN, 1 + kernel_radius(self._blur))
         model, squared, ratio = self._difference(rendering.maps)
         comparison = self._comparison(rendering, squared, ratio)
         residual = self._observed - model
@@ -176,7 +176,7 @@ class SurfaceFactor:
             windows.append(window)
             blocks.append((block.unknowns, values))
         for (a, (mine, first)), (b, (others, second)) in combinations(zip(windows, blocks, strict=True), 2):
-            common = a.common(b)
+            common = a.intersection(b)
             if common is None:
                 continue
             ours = (common.inside(a).of(first) * common.of(weight)).flatten(1)
@@ -377,7 +377,7 @@ class LocalEdgeFactor:
 
     def __init__(self, factor: EdgeFactor, offsets: Float[Tensor, " n"], counts: Tensor, weight: float) -> None:
         self._factor, self._counts, self._weight = factor, counts, weight
-        self._tangents = factor.renderer.tangents(factor.variables.around(offsets), APART)
+        self._tangents = factor.renderer.tangents(factor.variables.around(offsets), DIFFERENCE_SPAN)
         self._render(offsets)
 
     def _render(self, offsets: Tensor) -> None:

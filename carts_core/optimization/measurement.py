@@ -57,7 +57,7 @@ class Measurement:
 
 
 @dataclass(frozen=True)
-class SolvedAlone:
+class SingleFrameFit:
     """Result of the single-frame solver."""
 
     correction: Float[np.ndarray, " n"]
@@ -164,13 +164,13 @@ class FrameSolver:
         end = self.warm(frame, variables, expected, _double(fit.reached.offsets))
         return replace(end, iterations=fit.used + end.iterations)
 
-    def alone(self, frame: Frame, variables: Variables) -> SolvedAlone | None:
+    def run_frame_stages(self, frame: Frame, variables: Variables) -> SingleFrameFit | None:
         """Run the stages of the settings, like `FrameOptimizer`; None if nothing is evaluated."""
         fit = self._run(frame, variables, None, self._settings.stages, np.zeros(len(variables)))
         if fit.best is None:
             return None
         found, used = fit.best.evaluation, fit.used
-        return SolvedAlone(_double(fit.best.offsets), found.uncertainty, found.loss, used, fit.assessment)
+        return SingleFrameFit(_double(fit.best.offsets), found.uncertainty, found.loss, used, fit.assessment)
 
     @_checkpointed
     def at(self, frame: Frame, variables: Variables, expected: Gaussian, correction: np.ndarray) -> Measurement:
@@ -319,7 +319,9 @@ class FrameEstimate:
         known = assessment.of(self.uncertainty)
         return replace(self, assessment=assessment, uncertainty=known, joint_std=_joint_std(known, scene))
 
-    def solved_alone(self, scene: Scene, variables: Variables, found: SolvedAlone, seconds: float) -> "FrameEstimate":
+    def with_single_frame_fit(
+        self, scene: Scene, variables: Variables, found: SingleFrameFit, seconds: float
+    ) -> "FrameEstimate":
         """Estimate whose values are replaced by those of the single-frame solver.
 
         Args:

@@ -112,15 +112,15 @@ def joint_words(undetermined: Sequence[str] | None) -> str:
 
 
 def uncertainty(
-    variables: Variables, prior: Prior, curvature: Float[Tensor, "n n"], common: Float[Tensor, " n"]
+    variables: Variables, prior: Prior, curvature: Float[Tensor, "n n"], outline_gradient: Float[Tensor, " n"]
 ) -> Uncertainty | None:
     """Uncertainty under the prior of the settings, from the curvature of an objective in units of its noise.
 
     Args:
         prior: prior of the offsets, before the image was used.
         curvature: J^T J / noise^2 and the prior's precision, per offset.
-        common: change of the gradient for one standard deviation of an error common to all pixels. It does not average
-            out, so its effect is added to that of the noise, up to the prior.
+        outline_gradient: change of the gradient for one standard deviation of an error common to all outlines. This
+            error does not average out, so its effect is added to that of the noise, up to the prior.
 
     Returns:
         The uncertainty; None if the prior does not constrain an unknown.
@@ -128,14 +128,14 @@ def uncertainty(
     if not (prior.precision.diagonal() > 0).all():
         return None
     covariance = torch.linalg.inv(curvature.double())
-    return _uncertainty(variables, prior, covariance, covariance @ common.double())
+    return _uncertainty(variables, prior, covariance, covariance @ outline_gradient.double())
 
 
 def uncertainty_after(
     variables: Variables,
     prior: Prior,
     curvature: Float[Tensor, "n n"],
-    common: Float[Tensor, " n"],
+    outline_gradient: Float[Tensor, " n"],
     moved: Float[Tensor, " n"],
     start_share: float,
 ) -> Uncertainty:
@@ -156,15 +156,19 @@ def uncertainty_after(
     scale = expected_scale(moved, information, precision, start_share)
     left = inverse @ (precision + start_share * information)
     covariance = scale**2 * left @ torch.linalg.inv(precision) @ left.T + inverse @ information @ inverse
-    return _uncertainty(variables, prior, covariance, inverse @ common.double(), scale)
+    return _uncertainty(variables, prior, covariance, inverse @ outline_gradient.double(), scale)
 
 
 def _uncertainty(
-    variables: Variables, prior: Prior, covariance: Float[Tensor, "n n"], common: Float[Tensor, " n"], scale: float = 1
+    variables: Variables,
+    prior: Prior,
+    covariance: Float[Tensor, "n n"],
+    outline_shift: Float[Tensor, " n"],
+    scale: float = 1,
 ) -> Uncertainty:
     scales = variables.scales.double()
     expected = scale * prior.marginal_precision.double().rsqrt() * scales
-    std = (covariance.diagonal().clamp(min=0) + common.square()).sqrt() * scales
+    std = (covariance.diagonal().clamp(min=0) + outline_shift.square()).sqrt() * scales
     return Uncertainty(tuple(variables.names), tuple(std.minimum(expected).tolist()), tuple(expected.tolist()))
 
 
@@ -225,5 +229,5 @@ class Evaluation:
     """Similarity per pixel, at most 1; 1 where nothing was compared."""
     attention: Float[Tensor, "cameras h w"]
     """Weight of each pixel, in [0, 1]."""
-    common: Float[Tensor, " n"] | None = field(default=None, kw_only=True)
-    """Change of the gradient for one standard deviation of an error common to all pixels; None without a Hessian."""
+    outline_gradient: Float[Tensor, " n"] | None = field(default=None, kw_only=True)
+    """Change of `gradient` for one standard deviation of an error common to all outlines; None without a Hessian."""

@@ -264,7 +264,7 @@ class SequenceOptimizer:
         if self.stop_reason is not None:
             return None
         while self._initial_queue:
-            if (alone := self._solve_alone(self._initial_queue.pop(0))) is not None:
+            if (alone := self._solve_initial(self._initial_queue.pop(0))) is not None:
                 return alone
         if self._queue:
             return self._visit(self._queue.pop(0))
@@ -308,7 +308,7 @@ class SequenceOptimizer:
         for estimate in failed if not self._keyframes and self._free.joints_only else ():
             began = time.perf_counter()
             frame, variables = self._open(estimate.index)
-            alone = self._solver.alone(frame, variables)
+            alone = self._solver.run_frame_stages(frame, variables)
             seconds = time.perf_counter() - began
             verdict = alone and alone.assessment and alone.assessment.verdict
             if alone is None or alone.uncertainty is None or verdict in (None, Verdict.FAILED):
@@ -316,7 +316,7 @@ class SequenceOptimizer:
                 yield replace(estimate, seconds=estimate.seconds + seconds)
             else:
                 in_vain = 0
-                yield estimate.solved_alone(self._scene, variables, alone, seconds)
+                yield estimate.with_single_frame_fit(self._scene, variables, alone, seconds)
             if in_vain == _IN_VAIN:
                 return
 
@@ -334,7 +334,7 @@ class SequenceOptimizer:
                     kept[index] = replace(measured, assessment=assessment, seconds=kept[index].seconds)
         self._estimates = kept
 
-    def _solve_alone(self, index: int) -> FrameEstimate | None:
+    def _solve_initial(self, index: int) -> FrameEstimate | None:
         """Measure a frame alone; None if it cannot be used, which is reported when it is visited."""
         began = time.perf_counter()
         try:

@@ -18,7 +18,7 @@ from .factors import Prior
 STEP = 1e-3
 """Step of central differences: offset of each of the two neighbouring states [rad]."""
 
-APART = 2 * STEP
+DIFFERENCE_SPAN = 2 * STEP
 """Distance between the two neighbouring states [rad]."""
 
 

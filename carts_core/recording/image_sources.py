@@ -19,7 +19,7 @@ from jaxtyping import UInt8
 from ..decoders import bags
 from ..errors import SequenceError
 from ..files.decoding import Limits, acquire, release
-from ..imports import needs_extra
+from ..package_imports import require_package
 from .images import ImageSource, decode_image
 
 BAG_SUFFIXES = (".bag", ".mcap", ".db3")
@@ -80,7 +80,7 @@ class Bag:
     """
 
     def __init__(self, path: Path) -> None:
-        needs_extra("rosbags", "import")
+        require_package("rosbags", "import")
         if not path.exists():
             raise SequenceError(f"bag {path} is missing. Restore it, or correct the path.")
         self.path = path

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Generic, TypeVar
 
 from carts_core.errors import CartsError, SettingsError
-from carts_core.export import FORMATS, Dataset, Monitor, Parts, export, mask_png, project_frame
+from carts_core.export import FORMATS, Dataset, ExportProgress, Parts, export, mask_png, project_frame
 from carts_core.files import OutputPath, file_name, output_path
 from carts_core.project import ProjectState, ReviewState, frames_in, import_annotations
 from carts_core.project.state import calibrated_scene
@@ -109,7 +109,7 @@ class ExportingHandler(Handler):
         make, count = self._dataset(intent)
         target = free_path(self._session.editor.project.path, _STEMS.get(intent.format, intent.format), intent)
         self._intent = intent
-        self._job = CooperativeThread(lambda monitor: export(make(monitor), intent.format, target, monitor=monitor))
+        self._job = CooperativeThread(lambda progress: export(make(progress), intent.format, target, progress=progress))
         self._context.change(export=ExportState(FORMATS[intent.format].label, count), error=None)
 
     def _on_CancelExport(self, intent: intents.CancelExport) -> None:
@@ -123,7 +123,7 @@ class ExportingHandler(Handler):
 
     # ---- The export ------------------------------------------------------------------------------------------------
 
-    def _dataset(self, intent: intents.Export) -> tuple[Callable[[Monitor], Dataset], int]:
+    def _dataset(self, intent: intents.Export) -> tuple[Callable[[ExportProgress], Dataset], int]:
         """A function that builds the dataset from the present project, and its number of frames."""
         state, session = self._context.state, self._session
         view = session.editor.view
@@ -137,8 +137,8 @@ class ExportingHandler(Handler):
         scene = calibrated_scene(session.scene, view).with_cameras(cameras)
         renderer, sequence, images = self._context.renderer, session.sequence, "copied" if intent.images else "named"
 
-        def make(monitor: Monitor) -> Dataset:
-            indices = Monitor(cancelled=monitor.cancelled).track(chosen)
+        def make(progress: ExportProgress) -> Dataset:
+            indices = ExportProgress(cancelled=progress.cancelled).track(chosen)
             frames = tuple(project_frame(sequence, view, index, cameras, renderer.mask) for index in indices)
             return Dataset(sequence, frames, scene, state.domain, parts=intent.parts, images=images)
 
@@ -260,7 +260,7 @@ T = TypeVar("T")
 
 
 class CooperativeThread(Generic[T]):
-    """Runs a function that checks a `Monitor` between its steps.
+    """Runs a function that checks a `ExportProgress` between its steps.
 
     The function has a thread of its own, but runs only while `advance` waits for it, so shared data need no lock.
 
@@ -269,7 +269,7 @@ class CooperativeThread(Generic[T]):
         total: all steps; 0 until the first is done.
     """
 
-    def __init__(self, function: Callable[[Monitor], T]) -> None:
+    def __init__(self, function: Callable[[ExportProgress], T]) -> None:
         self.done, self.total = 0, 0
         self._function = function
         self._go, self._back = threading.Semaphore(0), threading.Semaphore(0)
@@ -304,7 +304,7 @@ class CooperativeThread(Generic[T]):
     def _work(self) -> None:
         self._go.acquire()
         try:
-            self._result = self._function(Monitor(self._report, self._stop))
+            self._result = self._function(ExportProgress(self._report, self._stop))
         except BaseException as error:
             self._error = error
         finally:

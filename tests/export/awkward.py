@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from carts_core.export import Dataset, Monitor
+from carts_core.export import Dataset, ExportProgress
 from carts_core.export.dataset import View
 
 CAMERA = "linke Kamera: ü"
@@ -34,7 +34,7 @@ def _beside() -> np.ndarray:
 
 
 def all_views(dataset: Dataset) -> list[View]:
-    return list(dataset.views(Monitor()))
+    return list(dataset.views(ExportProgress()))
 
 
 def expected_masks(dataset: Dataset) -> Masks:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from awkward import ARMS, CAMERA, SOURCES, awkward
 
-from carts_core.export import Dataset, ExportFrame, Monitor, measured_frames
+from carts_core.export import Dataset, ExportFrame, ExportProgress, measured_frames
 from carts_core.recording import Sequence
 
 OPTIONS = {"masks": False, "truth": False, "width": 161, "height": 127, "edit": awkward}
@@ -34,7 +34,7 @@ def _edited(sequence: Sequence) -> Dataset:
     """Frame 0 as rendered, frame 1 with an empty mask, frame 2 with a hole, a stroke and a single pixel."""
     frames = measured_frames(sequence, range(3))
     plain = Dataset(sequence, tuple(frames), sequence.scene, "regular")
-    (*_, last) = plain.views(Monitor())
+    (*_, last) = plain.views(ExportProgress())
     repaired = last.link_ids >= 0
     rows, columns = np.nonzero(repaired)
     middle = int(np.median(rows)), int(np.median(columns[rows == int(np.median(rows))]))

@@ -14,9 +14,9 @@ from carts_core.export import (
     FORMATS,
     Dataset,
     ExportCancelled,
+    ExportProgress,
     FormatName,
     KinematicsRow,
-    Monitor,
     corrected_frames,
     export,
     measured_frames,
@@ -146,6 +146,6 @@ def test_a_cancelled_export_leaves_nothing(dataset: Dataset, name: FormatName, t
     folder = tmp_path / "exports"
     folder.mkdir()
     with pytest.raises(ExportCancelled):
-        export(dataset, name, folder / "out", monitor=Monitor(progress, cancel.is_set))
+        export(dataset, name, folder / "out", progress=ExportProgress(progress, cancel.is_set))
     assert steps == [(1, len(dataset.scene.arms) if name.startswith("dvrk") else 3)]
     assert os.listdir(folder) == []

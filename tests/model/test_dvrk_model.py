@@ -8,14 +8,14 @@ import pytest
 import torch
 from dvrk_tree import XACRO, write_model
 
-from carts_core import imports as extras
+from carts_core import package_imports as extras
 from carts_core.cli.command_line import BAD_INPUT, main
 from carts_core.decoders.meshes import MOST_FACES
 from carts_core.errors import CartsError, RobotError
-from carts_core.imports import needs_extra
 from carts_core.model.dvrk_model import dvrk_urdf, list_instruments
 from carts_core.model.psm_kinematics import CLASSIC, JOINT_NAMES, SI, forward
 from carts_core.model.robot import Robot
+from carts_core.package_imports import require_package
 
 
 @pytest.fixture
@@ -123,7 +123,7 @@ def test_another_folder_and_broken_macros_are_refused(model, tmp_path):
 def test_a_missing_extra_is_said_with_the_command_that_installs_it(monkeypatch):
     monkeypatch.setattr(extras, "find_spec", lambda name: None)
     with pytest.raises(CartsError, match=r"requires the package xacrodoc, .*: pip install 'carts\[import\]'"):
-        needs_extra("xacrodoc", "import")
+        require_package("xacrodoc", "import")
 
 
 @pytest.mark.parametrize("number", [pytest.param("400006", marks=pytest.mark.slow), "420093"])

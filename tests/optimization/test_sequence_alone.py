@@ -9,7 +9,7 @@ import pytest
 from short_sequence import ARM, FRAMES, Truths, optimizer
 
 from carts_core.optimization import FrameOptimizer, FreeParameters, SequenceOptimizer, SequenceSettings, SurfaceSolver
-from carts_core.optimization.measurement import FrameSolver, Origin, SolvedAlone
+from carts_core.optimization.measurement import FrameSolver, Origin, SingleFrameFit
 from carts_core.optimization.variables import Variables
 from carts_core.optimization.verdict import Verdict
 from carts_core.recording import Frame, Sequence
@@ -82,11 +82,11 @@ def test_what_other_frames_depend_on_is_not_left_to_one_alone(
 
 def watched(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """Positions of the frames that are solved alone from now on."""
-    tried, alone = [], FrameSolver.alone
+    tried, alone = [], FrameSolver.run_frame_stages
 
-    def counted(solver: FrameSolver, frame: Frame, variables: Variables) -> SolvedAlone | None:
+    def counted(solver: FrameSolver, frame: Frame, variables: Variables) -> SingleFrameFit | None:
         tried.append(frame.index)
         return alone(solver, frame, variables)
 
-    monkeypatch.setattr(FrameSolver, "alone", counted)
+    monkeypatch.setattr(FrameSolver, "run_frame_stages", counted)
     return tried

@@ -11,7 +11,7 @@ from torch.nn import functional
 from carts_core.imaging.working_image import smoothed
 from carts_core.model.scene import Scene, SceneState
 from carts_core.optimization import FreeParameters
-from carts_core.optimization.variables import APART, Variables
+from carts_core.optimization.variables import DIFFERENCE_SPAN, Variables
 from carts_core.recording import Sequence
 from carts_core.rendering import Renderer, jacobian
 
@@ -33,13 +33,13 @@ def test_the_compiled_kernel_agrees_with_torch(
     chosen = replace(FreeParameters(joints=False), **{free: True})
     parameters = Variables(scene, scene.state(sequence.frame(0).measured), chosen, 0.15)
     renderer, around = Renderer(scene, width=160, height=120), parameters.around(torch.zeros(len(parameters)))
-    compiled = renderer.surface(around, APART, margin=4).jacobian
+    compiled = renderer.surface(around, DIFFERENCE_SPAN, margin=4).jacobian
 
     def without_kernel(*arguments) -> torch.Tensor:
         return jacobian_ref(*arguments[:-2], box=arguments[-1])
 
     monkeypatch.setattr(jacobian, "jacobian_of_box", without_kernel)
-    plain = renderer.surface(around, APART, margin=4).jacobian
+    plain = renderer.surface(around, DIFFERENCE_SPAN, margin=4).jacobian
     seen = [index for index, name in enumerate(parameters.names) if "blind" not in name]
     assert sorted(index for block in compiled for index in block.unknowns.tolist()) == seen
     for one, other in zip(compiled, plain, strict=True):
@@ -56,7 +56,7 @@ def test_the_jacobian_agrees_with_finite_differences(close_up: tuple[Scene, Scen
     fine = Renderer(scene, width=8 * renderer.width, height=8 * renderer.height)
     count, at = len(parameters), torch.zeros(len(parameters))
     eye = torch.eye(count)
-    rendering = renderer.surface(parameters.around(at), APART)
+    rendering = renderer.surface(parameters.around(at), DIFFERENCE_SPAN)
     analytic_maps = torch.stack([block.dense(count, rendering.maps) for block in rendering.jacobian]).sum(0)
     step = 0.002
     for index in range(count):

@@ -10,7 +10,7 @@ from slow_references import normal_motion_ref, outline_pixels_ref, outline_posit
 
 from carts_core.model.scene import Scene, SceneState
 from carts_core.optimization import FreeParameters
-from carts_core.optimization.variables import APART, Variables
+from carts_core.optimization.variables import DIFFERENCE_SPAN, Variables
 from carts_core.rendering import Outline, Renderer
 from carts_core.rendering.jacobian import BORDER, outline_position
 
@@ -18,7 +18,7 @@ WIDTH, HEIGHT, FINER = 640, 480, 4
 
 
 def outline(renderer: Renderer, parameters: Variables, offsets: torch.Tensor) -> Outline:
-    tangents = renderer.tangents(parameters.around(offsets), APART)
+    tangents = renderer.tangents(parameters.around(offsets), DIFFERENCE_SPAN)
     return renderer.outline(parameters.state(offsets), tangents)
 
 

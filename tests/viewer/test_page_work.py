@@ -123,8 +123,8 @@ def test_exports_are_downloaded_written_beside_the_project_and_cancelled(
     content = json.loads((path / "annotations" / "instances_default.json").read_text())
     assert path.parent == app.project.path.with_name("sequence_exports") and len(content["images"]) == 1
 
-    def endless(dataset: object, folder: object, monitor) -> None:
-        for _ in monitor.track(range(10**9)):
+    def endless(dataset: object, folder: object, progress) -> None:
+        for _ in progress.track(range(10**9)):
             pass
 
     monkeypatch.setitem(FORMATS, "video", replace(FORMATS["video"], write=endless))

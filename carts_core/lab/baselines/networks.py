@@ -19,10 +19,10 @@ from torch import Tensor, nn
 from ...errors import SettingsError, WeightsError
 from ...files import OutputPath, write_bytes
 from ...files.reading import WEIGHTS, check_regular, parse_json, read_bytes
-from ...imports import needs_extra
 from ...model.parts import SURFACE_CHANNELS
 from ...networks.network import FeatureNetwork
 from ...networks.weights import read_weights, tensor_bytes
+from ...package_imports import require_package
 from ...settings import Architecture
 from ...settings.training import BaselineNetwork
 from ...wording import shortened
@@ -39,7 +39,7 @@ def segmentation_models() -> ModuleType:
         CartsError: the optional dependencies are not installed.
     """
     for module in ("segmentation_models_pytorch", "timm", "torchvision"):
-        needs_extra(module, EXTRA)
+        require_package(module, EXTRA)
     _import_torchvision()
     import segmentation_models_pytorch  # noqa: PLC0415
 

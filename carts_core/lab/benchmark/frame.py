@@ -183,7 +183,7 @@ def start_of(scene: Scene, frame: Frame, run: Run, joints: Mapping[str, tuple[st
     if error is None:
         return frame.measured
     origin = {**frame.measured, **(frame.truth or {})}
-    seed = (_SEED, round(1e3 * error)) if METHODS[run.method].together else (_SEED, frame.index)
+    seed = (_SEED, round(1e3 * error)) if METHODS[run.method].as_sequence else (_SEED, frame.index)
     return perturb(scene, origin, error, seed, joints)
 
 
@@ -262,7 +262,7 @@ class SourceBench:
     def measure(self, runs: list[Run]) -> list[Measurement]:
         """Measure one run, or all runs that a method corrects together."""
         method = METHODS[runs[0].method]
-        if not method.together:
+        if not method.as_sequence:
             return [self._measure_alone(runs[0])]
         first = method.settings(self._scope.steps(runs[0])) if method.settings else None
         return self._forwards(runs, first) if isinstance(first, DescentSolver) else self._together(runs)

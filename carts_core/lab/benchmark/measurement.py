@@ -68,7 +68,7 @@ def run_fingerprint(
     """
     method = METHODS[run.method]
     settings = to_plain(method.settings(scope.steps(run))) if method.settings else {}
-    company = scope.calibration_frames if method.calibrated else scope.consecutive if method.together else 1
+    company = scope.calibration_frames if method.calibrated else scope.consecutive if method.as_sequence else 1
     parts = (settings, company, extractor.fingerprint, str(extractor.device), source, TOLERANCE, code_fingerprint())
     parts += (baseline,) if baseline is not None else ()
     return hashlib.sha256(repr(parts).encode()).hexdigest()[:32]

@@ -38,7 +38,7 @@ def plan(scope: Scope, sources: Items[Source], baselines: Items[str] = ()) -> li
     for source in sources:
         for frame in source.further:
             runs += _runs_of_further_frame(scope, source, frame)
-    together = [name for name, method in METHODS.items() if method.together]
+    together = [name for name, method in METHODS.items() if method.as_sequence]
     runs += [
         Run(source.name, domain, frame, method, error)
         for source in sources
@@ -161,6 +161,6 @@ class Benchmark:
 
     def _group(self, run: Run) -> list[Run]:
         """Runs measured together with this one."""
-        if not METHODS[run.method].together:
+        if not METHODS[run.method].as_sequence:
             return [run]
         return [other for other in self.runs if replace(other, frame=run.frame) == run]

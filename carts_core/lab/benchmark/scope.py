@@ -139,7 +139,7 @@ class Method:
     """Whether the poses of all cameras except the first are also optimized."""
     calibrated: bool = False
     """Whether base frames come from one calibration of the whole recording."""
-    together: bool = False
+    as_sequence: bool = False
     """Whether frames are corrected together, as a sequence."""
     masks_given: bool = False
     """Whether given masks are fitted, without a network."""
@@ -171,8 +171,8 @@ METHODS = {
     "stereo_posed": Method("ours, all cameras, posed", _ours, every_camera=True, poses=True),
     "calibrated": Method("one calibration, joints as measured", _start, calibrated=True),
     "calibrated_ours": Method("one calibration, then ours", _ours, calibrated=True),
-    "sequence": Method("ours, sequence mode", _ours, together=True),
-    "temporal": Method("TC-CaRTS, its temporal pipeline", DescentSolver.paper, together=True),
+    "sequence": Method("ours, sequence mode", _ours, as_sequence=True),
+    "temporal": Method("TC-CaRTS, its temporal pipeline", DescentSolver.paper, as_sequence=True),
     "masks": Method("ours, masks as target", _ours, masks_given=True),
 }
 _NETWORKS: dict[BaselineName, str] = {"unet": "U-Net", "hrnet": "HRNet", "swin": "Swin", "colleoni": "Colleoni's"}

@@ -122,7 +122,7 @@ def speed_table(data: Measurements) -> Table | None:
     for source, (method, entry) in product(data.sources(), METHODS.items()):
         chosen = data.of(source=source, method=method)
         # Methods that correct frames together have other tables, because their time is not spent frame by frame.
-        if not chosen or entry.together or entry.calibrated:
+        if not chosen or entry.as_sequence or entry.calibrated:
             continue
         steps, seconds = (
             mean(values) for values in zip(*((m.iterations, m.final.seconds) for m in chosen), strict=True)

@@ -20,7 +20,7 @@ from ...networks.network import ImageNetwork, channels_last
 from ...networks.surface import SurfaceNetwork
 from ...networks.weights import read_weights, save_weights
 from ...settings import TrainingConfig
-from ...stopping import when_stopped
+from ...stopping import message_if_stopped
 from ...wording import counted
 from .cache import make_cache
 from .loader import training_batches, validation_set
@@ -157,7 +157,7 @@ def train(
     with locked_folder(output):
         run = _Run(config, output)
         try:
-            with when_stopped(run.kept):
+            with message_if_stopped(run.kept):
                 return run.finish(progress or (lambda event: None))
         except KeyboardInterrupt:
             run.loop.save()

@@ -36,7 +36,7 @@ class Solid:
         return Solid(self.vertices + np.array([x, y, z]), self.faces)
 
 
-def together(parts: Iterable[Solid]) -> Solid:
+def merged(parts: Iterable[Solid]) -> Solid:
     """Combine several solids into one mesh."""
     vertices, faces, count = [], [], 0
     for part in parts:
@@ -167,7 +167,7 @@ def wide_body(length: float) -> Solid:
         for pulley in pulleys:
             placed = pulley.moved(x=3.2, y=-2.2)
             parts.append(placed if side > 0 else Solid(placed.vertices * (1, -1, -1), placed.faces))
-    return together(parts)
+    return merged(parts)
 
 
 def _block(length: float) -> Solid:
@@ -197,7 +197,7 @@ def wide_cables(length: float) -> Solid:
     """Two cables that run between the cheeks to the tip's hub."""
     run = np.array([(2.5, -0.3, 2.5), (5.0, 0.4, 3.3), (length - 1.5, 0.9, 3.5), (length + 0.5, 0.9, 3.45)])
     first = wire(run, 0.25, 6)
-    return together([first, Solid(first.vertices * (1, -1, -1), first.faces)])
+    return merged([first, Solid(first.vertices * (1, -1, -1), first.faces)])
 
 
 Table = tuple[tuple[float, float], ...]
@@ -259,7 +259,7 @@ class Jaws:
             low[:, 4] = np.minimum(table[:, 3] + self.rim, table[:, 4])
             high[:, 3] = np.maximum(table[:, 4] - self.rim, table[:, 3])
             parts += [bar(low), bar(high)]
-        return together(parts)
+        return merged(parts)
 
     def base(self) -> Solid | None:
         """Bearing of the jaws beyond the yaw axis."""
@@ -268,7 +268,7 @@ class Jaws:
         reach = self.pivot + 0.55 * self.hub.radius
         places = [(-0.6, 0.9), (2.5, 0.95), (0.6 * self.pivot, 0.8), (self.pivot, 0.6), (reach, 0.4)]
         bridge = bar(np.array([(y, -r * self.hub.radius, r * self.hub.radius, -1.25, 1.25) for y, r in places]))
-        return together([cylinder(self.hub.radius, -self.hub.height, self.hub.height, "z", 32), bridge])
+        return merged([cylinder(self.hub.radius, -self.hub.height, self.hub.height, "z", 32), bridge])
 
     def inserted(self, side: int) -> Solid | None:
         """Insert of one jaw; None if it has none."""
@@ -323,7 +323,7 @@ class Scissors:
         x = np.sort(np.stack([edge, back], axis=1), axis=1)
         z = (0.03, self.blade) if side == FIRST else (-self.blade, -0.03)
         table = np.column_stack([y, x, middle + z[0], middle + z[1]])
-        return together([_hub(self.hub, side, 0.0), bar(table, 0.15)])
+        return merged([_hub(self.hub, side, 0.0), bar(table, 0.15)])
 
     def inserted(self, side: int) -> Solid | None:
         """None: a blade is made of one material."""
@@ -364,7 +364,7 @@ class ClipApplier:
         for start, stop in ((far - 2.4, far - 1.7), (far - 0.8, far)):
             lip = sorted((side * 0.12, side * 1.4))
             parts.append(bar(np.array([(y, *lip, -self.height, self.height) for y in (start, stop)])))
-        return together(parts)
+        return merged(parts)
 
     def inserted(self, side: int) -> Solid | None:
         """None: an arm is made of one material."""
@@ -391,7 +391,7 @@ class Electrode:
         """Hub and collar."""
         collar = [cylinder(1.7, 2.0, self.collar, "y"), cylinder(1.1, self.collar - 0.2, self.collar + 0.9, "y")]
         hub = cylinder(self.hub.radius, -self.hub.height, self.hub.height, "z", 32)
-        return together([hub, *(part.moved(z=self.height) for part in collar)])
+        return merged([hub, *(part.moved(z=self.height) for part in collar)])
 
     def electrode(self) -> Solid:
         """Wire, with its paddle if it has one."""
@@ -405,7 +405,7 @@ class Electrode:
             low, high = self.height - thickness, self.height + thickness
             rows = [(end - 0.4 + s * length, -w, w, low, high) for s, w in zip(places, half, strict=True)]
             parts.append(bar(np.array(rows)))
-        return together(parts)
+        return merged(parts)
 
 
 Tip = Jaws | Scissors | ClipApplier | Electrode

@@ -12,7 +12,7 @@ import numpy as np
 from ...decoders import tables
 from ...files.decoding import decoded
 from ...files.reading import TABLE, read_text
-from ...imports import needs_extra
+from ...package_imports import require_package
 from ...wording import shown
 from .found import PartError, well_formed
 
@@ -206,7 +206,7 @@ def _is_number(cell: str, commas: bool = False) -> bool:
 
 def read_parquet(path: Path) -> dict[str, np.ndarray]:
     """Columns of a Parquet file by name [rows]; [rows, values] if rows have equally many numbers."""
-    needs_extra("pyarrow", "import")
+    require_package("pyarrow", "import")
     columns = decoded(tables.read_parquet, path)
     for name, values in columns.items():
         if isinstance(values, list):

@@ -9,7 +9,7 @@ import numpy as np
 
 from ...errors import SequenceError
 from ...files.reading import VALUES, parse_json, read_text
-from ...imports import needs_extra
+from ...package_imports import require_package
 from ..importing.cameras import calibration_of, find_images, side_of
 from ..importing.columns import arm_log, guess_columns, samples
 from ..importing.foreign_tables import ForeignTable, read_parquet
@@ -40,7 +40,7 @@ def _root(path: Path) -> Path:
 
 
 def _read(path: Path, job: Import) -> FoundRecording:
-    needs_extra("pyarrow", "import")
+    require_package("pyarrow", "import")
     root = _root(path)
     with well_formed(f"{root / 'meta/info.json'} is not a LeRobot description with features and fps"):
         info = parse_json(read_text(root / "meta/info.json", VALUES))

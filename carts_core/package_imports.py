@@ -11,7 +11,7 @@ from types import ModuleType
 from .errors import CartsError
 
 
-def needs_extra(module: str, extra: str) -> None:
+def require_package(module: str, extra: str) -> None:
     """Check that a module of an optional dependency is installed.
 
     Raises:
@@ -28,7 +28,7 @@ def needs_extra(module: str, extra: str) -> None:
 
 
 @contextmanager
-def uncollected() -> Iterator[None]:
+def gc_paused() -> Iterator[None]:
     """Pause garbage collection in a block that creates many objects but no reference cycles.
 
     It speeds up imports (the viewer starts 0.6 s sooner) and large JSON files (seven times).
@@ -50,7 +50,7 @@ class _Later(ModuleType):
 
 
 @contextmanager
-def deferred(package: str, name: str) -> Iterator[None]:
+def deferred_import(package: str, name: str) -> Iterator[None]:
     """Make `from package import name` in the block import the module `name` on first use."""
     whole = f"{package}.{name}"
     if whole in sys.modules:
