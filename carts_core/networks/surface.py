@@ -1,7 +1,7 @@
 """Surface network: a pretrained encoder, conditioned on the surface map of the measured kinematics, and a decoder.
 
-The encoder is EfficientNet-Lite0 up to stride 16, trained on ImageNet; its batch norms are folded into the
-convolutions. The measured kinematics have errors of a few degrees but provide a prior pose, which the network corrects.
+The encoder is EfficientNet-Lite0 up to stride 16, trained on ImageNet. The measured kinematics have errors of a few
+degrees but provide a prior pose, which the network corrects.
 """
 
 from dataclasses import dataclass
@@ -45,15 +45,25 @@ STEM = 32
 """Channels of the stem, at stride 2."""
 
 
+_EPSILON, _MOMENTUM = 1e-3, 0.01
+"""Of the batch norms of EfficientNet-Lite."""
+
+
+def _normalized(inputs: int, outputs: int, kernel: int = 1, stride: int = 1, groups: int = 1) -> nn.Sequential:
+    """Convolution with batch norm."""
+    convolution = nn.Conv2d(inputs, outputs, kernel, stride, kernel // 2, groups=groups, bias=False)
+    return nn.Sequential(convolution, nn.BatchNorm2d(outputs, _EPSILON, _MOMENTUM))
+
+
 class InvertedResidual(nn.Module):
     """Block of EfficientNet-Lite: expansion, depthwise convolution and projection."""
 
     def __init__(self, inputs: int, outputs: int, expansion: int, kernel: int, stride: int) -> None:
         super().__init__()
         middle = inputs * expansion
-        self.expand = nn.Conv2d(inputs, middle, 1) if expansion > 1 else None
-        self.depthwise = nn.Conv2d(middle, middle, kernel, stride, kernel // 2, groups=middle)
-        self.project = nn.Conv2d(middle, outputs, 1)
+        self.expand = _normalized(inputs, middle) if expansion > 1 else None
+        self.depthwise = _normalized(middle, middle, kernel, stride, groups=middle)
+        self.project = _normalized(middle, outputs)
         self._skips = inputs == outputs and stride == 1
 
     def forward(self, x: Tensor) -> Tensor:
@@ -64,11 +74,11 @@ class InvertedResidual(nn.Module):
 
 
 class Encoder(nn.Module):
-    """EfficientNet-Lite0 up to stride 16, with folded batch norms."""
+    """EfficientNet-Lite0 up to stride 16."""
 
     def __init__(self) -> None:
         super().__init__()
-        self.stem = nn.Conv2d(3, STEM, 3, 2, 1)
+        self.stem = _normalized(3, STEM, 3, 2)
         self.stages = nn.ModuleList()
         inputs = STEM
         for expansion, outputs, blocks, stride, kernel in STAGES:
