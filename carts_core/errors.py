@@ -6,7 +6,7 @@ Each message states what was given, what is allowed, and a remedy.
 from .wording import shortened
 
 _LONGEST = 4000
-"""Longest message, which may quote a file [characters]."""
+"""Maximum length of a message, which may quote a file [characters]."""
 
 
 class CartsError(Exception):

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 MOST_THREADS = 4
-"""Largest useful number of threads for images of this size."""
+"""Maximum useful number of threads for images of this size."""
 
 _MMAP_THRESHOLD = 1 << 30
 """Allocations below this size come from the heap, which keeps freed memory [bytes]."""

@@ -39,7 +39,7 @@ unusable.
 _OURS = ("carts_core", "carts_viewer")
 _INSTALLED = ("<frozen", *(sysconfig.get_path(name) for name in ("stdlib", "platstdlib", "purelib", "platlib")))
 _PATIENCE = 2.0
-"""Longest wait for a stack without library code [s]."""
+"""Maximum wait for a stack without library code [s]."""
 _AGAIN = 0.02
 """Interval after which a pending signal is sent again [s]."""
 PARENT = "CARTS_PARENT"

@@ -5,7 +5,7 @@ from difflib import get_close_matches
 from itertools import islice
 
 _LONGEST_COMPARED, _MOST_COMPARED = 100, 200
-"""Largest length and number of names searched for misspellings, since the cost grows with the product of lengths."""
+"""Maximum length and number of names searched for misspellings, since the cost grows with the product of lengths."""
 
 
 def counted(number: int, what: str) -> str:

@@ -145,7 +145,7 @@ FINDINGS_FILE = "findings.json"
 _WORST = 3
 """Number of worst frames of a job with preview images."""
 _WIDTH = 480
-"""Largest width of preview images [px]."""
+"""Maximum width of preview images [px]."""
 
 
 @dataclass(frozen=True)
@@ -256,7 +256,7 @@ def _pictured(folder: OutputPath, sequence: Sequence, part: Path, frames: list[F
 
 BATCH_FILE = "batch.json"
 _LONGEST_ERROR = 1000
-"""Largest length of a stored error [characters]."""
+"""Maximum length of a stored error [characters]."""
 ORDER = ("failed", "lost", "stopped", "running", "waiting", "done")
 """Statuses, most urgent first."""
 

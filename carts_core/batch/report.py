@@ -21,7 +21,7 @@ matplotlib.use("Agg")
 matplotlib.rcParams["text.parse_math"] = False
 
 _SHOWN = 24
-"""Largest number of worst frames on the page."""
+"""Maximum number of worst frames on the page."""
 _VERDICTS = ("good", "doubtful", "failed")
 
 

@@ -1,4 +1,4 @@
-"""`carts batch`: pipelines over many recordings, on one machine or several."""
+"""`carts batch`: pipelines over many recordings, on one or several machines."""
 
 from collections import Counter
 from dataclasses import dataclass
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from ..settings.optimization import Engine
 
 _NAMED = 5
-"""Number of failed jobs that the final message names."""
+"""Maximum number of failed jobs named in the final message."""
 
 
 @dataclass(frozen=True)
@@ -30,21 +30,22 @@ class Batch(RangedOptions):
     manifest: Annotated[Path, tyro.conf.Positional]
     """Manifest of recordings, cameras, domains and steps (docs: batch)."""
     output: Path | None = None
-    """Folder to write to; by default `runs/batch/NAME`, after the manifest. Each job has its own folder in `jobs`."""
+    """Output folder; by default `runs/batch/NAME`, with the name of the manifest. Each job has its own folder in
+    `jobs`."""
     workers: Annotated[int, Range(0)] = 0
     """Parallel jobs; by default the number of cores."""
     threads: Count = 1
-    """Threads of each job. One is most efficient with more jobs than cores."""
+    """Threads per job. One thread is most efficient with more jobs than cores."""
     shard: str = "1/1"
     """Run every N-th job, starting with the I-th, as `I/N`. Shards may run on all machines that share the folder."""
     scheduler: str | None = None
-    """Give jobs to dask.distributed: address of its scheduler, or `local` for workers on this machine."""
+    """Run jobs with dask.distributed: address of its scheduler, or `local` for workers on this machine."""
     project: Literal["beside", "none"] = "beside"
-    """Corrections for jobs that only evaluate or export: those in the project beside the recording, or `none`."""
+    """Corrections for jobs that only evaluate or export: `beside` for the project beside the recording, or `none`."""
     again: bool = False
-    """Repeat finished steps; each recomputes results whose inputs have changed."""
+    """Repeat finished steps, which recomputes results with changed inputs."""
     report_only: bool = False
-    """Write the report on finished jobs without running jobs."""
+    """Only write the report on finished jobs."""
 
     def run(self) -> None:
         """Run the jobs of the shard, and write the report on all jobs; `CartsError` if a job failed."""
@@ -65,7 +66,7 @@ class Batch(RangedOptions):
         if len(chosen) == len(jobs):
             console.print(f"wrote {write_batch_report(folder, f'CaRTS batch {self.manifest.stem}', jobs)}")
         else:
-            console.print("one shard is done; when all are, write the report with --report-only")
+            console.print("this shard is done; after the last shard, write the report with --report-only")
         console.print(f"to inspect the results: carts view {folder}")
         if failed:
             lines = {name: (error.strip() or "unknown cause").splitlines()[-1] for name, error in failed.items()}
@@ -110,7 +111,7 @@ class Batch(RangedOptions):
 
 
 def _inference(folder: "OutputPath") -> "Engine":
-    """Inference engine of all jobs: the faster one on the machine that started the batch."""
+    """Inference engine of all jobs: the faster engine on the machine that started the batch."""
     from ..files import write_new
     from ..files.reading import SETTINGS, read_text
     from ..networks.extractor import FeatureExtractor

@@ -45,7 +45,7 @@ _COMMANDS: dict[Step, type] = {
 _GIVEN = ("--output", "-o", "--overwrite", "--json", "--kinematics", "--mode", "--camera", "--domain")
 """Options that a job sets itself."""
 _CORRECTING: tuple[Step, ...] = ("import", "calibrate", "optimize", "sequence")
-"""Steps after which a job evaluates and exports its own results."""
+"""Steps after which a job evaluates and exports the results of these steps."""
 _CODE = ("**/*.py",)
 
 
@@ -56,7 +56,8 @@ class BatchWork:
     Args:
         folder: folder of the batch.
         again: whether finished steps are repeated.
-        inference: inference engine of the surface network on all machines, unless a step's options select another.
+        inference: inference engine of the surface network on all machines, unless the options of a step select another
+            engine.
         project: whether the project beside a recording is applied; see `with_project`.
     """
 
@@ -86,13 +87,13 @@ class BatchWork:
 
 
 def with_project(job: Job) -> Path | None:
-    """Project beside the recording of a job that only evaluates or exports; None for other jobs."""
+    """Project beside the recording, for a job that only evaluates or exports; None for other jobs."""
     used = {"evaluate", "export"} & set(job.steps) and not set(_CORRECTING) & set(job.steps)
     return FromProject().path(job.recording) if used else None
 
 
 def check_options(jobs: Sequence[Job]) -> None:
-    """Check the options of all steps before the first run; `SettingsError` for options unknown to the command."""
+    """Check the options of all steps before the first job; `SettingsError` for options that a command does not have."""
     called: set[tuple[Step, tuple[str, ...]]] = set()
     for job in jobs:
         called |= {(step, job.options.get(step, ())) for step in job.steps}
@@ -136,7 +137,7 @@ def _steps(job: Job, folder: OutputPath, state: RunningJob, work: BatchWork) -> 
         known = state.state.steps.get(step)
         if work.again or known is None or known.key != key:
             began = time.perf_counter()
-            # They describe earlier results. If the process is killed, they are written when the job resumes.
+            # The findings describe earlier results. If the process is killed, they are written when the job resumes.
             remove_file(folder / FINDINGS_FILE)
             with _logged(folder / f"{step}.log"):
                 _parsed(step, [*_arguments(job, step, sequence, folder), *options]).run()
@@ -156,7 +157,7 @@ def _steps(job: Job, folder: OutputPath, state: RunningJob, work: BatchWork) -> 
 
 
 def _inference(step: Step, job: Job, inference: Inference) -> tuple[str, ...]:
-    """Option that selects the same inference engine on every machine, for steps that run the network on a CPU."""
+    """Options that select the same inference engine on every machine, for steps that run the network on a CPU."""
     if step in ("import", "export") or _given(job.options.get(step, ()), "--device"):
         return ()
     return ("--device", "cpu" if inference == "auto" else f"cpu:{inference}")
@@ -196,7 +197,7 @@ def _table(job: Job, folder: OutputPath) -> Path | None:
     found = kinematics_tables(folder, job)
     if len(found) > 1:
         raise SettingsError(
-            f"job {job.name}: {len(found)} cameras were solved separately, and an export holds one table. Give one "
+            f"job {job.name}: {len(found)} cameras were solved separately, but an export uses one table. Give one "
             "camera per job, or add --together to the options."
         )
     return found[0] if found else None

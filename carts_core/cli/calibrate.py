@@ -1,4 +1,4 @@
-"""`carts hand-eye`, `carts time-offset` and `carts calibrate`: base frames, cameras, and the image delay."""
+"""`carts hand-eye`, `carts time-offset` and `carts calibrate`: base frames, cameras, and the delay of images."""
 
 import json
 from dataclasses import asdict, dataclass, field, replace
@@ -25,9 +25,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class HandEye:
-    """Estimate base frames from landmarks clicked in 3 to 6 images; no initial pose is needed.
+    """Estimate base frames from landmarks clicked in 3 to 6 images, without an initial pose.
 
-    The points are read from a table (docs/howto/own_recording.md); in `carts view` (New recording) they are clicked.
+    The points are read from a table (docs/howto/own_recording.md). To click points, use *New recording* in `carts
+    view`.
     """
 
     sequence: SequencePath
@@ -40,14 +41,14 @@ class HandEye:
     overwrite: bool = False
     """Replace an earlier result there."""
     focal_length: bool = False
-    """Estimate the focal lengths, too, and print their standard deviation. Requires points at several depths."""
+    """Also estimate the focal lengths, and print their standard deviations. Requires points at several depths."""
     free_cameras: tuple[str, ...] = ()
     """Cameras whose pose relative to the other cameras is unknown."""
     pixel_error: float = 2.0
     """Expected error of a point [px]."""
 
     def run(self) -> None:
-        """Solve, and write the result; no files are left after an error."""
+        """Solve and write the result; no files are left after an error."""
         from ..files import MARKER, published, write_text
         from ..optimization.hand_eye import (
             RESULT_FILE,
@@ -99,23 +100,24 @@ def _print(console: Console, sequence: "Sequence", points: "Points[ImagePoint]",
 
 @dataclass(frozen=True)
 class TimeOffset:
-    """Estimate the delay between images and joint positions from their motion, and propose a time_offset.
+    """Estimate the delay between images and joint positions from the motion of the arms, and propose a time_offset.
 
-    Neither a hand-eye calibration nor a network is needed. The sequence file is not changed.
+    This requires neither a hand-eye calibration nor a network. The sequence file is not changed.
     """
 
     sequence: SequencePath
-    """Sequence file that matches table rows to frames by time ([frames])."""
+    """Sequence file whose table rows are matched with frames by time ([frames])."""
     output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
-    """Folder to create for a sequence file with the proposed time_offset; by default it is only printed."""
+    """Folder to create for a sequence file with the proposed time_offset; by default the offset is only printed."""
     overwrite: bool = False
     """Replace an earlier result there."""
     camera: str | None = None
-    """Camera whose images are used; by default the first one."""
+    """Camera whose images are used; by default the first camera."""
     domain: str | None = None
-    """Domain of the images; by default the first one."""
+    """Domain of the images; by default the first domain."""
     largest: float = 0.5
-    """Search range around the current time_offset [s]; extended up to 3 s if no delay in it explains the motion."""
+    """Search range around the current time_offset [s], extended to at most 3 s if no delay in this range explains the
+    motion."""
 
     def run(self) -> None:
         """Print the estimate, and write a sequence file if a folder is given."""
@@ -162,16 +164,16 @@ class Calibrate:
     overwrite: bool = False
     """Replace an earlier calibration there."""
     frames: str | None = None
-    """Frames used for calibration: `spread:20` (the default) for 20 evenly spaced frames, or frame ids as in
-    `carts evaluate`: `all`, `001-010,015`, `::3`."""
+    """Frames used for the calibration: `spread:20` (default) for 20 evenly spaced frames, or frame ids as in `carts
+    evaluate`: `all`, `001-010,015`, `::3`."""
     positions: str | None = None
     """Frames by position in the sequence instead of id, counted from 1: `1-10,15`."""
     camera: tuple[str, ...] = Selection.camera
     """Cameras, by name; all are calibrated jointly."""
     domain: str | None = None
-    """Domain, by name; by default the first one of the sequence."""
+    """Domain, by name; by default the first domain of the sequence."""
     joint_prior_deg: float = 0.1
-    """With `--joints`: standard deviation of a joint's error in a frame [deg]. Output files contain the measured
+    """With `--joints`: standard deviation of the joint errors in a frame [deg]. Output files contain the measured
     joints.
     """
     beyond_hand_eye: bool = False
@@ -197,7 +199,7 @@ class Calibrate:
         output = output_folder(self.output, sequence.name, "calibration")
         observer = self.network.observer(self.solving.chosen, sequence)
         prior = read_prior(sequence)
-        # Cameras whose pose was known before the hand-eye calibration are locked.
+        # Cameras with known poses before the hand-eye calibration are locked.
         known_cameras = [name for name in cameras if prior is not None and name not in prior.free_cameras]
         free = replace(self.free, locked_cameras=tuple(dict.fromkeys((*self.free.locked_cameras, *known_cameras))))
         observer.check(sequence, indices, cameras, [self.domain])
@@ -242,7 +244,7 @@ class Calibrate:
         print_hints(console, calibration_hint(result.assessment, result.stop_reason), remark(sequence.scene, result))
 
     def _summary(self, weights: str, frames: list[str], cameras: list[str]) -> dict:
-        """Description of the run, for the folder's marker file."""
+        """Description of the run, for the marker file of the folder."""
         return {
             "format": "calibration",
             "sequence": str(self.sequence),
@@ -267,7 +269,7 @@ def frame_indices(frames: str | None, positions: str | None, sequence: "Sequence
     if not (count.isdecimal() and int(count) >= 1):
         raise SettingsError(f"--frames {frames!r} selects no frame. Give a number of at least 1, such as `spread:20`.")
     if positions is not None:
-        raise SettingsError("--frames and --positions are mutually exclusive. Give one of them.")
+        raise SettingsError("--frames and --positions are mutually exclusive. Give only one of them.")
     from ..recording import spread
 
     return spread(len(sequence), int(count))

@@ -34,7 +34,7 @@ from .view import View
 
 
 def settings_reference() -> str:
-    """All settings of a settings file, with defaults and meanings."""
+    """Description of all settings of a settings file, with defaults and meanings."""
     parts = [
         "Settings in the tables [solver] and [sequence] of `--settings FILE`; --print-settings writes all of them.",
         *(described(kind) for kind in (SurfaceSolver, DescentSolver, SequenceSettings)),
@@ -78,7 +78,7 @@ COMMANDS: dict[str, type] = {
 Command: Any = reduce(or_, (Annotated[kind, tyro.conf.subcommand(name)] for name, kind in COMMANDS.items()))
 
 _AT_ONCE = (View, Live, RobotCommand, Robots)
-"""Commands that print no message at the start."""
+"""Commands without a message at the start."""
 _INVALID_CHOICE = re.compile(r"invalid choice '(?P<given>[^']*)' for .*?Expected one of \((?P<known>[^)]*)\)")
 """Pattern of tyro's error message, without the surrounding box."""
 
@@ -109,7 +109,7 @@ def main(arguments: list[str] | None = None) -> None:
                 print(command.solving.printed())
                 return
         if not isinstance(command, _AT_ONCE):
-            # Imports may take seconds on a busy machine.
+            # The imports may take seconds on a busy machine.
             Terminal(stderr=True).print(f"carts {arguments[0]}: starting", style="dim")
         with gc_paused():
             from ..process import tune_process
@@ -136,7 +136,7 @@ def _parsed(arguments: list[str]) -> Any:
     try:
         with contextlib.redirect_stderr(said):
             if name in COMMANDS:
-                # Suggest only options of this command for a misspelt option.
+                # For a misspelt option, suggest only options of the same command.
                 return tyro.cli(COMMANDS[name], prog=f"carts {name}", args=options)
             return tyro.cli(Command, prog="carts", description=_DESCRIPTION, args=arguments)  # pyright: ignore
     except SystemExit:
@@ -148,14 +148,14 @@ def _parsed(arguments: list[str]) -> Any:
 
 @contextmanager
 def _quiet_when_unread() -> Iterator[None]:
-    """Exit without a traceback if the reader of the output pipe, such as `head`, has closed it."""
+    """Exit without a traceback if the reader of the output, such as `head`, has closed the pipe."""
     try:
         try:
             yield
         finally:
             print(end="", flush=True)
     except BrokenPipeError:
-        # Python flushes again at exit.
+        # Python flushes the output again at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(1)
 

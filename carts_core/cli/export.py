@@ -20,14 +20,14 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Render:
-    """Render the arms, alone or over the frames, with the corrections of the project beside the sequence."""
+    """Render the arms, alone or over the images, with the corrections of the project beside the sequence."""
 
     sequence: SequencePath
     """Sequence file."""
     output: Path | None = None
-    """Folder to write to; by default `runs/NAME/render`."""
+    """Output folder; by default `runs/NAME/render`."""
     style: Literal["overlay", "image", "mask"] = "overlay"
-    """Rendering blended over the frame, rendering alone, or mask."""
+    """Rendering blended over the image, rendering alone, or mask."""
     opacity: float = 0.6
     """Opacity of the rendering in an overlay, 0 to 1."""
     source: Annotated[FromProject, tyro.conf.arg(name="")] = field(default_factory=FromProject)
@@ -88,10 +88,10 @@ class Export:
     parts: Parts = "arms"
     """Categories: one per arm, per part (shaft, wrist, jaws), or per link."""
     images: Images = "named"
-    """`named`: labels name the recording's own images, and formats that need images beside their labels (bop, voc,
-    yolo) get copies; `copied`: copies for every format; `none`: no images. Copies have the same bytes."""
+    """`named`: labels refer to the images of the recording, and formats that require images beside their labels (bop,
+    voc, yolo) get copies; `copied`: copies for every format; `none`: no images. Copies are bit-identical."""
     frame_rate: float | None = None
-    """Frame rate of a video [1/s]; by default that of the recording, or 25 without times."""
+    """Frame rate of a video [1/s]; by default the frame rate of the recording, or 25 without times."""
     overwrite: bool = False
     """Replace an earlier export."""
     select: Annotated[Selection, tyro.conf.arg(name="")] = field(default_factory=Selection)
@@ -105,7 +105,7 @@ class Export:
         sequence = Sequence.open(self.sequence, progress=console.print)
         domains = self.select.domain_names(sequence)
         if len(domains) > 1:
-            raise SettingsError(f"--domain: {len(domains)} domains were given; an export holds one. Give one.")
+            raise SettingsError(f"--domain: {len(domains)} domains were given, but an export has one domain. Give one.")
         cameras = self.select.camera_names(sequence.scene)
         sequence, frames = self._frames(sequence, cameras, console)
         dataset = Dataset(
@@ -131,13 +131,13 @@ class Export:
     def _frames(
         self, sequence: "Sequence", cameras: list[str], console: Terminal
     ) -> "tuple[Sequence, list[ExportFrame]]":
-        """The recording with corrections applied, and the frames to export."""
+        """Corrected recording, and frames to export."""
         from ..export import corrected_frames, measured_frames, project_frame, read_kinematics_csv
 
         indices = self.select.frame_indices(sequence)
         if self.kinematics is not None:
             if self.source.named:
-                raise SettingsError("--kinematics and --project are mutually exclusive. Give one of them.")
+                raise SettingsError("--kinematics and --project are mutually exclusive. Give only one of them.")
             if (beside := self.source.path(sequence.path)) is not None:
                 console.print(f"{beside} is not used, since --kinematics is given", soft_wrap=True)
             return sequence, corrected_frames(sequence, indices, read_kinematics_csv(self.kinematics, sequence.scene))

@@ -38,7 +38,7 @@ class Import:
         from ..files.decoding import prepare
 
         if self.source is not None:
-            prepare()  # Displayed while torch is loaded.
+            prepare()  # Loading torch takes time, so a message is displayed.
         from ..recording.importing.found import recording_name
         from ..recording.importing.importer import import_recording, known_kinds
 
@@ -56,7 +56,7 @@ class Import:
 
 
 def print_report(console: Console, recording: "FoundRecording") -> None:
-    """Print the contents of a recording, and what was guessed or is missing."""
+    """Print the content of a recording, with guessed and missing values."""
     frames, times = len(recording.frame_ids), recording.frame_times
     span = "" if times is None or frames < 2 else f", {times[-1] - times[0]:.1f} s, {_rate(times):.1f} images/s"
     console.print(f"{recording.name}: {recording.kind}, {frames} frames{span}", markup=False)
@@ -75,7 +75,7 @@ def _rate(times: "np.ndarray") -> float:
 
 @dataclass(frozen=True)
 class ImportMasks:
-    """Import masks and keypoints into the project of a sequence, as layers separate from painted ones.
+    """Import masks and keypoints into the project of a sequence, as layers separate from painted layers.
 
     Reads COCO (.json), CVAT for images (.xml), folders of PNG masks, EndoVis 2017 and 2018, and keypoints of SurgPose.
     The import is one undo step in `carts view`.
@@ -86,14 +86,14 @@ class ImportMasks:
     source: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SOURCE")]
     """File or folder with the masks or keypoints."""
     project: Path | None = None
-    """Project file; by default the one beside the sequence."""
+    """Project file; by default the project beside the sequence."""
     camera: str | None = None
     """Camera of the images, if file and folder names do not contain it."""
     replace: bool = False
     """Replace earlier imports. Painted layers are not changed."""
 
     def run(self) -> None:
-        """Import, and print a report."""
+        """Import the masks and print a report."""
         from ..project import Project, import_annotations
         from ..recording import Sequence
         from ..recording.annotations import read_annotations

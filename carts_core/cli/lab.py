@@ -28,7 +28,7 @@ class Synthesize:
     """
 
     output: Annotated[Path, tyro.conf.Positional]
-    """Folder to create; it must not exist."""
+    """Folder to create, which must not exist."""
     synthesis: Annotated[SynthesisConfig, tyro.conf.arg(name="")] = field(default_factory=SynthesisConfig)
 
     def run(self) -> None:
@@ -53,18 +53,18 @@ class Train(RangedOptions):
     output: Annotated[Path, tyro.conf.Positional] = Path("runs/train")
     """Folder for checkpoints, weights and the training report."""
     for_: Annotated[Path | None, tyro.conf.arg(name="for", metavar="SEQUENCE")] = None
-    """Sequence file to adapt the shipped network to: its robots, cameras, distances and empty backgrounds. Training
+    """Sequence file to which the shipped network is adapted: robots, cameras, distances and empty backgrounds. Training
     stops when validation no longer improves, after 400 steps (`--steps`), or after `--minutes` of CPU time. The weights
-    are kept if no fit gets worse.
+    are accepted if no fit gets worse.
     """
     fits: Count = 8
-    """With `--for`: number of synthetic images on which fits are compared; half as many frames of the recording are
+    """With `--for`: number of synthetic images for the comparison of fits; half as many frames of the recording are
     added.
     """
     training: Annotated[TrainingConfig, tyro.conf.arg(name="")] = field(default_factory=TrainingConfig)
 
     def run(self) -> None:
-        """Train to the end."""
+        """Train the network, and print the results."""
         from ..lab.training.training import TrainingProgress, train
 
         check_device(self.training.device)
@@ -83,7 +83,7 @@ class Train(RangedOptions):
         console.print(f"weights: {result.weights}\nreport:  {result.report}\n{result.validation}")
 
     def _adapt(self, recording: Path, console: Terminal) -> None:
-        """Adapt the shipped network to a recording; keep the weights if no fit is worse."""
+        """Adapt the shipped network to a recording; the weights are accepted if no fit is worse."""
         from ..lab.training.adaptation import adapted_to, gain, offer
         from ..lab.training.training import TrainingProgress, train
 
@@ -125,18 +125,18 @@ class Train(RangedOptions):
 
 @dataclass(frozen=True)
 class Baseline:
-    """Train HRNet, Swin, Colleoni's network or a U-Net for `carts bench --baselines`; rerun it to resume."""
+    """Train HRNet, Swin, Colleoni's network or a U-Net for `carts bench --baselines`; rerun the command to resume."""
 
     output: Annotated[Path, tyro.conf.Positional]
     """Folder for checkpoints and weights."""
     frames: Path = Path("runs/baseline_frames")
-    """Folder of training frames, which all baselines share; missing ones are created."""
+    """Folder of training frames, shared by all baselines; missing frames are created."""
     network: Annotated[BaselineNetwork, tyro.conf.arg(name="")] = field(default_factory=BaselineNetwork)
     training: BaselineTraining = field(default_factory=BaselineTraining)
     """Settings of the training."""
 
     def run(self) -> None:
-        """Train to the end."""
+        """Train the network, and print the results."""
         from ..lab.baselines.training import prepare_frames, train_baseline
 
         check_device(self.training.device)
@@ -153,20 +153,20 @@ class Baseline:
 
 @dataclass(frozen=True)
 class Bench:
-    """Measure accuracy and speed of all methods, and write a report; rerun it to resume."""
+    """Measure accuracy and speed of all methods, and write a report; rerun the command to resume."""
 
     output: Annotated[Path | None, tyro.conf.Positional] = None
     """Folder of the report; by default `runs/bench/quick` or `runs/bench/full`."""
     quick: bool = False
     """Use few frames and steps: minutes instead of hours."""
     real: Path | None = None
-    """Sequence file with real frames and masks, evaluated as recorded and with other backgrounds."""
+    """Sequence file with real frames and masks, evaluated with the recorded background and with other backgrounds."""
     rooms: Path | None = None
     """Folder of photographs used as additional backgrounds."""
     report_only: bool = False
-    """Write the report from earlier measurements only."""
+    """Only write the report, from earlier measurements."""
     frames: int | None = None
-    """Number of frames of each sequence; by default that of the scope."""
+    """Number of frames per sequence; by default as in the scope."""
     seed: int | None = None
     """Seed of the synthetic sequence."""
     baselines: tuple[Path, ...] = ()
@@ -240,8 +240,8 @@ class Bench:
             trained = read_baseline(path)
             if trained.row in found:
                 raise CartsError(
-                    f"--baselines gives two files for the row {trained.row}; {path} is the second. Give one per "
-                    "network and augmentation, and the other in a separate run."
+                    f"--baselines gives two files for the row {trained.row}; {path} is the second. Give one file per "
+                    "network and augmentation, and the other file in a separate run."
                 )
             found[trained.row] = trained
         return found

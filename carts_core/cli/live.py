@@ -1,4 +1,4 @@
-"""`carts live`: tracks the arms in a stream."""
+"""`carts live`: tracking of the arms in a stream."""
 
 from collections.abc import Callable
 from contextlib import ExitStack, suppress
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Live(RangedOptions):
-    """Track the arms in a stream of images and joints; late frames are dropped. Ctrl-C ends it."""
+    """Track the arms in a stream of images and joints; late frames are dropped. Press Ctrl-C to stop."""
 
     sequence: SequencePath
     """Sequence file that defines arms and cameras and, for a replay, images and joints."""
@@ -29,7 +29,7 @@ class Live(RangedOptions):
     joints_port: int | None = None
     """With `camera` and `video`: port on 127.0.0.1 for joints and results."""
     rate: Annotated[float | None, Range(0, 1000, above=True)] = None
-    """Replay: frame rate [1/s]; by default that of the recording."""
+    """Replay: frame rate [1/s]; by default the frame rate of the recording."""
     loops: Count = 1
     """Replay: number of repetitions."""
     output: Path | None = None
@@ -41,11 +41,11 @@ class Live(RangedOptions):
     masks: bool = False
     """Include masks in the results."""
     record: Path | None = None
-    """New folder to record the stream to, as a sequence and a project with its corrections."""
+    """New folder in which the stream is recorded, as a sequence and a project with the corrections."""
     camera: tuple[str, ...] = Selection.camera
     """Cameras, by name."""
     domain: str | None = None
-    """Replay: domain, by name; by default the first one of the sequence."""
+    """Replay: domain, by name; by default the first domain of the sequence."""
     free: Annotated[FreeInFrames, tyro.conf.arg(name="")] = field(default_factory=FreeInFrames)
     network: Annotated[Network, tyro.conf.arg(name="")] = field(default_factory=Network)
 
@@ -56,7 +56,7 @@ class Live(RangedOptions):
             check_writable(self.output.parent)
 
     def run(self) -> None:
-        """Track until the stream ends or Ctrl-C."""
+        """Track until the end of the stream or Ctrl-C."""
         from ..live import LiveStatistics, LiveTracker, Recorder, Results, follow, open_stream
         from ..optimization import Backgrounds
         from ..project import Provenance
@@ -106,7 +106,7 @@ class Live(RangedOptions):
                     console.print(f"wrote {path}. To inspect it: carts view {path}")
 
     def _lines(self) -> "list[Callable]":
-        """Functions that each write a result as a line of JSON."""
+        """Functions that write results as lines of JSON."""
         import os
         import sys
 
@@ -126,7 +126,7 @@ class Live(RangedOptions):
                 sys.stdout.buffer.write(encoder.encode(message) + b"\n")
                 sys.stdout.buffer.flush()
             except BrokenPipeError:
-                # Otherwise Python would flush again at exit, with an error.
+                # Otherwise Python would flush the output again at exit, with an error.
                 os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
                 raise
 

@@ -27,7 +27,7 @@ from .options import (
 
 @dataclass(frozen=True)
 class Optimize(OptimizeOptions):
-    """Correct the kinematics of frames; write masks (PNG) and kinematics (CSV). Rerun it to resume."""
+    """Correct the kinematics of frames; write masks (PNG) and kinematics (CSV). Rerun the command to resume."""
 
     def run(self) -> None:
         """Optimize the frames without an up-to-date result."""
@@ -45,17 +45,18 @@ _WIDTH = 110
 class Evaluate:
     """Optimize frames and compare masks and joints with ground truth, before and after.
 
-    The initial state has the corrections of the project beside the sequence; without a project, it is the measured one.
+    The initial state includes the corrections of the project beside the sequence; without a project, it is the measured
+    state.
     """
 
     sequence: SequencePath
     """Sequence file."""
     json: Path | None = None
-    """Write the scores of all frames and their means to this file; missing folders are created. `-` writes them to the
-    standard output, and everything else to the standard error.
+    """Write the scores of all frames and their means to this file; missing folders are created. `-` writes the scores
+    to the standard output, and all messages to the standard error.
     """
     mode: Mode = "frame"
-    """Optimize each frame alone, or all frames jointly (docs: sequences)."""
+    """Optimize each frame individually, or all frames jointly (docs: sequences)."""
     together: bool = False
     """Optimize each frame jointly over all selected cameras (stereo); otherwise once per camera."""
     source: Annotated[FromProject, tyro.conf.arg(name="")] = field(default_factory=FromProject)
@@ -85,7 +86,7 @@ class Evaluate:
 
         console = Terminal(stderr=self.json == STANDARD_OUTPUT)
         if not console.is_terminal:
-            console.width = _WIDTH  # rich assumes 80 columns and would truncate the table
+            console.width = _WIDTH  # rich assumes 80 columns, which would truncate the table
         sequence = Sequence.open(self.sequence, progress=console.print)
         frames = self.select.frame_indices(sequence)
         cameras = self.select.camera_names(sequence.scene)

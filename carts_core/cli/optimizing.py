@@ -53,7 +53,7 @@ InputHashes = Mapping[str, str]
 """Kind of input -> its fingerprint; the kinds are the keys of `_CHANGED`."""
 
 _CHANGED = {
-    "code": "another version of the program wrote them",
+    "code": "another version of the program wrote the results",
     "weights": "the weights changed",
     "settings": "the settings changed",
     "robot": "the robot changed",
@@ -62,7 +62,7 @@ _CHANGED = {
     "images": "the images changed",
     "masks": "the masks changed",
     "background": "the background changed",
-    "together": "they were solved together with other frames",
+    "together": "the frames were solved together with other frames",
 }
 """Kind of input -> message if its fingerprint differs."""
 
@@ -84,7 +84,7 @@ class FrameInputs:
     """Fingerprints of the inputs of frames. No image is decoded, except for backgrounds.
 
     Args:
-        settings: settings of the run as text.
+        settings: settings of the run, as text.
     """
 
     def __init__(self, setup: Setup, observer: Observer, settings: str) -> None:
@@ -106,7 +106,7 @@ class FrameInputs:
         return self._common
 
     def of(self, index: int) -> InputHashes:
-        """Fingerprints of a frame corrected alone; `SequenceError` if an image is missing."""
+        """Fingerprints of an individually corrected frame; `SequenceError` if an image is missing."""
         sequence, domain = self._setup.sequence, self._setup.domain
         start = self._setup.frame(index, cameras=()).measured
         joints = [(name, start[name], sequence.measured[name][index]) for name in sorted(start)]
@@ -119,7 +119,7 @@ class FrameInputs:
         return origin
 
     def of_all(self, indices: Several[int]) -> InputHashes:
-        """Fingerprints of frames that are corrected jointly: each depends on the inputs of all."""
+        """Fingerprints of jointly corrected frames, each of which depends on the inputs of all frames."""
         each = [self.of(index) for index in indices]
         sequence = self._setup.sequence
         stamps = sequence.timestamps
@@ -141,16 +141,16 @@ def changes(before: InputHashes, now: InputHashes) -> str | None:
         # A change of frames implies changes of joints, images and masks.
         different = [kind for kind in different if kind not in ("joints", "images", "masks")]
     if "calibration" in different:
-        # Masks and backgrounds are compared undistorted; the distortion belongs to the calibration.
+        # Masks and backgrounds are compared after undistortion; the distortion is part of the calibration.
         different = [kind for kind in different if kind not in ("masks", "background")]
     if "joints" in different or "images" in different:
-        # A background is computed from frames.
+        # The background is computed from frames.
         different = [kind for kind in different if kind != "background"]
     return " and ".join(_CHANGED[kind] for kind in different) or None
 
 
 def row_fingerprint(scene: Scene, row: KinematicsRow) -> str:
-    """Fingerprint of a table row, with the digits written to the file."""
+    """Fingerprint of a table row, with the precision of the file."""
     values = np.concatenate([position_values(scene, row), std_values(scene, row)])
     verdict = [row.verdict] if row.verdict else []
     return fingerprint(row.frame_id, row.source, [f"{value:.9g}" for value in values], *verdict)
@@ -163,16 +163,17 @@ class FrameResult:
     row: KinematicsRow
     state: SceneState
     origin: InputHashes
-    """Fingerprints of its inputs."""
+    """Fingerprints of the frame's inputs."""
     assessment: Assessment | None = None
-    """Verdict on the result, where it was assessed."""
+    """Verdict on the result; None if not assessed."""
 
 
 class FrameFolder:
     """Folder with masks, kinematics (`kinematics.csv`), settings (`settings.json`) and provenance (`results.json`).
 
-    A mask is `masks/FRAME.png`, or `masks/CAMERA/FRAME.png` with several cameras. Files are written atomically, and a
-    frame counts only if all its files were written. Nothing is created or changed before the first frame is written.
+    Masks are `masks/FRAME.png`, or `masks/CAMERA/FRAME.png` for several cameras. Files are written atomically, and a
+    frame is complete only if all its files were written. The folder is not created or changed before the first frame is
+    written.
 
     Args:
         settings: settings of the run; a folder with results of another `sequence` is refused.
@@ -227,15 +228,15 @@ class FrameFolder:
         record = self._records.get(frame_id)
         row = self.rows[bisect_left(self.rows, self._order[frame_id], key=lambda row: self._order[row.frame_id])]
         if record is None:
-            return "their inputs are unknown"
+            return "the inputs are unknown"
         if record.row != row_fingerprint(self._scene, row):
-            return "their rows in the table have changed"
+            return "the rows in the table have changed"
         if changed := changes(record.origin, origin):
             return changed
         for camera, folder in self._masks.items():
             path = folder / f"{frame_id}.png"
             if not holds_file(path) or fingerprint(path.path.read_bytes()) != record.masks.get(camera):
-                return "their masks are missing or damaged"
+                return "the masks are missing or damaged"
         return None
 
     def others_dropped(self, chosen: Several[str]) -> int:
@@ -276,16 +277,16 @@ class FrameFolder:
             new = {result.row.frame_id: result.row for result in results}
             rows = {row.frame_id: row for row in self.rows} | new
             self.rows = sorted(rows.values(), key=lambda row: self._order[row.frame_id])
-            # A frame counts only if all three files list it, so that a frame interrupted by a kill is redone.
+            # A frame is complete only if all three files list it, so that a frame interrupted by a kill is repeated.
             write_text(self._table, kinematics_csv(self._scene, self.rows))
             known = {row.frame_id: self._records[row.frame_id] for row in self.rows if row.frame_id in self._records}
-            # One line per frame.
+            # The file has one line per frame.
             lines = [f"{json.dumps(frame_id)}: {json.dumps(asdict(record))}" for frame_id, record in known.items()]
             content = f'{{"format": "{RESULTS_FORMAT}", "frames": {{\n' + ",\n".join(lines) + "\n}}\n"
             write_text(self._records_file, content)
 
     def _written_before(self) -> list[str]:
-        """Frames of this sequence with results in the folder, under any settings."""
+        """Frames of this sequence with results in the folder, for any settings."""
         if not holds_file(self._table):
             return []
         lines = self._table.path.read_text(encoding="utf-8", errors="replace").splitlines()
@@ -318,7 +319,7 @@ class FrameFolder:
 
 @dataclass(frozen=True)
 class _Part:
-    """Frames of one domain, seen by cameras that are optimized together."""
+    """Frames of one domain and one group of cameras that are optimized together."""
 
     setup: Setup
     output: FrameFolder
@@ -330,7 +331,7 @@ class _Part:
 
 
 class Optimizing:
-    """Corrects the selected frames and writes the results."""
+    """Correction of the selected frames, and output of the results."""
 
     def __init__(self, asked: OptimizeOptions) -> None:
         self._asked, self._console, self._solver = asked, Terminal(), asked.solving.chosen
@@ -360,7 +361,7 @@ class Optimizing:
         asked, sequence = self._asked, self._sequence
         scene = sequence.scene.with_cameras(cameras)
         start = scene.state({arm: rows[0] for arm, rows in sequence.measured.items()})
-        # Raises for unknown names of free or locked parameters.
+        # This raises an error for unknown names of free or locked parameters.
         Variables(scene, start, self._free, self._solver.length_scale)
         folder = output_folder(asked.output, sequence.name) / domain / "+".join(cameras)
         model = asked.solving.sequence if asked.mode == "sequence" else None
@@ -387,10 +388,10 @@ class Optimizing:
         if not together:
             self._solve_frames(todo, part, now)
         elif todo:
-            # Every frame depends on all others, so a missing one requires solving all again.
+            # Every frame depends on all other frames, so a missing frame requires solving all frames again.
             self._solve_sequence(part, now, common)
         else:
-            # Left behind if the process was killed after the last result.
+            # The checkpoint remains if the process was killed after the last result.
             remove_file(output.checkpoint)
         if todo:
             print_hints(self._console, constant_correction_hint(part.name, self._sequence, output.rows))
@@ -424,7 +425,7 @@ class Optimizing:
             self._console.print(f"{output.folder}: {note}")
 
     def _kept(self, part: _Part) -> str:
-        """Message on the results kept by a stopped run."""
+        """Message on the kept results of a stopped run."""
         there = f"{part.output.folder} holds {counted(len(part.output.rows), 'frame')}"
         if self._running is not None:
             done, total = self._running.progress
@@ -488,7 +489,7 @@ class Optimizing:
         )
 
     def _print_verdicts(self, part: _Part, frame_ids: list[str]) -> None:
-        """Print verdicts on masks and the number of undetermined joints."""
+        """Print the verdicts on masks and the number of undetermined joints."""
         rows = [row for row in part.output.rows if row.frame_id in set(frame_ids)]
         joints = [row.undetermined(self._sequence.scene) for row in rows]
         if line := verdict_line(part.name, [row.verdict for row in rows], joints):
@@ -507,7 +508,7 @@ class Optimizing:
         return {index: rows[ids[index]] for index in self._frames if ids[index] in rows}
 
     def _settings(self) -> dict[str, Any]:
-        """Settings stored with the results; inputs are stored as fingerprints (`FrameInputs`)."""
+        """Settings stored with the results. Inputs are stored as fingerprints (`FrameInputs`)."""
         asked = self._asked
         settings = {
             "sequence": str(asked.sequence.resolve()),

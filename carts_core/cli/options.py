@@ -1,4 +1,4 @@
-"""Options shared by several commands: frames, cameras, projects, networks, fitted masks, solver settings."""
+"""Options shared by several commands: frames, cameras, projects, networks, fitted masks and solver settings."""
 
 import json
 import os
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 ALL = "all"
 
 Mode = Literal["frame", "sequence"]
-"""Solve each frame alone, or all frames jointly (docs: sequences)."""
+"""Solve each frame individually, or all frames jointly (docs: sequences)."""
 
 
 @dataclass(frozen=True)
@@ -47,28 +47,28 @@ class Selection:
     """Frames, cameras and domains of a sequence."""
 
     frames: str | None = None
-    """Frame ids as in the recording and the page: `all` (the default), `007`, a range in the recording's order such as
-    `001-010`, several separated by commas, or `::3` for every third.
+    """Frame ids as in the recording and the page: `all` (default), `007`, a range in the order of the recording such as
+    `001-010`, several separated by commas, or `::3` for every third frame.
     """
     positions: str | None = None
     """Frames by position in the sequence instead of id, counted from 1: `1-10,15`."""
     camera: tuple[str, ...] = (ALL,)
     """Cameras, by name."""
     domain: tuple[str, ...] = ()
-    """Domains, by name, or `all`; by default the first one of the sequence."""
+    """Domains, by name, or `all`; by default the first domain of the sequence."""
 
     def frame_indices(self, sequence: "Sequence") -> list[int]:
         """Indices of the selected frames; errors as in `chosen_frames`."""
         return chosen_frames(self.frames, self.positions, sequence.frame_ids)
 
     def camera_names(self, scene: "Scene") -> list[str]:
-        """Names of the selected cameras; `RobotError` for an unknown one."""
+        """Names of the selected cameras; `RobotError` for an unknown camera."""
         if ALL in self.camera:
             return [camera.name for camera in scene.cameras]
         return [scene.camera(name).name for name in self.camera]
 
     def domain_names(self, sequence: "Sequence") -> list[str]:
-        """Names of the selected domains; `SettingsError` for an unknown one."""
+        """Names of the selected domains; `SettingsError` for an unknown domain."""
         if not self.domain:
             return [sequence.domains[0]]
         if ALL in self.domain:
@@ -84,10 +84,10 @@ def chosen_frames(frames: str | None, positions: str | None, ids: Names[str]) ->
     """0-based indices selected by `--frames` (ids) or `--positions` (from 1); all frames if neither is given.
 
     Raises:
-        SettingsError: both are given, or one is invalid or names a frame that is not in the recording.
+        SettingsError: both are given, a value is invalid, or a frame is not in the recording.
     """
     if frames is not None and positions is not None:
-        raise SettingsError("--frames and --positions are mutually exclusive. Give one of them.")
+        raise SettingsError("--frames and --positions are mutually exclusive. Give only one of them.")
     if positions is not None:
         numbers = [str(position) for position in range(1, len(ids) + 1)]
         return _chosen("--positions", positions, numbers, "Positions count from 1, as in the viewer; they are")
@@ -103,7 +103,7 @@ def chosen_frames(frames: str | None, positions: str | None, ids: Names[str]) ->
 
 
 def _chosen(option: str, text: str, names: Names[str], known: str) -> list[int]:
-    """Indices of the names selected by a text of names, ranges and steps."""
+    """Indices of the names selected by a list of names, ranges and steps."""
     place = {name: index for index, name in enumerate(names)}
     known = f"{known} {names[0]} to {names[-1]}. Give `all`, `{names[0]}`, `{names[0]}-{names[-1]}` or `::3`."
     if text == ALL:
@@ -145,7 +145,7 @@ class FromProject:
         return self.project not in (None, NO_PROJECT)
 
     def path(self, sequence_file: Path) -> Path | None:
-        """The project file; None if there is none. `SettingsError` if the given file is missing."""
+        """Path of the project file; None without a project. `SettingsError` if the given file is missing."""
         if self.project == NO_PROJECT:
             return None
         from ..project import default_path
@@ -158,8 +158,8 @@ class FromProject:
         return path
 
     def read(self, sequence: "Sequence") -> "ProjectState | None":
-        """Current state of the project; None if there is none. `SettingsError` or `ProjectError` if it cannot be
-        used."""
+        """Read the current state of the project; None without a project. `SettingsError` or `ProjectError` if the
+        project cannot be used."""
         path = self.path(sequence.path)
         if path is None:
             return None
@@ -172,7 +172,7 @@ class FromProject:
             raise ProjectError(f"{error} To ignore it: --project {NO_PROJECT}.") from error
 
     def sentence(self, sequence: "Sequence", project: "ProjectState | None", frames: Names[int]) -> str | None:
-        """Sentence on the project in use and the review states of the selected frames; None without a project."""
+        """Message on the project in use and the review states of the selected frames; None without a project."""
         if project is None:
             return None
         states = Counter(project.review(index).state.value for index in frames)
@@ -183,8 +183,8 @@ class FromProject:
         )
 
     def corrected(self, sequence: "Sequence", frames: Names[int], console: "Console") -> "Sequence":
-        """Apply the project's corrections to the sequence and print a note; without a project, returns it unchanged.
-        Errors as in `read`.
+        """Apply the project's corrections to the sequence and print a note; without a project, return the sequence
+        unchanged. Errors as in `read`.
         """
         project = self.read(sequence)
         if project is None:
@@ -196,24 +196,24 @@ class FromProject:
 
 
 class RangedOptions(Ranged):
-    """Base of options with ranges, which messages name as on the command line."""
+    """Base of options with ranges; messages use the command-line names of the options."""
 
     @classmethod
     def label(cls, field: str) -> str:
-        """Name of an option."""
+        """Command-line name of an option."""
         return f"--{field.replace('_', '-')}"
 
 
 @dataclass(frozen=True)
 class Perturbation(RangedOptions):
-    """Offset of the initial joint positions, for experiments."""
+    """Perturbation of the initial joint positions, for experiments."""
 
     perturb_deg: Annotated[float, Range(0, 180)] = 0.0
-    """Offset of every initial joint position [deg, mm]: from the true joint positions where the sequence has them, else
-    from the measured ones. 0 starts at the measured positions.
+    """Offset of every initial joint position [deg, mm] from the true joint positions, if known, else from the measured
+    joint positions. 0 starts at the measured positions.
     """
     seed: Annotated[int, Range(0)] = 0
-    """Random seed of the offset's signs, which are equal in all frames in sequence mode."""
+    """Random seed of the signs of the offsets; in sequence mode, all frames have the same signs."""
 
 
 _ENGINES: dict[str, Inference] = {"cpu:torch": "torch", "cpu:onnx": "onnx"}
@@ -229,7 +229,7 @@ class Network:
     device: str = "cpu"
     """Device of the networks: `cpu`, or a CUDA device such as `cuda` or `cuda:1`. On a CPU, the surface network runs in
     torch or ONNX Runtime (results agree to 1e-4), whichever is faster in a benchmark that runs once; `cpu:torch` and
-    `cpu:onnx` select one.
+    `cpu:onnx` select the engine.
     """
 
     def __post_init__(self) -> None:
@@ -268,7 +268,7 @@ def check_device(device: str) -> None:
 
 
 def output_folder(named: Path | None, *default: str) -> OutputPath:
-    """Output folder of a command: the given one, else the default path below `runs`."""
+    """Output folder of a command: the given folder, else the default path below `runs`."""
     return output_path(Path(), "runs", *default) if named is None else output_path(named)
 
 
@@ -276,16 +276,18 @@ def check_writable(folder: Path) -> None:
     """Check in advance that a folder can be written to or created; `SettingsError` otherwise."""
     there = next(path for path in (folder, *folder.absolute().parents) if path.exists())
     if not (there.is_dir() and os.access(there, os.W_OK)):
-        raise SettingsError(f"{folder} cannot be created or written, because of {there}. Give another folder.")
+        raise SettingsError(
+            f"{folder} cannot be created or written to: {there} is not a writable folder. Give another folder."
+        )
 
 
 SequencePath = Annotated[Path, tyro.conf.Positional]
-"""A sequence file as the first argument."""
+"""Sequence file, given as the first argument."""
 
 
 @dataclass(frozen=True)
 class FreeInFrames(FreeParameters):
-    """Free parameters of frames; rarely used ones are set by --settings."""
+    """Free parameters of frames; rarely used parameters are set with --settings."""
 
     locked_cameras: tyro.conf.Suppress[tuple[str, ...]] = ()
 
@@ -296,18 +298,18 @@ class SolverOptions:
 
     solver: Annotated[SolverName, tyro.conf.EnumChoicesFromValues] = SolverName.SURFACE
     """Solver: `surface` is the default; `occluded` repeats the optimization without occluded pixels; `acs`,
-    `acs_reference`, `l1` and `paper` compare image features as the paper does; `none` only evaluates the initial state.
+    `acs_reference`, `l1` and `paper` compare image features, as in the paper; `none` only evaluates the initial state.
     """
     settings: tuple[str, ...] = ()
-    """Settings that override the solver's: TOML files as written by --print-settings, or single settings such as
-    `iterations=20`, `sequence.initial_frames=3` and `free.locked_cameras=["left"]`."""
+    """Settings that override the defaults of the solver: TOML files as written by --print-settings, or single settings
+    such as `iterations=20`, `sequence.initial_frames=3` and `free.locked_cameras=["left"]`."""
 
     def __post_init__(self) -> None:
-        _ = self.chosen, self.sequence, self.freed(FreeParameters())  # Report an unusable file immediately.
+        _ = self.chosen, self.sequence, self.freed(FreeParameters())  # Unusable files are reported immediately.
 
     @property
     def chosen(self) -> SolverSettings:
-        """The solver's settings."""
+        """Settings of the solver."""
         return changed(named_solver(self.solver), _table(self.settings, "solver"), "[solver]")
 
     @property
@@ -316,18 +318,18 @@ class SolverOptions:
         return changed(SequenceSettings(), _table(self.settings, "sequence"), "[sequence]")
 
     def freed(self, free: FreeParameters) -> FreeParameters:
-        """Free parameters from options and settings."""
+        """Merge the free parameters of options and settings."""
         return changed(free, _table(self.settings, "free"), "[free]")
 
     def check_surface(self, what: str) -> None:
         """Check that the solver is `surface`, which `what` requires because it estimates standard deviations."""
         if not isinstance(self.chosen, SurfaceSolver):
             raise SettingsError(
-                f"{what} requires --solver surface, but --solver {self.solver} was given. Leave one of them out."
+                f"{what} requires --solver surface, but --solver {self.solver} was given. Remove one of the options."
             )
 
     def printed(self) -> str:
-        """All settings as a settings file."""
+        """All settings, formatted as a settings file."""
         return tomlkit.dumps({"solver": to_plain(self.chosen), "sequence": to_plain(self.sequence)})
 
 
@@ -344,11 +346,11 @@ class CalibrationOptions:
 
     @property
     def chosen(self) -> SurfaceSolver:
-        """The solver's settings."""
+        """Settings of the solver."""
         return changed(CALIBRATION_SETTINGS, _table(self.settings, "solver"), "[solver]")
 
     def printed(self) -> str:
-        """All settings as a settings file."""
+        """All settings, formatted as a settings file."""
         return tomlkit.dumps({"solver": to_plain(self.chosen)})
 
 
@@ -373,7 +375,8 @@ def _table(given: tuple[str, ...], name: str) -> dict[str, Any]:
 
 
 def _of_solver(text: str) -> str:
-    """Convert a single setting to TOML; without a table it belongs to the solver, and a bare word is a string."""
+    """Convert a single setting to TOML; a setting without a table belongs to the solver, and a bare word is a
+    string."""
     key, _, value = (part.strip() for part in text.partition("="))
     key = key if "." in key else f"solver.{key}"
     try:
@@ -384,9 +387,9 @@ def _of_solver(text: str) -> str:
 
 
 RECORDING = "recording"
-"""Masks of the sequence file."""
+"""Value of `--masks` for the masks of the sequence file."""
 LAYERS: dict[str, "MaskLayer"] = {"imported": "imported", "painted": "painted"}
-"""Masks of the sequence's project."""
+"""Value of `--masks` -> layer of the sequence's project."""
 
 
 @dataclass(frozen=True)
@@ -399,7 +402,7 @@ class Observer:
     masked: bool
     """Whether masks are fitted."""
     given: "GivenMasks | None" = None
-    """Fitted masks; None for those of the sequence file."""
+    """Fitted masks; None for the masks of the sequence file."""
     every: bool = False
     """Whether each frame needs a mask."""
 
@@ -423,13 +426,14 @@ class Observer:
     def check(
         self, sequence: "Sequence", frames: Iterable[int], cameras: Iterable[str], domains: Iterable[str | None]
     ) -> None:
-        """Check that all frames have the masks to be fitted; `SettingsError` otherwise."""
+        """Check that all frames have the required masks; `SettingsError` otherwise."""
         if not self.masked:
             return
         frames = list(frames)
         for camera, domain in product(cameras, domains):
             without = [index for index in frames if not self._has_mask(sequence, index, camera, domain)]
-            # With the network, external masks must belong to this recording, and recorded masks may be missing.
+            # If the network is also used, recorded masks may be missing, but external masks must belong to this
+            # recording.
             if without and (self.every or (self.given is not None and len(without) == len(frames))):
                 raise SettingsError(
                     f"{len(without)} of {counted(len(frames), 'frame')} have no {self._origin} of camera "
@@ -449,7 +453,7 @@ class Observer:
     def warnings(
         self, sequence: "Sequence", index: int, domain: str | None, cameras: tuple[str, ...], *, background: bool
     ) -> list[str]:
-        """Warnings based on one frame: the network is not suited to these arms or images, or masks of cameras are
+        """Warnings based on one frame: arms or images are outside the network's domain, or masks of cameras are
         missing.
 
         Args:
@@ -461,8 +465,8 @@ class Observer:
                 return []
             return [
                 f"Frame {sequence.frame_ids[index]} has no {self._origin} of camera {', '.join(without)}, so all "
-                f"cameras fitted together ({', '.join(cameras)}) use the network there, even those with masks. "
-                "Leave that camera out with --camera, or give it masks."
+                f"cameras fitted together ({', '.join(cameras)}) use the network in this frame, even those with masks. "
+                "Leave out that camera with --camera, or give masks for it."
             ]
         from ..optimization import check_domain
 
@@ -473,22 +477,24 @@ class Observer:
 
 @dataclass(frozen=True)
 class Observing(Network):
-    """Observations that are fitted: predictions of the network, masks, or both."""
+    """Options for the fitted observations: predictions of the network, masks, or both."""
 
     observe: Literal["network", "masks", "both"] = "network"
     """Fitted observations: predictions of the network, the sequence's masks (no network is loaded), or both: masks for
     coverage, and the network for parts, normals and frames without a mask.
     """
     masks: str = RECORDING
-    """Masks to fit: `recording` for those of the sequence file, `imported` or `painted` for those of its project
-    (`carts import-masks`, `carts view`), a layer of another project such as `other.carts:painted`, or a file or folder
-    of masks (docs: masks).
+    """Masks to fit: `recording` for the masks of the sequence file, `imported` or `painted` for the masks of its
+    project (`carts import-masks`, `carts view`), a layer of another project such as `other.carts:painted`, or a file or
+    folder of masks (docs: masks).
     """
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.masks != RECORDING and self.observe == "network":
-            raise SettingsError(f"--masks {self.masks} requires --observe masks or both. Add it, or leave --masks out.")
+            raise SettingsError(
+                f"--masks {self.masks} requires --observe masks or both. Add --observe, or leave out --masks."
+            )
         if self.masks in (RECORDING, *LAYERS):
             return
         named = self._layer[0] or Path(self.masks)
@@ -510,7 +516,7 @@ class Observing(Network):
                 "features. Leave out --solver or --observe."
             )
         if self.observe == "masks" and self.weights:
-            raise SettingsError("--observe masks loads no network, but --weights was given. Leave one of them out.")
+            raise SettingsError("--observe masks loads no network, but --weights was given. Remove one of the options.")
         from ..optimization import MaskPredictor, NetworkPredictor
 
         given = self._given(sequence)
@@ -538,7 +544,7 @@ class Observing(Network):
         return Path(project) if project else None, layer
 
     def _given(self, sequence: "Sequence") -> "GivenMasks | None":
-        """Masks to be fitted; None for those of the sequence file."""
+        """Masks to be fitted; None for the masks of the sequence file."""
         if self.masks == RECORDING:
             return None
         from ..project import Project
@@ -559,11 +565,11 @@ class Observing(Network):
 
     @property
     def caution(self) -> str | None:
-        """Remark that Dice scores refer to the fitted masks; None if no masks are fitted."""
+        """Remark that Dice scores refer to the fitted masks; None without fitted masks."""
         if self.observe == "network":
             return None
-        against = "the fitted masks" if self.masks == RECORDING else "the fitted masks where the recording has none"
-        return f"Dice is against {against}, so it measures agreement with them, not accuracy."
+        against = "the fitted masks" if self.masks == RECORDING else "the fitted masks if the recording has no masks"
+        return f"Dice is computed with {against}, so it measures agreement with these masks instead of accuracy."
 
 
 @dataclass(frozen=True)
@@ -573,13 +579,13 @@ class OptimizeOptions:
     sequence: SequencePath
     """Sequence file."""
     output: Path | None = None
-    """Folder to write to; by default `runs/NAME/DOMAIN/CAMERA`; with --together, CAMERA combines the names of all
-    cameras.
+    """Output folder; by default `runs/NAME/DOMAIN/CAMERA`, where CAMERA combines the names of all cameras with
+    --together.
     """
     overwrite: bool = False
     """Discard earlier results in the folder and start over."""
     mode: Mode = "frame"
-    """Correct each frame alone, or all frames jointly (docs: sequences)."""
+    """Correct each frame individually, or all frames jointly (docs: sequences)."""
     together: bool = False
     """Optimize each frame jointly over all selected cameras (stereo); otherwise once per camera."""
     keyframes: Path | None = None
@@ -593,7 +599,7 @@ class OptimizeOptions:
     def __post_init__(self) -> None:
         if self.keyframes is not None and self.mode != "sequence":
             raise SettingsError(
-                f"--keyframes {self.keyframes} requires --mode sequence. Add it, or leave --keyframes out."
+                f"--keyframes {self.keyframes} requires --mode sequence. Add --mode sequence, or leave out --keyframes."
             )
         if self.mode == "sequence":
             self.solving.check_surface("--mode sequence")

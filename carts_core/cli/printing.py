@@ -18,14 +18,14 @@ _NAMED = 5
 
 
 def print_hints(console: Console, *hints: str | None) -> None:
-    """Print hints, leaving out None."""
+    """Print the hints that are not None."""
     for hint in hints:
         if hint is not None:
             console.print(hint, style="yellow")
 
 
 def kept_start_hint(where: str, stopped: Sequence[str]) -> str | None:
-    """Hint that estimates equal their initial values; None if there are no such estimates."""
+    """Hint that estimates equal their initial values; None without such estimates."""
     kept = sum(reason == "start kept" for reason in stopped)
     if not kept:
         return None
@@ -38,7 +38,7 @@ def kept_start_hint(where: str, stopped: Sequence[str]) -> str | None:
 def verdict_line(
     where: str, verdicts: Sequence[str | None], undetermined: Sequence[Sequence[str] | None]
 ) -> str | None:
-    """Line on the mask verdicts and numbers of undetermined joints (None: unknown) of runs; None if no run was
+    """Summary of the mask verdicts and numbers of undetermined joints (None: unknown) of runs; None if no run was
     assessed.
     """
     runs = [(verdict, joints) for verdict, joints in zip(verdicts, undetermined, strict=True) if verdict is not None]
@@ -63,7 +63,7 @@ def verdict_hints(where: str, assessed: Mapping[str, Assessment | None]) -> list
 
 
 def sequence_hint(where: str, found: SequenceAssessment | None) -> str | None:
-    """Reason why a sequence is doubtful or failed; None if it is good or was not assessed."""
+    """Reason why a sequence is doubtful or failed; None for a good or unassessed sequence."""
     if found is None or found.verdict is Verdict.GOOD:
         return None
     kept = " Failed frames keep the measured values." if found.verdict is Verdict.FAILED else ""
@@ -71,7 +71,7 @@ def sequence_hint(where: str, found: SequenceAssessment | None) -> str | None:
 
 
 def calibration_hint(found: Assessment | None, stopped: StopReason) -> str | None:
-    """Verdict on a calibration; None if it was not assessed."""
+    """Verdict on a calibration; None for an unassessed calibration."""
     if found is None:
         return None
     kept = " The calibration was not changed." if stopped in (StopReason.FAILED, StopReason.START_KEPT) else ""
@@ -80,7 +80,7 @@ def calibration_hint(found: Assessment | None, stopped: StopReason) -> str | Non
 
 def base_frame_hint(where: str, gains: Sequence[float | None]) -> str | None:
     """Hint that base frames are probably wrong, from the mean share of the residual that free base frames would
-    explain; None if they are not.
+    explain; None without an indication of wrong base frames.
     """
     known = [gain for gain in gains if gain is not None]
     if not known or np.mean(known) < BASE_FRAME_GAIN:
@@ -99,7 +99,7 @@ _LARGE = 5.0
 
 
 def constant_correction_hint(where: str, sequence: recording.Sequence, rows: Sequence[KinematicsRow]) -> str | None:
-    """Hint on large corrections that are nearly constant over the optimized frames; None if there are none.
+    """Hint on large corrections that are nearly constant over the optimized frames; None without such corrections.
 
     A wrong focal length or base frame is compensated by the joints: the image fits, but the joints are wrong.
     """
@@ -114,7 +114,7 @@ def constant_correction_hint(where: str, sequence: recording.Sequence, rows: Seq
     prismatic = np.array([unit == "m" for unit in joint_units(scene)])
     shown = np.where(prismatic, 1e3 * off, np.degrees(off))
     typical = np.median(shown, axis=0)
-    # 80 % of the frames agree with the median to within half of it.
+    # In 80 % of the frames the correction differs from the median by at most half of the median.
     spread = np.quantile(np.abs(shown - typical), 0.8, axis=0)
     constant = np.flatnonzero((np.abs(typical) >= _LARGE) & (spread < np.abs(typical) / 2))
     if not constant.size:
@@ -129,7 +129,7 @@ def constant_correction_hint(where: str, sequence: recording.Sequence, rows: Seq
 
 
 def score_table(scores: list[FrameScore], title: str) -> Table:
-    """Table of means per domain and camera, as `carts evaluate` prints it."""
+    """Table of means per domain and camera for `carts evaluate`."""
     table = Table(title=title, caption="MAE, std: over the measured revolute joints. s: wall time per frame.")
     for column in (
         "domain",

@@ -18,7 +18,7 @@ class Robots:
     """List the built-in robots, for `robot = "builtin:NAME"` in a sequence file."""
 
     pictures: Path | None = None
-    """Folder for a picture of each robot, NAME.png."""
+    """Folder in which a picture of each robot is written, NAME.png."""
 
     def run(self) -> None:
         """Print the list, and write pictures if a folder is given."""
@@ -66,7 +66,7 @@ class RobotCommand:
     """Create a URDF of an arm with an instrument from dvrk_model; without --instrument, list the instruments."""
 
     model: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="MODEL")]
-    """Checkout of https://github.com/jhu-dvrk/dvrk_model, the folder that contains `urdf` and `meshes`."""
+    """Checkout of https://github.com/jhu-dvrk/dvrk_model: the folder with `urdf` and `meshes`."""
     instrument: str | None = None
     """Last six digits of the instrument's model number: 400... for the classic arm, 420... for Si."""
     output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
@@ -75,7 +75,7 @@ class RobotCommand:
     """Replace an existing file."""
 
     def run(self) -> None:
-        """Write the URDF after all its meshes have been read."""
+        """Write the URDF, after reading all its meshes."""
         from ..files import write_text
         from ..model.dvrk_model import dvrk_urdf, list_instruments
         from ..model.robot import Robot
@@ -97,4 +97,6 @@ class RobotCommand:
         write_text(output, dvrk_urdf(self.model, self.instrument, output.absolute().parent))
         console.print(f"wrote {output}: joints {', '.join(robot.joint_names)}")
         console.print(f"meshes: {robot.decimation}")
-        console.print(f'In a sequence file: robot = "{output.name}", as a path from that file.', markup=False)
+        console.print(
+            f'In a sequence file: robot = "{output.name}", with the path relative to that file.', markup=False
+        )

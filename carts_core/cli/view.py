@@ -19,21 +19,21 @@ class View:
     sequence: Annotated[Path | None, tyro.conf.Positional] = None
     """Sequence file, or the folder of a batch."""
     root: tuple[Path, ...] = ()
-    """Folders that the start page may read; by default the working folder. With a sequence: additional folders from
+    """Folders that the start page may read; by default the current folder. With a sequence: additional folders from
     which masks may be imported.
     """
     project: Path | None = None
     """Project file with the corrections; by default beside the sequence, or in the user's data folder."""
     host: str = "127.0.0.1"
-    """Address to listen on; by default only reachable from this machine. Other machines need the token in the printed
+    """Address to listen on; by default only this machine can connect. Other machines need the token in the printed
     address.
     """
     port: int = 8080
-    """Port to listen on; the next free one if it is taken."""
+    """Port to listen on; if it is in use, the next free port."""
     open_browser: bool = False
     """Open the page in the default browser."""
     segmenter: tuple[Path, Path] | None = None
-    """Encoder and decoder of a SAM-type model as ONNX files, for the tool *Prompt*; by default the shipped model."""
+    """Encoder and decoder of a SAM-type model as ONNX files, for the *Prompt* tool; by default the shipped model."""
     network: Annotated[Network, tyro.conf.arg(name="")] = field(default_factory=Network)
 
     def run(self) -> None:
@@ -42,7 +42,7 @@ class View:
             from carts_viewer.serving import serve, serve_site
 
             from ..batch.folder import is_batch
-        # Otherwise each garbage collection would scan all modules and block the page for 0.2 s.
+        # Otherwise each garbage collection would scan all modules, which blocks the page for 0.2 s.
         gc.freeze()
         segmenter = None
         if self.segmenter is not None:
@@ -62,7 +62,7 @@ class View:
             serve(self.sequence, project=self.project, folders=self.root, **options)
             return
         if self.project is not None:
-            raise SettingsError("--project requires a sequence. Give its sequence file, too.")
+            raise SettingsError("--project requires a sequence. Also give the sequence file.")
         batch = None if self.sequence is None else self.sequence.resolve()
         roots = self.root or (Path(), *([self.sequence] if self.sequence is not None else []))
         serve_site(roots, batch=batch, **options)

@@ -13,9 +13,9 @@ from ..errors import RobotError
 from ..files.reading import IMAGE, MESH, is_regular, read_bytes, size_problem
 
 MOST_FACES = 1_000_000
-"""Largest number of triangles in a mesh file, before simplification."""
+"""Maximum number of triangles in a mesh file, before simplification."""
 MOST_PARTS = 1_000
-"""Largest number of mesh instances in a file."""
+"""Maximum number of mesh instances in a file."""
 _IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from ..files.reading import CALIBRATION, TABLE, read_bytes
 
 MOST_CELLS, MOST_ROWS, MOST_COLUMNS = 10_000_000, 1_500_000, 10_000
-"""Largest number of values, rows and columns of a table."""
+"""Maximum number of values, rows and columns of a table."""
 LIBRARIES = {"read_parquet": ("pyarrow.parquet",), "read_matlab": ("scipy.io",)}
 """Modules per function that are imported before the memory limit applies."""
 

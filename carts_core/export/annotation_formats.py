@@ -60,7 +60,7 @@ def write_coco(dataset: Dataset, folder: OutputPath, progress: ExportProgress) -
 
 
 def mask_annotation(view: View, category_id: int, mask: Bool[ndarray, "height width"]) -> Annotation:
-    """Annotation of an object in a view, without its id; the box of an invisible object is empty."""
+    """Create the annotation of an object in a view, without id; the box of an invisible object is empty."""
     return {
         "image_id": view.id,
         "category_id": category_id,
@@ -125,7 +125,7 @@ def write_coco_keypoints(dataset: Dataset, folder: OutputPath, progress: ExportP
             yield from _annotations(dataset, view, category, points[category.arm])
 
     categories = [_category(category, points[category.arm]) for category in dataset.arms]
-    # CVAT and Datumaro expect "person" in the name for any kind of object.
+    # CVAT and Datumaro expect "person" in the file name for all kinds of objects.
     write_annotations(dataset, folder, progress, "person_keypoints", categories, annotations)
 
 
@@ -147,7 +147,7 @@ def _category(category: Category, points: tuple[Keypoint, ...]) -> dict[str, Any
 def _annotations(
     dataset: Dataset, view: View, category: Category, points: tuple[Keypoint, ...]
 ) -> Iterable[Annotation]:
-    """Annotation of an arm in a view; empty if the image contains none of its pixels or keypoints."""
+    """Annotation of an arm in a view; empty if neither pixels nor keypoints of the arm are in the image."""
     mask = dataset.label_image(view, "arms") == category.id
     pixels = project_keypoints(dataset.scene, dataset.state(view.frame), points, view.camera.name).double().numpy()
     values: list[float] = []
@@ -163,7 +163,7 @@ def _annotations(
 
 
 def _element(tag: str, content: object) -> ElementTree.Element:
-    """XML element with a text, or with one child per entry of a mapping and one per item of a list."""
+    """Create an XML element with text, or with one child per entry of a mapping and per item of a list."""
     element = ElementTree.Element(tag)
     if isinstance(content, Mapping):
         for name, value in content.items():
@@ -234,15 +234,18 @@ def write_datumaro(dataset: Dataset, folder: OutputPath, progress: ExportProgres
 
 
 _LISTS = ("Main", "Segmentation")
-"""Folders in `ImageSets` with image lists; each contains all images, since there is no split."""
+"""Folders in `ImageSets` with image lists; each list has all images, since there is no split."""
 _MOST_CATEGORIES = 254
-"""Largest number of categories; 0 is the background and 255 is VOC's void."""
+"""Maximum number of categories; 0 is the background, and 255 is VOC's void."""
 
 
 def write_voc(dataset: Dataset, folder: OutputPath, progress: ExportProgress) -> None:
     """Write the dataset in Pascal VOC format, with lossless label images; images keep their file format."""
     if len(dataset.categories) > _MOST_CATEGORIES:
-        raise CartsError(f"Pascal VOC holds {_MOST_CATEGORIES} categories, not {len(dataset.categories)}. Export COCO.")
+        raise CartsError(
+            f"Pascal VOC supports at most {_MOST_CATEGORIES} categories; given: {len(dataset.categories)}. "
+            "Export COCO instead."
+        )
     for view in dataset.views(progress):
         stem = dataset.stems[view.id - 1]
         file = dataset.write_image_as(view, folder / "JPEGImages", stem)
@@ -285,8 +288,8 @@ def _name(category: Category) -> str:
 
 
 def _palette() -> UInt8[np.ndarray, "256 3"]:
-    """VOC's colour map: the bits of a label, from the lowest, set red, green and blue in turn, from their highest
-    bit."""
+    """VOC's colour map: the bits of a label, from the lowest, are assigned to red, green and blue in turn, from the
+    highest bit of these."""
     labels = np.arange(256)[:, None]
     bits = (labels >> np.arange(8)) & 1
     return np.stack(
@@ -302,8 +305,8 @@ def _write_palette(path: OutputPath, labels: UInt8[np.ndarray, "height width"]) 
 
 
 _INTO_PIXEL = 0.25
-"""Offset added to pixel indices [px], so that readers recover the pixel both by rounding (supervision) and by
-truncation (Ultralytics).
+"""Offset added to pixel indices [px], so that rounding (supervision) and truncation (Ultralytics) both recover the
+pixel.
 """
 
 
@@ -331,7 +334,7 @@ _NOWHERE = [-1, -1, -1, -1]
 
 @dataclass(frozen=True)
 class _Object:
-    """A link as a BOP object."""
+    """Link as a BOP object."""
 
     id: int
     """Object id, from 1."""
@@ -343,9 +346,9 @@ class _Object:
 
 
 def write_bop(dataset: Dataset, folder: OutputPath, progress: ExportProgress) -> None:
-    """Write the dataset in BOP format: 6D poses and masks of all links in the camera's field of view, and models.
+    """Write the dataset in BOP format: models, and 6D poses and masks of all links in the camera's field of view.
 
-    There is one scene per camera (`test/000001` etc.). Each link of an arm is an object, since BOP objects are rigid.
+    Each camera is a scene (`test/000001` etc.), and each link of an arm an object, since BOP objects are rigid.
     Lengths are in millimetres.
     """
     objects = list(_bop_objects(dataset.scene.arms))
@@ -414,7 +417,7 @@ def _bop_camera(dataset: Dataset, view: View) -> dict[str, Any]:
 def _bop_links(
     dataset: Dataset, view: View, objects: list[_Object], folder: OutputPath
 ) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
-    """Write the masks of all links in the image, occluded ones included; returns their poses and visibility."""
+    """Write the masks of all links in the image, including occluded links; returns their poses and visibility."""
     state, row = dataset.state(view.frame), _row(dataset, view)
     Ts = link_transforms(dataset.scene, state)[row]
     poses: list[dict[str, Any]] = []

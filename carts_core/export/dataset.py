@@ -1,4 +1,5 @@
-"""Dataset of an export: frames of a recording, a table or a project, and their labelled images, one at a time."""
+"""Dataset of an export: frames of a recording, a table or a project, with labelled images that are rendered one at a
+time."""
 
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -31,19 +32,19 @@ from .kinematics import KinematicsRow
 
 @dataclass(frozen=True)
 class ExportFrame(KinematicsRow):
-    """A frame to export: joint positions, their source, and corrected masks."""
+    """Frame to export: joint positions, their source, and corrected masks."""
 
     index: int = field(kw_only=True)
     """0-based position in the sequence."""
     review: str | None = field(default=None, kw_only=True)
-    """Review state, such as accepted; None without a project."""
+    """Name of the review state, such as accepted; None without a project."""
     dice: float | None = field(default=None, kw_only=True)
-    """Dice with the recorded masks, lowest over the cameras [1]; None if unknown."""
+    """Minimum Dice with the recorded masks over the cameras [1]; None if unknown."""
     masks: Mapping[str, Bool[ndarray, "height width"]] = field(default_factory=dict, kw_only=True)
-    """Camera -> corrected mask at the camera's size; other cameras get the rendered mask."""
+    """Camera -> corrected mask at the camera's size; rendered masks are used for other cameras."""
     part_labels: Mapping[str, UInt8[ndarray, "height width"]] = field(default_factory=dict, kw_only=True)
-    """Camera -> painted part class number (`carts_core.model.parts.PartClass`) per pixel, 0 for none. Painted classes
-    override the rendered ones, and painted pixels belong to the mask.
+    """Camera -> painted part class number (`carts_core.model.parts.PartClass`) per pixel, 0 if not painted. Painted
+    classes override rendered classes, and painted pixels belong to the mask.
     """
 
 
@@ -61,7 +62,7 @@ def measured_frames(sequence: Sequence, indices: Iterable[int]) -> list[ExportFr
 
 
 def corrected_frames(sequence: Sequence, indices: Iterable[int], rows: Iterable[KinematicsRow]) -> list[ExportFrame]:
-    """Frames of `indices` that have a table row, with its joint positions.
+    """Frames of `indices` with a table row, which has their joint positions.
 
     Raises:
         SequenceError: a row refers to a frame that is not in the sequence, or two rows to the same frame.
@@ -71,11 +72,11 @@ def corrected_frames(sequence: Sequence, indices: Iterable[int], rows: Iterable[
     for row in rows:
         if row.frame_id not in known:
             raise SequenceError(
-                f"the kinematics are of frame {row.frame_id!r}, which {sequence.path} does not have. "
-                "Give the table of this sequence."
+                f"the kinematics contain frame {row.frame_id!r}, which {sequence.path} does not have. Give the table "
+                "of this sequence."
             )
         if row.frame_id in by_id:
-            raise SequenceError(f"the kinematics have frame {row.frame_id!r} twice. Remove one of the rows.")
+            raise SequenceError(f"the kinematics contain frame {row.frame_id!r} twice. Remove one of the rows.")
         by_id[row.frame_id] = row
     chosen = ((index, by_id[sequence.frame_ids[index]]) for index in indices if sequence.frame_ids[index] in by_id)
     return [
@@ -117,8 +118,8 @@ def project_frame(
     """Frame with the corrections of a project, and with painted masks and parts for the given cameras.
 
     Args:
-        recording: recording with the project's time offset; other corrections may be applied.
-        render: renders masks; called for cameras whose mask was corrected.
+        recording: recording with the project's time offset, and possibly its other corrections.
+        render: renders masks; called only for cameras with a corrected mask.
     """
     frame = recording.frame(index, cameras=[])
     pose = corrected_state(recording.scene, frame, project)
@@ -160,7 +161,7 @@ class ExportProgress:
     """Called before each step; True cancels the export. Example: `threading.Event().is_set`."""
 
     def track(self, steps: Items[T]) -> Iterator[T]:
-        """Yield the steps, reporting progress; raises `ExportCancelled` if cancelled."""
+        """Yield the steps and report progress; raises `ExportCancelled` if cancelled."""
         for done, step in enumerate(steps):
             self._check()
             yield step
@@ -195,13 +196,11 @@ class View:
     name: str
     """View name, unique in the export; the stem of all files of this view."""
     link_ids: Int[np.ndarray, "height width"]
-    """Index of the visible link over all arms; -1 for background."""
+    """Index of the visible link per pixel, numbered over all arms; -1 for background."""
 
     @property
     def painted(self) -> bool:
-        """Whether the view has painted masks or parts, so that its labels are not determined by the joint positions
-        alone.
-        """
+        """Whether the view has painted masks or parts, so that its labels do not follow from joint positions alone."""
         return self.camera.name in self.frame.masks or self.camera.name in self.frame.part_labels
 
 
@@ -217,15 +216,15 @@ class Dataset:
     parts: Parts = "arms"
     """Granularity of the categories."""
     images: Images = "named"
-    """Whether labels refer to the recording's images or to copies, or no images are written, where the format allows
-    it.
+    """Whether labels refer to the recording's images or to copies, or no images are written, if supported by the
+    format.
     """
     frame_rate: float | None = None
-    """Frame rate of a video [1/s]; as recorded if None."""
+    """Frame rate of a video [1/s]; None for the recorded rate."""
 
     def __post_init__(self) -> None:
         if not self.frames:
-            raise SettingsError("there is no frame to export. Choose other frames, or correct some first.")
+            raise SettingsError("there is no frame to export. Choose other frames, or correct frames first.")
         known = {camera.name for camera in self.sequence.scene.cameras}
         if unknown := {camera for frame in self.frames for camera in frame.masks} - known:
             raise SettingsError(
@@ -279,7 +278,7 @@ class Dataset:
         }
 
     def state(self, frame: ExportFrame) -> SceneState:
-        """The scene at a frame's joint positions and camera poses."""
+        """State of the scene in a frame, with its joint positions and camera poses."""
         return self.scene.state(frame.joint_positions, mounts=self.sequence.mounts(frame.index))
 
     def views(self, progress: ExportProgress) -> Iterator[View]:
@@ -308,7 +307,7 @@ class Dataset:
             ids = [arms[link.arm] for link in self.links]
         else:
             numbers = [one.number for one in part_classes(self.scene.arms)]
-            # Links without a mesh may lack a class.
+            # Links without a mesh may have no class.
             ids = [numbers.index(number) + 1 if number in numbers else 0 for number in self.link_classes.tolist()]
         of_link = [0, *ids]
         return np.array(of_link, np.uint8 if max(of_link) <= 255 else np.uint16)[view.link_ids + 1]
@@ -322,7 +321,7 @@ class Dataset:
                 yield category, mask
 
     def image(self, view: View) -> UInt8[np.ndarray, "height width 3"]:
-        """Undistorted RGB image of the view; `SequenceError` if it is missing or damaged."""
+        """Undistorted RGB image of the view; `SequenceError` for a missing or damaged image."""
         return self.sequence.frame(view.frame.index, self.domain, [view.camera.name]).images[view.camera.name]
 
     @cached_property
@@ -334,14 +333,14 @@ class Dataset:
 
     @property
     def remade_cameras(self) -> tuple[str, ...]:
-        """Cameras whose images are not files of the recording; see `files`."""
+        """Cameras whose images are not unchanged files of the recording; see `files`."""
         steps = zip(self.steps, self.files, strict=True)
         return tuple(dict.fromkeys(camera.name for (_, _, camera), file in steps if file is None))
 
     @cached_property
     def image_folder(self) -> Path:
-        """Folder to which image names are relative: that of the sequence file, else the innermost common folder of all
-        recorded images.
+        """Folder to which image names are relative: the folder of the sequence file, else the innermost common folder
+        of all recorded images.
         """
         beside = self.sequence.path.parent
         cameras = self.sequence.scene.cameras
@@ -352,11 +351,11 @@ class Dataset:
         return Path(os.path.commonpath(folders))
 
     def image_name(self, view: View) -> str:
-        """Image path used in labels: that of the recorded file relative to `image_folder`, or `NAME.png`."""
+        """Image path used in labels: path of the recorded file relative to `image_folder`, or `NAME.png`."""
         return self._image_names[view.id - 1]
 
     def write_image(self, view: View, folder: OutputPath) -> str:
-        """Write the view's image into `folder` if copies are requested or it is not a recorded file; returns its
+        """Write the view's image into `folder` if copies are requested or the image is not a recorded file; returns the
         `image_name`.
 
         Recorded files are copied byte for byte; other images (see `remade_cameras`) are written as PNG.
@@ -373,7 +372,7 @@ class Dataset:
         return name
 
     def write_image_as(self, view: View, folder: OutputPath, stem: str) -> str:
-        """Like `write_image`, for formats that prescribe the file name; returns the name with its suffix."""
+        """Like `write_image`, for formats that prescribe the stem of the file name; returns the file name."""
         file = self.files[view.id - 1]
         name = f"{stem}{'.png' if file is None else file.suffix.lower()}"
         if self.images != "none":
@@ -389,7 +388,7 @@ class Dataset:
 
     @cached_property
     def stems(self) -> list[str]:
-        """File stem of each view in flat folders: that of the recorded image if all stems differ, else the view's
+        """File stem of each view in flat folders: the stem of the recorded image if all stems differ, else the view's
         name."""
         own = [PurePath(name).stem for name in self._image_names]
         unique = len({stem.casefold() for stem in own}) == len(own) and not any(map(name_fault, own))
@@ -397,8 +396,8 @@ class Dataset:
 
     @cached_property
     def _image_names(self) -> list[str]:
-        """Image name of each view; all are view names if two label files would collide or a recorded name cannot be
-        written.
+        """Image name of each view; all names are view names if two label files would collide or a recorded name cannot
+        be written.
         """
         files = self.files
         paths = [PurePath(f"{name}.png") for name, _, _ in self.steps]
@@ -418,7 +417,7 @@ def labelled(
     """Restrict `rendered` labels (-1 for background) to `mask`; additional pixels get the nearest rendered label.
 
     Raises:
-        CartsError: the mask of the view `where` has another size, or there is no rendered label for its pixels.
+        CartsError: the mask of the view `where` has another size, or the view has no rendered label.
     """
     if mask.shape != rendered.shape or mask.dtype != bool:
         raise CartsError(
@@ -429,8 +428,8 @@ def labelled(
         return np.full_like(rendered, -1)
     if (rendered < 0).all():
         raise CartsError(
-            f"{where}: the mask has {counted(int(mask.sum()), 'pixel')}, but no arm is in view there, so its arm is "
-            "unknown. Correct the joint positions of this frame, clear its mask, or leave the frame out."
+            f"{where}: the mask has {counted(int(mask.sum()), 'pixel')}, but no arm is in view, so the arm of the mask "
+            "is unknown. Correct the joint positions of this frame, clear its mask, or leave the frame out."
         )
     rows, columns = _nearest(rendered >= 0)
     return np.where(mask, rendered[rows, columns], -1)
@@ -448,11 +447,10 @@ def painted_links(
     classes: Int[np.ndarray, " links"],
     where: str,
 ) -> Int[np.ndarray, "height width"]:
-    """`link_ids` in which each pixel painted as a part class (0: not painted) gets the nearest rendered link of that
-    class.
+    """Replace `link_ids` in pixels painted as a part class (0: not painted) by the nearest rendered link of that class.
 
     Args:
-        rendered: like `link_ids` (-1 for background), before a mask was applied.
+        rendered: like `link_ids` (-1 for background), before masks were applied.
         classes: part class number of each link.
 
     Raises:

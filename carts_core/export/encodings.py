@@ -29,14 +29,16 @@ def image_png(image: UInt8[np.ndarray, "height width channels"]) -> bytes:
 
 
 def coco_rle(mask: Bool[np.ndarray, "height width"]) -> dict[str, object]:
-    """COCO's compressed run-length encoding (column-major): `size` as [height, width], and `counts` as text."""
+    """Encode a mask as COCO's compressed run-length encoding (column-major): `size` as [height, width], and `counts` as
+    text."""
     counts = coco_mask.encode(np.asfortranarray(mask, dtype=np.uint8))["counts"]
     assert isinstance(counts, bytes)
     return {"size": list(mask.shape), "counts": counts.decode("ascii")}
 
 
 def row_runs(mask: Bool[np.ndarray, "height width"]) -> list[int]:
-    """Row-major run lengths, alternately outside and inside the mask; the first is outside and may be 0."""
+    """Row-major run lengths, alternately outside and inside the mask; the first run is outside and may have length
+    0."""
     flat = mask.ravel()
     changes = np.flatnonzero(flat[1:] != flat[:-1]) + 1
     lengths = np.diff(changes, prepend=0, append=flat.size).tolist()
@@ -54,10 +56,10 @@ MIN_POINTS = 3
 
 
 def polygons(mask: Bool[np.ndarray, "height width"]) -> list[Int[np.ndarray, "points 2"]]:
-    """One closed polygon per connected component of a mask, through the centres of its boundary pixels.
+    """Closed polygon for each connected component of a mask, through the centres of its boundary pixels.
 
-    Filled including its edges, as in OpenCV, each polygon reproduces its component exactly. Holes are connected to the
-    outline by slits of zero width, since a polygon has a single boundary.
+    If filled including its edges, as in OpenCV, each polygon reproduces its component exactly. Holes are connected to
+    the outline by slits of zero width, since a polygon has a single boundary.
 
     Returns:
         Integer points (column, row) [px]; the centre of pixel (0, 0) is at (0, 0).
@@ -75,8 +77,8 @@ def polygons(mask: Bool[np.ndarray, "height width"]) -> list[Int[np.ndarray, "po
 
 
 def _with_holes(rim: np.ndarray, holes: list[np.ndarray]) -> np.ndarray:
-    """Closed polyline along the outline and all holes. The shortest link is added first, so that it crosses no other
-    hole; links of the remaining holes are then compared only with links to the new points.
+    """Closed polyline along the outline and all holes. The shortest link is added first, so that no link crosses
+    another hole. Afterwards, the links of the remaining holes are only compared with links to the new points.
     """
     if not holes:
         return rim
@@ -88,7 +90,7 @@ def _with_holes(rim: np.ndarray, holes: list[np.ndarray]) -> np.ndarray:
         rim = np.concatenate([rim[: joint + 1], hole, hole[:1], rim[joint:]])
         at[at > joint] += len(hole) + 2
         new_length, new_at, new_start = _links(hole, points, first)
-        # Among links of equal length, the first along the line.
+        # Among links of equal length, the first along the line is used.
         better = (new_length < length) | ((new_length == length) & (at > joint))
         better &= np.isfinite(length)
         length[better], at[better], start[better] = new_length[better], joint + 1 + new_at[better], new_start[better]
@@ -97,14 +99,14 @@ def _with_holes(rim: np.ndarray, holes: list[np.ndarray]) -> np.ndarray:
 
 
 _ROWS = 512
-"""Number of points whose distances are computed at a time."""
+"""Number of points whose distances are computed at once."""
 
 
 def _links(line: np.ndarray, points: np.ndarray, first: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Shortest link from a line to each hole: squared length [px^2], index along the line, index along the hole.
 
     Args:
-        points: points of all holes; hole n has those from `first[n]` to `first[n + 1]`.
+        points: points of all holes; those of hole n are `first[n]` to `first[n + 1]`.
     """
     length, at = np.full(len(points), np.inf), np.zeros(len(points), np.int64)
     for row in range(0, len(line), _ROWS):
@@ -121,7 +123,7 @@ def _links(line: np.ndarray, points: np.ndarray, first: np.ndarray) -> tuple[np.
 
 
 def _corners(line: np.ndarray) -> np.ndarray:
-    """Closed line without the intermediate points of straight segments."""
+    """Remove the intermediate points of straight segments from a closed line."""
     before, after = line - np.roll(line, 1, axis=0), np.roll(line, -1, axis=0) - line
     corners = line[(before != after).any(1)]
     return corners if len(corners) else line[:1]

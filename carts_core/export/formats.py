@@ -1,4 +1,4 @@
-"""Export formats by name, and kinematics formats: joint positions as CSV, NPZ or JSON, and base frames of the dVRK."""
+"""Export formats by name, and the kinematics formats: joint positions as CSV, NPZ or JSON, and dVRK base frames."""
 
 import json
 import math
@@ -48,10 +48,10 @@ def write_kinematics_csv(dataset: Dataset, path: OutputPath, progress: ExportPro
 def write_kinematics_npz(dataset: Dataset, path: OutputPath, progress: ExportProgress) -> None:
     """Write a NumPy archive (NPZ) without pickled objects.
 
-    Arrays: `frame_id`, `source`, `verdict` (of the mask, empty if not assessed), `not_determined` (joints not
+    The arrays are: `frame_id`, `source`, `verdict` (of the mask, empty if not assessed), `not_determined` (joints not
     determined by the images, separated by `; `) and `index` [frames]; `column` (`ARM.JOINT`) and `unit` [columns];
-    `joint_positions` and `joint_std` [frames, columns] in the unit given by `unit`; unknown `joint_std` is NaN. If
-    cameras move, `T_camera_world` [frames, cameras, 4, 4] [m] contains their poses, and `camera` their names.
+    `joint_positions` and `joint_std` [frames, columns] in the unit given by `unit`; unknown `joint_std` is NaN. For
+    moving cameras, `T_camera_world` [frames, cameras, 4, 4] [m] contains the poses, and `camera` the names.
     """
     frames = list(progress.track(dataset.frames))
     moving, poses = _camera_poses(dataset, frames), {}
@@ -74,8 +74,8 @@ def write_kinematics_npz(dataset: Dataset, path: OutputPath, progress: ExportPro
 
 
 def write_kinematics_json(dataset: Dataset, path: OutputPath, progress: ExportProgress) -> None:
-    """Write JSON: the unit of every `ARM.JOINT`, then the frames with positions and standard deviations, null if
-    unknown."""
+    """Write JSON: the unit of every `ARM.JOINT`, then the frames with positions and standard deviations (null if
+    unknown)."""
     columns, moving = joint_columns(dataset.scene), _camera_poses(dataset, dataset.frames)
     frames = [
         {
@@ -122,16 +122,16 @@ def _write_base_frames(
 
 
 write_dvrk = partial(_write_base_frames, lambda name, T: {"base_frame": {"reference_frame": name, "transform": T}})
-"""Writes base frames to be merged into a dVRK system file (version 2.4)."""
+"""Function that writes base frames to be merged into a dVRK system file (version 2.4)."""
 write_dvrk_2_3 = partial(_write_base_frames, lambda name, T: {"base-frame": {"reference-frame": name, "transform": T}})
-"""Writes base frames for a dVRK console file (version 2.3 and earlier)."""
+"""Function that writes base frames for a dVRK console file (version 2.3 and earlier)."""
 write_dvrk_suj = partial(_write_base_frames, lambda name, T: {"measured_cp": T})
-"""Writes base frames as a fixed set-up joint file of the dVRK."""
+"""Function that writes base frames as a fixed set-up joint file of the dVRK."""
 
 
 @dataclass(frozen=True)
 class ExportFormat:
-    """An export format."""
+    """Export format."""
 
     label: str
     """Label of the format."""
@@ -175,15 +175,15 @@ def export(
     Args:
         dataset: content of the export.
         name: one of `FORMATS`.
-        output: folder or file to create. A file gets the format's suffix if it has another one.
+        output: folder or file to create. A file with another suffix gets the format's suffix.
         overwrite: replace a file, or a folder written by an export.
-        progress: progress and cancellation.
+        progress: progress and cancellation; none by default.
 
     Returns:
         Path of the output.
 
     Raises:
-        ExportCancelled: cancelled by the progress.
+        ExportCancelled: `progress` was cancelled.
         CartsError: the output exists or cannot be written, or required data is missing.
     """
     chosen = FORMATS[name]

@@ -1,4 +1,4 @@
-"""Corrected kinematics as CSV: one row per frame, with columns `source` and one `ARM.JOINT` per joint [rad, m].
+"""Corrected kinematics as CSV: one row per frame, with a column `source` and a column `ARM.JOINT` per joint [rad, m].
 
 If standard deviations are known, a column `ARM.JOINT.std` [rad, m] per joint follows. If a frame has a verdict,
 `verdict` (of the mask) and `not_determined` (joints not determined by the image) follow.
@@ -68,7 +68,7 @@ def std_values(scene: Scene, row: KinematicsRow) -> np.ndarray:
 
 
 def kinematics_csv(scene: Scene, rows: Iterable[KinematicsRow]) -> str:
-    """Kinematics table as CSV text; with standard deviations if any row has them."""
+    """Format a kinematics table as CSV, with standard deviations if any row has them."""
     rows = list(rows)
     with_std, with_verdict = any(row.joint_std is not None for row in rows), any(row.verdict for row in rows)
     text = io.StringIO()
@@ -100,7 +100,7 @@ def _read(path: Path, scene: Scene) -> list[KinematicsRow]:
     with io.TextIOWrapper(open_regular(path, TABLE), encoding="utf-8", newline="") as file:
         table = csv.reader(file)
         header = next(table, [])
-        # Tables of earlier versions end with the verdict.
+        # In tables of earlier versions, the verdict is the last column.
         texts = [name for name in header[-len(_TEXT_COLUMNS) :] if name in _TEXT_COLUMNS]
         numbers = header[: len(header) - len(texts)]
         with_std = numbers == _header(scene, True)

@@ -61,7 +61,7 @@ def write_video(dataset: Dataset, folder: OutputPath, progress: ExportProgress) 
             file = stack.enter_context(output_stream(folder / f"{name}.mp4"))
             container = stack.enter_context(av.open(file, "w", format="mp4"))
             stream = container.add_stream("libx264", rate=rate, options=_QUALITY)
-            # H.264 requires even sides.
+            # H.264 requires even widths and heights.
             stream.width, stream.height = camera.width + camera.width % 2, camera.height + camera.height % 2
             stream.pix_fmt = "yuv420p"
             streams[camera.name] = container, stream
@@ -74,7 +74,7 @@ def write_video(dataset: Dataset, folder: OutputPath, progress: ExportProgress) 
 
 
 def frame_rate(dataset: Dataset) -> float:
-    """Frame rate of a video [1/s]: as set, else that of the recording, else 25."""
+    """Frame rate of a video [1/s]: the given rate, else the rate of the recording, else 25."""
     times = dataset.sequence.timestamps
     if dataset.frame_rate is not None:
         return dataset.frame_rate

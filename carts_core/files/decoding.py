@@ -47,7 +47,7 @@ _PATIENCE = 20
 _IDLE = 10.0
 _MOST_IDLE = 4
 _LARGEST_FILE = GIB
-"""Largest temporary file of a library [bytes], in addition to a hundred times the size of the decoded file."""
+"""Maximum temporary file of a library [bytes], in addition to a hundred times the size of the decoded file."""
 _ARRAY, _PATH = 1, 2
 _ENVIRONMENT = {
     # Thread pools and arenas reserve address space, which would count as memory.
@@ -66,7 +66,7 @@ class Limits:
     memory: int = _MEMORY
     """Memory [bytes]."""
     written: int = _LARGEST_FILE
-    """Largest temporary file [bytes]."""
+    """Maximum temporary file [bytes]."""
 
     @staticmethod
     def of(path: Path) -> "Limits":

@@ -12,9 +12,9 @@ from pathlib import Path
 from ..errors import OutputError
 
 NAME_BYTES = 200
-"""Largest length of an untrusted name [bytes]; the remainder is reserved for additions such as `.png`."""
+"""Maximum length of an untrusted name [bytes]; the remainder is reserved for additions such as `.png`."""
 _FILE_BYTES = 255
-"""Largest length of a path component in file systems [bytes]."""
+"""Maximum length of a path component in file systems [bytes]."""
 _REFUSED = re.compile(r"[/\\\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]")
 """Path separators, control characters, line separators and surrogates."""
 

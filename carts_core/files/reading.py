@@ -32,14 +32,14 @@ JPEG = b"\xff\xd8"
 TIFF = {b"II*\0": "little", b"MM\0*": "big"}
 """Magic numbers and byte order of TIFF."""
 LARGEST_IMAGE = 40_000_000
-"""Largest number of pixels of an image or video frame; 8K has 33 million."""
+"""Maximum number of pixels of an image or video frame; 8K has 33 million."""
 
 _OTHERS = ("TIFF", "BMP", "WEBP", "PPM")
 _START_OF_SCAN = 0xDA
 _NO_FRAME_HEADER = (0xC4, 0xC8, 0xCC)
 """Markers between 0xC0 and 0xCF that are not frame headers."""
 _MOST_SCANS = 200
-"""Largest number of scans of a progressive JPEG, each of which is decoded."""
+"""Maximum number of scans of a progressive JPEG, each of which is decoded."""
 _TIFF_TILE = (322, 323)
 _ORIENTATION = 0x0112
 _EXIF = b"Exif\0\0"
@@ -191,16 +191,16 @@ T = TypeVar("T")
 MIB = 2**20
 GIB = 2**30
 LARGEST_DEPTH = 32
-"""Largest nesting depth of TOML, JSON and YAML."""
+"""Maximum nesting depth of TOML, JSON and YAML."""
 MOST_YAML_EVENTS = 500_000
-"""Largest number of YAML events: values, and starts and ends of lists and mappings."""
+"""Maximum number of YAML events: values, and starts and ends of lists and mappings."""
 MOST_JSON_PARTS = 3_000_000
-"""Largest number of lists and objects in JSON."""
+"""Maximum number of lists and objects in JSON."""
 MOST_INI_LINES = 10_000
 LARGEST_NAME = 255
-"""Longest name of a file or folder [bytes]."""
+"""Maximum length of the name of a file or folder [bytes]."""
 LARGEST_PATH = 4096
-"""Longest path [bytes]."""
+"""Maximum length of a path [bytes]."""
 LARGEST_WHOLE_NUMBER = 2**63 - 1
 
 
@@ -225,7 +225,7 @@ WEIGHTS = Kind("weights file", 512 * MIB)
 _POINTER = b"version https://git-lfs"
 """First bytes of a Git LFS pointer, the placeholder of a file that was not fetched."""
 _LARGEST_POINTER = 1024
-"""Largest size of a pointer [bytes]."""
+"""Maximum size of a pointer [bytes]."""
 _POINTER_TEXT = "it is a Git LFS pointer without its content; run `git lfs pull` in its repository"
 BAG = Kind("ROS bag", 1024 * GIB)
 VIDEO = Kind("video", 1024 * GIB)

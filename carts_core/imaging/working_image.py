@@ -202,7 +202,7 @@ _AIRLIGHT = 0.75
 """Value of opaque haze, in each colour [1]."""
 
 _LEAST = 0.25
-"""Smallest transmission [1]; dehazing amplifies noise by its inverse."""
+"""Minimum transmission [1]; dehazing amplifies noise by its inverse."""
 
 
 def transmission(images: Float[Tensor, "n 3 h w"], share: float) -> Float[Tensor, "n 1 h w"]:

@@ -21,7 +21,7 @@ from ..recording import Frame, Sequence
 from ..recording.kinematics_table import PLAUSIBLE
 
 LARGEST = 64 * 2**20
-"""Largest size of a message [bytes]."""
+"""Maximum size of a message [bytes]."""
 _LENGTH = struct.Struct(">I")
 
 

@@ -27,7 +27,7 @@ from .messages import mounts_of
 from .tracker import LiveVerdict
 
 _WAITING = 32
-"""Largest number of frames waiting for the disk; further ones are not recorded."""
+"""Maximum number of frames waiting for the disk; further ones are not recorded."""
 _AGAIN = "Fit the frame again; live tracking had too little time."
 _VERDICTS = {
     LiveVerdict.GOOD: FitVerdict("good", "Fitted live."),

@@ -34,7 +34,7 @@ from .messages import (
 
 HOST = "127.0.0.1"
 _WAITING = 8
-"""Largest number of results waiting for a slow client; older ones are dropped."""
+"""Maximum number of results waiting for a slow client; older ones are dropped."""
 _CLIENTS = 16
 _SILENCE = 10.0
 """Idle time after which a client is disconnected in favour of a new one, if no more connections are allowed [s]."""
@@ -175,7 +175,7 @@ def _put_newest(waiting: queue.Queue, item: object) -> None:
 _log = logging.getLogger(__name__)
 
 _NAMED = 20
-"""Largest number of logged unusable frames."""
+"""Maximum number of logged unusable frames."""
 _POLL = 0.01
 """Polling interval of a folder [s]."""
 _SUFFIXES = (".png", ".jpg", ".jpeg")

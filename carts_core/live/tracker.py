@@ -83,7 +83,7 @@ def small_picture(frame: Frame) -> Picture:
 
 
 def change(before: Picture, now: Picture) -> float:
-    """Largest change of a thumbnail over the cameras [1]; 0.7 for uncorrelated ones."""
+    """Maximum change of a thumbnail over the cameras [1]; 0.7 for uncorrelated ones."""
     sizes = np.linalg.norm(before, axis=1) + np.linalg.norm(now, axis=1)
     return float((np.linalg.norm(now - before, axis=1) / (sizes + np.sqrt(before.shape[1]))).max())
 

@@ -18,11 +18,11 @@ DISTORTION_LENGTHS = (0, 4, 5, 8, 12, 14)
 """Numbers of coefficients of OpenCV's distortion models."""
 
 RIGID_TOLERANCE = 1e-3
-"""Largest deviation of R^T R from the identity, per element [1]."""
+"""Maximum deviation of R^T R from the identity, per element [1]."""
 EXACT = 1e-9
 """Deviation of R^T R from the identity [1] below which rotations are unchanged; others are projected onto SO(3)."""
 LAST_ROW_TOLERANCE = 1e-6
-"""Largest deviation of the last row from 0, 0, 0, 1, for matrices in single precision [1]."""
+"""Maximum deviation of the last row from 0, 0, 0, 1, for matrices in single precision [1]."""
 
 T_DVRK_OPENCV = np.diag([-1.0, -1.0, 1.0, 1.0])
 """Transform from OpenCV's camera frame (x right, y down) to the dVRK's (x left, y up); its own inverse."""
@@ -35,7 +35,7 @@ SQUARE_RANGE = 0.9, 1.1
 """Plausible ratios fx / fy [1]; pixels are nearly square."""
 
 FARTHEST = 1e6
-"""Largest coordinate of a transform [m], focal length and principal point [px]."""
+"""Maximum coordinate of a transform [m], focal length and principal point [px]."""
 
 
 def rigid_transform(value: ArrayLike, what: str) -> Float[np.ndarray, "4 4"]:

@@ -42,7 +42,7 @@ def decimated(
 
     Args:
         vertices: mesh vertices [m].
-        tolerance: largest distance of points of either surface from the other [m].
+        tolerance: maximum distance of points of either surface from the other [m].
 
     Raises:
         DecimationError: decimation takes too long or too much memory, or fails.
@@ -78,7 +78,7 @@ def deviation(
 def _farthest(
     triangles: Float[np.ndarray, "F 3 3"], others: Float[np.ndarray, "G 3 3"], tolerance: float | None
 ) -> float:
-    """Largest distance of samples on `triangles` from the surface of `others` [m].
+    """Maximum distance of samples on `triangles` from the surface of `others` [m].
 
     The triangles of the nearest samples give upper bounds; for points with the largest bounds, all triangles are
     tested.

@@ -17,7 +17,7 @@ from .robot import Robot
 from .scene import Arm, Scene, SceneState
 
 MOST_KEYPOINTS = 6
-"""Largest number of keypoints of an arm; those nearest to the tip are kept."""
+"""Maximum number of keypoints of an arm; those nearest to the tip are kept."""
 _SAME_POINT = 5e-4
 """Distance below which joints are merged into one point [m]."""
 
@@ -125,7 +125,7 @@ SHAFT_MIDDLE = "shaft middle"
 _OUTER_SHARE = 90
 """Percentile of the distances of a shaft's vertices from its axis that is taken as its radius."""
 _LEAST_SLENDERNESS = 5.0
-"""Smallest ratio of length to width of a shaft [1]."""
+"""Minimum ratio of length to width of a shaft [1]."""
 
 
 class LandmarkKind(StrEnum):

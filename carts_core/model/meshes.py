@@ -22,7 +22,7 @@ from .decimation import DecimationError, decimated
 
 FORMATS = ("obj", "stl", "ply", "glb", "gltf", "dae")
 FARTHEST = 100.0
-"""Largest coordinate of a mesh after scaling [m]; instruments and robots are far smaller."""
+"""Maximum coordinate of a mesh after scaling [m]; instruments and robots are far smaller."""
 _HEAD = 2**16
 """Number of bytes at the start of a COLLADA file that are searched for its unit and up axis."""
 _UNIT = re.compile(rb"<unit\b[^>]*?\bmeter\s*=\s*[\"']\s*([0-9.eE+-]+)\s*[\"']")
@@ -105,7 +105,7 @@ def check_mesh(mesh: trimesh.Trimesh, name: str, farthest: float = FARTHEST) -> 
     """Check the coordinates and indices of a mesh.
 
     Args:
-        farthest: largest allowed coordinate.
+        farthest: maximum allowed coordinate.
 
     Raises:
         RobotError: a coordinate is not finite or too large, or a triangle refers to a missing vertex.
@@ -123,16 +123,16 @@ def check_mesh(mesh: trimesh.Trimesh, name: str, farthest: float = FARTHEST) -> 
 
 
 SHARP_EDGE = np.deg2rad(38.0)
-"""Largest angle between faces that share a smooth normal [rad]."""
+"""Maximum angle between faces that share a smooth normal [rad]."""
 
 _DEFAULT_COLOR = np.array([0.6, 0.6, 0.6])
 _OPAQUE = 0.99
 _AT_ONCE = 4
-"""Largest number of meshes that are decimated concurrently; each may take much memory."""
+"""Maximum number of meshes that are decimated concurrently; each may take much memory."""
 MOST_KEPT = 10
 """Ratio of triangles to the requested number from which meshes are clustered first [1]."""
 _CLUSTERED = MOST_KEPT / 2
-"""Largest ratio of triangles to the requested number after clustering [1]."""
+"""Maximum ratio of triangles to the requested number after clustering [1]."""
 _FIRST_CELL = 0.25
 """Cell size of the first clustering, relative to the tolerance [1]."""
 
@@ -224,7 +224,7 @@ def simplify(
 
     Args:
         mesh: mesh in metres.
-        tolerance: largest deviation of its surface [m]; None for no decimation.
+        tolerance: maximum deviation of its surface [m]; None for no decimation.
 
     Raises:
         DecimationError: the mesh is degenerate, or so irregular that it takes too long.
@@ -255,7 +255,7 @@ class Decimation:
     after: int
     """Number of rendered triangles."""
     deviation: float
-    """Largest surface deviation of a part [m]."""
+    """Maximum surface deviation of a part [m]."""
 
     def __str__(self) -> str:
         if self.deviation == 0.0:
@@ -277,7 +277,7 @@ def build_link_meshes(
     Args:
         parts: index of a link, a mesh of it [m], and its colour.
         max_faces: total number of triangles up to which meshes are not decimated.
-        tolerance: largest deviation of a surface [m].
+        tolerance: maximum deviation of a surface [m].
 
     Raises:
         RobotError: a mesh is degenerate, or so irregular that it takes too long or keeps too many triangles.

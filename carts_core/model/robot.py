@@ -164,9 +164,9 @@ _MOST_ELEMENTS = 100_000
 _MOST_LINKS = 1_000
 _DEEPEST = 32
 _FARTHEST = 1e3
-"""Largest coordinate, size or angle of a robot [m], [rad]."""
+"""Maximum coordinate, size or angle of a robot [m], [rad]."""
 _LARGEST_FACTOR = 1e6
-"""Largest scale of a mesh and factor of a mimic joint; the smallest is its inverse."""
+"""Maximum scale of a mesh and factor of a mimic joint; the smallest is its inverse."""
 _SHORTEST_AXIS = 1e-6
 _TYPES = ("revolute", "continuous", "prismatic", "fixed")
 _XACRO = "ros.org/wiki/xacro}"
@@ -352,11 +352,11 @@ def _wrong(element: Element, key: str, source: Path, allowed: str) -> RobotError
 
 
 INSTRUMENT_TOLERANCE = 2e-4
-"""Largest surface deviation by decimation of an instrument [m]."""
+"""Maximum surface deviation by decimation of an instrument [m]."""
 REACH_TOLERANCE = 1e-3
-"""Largest surface deviation for other robots, relative to their reach [1]."""
+"""Maximum surface deviation for other robots, relative to their reach [1]."""
 SLENDER = 0.1
-"""Largest width of a shaft, relative to its length [1]."""
+"""Maximum width of a shaft, relative to its length [1]."""
 
 
 class Robot:
@@ -549,7 +549,7 @@ def _prepared_meshes(
 def _tolerance(
     kinematics: Kinematics, link_names: tuple[str, ...], parts: list[tuple[int, trimesh.Trimesh, np.ndarray]]
 ) -> float:
-    """Largest surface deviation [m]: below an endoscope's resolution, or a share of a robot's reach."""
+    """Maximum surface deviation [m]: below an endoscope's resolution, or a share of a robot's reach."""
     if not parts:
         return INSTRUMENT_TOLERANCE
     longest = max((np.sort(mesh.extents) for _, mesh, _ in parts), key=lambda extents: extents[-1])

@@ -17,9 +17,9 @@ from ..errors import RobotError
 from ..files.reading import CALIBRATION, ROBOT, parse_yaml, read_text
 
 _LONGEST = 100_000
-"""Longest string or list in an expression."""
+"""Maximum length of a string or list in an expression."""
 _LARGEST = 2.0**63
-"""Largest integer in an expression."""
+"""Maximum integer in an expression."""
 _LONGEST_EXPRESSION = 2_000
 LIBRARIES = {"expanded": ("xacro", "xacrodoc")}
 """Modules that a child process imports before its memory is measured."""

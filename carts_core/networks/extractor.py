@@ -113,7 +113,7 @@ def _exported(network: AnySurfaceNetwork) -> bytes:
 
 
 TOLERANCE = 1e-4
-"""Largest difference between equivalent surface maps [1]."""
+"""Maximum difference between equivalent surface maps [1]."""
 _GAIN = 0.9
 """Ratio to torch's time below which another engine is preferred [1]."""
 _ROUNDS = 7
@@ -213,7 +213,7 @@ def _read(path: Path) -> Engine | None:
 
 @torch.no_grad()
 def _times(network: AnySurfaceNetwork, other: Surface) -> dict[Engine, float]:
-    """Shortest of several alternating timings of each engine [s]."""
+    """Minimum of several alternating timings of each engine [s]."""
     images, given = _probe(network)
     engines: dict[Engine, Callable[[], Tensor]] = {
         "torch": lambda: network(images.contiguous(memory_format=torch.channels_last), given).map(),

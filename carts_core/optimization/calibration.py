@@ -72,7 +72,7 @@ def _moved(given: np.ndarray, start: SceneState, state: SceneState, name: str, i
 
 
 _TRIED = 4
-"""Largest number of frames for the domain check."""
+"""Maximum number of frames for the domain check."""
 
 _HELD_INTRINSICS = 0.01
 """Expected error of fixed focal lengths and principal points, as a share of the focal length [1]. It increases standard
@@ -81,7 +81,7 @@ navigation problems, 1966).
 """
 
 _TOO_FAR = 3.0
-"""Largest motion of a base frame, in its known standard deviations [1]."""
+"""Maximum motion of a base frame, in its known standard deviations [1]."""
 
 _CORRELATED = SequenceSettings.measurement_noise / SurfaceSolver.noise
 """Ratio of a standard deviation to that for independent pixels, as in sequence mode [1]."""
@@ -92,7 +92,7 @@ class CalibrationIterate:
     """One iterate of a calibration; an immutable copy."""
 
     index: int
-    """Iteration number; 0 is the start."""
+    """Iteration number; 0 for the start."""
     stage: int
     stages: int
     loss: float
@@ -115,15 +115,15 @@ class UnknownChange:
     """Unit of all other fields: deg, mm, px or %."""
     change: float
     standard_deviation: float
-    """Total standard deviation from all modelled errors: frame errors, a common outline error, fixed intrinsics, and
-    early termination of the optimization.
+    """Standard deviation from all modelled errors: frame errors, a common outline error, fixed intrinsics, and early
+    termination of the optimization.
     """
     deviation: float
     """Standard deviation from the curvature alone, for independent pixels."""
     deviation_between_frames: float | None
     """Standard deviation from the differences between frames (jackknife); None with one frame."""
     prior_deviation: float
-    """Standard deviation of the prior; an unknown whose `deviation` is close to it was not determined."""
+    """Standard deviation of the prior; an unknown with a similar `deviation` is not determined by the images."""
 
 
 @dataclass(frozen=True)
@@ -134,7 +134,7 @@ class CalibrationResult:
     """The given scene with the new calibration."""
     unknowns: tuple[UnknownChange, ...]
     frame_losses_before: Float[np.ndarray, " frames"]
-    """Initial loss of each frame with measured joints, like `frame_losses_after`, under the last observation."""
+    """Loss of each frame before the calibration, with measured joints, under the last observation."""
     frame_losses_after: Float[np.ndarray, " frames"]
     frame_weights: Float[np.ndarray, " frames"]
     """Weights of the frames, in [0, 1]."""
@@ -155,7 +155,7 @@ class CalibrationOptimizer:
 
     Args:
         frames: observed images and measured joint positions.
-        networks: the networks, or another predictor of surface maps.
+        networks: the networks, or a predictor of surface maps.
         settings: the solver, with its `frame_prior_deg` and `intrinsics_prior`.
         free: unknowns. Joints are free in each frame separately.
         joint_prior_deg: expected error of free joints [deg].
@@ -163,7 +163,7 @@ class CalibrationOptimizer:
         cameras: names of the cameras to use, all by default.
         backgrounds: known mean backgrounds of these cameras, as in `FrameOptimizer`.
         known_base_frames: arm -> covariance of the base frame's rotation and translation in its own axes [rad, m], as
-            in `HandEyeResult`, if it is more accurate than the prior of the settings.
+            in `HandEyeResult`, if more accurate than the prior of the settings.
 
     Raises:
         SettingsError: there are no frames, no calibration parameter is free, the settings belong to another solver, or
@@ -215,7 +215,7 @@ class CalibrationOptimizer:
         self.stop_reason: StopReason | None = None
         self.assessment: Assessment | None = None
         """Final verdict. A calibration that failed, or fits worse than the start by any measure, is replaced by the
-        start. A doubtful one counts as failed if the network is not suited to the robot.
+        start. A doubtful calibration counts as failed if the robot is outside the network's domain.
         """
 
     def cancel(self) -> None:
@@ -269,7 +269,7 @@ class CalibrationOptimizer:
         yield replace(self._fit.evaluate(problem.present), objective_key=(*last.objective_key, "start"))
 
     def _with_knowledge(self, found: Assessment) -> Assessment:
-        """Verdict that accounts for a network not suited to the arms; given masks need no network."""
+        """Verdict that accounts for arms outside the network's domain; given masks need no network."""
         if found.verdict is not Verdict.DOUBTFUL or self._problem.some_masked:
             return found
         tried = [self._frames[index] for index in spread(len(self._frames), _TRIED)]
@@ -327,7 +327,7 @@ class CalibrationOptimizer:
         together = torch.cat(shifts, 1)
         shared = together @ together.T
         if self._known:
-            # The jackknife does not show the error of known base frames.
+            # The jackknife does not include the error of known base frames.
             shared = shared + alone @ self._problem.prior.precision.double().cpu() @ alone
         # With a single frame, the correlation of pixels is taken from the settings.
         frames = _CORRELATED**2 * alone if between is None else between
@@ -390,7 +390,7 @@ def _between_frames(evaluation: CalibrationEvaluation) -> Float[torch.Tensor, "n
 def _widened(
     frames: Float[torch.Tensor, " n"], shared: Float[torch.Tensor, " n"], count: int
 ) -> Float[torch.Tensor, " n"]:
-    """Standard deviations, enlarged by the ratio of Student's t to Gaussian quantiles.
+    """Standard deviations, multiplied by the ratio of Student's t to Gaussian quantiles.
 
     Args:
         frames: variances estimated from `count` frames, with `count - 1` degrees of freedom.
@@ -399,7 +399,7 @@ def _widened(
     variance = frames + shared
     if count < 2:
         return variance.sqrt()
-    # Welch's and Satterthwaite's degrees of freedom of a sum (An approximate distribution of estimates of variance
+    # Welch-Satterthwaite degrees of freedom of a sum (An approximate distribution of estimates of variance
     # components, 1946).
     freedom = (count - 1) * (variance / frames.clamp(min=1e-30)).square()
     wider = stdtrit(freedom.clamp(max=1e9).numpy(), ndtr(1.0))

@@ -32,7 +32,7 @@ class Eliminated:
 
     gradient: Float[Tensor, " shared"]
     curvature: Float[Tensor, "shared shared"]
-    """The Schur complement of the own unknowns' block."""
+    """Schur complement of the block of own unknowns."""
     _step: Float[Tensor, " own"]
     _gain: Float[Tensor, "own shared"]
 
@@ -42,7 +42,7 @@ class Eliminated:
 
 
 def eliminate(gradient: Float[Tensor, " n"], curvature: Float[Tensor, "n n"], own: int) -> Eliminated:
-    """Eliminate the first `own` unknowns of a quadratic model; none if 0.
+    """Eliminate the first `own` unknowns of a quadratic model.
 
     Args:
         gradient, curvature: quadratic model; the block of the own unknowns must be positive definite.
@@ -63,7 +63,7 @@ _GOOD = 1.5
 
 
 _ASSESSED, _COMPARED = 12, 4
-"""Largest number of frames for the assessment, and for a search."""
+"""Maximum number of frames for the assessment, and for a search."""
 
 
 @dataclass(frozen=True)
@@ -78,13 +78,11 @@ class CalibrationEvaluation(Evaluation):
     frame_curvatures: Float[Tensor, "frames n n"] | None
     """Each frame's contribution to the curvature, without the prior."""
     outline: Float[Tensor, " n"] | None
-    """Change of the gradient for one standard deviation of an error common to all outlines."""
+    """Change of the gradient for one standard deviation of an error common to all outlines [1]."""
 
 
 class _FramePart:
-    """Problem of one frame in its own unknowns (joint offsets) and the shared ones; stores the values of its own
-    unknowns.
-    """
+    """Problem of one frame in its own unknowns (joint offsets), whose values are stored, and the shared unknowns."""
 
     def __init__(self, problem: FrameProblem, own: int) -> None:
         self.problem = problem
@@ -92,18 +90,18 @@ class _FramePart:
         self._anchor: tuple[Tensor, Tensor, Eliminated] | None = None
 
     def at(self, shared: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch m"]:
-        """All unknowns of the frame, with measured joints, at one calibration or a batch."""
+        """All unknowns of the frame, with measured joints, at one calibration or a batch of calibrations."""
         return torch.cat([shared.new_zeros(*shared.shape[:-1], len(self.own)), shared], -1)
 
     def follow(self, shared: Float[Tensor, " n"]) -> None:
-        """Update the own unknowns for a calibration, using the anchored model."""
+        """Update the own unknowns for a calibration, using the stored model."""
         if self._anchor is not None and len(self.own):
             at, own, model = self._anchor
             moved = own + model.own_step(shared - at).to(own)
             self.own = self.problem.variables.clamp(torch.cat([moved, shared]))[: len(own)]
 
     def anchor(self, shared: Float[Tensor, " n"], model: Eliminated) -> None:
-        """Anchor a model at the current own unknowns."""
+        """Store a quadratic model around the current own unknowns."""
         self._anchor = (shared, self.own, model)
 
     def observe(self, stage: Observe, shared: Float[Tensor, " n"]) -> None:
@@ -140,7 +138,7 @@ class CalibrationProblem:
         joint_prior_deg: expected error of free joints [deg]; `settings.length_scale` converts it to metres.
         backgrounds: known mean backgrounds of the cameras; see `FrameProblem`.
         known_base_frames: arm -> covariance of the base frame's rotation and translation in its own axes [rad, m], if
-            it is more accurate than the prior of `settings`.
+            more accurate than the prior of `settings`.
 
     Attributes:
         variables: unknowns of the calibration.
@@ -207,7 +205,7 @@ class CalibrationProblem:
         self._begun = False
 
     def evaluate(self, offsets: Float[Tensor, " n"], stage: Descend, *, gradient: bool = True) -> CalibrationEvaluation:
-        """Evaluate a calibration; free joints are updated for it."""
+        """Evaluate a calibration; free joints are updated for this calibration."""
         if stage is not self.present or not self._begun:
             self.present, self._lowest, self._begun = stage, math.inf, True
             self.stage += 1
@@ -222,7 +220,7 @@ class CalibrationProblem:
                 outlines.append(eliminate(evaluation.outline_gradient, evaluation.hessian, own).gradient)
         combined = self._combined(offsets, evaluations, models, outlines)
         self._losses = combined.frame_losses
-        # The solver, and with it the frames' own unknowns, steps from the best point so far.
+        # The solver steps from the best point so far, so the frames' own unknowns start there as well.
         if models and combined.value < self._lowest:
             self._lowest = combined.value
             for part, model in zip(self._parts, models, strict=True):
@@ -268,7 +266,7 @@ class CalibrationProblem:
         found = search_silhouettes(distances, deviation, self.variables.clamp, stage)
         if self._given_prior:
             return found
-        # Searched unknowns get the search range as prior; the others keep theirs.
+        # The search range is the prior of the searched unknowns; the other unknowns keep their prior.
         wide = torch.where(deviation > 0, deviation, self.prior.marginal_precision.rsqrt().to(deviation))
         self.prior = replace(Prior.around_start(wide.to(found) ** -2), mean=found)
         return found
@@ -341,8 +339,8 @@ def _with_base_frames(
 
 
 def frame_weights(losses: Float[Tensor, " frames"]) -> Float[Tensor, " frames"]:
-    """Robust frame weights in [0, 1]: 1 up to a multiple of the median loss, decreasing beyond, so that outliers (bad
-    kinematics, smoke) have little influence.
+    """Robust frame weights in [0, 1], which reduce the influence of outliers (bad kinematics, smoke): 1 up to a
+    multiple of the median loss, then decreasing.
     """
     shown = losses[losses > 0]
     if not len(shown):

@@ -30,18 +30,18 @@ class Information:
 
     @staticmethod
     def nothing(n: int) -> "Information":
-        """No information, for a frame whose image is ignored."""
+        """Zero information, for a frame whose image is ignored."""
         return Information(np.zeros((n, n)), np.zeros(n))
 
     @staticmethod
     def known(correction: Float[np.ndarray, " n"], std: Float[np.ndarray, " n"] | float = 0.0) -> "Information":
-        """Information of a known correction with a standard deviation [rad]; NaN entries are unknown."""
+        """Information of a known correction with a standard deviation [rad]; entries with NaN are unknown."""
         known = np.isfinite(correction)
         precision = np.where(known, 1.0 / (np.square(std) + 1.0 / _EXACT), 0.0)
         return Information(np.diag(precision), precision * np.where(known, correction, 0.0))
 
     def scaled(self, share: float) -> "Information":
-        """The information times a weight in [0, 1]."""
+        """Copy, multiplied by a weight in [0, 1]."""
         return Information(share * self.precision, share * self.vector)
 
     def __add__(self, other: "Information") -> "Information":
@@ -50,9 +50,9 @@ class Information:
     def mahalanobis(self, expected: Gaussian) -> float:
         """Squared Mahalanobis distance from the prediction, averaged over the measured directions [1].
 
-        It is the normalized innovation squared of a filter (Bar-Shalom, Li and Kirubarajan, Estimation with
+        This is the normalized innovation squared of a filter (Bar-Shalom, Li and Kirubarajan, Estimation with
         Applications to Tracking and Navigation, 2001, 5.4), whose degrees of freedom are the rank of the precision:
-        about 1 for a consistent measurement, and 0 if no direction is measured.
+        it is about 1 for a consistent measurement, and 0 if no direction is measured.
         """
         residual = self.vector - self.precision @ expected.mean
         # r (L + L S L)^-1 r, with the pseudoinverse of L, which may be singular, and an S that may be 0.
@@ -84,7 +84,8 @@ class ErrorModel:
     """Kalman model of n corrections with the state [3 n]: constant, drift and noise components.
 
     Args:
-        settings: standard deviations for joints; drift and noise of other unknowns scale with their constant.
+        settings: standard deviations for joints; for other unknowns, drift and noise are scaled in proportion to their
+            constant.
         constant: standard deviation of each unknown's constant component [rad].
     """
 
@@ -96,7 +97,7 @@ class ErrorModel:
         self._sum = np.tile(np.eye(n), 3)
 
     def initial(self) -> Gaussian:
-        """The prior, before any frame."""
+        """State before the first frame: the prior."""
         return Gaussian(np.zeros(3 * self._n), np.diag(self._variance))
 
     def predicted(self, state: Gaussian, seconds: float) -> Gaussian:
@@ -135,7 +136,7 @@ def combined(state: Gaussian, information: Information, C: Float[np.ndarray, "m 
     """Kalman update of a state x by a measurement of C x (x itself by default)."""
     C = np.eye(len(state.mean)) if C is None else C
     precision, cross = information.precision, state.covariance @ C.T
-    # K = P C^T (1 + L C P C^T)^-1 L needs no inverse of L, which may be singular.
+    # K = P C^T (1 + L C P C^T)^-1 L avoids inverting L, which may be singular.
     gain = cross @ np.linalg.inv(np.eye(len(C)) + precision @ C @ cross)
     covariance = state.covariance - gain @ precision @ cross.T
     mean = state.mean + gain @ (information.vector - precision @ C @ state.mean)
@@ -169,10 +170,10 @@ def remove_measurement(smoothed: Gaussian, own: Information) -> Gaussian:
 
 
 class Smoother:
-    """Forward filter over frames in visiting order, with a backward smoother.
+    """Kalman filter over frames in visiting order, with a backward smoother.
 
     Image errors of neighbouring frames are correlated, so only a share of a frame's information is used for other
-    frames; all of it is used for the frame itself.
+    frames. The frame itself uses all of its information.
 
     Args:
         gaps: frame index -> time from the previously visited frame [s], in visiting order.
@@ -222,7 +223,7 @@ class Smoother:
         return {index: combined(state, own[index]) for index, state in zip(self._order, states, strict=True)}
 
     def cautious(self, correlation_seconds: float) -> "Smoother":
-        """Smoother of the same measurements with a longer correlation of image errors [s]."""
+        """Smoother of the same measurements with a longer correlation time of image errors [s]."""
         other = Smoother(self._errors, self._gaps, correlation_seconds, self._exact)
         other._order, other._measured = self._order, self._measured
         return other
@@ -235,7 +236,7 @@ class Smoother:
         return self._errors.predicted(self._filtered[place - 1], self._gaps[index])
 
     def _filter(self, count: int) -> None:
-        """Filter the first `count` frames."""
+        """Extend the filter to the first `count` frames in visiting order."""
         for place in range(len(self._filtered), count):
             index = self._order[place]
             shared = self._measured[index].scaled(self._shares[index])

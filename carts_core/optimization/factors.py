@@ -27,7 +27,7 @@ class Linearization:
 
 
 class Factor(Protocol):
-    """A term of an objective. `FrameOptimizer(factors=...)` adds one to a frame's objective; `Prior` is a short
+    """A term of an objective. `FrameOptimizer(factors=...)` adds factors to a frame's objective; `Prior` is a short
     example.
     """
 
@@ -76,7 +76,7 @@ class Prior:
 _FIRST_DAMPING, _LEAST_DAMPING = 1e-2, 1e-4
 _SOFTER, _HARDER = 0.25, 8.0
 _LONGEST_STEP = 0.15
-"""Largest change of an unknown in one step [rad], the range of validity of the linear model."""
+"""Maximum change of an unknown in one step [rad], the range of validity of the linear model."""
 
 REJECTIONS = 3
 """Number of consecutive rejected steps after which a descent has converged [1]."""
@@ -130,7 +130,7 @@ def bounded_step(
     lower: Float[Tensor, " n"],
     upper: Float[Tensor, " n"],
 ) -> Float[Tensor, " n"]:
-    """Step to the minimum of the quadratic model over the unknowns not held at a bound.
+    """Step to the minimum of the quadratic model over the unknowns that are not fixed at a bound.
 
     Args:
         offsets: current point [rad].
@@ -143,7 +143,7 @@ def bounded_step(
 
 
 def shortened(step: Float[Tensor, " n"], longest: float) -> Float[Tensor, " n"]:
-    """The step, scaled down so that no unknown changes by more than `longest`."""
+    """Scale down a step so that no unknown changes by more than `longest`."""
     return step * min(1.0, longest / float(step.abs().max().clamp(min=1e-12)))
 
 

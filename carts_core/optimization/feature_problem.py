@@ -1,4 +1,4 @@
-"""The method of the paper: losses between observed and rendered features, as an optimization problem."""
+"""Optimization problem of the paper: losses between observed and rendered features."""
 
 from collections.abc import Mapping
 
@@ -94,7 +94,7 @@ class FeatureProblem:
         self._observed = self._images
 
     def _represent(self, images: Tensor) -> Tensor:
-        """Network features for ACS, predictions for L1."""
+        """Representation of images that is compared: network features for ACS, predictions for L1."""
         if self.settings.loss is Loss.L1:
             return self._extractor.probability(images)[:, 0]
         return self._extractor.features(images)
@@ -153,9 +153,9 @@ class FeatureProblem:
         )
 
     def _observed_around(self, silhouette: Float[Tensor, "cameras h w"], radius: int) -> Window:
-        """Compared window: the area of the attention, with a margin for the network.
+        """Window that is compared: the area of the attention, with a margin for the network.
 
-        It is kept as long as it contains the attention, so that observed features are computed once.
+        The window changes only if it no longer contains the attention, so that observed features are computed once.
         """
         size = (self.renderer.width, self.renderer.height)
         if self.settings.loss is Loss.L1:

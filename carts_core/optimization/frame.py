@@ -38,7 +38,7 @@ _BLUR = 3.0
 def base_frame_gain(problem: FrameProblem, offsets: Float[Tensor, " n"], free: FreeParameters) -> float:
     """Share of the surface residual at a point that free base frames would explain [1].
 
-    The part that the current unknowns alone would explain is excluded, and joints at a limit stay there.
+    The part that the current unknowns would explain is excluded; joints at a limit are fixed.
     """
     settings, own = problem.settings, problem.variables
     wider = Variables(problem.scene, own.start, replace(free, base_frames=True), settings.length_scale)
@@ -68,10 +68,10 @@ class Iterate:
     """One iterate of an optimization with its rendering; an immutable copy."""
 
     index: int
-    """Iteration number; 0 is the start."""
+    """Iteration number; 0 for the start."""
     state: SceneState
     loss: float
-    """Loss without the prior. Comparable within one observation and, if not `live`, one blur."""
+    """Loss without the prior; comparable within one observation and, if not `live`, one blur."""
     gradient_norms: dict[str, float]
     """Gradient norm per unknown, in radian-like units."""
     seconds: float
@@ -102,7 +102,7 @@ class Iterate:
 
 @dataclass(frozen=True)
 class Progress:
-    """Scalars of an iterate, stored in the history."""
+    """Loss, time and stage of an iterate, stored in the history."""
 
     index: int
     loss: float
@@ -118,7 +118,7 @@ class FrameOptimizer:
         frame: observed images and measured joint positions.
         backgrounds: camera name -> mean background BG_m. A `DescentSolver` requires all of them; a `SurfaceSolver` uses
             them to discard false detections, and skips missing ones. `Backgrounds` caches this across frames.
-        networks: the networks, or another predictor of surface maps.
+        networks: the networks, or a predictor of surface maps.
         ignore: camera name -> pixels that show an occluder; a `SurfaceSolver` excludes them.
         start: arm name -> joint positions to start from, the measured ones by default.
         settings: the solver, `SurfaceSolver()` by default.
@@ -232,11 +232,11 @@ class FrameOptimizer:
     def base_frame_gain(self) -> float | None:
         """Share of the surface residual at the best iterate that free base frames would explain [1].
 
-        It is computed from the linear model, at the cost of one comparison, without ignored pixels. All cameras are
-        combined, which reduces the effect of a single camera with a wrong pose.
+        The share is computed from the linear model without ignored pixels, which takes as long as one comparison. All
+        cameras are combined, which reduces the effect of a single camera with a wrong pose.
 
         Returns:
-            The share; None before the end, if base frames are free already, or for losses without a surface factor.
+            The share; None before the end, if base frames are free, or for losses without a surface factor.
         """
         ended = self.stop_reason not in (None, StopReason.CANCELLED, StopReason.NOT_OPTIMIZED)
         if not ended or self._free.base_frames or not isinstance(self._problem, FrameProblem):

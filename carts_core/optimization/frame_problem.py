@@ -31,7 +31,7 @@ _CONTRADICTS = 0.5
 _SMALLEST, _NEAR, _GAP, _RIM = 2, 5, 7, 2
 """Radii at an image width of 320 px [px]: smallest object, distance from the silhouette, closed holes, and margin."""
 _MOST = 0.5
-"""Contradicting share of the silhouette above which the estimate counts as wrong, not as occluded [1]."""
+"""Contradicting share of the silhouette above which the estimate is considered wrong instead of occluded [1]."""
 
 
 def propose_ignore(
@@ -78,10 +78,10 @@ _FIRST = 4
 """Factor for the number of candidates in the first round [1]."""
 
 _LEAST = 0.02
-"""Smallest standard deviation of a round, relative to the first one [1]."""
+"""Minimum standard deviation of a round, relative to the first round [1]."""
 
 _HOLD = 0.05
-"""Cost of a mean squared offset of 1, in standard deviations [px]."""
+"""Cost of a mean squared offset of one standard deviation [px]."""
 
 
 def mask_distances(mask: Bool[np.ndarray, "*cameras h w"]) -> Float[np.ndarray, "*cameras h w"]:
@@ -129,7 +129,7 @@ class SilhouetteComparison:
         return 2 * int((rendered & masks).sum()) / total if total else 1.0
 
     def distances(self, states: SceneState) -> Float[np.ndarray, " batch"]:
-        """Distances for a batch of states; see `silhouette_distance`."""
+        """Distances of a batch of states from the masks; see `silhouette_distance`."""
         return silhouette_distance(self._renderer.segment(states) >= 0, self._masks, self._weight)
 
 
@@ -164,7 +164,7 @@ def search_silhouettes(
 
 
 _SHOWN_BLUR = 1.6
-"""Largest blur under which displayed iterates are compared [px of the working image]."""
+"""Maximum blur under which displayed iterates are compared [px of the working image]."""
 
 
 _BESIDE = ThreadPoolExecutor(2, "edges")
@@ -176,7 +176,7 @@ class FrameProblem:
 
     Args:
         ignore: camera name -> pixels that show an occluder.
-        prior: prior of the unknowns; by default that of the settings.
+        prior: prior of the unknowns, by default the prior of the settings.
         backgrounds: mean backgrounds of the cameras; predictions in them are false positives.
         live: whether coarse stages are also compared under a fine blur for display, which increases the time by a
             third.
@@ -255,7 +255,8 @@ class FrameProblem:
         return self._images[scale]
 
     def toggle_background_mode(self) -> None:
-        """Switch between replacing the empty background in the images and subtracting the predictions in it."""
+        """Switch between replacing the empty background in the images and subtracting the network's predictions in the
+        background."""
         self._replaced = not self.images(1.0).replaced
         self._images, self._evidence = {}, None
 
@@ -362,7 +363,7 @@ class FrameProblem:
 
     @property
     def distance(self) -> float:
-        """Distance of the arms from the cameras at the start [m]."""
+        """Median distance of the arms' links from the cameras at the start [m]."""
         return self.scene.distance(self.variables.start)
 
     @property
@@ -379,7 +380,7 @@ class FrameProblem:
         return self.silhouettes(scale).overlap(self.variables.state(offsets))
 
     def search_silhouettes(self, stage: SilhouetteSearch) -> Float[Tensor, " n"]:
-        """Offsets whose silhouettes are nearest to the masks."""
+        """Search for the offsets whose silhouettes are nearest to the masks."""
         compared, variables = self.silhouettes(stage.scale), self.variables
         deviation = variables.spread(stage.joints_deg, stage.frames_deg, self.distance)
         return search_silhouettes(
@@ -387,7 +388,7 @@ class FrameProblem:
         )
 
     def _loss(self, factor: SurfaceFactor, compared) -> float:
-        """Cost per arm pixel, where the area is the mean of the rendered and observed areas.
+        """Cost divided by the arm area, the mean of the rendered and the observed area.
 
         The area has the same weights as the cost, so that losses of clear and hazy images are comparable.
         """

@@ -1,8 +1,8 @@
 """Factors of one frame: surface maps, and outlines at image edges.
 
-The renderer computes the quantities predicted by the network (parts and normals, see `carts_core.model.parts`)
-exactly for any state, so steps need no background, shading or network, and residuals have a Jacobian. A robust weight
-per pixel limits the influence of outliers (an occluder, a false detection).
+The renderer computes the quantities that the network predicts (parts and normals, see `carts_core.model.parts`) exactly
+for any state. Steps therefore need no background, shading or network, and residuals have a Jacobian. A robust weight
+per pixel limits the influence of outliers (occluders, false detections).
 """
 
 import math
@@ -44,10 +44,10 @@ _REDUCTIONS = (1, 2, 4, 8)
 """Allowed reductions of the observed images in a factor [1]."""
 
 _PIXELS_AT_ONCE = 1 << 20
-"""Largest number of pixels, over all states, that are rendered at once."""
+"""Maximum number of pixels, over all states, that are rendered at once."""
 
 _SMALLEST_BLUR = 1.2
-"""Smallest blur after reduction of the images [px of the reduced image]."""
+"""Minimum blur after reduction of the images [px of the reduced image]."""
 
 
 class SurfaceFactor:
@@ -118,7 +118,7 @@ class SurfaceFactor:
         return self._comparison(rendering, squared, ratio)
 
     def linearize(self, offsets: Float[Tensor, " n"]) -> "SurfaceLinearization":
-        """The quadratic model around a point, and the comparison there."""
+        """Quadratic model around a point, and the comparison at the point."""
         around: SceneState = self._variables.around(offsets)
         rendering = self.renderer.surface(around, DIFFERENCE_SPAN, 1 + kernel_radius(self._blur))
         model, squared, ratio = self._difference(rendering.maps)
@@ -242,7 +242,7 @@ def _nearest(gradient, camera, position, normal, samples, expected, sampling, di
         before, peak, after = strength[middle - 1], strength[middle], strength[middle + 1]
         finer = np.float32(0.5) * (after - before) / max(np.float32(2.0) * peak - before - after, np.float32(1e-12))
         distance[k] = samples[middle] + sampling * min(max(finer, np.float32(-0.5)), np.float32(0.5))
-        # A maximum at either end is the flank of a more distant edge.
+        # A maximum at either end of the search range belongs to a more distant edge.
         found[k] = 1.0 if 0 < best < last else 0.0
 
 
@@ -254,7 +254,7 @@ def nearest_edges(
     samples: Float[np.ndarray, " samples"],
     expected: Float[np.ndarray, " samples"],
 ) -> tuple[Float[np.ndarray, " K"], Float[np.ndarray, " K"]]:
-    """Distance to the strongest edge along the outward normal [px], and 1 if there is one, else 0.
+    """Distance to the strongest edge along the outward normal [px], and 1 if an edge is found, else 0.
 
     Args:
         gradient: image gradients of the three colour channels, in x and then in y [1/px].
@@ -278,7 +278,7 @@ _LIKELY = 3.0
 """Standard deviation of the expected distance between outline and true edge [px]."""
 
 _NEAR = 8
-"""Largest distance of an outline from predicted coverage [px]."""
+"""Maximum distance of an outline from predicted coverage [px]."""
 
 _ROBUST = 1.5
 """Distance at which the weight of an edge is reduced to a quarter [px]."""
@@ -290,7 +290,7 @@ _SHARE = (0.3, 1.0, 1.0)
 """Weight of an outline pixel per part [1]; errors along a straight shaft are correlated over many pixels."""
 
 _RENDERED_ANEW = 1.0
-"""Motion beyond which outlines are rendered again; below, they are moved by their Jacobian [px]."""
+"""Motion beyond which outlines are rendered again; smaller motions use their Jacobian [px]."""
 
 
 class EdgeFactor:
@@ -334,7 +334,8 @@ class EdgeFactor:
         """Local edge factor in the neighbourhood of a point.
 
         Args:
-            coverage: observed coverage of the arms in the whole image, at any resolution; edges elsewhere are ignored.
+            coverage: observed coverage of the arms in the whole image, at any resolution; edges outside of it are
+                ignored.
             weight: weight of a squared distance per outline pixel [1/px^2].
         """
         near = functional.interpolate(coverage[:, None], self._shown.shape[2:], mode="bilinear").clamp(0.0, 1.0)
@@ -353,7 +354,7 @@ class EdgeFactor:
     def cost(self, outline: Outline, counts: Float[Tensor, "cameras 1 h w"]) -> float:
         """Edge cost of outlines: sum of robust squared distances [px^2].
 
-        A pixel without an edge costs as much as one with a distant edge, so that costs of poses are comparable.
+        An outline pixel without an edge has the cost of a distant edge, so that costs of poses are comparable.
         """
         distance, found = self._nearest(outline)
         column, row = outline.position.round().long()
@@ -362,7 +363,7 @@ class EdgeFactor:
         return total(weight * (found * squared + (1.0 - found) * _ROBUST**2))
 
     def _nearest(self, outline: Outline) -> tuple[Float[Tensor, " K"], Float[Tensor, " K"]]:
-        """Distance to the edge along the outward normal [px], and 1 if there is one, else 0."""
+        """Distance to the edge along the outward normal [px], and 1 if an edge is found, else 0."""
         values = outline.camera, outline.position, outline.normal, self._samples, self._expected
         near = nearest_edges(as_array(self._gradient.permute(0, 2, 3, 1)), *map(as_array, values))
         distance, found = (torch.from_numpy(each).to(self._gradient.device) for each in near)
@@ -395,7 +396,7 @@ class LocalEdgeFactor:
         return self._factor.cost(self._outline, self._counts)
 
     def moved_by(self, step: Float[Tensor, " n"]) -> float:
-        """Largest motion of the outlines for a step [px]."""
+        """Maximum motion of the outlines for a step [px]."""
         return self._outline.moved_by(step)
 
 

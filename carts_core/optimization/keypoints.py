@@ -42,7 +42,7 @@ class KeypointSettings(Ranged):
     length_scale: Positive = SurfaceSolver.length_scale
     """Translation equivalent to one radian [m]."""
     iterations: Count = 60
-    """Largest number of iterations [1]."""
+    """Maximum number of iterations [1]."""
 
 
 @dataclass(frozen=True, eq=False)

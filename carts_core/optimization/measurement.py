@@ -37,7 +37,7 @@ Found = TypeVar("Found")
 Ignore = Callable[[int], Mapping[str, Bool[np.ndarray, "h w"]]]
 
 _QUICK_SCALE = 1.0
-"""Largest `Observe.scale` of a quick cold start [1]."""
+"""Maximum `Observe.scale` of a quick cold start [1]."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class Measurement:
     iterations: int
 
     def left_out(self) -> "Measurement":
-        """Copy of the measurement without the information of its image."""
+        """Copy without the information of its image."""
         return replace(self, information=Information.nothing(len(self.correction)))
 
 
@@ -165,7 +165,7 @@ class FrameSolver:
         return replace(end, iterations=fit.used + end.iterations)
 
     def run_frame_stages(self, frame: Frame, variables: Variables) -> SingleFrameFit | None:
-        """Run the stages of the settings, like `FrameOptimizer`; None if nothing is evaluated."""
+        """Run the stages of the settings, like `FrameOptimizer`; None without an evaluation."""
         fit = self._run(frame, variables, None, self._settings.stages, np.zeros(len(variables)))
         if fit.best is None:
             return None
@@ -251,7 +251,7 @@ def _prior(expected: Gaussian, variables: Variables) -> Prior:
 
 
 def _offsets(correction: np.ndarray, variables: Variables) -> Tensor:
-    """Convert a correction [n] to offsets within the joint limits."""
+    """Convert a correction [n] to offsets, clamped to the joint limits."""
     return variables.clamp(torch.from_numpy(correction).to(variables.lower))
 
 
@@ -279,16 +279,16 @@ class Origin(StrEnum):
     COLD = "cold"
     """Optimized from the measured values."""
     KEYFRAME = "keyframe"
-    """Set manually."""
+    """Joint positions set manually."""
     CARRIED = "carried"
     """Predicted from the other frames; the image contradicts them and is ignored."""
     MEASURED = "measured"
-    """Measured values, kept because the sequence and this frame failed."""
+    """Measured values, restored because the sequence and this frame failed."""
 
 
 @dataclass(frozen=True)
 class FrameEstimate:
-    """Estimate of one frame, based on its own and the other frames' measurements."""
+    """Estimate of one frame from the measurements of all frames."""
 
     index: int
     frame_id: str
@@ -300,7 +300,7 @@ class FrameEstimate:
     uncertainty: Uncertainty
     """Posterior and prior standard deviations of all unknowns."""
     loss: float
-    """Loss of the surface factor when the frame was last solved."""
+    """Loss of the surface factor at the last visit."""
     start: Origin
     iterations: int
     """Number of optimization steps over all visits."""

@@ -42,7 +42,7 @@ class Uncertainty:
     prior."""
 
     def observability(self, name: str) -> Observability:
-        """Observability of an unknown: whether its standard deviation decreases to a third, a little, or hardly at
+        """Observability of an unknown: whether its standard deviation decreases to a third, slightly, or hardly at
         all."""
         index = self.names.index(name)
         share = self.std[index] / self.expected[index] if self.left is None else self.left[index]
@@ -54,9 +54,10 @@ class Uncertainty:
         return np.array([known.get(f"{arm}/{joint}", np.nan) for joint in joints])
 
     def doubted(self, probability: float) -> "Uncertainty":
-        """Standard deviations given a probability that the fit is wrong [1], in which case the prior applies.
+        """Standard deviations that account for the probability that the fit is wrong [1], in which case the prior
+        applies.
 
-        They are those of the mixture of both cases, by the law of total variance.
+        The two cases are combined by the law of total variance.
         """
 
         def mixed(right: Sequence[float], wrong: Sequence[float]) -> tuple[float, ...]:
@@ -143,7 +144,7 @@ def uncertainty_after(
 
     The fit is the optimum under the original prior, so part of an error e of the start remains:
     (P + a I) (I + P)^-1 e, where I is the image's information, P the prior's precision and a the share of the start in
-    the network's prediction. Noise is added to it.
+    the network's prediction. The noise of the image is added.
 
     Args:
         prior: prior of the offsets, before the image was used; it must constrain all of them.
@@ -184,8 +185,8 @@ def expected_scale(
     """Estimated ratio of the start's errors to the prior standard deviation, from the corrections of a fit [1].
 
     Hierarchical prior (Gelman et al., Bayesian Data Analysis, 2013, chapter 5): the square of the scale is lognormal
-    with mean 1 and a standard deviation of 1 of its logarithm, and corrections are Gaussian in each direction, given
-    the scale. The result is the root of the posterior mean of the square; it is 1 if the image determines nothing.
+    with mean 1 and a standard deviation of 1 of its logarithm, and corrections are Gaussian in each direction for a
+    given scale. The result is the root of the posterior mean of the square, and 1 if the image determines no direction.
 
     Args:
         information: curvature of the image term of the objective.
@@ -212,7 +213,7 @@ class Evaluation:
     value: float
     """Sum of all factors, the prior included."""
     loss: float
-    """Loss per arm pixel, without the prior. Comparable within one observation and, unless the problem is live, one
+    """Loss per arm pixel, without the prior; comparable within one observation and, unless the problem is live, one
     blur."""
     stage_loss: float
     """Loss under the blur of the descent."""

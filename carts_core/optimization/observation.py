@@ -1,8 +1,8 @@
 """Observations: images of a frame at the size of comparison, and the surface maps predicted from them.
 
 The paper compares an image with BG_m + rendering, so background structures that resemble an arm occur in both. The
-surface network gets a single image. It is therefore run once on the mean background, and its predictions there are
-subtracted from those in an image where the image still shows that background.
+surface network gets a single image. The network is therefore also run once on the mean background; these predictions
+are subtracted in the pixels where an image still shows that background.
 """
 
 from collections.abc import Iterable, Mapping
@@ -42,18 +42,18 @@ _PATCH = 3
 """Side of the patches over which differences are averaged [px of the working image]."""
 
 _NOISE = 3.0, 6.0
-"""Noise standard deviations above the median at which a difference starts to count, and the further number after which
-it counts fully [1].
+"""Difference above the median, in standard deviations of the noise, at which the confidence starts to rise, and further
+increase to full confidence [1].
 """
 
 _CONTRAST = 0.04, 0.10
-"""Lower bounds of these two thresholds, for images without noise [1]."""
+"""Lower bounds of the two values of `_NOISE` as differences, for images without noise [1]."""
 
 _FOREIGN = 0.06
 """Median difference above which a background does not belong to the image [1]."""
 
 _UNTELLING = 0.15
-"""Difference above which arms may be indistinguishable from other changes, such as moving smoke [1]."""
+"""Difference above which arms are not distinguishable from other changes, such as moving smoke [1]."""
 
 DECEPTIVE = 0.08
 """Share of a background with false positives above which the background is removed from the network's input [1]."""
@@ -77,7 +77,7 @@ class Change:
     """Confidence that a pixel differs, in [0, 1]; 1 where the background is unknown."""
     telling: Float[Tensor, "cameras 1 h w"]
     """Confidence that an unchanged pixel shows no arm, in [0, 1]: 0 where the background is unknown, in images of
-    another scene, and where smoke differs as much as an arm would.
+    another scene, and where smoke differs from the background as much as an arm would.
     """
 
 
@@ -214,7 +214,7 @@ class Backgrounds:
 
     @staticmethod
     def forget(recording: Recording) -> None:
-        """Drop the cached objects of a recording, which itself caches the mean backgrounds."""
+        """Remove the cached objects of a recording; the recording itself caches the mean backgrounds."""
         _MADE.pop(recording, None)
 
     def covers(self, scene: Scene) -> bool:
@@ -222,8 +222,8 @@ class Backgrounds:
         return all(camera.name in self.images for camera in scene.cameras)
 
     def at(self, scene: Scene, size: tuple[int, int], dehaze: float, predictor: FramePredictor) -> Background:
-        """Backgrounds of a scene's cameras at a given width and height [px]; `SettingsError` if one is missing or does
-        not fit.
+        """Backgrounds of a scene's cameras at a given width and height [px]; `SettingsError` if a background is missing
+        or has the wrong size.
         """
         key = tuple(camera.name for camera in scene.cameras), size, dehaze, predictor
         if key not in self._found:
@@ -238,7 +238,7 @@ class Backgrounds:
             while len(self._found) > _KEPT:
                 del self._found[next(iter(self._found))]
         else:
-            # The least recently used entry comes first.
+            # The first entry is the least recently used one.
             self._found[key] = self._found.pop(key)
         return self._found[key]
 
@@ -267,7 +267,7 @@ class FrameImages:
     explained: Float[Tensor, "cameras 1 h w"] | None
     """Share of the predicted coverage explained by the empty background [1]; None if unknown."""
     change: Change | None
-    """Difference from the empty background; None if that is unknown."""
+    """Difference from the empty background; None if the background is unknown."""
     renderer: Renderer
     """Renderer of the whole image."""
 
@@ -317,10 +317,11 @@ class FrameImages:
         Args:
             ignore: camera name -> pixels that show an occluder.
             settings: working size and dehazing.
-            predictor: image sizes are multiples of its stride; it is also run once on the backgrounds.
+            predictor: predictor of the surface maps; image sizes are multiples of its stride. It is also run once on
+                the backgrounds.
             scale: image size relative to the working size [1].
             replaced: whether unchanged background is replaced before prediction; otherwise predictions in the
-                background are subtracted. By default it is replaced where it causes false detections.
+                background are subtracted. By default, backgrounds with false detections are replaced.
 
         Raises:
             SettingsError: an image is missing, or the size of an image or mask differs from that of its camera.
@@ -344,7 +345,7 @@ class FrameImages:
             size=size,
             images=dehazed(stacked, through),
             weight=pixel_weights(scene, ignore, size).to(predictor.device),
-            # Smoke affects the network more than noise: docs/explanation/decisions.md.
+            # Squared, since smoke degrades predictions more than amplified noise does: docs/explanation/decisions.md.
             certainty=torch.ones_like(through) if predictor.masked else certainty(through).square(),
             explained=explained,
             change=change,

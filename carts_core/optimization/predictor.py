@@ -18,17 +18,17 @@ from ..recording import Frame
 
 
 class FramePredictor(Protocol):
-    """Predicts the surface maps of one frame's images (`carts_core.model.parts`)."""
+    """Predictor of the surface maps (`carts_core.model.parts`) of one frame's images."""
 
     @property
     def masked(self) -> bool:
-        """Whether coverage comes from given masks. If so, the whole image is compared, without haze, backgrounds and
-        edges."""
+        """Whether coverage comes from given masks. In this case the whole image is compared, without dehazing,
+        backgrounds and edges."""
         ...
 
     @property
     def knows_parts(self) -> bool:
-        """Whether parts and normals are predicted. If not, the first channel is the coverage of the whole arm."""
+        """Whether parts and normals are predicted; otherwise the first channel is the coverage of the whole arm."""
         ...
 
     @property
@@ -65,7 +65,7 @@ class SurfacePredictor(Protocol):
         ...
 
     def for_frame(self, frame: Frame, cameras: Sequence[str]) -> FramePredictor:
-        """Predictor of one frame and some cameras."""
+        """Predictor for one frame and a subset of the cameras."""
         ...
 
 
@@ -89,8 +89,8 @@ class NetworkPredictor(ImagePredictor):
 
     @property
     def device(self) -> torch.device:
-        """The CPU, independent of the network's device: the rest of a frame consists of thousands of small operations,
-        which are slower on a GPU."""
+        """The CPU, independent of the network's device, since the thousands of small operations per frame are slower on
+        a GPU."""
         return torch.device("cpu")
 
     @property
@@ -122,14 +122,14 @@ _STRIDE = 8
 
 @dataclass(frozen=True, eq=False)
 class GivenMasks:
-    """Masks from outside the recording, by frame."""
+    """Masks that are not part of the recording, by frame."""
 
     origin: str
-    """Noun for messages, such as "imported mask"."""
+    """Name of such a mask in messages, such as "imported mask"."""
     masks: Callable[[int], Mapping[str, GivenMask]]
-    """Frame index -> camera name -> mask at the camera's size, for the cameras that have one."""
+    """Frame index -> camera name -> mask at the camera's size, for the cameras with a mask."""
     there: Callable[[int, str], bool]
-    """(frame index, camera name) -> whether there is a mask."""
+    """(frame index, camera name) -> whether a mask is available."""
     ignored: Callable[[int], Mapping[str, Bool[np.ndarray, "h w"]]] = lambda _: {}
     """Frame index -> camera name -> unlabelled pixels, which are not compared."""
 
@@ -144,8 +144,8 @@ class MaskPredictor:
     """Predictor that uses given masks instead of a network. Implements `SurfacePredictor`.
 
     Args:
-        network: predicts parts and normals inside the masks, and everything in frames without a mask; None for masks
-            only.
+        network: predicts parts and normals inside the masks, and whole surface maps in frames without a mask; None to
+            use masks only.
         masks: frame index -> camera name -> mask at the camera's size; `Frame.masks` by default.
     """
 
@@ -159,7 +159,7 @@ class MaskPredictor:
         self.device = torch.device("cpu") if network is None else network.device
 
     def for_frame(self, frame: Frame, cameras: Sequence[str]) -> FramePredictor:
-        """Predictor of one frame.
+        """Predictor for one frame.
 
         Raises:
             SettingsError: a camera has no mask of the frame and there is no network, or a mask has the wrong size.
@@ -171,7 +171,7 @@ class MaskPredictor:
             return network
         if missing:
             raise SettingsError(
-                f"frame {frame.frame_id} has no {self._origin} of camera {missing[0]!r} to fit. Give one, leave out "
+                f"frame {frame.frame_id} has no {self._origin} of camera {missing[0]!r} to fit. Give a mask, leave out "
                 "the frame or camera, or observe both masks and the network."
             )
         for name in cameras:
@@ -218,7 +218,7 @@ class _FrameMasks:
             maps = covered.new_zeros(len(covered), SURFACE_CHANNELS, *covered.shape[-2:])
         else:
             maps = self.network.predict(images, given, window) * covered[:, None]
-        # Every mask pixel belongs to some part: the first one where the network predicts none.
+        # Mask pixels for which the network predicts no part belong to the first part.
         parts = maps[:, COVERAGE]
         parts = parts * (covered / parts.sum(1).clamp(min=1e-6)).clamp(max=1.0)[:, None]
         parts[:, 0] += covered - parts.sum(1)

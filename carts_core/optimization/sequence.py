@@ -37,12 +37,12 @@ def visiting_gaps(times: Mapping[int, float | None], model: SequenceSettings) ->
         SettingsError: there are no frames, only some have times, or times do not increase.
     """
     if not times:
-        raise SettingsError("no frame was given. Choose at least one.")
+        raise SettingsError("no frame was given. Choose at least one frame.")
     without = [index for index, seconds in sorted(times.items()) if seconds is None]
     if 0 < len(without) < len(times):
         raise SettingsError(
-            f"{len(without)} of {len(times)} frames have no time; the first is frame {without[0]}. Give all frames "
-            "times, or none of them."
+            f"{len(without)} of {len(times)} frames have no time; the first is frame {without[0]}. Give times for all "
+            "frames or for none."
         )
     known = {
         index: index * model.frame_seconds if seconds is None else seconds for index, seconds in sorted(times.items())
@@ -63,10 +63,11 @@ def initial_correction(
     open_frame: Callable[[int], tuple[Frame, Variables]],
     allowance: float,
 ) -> Float[np.ndarray, " n"]:
-    """Correction [rad] of a frame solved alone (by frame index) with the lowest mean loss over all these frames.
+    """Of the corrections [rad] of individually solved frames (by frame index), the one with the lowest mean loss over
+    these frames.
 
-    Corrections whose loss in the first frame exceeds `allowance` times the lowest are excluded, since the error may
-    have jumped.
+    Corrections whose loss in the first frame exceeds `allowance` times the minimum are excluded, since the error may
+    jump between frames.
     """
     candidates = list(corrections.values())
     losses = np.array([solver.losses(*open_frame(index), candidates) for index in corrections])
@@ -116,7 +117,8 @@ class Keyframes:
         return correction, Information.known(correction, farther - correction)
 
     def as_given(self, estimate: FrameEstimate) -> FrameEstimate:
-        """Estimate with the joint positions and standard deviations of the keyframe; unchanged for other frames."""
+        """Estimate with the joint positions and standard deviations of its keyframe; unchanged if the frame is not a
+        keyframe."""
         if estimate.index not in self:
             return estimate
         given = self._positions[estimate.index]
@@ -141,18 +143,19 @@ def _arrays(given: GivenPositions | None) -> dict[int, dict[str, np.ndarray]]:
 
 
 class SequenceOptimizer:
-    """Corrects the frames of a sequence one after another.
+    """Optimizer that corrects the frames of a sequence one after another.
 
-    A few evenly spaced frames are solved alone first; the first frame starts at the correction that fits all of them
-    best. Each later frame starts at its predicted correction, with the covariance of the prediction as prior. After the
-    last frame all corrections are smoothed backwards, and frames whose images contradict the result are visited again.
-    Finally, all estimates are assessed. Failed frames are solved alone if only joints are free; if the sequence failed,
-    frames that still fail return to their measured values. Frames in `keyframes` are not changed.
+    First, a few evenly spaced frames are solved individually; the first frame starts at the correction that fits all of
+    these best. Each later frame starts at its predicted correction, with the covariance of the prediction as prior.
+    After the last frame all corrections are smoothed backwards, and frames whose images contradict the result are
+    visited again. Finally, all estimates are assessed. Failed frames are solved individually if only joints are free;
+    if the sequence failed, frames that still fail return to their measured values. Frames in `keyframes` are not
+    changed.
 
     Args:
         load: returns the frame at an index of the sequence, whose `measured` values are corrected.
         times: index of each frame to be corrected -> time [s], or None if unknown.
-        networks: the networks, or another predictor of surface maps.
+        networks: the networks, or a predictor of surface maps.
         settings: noise, weights and working size; the stages are those of `model`.
         model: model of the measurement error, direction and stages.
         keyframes: frame index -> arm name -> manually set joint positions [rad, m].
@@ -161,7 +164,7 @@ class SequenceOptimizer:
         ignore: frame index -> camera name -> pixels that show an occluder; none by default.
         backgrounds: mean backgrounds of the cameras, in which detections are false positives.
         cameras: names of the cameras to use, all by default.
-        checkpoint: stores intermediate results, so that a stopped run can continue; see `sequence_checkpoint`.
+        checkpoint: stores intermediate results, so that a stopped run can be resumed; see `sequence_checkpoint`.
 
     Raises:
         RobotError: a keyframe lacks an arm, or has the wrong number of joint positions.
@@ -193,14 +196,16 @@ class SequenceOptimizer:
         gaps = visiting_gaps(times, self.model)
         unknown = set(self._keyframes) - set(gaps)
         if unknown:
-            raise SettingsError(f"keyframe {min(unknown)} is not among the frames. Choose it too, or leave it out.")
+            raise SettingsError(
+                f"keyframe {min(unknown)} is not among the frames. Add it to the frames, or remove the keyframe."
+            )
         self._solver = FrameSolver(
             self._scene, self._predictor, self.settings, self.model, ignore or (lambda _: {}), backgrounds, checkpoint
         )
         self._queue, self._frames = list(gaps), len(gaps)
         initial = {self._queue[place] for place in spread(len(self._queue), self.model.initial_frames)}
         initial.update([index for index in self._queue if index in self._keyframes][:1])
-        # A single frame, or an initial keyframe, requires no initial frames.
+        # No initial frames are needed for a single frame, or if the first frame is a keyframe.
         alone = len(initial) == 1 or self._queue[0] in self._keyframes
         self._initial_queue = [] if alone else [index for index in self._queue if index in initial]
         self._initial: dict[int, Visit] = {}
@@ -233,7 +238,7 @@ class SequenceOptimizer:
 
     @property
     def seconds_left(self) -> float:
-        """Remaining time at the median time of a frame [s]."""
+        """Remaining time, estimated from the median time of a frame [s]."""
         visited, frames = self.progress
         return (frames - visited) * statistics.median([visit.seconds for visit in self._visits.values()] or [0.0])
 
@@ -258,8 +263,8 @@ class SequenceOptimizer:
     def step(self) -> FrameEstimate | None:
         """Visit the next frame; None once all frames are finished.
 
-        The first steps solve a few frames alone; their results are not in `estimates`. Later steps return the filtered
-        estimate, based on the frames visited so far; `estimates` has smoothed ones, based on all visited frames.
+        The first steps solve a few frames individually; their results are not in `estimates`. Later steps return the
+        filtered estimate, based on the frames visited so far; `estimates` are smoothed over all visited frames.
         """
         if self.stop_reason is not None:
             return None
@@ -282,7 +287,8 @@ class SequenceOptimizer:
         return None
 
     def base_frame_gain(self) -> float | None:
-        """Like `FrameOptimizer.base_frame_gain`, from a few frames; None before the end, or if base frames are free."""
+        """Like `FrameOptimizer.base_frame_gain`, as median over a few frames; None before the end, or if base frames
+        are free."""
         if self.assessment is None or self._free.base_frames:
             return None
         corrections = self._smoother.smoothed()
@@ -293,7 +299,8 @@ class SequenceOptimizer:
         )
 
     def _assessed(self) -> Iterator[FrameEstimate]:
-        """Assess all estimates, then solve failed frames alone if only joints are free; yields each new estimate."""
+        """Assess all estimates, then solve failed frames individually if only joints are free; yields each new
+        estimate."""
         failed, corrections = [], self._smoother.smoothed()
         for index, estimate in self.estimates.items():
             began = time.perf_counter()
@@ -335,7 +342,7 @@ class SequenceOptimizer:
         self._estimates = kept
 
     def _solve_initial(self, index: int) -> FrameEstimate | None:
-        """Measure a frame alone; None if it cannot be used, which is reported when it is visited."""
+        """Solve an initial frame; None if the frame cannot be used, which is reported when it is visited."""
         began = time.perf_counter()
         try:
             frame, variables = self._open(index)
@@ -361,7 +368,7 @@ class SequenceOptimizer:
         else:
             start, measurement, lost = self._measure(frame, variables, expected)
             if self._visits and measurement.information.contradicts(expected):
-                # A badly fitting image is ignored; otherwise the prediction is wrong, and the filter restarts.
+                # If the image fits badly, it is ignored; otherwise the prediction is wrong, and the filter restarts.
                 if lost:
                     start, measurement = Origin.CARRIED, measurement.left_out()
                 else:
@@ -376,8 +383,8 @@ class SequenceOptimizer:
         return self._estimate(index, visit, self._smoother.add(index, measurement.information))
 
     def _measure(self, frame: Frame, variables: Variables, expected: Gaussian) -> tuple[Origin, Measurement, bool]:
-        """Measure a frame from a warm start, or a cold one for the first frame or after an unusual loss; the last value
-        tells whether recovery failed."""
+        """Measure a frame from a warm start, or from a cold start for the first frame or after an unusual loss; the
+        last value is whether recovery failed."""
         if not self._visits:
             if self._initial_correction is None:
                 return Origin.COLD, self._solver.cold(frame, variables, self._prior), False

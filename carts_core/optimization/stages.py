@@ -64,7 +64,7 @@ class Problem(Protocol):
         ...
 
     def evaluate(self, offsets: Float[Tensor, " n"], stage: Any, *, gradient: bool = True) -> Evaluation:
-        """Evaluate the objective at a point, with the comparison settings of a stage."""
+        """Evaluate the objective at a point, with the blur and robust scale of a stage."""
         ...
 
     def objective_key(self, blur: float) -> tuple[int, float]:
@@ -82,7 +82,7 @@ class Point:
     """Key of the objective; losses are comparable within one key."""
 
     def improves_on(self, best: "Point | None") -> bool:
-        """Whether the loss is lower than that of the best point so far, or not comparable with it."""
+        """Whether the loss is lower than the loss of the best point so far, or the losses are not comparable."""
         return best is None or self.objective_key != best.objective_key or self.evaluation.loss < best.evaluation.loss
 
 
@@ -93,7 +93,7 @@ class Fit:
     Args:
         problem: the optimization problem.
         offsets: current estimate, initially the start.
-        budget: largest number of evaluations.
+        budget: maximum number of evaluations.
     """
 
     problem: Problem
@@ -112,7 +112,7 @@ class Fit:
     """Number of evaluations so far."""
     solver: LevenbergMarquardt = field(init=False)
     descent: FirstOrderDescent | None = None
-    """First-order optimizer, kept from one `FirstOrder` stage to the next."""
+    """First-order optimizer, shared by consecutive `FirstOrder` stages."""
     losses: list[float] = field(default_factory=list)
     """Losses of all points of `FirstOrder` stages."""
     assessment: Assessment | None = None
@@ -138,7 +138,7 @@ class Fit:
         return Point(self.offsets, evaluation, (self.restarts, *self.problem.objective_key(stage.blur)))
 
     def jump_to(self, offsets: Float[Tensor, " n"]) -> None:
-        """Replace the estimate; later descents use the smaller tolerance."""
+        """Replace the estimate; later descents use a smaller tolerance."""
         self.offsets, self.restarts = offsets, self.restarts + 1
         self.solver.reset()
 
@@ -154,7 +154,7 @@ _SUPPORT = 0.5
 
 
 def arm_is_lost(problem: FrameProblem, offsets: Float[Tensor, " n"]) -> bool:
-    """Whether an arm visible at the start has left the image, or is where no arm was observed."""
+    """Whether an arm visible at the start has left the image, or is at a position where no arm was observed."""
     seen, images = problem.observation, problem.observation.images
     before, after = (problem.variables.state(point) for point in (problem.start, offsets))
     start, end = (images.renderer.segment(state) for state in (before, after))
@@ -178,7 +178,7 @@ def best_random_start(
 
     Args:
         problem: one frame; its observation is replaced by that of the whole image.
-        offsets: current estimate; it and the start are among the candidates.
+        offsets: current estimate, which is a candidate, as is the start.
     """
     generator = torch.Generator().manual_seed(seed)
     deviation = stage.deviation * problem.prior.marginal_precision.rsqrt().cpu()
@@ -199,8 +199,9 @@ def best_random_start(
 def start_explains_as_well(problem: FrameProblem, offsets: Float[Tensor, " n"], stage: PreferStart) -> bool:
     """Whether the start fits the edges and an observation conditioned on it as well as the estimate does.
 
-    If the two silhouettes differ strongly, the result is False without an observation. If True, that observation
-    replaces the problem's. Always False if a calibration is free, since its start is expected to be wrong.
+    If the two silhouettes differ strongly, the result is False without an observation. If True, the new observation
+    replaces the observation of the problem. Always False if a calibration is free, since its start is expected to be
+    wrong.
     """
     if problem.variables.moves_calibration:
         return False
@@ -249,7 +250,7 @@ def run_observe(stage: Observe, fit: Fit) -> Iterator[Point]:
 @run_stage.register
 def run_descend(stage: Descend, fit: Fit) -> Iterator[Point]:
     """Levenberg-Marquardt on the objective under one blur, until the predicted reduction is small."""
-    # After a restart, no later stage refines the result.
+    # A smaller tolerance is used after a restart, since no later stage refines the result.
     tolerance = min(stage.tolerance, Descend.tolerance) if fit.restarts else stage.tolerance
     best, rejections = None, 0
     for taken in range(1, stage.steps + 1):
@@ -266,7 +267,7 @@ def run_descend(stage: Descend, fit: Fit) -> Iterator[Point]:
         step = fit.solver.step(best.offsets, known.gradient, known.hessian)
         converged = rejections >= REJECTIONS or step.reduction < tolerance * known.value
         fit.reached = best
-        # This also holds after rejections, where the step is short and the next stage uses another blur.
+        # This also applies after rejected steps, since the step is short and the next stage uses another blur.
         fit.offsets = fit.problem.variables.clamp(best.offsets + step.change)
         fit.stop_reason = StopReason.CONVERGED if converged else StopReason.ITERATIONS
         yield point
@@ -299,7 +300,7 @@ def run_align_edges(stage: AlignEdges, fit: Fit) -> Iterator[Point]:
     """Align outlines with image edges, from the best point of the last descent."""
     assert fit.reached is not None, "AlignEdges must follow a Descend stage"
     if _one_frame(fit).predictor.masked:
-        # The descent is one step beyond the best point, and that step would not be evaluated before the end.
+        # The estimate is one step beyond the best point, and this step has not been evaluated.
         fit.offsets = fit.reached.offsets
         return
     fit.offsets, fit.edges = _one_frame(fit).aligned(stage, fit.reached.offsets, fit.reached.evaluation)
@@ -320,19 +321,19 @@ def run_evaluate(stage: Evaluate, fit: Fit) -> Iterator[Point]:
     kept, known = fit.stop_reason is StopReason.START_KEPT, fit.reached
     point = fit.evaluate(FINEST, gradient=kept)
     if known is not None and not kept:
-        # Edges have no uncertainty model, so that of the last descent is kept.
+        # Edges have no uncertainty model, so the uncertainty of the last descent is kept.
         before = known.evaluation
         evaluation = replace(point.evaluation, gradient=before.gradient)
         if isinstance(fit.problem, FrameProblem):
             evaluation = replace(evaluation, uncertainty=fit.problem.uncertainty_after(fit.offsets, before))
         point = replace(point, evaluation=evaluation)
-    # The last evaluation is the result independent of its loss, which does not include edges.
+    # The last evaluation is the result regardless of its loss, which does not include edges.
     yield replace(point, objective_key=(*point.objective_key, "end"))
 
 
 @run_stage.register
 def run_other_background(stage: OtherBackground, fit: Fit) -> Iterator[Point]:
-    """Repeat a failed fit with the other background mode, and keep the better one."""
+    """Repeat a failed fit with the other background mode, and keep the better fit."""
     problem = _one_frame(fit)
     before = problem.evidence_at(fit.offsets)
     known = assess(before)

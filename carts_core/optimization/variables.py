@@ -24,7 +24,7 @@ DIFFERENCE_SPAN = 2 * STEP
 
 @dataclass(frozen=True)
 class _Block:
-    """A contiguous block of the vector of unknowns."""
+    """Contiguous block of the vector of unknowns."""
 
     kind: str
     index: int
@@ -110,7 +110,8 @@ class Variables:
             scale = self._joint_scale(scene, index, column)
             low, high = arm.robot.joint_limits[column].tolist()
             value = start[..., column]
-            # A start outside the limits (such as from a wrong encoder calibration) may stay, but not move further out.
+            # A start outside the limits (such as after a wrong encoder calibration) is allowed, but a joint may not
+            # move further out.
             lower.append((min(low, float(value.min())) - float(value.min())) / scale)
             upper.append((max(high, float(value.max())) - float(value.max())) / scale)
         self._add("joints", index, arm.name, tuple(arm.robot.joint_names[c] for c in columns), columns)
@@ -195,7 +196,7 @@ class Variables:
         Args:
             joints_deg: standard deviation of joint positions [deg]; `length_scale` converts it to metres.
             frames_deg: standard deviation of rotations of base frames and cameras [deg]; half of this angle times
-                `distance` is that of translations.
+                `distance` is the standard deviation of translations.
             distance: distance of the arms from the cameras [m].
         """
         deviation = self.expected(joints_deg, frames_deg, 0.0)
@@ -259,7 +260,7 @@ class Variables:
 
 
 def _update(stack: Tensor, index: int, change, *, matrix: bool = True) -> Tensor:
-    """`stack` with entry `index` of its arms or cameras replaced by `change(entry)`."""
+    """Copy of `stack` with the entry `index` of arms or cameras replaced by `change(entry)`."""
     dim = -3 if matrix else -2
     parts = list(stack.unbind(dim))
     parts[index] = change(parts[index])

@@ -47,7 +47,7 @@ logistic regressions on 503 frames with ground truth, none held out; see docs/ex
 """
 
 _LEAST_CHANGE, _CHANGE_SLOPE = 0.6, 40.0
-"""Lowest overlap with change among correct fits, and slope of the log odds below it."""
+"""Minimum overlap with change among correct fits, and slope of the log odds below it."""
 
 _MASK_MIDDLE, _MASK_SLOPE = 0.8, 22.0
 """Overlap with a given mask at log odds 0, and slope of the log odds: a fit is good from 0.9 and doubtful below, since
@@ -77,8 +77,8 @@ _MARGIN, _RIM = 16, 8
 image]."""
 
 _SHOWN, _TELLING = 2e-3, 0.3
-"""Minimum area of an arm that is assessed separately, as a share of the images, and minimum share of an arm with
-informative change [1].
+"""Minimum area of a separately assessed arm, as a share of the images, and minimum share of an arm with informative
+change [1].
 """
 
 _PART_SHOWN = 60.0
@@ -101,9 +101,9 @@ class Evidence(ArmEvidence):
     predicted: float
     """Share of the rendered arms in the network's unconditioned prediction [1]."""
     changed: float | None
-    """Share of the rendered arms that differs from the mean background [1]; None if that is unknown."""
+    """Share of the rendered arms that differs from the mean background [1]; None if the background is unknown."""
     still_in_view: float = 1.0
-    """Smallest ratio of an arm's area to its area at the start, over the arms initially in view [1]; parts occluded by
+    """Minimum ratio of an arm's area to its area at the start, over the arms initially in view [1]; parts occluded by
     another arm count as in view.
     """
     elsewhere: float = 0.0
@@ -122,7 +122,7 @@ class Evidence(ArmEvidence):
 def evidence(
     images: FrameImages, start: SceneState, end: SceneState, predictor: FramePredictor, loss: float
 ) -> Evidence:
-    """Collect image evidence for and against a fit; runs the predictor twice."""
+    """Compute image evidence for and against a fit; runs the predictor twice."""
     before, maps = (images.renderer.surface_maps(state) for state in (start, end))
     covered, was = (part[:, COVERAGE].sum(1, keepdim=True) for part in (maps, before))
     margin = max(images.size) if predictor.masked else round(_MARGIN * images.scale)
@@ -189,7 +189,7 @@ def _places(
     *,
     whole: bool,
 ) -> list[Float[Tensor, "cameras 1 h w"]]:
-    """Pixel weights at and around each visible arm, excluding other arms; all pixels if `whole`."""
+    """Pixel weights of each visible arm and its surroundings, excluding other arms; all pixels if `whole`."""
     labels = window.of(torch.from_numpy(arm_ids).to(weight.device))[:, None]
     arms = [labels == arm for arm in range(count)]
     shown = [arm for arm in arms if float(arm.sum()) >= _SHOWN * arm_ids.size]
@@ -272,7 +272,7 @@ class Assessment:
     def of(self, known: Uncertainty) -> Uncertainty:
         """Uncertainty that accounts for a wrong fit.
 
-        For a certain fit it is unchanged; for a failed fit it becomes the prior.
+        The uncertainty of a certain fit is unchanged; that of a failed fit becomes the prior.
         """
         if self.certain:
             return known
@@ -295,8 +295,8 @@ def assess(found: Evidence) -> Assessment:
 def assess_calibration(frames: Sequence[Evidence]) -> Assessment:
     """Verdict on a calibration, from the median evidence of its frames with measured joints.
 
-    Its threshold for doubt is lower than a frame's, since all frames depend on it, and its masks can be right although
-    it is wrong.
+    The threshold for doubt is lower than for a frame, since all frames depend on the calibration, and masks can be
+    correct with a wrong calibration.
     """
     median = median_evidence(frames)
     what = "given masks" if median.masked else "images"
@@ -311,7 +311,7 @@ def _assessed(found: Evidence, doubtful_from: float, contradicts: str, supports:
 
     Args:
         doubtful_from: probability of failure from which the verdict is doubtful [1].
-        contradicts, supports: subject and verb of the sentences that give the reason.
+        contradicts, supports: subject and verb of the reason's sentence.
     """
     probability = 1.0 / (1.0 + math.exp(-log_odds_of_failure(found.loss, found, found.masked)))
     for applies, reason, remedy in _NOTHING_THERE:
@@ -332,7 +332,7 @@ def _assessed(found: Evidence, doubtful_from: float, contradicts: str, supports:
 
 
 def arm_is_elsewhere(found: Evidence) -> bool:
-    """Whether a fitted arm is out of view while an arm is predicted elsewhere in the image."""
+    """Whether a fitted arm is out of view, but an arm is predicted elsewhere in the image."""
     return found.elsewhere >= _LOOKS_LIKE_ONE
 
 
@@ -402,12 +402,12 @@ _CALIBRATION_REMEDY = (
 
 
 def _weakest(found: Evidence) -> str:
-    """Text on the strongest evidence against a fit."""
+    """Description of the strongest evidence against a fit."""
     if found.masked:
         return "the rendering and the given mask differ."
     against = {
         "the network's prediction lies elsewhere.": found.agreement,
-        "the network predicts otherwise without the fit as its prior.": found.unconditioned,
+        "the network's prediction without the fit as prior differs from it.": found.unconditioned,
     }
     if found.overlap_with_change is not None:
         against["the difference from the empty background lies elsewhere."] = found.overlap_with_change
@@ -430,7 +430,7 @@ UNKNOWN_ROBOT_REMEDY = (
 
 
 def overlap_below_usual(overlap: float) -> str:
-    """Text on an overlap below `RECOGNIZED`, rounded down."""
+    """Description of an overlap below `RECOGNIZED`, rounded down."""
     return f"an overlap of only {math.floor(1000 * overlap) / 1000:.3f} ({RECOGNIZED} or more is usual)"
 
 
@@ -506,7 +506,7 @@ _LEVEL = 0.05
 """Family-wise significance level of the tests for deteriorated measures [1]."""
 
 _SCATTER, _SCATTER_FREEDOM = 0.01, 4
-"""Prior standard deviation of a measure's change between frames, and its degrees of freedom [1]."""
+"""Prior standard deviation of the change of a measure between frames, and degrees of freedom of this prior [1]."""
 
 _BETTER_HIGHER = ("agreement", "unconditioned", "overlap_with_change")
 _BETTER_LOWER = ("residual", "loss")
@@ -546,7 +546,8 @@ def assess_sequence(frames: Sequence[Assessment]) -> SequenceAssessment:
 
 
 def without_knowledge(found: Assessment, known: Sequence[DomainCheck]) -> Assessment:
-    """Verdict on a calibration; a doubtful one becomes failed if the network does not suit the robot."""
+    """Verdict on a calibration; a doubtful calibration counts as failed if the robot is outside the network's
+    domain."""
     recognized = [one.recognized for one in known if one.recognized is not None]
     if found.verdict is not Verdict.DOUBTFUL or not recognized or float(np.median(recognized)) >= RECOGNIZED:
         return found
@@ -558,7 +559,7 @@ def without_knowledge(found: Assessment, known: Sequence[DomainCheck]) -> Assess
 
 
 def median_evidence(frames: Sequence[Evidence]) -> Evidence:
-    """Median of each measure over frames; None if any frame lacks it."""
+    """Median of each measure over frames; None for a measure that a frame lacks."""
     values = {}
     for field in fields(Evidence):
         known = [value for frame in frames if (value := getattr(frame, field.name)) is not None]
@@ -567,7 +568,7 @@ def median_evidence(frames: Sequence[Evidence]) -> Evidence:
 
 
 def worse_in(before: Sequence[Evidence], after: Sequence[Evidence]) -> list[str]:
-    """Names of the measures by which frames fit significantly worse than before.
+    """Names of the measures in which frames fit significantly worse than before.
 
     One-sided moderated t-tests (Smyth, Linear models and empirical Bayes methods for assessing differential expression,
     2004) with Holm's correction for several tests (A simple sequentially rejective multiple test procedure, 1979).
@@ -590,7 +591,7 @@ def worse_in(before: Sequence[Evidence], after: Sequence[Evidence]) -> list[str]
 
 
 def _chance(rises: Float[np.ndarray, " frames"]) -> float:
-    """p-value of a mean increase under the null hypothesis of no increase [1]."""
+    """p-value of the mean increase under the null hypothesis of no increase [1]."""
     freedom = len(rises) - 1 + _SCATTER_FREEDOM
     squares = ((rises - rises.mean()) ** 2).sum() + _SCATTER_FREEDOM * _SCATTER**2
     return float(stdtr(freedom, -rises.mean() / np.sqrt(squares / freedom / len(rises))))

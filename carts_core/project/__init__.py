@@ -1,4 +1,4 @@
-"""Annotation projects: one SQLite file with all corrections, and undo and redo across restarts."""
+"""Annotation projects: one SQLite file with all corrections, with undo and redo across restarts."""
 
 from .database import DamagedProject as DamagedProject
 from .identity import SequenceIdentity as SequenceIdentity

@@ -1,4 +1,4 @@
-"""The SQLite database of a project file: schema, connections, and digests of its contents."""
+"""SQLite database of a project: schema, connections, and digests of the content."""
 
 import errno
 import secrets
@@ -20,7 +20,7 @@ TABLES = {
     "figures": ("frame", "revision", "loss", "dice"),
     "exports": ("time", "format", "path", "frames", "settings"),
 }
-"""Columns of each table that are covered by the rows' digests."""
+"""Columns of each table that are included in the digests of its rows."""
 NONCE_BYTES = 16
 _BYTES = 16
 _MODULUS = 1 << (8 * _BYTES)
@@ -33,13 +33,13 @@ def row_digest(table: str, row: Sequence[object]) -> bytes:
 
 
 def as_number(digest: bytes) -> int:
-    """Convert a digest to a number that is added to the total."""
+    """Convert a digest to a number, so that digests can be summed."""
     return int.from_bytes(digest, "big")
 
 
 @dataclass(frozen=True)
 class Seal:
-    """Content of the table `seal`, except for the position in the history."""
+    """Content of the table `seal`, except the position in the history."""
 
     nonce: bytes
     """Random number that identifies the file."""
@@ -55,7 +55,7 @@ class Seal:
         return Seal(nonce, about, total % _MODULUS)
 
     def plus(self, change: int) -> "Seal":
-        """Seal after adding a sum of digests, which is negative for removed rows."""
+        """Seal after a change of the sum of digests."""
         return replace(self, total=(self.total + change) % _MODULUS)
 
     def row(self, position: int) -> tuple[bytes, bytes, bytes]:
@@ -66,7 +66,8 @@ class Seal:
 
 
 def seal(connection: sqlite3.Connection, nonce: bytes) -> None:
-    """Compute the digests of all rows in the caller's transaction; `nonce` is used if the file has none."""
+    """Compute and store the digests of all rows in the caller's transaction; `nonce` is used if the file has no
+    nonce."""
     total = 0
     for table, columns in TABLES.items():
         rows = connection.execute(f"SELECT rowid, {', '.join(columns)} FROM {table}").fetchall()
@@ -81,8 +82,7 @@ def seal(connection: sqlite3.Connection, nonce: bytes) -> None:
 
 
 def check_seal(connection: sqlite3.Connection, total: int) -> Seal:
-    """Return the seal of a file, given the sum `total` of its verified rows' digests; `ProjectError` if they do not
-    match."""
+    """Read the seal of a file; `ProjectError` if it does not match the file, whose row digests have the sum `total`."""
     projects = connection.execute("SELECT identity, position, created FROM project").fetchmany(2)
     seals = connection.execute("SELECT nonce, total, digest FROM seal").fetchmany(2)
     if len(projects) != 1 or len(seals) != 1:
@@ -99,10 +99,10 @@ def check_seal(connection: sqlite3.Connection, total: int) -> Seal:
 
 
 def checked_rows(connection: sqlite3.Connection, table: str) -> Iterable[tuple]:
-    """Yield the rows of a table, verified, with their digests as numbers in the last column; `ProjectError` for a
+    """Yield the verified rows of a table, with their digests as numbers in the last column; `ProjectError` for a
     changed row."""
     columns = TABLES[table]
-    # Indices are not trusted: rows are read in storage order.
+    # Rows are read in storage order, since indices are not trusted.
     query = f"SELECT {', '.join(columns)}, digest FROM {table} NOT INDEXED ORDER BY rowid"
     for row in connection.execute(query):
         if row_digest(table, row[:-1]) != row[-1]:
@@ -111,7 +111,7 @@ def checked_rows(connection: sqlite3.Connection, table: str) -> Iterable[tuple]:
 
 
 def verify(connection: sqlite3.Connection) -> Seal:
-    """Verify every row without decoding values, and return the seal of the file; `ProjectError` for any change."""
+    """Verify all rows without decoding values, and return the seal of the file; `ProjectError` for any change."""
     return check_seal(connection, sum(row[-1] for table in TABLES for row in checked_rows(connection, table)))
 
 
@@ -181,7 +181,7 @@ SEALED = 3
 """First schema with digests."""
 
 LONGEST_VALUE = 128 * 2**20
-"""Largest value of a row [bytes]."""
+"""Maximum value of a row [bytes]."""
 _LIMITS = {
     sqlite3.SQLITE_LIMIT_LENGTH: LONGEST_VALUE,
     sqlite3.SQLITE_LIMIT_SQL_LENGTH: 1_000_000,
@@ -201,16 +201,16 @@ _NEVER = {
     sqlite3.SQLITE_CREATE_VTABLE,
 }
 _STEPS_BETWEEN_LOOKS = 10_000
-"""Number of SQLite virtual machine instructions between checks of the time limit; some tens of microseconds."""
+"""Number of SQLite virtual machine instructions between checks of the time limit, which take tens of microseconds."""
 _DISK_FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO}
 
 
 class DamagedProject(ProjectError):
-    """A project file differs from what CaRTS wrote."""
+    """The content of a project file differs from what CaRTS wrote."""
 
 
 def hardened(connection: sqlite3.Connection) -> sqlite3.Connection:
-    """Harden a connection: no code from the file's schema runs, and no other file is opened."""
+    """Prevent a connection from running code of the file's schema and from opening other files."""
     for limit, value in _LIMITS.items():
         connection.setlimit(limit, value)
     for setting in ("trusted_schema = OFF", "cell_size_check = ON", "mmap_size = 0", "temp_store = MEMORY"):
@@ -220,14 +220,13 @@ def hardened(connection: sqlite3.Connection) -> sqlite3.Connection:
 
 
 def _authorized(action: int, _first: object, _second: object, _schema: object, inside: str | None) -> int:
-    """Deny actions not used by CaRTS, and those requested by a foreign trigger or view."""
+    """SQLite authorizer that denies actions not used by CaRTS, and actions of foreign triggers and views."""
     return sqlite3.SQLITE_DENY if action in _NEVER or inside not in (None, "current") else sqlite3.SQLITE_OK
 
 
 @contextmanager
 def time_limit(connection: sqlite3.Connection, seconds: float) -> Iterator[None]:
-    """Interrupt SQLite (`sqlite3.OperationalError`) if the block exceeds a time limit [s], which happens only for
-    crafted files."""
+    """Interrupt SQLite (`sqlite3.OperationalError`) if the block exceeds a time limit [s], as only crafted files do."""
     end = time.monotonic() + seconds
     connection.set_progress_handler(lambda: time.monotonic() > end, _STEPS_BETWEEN_LOOKS)
     try:
@@ -251,8 +250,8 @@ def empty(identity: SequenceIdentity) -> sqlite3.Connection:
 
 
 def migrate(connection: sqlite3.Connection, nonce: bytes) -> None:
-    """Run the missing migrations of a verified project in one transaction; if there are none, check that it is
-    writable."""
+    """Run the missing migrations of a verified project in one transaction; without missing migrations, check that the
+    project is writable."""
     missing = MIGRATIONS[version(connection) :]
     with transaction(connection):
         for statement in _statements("".join(missing)):
@@ -297,7 +296,7 @@ def not_a_project(path: Path) -> ProjectError:
 
 @contextmanager
 def transaction(connection: sqlite3.Connection) -> Iterator[sqlite3.Connection]:
-    """Transaction that is committed and synchronized to disk if the block ends without an exception."""
+    """Run a transaction, which is committed and synchronized to disk if the block ends without an exception."""
     connection.execute("BEGIN IMMEDIATE")
     try:
         yield connection
@@ -346,7 +345,7 @@ def _advice(code: str) -> str:
     if code.startswith(("SQLITE_READONLY", "SQLITE_CANTOPEN", "SQLITE_PERM")):
         return "Choose a file in a writable folder, or open the project read-only."
     if code.startswith("SQLITE_NOTADB"):
-        return "It is not a project; nothing was changed. Choose another file."
+        return "The file is not a project; nothing was changed. Choose another file."
     if code.startswith("SQLITE_BUSY"):
-        return "Another program has it open. Close that program and try again."
+        return "The project is open in another program. Close that program and try again."
     return "This change was not saved. If the error persists, the file may be damaged: keep a copy of it."

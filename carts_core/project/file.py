@@ -1,9 +1,10 @@
-"""The project file on disk: file checks, writer lock, verified copy in memory, and verified commits.
+"""Project file on disk: file checks, writer lock, verified copy in memory, and verified commits.
 
 The lock covers the bytes that SQLite locks and belongs to the open file description (F_OFD_SETLK), so it is released at
-the end of the process, not when another descriptor is closed. While the file is open, edits are written to SQLite's
-write-ahead log, so any other change of the file is foreign. SQLite replays a log up to its first damaged frame; only an
-incomplete, unacknowledged transaction may follow. Format: https://www.sqlite.org/fileformat2.html#the_write_ahead_log
+the end of the process instead of when another descriptor is closed. While the file is open, edits are written to
+SQLite's write-ahead log, so other processes caused any other change of the file. SQLite replays a log up to the first
+damaged frame, which may only be followed by an incomplete, unacknowledged transaction. Format:
+https://www.sqlite.org/fileformat2.html#the_write_ahead_log
 """
 
 import ctypes
@@ -32,16 +33,16 @@ _OPEN = os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC | getattr(os, "O_NOCTTY", 0
 
 
 def beside(path: Path, suffix: str) -> Path:
-    """Path of a companion file of SQLite, such as the log."""
+    """Path of a companion file of a database, such as the log."""
     return path.with_name(path.name + suffix)
 
 
 def check_files(path: Path) -> bool:
-    """Check a project and its companion files before any is opened; returns whether the project exists.
+    """Check a project and its companion files before opening them; returns whether the project exists.
 
     Raises:
         ProjectError: a file is a link, has a second hard link or is not a regular file; or another program left a
-            journal, which SQLite would apply.
+            journal that SQLite would apply.
         OSError: the folder cannot be read.
     """
     there = _is_there(path)
@@ -49,7 +50,7 @@ def check_files(path: Path) -> bool:
     if _is_there(beside(path, JOURNAL)):
         raise ProjectError(
             f"{beside(path, JOURNAL)} is beside the project, but carts does not create such files. Nothing was "
-            "changed. If another program changed the project, let it finish; otherwise move that file away."
+            "changed. If another program is changing the project, let it finish; otherwise move that file away."
         )
     if log and not there:
         raise ProjectError(
@@ -117,7 +118,7 @@ def try_lock(descriptor: int) -> bool:
 
 
 def holder(path: Path) -> str:
-    """Text that names the process that has a project open, if the system provides it."""
+    """Description of the process that has a project open, if the system provides its name."""
     own = str(os.getpid())
     with suppress(OSError):
         wanted = os.stat(path, follow_symlinks=False)
@@ -140,9 +141,10 @@ _PAGE_SIZES = frozenset(1 << n for n in range(9, 17))
 
 
 def _recovered(main: bytes, log: bytes) -> tuple[bytearray, bool]:
-    """Database after all committed transactions of a log, as recovered by SQLite, and whether the log is damaged.
+    """Recover the database after all committed transactions of a log, like SQLite; also returns whether the log is
+    damaged.
 
-    Logs start empty, so the committed transactions are followed by at most one incomplete transaction.
+    Logs start empty, so that at most one incomplete transaction follows the committed transactions.
     """
     result, unfinished = bytearray(main), []
     for frame in _frames(log):
@@ -161,12 +163,14 @@ def _recovered(main: bytes, log: bytes) -> tuple[bytearray, bool]:
 
 
 def _frames(log: bytes) -> Iterator[tuple[int, int, bytes] | None]:
-    """Yield each complete frame: page number, database size [pages] if the frame commits a transaction, and page.
+    """Yield each complete frame: page number, database size [pages] if the frame commits a transaction (else 0), and
+    page.
 
-    The last item is None if that frame or the header is damaged.
+    The last item is None if the last frame or the header is damaged.
     """
     if len(log) < HEADER:
-        # The header is written first, in one call; it is incomplete only if the process was killed at that moment.
+        # The header is written first and in one call, so it is incomplete only if the process was killed during this
+        # call.
         return
     magic, _, page_size, _, *salts, s, t = struct.unpack_from(">8I", log)
     order = _ORDERS.get(magic)
@@ -190,7 +194,7 @@ def _frames(log: bytes) -> Iterator[tuple[int, int, bytes] | None]:
 
 
 def _checksums(order: Literal["<", ">"], *parts: bytes) -> list[list[int]]:
-    """WAL checksums of equal-length parts, each from (0, 0), then of a zero block from (1, 0) and from (0, 1)."""
+    """WAL checksums of equal-length blocks, each from (0, 0), then of a block of zeros from (1, 0) and from (0, 1)."""
     words = np.frombuffer(b"".join([*parts, bytes(2 * len(parts[0]))]), np.dtype(np.uint32).newbyteorder(order))
     s, t = np.zeros((2, len(parts) + 2), np.uint32)
     s[-2] = t[-1] = 1
@@ -201,11 +205,11 @@ def _checksums(order: Literal["<", ">"], *parts: bytes) -> list[list[int]]:
 
 
 LARGEST = 768 * 2**20
-"""Largest size of a project including its log [bytes]; opening it requires twice as much memory."""
+"""Maximum size of a project including its log [bytes]; opening it requires twice as much memory."""
 _TRIES = 5
 _MAGIC = b"SQLite format 3\0"
 _WRITE_VERSION = slice(18, 20)
-"""Header bytes of the journal mode (WAL or rollback); an in-memory database requires a rollback journal."""
+"""Header bytes with the journal mode (WAL or rollback); an in-memory database requires a rollback journal."""
 
 
 @dataclass(frozen=True)
@@ -218,11 +222,11 @@ class Content:
 
 @dataclass(frozen=True)
 class Copy:
-    """An unverified copy of a project in memory.
+    """Unverified copy of a project in memory.
 
     Attributes:
         connection: connection to the copy.
-        fault: clause that describes damage of the files; None if there is none.
+        fault: clause that describes damage of the files; None for intact files.
     """
 
     connection: sqlite3.Connection
@@ -230,9 +234,12 @@ class Copy:
 
 
 def read_files(path: Path) -> Content:
-    """Read a consistent snapshot of project and log; `ProjectError` if it is missing, too large, or keeps changing."""
+    """Read a consistent snapshot of project and log; `ProjectError` if the project is missing, too large, or keeps
+    changing."""
     if not check_files(path):
-        raise ProjectError(f"there is no project {path}. Choose an existing one, or open it for writing to create one.")
+        raise ProjectError(
+            f"there is no project {path}. Choose an existing project, or open this one for writing to create it."
+        )
     for _ in range(_TRIES):
         descriptor = open_regular(path)
         try:
@@ -250,15 +257,15 @@ def read_files(path: Path) -> Content:
             after = os.fstat(descriptor)
         finally:
             os.close(descriptor)
-        # A writer appends to the log, and checkpoints it into the file when it is full or closed.
+        # A writer appends to the log, and checkpoints a large log into the file, as well as when closing the file.
         if (before.st_size, before.st_mtime_ns) == (after.st_size, after.st_mtime_ns):
             return Content(main, log)
     raise ProjectError(f"project {path} is changing continuously. Try again later.")
 
 
 def open_copy(content: Content, path: Path) -> Copy:
-    """Open a project as an unverified copy in memory; `ProjectError` or `sqlite3.Error` if it is not a project or is
-    too new."""
+    """Open a project as an unverified copy in memory; `ProjectError` or `sqlite3.Error` if the file is not a project or
+    its schema is too new."""
     main = content.database
     if not main.startswith(_MAGIC) or len(main) < 512:
         raise database.not_a_project(path)
@@ -266,7 +273,7 @@ def open_copy(content: Content, path: Path) -> Copy:
     memory = sqlite3.connect(":memory:", isolation_level=None, check_same_thread=False)
     try:
         patched[_WRITE_VERSION] = b"\1\1"
-        # SQLite does not open truncated files; padded with zeros, the rest can be read.
+        # SQLite does not open truncated files; with zeros appended, the remaining content can be read.
         page_size = int.from_bytes(patched[16:18], "big")
         promised = int.from_bytes(patched[28:32], "big") * (65536 if page_size == 1 else page_size)
         missing = min(promised, LARGEST) - len(patched)
@@ -315,15 +322,15 @@ SealRow = tuple[bytes, bytes, bytes]
 """Row of the table `seal`."""
 
 LARGEST_LOG = 64 * 2**20
-"""Size of the log above which it is checkpointed into the file [bytes]."""
+"""Size above which the log is checkpointed into the file [bytes]."""
 
 
 class LostFile(ProjectError):
-    """The file on disk is not, or may not be, the opened one. The message describes the incident."""
+    """The file on disk is not, or may not be, the opened file. The message is a clause on its cause."""
 
 
 class ProjectFile:
-    """A project file locked for writing. Made by `locked`.
+    """Project file locked for writing, created by `locked`.
 
     Attributes:
         path: path of the file.
@@ -343,7 +350,7 @@ class ProjectFile:
 
     @classmethod
     def locked(cls, path: Path) -> "ProjectFile | None":
-        """Lock an existing project file; None if another process has it open for writing."""
+        """Lock an existing project file; None if another process has locked it."""
         descriptor = open_regular(path, write=True)
         try:
             if try_lock(descriptor):
@@ -358,15 +365,15 @@ class ProjectFile:
         """Open the verified file with SQLite, and migrate it.
 
         Args:
-            nonce: nonce for a file whose schema has none.
+            nonce: nonce for a file with a schema without nonce.
             seal: seal of the file after the migration.
 
         Raises:
-            ProjectError: it cannot be written to, or was replaced by another file.
+            ProjectError: the file cannot be written to, or was replaced by another file.
         """
         uri = f"{self.path.as_uri()}?mode=rw&vfs=unix-none"
         with database.errors_explained(self.path):
-            # This process already holds the lock, so SQLite takes none and keeps its log index in memory.
+            # This process already holds the lock, so SQLite does not lock the file and keeps its log index in memory.
             connection = sqlite3.connect(uri, uri=True, isolation_level=None, check_same_thread=False)
             self._connection = connection
             connection.execute("PRAGMA locking_mode = EXCLUSIVE")
@@ -389,7 +396,7 @@ class ProjectFile:
 
         Raises:
             LostFile: the file has changed; it is unknown whether the edit was written.
-            ProjectError: the transaction could not be written; nothing is changed then.
+            ProjectError: the transaction could not be written, and nothing was changed.
         """
         connection = self._usable()
         self.check()
@@ -409,7 +416,7 @@ class ProjectFile:
         self._remember()
 
     def checkpoint(self) -> None:
-        """Checkpoint a large log into the file, and verify the result; `LostFile` if that fails."""
+        """Checkpoint a large log into the file, and verify the file; `LostFile` if the content differs."""
         if os.fstat(self._open_log()).st_size < LARGEST_LOG:
             return
         with suppress(sqlite3.Error):
@@ -424,7 +431,7 @@ class ProjectFile:
         """Check that file and log are unchanged since the last write of this process; `LostFile` otherwise."""
         self._check_names()
         if self._look() != self._left:
-            # The file may have a new modification time without a change.
+            # The modification time may change without a change of the content.
             self._check_content()
             self._remember()
 
@@ -439,7 +446,7 @@ class ProjectFile:
         self._release()
 
     def dismiss(self) -> None:
-        """Close a file in which this process made no edits."""
+        """Close the file without edits of this process."""
         if self._connection is not None and _lies_at(self.path, self._descriptor):
             with suppress(sqlite3.Error):
                 self._connection.close()
@@ -447,13 +454,14 @@ class ProjectFile:
         self.abandon()
 
     def abandon(self) -> None:
-        """Close a lost file without writing to it again."""
+        """Close a lost file without writing to it."""
         if self._connection is not None:
-            # Closing it would checkpoint the log into the file, and remove any file that now has the log's name.
+            # Closing the connection would checkpoint the log into the file, and remove any file with the name of the
+            # log.
             ctypes.pythonapi.Py_IncRef(ctypes.py_object(self._connection))
             self._connection = None
         if self._log is not None and not _lies_at(self.path, self._descriptor) and _lies_at(self._log_path, self._log):
-            # The log is useless without its file, and SQLite would apply it to another file of that name.
+            # Without its file the log is useless, and SQLite would apply it to another file of that name.
             with suppress(OSError):
                 self._log_path.unlink()
         self._release()
@@ -480,7 +488,7 @@ class ProjectFile:
         self._left = self._look()
 
     def _check_names(self, *, log: bool = True) -> None:
-        """Check that both paths still refer to the opened files."""
+        """Check that the paths of file and log still refer to the opened files."""
         if not _lies_at(self.path, self._descriptor):
             if os.path.lexists(self.path):
                 raise LostFile("was replaced by another file")
@@ -515,7 +523,7 @@ class ProjectFile:
         self._end, self._written = end, headers
 
     def _headers(self, end: int) -> tuple[bytes, bytes]:
-        """Headers of the log and of the frame that ends at an offset [bytes]."""
+        """Headers of the log, and of the log frame that ends at an offset [bytes]."""
         log = self._open_log()
         header = os.pread(log, HEADER, 0)
         size = FRAME_HEADER + int.from_bytes(header[8:12], "big")

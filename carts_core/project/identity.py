@@ -36,7 +36,7 @@ class SequenceIdentity:
 
     @staticmethod
     def of(sequence: "Sequence") -> "SequenceIdentity":
-        """Compute the identity of an open sequence; reads its kinematics tables again."""
+        """Compute the identity of an open sequence, which reads its kinematics tables again."""
         root = parse_toml(read_text(sequence.path, SEQUENCE))
         tables = [root["kinematics"]["table"], *(arm["table"] for arm in root["arms"] if arm.get("table"))]
         digest = hashlib.sha256()
@@ -52,13 +52,13 @@ class SequenceIdentity:
         )
 
     def to_json(self) -> str:
-        """The identity as JSON text."""
+        """Encode the identity as JSON."""
         # `dataclasses.asdict` would copy every frame's id.
         return json.dumps(vars(self))
 
     @staticmethod
     def from_json(text: str) -> "SequenceIdentity":
-        """The identity from `to_json`; `ValueError`, `TypeError` or `KeyError` for other texts."""
+        """Decode the result of `to_json`; `ValueError`, `TypeError` or `KeyError` for other strings."""
         values: dict[str, Any] = json.loads(text)
         return SequenceIdentity(
             name=values["name"],
@@ -69,12 +69,12 @@ class SequenceIdentity:
         )
 
     def difference(self, other: "SequenceIdentity") -> str | None:
-        """First difference from `other`, as a clause; None if they are the same recording."""
+        """First difference from `other`, as a clause; None for the same recording."""
         if len(self.frame_ids) != len(other.frame_ids):
             return f"{counted(len(self.frame_ids), 'frame')} against {len(other.frame_ids)}"
         for index, (own, others) in enumerate(zip(self.frame_ids, other.frame_ids, strict=True)):
             if own != others:
-                return f"the name of frame number {index} is {own!r} against {others!r}"
+                return f"frame number {index} is named {own!r} in one and {others!r} in the other"
         if self.arms != other.arms:
             return f"arms {_list(self.arms)} against {_list(other.arms)}"
         if self.cameras != other.cameras:
@@ -90,33 +90,33 @@ def _list(parts: Mapping[str, tuple]) -> str:
 
 SUFFIX = ".carts"
 _RESCUED = r"\.rescued-\d{8}-\d{6}(?:-\d+)?"
-"""Pattern of the suffix made by `rescue_paths`."""
+"""Pattern of the suffixes created by `rescue_paths`."""
 
 
 def data_dir() -> Path:
-    """Folder of the user's own data: `$CARTS_DATA`, else `$XDG_DATA_HOME/carts`, else `~/.local/share/carts`."""
+    """Folder of user data: `$CARTS_DATA`, else `$XDG_DATA_HOME/carts`, else `~/.local/share/carts`."""
     if configured := os.environ.get("CARTS_DATA"):
         return Path(configured)
     return Path(os.environ.get("XDG_DATA_HOME") or home() / ".local" / "share") / "carts"
 
 
 def default_path(sequence_file: Path) -> Path:
-    """`NAME.carts` beside `NAME.toml`; in `data_dir()` for the shipped sequence and where the folder is read-only.
+    """`NAME.carts` beside `NAME.toml`, or in `data_dir()` for the shipped sequence and read-only folders.
 
-    An existing project beside the sequence is used in any case.
+    An existing project beside the sequence is always used.
     """
     sequence_file = sequence_file.resolve()
     beside = sequence_file.with_suffix(SUFFIX)
     shipped = sequence_file.is_relative_to(sample_data_dir().resolve())
     if beside.exists() or (os.access(sequence_file.parent, os.W_OK) and not shipped):
         return beside
-    # Sequences of the same name in different folders are distinct.
+    # The name distinguishes sequences of the same name in different folders.
     folder = hashlib.sha256(str(sequence_file.parent).encode()).hexdigest()[:8]
     return data_dir() / f"{sequence_file.stem}-{folder}{SUFFIX}"
 
 
 def rescue_paths(path: Path, when: float) -> Iterator[Path]:
-    """Candidate paths of a rescued project: beside it, in the user's data folder, in the temporary folder."""
+    """Candidate paths for a rescued project: in its folder, in the user's data folder, and in the temporary folder."""
     stamp = time.strftime("%Y%m%d-%H%M%S", time.localtime(when))
     for folder in (path.parent, data_dir(), Path(tempfile.gettempdir())):
         for number in range(1, 20):
@@ -125,7 +125,7 @@ def rescue_paths(path: Path, when: float) -> Iterator[Path]:
 
 
 def rescued_copies(path: Path) -> list[Path]:
-    """Rescued copies of a project beside it, the newest first."""
+    """Rescued copies in the folder of a project, the newest first."""
     named = re.compile(re.escape(path.stem) + _RESCUED + re.escape(path.suffix))
     names = os.listdir(path.parent) if path.parent.is_dir() else []
     copies = (path.parent / name for name in sorted(names, reverse=True) if named.fullmatch(name))

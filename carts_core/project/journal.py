@@ -1,6 +1,6 @@
-"""Journal of all steps with their changes. The state is given by the journal up to a position, which undo moves.
+"""Journal of all steps with their changes. The state results from the steps up to a position, which undo changes.
 
-Changes are returned as a `Script` that is run on the file and on its in-memory copy.
+Changes are returned as a `Script`, which is run on the file and on its in-memory copy.
 """
 
 import sqlite3
@@ -20,9 +20,9 @@ class Script:
 
     Attributes:
         statements: SQL statements, each with its parameter rows.
-        digests: change of the sum of all digests.
-        position: position in the history afterwards; None if unchanged.
-        cut_at: step from which rows are removed first; None to remove none.
+        digests: change of the sum of digests.
+        position: new position in the history; None if unchanged.
+        cut_at: first step whose rows are removed, before the statements; None to keep all.
     """
 
     statements: list[tuple[str, list[tuple]]] = field(default_factory=list)
@@ -31,7 +31,7 @@ class Script:
     cut_at: int | None = None
 
     def insert(self, table: str, rows: Iterable[tuple]) -> None:
-        """Add rows, replacing those with the same key."""
+        """Add rows, which replace rows with the same key."""
         sealed = [(*row, row_digest(table, row)) for row in rows]
         columns = TABLES[table]
         marks = ", ".join("?" * (len(columns) + 1))
@@ -45,10 +45,10 @@ class Script:
 
 
 def load(connection: sqlite3.Connection) -> tuple[ProjectState, Seal]:
-    """Load state and seal of a project. Every row is verified, including undone values.
+    """Load the state and seal of a project; all rows are verified, including undone steps.
 
     Raises:
-        ProjectError, sqlite3.Error and those of `store.UNREADABLE`: it cannot be read, or was changed.
+        ProjectError, sqlite3.Error and those of `store.UNREADABLE`: the project cannot be read, or was changed.
     """
     row = connection.execute("SELECT identity, position FROM project").fetchone()
     if row is None:
@@ -104,7 +104,8 @@ def append(memory: sqlite3.Connection, step: Step, edits: Edits, last: int) -> S
 
 
 def move(memory: sqlite3.Connection, start: int, target: int) -> tuple[Script, dict[Key[Any], Entry | None]]:
-    """Move to another position of the history; also returns the entries that may differ there (None: absent)."""
+    """Move to another position of the history; also returns the entries that may differ at the new position (None:
+    absent)."""
     touched = memory.execute(
         "SELECT DISTINCT kind, frame, name FROM changes WHERE step > ? AND step <= ?", sorted((start, target))
     ).fetchall()
@@ -117,7 +118,7 @@ def move(memory: sqlite3.Connection, start: int, target: int) -> tuple[Script, d
 
 
 def _newest(memory: sqlite3.Connection, about: tuple[str, int, str], last: int) -> tuple[int, Any]:
-    """Latest step up to `last` that set a key, and the stored value; (-1, None) if there is none."""
+    """Latest step up to `last` that set a key, and the stored value; (-1, None) without such a step."""
     query = "SELECT step, value FROM changes WHERE kind = ? AND frame = ? AND name = ? AND step <= ?"
     return memory.execute(f"{query} ORDER BY step DESC LIMIT 1", (*about, last)).fetchone() or (-1, None)
 
@@ -125,7 +126,7 @@ def _newest(memory: sqlite3.Connection, about: tuple[str, int, str], last: int) 
 def before(memory: sqlite3.Connection, step: int, position: int) -> tuple[dict[Key[Any], Any], int | None]:
     """Edits that undo a step, and the number of a later step that changed the same keys, if any.
 
-    Verdicts are omitted, since they depend on all values of their frame.
+    Verdicts are omitted, since a verdict depends on all values of its frame.
     """
     edits: dict[Key[Any], Any] = {}
     later: list[int] = []
@@ -152,7 +153,7 @@ def add_figures(memory: sqlite3.Connection, script: Script, figures: Mapping[tup
 
 
 def add_remark(memory: sqlite3.Connection, key: Key[Any], entry: Entry) -> Script:
-    """Set a value as part of an existing step, replacing that step's value."""
+    """Set a value as part of an existing step, which replaces the step's previous value."""
     script, row = Script(), (key.kind.value, int(key.frame), str(key.name), entry.step)
     found = "SELECT digest FROM changes WHERE kind = ? AND frame = ? AND name = ? AND step = ?"
     script.take_out(memory.execute(found, row))

@@ -17,7 +17,7 @@ _HEADER = b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR"
 
 @dataclass(frozen=True)
 class Layer:
-    """A painted layer, created by `of` of its subclasses; `ProjectError` if the bytes are not a PNG."""
+    """Painted layer, created by `of` of its subclasses; `ProjectError` if the bytes are not a PNG."""
 
     png: bytes
 
@@ -77,7 +77,7 @@ class IgnoreRegion(Layer):
 
     @classmethod
     def of(cls, region: Bool[np.ndarray, "height width"]) -> Self:
-        """Create a region from a mask; `ProjectError` if it is not a mask."""
+        """Create a region from a mask; `ProjectError` if the array is not a mask."""
         region = np.asarray(region, bool)
         if region.ndim != 2:
             raise ProjectError(f"an ignore region has shape {region.shape}. Give a mask [height, width].")
@@ -89,11 +89,11 @@ class IgnoreRegion(Layer):
 
 
 class LabelLayer(Layer):
-    """A label image; 0 means unlabelled."""
+    """Label image; 0 is unlabelled."""
 
     @classmethod
     def of(cls, labels: UInt8[np.ndarray, "height width"]) -> Self:
-        """Create a layer from label numbers; `ProjectError` unless they are an 8-bit image."""
+        """Create a layer from an 8-bit image of label numbers; `ProjectError` for other arrays."""
         labels = np.asarray(labels)
         if labels.ndim != 2 or labels.dtype != np.uint8:
             raise ProjectError(f"labels are {labels.dtype} {labels.shape}. Give 8 bits per pixel [height, width].")
@@ -109,7 +109,7 @@ class PartLabels(LabelLayer):
 
 
 class ImportedMask(LabelLayer):
-    """Imported labels (numbers of `ImportedLabels`) of the pixels of a frame."""
+    """Imported label numbers (see `ImportedLabels`) of the pixels of an image."""
 
     def mask(self) -> Bool[np.ndarray, "height width"]:
         """Labelled pixels."""
@@ -118,7 +118,7 @@ class ImportedMask(LabelLayer):
 
 @lru_cache(maxsize=8)
 def _decoded(png: bytes, size: tuple[int, int]) -> UInt8[np.ndarray, "height width"]:
-    """Cached decoder, since overlay, scores and panels read a layer several times per stroke."""
+    """Decode a PNG; cached, since overlay, scores and panels read a layer several times per stroke."""
     image = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_GRAYSCALE)
     if image is None or image.shape[::-1] != size:
         raise ProjectError("a painted layer is damaged. Undo to a step before it was painted, or repaint it.")

@@ -1,4 +1,4 @@
-"""Masks of a project: import of annotations as layers, and masks fitted by the optimizer."""
+"""Masks of a project: import of annotations as layers, and masks as targets of the optimizer."""
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
@@ -28,7 +28,7 @@ MaskLayer = Literal["imported", "painted"]
 """Source of masks in a project."""
 
 _LEFT_OUT = {"ignore", "ignored", "void"}
-"""Labels of pixels that are neither instrument nor background."""
+"""Names of labels for pixels that are neither instrument nor background."""
 
 Masks = dict[str, Bool[np.ndarray, "height width"]]
 
@@ -65,7 +65,7 @@ def project_masks(layer: MaskLayer, state: ProjectState, recording: Recording) -
 
 
 def file_masks(source: Path, recording: Recording) -> GivenMasks:
-    """Masks from a file or folder, read by `read_annotations`; `ProjectError` if it has no mask of any frame."""
+    """Masks from a file or folder, read by `read_annotations`; `ProjectError` if no mask matches a frame."""
     found = read_annotations(source, recording)
     layers = {
         (frame.frame, frame.camera): ImportedMask.of(frame.labels) for frame in found.frames if frame.labels is not None
@@ -81,7 +81,7 @@ def file_masks(source: Path, recording: Recording) -> GivenMasks:
 
 
 def ignored_labels(layer: ImportedMask, names: Sequence[str]) -> Bool[np.ndarray, "height width"]:
-    """Pixels of a layer with a label that is ignored, such as `ignore`."""
+    """Pixels of a layer whose label name means that they are ignored, such as `ignore`."""
     numbers = [number for number, name in enumerate(names, start=1) if name.casefold() in _LEFT_OUT]
     return np.isin(layer.labels(), numbers)
 
@@ -119,7 +119,7 @@ def _ignored(state: ProjectState, cameras: Iterable[str], index: int) -> Masks:
 
 
 _SHOWN = 5
-"""Largest number of remarks in a sentence."""
+"""Maximum number of remarks in a sentence."""
 
 
 @dataclass(frozen=True)
@@ -135,7 +135,7 @@ class ImportReport:
     labels: tuple[str, ...]
     """Labels of the masks."""
     unknown: tuple[str, ...]
-    """Images of the source that match no frame."""
+    """Names of images without a matching frame."""
     changed: bool
     """Whether the project changed."""
     remarks: tuple[str, ...] = ()
@@ -167,8 +167,8 @@ def import_annotations(
         replace: whether previously imported layers may be replaced.
 
     Raises:
-        ProjectError: no annotation matches a frame, or a layer would be replaced without permission. Nothing is changed
-            then.
+        ProjectError: no annotation matches a frame, or a layer would be replaced without permission. In both cases
+            nothing is changed.
         SequenceError: the source cannot be read.
     """
     state = project.state
@@ -198,7 +198,7 @@ def import_annotations(
 
 
 def _edits(state: ProjectState, annotations: "Annotations") -> tuple[dict[Key[Any], Any], int, int]:
-    """Edits, and numbers of images with masks and keypoints; new labels are numbered after the existing ones."""
+    """Edits, and numbers of images with masks and with keypoints; new labels are numbered after the existing labels."""
     known = state.get(Key.imported_labels())
     names = [] if known is None else list(known.names)
     edits: dict[Key[Any], Any] = {}
@@ -209,7 +209,7 @@ def _edits(state: ProjectState, annotations: "Annotations") -> tuple[dict[Key[An
             numbers = np.zeros(256, np.uint8)
             for number, name in enumerate(annotations.label_names, start=1):
                 if names.index(name) > 254:
-                    raise ProjectError("the project would have more than 255 labels. Merge some of them.")
+                    raise ProjectError("the project would have more than 255 labels. Merge some labels.")
                 numbers[number] = names.index(name) + 1
             edits[Key.imported_mask(found.frame, found.camera)] = ImportedMask.of(numbers[found.labels])
             masks += 1

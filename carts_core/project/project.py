@@ -1,4 +1,4 @@
-"""An open project: durable edits, undo and redo, one writer at a time."""
+"""Open project with durable edits, undo and redo, and one writer at a time."""
 
 import json
 import logging
@@ -27,22 +27,22 @@ Action = Literal["apply", "undo", "redo", "figures", "export"]
 
 @dataclass(frozen=True)
 class Change:
-    """A saved change; the new state is `Project.state`."""
+    """Notification of a saved change; the new state is `Project.state`."""
 
     action: Action
     step: Step | None
-    """The step that was done or undone; the outermost one if several were."""
+    """The step that was done or undone; the outermost of several steps."""
     keys: frozenset[Key[Any]]
     """Keys whose values may have changed."""
     frames: tuple[int, ...]
-    """Sorted indices of the affected frames; values of the whole project are not included."""
+    """Sorted indices of the affected frames; empty for values of the whole project."""
 
 
 Listener = Callable[[Change], None]
 
 
 LONGEST_NAME = 200
-"""Largest length of a step's name [characters]."""
+"""Maximum length of a step's name [characters]."""
 
 
 class Project:
@@ -50,14 +50,14 @@ class Project:
 
     Attributes:
         state: current state, an immutable snapshot that is read without a lock.
-        read_only_reason: sentence on why nothing can be saved; None if the project is writable.
+        read_only_reason: sentence on the reason why edits cannot be saved; None if the project is writable.
 
     Args:
-        read_only: do not write; later edits of other processes are not loaded.
+        read_only: open without writing; later edits of other processes are not loaded.
 
     Raises:
         ProjectError: the file belongs to another sequence or to a newer version of carts, is not a project, does not
-            exist (if read-only), or cannot be written (folder read-only, disk full). Nothing is changed then.
+            exist (if read-only), or cannot be written (folder read-only, disk full). Nothing is changed in these cases.
     """
 
     def __init__(self, identity: SequenceIdentity, path: Path, *, read_only: bool = False) -> None:
@@ -73,9 +73,9 @@ class Project:
 
     @classmethod
     def open(cls, sequence: "Sequence", path: Path | None = None, *, read_only: bool = False) -> Self:
-        """Open the project of a sequence, by default at `default_path`; created if missing.
+        """Open the project of a sequence, by default at `default_path`; a missing project is created.
 
-        If another process has it open for writing, it is opened read-only; see `writable`. Errors as in the class.
+        A project that another process has open for writing is opened read-only; see `writable`. Errors as in the class.
         """
         if path is None:
             path = default_path(Path(sequence.path))
@@ -86,7 +86,7 @@ class Project:
 
     @property
     def path(self) -> Path:
-        """Path of the project file; another file after a rescue, see `incident`."""
+        """Path of the project file, which changes after a rescue; see `incident`."""
         return self._path if self._store is None else self._store.path
 
     @property
@@ -96,7 +96,7 @@ class Project:
 
     @property
     def incident(self) -> str | None:
-        """Sentence on what happened to the opened file and where its edits are saved; None without an incident."""
+        """Message describing the failure of the opened file and where edits are now saved; None without a failure."""
         return self._incident if self._store is None else self._store.incident
 
     @property
@@ -105,13 +105,13 @@ class Project:
         return self._store is None or self._store.safe
 
     def check(self) -> None:
-        """Check that the file is unchanged since the last write; otherwise everything is saved to another file, see
+        """Check that the file is unchanged since the last write; otherwise save the project to another file, see
         `incident`.
 
-        Every edit does this as well.
+        Every edit includes this check.
 
         Raises:
-            ProjectError: the file has changed, and the project could not be saved elsewhere.
+            ProjectError: the file has changed, and the project could not be saved to another file.
         """
         with self._edit:
             if self._store is not None:
@@ -123,13 +123,13 @@ class Project:
         Args:
             name: name in the history, such as "Drag PSM1"; shortened to `LONGEST_NAME` characters.
             edits: new values by key; see `ProjectState.changed` for omitted and additional edits.
-            figures: frame -> quality figures with these edits; saved even if nothing else changes.
+            figures: frame -> quality figures with these edits, saved even without other changes.
 
         Returns:
-            The saved change; None if nothing changes.
+            The saved change; None without a change.
 
         Raises:
-            ProjectError: an edit does not fit the sequence, or could not be saved. Nothing is changed then.
+            ProjectError: an edit does not fit the sequence, or could not be saved. In both cases nothing is changed.
         """
         with self._edit:
             state = self.state
@@ -142,7 +142,7 @@ class Project:
             title = " ".join(name.encode("utf-8", "replace").decode().split())
             if not title:
                 raise ProjectError("a step has an empty name. Give a name.")
-            # Names of arms, joints and frames, which are part of step names, may be long.
+            # Step names contain names of arms, joints and frames, which may be long.
             title = title if len(title) <= LONGEST_NAME else f"{title[: LONGEST_NAME - 1]}…"
             step = Step(state.position + 1, title, time.time())
             after = state.after(step, changed)
@@ -153,18 +153,18 @@ class Project:
             return self._saved(after.with_figures(known), "apply", step, changed.keys())
 
     def undo(self) -> Change | None:
-        """Undo the last step; None if there is none. `ProjectError` if it could not be saved."""
+        """Undo the last step; None without a step to undo. `ProjectError` if the change could not be saved."""
         with self._edit:
             return self.go_to(max(self.state.position - 1, 0))
 
     def redo(self) -> Change | None:
-        """Redo the last undone step; None if there is none. Errors as in `undo`."""
+        """Redo the last undone step; None without a step to redo. Errors as in `undo`."""
         with self._edit:
             return self.go_to(min(self.state.position + 1, len(self.state.steps)))
 
     def go_to(self, position: int) -> Change | None:
-        """Undo or redo to a position of the history; None if it is the current one. `ProjectError` if it does not
-        exist."""
+        """Undo or redo to a position of the history; None at the current position. `ProjectError` for a position that
+        does not exist."""
         with self._edit:
             state = self.state
             if not 0 <= position <= len(state.steps):
@@ -182,7 +182,7 @@ class Project:
             return self._saved(moved, "undo" if back else "redo", step, entries.keys())
 
     def reverting(self, number: int) -> tuple[Edits, Mapping[int, Figures]]:
-        """Edits that undo a single step and keep all later ones, with figures as for `apply`.
+        """Edits that undo a single step and keep all later steps, with figures as for `apply`.
 
         The project is not changed. A frame restored to its state before the step regains its verdict and figures.
 
@@ -198,7 +198,7 @@ class Project:
             if later is not None:
                 raise ProjectError(
                     f"step {number} ({state.steps[number - 1].name}) cannot be reverted alone: step {later} "
-                    f"({state.steps[later - 1].name}) has changed the same values since. Revert that one first."
+                    f"({state.steps[later - 1].name}) has changed the same values since. Revert that step first."
                 )
             _, entries = journal.move(memory, state.position, number - 1)
             verdicts, figures = state.regained(state.with_entries(entries), edits)
@@ -209,9 +209,9 @@ class Project:
         return self.state.steps
 
     def record_figures(self, figures: Mapping[int, Figures], state: ProjectState) -> None:
-        """Save figures that were computed for frames of `state`. Not an undo step.
+        """Save figures computed for frames of `state`; not an undo step.
 
-        Undo and redo restore them when they restore that state of the frames.
+        Undo and redo restore figures together with the state of the frames.
 
         Raises:
             ProjectError: a frame does not exist, or the figures could not be saved.
@@ -228,7 +228,7 @@ class Project:
                 self._saved(self.state.with_figures(known), "figures", frames=[frame for frame, _ in known])
 
     def record_verdict(self, frame: int, verdict: FitVerdict) -> None:
-        """Save the verdict on the current fit of a frame. Not an undo step. Errors as in `record_figures`."""
+        """Save the verdict on the current fit of a frame; not an undo step. Errors as in `record_figures`."""
         key = Key.verdict(frame)
         with self._edit:
             check_edit(self.state.identity, key, verdict)
@@ -238,7 +238,7 @@ class Project:
             self._saved(self.state.with_entries({key: entry}), "figures", frames=[frame])
 
     def log_export(self, format: str, path: Path, frames: int, settings: Mapping[str, Any]) -> None:
-        """Log a finished export. Not an undo step. `ProjectError` if it could not be saved."""
+        """Log a finished export; not an undo step. `ProjectError` if the log entry could not be saved."""
         record = ExportRecord(time.time(), format, str(path), frames, json.dumps(settings, allow_nan=False))
         with self._edit:
             self._writer().commit(journal.add_export(record))
@@ -255,7 +255,8 @@ class Project:
         return remove
 
     def close(self) -> None:
-        """Close the file for other writers; the state stays readable. `ProjectError` if saved edits are lost."""
+        """Close the file, so that others can write it; the state stays readable. `ProjectError` if saved edits are
+        lost."""
         with self._edit:
             if self._store is not None:
                 store, self._store = self._store, None
@@ -301,7 +302,7 @@ class Project:
         for listener in tuple(self._listeners):
             try:
                 listener(change)
-            except Exception:  # The edit is saved nevertheless.
+            except Exception:  # The edit has been saved.
                 logging.getLogger(__name__).exception("a listener of project %s failed", self.path)
         return change
 

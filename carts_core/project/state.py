@@ -1,4 +1,4 @@
-"""Immutable snapshots of a project's state, queries for frames to review, and recordings with its corrections."""
+"""Immutable snapshots of a project's state, queries for frames to review, and corrected recordings."""
 
 import math
 from bisect import bisect_left, bisect_right
@@ -59,7 +59,7 @@ class ExportRecord:
 
 @dataclass(frozen=True)
 class Entry:
-    """A value and the step that set it; None if the step removed the value."""
+    """Value, and the step that set it; the value is None if the step removed it."""
 
     step: int
     value: Any
@@ -70,11 +70,11 @@ class Record:
     """Values of one frame, or of the whole project."""
 
     entries: Mapping[Key[Any], Entry]
-    """Values that differ, or once differed, from the sequence."""
+    """Values that differ or have differed from the sequence."""
     figures: Mapping[int, Figures]
     """Quality figures by revision; see `ProjectState.revision`."""
 
-    # Computed once per record; records are shared by successive states, so queries over all frames recompute only few.
+    # Computed once per record. Successive states share records, so queries over all frames recompute few of them.
     @cached_property
     def review(self) -> Review:
         """Review state and note. Without a manual review, the state depends on the source of the joint positions."""
@@ -90,8 +90,7 @@ class Record:
 
     @cached_property
     def _optimized(self) -> bool:
-        """Whether the joint positions come from an optimizer run of one or several frames; copied ones have no
-        settings."""
+        """Whether the joint positions are the result of an optimizer run; copied positions have no settings."""
         made = [correction.provenance for correction in self._values(Kind.JOINTS)]
         by_hand = any(one.source is Source.HAND for one in made)
         return not by_hand and any(one.settings is not None for one in made)
@@ -103,7 +102,7 @@ class Record:
 
     @cached_property
     def is_kept(self) -> bool:
-        """Whether propagation must not change the frame, because it is a keyframe or was manually accepted."""
+        """Whether propagation must not change the frame: a keyframe, or a manually accepted frame."""
         return self.is_keyframe or self.review.state is ReviewState.ACCEPTED
 
     def _values(self, kind: Kind) -> Iterator[Any]:
@@ -124,20 +123,20 @@ class ProjectState:
 
     identity: SequenceIdentity
     steps: tuple[Step, ...] = ()
-    """The history, oldest first; those after `position` are undone and can be redone."""
+    """History, oldest step first; steps after `position` are undone and can be redone."""
     position: int = 0
     """Number of steps in effect."""
     records: Mapping[int, Record] = field(default_factory=dict)
-    """Records by frame. Nested, because an edit copies this mapping and the affected records only."""
+    """Frame -> record; an edit copies only this mapping and the affected records."""
     exports: tuple[ExportRecord, ...] = ()
 
     def get(self, key: Key[V]) -> V | None:
-        """Value of a key; None if it is the sequence's own."""
+        """Value of a key; None if the value of the sequence applies."""
         entry = self._record(key.frame).entries.get(key)
         return None if entry is None else entry.value
 
     def changed(self, edits: Edits) -> dict[Key[Any], Any]:
-        """The edits that change values, including given verdicts on changed poses even if these verdicts are equal.
+        """Edits that change values, and the given verdicts on changed poses even if these verdicts are equal.
 
         Changing an accepted frame withdraws its acceptance in the same step, unless an edit sets its review.
         """
@@ -192,15 +191,15 @@ class ProjectState:
 
     @cached_property
     def kept_frames(self) -> tuple[int, ...]:
-        """Sorted frames that propagation must not change: keyframes and manually accepted ones."""
+        """Sorted frames that propagation must not change: keyframes and manually accepted frames."""
         return tuple(sorted(i for i, record in self.records.items() if i != WHOLE_PROJECT and record.is_kept))
 
     def figures(self, frame: int) -> Figures | None:
-        """Quality figures of a frame; None if it has changed since they were computed."""
+        """Quality figures of a frame; None if the frame has changed since their computation."""
         return self._record(frame).figures.get(self.revision(frame))
 
     def revision(self, frame: int) -> int:
-        """Last step that changed the inputs of the frame's figures; 0 if none did."""
+        """Last step that changed the inputs of the frame's figures; 0 without such a step."""
         entries = self._record(frame).entries.items()
         own = max((entry.step for key, entry in entries if key.kind not in _MARKS), default=0)
         return max(own, self._calibration_revision)
@@ -227,16 +226,16 @@ class ProjectState:
 
     @property
     def undoable(self) -> Step | None:
-        """The step that `Project.undo` undoes; None if there is none."""
+        """Step that `Project.undo` undoes, or None."""
         return self.steps[self.position - 1] if self.position else None
 
     @property
     def redoable(self) -> Step | None:
-        """The step that `Project.redo` redoes; None if there is none."""
+        """Step that `Project.redo` redoes, or None."""
         return self.steps[self.position] if self.position < len(self.steps) else None
 
     def after(self, step: Step, edits: Edits) -> "ProjectState":
-        """State after one more step, with redoable steps discarded."""
+        """State after one more step, without redoable steps."""
         state = self
         if self.redoable is not None:
             records = {
@@ -284,12 +283,12 @@ def by_revision(state: ProjectState, figures: Mapping[int, Figures]) -> dict[tup
 
 
 def step_at(state: ProjectState, number: int) -> tuple[Step, ...]:
-    """The step with this number, as a tuple; empty if there is none."""
+    """The step with this number as a tuple; empty if it does not exist."""
     return state.steps[max(number - 1, 0) : number]
 
 
 def frames_in(state: ProjectState, review_states: Collection[ReviewState]) -> list[int]:
-    """Indices of the frames in one of these review states, in order."""
+    """Sorted indices of the frames in one of these review states."""
     return [index for index in range(len(state.identity.frame_ids)) if state.review(index).state in review_states]
 
 
@@ -301,7 +300,7 @@ def by_hand(state: ProjectState, frame: int) -> bool:
 
 
 def next_unreviewed(state: ProjectState, after: int, step: int = 1, within: range | None = None) -> int | None:
-    """Next frame without review, cyclically; None if there is none.
+    """Next frame without review, cyclically; None if all frames are reviewed.
 
     Args:
         after: index of the current frame, which is considered last.
@@ -329,9 +328,10 @@ def between_kept(state: ProjectState, frame: int, within: range | None = None) -
 
 
 def worst_first(state: ProjectState, frames: Iterable[int] | None = None) -> list[int]:
-    """Frames, by default all, sorted by decreasing badness of fit; those without a measure come last, in order.
+    """Frames, by default all, sorted from the worst to the best fit; frames without a measure come last, in order.
 
-    The measure is 1 - Dice if any frame has Dice, else the probability of failure if any has a verdict, else the loss.
+    The measure is 1 - Dice if any frame has a Dice, else the probability of failure if any frame has a verdict, else
+    the loss.
     """
     indices = list(range(len(state.identity.frame_ids)) if frames is None else frames)
     dice, failure, loss = {}, {}, {}
@@ -352,8 +352,8 @@ _SOURCE_ORDER = (Source.HAND, Source.PROPAGATED, Source.OPTIMIZER, Source.MEASUR
 
 
 def corrected_sequence(sequence: Sequence, project: ProjectState) -> Sequence:
-    """Recording with the project's time offset, calibration and joints; `SequenceError` if no table row matches a
-    frame."""
+    """Recording with the project's time offset, calibration and joint positions; `SequenceError` if no table row
+    matches a frame."""
     offset = project.get(Key.time_offset())
     if offset is not None and sequence.matching is not None and offset.seconds != sequence.matching.time_offset:
         sequence = sequence.with_time_offset(offset.seconds)
@@ -384,7 +384,7 @@ def source_of(project: ProjectState, frame: int) -> Source:
 
 
 def corrected_state(scene: Scene, frame: Frame, project: ProjectState) -> SceneState:
-    """State of a frame under the project's calibration, with corrected joint positions where available, else measured
+    """State of a frame under the project's calibration, with corrected joint positions if available, else the measured
     ones."""
     measured = {name: frame.measured[name] for name in project.identity.arms}
     corrected = {name: found.joint_positions for name, found in project.joints(frame.index).items()}

@@ -1,7 +1,7 @@
-"""Opening, committing and rescuing of projects, each a file with an in-memory copy.
+"""Opening, committing and rescuing of projects; a project is a file with an in-memory copy.
 
 All checks run on the copy first, so a refused file is not changed. A file that is lost while open is rescued from the
-copy; the readable content of a damaged file becomes a new project.
+copy. The readable content of a damaged file is saved as a new project.
 """
 
 import logging
@@ -26,7 +26,7 @@ from .state import ProjectState
 from .values import Figures, Key, Kind, check_edit, decode
 
 UNREADABLE = (ValueError, TypeError, KeyError, AttributeError, OverflowError, RecursionError, MemoryError)
-"""Exceptions raised on decoding untrusted values, besides `ProjectError`."""
+"""Exceptions raised when decoding untrusted values, in addition to `ProjectError`."""
 _TYPES: dict[str, tuple[Any, ...]] = {
     "steps": (int, str, float),
     "changes": (str, int, str, int, str | bytes | None),
@@ -40,7 +40,7 @@ _LOST_STEP = "Step (name lost)"
 
 @dataclass
 class Rescued:
-    """A rescued project in memory, with a report."""
+    """Rescued project in memory, with a report."""
 
     connection: sqlite3.Connection
     kept: int = 0
@@ -55,7 +55,7 @@ class Rescued:
 
 
 def rescue(copy: Copy, identity: SequenceIdentity) -> Rescued | None:
-    """Rescue the readable content of a project of this sequence; None if there is none."""
+    """Rescue the readable content of a project of this sequence; None without readable content."""
     old = copy.connection
     rescued = Rescued(database.empty(identity))
     tables = {table: list(_rows(copy, table, rescued)) for table in TABLES}
@@ -128,7 +128,7 @@ def _fits(identity: SequenceIdentity, table: str, row: tuple, rescued: Rescued) 
 
 
 def _position(old: sqlite3.Connection, numbers: list[int]) -> int:
-    """Number of steps in effect; all steps if it cannot be read."""
+    """Number of steps in effect; all steps if the position cannot be read."""
     try:
         (position,) = old.execute("SELECT position FROM project").fetchone()
     except (sqlite3.Error, TypeError):
@@ -156,8 +156,8 @@ class Store:
 
     Attributes:
         memory: connection to the in-memory copy.
-        path: file to which edits are written; another one after a rescue.
-        incident: sentence on what happened to the opened file; None without an incident.
+        path: file to which edits are written, which changes after a rescue.
+        incident: message describing the failure of the opened file; None without a failure.
     """
 
     def __init__(self, memory: sqlite3.Connection, seal: Seal, position: int, file: ProjectFile) -> None:
@@ -198,7 +198,8 @@ class Store:
         self._guarded(lambda file: file.checkpoint())
 
     def check(self) -> None:
-        """Check that the file is unchanged since the last write; otherwise rescue everything (or `ProjectError`)."""
+        """Check that the file is unchanged since the last write; otherwise rescue the project, or raise
+        `ProjectError`."""
         self._guarded(lambda file: file.check())
 
     def close(self) -> None:
@@ -229,7 +230,7 @@ class Store:
         return self._file
 
     def _rescue(self, what: str) -> None:
-        """Write everything to a new file that replaces the lost one."""
+        """Write the project to a new file that replaces the lost file."""
         lost = self.path
         if self._file is not None:
             self._what = what
@@ -246,7 +247,7 @@ class Store:
                 break
         else:
             failed = (
-                f"NOT SAVED: project {lost} {what} while it was open, and its edits could not be saved elsewhere "
+                f"NOT SAVED: project {lost} {what} while it was open, and its edits could not be saved to another file "
                 f"either ({failure}). They are in memory. Free disk space, or make the folder writable; saving is "
                 "retried."
             )
@@ -279,12 +280,12 @@ class Store:
 
 
 def open_or_begin(path: Path, identity: SequenceIdentity) -> tuple[ProjectState, Store | str]:
-    """Open the project of a sequence, created if missing; returns its state, and its store or the reason why another
-    process holds it.
+    """Open the project of a sequence; a missing project is created. Returns the state, and the store or a message that
+    another process has the project open.
 
     Raises:
-        DamagedProject: it is damaged; its readable content was saved to a new file.
-        ProjectError, OSError, sqlite3.Error: it cannot be opened; nothing is changed.
+        DamagedProject: the project is damaged; its readable content was saved to a new file.
+        ProjectError, OSError, sqlite3.Error: the project cannot be opened; nothing is changed.
     """
     if not check_files(path):
         _begin(path, identity)
@@ -304,7 +305,7 @@ def open_or_begin(path: Path, identity: SequenceIdentity) -> tuple[ProjectState,
 
 
 def read_project(path: Path, identity: SequenceIdentity | None) -> ProjectState:
-    """Read the state of the project of a sequence (of any sequence if None); errors as in `open_or_begin`."""
+    """Read the state of the project of a sequence, or of any sequence; errors as in `open_or_begin`."""
     memory, state, _ = _load(path, identity, keep_what_is_left=False)
     memory.close()
     return state
@@ -312,7 +313,7 @@ def read_project(path: Path, identity: SequenceIdentity | None) -> ProjectState:
 
 def _begin(path: Path, identity: SequenceIdentity) -> None:
     try:
-        # A process that creates it concurrently writes the same content.
+        # Another process that creates the file concurrently writes the same content.
         write_new(path, file_content(database.empty(identity)))
     except OutputError as error:
         if isinstance(error.__cause__, OSError):
@@ -369,7 +370,7 @@ def _damaged(
         return database.DamagedProject(f"{begin} It cannot be read. Restore a backup copy.")
     when = time.time()
     with suppress(OSError, OverflowError, ValueError):
-        # Named by the file's modification time, so that another attempt finds the same rescued file.
+        # The name contains the file's modification time, so that another attempt finds the same rescued file.
         when = path.stat().st_mtime
         time.localtime(when)
     target, new = next(rescue_paths(path, when)), False

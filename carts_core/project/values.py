@@ -38,14 +38,15 @@ class Provenance:
     """Origin of a value, with settings and weights.
 
     Raises:
-        ProjectError: an optimizer's value lacks settings, settings are not JSON, or a hash is invalid.
+        ProjectError: a value of the optimizer lacks settings, settings are not JSON, or a hash is invalid.
     """
 
     source: Source
     settings: str | None = None
-    """JSON text of the settings; required for the optimizer."""
+    """Settings as JSON; required for values of the optimizer."""
     weights_sha256: str | None = None
-    """Hash of the network's weights; required for the optimizer, unless it fitted masks without a network."""
+    """SHA-256 of the network's weights; required for values of the optimizer, except for fits of masks without a
+    network."""
 
     def __post_init__(self) -> None:
         _set(self, "source", _choice(Source, self.source, "provenance"))
@@ -68,17 +69,17 @@ class Provenance:
         Args:
             settings: JSON-compatible values, such as a solver's settings converted by
                 `carts_core.settings.serialization.to_plain`.
-            weights_sha256: SHA-256 of the weights file; None if only masks were fitted (`observe` in the settings).
+            weights_sha256: SHA-256 of the weights file; None if only masks were fitted (see `observe` in the settings).
             source: OPTIMIZER, or PROPAGATED for a frame solved between keyframes.
         """
         return Provenance(source, json.dumps(settings, sort_keys=True, allow_nan=False), weights_sha256)
 
 
 class JsonValue:
-    """A dataclass that is stored as JSON text."""
+    """Dataclass that is stored as JSON."""
 
     def encode(self) -> str:
-        """The value as JSON text."""
+        """Encode the value as JSON."""
         return json.dumps(asdict(self), allow_nan=False)  # pyright: ignore[reportArgumentType]
 
     @classmethod
@@ -92,14 +93,14 @@ class JsonValue:
 
 @dataclass(frozen=True)
 class JointCorrection(JsonValue):
-    """Joint positions of one arm in one frame. Any sequences of numbers are accepted and stored as tuples.
+    """Joint positions of one arm in one frame. All sequences of numbers are accepted, and stored as tuples.
 
     Raises:
         ProjectError: a number is not finite, or the lengths differ.
     """
 
     joint_positions: tuple[float, ...]
-    """In the order of `Robot.joint_names` [rad, m]."""
+    """Joint positions in the order of `Robot.joint_names` [rad, m]."""
     provenance: Provenance
     standard_deviations: tuple[float | None, ...] | None = None
     """Standard deviation of each joint [rad, m], None if not determined; NaN and infinity become None."""
@@ -118,7 +119,7 @@ class JointCorrection(JsonValue):
 
 @dataclass(frozen=True)
 class CorrectedTransform(JsonValue):
-    """A rigid transform of the calibration: `T_world_base` of an arm or `T_camera_world` of a camera."""
+    """Rigid transform of the calibration: `T_world_base` of an arm or `T_camera_world` of a camera."""
 
     transform: tuple[tuple[float, ...], ...]
     """Transform as 4 rows of 4 numbers [m]."""
@@ -155,8 +156,7 @@ class CorrectedIntrinsics(JsonValue):
 
 @dataclass(frozen=True)
 class TimeOffset(JsonValue):
-    """Time in the kinematics table minus time of the image, which overrides that of the sequence; see
-    `TimeMatching`."""
+    """Time offset (kinematics minus image) that overrides the sequence's time offset; see `TimeMatching`."""
 
     seconds: float
     """Time offset [s]."""
@@ -167,13 +167,13 @@ class TimeOffset(JsonValue):
 
 @dataclass(frozen=True)
 class Keyframe(JsonValue):
-    """User's choice whether a frame is a keyframe; see `ProjectState.is_keyframe`."""
+    """Whether a frame is a keyframe by the user's choice; see `ProjectState.is_keyframe`."""
 
     held: bool
 
 
 class ReviewState(StrEnum):
-    """Review state of a frame, set by the user or the last run."""
+    """Review state of a frame, set by the user or by the last run."""
 
     UNTOUCHED = "untouched"
     OPTIMIZED = "optimized"
@@ -204,7 +204,7 @@ class Figures:
     """Quality of the fit of a frame; finite numbers."""
 
     loss: float | None = None
-    """Loss of the optimizer; lower is better."""
+    """Loss of the optimizer."""
     dice: float | None = None
     """Dice with the ground-truth mask, 0 to 1; None without ground truth."""
 
@@ -217,7 +217,7 @@ class Figures:
 
 @lru_cache(maxsize=1024)
 def _shared_provenance(source: str, settings: str | None, weights_sha256: str | None) -> Provenance:
-    """Interned provenance: equal values share one object, which saves memory."""
+    """Intern provenances, so that equal values share one object, which saves memory."""
     return Provenance(Source(source), settings, weights_sha256)
 
 
@@ -238,7 +238,7 @@ def _finite(values: Iterable[float], what: str) -> tuple[float, ...]:
         numbers = tuple(map(float, values))
     except (TypeError, ValueError) as error:
         raise ProjectError(f"{what} must be a list of numbers, not {values!r}.") from error
-    # The sum is a fast test: it is finite unless a number is not finite, or the sum overflows.
+    # The sum is a fast test: it is not finite if a number is not finite, or if it overflows.
     if not math.isfinite(sum(numbers)) and not all(map(math.isfinite, numbers)):
         raise ProjectError(f"{what} are {list(numbers)}. Give finite numbers.")
     return numbers
@@ -267,7 +267,7 @@ class ImportedLabels(JsonValue):
     """Label names of imported masks, at most 255."""
 
     names: tuple[str, ...]
-    """Names of the labels from 1."""
+    """Names of the labels, numbered from 1."""
 
     def __post_init__(self) -> None:
         _set(self, "names", tuple(self.names))
@@ -297,7 +297,7 @@ class ImportedKeypoints(JsonValue):
 VERDICTS = ("good", "doubtful", "failed")
 """Names of verdicts, as in `carts_core.optimization.Verdict`."""
 LONGEST_TEXT = 2_000
-"""Largest length of a text [characters]."""
+"""Maximum length of a text [characters]."""
 
 
 @dataclass(frozen=True)
@@ -309,7 +309,7 @@ class FitVerdict(JsonValue):
     reason: str = ""
     """Reason, as a sentence."""
     remedy: str = ""
-    """Proposed remedy, as a sentence; empty if none is needed."""
+    """Proposed remedy, as a sentence; empty if no remedy is needed."""
     failure: float = 0.0
     """Probability that the mask is wrong (Dice below 0.9) [1]."""
     cameras: tuple[tuple[str, float], ...] = ()
@@ -380,7 +380,7 @@ _OF_NOBODY = {*_MARKS, Kind.TIME_OFFSET, Kind.IMPORTED_LABELS}
 
 @dataclass(frozen=True)
 class Key(Generic[V_co]):
-    """Key of one value, created by static methods that fix the value's type."""
+    """Key of one value, created by static methods that determine the value's type."""
 
     kind: Kind
     frame: int
@@ -460,11 +460,11 @@ class Key(Generic[V_co]):
 
 
 Edits = Mapping[Key[Any], Any]
-"""Edits of one step: key -> new value, or None to restore the sequence's own."""
+"""Edits of one step: key -> new value, or None to restore the value of the sequence."""
 
 
 def decode(kind: Kind, stored: str | bytes | None) -> Any:
-    """Decode a stored value of the given kind; raises `ValueError`, `TypeError` or `ProjectError` if it is invalid."""
+    """Decode a stored value of the given kind; `ValueError`, `TypeError` or `ProjectError` if it is invalid."""
     if stored is None:
         return None
     return _decoded_mark(kind, stored) if kind in _MARKS else VALUE_TYPES[kind].decode(stored)
@@ -472,7 +472,7 @@ def decode(kind: Kind, stored: str | bytes | None) -> Any:
 
 @lru_cache(maxsize=1024)
 def _decoded_mark(kind: Kind, stored: str | bytes) -> Any:
-    """Interned marks: equal values of many frames share one object."""
+    """Decode and intern marks, so that equal values of many frames share one object."""
     return VALUE_TYPES[kind].decode(stored)
 
 

@@ -1,4 +1,4 @@
-"""The mean background BG_m of the paper, estimated from a recording when it is not given."""
+"""Estimation of the mean background BG_m of the paper from a recording."""
 
 from collections.abc import Callable, Iterable
 from collections.abc import Sequence as Items
@@ -12,22 +12,22 @@ from ..errors import SequenceError
 from ..model.scene import Scene, SceneState
 
 FRAMES = 30
-"""Largest number of frames, spread evenly over the recording, of which the background is the median."""
+"""Maximum number of frames, evenly spaced over the recording, for the median background."""
 
 MARGIN = 15 / 640
 """Uncertainty margin around the silhouette of an arm, relative to the width of the image."""
 
 _LARGEST_ERROR = 3
-"""Largest error of measured kinematics, in margins [1]."""
+"""Maximum error of measured kinematics, in margins [1]."""
 
 _STAYS = 0.4
 """Share of an arm's silhouette that is covered in all views, above which the arm counts as immobile [1]."""
 
 _FEWEST = 3
-"""Smallest number of views whose agreement makes a pixel known [1]."""
+"""Minimum number of views whose agreement makes a pixel known [1]."""
 
 _AGREE = 3.0, 4.0
-"""Largest difference between views of the empty scene: multiple of the image's typical deviation, plus grey levels."""
+"""Maximum difference between views of the empty scene: a multiple of the image's median deviation, plus grey levels."""
 
 _COVERED = 256
 _ROWS_AT_ONCE = 64
@@ -41,16 +41,16 @@ class MeanBackground:
     known: Bool[np.ndarray, "height width"]
     """Pixels that show no arm, even with the expected error of measured kinematics."""
     problem: str | None = None
-    """Why the background is not reliable, as a sentence; None if it is reliable."""
+    """Reason why the background is unreliable, as a sentence; None for a reliable background."""
 
 
 def spread(length: int, count: int = FRAMES) -> list[int]:
-    """At most `count` different frame numbers, evenly spread over `length`."""
+    """At most `count` different frame numbers, evenly spaced over `length`."""
     return sorted({round(float(index)) for index in np.linspace(0, length - 1, min(count, length))})
 
 
 def widen(silhouette: Bool[np.ndarray, "height width"], margins: int = 1) -> Bool[np.ndarray, "height width"]:
-    """A silhouette dilated by one or several uncertainty margins of measured kinematics."""
+    """Dilate a silhouette by one or several uncertainty margins of measured kinematics."""
     radius = max(1, round(margins * MARGIN * silhouette.shape[1]))
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
     return cv2.dilate(silhouette.astype(np.uint8), disc).astype(bool)
@@ -59,11 +59,11 @@ def widen(silhouette: Bool[np.ndarray, "height width"], margins: int = 1) -> Boo
 def background_of_recording(
     scene: Scene, camera: str, states: Items[SceneState], image: Callable[[int], UInt8[np.ndarray, "height width 3"]]
 ) -> MeanBackground:
-    """The mean background of a recording: the median of each pixel over the views in which no arm covers it.
+    """Mean background of a recording: the median of each pixel over the views in which no arm covers this pixel.
 
-    A pixel that is always covered is filled in from its surroundings. A pixel is known if the arms are far from it in
-    most of the views in its median, or if many views agree: an arm that is present despite inaccurate kinematics moves
-    and changes its shading.
+    Pixels covered in every view are filled in from their surroundings. A pixel is known if the arms are far from it in
+    most views of its median, or if many views agree, since an arm that is visible because of inaccurate kinematics
+    would move and change its shading.
 
     Args:
         scene: scene with the camera.
@@ -71,7 +71,7 @@ def background_of_recording(
         states: measured state of the scene in each view.
         image: index in `states` -> image of the frame.
     """
-    # Imported here, so that reading and importing recordings need neither the renderer nor its compiler.
+    # Imported here, so that reading and importing recordings require neither the renderer nor its compiler.
     from ..rendering import Renderer  # noqa: PLC0415
 
     renderer = Renderer(scene, cameras=[camera])
@@ -95,9 +95,10 @@ def background_of_recording(
 def uncovered_median(
     views: Iterable[tuple[UInt8[np.ndarray, "height width 3"], Bool[np.ndarray, "height width"]]],
 ) -> tuple[UInt8[np.ndarray, "height width 3"], Float[np.ndarray, "height width"]]:
-    """Median of every pixel over the views in which it is not covered, and the median deviation from it [grey levels].
+    """Median of every pixel over the views in which the pixel is not covered, and median absolute deviation [grey
+    levels].
 
-    Both are 0 where a pixel is covered in every view; `SequenceError` if all pixels are.
+    Both are 0 for pixels covered in every view; `SequenceError` if this applies to all pixels.
     """
     images, covers = (np.stack(arrays) for arrays in zip(*views, strict=True))
     seen = (~covers).sum(0)
@@ -130,7 +131,7 @@ def filled_in(
     image: UInt8[np.ndarray, "height width 3"], hole: Bool[np.ndarray, "height width"]
 ) -> UInt8[np.ndarray, "height width 3"]:
     """`image` with permanently covered pixels filled in from their surroundings."""
-    # Next to permanently covered pixels the arm itself may be visible, if its error exceeds the margin.
+    # If the kinematic error exceeds the margin, the arm may be visible next to permanently covered pixels.
     rim = widen(hole)
     return fill(image, hole if rim.all() else rim)
 
@@ -147,7 +148,7 @@ def fill(
 
 
 def _pull_push(weighted: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """Mean colours where `weight` is positive, those of the next coarser level where it is 0."""
+    """Mean colours where `weight` is positive; colours of the next coarser level elsewhere."""
     height, width = weight.shape
     mean = weighted / np.maximum(weight, 1e-6)[..., None]
     if weight.all() or min(height, width) < 2:

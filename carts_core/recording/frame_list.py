@@ -25,14 +25,14 @@ EXAMPLES = '"left/{frame}.jpg", "left/{frame:06d}.png", "{domain}/{index:04d}.jp
 
 
 class FrameId(str):
-    """Id of a frame for use in patterns: `{frame}` gives its text, `{frame:03d}` its padded number."""
+    """Frame id for use in patterns: `{frame}` is its text, `{frame:03d}` its padded number."""
 
     def __format__(self, spec: str) -> str:
         return format(int(self), spec) if spec.endswith("d") else format(str(self), spec)
 
 
 def expand(pattern: str, key: str, **values: object) -> str:
-    """`pattern` with its {placeholders} filled in."""
+    """Fill in the {placeholders} of a pattern."""
     try:
         _check_format(pattern)
         filled = pattern.format(**values)
@@ -51,14 +51,14 @@ def expand(pattern: str, key: str, **values: object) -> str:
 
 @lru_cache(maxsize=64)
 def _check_format(pattern: str) -> None:
-    """Check a pattern; `KeyError` for unknown placeholders, `ValueError` for malformed or too wide ones."""
+    """Check a pattern; `KeyError` for unknown placeholders, `ValueError` for malformed or too wide placeholders."""
     for _, name, form, conversion in Formatter().parse(pattern):
         if name is None:
             continue
         if name not in _PLACEHOLDERS:
             raise KeyError(name)
         if conversion or "{" in (form or ""):
-            raise ValueError("a placeholder takes a width such as 06d, and nothing else")
+            raise ValueError("a placeholder may only have a width, such as 06d")
         if any(len(width) > _WIDTH_DIGITS or int(width) > LARGEST_NAME for width in re.findall(r"[0-9]+", form or "")):
             raise ValueError(f"a name is longer than {LARGEST_NAME} characters")
 
@@ -69,16 +69,16 @@ def is_per_frame(pattern: str) -> bool:
 
 
 def is_glob(pattern: str) -> bool:
-    """Whether the pattern has wildcards, which match files in sorted order."""
+    """Whether the pattern has wildcards; the matching files are used in sorted order."""
     return "*" in pattern or "?" in pattern
 
 
 _FRAME_ALONE = "{frame}"
-"""Pattern of frames whose cells are their ids."""
+"""Pattern of ids that are the cells of their column."""
 _SHORT = 50
-"""Number of digits up to which no id is too long for a name."""
+"""Number of digits up to which an id is never too long for a file name."""
 MOST_FRAMES = 1_000_000
-"""Longest sequence; nine hours at 30 frames per second."""
+"""Maximum number of frames of a sequence; nine hours at 30 frames per second."""
 
 
 @dataclass(frozen=True)
@@ -89,11 +89,11 @@ class FrameList:
     timestamps: Float[np.ndarray, " frames"] | None
     """Acquisition time of each image [s]."""
     video_frames: tuple[int, ...]
-    """Number of every frame in its video, from 0."""
+    """Number of each frame in its video, from 0."""
     counted: str
     """Number of frames, as a clause for errors, such as "the kinematics table has 3 rows"."""
     table: Table | None = None
-    """Table with a row per frame; None for all frames of a video."""
+    """Table with one row per frame; None for all frames of a video."""
 
     def __post_init__(self) -> None:
         if len(self.frame_ids) > MOST_FRAMES:
@@ -102,16 +102,16 @@ class FrameList:
 
 @dataclass(frozen=True)
 class FrameNames:
-    """Column and pattern of the frames' ids in a table."""
+    """Column of frame ids in a table, and pattern of the ids."""
 
     column: str
     pattern: str
-    """Pattern that makes the id from a cell of the column."""
+    """Pattern that converts a cell of the column to an id."""
     key: str
     """Key that names the column, for errors."""
 
     def of(self, table: Table) -> tuple[str, ...]:
-        """The id of every row."""
+        """Frame ids of all rows."""
         key = f"{table.path}, column {self.column!r}"
         cells = table.text(self.column, self.key)
         if self.pattern == _FRAME_ALONE:
@@ -119,7 +119,7 @@ class FrameNames:
         else:
             ids = tuple(expand(self.pattern, key, frame=FrameId(cell)) for cell in cells)
         if all(map(str.isdecimal, ids)) and max(map(len, ids)) <= _SHORT and len(set(ids)) == len(ids):
-            return ids  # Fast path, since an hour has 100,000 frames: numbers can only be wrong by repetition.
+            return ids  # Fast path, since an hour has 100,000 frames: whole numbers are invalid only if repeated.
         lines: dict[str, int] = {}
         for row, (frame_id, line) in enumerate(zip(ids, table.lines, strict=True)):
             if not frame_id:
@@ -140,12 +140,12 @@ def take_frame_names(section: TomlTable) -> FrameNames:
 
 
 def take_frame_list(section: TomlTable) -> FrameList:
-    """Frames that the `[frames]` table describes: the rows of a table, or all frames of a video."""
+    """Read the frames described by `[frames]`: the rows of a table, or all frames of a video."""
     if "video" in section:
         return _frames_of_video(section)
     if "table" not in section:
         raise section.error(
-            "table", "is missing. Name a CSV file with a row per frame and its time, or a `video` with frame times."
+            "table", "is missing. Name a CSV file with the time of every frame, or a `video` with frame times."
         )
     table = read_table(section.path(section.take("table", str)), take_delimiter(section), "table of frames")
     timestamp = section.take("timestamp", str, "timestamp")
@@ -157,7 +157,7 @@ def take_frame_list(section: TomlTable) -> FrameList:
 
 
 def list_of_rows(table: Table, names: FrameNames, timestamp: str, section: TomlTable, counted: str) -> FrameList:
-    """Frames from the rows of a table, and from the key `video_frame` of its section.
+    """Create frames from the rows of a table and the key `video_frame` of its section.
 
     Args:
         timestamp: name of the column with times [s]; empty for frames without times.
@@ -204,7 +204,7 @@ def _take_pattern(section: TomlTable) -> str:
 
 
 def numbers_of_frames(table: Table, column: str, key: str) -> tuple[int, ...]:
-    """Video frame numbers of the rows, from a column of a table."""
+    """Read the video frame numbers of the rows from a column of a table."""
     numbers = table.numbers(column, key)
     if (wrong := np.flatnonzero((numbers < 0) | (numbers != np.round(numbers)))).size:
         text = f", column {column!r}: {numbers[wrong[0]]:g} is not a frame number. Frames of a video count from 0."
@@ -219,7 +219,7 @@ _MOST_WILD_PARTS = 2
 def frame_files(
     folder: Path, pattern: str, key: str, frames: FrameList, *, domain: str, camera: str
 ) -> tuple[Path, ...]:
-    """One path per frame, in the frames' order; the files need not exist."""
+    """File of each frame, in the order of the frames; the files need not exist."""
     if is_per_frame(pattern):
         return tuple(
             folder / expand(pattern, key, frame=FrameId(frame_id), index=row, domain=domain, camera=camera)
@@ -237,7 +237,7 @@ def frame_files(
 
 
 def _matching(base: Path, key: str) -> tuple[Path, list[Path]]:
-    """The folder above the first wildcard, and the files below it that match, in natural order."""
+    """Folder above the first wildcard, and the matching files in it, in natural order."""
     fixed = next(parent for parent in base.parents if not is_glob(str(parent)))
     wild = base.relative_to(fixed)
     if "**" in wild.parts or len(wild.parts) > _MOST_WILD_PARTS:

@@ -31,7 +31,7 @@ _ENCODINGS: dict[str, tuple[int, int | None]] = {
     "rgba8": (4, cv2.COLOR_RGBA2RGB),
     "bgra8": (4, cv2.COLOR_BGRA2RGB),
     "mono8": (1, cv2.COLOR_GRAY2RGB),
-    # ROS names the first two pixels of the first row, OpenCV those of the second.
+    # ROS names Bayer patterns by the first two pixels of the first row, OpenCV by those of the second row.
     "bayer_rggb8": (1, cv2.COLOR_BayerBG2RGB),
     "bayer_bggr8": (1, cv2.COLOR_BayerRG2RGB),
     "bayer_gbrg8": (1, cv2.COLOR_BayerGR2RGB),
@@ -42,7 +42,7 @@ _ENCODINGS: dict[str, tuple[int, int | None]] = {
 
 @dataclass(frozen=True)
 class Cropped:
-    """A rectangle of every image of another source."""
+    """Rectangular crop of every image of another source."""
 
     source: ImageSource
     crop: tuple[int, int, int, int]
@@ -53,7 +53,7 @@ class Cropped:
         return self.source.name(index)
 
     def read(self, index: int) -> UInt8[np.ndarray, "height width 3"]:
-        """The rectangle, RGB; `SequenceError` if the image cannot be read or does not contain the rectangle."""
+        """Cropped image, RGB; `SequenceError` if the image cannot be read or does not contain the rectangle."""
         image = self.source.read(index)
         left, top, width, height = self.crop
         if left + width > image.shape[1] or top + height > image.shape[0]:
@@ -64,7 +64,7 @@ class Cropped:
         return np.ascontiguousarray(image[top : top + height, left : left + width])
 
     def fingerprint(self, index: int) -> str:
-        """Fingerprint of the uncropped image, with the rectangle."""
+        """Fingerprint of the uncropped image and the rectangle."""
         return f"{self.source.fingerprint(index)} {self.crop}"
 
     def remarks(self) -> tuple[str, ...]:
@@ -73,7 +73,7 @@ class Cropped:
 
 
 class Bag:
-    """An opened ROS bag, read in a child process, one call at a time; use as a context manager.
+    """Open ROS bag, read in a child process, one call at a time; a context manager.
 
     Attributes:
         topics: name and message type of each topic.
@@ -96,7 +96,7 @@ class Bag:
         self.close()
 
     def rows(self, wanted: dict[str, tuple[str, str]]) -> dict[str, Any]:
-        """Logged rows of topics, as `decoders.bags.rows`."""
+        """Logged rows of topics; see `decoders.bags.rows`."""
         return self._call(bags.rows, wanted)
 
     def image_times(self, topic: str) -> tuple[np.ndarray, np.ndarray]:
@@ -129,7 +129,7 @@ _SHARED: "weakref.WeakValueDictionary[tuple[Path, int], Bag]" = weakref.WeakValu
 
 
 class BagImages:
-    """Images of one topic of a ROS bag, each found by the time at which it was recorded; safe to use from threads.
+    """Images of one topic of a ROS bag, found by their record times; thread-safe.
 
     Args:
         path: ROS 1 bag, MCAP file or ROS 2 bag folder.
@@ -156,7 +156,7 @@ class BagImages:
         return decode_message(self._message(index), self.name(index))
 
     def fingerprint(self, index: int) -> str:
-        """SHA-256 of the message's fields; `SequenceError` if it is missing."""
+        """SHA-256 of the message's fields; `SequenceError` if the message is missing."""
         fields = vars(self._message(index))
         data = np.asarray(fields.pop("data"), np.uint8).tobytes()
         return hashlib.sha256(repr(fields).encode() + data).hexdigest()

@@ -52,7 +52,7 @@ class ByteCache(Generic[T]):
         self._changed = threading.Condition()
 
     def get(self, key: Hashable, make: Callable[[], T]) -> T:
-        """The value of `key`, computed by `make` if it is not cached; if `make` raises, nothing is cached, and waiting
+        """Return the value of `key`, computed by `make` if not cached; if `make` raises, nothing is cached, and waiting
         threads call their own `make`."""
         with self._changed:
             self._changed.wait_for(lambda: key not in self._making)
@@ -69,14 +69,14 @@ class ByteCache(Generic[T]):
         return value
 
     def find(self, key: Hashable) -> T | None:
-        """The cached value of `key`; None if it is not cached."""
+        """Return the cached value of `key`, or None."""
         with self._changed:
             if key in self._values:
                 self._values.move_to_end(key)
             return self._values.get(key)
 
     def add(self, key: Hashable, value: T) -> None:
-        """Cache a value; the least recently used ones are dropped beyond the limit."""
+        """Cache a value; beyond the limit, the least recently used values are removed."""
         with self._changed:
             if key in self._values:
                 self._used -= self._size(self._values.pop(key))
@@ -99,17 +99,17 @@ class ByteCache(Generic[T]):
 _START_OF_SCAN, _END_OF_IMAGE = b"\xff\xda", b"\xff\xd9"
 _REMEDY = "Copy or export it again."
 _HEADER = 2**18
-"""Bytes at the beginning of an image that contain its traits."""
+"""Number of bytes at the beginning of an image that contain its traits."""
 DEPTHS = (8, 10, 12, 14, 16)
 """Bit depths of cameras."""
 _SAMPLED, _SAMPLED_MASKS = 12, 2
-"""Number of images of a camera whose bit depth is measured, and of masks that are checked for grey borders, on
+"""Number of images of a camera of which the bit depth is measured, and of masks checked for grey borders, on
 opening."""
 _NEAR = 16
 """Distance from black or white within which values of compressed masks count as black or white."""
 _MOST_LABELS = 32
 _ONE_COLOUR = 0.35
-"""Largest distance between the colours of one label, relative to their brightest channel."""
+"""Maximum distance between the colours of one label, relative to their brightest channel."""
 
 
 class ImageSource(Protocol):
@@ -120,11 +120,11 @@ class ImageSource(Protocol):
         ...
 
     def read(self, index: int) -> UInt8[np.ndarray, "height width 3"]:
-        """The image of frame `index` as recorded, RGB."""
+        """Recorded image of frame `index`, RGB."""
         ...
 
     def fingerprint(self, index: int) -> str:
-        """Text that changes when the stored image of frame `index` does; the image is not decoded."""
+        """Text that changes with the stored image of frame `index`; the image is not decoded."""
         ...
 
     def remarks(self) -> tuple[str, ...]:
@@ -133,11 +133,11 @@ class ImageSource(Protocol):
 
 
 class ImageFiles:
-    """An image file per frame.
+    """Image source with one file per frame.
 
     Args:
         files: paths of the files.
-        bits: bit depth of files of 16 bits; None for the depth in use, measured in some of them.
+        bits: bit depth of 16-bit files; by default measured in a sample of the files.
     """
 
     def __init__(self, files: tuple[Path, ...], bits: int | None = None) -> None:
@@ -170,14 +170,14 @@ class ImageFiles:
         return traits is None or traits.orientation == 1
 
     def remarks(self) -> tuple[str, ...]:
-        """Remarks on some of the images."""
+        """Remarks on a sample of the images."""
         bits = () if self._given is not None else bits_remark(self.files)
         return (*image_remarks(spread_files(self.files)), *bits)
 
 
 def read_image(path: Path, bits: Callable[[], int] | None = None) -> UInt8[np.ndarray, "height width 3"]:
-    """Read an image file as RGB, rotated by its EXIF orientation; `bits` is the bit depth of files of 16 bits, by
-    default the depth in use."""
+    """Read an image file as RGB, rotated by its EXIF orientation; `bits` is the bit depth of 16-bit files, by default
+    the depth in use."""
     return _eight_bits(_decode(path, colour=True), f"image {path}", bits)
 
 
@@ -187,8 +187,8 @@ def decode_image(content: bytes, what: str) -> UInt8[np.ndarray, "height width 3
 
 
 def read_mask(path: Path) -> Bool[np.ndarray, "height width"]:
-    """Read a mask file: instruments are white, of one colour, or opaque on transparent; values from 128 of 255 count as
-    white. Labels instead of black and white raise `SequenceError`."""
+    """Read a mask file: instruments are white, of one colour, or opaque on transparent; values of at least 128 of 255
+    count as white. Label images raise `SequenceError`."""
     raster = _decode(path, colour=False)
     mask = _white_part(raster, f"mask {path}")
     if mask is not None:
@@ -214,7 +214,7 @@ def read_mask(path: Path) -> Bool[np.ndarray, "height width"]:
 
 @dataclass(frozen=True, eq=False)
 class LabelImage:
-    """A label image: one value per pixel, a colour per pixel, or a mask."""
+    """Label image with a value or a colour per pixel, or mask."""
 
     mask: Bool[np.ndarray, "height width"] | None
     """White pixels; None for an image with labels."""
@@ -247,7 +247,7 @@ def read_labels(path: Path) -> LabelImage:
 
 
 def mask_remarks(files: Iterable[Path]) -> tuple[str, ...]:
-    """Remarks on some of the mask files; unreadable files are ignored here."""
+    """Remarks on a sample of the mask files; unreadable files are ignored."""
     found: list[str] = []
     chosen = spread_files([*files], _SAMPLED_MASKS)
     for file in chosen:
@@ -259,7 +259,7 @@ def mask_remarks(files: Iterable[Path]) -> tuple[str, ...]:
 
 
 def image_remarks(files: Sequence[Path]) -> tuple[str, ...]:
-    """Remarks on images, from their headers; missing files are ignored."""
+    """Remarks on images from their headers; missing files are ignored."""
     traits = [each for each in map(_header, files) if each is not None]
     found = [f"images: {text} ({len(traits)} checked)." for text in _orientation_remarks(traits)]
     if any(each.alpha for each in traits):
@@ -277,7 +277,7 @@ def _header(file: Path) -> ImageTraits | None:
 
 
 def bits_remark(files: Sequence[Path]) -> tuple[str, ...]:
-    """Remark on the bit depth of images of 16 bits; empty for 8."""
+    """Remark on the bit depth of 16-bit images; empty for 8-bit images."""
     if not is_deep(files):
         return ()
     bits = bits_of_files(files)
@@ -300,7 +300,7 @@ def is_deep(files: Sequence[Path]) -> bool:
 
 
 def bits_of_files(files: Sequence[Path]) -> int:
-    """Bit depth in use, measured in some of a camera's images; at least 8."""
+    """Bit depth in use, measured in a sample of a camera's images; at least 8."""
     largest = 0
     for file in spread_files(files) if is_deep(files) else ():
         try:
@@ -322,14 +322,14 @@ class _Raster:
     pixels: np.ndarray
     """[height, width] or [height, width, 3], RGB, of 8 or 16 bits."""
     opaque: np.ndarray | None
-    """Opaque pixels; None if all are."""
+    """Opaque pixels; None if all pixels are opaque."""
     indices: np.ndarray | None
     """Palette indices; None without a palette."""
     traits: ImageTraits
 
     @property
     def white(self) -> int:
-        """Largest possible value of a pixel."""
+        """Maximum value of the pixel type."""
         return int(np.iinfo(self.pixels.dtype).max)
 
     @property
@@ -369,7 +369,7 @@ def _raster(content: bytes, what: str, *, colour: bool) -> _Raster:
     except cv2.error:
         image = None
     if image is None and colour and content[:4] in TIFF:
-        return _raster(content, what, colour=False)  # For the error: it has no colours of 8 or 16 bits.
+        return _raster(content, what, colour=False)  # Decoded for the error: the pixel type is not 8 or 16 bits.
     if image is None:
         raise SequenceError(f"{what} cannot be decoded; its content is damaged. {_REMEDY}")
     if image.dtype not in (np.uint8, np.uint16):
@@ -402,7 +402,7 @@ _TO_UPRIGHT: dict[int, Callable[[np.ndarray], np.ndarray]] = {
     7: lambda image: image.swapaxes(0, 1)[::-1, ::-1],
     8: np.rot90,
 }
-"""EXIF orientation -> rotation or reflection of stored pixels to upright ones."""
+"""EXIF orientation -> rotation or reflection of the stored image to the upright image."""
 
 
 def _fewest_bits(largest: int) -> int:
@@ -452,7 +452,7 @@ def _is_two_valued(grey: np.ndarray, raster: _Raster) -> bool:
 
 
 def _flat_values(grey: np.ndarray) -> np.ndarray:
-    """Values of the interior of areas: pixels that are equal to all their neighbours."""
+    """Values of pixels that are equal to all their neighbours."""
     kernel = np.ones((3, 3), np.uint8)
     return np.unique(grey[cv2.erode(grey, kernel) == cv2.dilate(grey, kernel)])
 
@@ -468,14 +468,14 @@ def _orientation_remarks(traits: Sequence[ImageTraits]) -> list[str]:
 
 
 def find_damage(content: bytes) -> str | None:
-    """Description of the damage of a JPEG or PNG file; None for an intact one and for other formats.
+    """Description of the damage of a JPEG or PNG file; None for intact files and other formats.
 
-    OpenCV decodes a truncated JPEG without an error and leaves the rest grey, so the file itself is checked.
+    OpenCV decodes a truncated JPEG without an error and leaves the missing part grey, so the file is checked.
     """
     if not content:
         return "the file is empty"
     if content.startswith(JPEG):
-        # In compressed data a byte 0xff is never followed by 0xd9, so this marker after the last scan is the end.
+        # In compressed data a byte 0xff is never followed by 0xd9, so this marker after the last scan ends the image.
         scan = content.rfind(_START_OF_SCAN)
         return None if content.find(_END_OF_IMAGE, scan + 2) > scan >= 0 else "the JPEG ends before its last pixel"
     if not content.startswith(PNG):

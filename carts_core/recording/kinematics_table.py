@@ -1,4 +1,4 @@
-"""Kinematics tables: CSV files with a row per frame, whose columns are joint positions in a given unit."""
+"""Kinematics tables: CSV files whose columns are joint positions in given units."""
 
 import csv
 import io
@@ -21,16 +21,16 @@ from ..wording import closest, listed, shown
 from .toml_table import TomlTable
 
 MOST_CELLS = 10_000_000
-"""Largest table; an hour at 100 rows per second has room for 27 columns."""
+"""Maximum number of cells of a table; one hour at 100 rows per second allows 27 columns."""
 
 
 class TableError(SequenceError):
-    """Unusable table of a sequence.
+    """Error of a sequence's table.
 
     Attributes:
         path: path of the table.
         row: index of the row; None for the whole table.
-        text: message that follows the location.
+        text: message, which follows the location.
     """
 
     def __init__(self, path: Path, text: str, row: int | None = None, line: int | None = None) -> None:
@@ -40,27 +40,27 @@ class TableError(SequenceError):
 
 @dataclass(frozen=True)
 class Table:
-    """A CSV file as text; cells are parsed when their column is requested."""
+    """CSV file as text; cells are parsed when their column is requested."""
 
     path: Path
     header: tuple[str, ...]
     rows: tuple[tuple[str, ...], ...]
     lines: tuple[int, ...]
-    """Line of the file in which each row ends, from 1."""
+    """Number of the line in which each row ends, from 1."""
 
     def __len__(self) -> int:
         return len(self.rows)
 
     def text(self, column: str, key: str) -> list[str]:
-        """The cells of a column."""
+        """Cells of a column as text."""
         return [cell.strip() for cell in self._cells(column, key)]
 
     def numbers(self, column: str, key: str) -> Float[np.ndarray, " rows"]:
-        """The values of a column."""
+        """Values of a column as numbers."""
         try:
             values = np.fromiter(map(float, self._cells(column, key)), np.float64, len(self))
         except ValueError:
-            # A cell is not a number; this slower loop finds it.
+            # This slower loop finds the cell that is not a number.
             values = np.fromiter(map(_number, self._cells(column, key)), np.float64, len(self))
         if (wrong := np.flatnonzero(~np.isfinite(values))).size:
             cell = self.text(column, key)[wrong[0]]
@@ -72,11 +72,11 @@ class Table:
         return values
 
     def error(self, text: str, row: int | np.integer | None = None) -> TableError:
-        """Error about the table or one of its rows."""
+        """Create an error about the table or one of its rows."""
         return TableError(self.path, text) if row is None else TableError(self.path, text, int(row), self.lines[row])
 
     def _cells(self, column: str, key: str) -> Iterator[str]:
-        """Unparsed cells of a column."""
+        """Cells of a column as text, not yet stripped."""
         if column not in self.header:
             raise self.error(
                 f" has no column {column!r}, which {key} names.{closest(column, self.header)} "
@@ -130,17 +130,17 @@ def _number(cell: str) -> float:
 
 
 ANGLE_UNITS: Mapping[str, float] = {"rad": 1.0, "deg": float(np.pi / 180)}
-"""Angle unit -> [rad]. "percent" is not among them, since it depends on the limits."""
+"""Angle unit -> [rad]; without "percent", which depends on the joint limits."""
 LENGTH_UNITS: Mapping[str, float] = {"m": 1.0, "dm": 0.1, "cm": 1e-2, "mm": 1e-3}
 """Length unit -> [m]."""
 PERCENT = "percent"
-"""Unit whose range of -100 to 100 is the range of the joint."""
+"""Unit in which the range of the joint is -100 to 100."""
 _BEYOND = 0.15
 """Share of a joint's range by which positions may exceed its limits."""
 FAR = 0.5
-"""Share of a joint's range beyond which the unit is assumed wrong."""
+"""Share of a joint's range beyond its limits above which the unit is considered wrong."""
 _FEW = 0.02
-"""Share of rows that may exceed the limits, such as encoder spikes."""
+"""Share of rows that may exceed the limits, for example because of encoder spikes."""
 
 
 @dataclass(frozen=True)
@@ -165,11 +165,11 @@ class Joint:
 
     @property
     def units(self) -> Mapping[str, float]:
-        """Unit -> [rad], [m]; without percent."""
+        """Unit -> [rad] or [m]; without percent."""
         return ANGLE_UNITS if self.revolute else LENGTH_UNITS
 
     def beyond(self, values: Float[np.ndarray, " rows"], share: float = _BEYOND) -> np.ndarray:
-        """Positions [rad], [m] that exceed the limits by more than a share of their range."""
+        """Mask of positions [rad], [m] that exceed the limits by more than a share of the joint's range."""
         if not np.isfinite([self.lower, self.upper]).all():
             return np.zeros(len(values), bool)
         margin = share * (self.upper - self.lower)
@@ -180,12 +180,12 @@ class Joint:
         return bool(self.beyond(values, share).mean() <= _FEW)
 
     def from_percent(self, values: Float[np.ndarray, " rows"]) -> Float[np.ndarray, " rows"]:
-        """Positions [rad], [m] from -100 to 100 percent of the range."""
+        """Convert positions from percent of the range (-100 to 100) to [rad] or [m]."""
         return self.lower + (values + 100) / 200 * (self.upper - self.lower)
 
 
 def joints_of(robot: str | Path) -> tuple[Joint, ...]:
-    """The independent joints of a robot, in the order of its URDF."""
+    """Independent joints of a robot, in the order of its URDF."""
     return _joints_of(robot_file(robot).absolute())
 
 
@@ -207,7 +207,7 @@ def _joints_of(urdf: Path) -> tuple[Joint, ...]:
 
 
 PLAUSIBLE = {"revolute": 4 * np.pi, "prismatic": 2.0}
-"""Largest plausible joint position [rad], [m]; larger values indicate a wrong unit."""
+"""Maximum plausible joint position [rad], [m]; larger values indicate a wrong unit."""
 
 
 @dataclass(frozen=True)
@@ -222,10 +222,10 @@ class JointColumn:
     """Offset [rad] or [m]."""
     unit: str
     given: bool = False
-    """Whether the file states the unit, so that positions beyond the limits are intended."""
+    """Whether the file states the unit, so that positions beyond the limits are accepted."""
 
     def read(self, table: Table, key: str) -> Float[np.ndarray, " rows"]:
-        """Joint positions of every row [rad], [m]."""
+        """Read the joint positions of all rows [rad], [m]."""
         joint, where = self.joint, f"column {self.column!r}"
         with np.errstate(over="ignore", invalid="ignore"):
             values = table.numbers(self.column, f"{key} {joint.name}") * self.scale + self.offset
@@ -239,7 +239,7 @@ class JointColumn:
             )
         if self.given or joint.fits(values, FAR):
             return values
-        # The unit is not stated, and another one may fit the limits of the robot.
+        # The unit is not stated, and another unit may fit the limits of the robot.
         fitting = [unit for unit, factor in joint.units.items() if factor != 1.0 and joint.fits(values * factor)]
         if fitting:
             option = "angle_unit" if joint.revolute else "length_unit"
@@ -259,7 +259,7 @@ class JointColumns:
     robot: Robot
     columns: tuple[JointColumn, ...]
     defaults: Mapping[str, float]
-    """Constant position [rad], [m] of every joint that the table does not measure."""
+    """Constant position [rad], [m] of each joint that the table does not measure."""
     key: str
     """Name of the mapping, for errors."""
 
@@ -270,7 +270,7 @@ class JointColumns:
         return tuple(name for name in self.robot.joint_names if name in mapped)
 
     def read(self, table: Table) -> Float[np.ndarray, "rows dofs"]:
-        """Joint positions of every row [rad], [m], in the robot's order; errors of `JointColumn.read`."""
+        """Read the joint positions of all rows [rad], [m], in the robot's order; errors as `JointColumn.read`."""
         names = self.robot.joint_names
         positions = np.tile([self.defaults.get(name, 0.0) for name in names], (len(table), 1))
         for column in self.columns:
@@ -332,7 +332,7 @@ def _take_column(mapping: TomlTable, name: str, robot: Robot, units: Mapping[str
 
 
 def _conversion(joint: Joint, unit: str, robot: Robot) -> tuple[float, float]:
-    """Scale and offset to [rad] or [m]; percent refers to the limits of the joint."""
+    """Scale and offset that convert a unit to [rad] or [m]; percent refers to the limits of the joint."""
     if unit != PERCENT:
         return joint.units[unit], 0.0
     if not np.isfinite([joint.lower, joint.upper]).all():

@@ -18,7 +18,7 @@ from .toml_table import TomlTable
 def neighbours(
     times: Float[np.ndarray, " rows"], wanted: Float[np.ndarray, " wanted"]
 ) -> tuple[Int[np.ndarray, " wanted"], Int[np.ndarray, " wanted"]]:
-    """Rows before and after each wanted time; both are the row at that time, or the last one outside the range."""
+    """Indices of the rows before and after each wanted time; equal at the time of a row and outside the range."""
     after = np.searchsorted(times, wanted).clip(0, len(times) - 1)
     return np.where(times[after] > wanted, after - 1, after).clip(0), after
 
@@ -26,25 +26,25 @@ def neighbours(
 def at_times(
     wanted: Float[np.ndarray, " wanted"], times: Float[np.ndarray, " rows"], values: Float[np.ndarray, "rows columns"]
 ) -> Float[np.ndarray, "wanted columns"]:
-    """Values interpolated linearly at other times; NaN outside the range of the rows."""
+    """Interpolate values linearly at wanted times; NaN outside the range of the rows."""
     return np.stack([np.interp(wanted, times, column, left=np.nan, right=np.nan) for column in values.T], axis=1)
 
 
 INTERPOLATIONS = ("linear", "nearest")
 _ROUNDING = 1e-6
-"""Smallest distinguishable time difference [s]."""
+"""Minimum distinguishable time difference [s]."""
 
 
 @dataclass(frozen=True)
 class TimeMatching:
-    """Matching of frames and rows: at the frame's time plus `time_offset` in the table's clock."""
+    """Matching of frames and rows, at the frame's time plus `time_offset` in the table's clock."""
 
     time_offset: float = 0.0
-    """Time in the table minus time of the image [s]."""
+    """Table time minus image time [s]."""
     interpolation: str = "linear"
-    """`linear` between the row before and the row after, or the `nearest` row."""
+    """`linear` between neighbouring rows, or the `nearest` row."""
     max_gap: float = 0.1
-    """Largest time between a frame and the rows used for it [s]."""
+    """Maximum time difference between a frame and the rows used for it [s]."""
 
 
 def take_matching(section: TomlTable) -> TimeMatching:
@@ -63,12 +63,12 @@ class Samples:
 
     values: Float[np.ndarray, "rows ..."]
     table: Table
-    """The table, for errors."""
+    """Table, for error messages."""
     times: Float[np.ndarray, " rows"] | None
     """Time of each row in the table's clock, increasing [s]; None if row n belongs to frame n."""
 
     def at_frames(self, frames: FrameList, matching: TimeMatching | None) -> Float[np.ndarray, "frames ..."]:
-        """The value of every frame; joints and positions are interpolated linearly, rotations spherically."""
+        """Values of the frames; joints and positions are interpolated linearly, rotations spherically."""
         if matching is None:
             return self.values
         assert self.times is not None and frames.timestamps is not None
@@ -89,7 +89,7 @@ class Samples:
         return (1.0 - share[:, None]) * self.values[before] + share[:, None] * self.values[after]
 
     def logged_at(self, times: Float[np.ndarray, " times"]) -> Float[np.ndarray, "times ..."]:
-        """Values at times of the table's clock; NaN outside its range."""
+        """Values at times of the table's clock; NaN outside the table's range."""
         assert self.times is not None
         if self.values.ndim == 2:
             return at_times(times, self.times, self.values)
@@ -123,36 +123,36 @@ class Samples:
             f"{frames.frame_ids[row]!r} at {wanted[row]:.6g} s of the table's clock (image time plus time_offset = "
             f"{matching.time_offset:g} s), next to {near}; at most {matching.max_gap:g} s are allowed. "
             f"The frames are from {wanted.min():.6g} to {wanted.max():.6g} s, the rows from {self.times[0]:.6g} to "
-            f"{self.times[-1]:.6g} s. Correct `time_offset` in [frames] (both clocks are in seconds), leave the frames "
-            "out by a table of the others, or allow a larger `max_gap`."
+            f"{self.times[-1]:.6g} s. Correct `time_offset` in [frames] (both clocks are in seconds), leave out these "
+            "frames with a table of the other frames, or allow a larger `max_gap`."
         )
 
 
 @dataclass(frozen=True)
 class Rows:
-    """The tables of a sequence, as `[kinematics]` and `[frames]` describe them."""
+    """Tables of a sequence, as described by `[kinematics]` and `[frames]`."""
 
     frames: FrameList
     matching: TimeMatching | None
-    """Matching of rows and frames by time; None if every row is a frame."""
+    """Matching of rows and frames by time; None if each row is a frame."""
     table: Table
     """Measured joint positions."""
     truth: Path | None
     """Table of true joint positions."""
     delimiter: str
     names: FrameNames | None
-    """Column and pattern of the frames' ids; None if rows are matched by time."""
+    """Column and pattern of frame ids; None if rows are matched by time."""
     timestamp: str
-    """Column with the time of a row; empty if there is none."""
+    """Column with the times of the rows; empty without times."""
 
     def measured_of(self, arm: TomlTable, columns: JointColumns) -> Samples:
-        """The measured joint positions of an arm, from its own `table` or that of the sequence; errors as `read`."""
+        """Measured joint positions of an arm, from its own `table` or the table of the sequence; errors as `read`."""
         own = arm.take("table", str, "")
         table = self.read(arm.path(own)) if own else self.table
         return self.samples(table, columns.read(table))
 
     def truth_of(self, arm: TomlTable, columns: JointColumns) -> Samples | None:
-        """The true joint positions of an arm, from its own `truth` or that of the sequence; errors as `read`."""
+        """True joint positions of an arm, from its own `truth` or the table of the sequence; errors as `read`."""
         own = arm.take("truth", str, "")
         if (path := arm.path(own) if own else self.truth) is None:
             return None
@@ -160,7 +160,7 @@ class Rows:
         return self.samples(table, columns.read(table))
 
     def read(self, path: Path) -> Table:
-        """Read another table with the same frames or the same clock."""
+        """Read another table, which must have the same frames or the same clock."""
         table = read_table(path, self.delimiter)
         if self.names is None:
             return table
@@ -176,7 +176,7 @@ class Rows:
         return table
 
     def samples(self, table: Table, values: np.ndarray) -> Samples:
-        """Values of the rows of a table with their times."""
+        """Values of the rows of a table, with their times."""
         if self.matching is None:
             return Samples(values, table, None)
         column = self.timestamp
@@ -192,7 +192,7 @@ class Rows:
 
 
 def take_rows(section: TomlTable, frames_section: TomlTable | None) -> Rows:
-    """Read the tables that `[kinematics]` and `[frames]` describe; without `[frames]`, every row is a frame."""
+    """Read the tables described by `[kinematics]` and `[frames]`; without `[frames]`, each row is a frame."""
     delimiter = take_delimiter(section)
     table = read_table(section.path(section.take("table", str)), delimiter)
     timestamp, truth = section.take("timestamp", str, ""), section.take("truth", str, "")
@@ -221,9 +221,9 @@ POSITION, ORIENTATION = ("x", "y", "z"), ("qx", "qy", "qz", "qw")
 """Default columns of a pose: position [m] and unit quaternion."""
 
 _NORM_TOLERANCE = 0.01
-"""Largest deviation of a quaternion's norm from 1."""
+"""Maximum deviation of a quaternion's norm from 1."""
 _FARTHEST = 100.0
-"""Largest distance of the mount from the origin [m]."""
+"""Maximum distance of the mount from the origin [m]."""
 
 
 def take_camera_motion(table: TomlTable, rows: Rows) -> Samples | None:

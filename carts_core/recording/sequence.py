@@ -1,4 +1,4 @@
-"""Recordings: frames with images, measured joint positions and, where known, masks and true joint positions."""
+"""Recordings: frames with images, measured joint positions and, if known, masks and true joint positions."""
 
 import hashlib
 import threading
@@ -26,7 +26,7 @@ CACHE_BYTES = 192 * 2**20
 
 @dataclass(frozen=True)
 class Frame:
-    """One time step of a sequence in one domain. The arrays are copies."""
+    """One time step of a sequence in one domain; arrays are copies."""
 
     index: int
     """0-based position in the sequence."""
@@ -36,7 +36,7 @@ class Frame:
     images: dict[str, UInt8[np.ndarray, "height width 3"]]
     """Camera -> RGB image, undistorted."""
     measured: dict[str, Float[np.ndarray, " dofs"]]
-    """Arm -> joint positions [rad, m] in the order of `Robot.joint_names`; unmeasured joints are at their default."""
+    """Arm -> joint positions [rad, m] in the order of `Robot.joint_names`; defaults for unmeasured joints."""
     truth: dict[str, Float[np.ndarray, " dofs"]] | None
     """Arm -> true joint positions [rad, m]; None if the sequence has none."""
     masks: dict[str, Bool[np.ndarray, "height width"]] | None
@@ -44,33 +44,33 @@ class Frame:
     timestamp: float | None
     """Acquisition time [s]; None if not known."""
     mounts: dict[str, Float[np.ndarray, "4 4"]] = field(default_factory=dict)
-    """Camera -> T_mount_world [m], of the cameras that move."""
+    """Camera -> T_mount_world [m], for moving cameras."""
 
 
 @dataclass(frozen=True)
 class Logged:
-    """Logged values at times of the tables' clock; NaN outside their range."""
+    """Logged values at times of the tables' clock; NaN outside the range of a table."""
 
     joints: dict[str, Float[np.ndarray, "times dofs"]]
     """Arm -> joint positions [rad, m]."""
     mounts: dict[str, Float[np.ndarray, "times 4 4"]]
-    """Camera -> T_world_mount [m], of the cameras that move."""
+    """Camera -> T_world_mount [m], for moving cameras."""
 
 
 class Sequence:
-    """A recording described by a sequence file. Created by `Sequence.open`; thread-safe.
+    """Recording described by a sequence file, created by `Sequence.open`; thread-safe.
 
     Attributes:
         path: the sequence file.
         name: name of the recording.
-        scene: arms and cameras as calibrated, cameras without distortion.
-        domains: the variants of every image; the first is the default.
-        frame_ids: name of every frame.
+        scene: calibrated arms and cameras, without distortion.
+        domains: variants of every image; the first is the default.
+        frame_ids: id of each frame.
         timestamps: acquisition time of each image [frames] [s], or None.
         matching: matching of joint positions with frames by time, or None if each row of the table is a frame.
-        measured_joints: arm -> joints that the kinematics table measures, in the robot's order.
+        measured_joints: arm -> joints in the kinematics table, in the robot's order.
         measured: arm -> joint positions of all frames [frames, dofs] [rad, m].
-        truth: arm -> true joint positions of all frames, or None; only the arms that have one.
+        truth: arm -> true joint positions of all frames, for arms with ground truth; None without ground truth.
         remarks: sentences on changes to images and masks before they are used (rotation, scaling to 8 bits,
             deinterlacing), and on unusual calibrations.
     """
@@ -109,20 +109,20 @@ class Sequence:
             SequenceError: the file, or a file that it refers to, is missing or invalid.
             RobotError: a robot or one of its meshes is missing or invalid.
         """
-        # Absolute, so that images are found later from any working directory.
+        # An absolute path stays valid if the working directory changes.
         return Sequence(read_description(Path(path).absolute(), progress))
 
     def with_time_offset(self, time_offset: float) -> "Sequence":
-        """The same images with joint positions at another time offset (kinematics minus image) [s]; `SequenceError` if
-        rows are not matched by time, or a frame has no row near enough."""
+        """Sequence with the same images and joint positions at another time offset (kinematics minus image) [s];
+        `SequenceError` if rows are not matched by time, or the rows of a frame are too distant in time."""
         matching = replace(self.checked_matching(), time_offset=time_offset)
         moved = Sequence(replace(self._description, matching=matching))
-        # Images and masks do not depend on it.
+        # Images and masks do not depend on the time offset.
         moved._cache = self._cache
         return moved
 
     def corrected(self, scene: Scene, measured: Mapping[str, Float[np.ndarray, "frames dofs"]]) -> "Sequence":
-        """The same images with another calibration and joint positions of all frames [rad, m] of the same arms."""
+        """Sequence with the same images, another calibration and other joint positions of all frames [rad, m]."""
         corrected = copy(self)
         corrected.scene, corrected.measured = scene, dict(measured)
         # The background depends on the poses of the arms.
@@ -137,7 +137,7 @@ class Sequence:
         return f"Sequence({self.name!r}, {frames}, cameras {cameras}, domains {domains})"
 
     def frame(self, index: int, domain: str | None = None, cameras: Iterable[str] | None = None) -> Frame:
-        """One frame with the images of some cameras (all by default), in a domain (the first by default).
+        """Read a frame with the images of some cameras (all by default) in a domain (the first by default).
 
         Raises:
             SequenceError: there is no such frame, domain or camera, or an image is missing, damaged or of a wrong size.
@@ -161,11 +161,11 @@ class Sequence:
 
     @property
     def moving_cameras(self) -> tuple[str, ...]:
-        """The cameras whose mounts move."""
+        """Names of the moving cameras."""
         return tuple(self._mounts)
 
     def mounts(self, index: int) -> dict[str, Float[np.ndarray, "4 4"]]:
-        """Camera -> T_mount_world of a frame [m], of the cameras that move."""
+        """Camera -> T_mount_world of a frame [m], for moving cameras."""
         return {camera: Ts[index].copy() for camera, Ts in self._mounts.items()}
 
     def logged_at(self, times: Float[np.ndarray, " times"]) -> Logged:
@@ -185,7 +185,8 @@ class Sequence:
         return self.matching
 
     def recorded_camera(self, name: str) -> Camera:
-        """A camera with the distortion of its recorded images, which `scene` lacks; `SequenceError` if unknown."""
+        """Camera of the recorded images, with their distortion, unlike in `scene`; `SequenceError` for an unknown
+        name."""
         return self._camera(name).camera
 
     def image_source(self, camera: str, domain: str | None = None) -> ImageSource:
@@ -193,8 +194,8 @@ class Sequence:
         return self._camera(camera).images[self._domain(domain)]
 
     def image_file(self, index: int, camera: str, domain: str | None = None) -> Path | None:
-        """File with exactly the pixels of a frame's image; None if the image is undistorted, cropped, rotated, or
-        decoded from a video or a bag. Errors as `has_masks`."""
+        """File that contains a frame's image unchanged; None if the image is undistorted, cropped, rotated, or decoded
+        from a video or a bag. Errors as `has_masks`."""
         entry = self._camera(camera)
         source = entry.images[self._domain(domain)]
         if not isinstance(source, ImageFiles) or any(entry.camera.distortion) or not source.upright(index):
@@ -202,22 +203,22 @@ class Sequence:
         return source.files[index]
 
     def image_fingerprint(self, index: int, camera: str, domain: str | None = None) -> str:
-        """Text that changes with the recorded image of a frame, which is not decoded; errors as `frame`."""
+        """Text that changes with the recorded image of a frame; the image is not decoded. Errors as `frame`."""
         return self._camera(camera).images[self._domain(domain)].fingerprint(index)
 
     def mask_fingerprint(self, index: int, camera: str, domain: str | None = None) -> str | None:
-        """SHA-256 of the mask file of a frame; None if it has no mask. Errors as `image_fingerprint`."""
+        """SHA-256 of the mask file of a frame; None without a mask. Errors as `image_fingerprint`."""
         masks = self._camera(camera).masks.get(self._domain(domain))
         path = None if masks is None else masks[index]
         return None if path is None else hashlib.sha256(read_file(path)).hexdigest()
 
     def has_masks(self, camera: str, domain: str | None = None, index: int | None = None) -> bool:
-        """Whether the sequence file gives masks for a camera, optionally in a domain or for one frame."""
+        """Whether the sequence file has masks for a camera, optionally in a domain or for one frame."""
         masks = self._camera(camera).masks.get(self._domain(domain))
         return masks is not None and (index is None or masks[index] is not None)
 
     def background(self, camera: str, domain: str | None = None) -> UInt8[np.ndarray, "height width 3"]:
-        """Mean background BG_m: the undistorted view of the camera without arms, RGB.
+        """Mean background BG_m: undistorted image of the camera without arms, RGB.
 
         It is the image given in the sequence file, else the median over the recording, excluding pixels covered by the
         arms at their measured positions. The first call may take seconds.
@@ -232,7 +233,7 @@ class Sequence:
         self._cache.clear()
 
     def mean_background(self, camera: str, domain: str | None = None) -> MeanBackground:
-        """The background with its known pixels and reliability; errors as `background`."""
+        """Background with its known pixels and reliability; errors as `background`."""
         domain = self._domain(domain)
         with self._background_lock:
             if (camera, domain) not in self._backgrounds:
@@ -312,14 +313,14 @@ class Sequence:
 AHEAD = 8
 """Number of frames to prefetch."""
 LONGEST_STRIDE = 10
-"""Largest step between frames from which a direction is inferred."""
+"""Maximum step between frames from which the direction of travel is inferred."""
 
 
 class FrameReader:
     """Reads frames and prefetches their neighbours in the direction of travel into the sequence's cache, on a thread.
 
-    A jump to another frame discards the queue. Errors of prefetched frames are dropped, since reading them again raises
-    them again. The thread ends when the queue is empty.
+    A jump to another frame discards the queue. Errors of prefetched frames are ignored, since reading these frames
+    raises them again. The thread ends when the queue is empty.
     """
 
     def __init__(self, sequence: Sequence) -> None:
@@ -332,7 +333,7 @@ class FrameReader:
         self._stride = 1
 
     def frame(self, index: int, domain: str, *cameras: str) -> Frame:
-        """One frame with the images of some cameras; errors as `Sequence.frame`."""
+        """Read a frame with the images of some cameras; errors as `Sequence.frame`."""
         self._replace_plan(())
         frame = self._sequence.frame(index, domain, list(cameras))
         moved = 0 if self._last is None else index - self._last
@@ -354,7 +355,7 @@ class FrameReader:
     def _neighbours(self, index: int, cameras: Collection[str]) -> list[int]:
         """Numbers of the frames to prefetch, the most probable first."""
         sizes = [own.width * own.height for own in self._sequence.scene.cameras if own.name in cameras]
-        # Image and mask of each frame, in at most half of the cache, so that recent frames stay.
+        # Prefetched images and masks use at most half of the cache, so that recent frames stay cached.
         ahead = min(AHEAD, CACHE_BYTES // 2 // max(4 * sum(sizes), 1))
         rows = [index + self._stride * count for count in range(1, ahead + 1)] + [index - self._stride]
         return [row for row in rows if 0 <= row < len(self._sequence)]

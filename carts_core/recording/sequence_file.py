@@ -1,4 +1,4 @@
-"""Sequence files: reading and checking of their tables, and writing of a copy with another calibration."""
+"""Sequence files: reading and validation, and writing of a copy with another calibration."""
 
 import os
 from collections.abc import Callable, Mapping
@@ -27,7 +27,7 @@ from .video import SUFFIXES, Video
 
 
 def take_value(table: TomlTable, key: str, default: Any) -> Any:
-    """Read the value of `key`; text `file.json#a/b` refers to the value under `a`, `b` in that JSON file."""
+    """Read the value of `key`; a string `file.json#a/b` refers to the value under `a`, `b` in that JSON file."""
     value = table.take(key, object, default)
     if not isinstance(value, str):
         return value
@@ -120,15 +120,15 @@ def _is_number(value: object) -> bool:
 
 @dataclass(frozen=True)
 class CameraInput:
-    """A camera with its images, masks and backgrounds by domain."""
+    """Camera with its images, masks and backgrounds by domain."""
 
     camera: Camera
     images: Mapping[str, ImageSource]
     masks: Mapping[str, tuple[Path | None, ...]]
-    """Mask file of every frame, None for a frame without one; empty for a sequence without masks."""
+    """Mask file of each frame, None for frames without a mask; empty for a sequence without masks."""
     background: Mapping[str, Path]
     motion: Samples | None
-    """Poses of the camera's mount; None for a static camera."""
+    """Poses of the camera mount; None for a static camera."""
 
     def remarks(self) -> tuple[str, ...]:
         """Remarks on changes to images and masks before they are used, and on unusual calibrations."""
@@ -136,7 +136,7 @@ class CameraInput:
         files = {file: None for domain in self.masks.values() for file in domain if file is not None}
         found: list[str] = []
         for source in self.images.values():
-            with suppress(SequenceError):  # The error is raised when the image is used.
+            with suppress(SequenceError):  # The error is raised when the image is read.
                 found += source.remarks()
         found += mask_remarks(list(files))
         unusual = implausible_intrinsics(camera.width, camera.height, camera.intrinsics, camera.distortion)
@@ -145,7 +145,7 @@ class CameraInput:
 
 
 def take_camera_input(table: TomlTable, rows: Rows, domains: tuple[str, ...]) -> CameraInput:
-    """Read the camera of a `[[cameras]]` table with its images, masks and motion; all its files must exist."""
+    """Read a `[[cameras]]` table: camera, images, masks and motion; all files must exist."""
     camera, frames = take_camera(table), rows.frames
     motion = take_camera_motion(table, rows)
     patterns = _by_domain(table, "images", domains, required=True)
@@ -165,7 +165,7 @@ def take_camera_input(table: TomlTable, rows: Rows, domains: tuple[str, ...]) ->
 
 
 def _path(table: TomlTable, key: str, pattern: str, domain: str, camera: str) -> Path:
-    """Path of a pattern that is the same for every frame."""
+    """Path from a pattern without frames."""
     return table.path(expand(pattern, table.name(key), domain=domain, camera=camera))
 
 
@@ -256,15 +256,15 @@ def _masks(
 
 
 FORMAT = "carts-sequence/1"
-"""Value of the key `format`."""
+"""Required value of the key `format`."""
 
 _BRIGHTEST = 1e3
-"""Largest value of the numeric keys of `[light]`."""
+"""Maximum value of the numeric keys of `[light]`."""
 
 
 @dataclass(frozen=True)
 class ArmInput:
-    """An arm and its joint positions."""
+    """Arm and its joint positions."""
 
     arm: Arm
     measured_joints: tuple[str, ...]
@@ -282,7 +282,7 @@ class Description:
     domains: tuple[str, ...]
     frames: FrameList
     matching: TimeMatching | None
-    """Matching of rows and frames by time; None if every row of the tables is a frame."""
+    """Matching of rows and frames by time; None if each row of the tables is a frame."""
     cameras: Mapping[str, CameraInput]
     arms: Mapping[str, ArmInput]
     remarks: tuple[str, ...] = ()
@@ -290,7 +290,7 @@ class Description:
 
 
 def read_description(path: Path, progress: Callable[[str], None] | None = None) -> Description:
-    """Read a sequence file and all files that it names, except images."""
+    """Read a sequence file and the files it refers to, except images."""
     root = read_toml(path)
     root.take_choice("format", (FORMAT,), "(none)")
     name = root.take("name", str, path.stem)
@@ -365,15 +365,15 @@ def _take_arm(
 def calibrated_sequence_file(
     path: Path, folder: Path, before: Scene, after: Scene, command: str = "calibrate", time_offset: float | None = None
 ) -> str:
-    """Text of a copy of a sequence file for another folder, with another calibration.
+    """Content of a copy of a sequence file for another folder, with another calibration.
 
-    Differences between the scenes are written as numbers; everything else is kept, including comments. Relative paths
-    are adapted to the new folder.
+    Differences between the scenes are written as numbers. All other content is kept, including comments, and relative
+    paths are adapted to the new folder.
 
     Args:
         before: the scene that `path` describes.
         after: the same scene with other base frames, extrinsics or intrinsics.
-        command: the `carts` command that found them, for the heading.
+        command: the `carts` command that estimated them, for the heading.
         time_offset: new `time_offset` in `[frames]` [s]; None keeps it.
     """
     document: dict[str, Any] = tomlkit.parse(read_text(path, SEQUENCE))
@@ -388,7 +388,7 @@ def calibrated_sequence_file(
             if isinstance(value, str):
                 table[key] = moved(value)
             elif isinstance(value, dict):
-                # Patterns by domain, or K as a table of numbers.
+                # The value is a table of patterns by domain, or K as a table of numbers.
                 for name, entry in value.items():
                     value[name] = moved(entry) if isinstance(entry, str) else entry
 

@@ -1,8 +1,8 @@
 """Estimation of the delay between images and kinematics from their common motion.
 
 Optical flow between two frames is nearly a linear function of the motion of points of the arms between the same times,
-for any hand-eye calibration. Flow is regressed on motion at many delays, without camera poses or a network; the
-estimate is the delay with the largest explained share, and its standard deviation is that of the jackknife over parts
+for any hand-eye calibration. Flow is regressed on motion at many delays, without camera poses or a network. The
+estimate is the delay with the largest explained share; its standard deviation is computed by the jackknife over parts
 of the recording.
 """
 
@@ -25,58 +25,58 @@ WIDTH = 192
 _CELLS = 6, 5
 """Columns and rows of the grid over which flow is averaged."""
 _MOST_FRAMES, _STRETCHES = 600, 4
-"""Largest number of frames that are read, and number of stretches over which they are spread."""
+"""Maximum number of frames that are read, and number of intervals over which they are distributed."""
 _FEWEST_STEPS = 60
-"""Smallest number of steps between frames."""
+"""Minimum number of steps between frames."""
 _LONGEST_STEP = 0.25
-"""Longest step between frames that counts as one motion [s]."""
+"""Maximum duration of a step between frames that counts as one motion [s]."""
 _BLOCKS = 10
 """Number of blocks of the jackknife."""
 _GRID = 0.02
 """Spacing of the initial grid of delays [s]."""
 _WIDEST = 3.0
-"""Largest delay to which the search extends when the optimum is at the end of its range [s]."""
+"""Maximum delay to which the search extends when the optimum is at the end of its range [s]."""
 _PLAIN = 0.6
-"""Explained share below which delays up to `_WIDEST` are tried as well."""
+"""Explained share below which delays up to `_WIDEST` are also tried."""
 _EQUAL, _APART = 0.05, 0.15
-"""Loss of explained share, and distance [s], that make another delay an equally good one."""
+"""Maximum difference in explained share [1], and minimum distance [s], of equally good delays."""
 _KEPT = 1e-4
-"""Share of the largest variance below which a direction of motion is dropped."""
+"""Share of the maximum variance below which a direction of motion is ignored."""
 _POSTURES = 3
 """Number of principal directions of link positions that modulate the flow."""
 _RIDGE = 1e-3
 _LEVER = 0.1
 """Lever arm by which rotations of a camera are converted to lengths [m]."""
 _FEWEST_KNOWN = 0.5
-"""Smallest share of the steps with logged rows."""
+"""Minimum share of the steps with logged rows."""
 _STILL = 0.02
-"""Smallest flow that counts as motion [px]."""
+"""Minimum flow that counts as motion [px]."""
 _FEWEST_EXPLAINED, _FEWEST_GAIN = 0.15, 0.1
-"""Smallest share of flow explained by the best delay, and its smallest margin over other delays."""
+"""Minimum share of flow explained by the best delay, and its smallest margin over other delays."""
 _MOST_DEVIATION = 0.04
-"""Largest standard deviation of a reliable estimate [s]."""
+"""Maximum standard deviation of a reliable estimate [s]."""
 _LEAST_DEVIATION = 0.001
 """Lower bound of the reported standard deviation [s]."""
 _WORTH_A_CHANGE = 3.0, 0.008
-"""Smallest change of the delay that is proposed, in standard deviations and in seconds."""
+"""Minimum proposed change of the delay, in standard deviations and in seconds."""
 
 
 @dataclass(frozen=True)
 class TimeOffsetEstimate:
-    """Estimate of `time_offset` from motion."""
+    """Estimated `time_offset`."""
 
     present: float
-    """`time_offset` of the sequence [s]."""
+    """Current `time_offset` of the sequence [s]."""
     seconds: float
     """Estimated offset [s]."""
     deviation: float
     """Standard deviation of the estimate [s]."""
     explained: float
-    """Share of the flow that the estimate predicts in held-out blocks [1]."""
+    """Share of the flow in held-out blocks explained by the estimate [1]."""
     explained_now: float
-    """Share that the current offset predicts; below 0 if it is worse than no prediction [1]."""
+    """Share explained by the current offset; negative if worse than no prediction [1]."""
     problem: str | None
-    """Why the estimate is not reliable, as a sentence; None if it is reliable."""
+    """Reason why the estimate is unreliable, as a sentence; None for a reliable estimate."""
     others: tuple[float, ...] = ()
     """Other delays with nearly the same explained share [s]."""
     at_end: bool = False
@@ -131,7 +131,7 @@ def estimate_time_offset(
     delays = _Delays(sequence, sequence.timestamps, steps, flows)
     found = delays.estimate(present, largest)
     if largest < _WIDEST and (found.at_end or found.explained < _PLAIN):
-        # Nearly periodic motion has several peaks.
+        # Nearly periodic motion has several maxima.
         return delays.estimate(present, _WIDEST)
     return found
 
@@ -141,7 +141,7 @@ def _unknown(present: float, problem: str) -> TimeOffsetEstimate:
 
 
 def _chosen(times: Float[np.ndarray, " frames"]) -> tuple[list[int], Float[np.ndarray, "steps 2"]]:
-    """Frames to read, and pairs of neighbours among them that are close enough in time."""
+    """Frames to read, and pairs of neighbouring frames that are close enough in time."""
     count, long = len(times), len(times) > _MOST_FRAMES
     length = _MOST_FRAMES // _STRETCHES if long else count
     starts = np.linspace(0, count - length, _STRETCHES if long else 1).astype(int)
@@ -159,7 +159,7 @@ def _flows(
     steps: np.ndarray,
     progress: Callable[[int, int], None] | None,
 ) -> Float[np.ndarray, "steps outputs"]:
-    """Mean flow in each cell of a grid [px at `WIDTH`], by step."""
+    """Mean flow of each step in each cell of a grid [px at `WIDTH`]."""
     found = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     wanted = {int(after) for _, after in steps}
     before: np.ndarray | None = None
@@ -178,7 +178,7 @@ def _flows(
 
 
 class _Delays:
-    """Regression of flow on motion at a given delay."""
+    """Regression of flow on motion as a function of the delay."""
 
     def __init__(self, sequence: Sequence, times: np.ndarray, steps: np.ndarray, flows: np.ndarray) -> None:
         self._sequence, self._begin, self._end = sequence, times[steps[:, 0]], times[steps[:, 1]]
@@ -215,7 +215,7 @@ class _Delays:
         )
 
     def _refined(self, around: float, blocks: np.ndarray) -> float:
-        """Refine an offset [s] on some of the blocks."""
+        """Refine an offset [s], using a subset of the blocks."""
 
         def unexplained(offset: float) -> float:
             parts = self._parts(offset)
@@ -236,13 +236,13 @@ class _Delays:
         if there.mean() < _FEWEST_KNOWN:
             return None
         if self._bases is None:
-            # Normalized once for all offsets, so that they are comparable.
+            # The normalization is the same for all offsets, so that they are comparable.
             middle = places[there].mean(0)
             postures = _basis(places[there] - middle)[:, :_POSTURES]
             self._bases = _basis(motion[there]), middle, postures
         moves, middle, postures = self._bases
         X, around = np.nan_to_num(motion) @ moves, np.nan_to_num(places - middle) @ postures
-        # The flow of a motion depends on the posture of the arms; a linear dependence is modelled.
+        # The flow caused by a motion depends on the posture of the arms; a linear dependence is modelled.
         X = np.concatenate([X, *(X * posture[:, None] for posture in around.T)], 1)
         Y = np.where(there[:, None], self._flows, 0.0)
         inside = [self._blocks == block for block in range(_BLOCKS)]
@@ -253,7 +253,7 @@ class _Delays:
         )
 
     def _motion(self, offset: float) -> tuple[Float[np.ndarray, "steps inputs"], Float[np.ndarray, "steps inputs"]]:
-        """Positions of link points, and motion of these and of camera mounts in each step [m]; NaN if not logged."""
+        """Positions of link points, and motion of link points and camera mounts in each step [m]; NaN if not logged."""
         begin, end = (self._sequence.logged_at(times + offset) for times in (self._begin, self._end))
         places, moved = [], []
         for arm in self._sequence.scene.arms:
@@ -295,7 +295,7 @@ def _points(robot: Robot, joints: Float[np.ndarray, "rows dofs"]) -> Float[np.nd
 
 
 def _predicted(parts: tuple[np.ndarray, np.ndarray, np.ndarray]) -> float:
-    """Share of the flow of every block predicted by a fit to the others; below 0 if worse than no prediction [1]."""
+    """Share of the flow explained in cross-validation over blocks; negative if worse than no prediction [1]."""
     XX, XY, YY = parts
     unexplained = 0.0
     for left in range(_BLOCKS):
@@ -313,7 +313,7 @@ def _problem(
     explained: float, curve: list[float], at_end: bool, deviation: float, others: tuple[float, ...]
 ) -> str | None:
     if explained < _FEWEST_EXPLAINED or explained - float(np.median(curve)) < _FEWEST_GAIN:
-        return "the motion of the arms does not explain that in the images. Check columns, signs and units."
+        return "the motion of the arms does not explain the motion in the images. Check columns, signs and units."
     if at_end:
         return "the best delay is at the end of the search range. Give a larger range, or check the clocks."
     if others:

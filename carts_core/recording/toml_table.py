@@ -1,4 +1,4 @@
-"""TOML tables with typed access to their keys and errors for wrong, missing and unknown ones."""
+"""TOML tables with typed access to keys, and errors for wrong, missing and unknown keys."""
 
 import difflib
 from pathlib import Path
@@ -10,13 +10,13 @@ from ..files.reading import SEQUENCE, all_finite, check_path, parse_toml, read_t
 from ..wording import closest, listed, shown
 
 _MOST_COMPARED = 200
-"""Number of keys that are compared for misspellings."""
+"""Maximum number of keys that are compared for misspellings."""
 _REQUIRED: Any = object()
 _KINDS = {str: "text", bool: "true or false", dict: "a table", list: "a list", float: "a number", int: "a whole number"}
 
 
 def read_toml(path: Path) -> "TomlTable":
-    """The root table of a TOML file."""
+    """Read the root table of a TOML file."""
     try:
         values = parse_toml(read_text(path, SEQUENCE))
     except FileNotFoundError as error:
@@ -31,7 +31,7 @@ def read_toml(path: Path) -> "TomlTable":
 
 
 class TomlTable:
-    """A table of a TOML file. Keys are taken one by one; `finish` raises an error for unknown ones."""
+    """Table of a TOML file. Keys are read one by one; `finish` raises an error for the remaining, unknown keys."""
 
     def __init__(self, values: dict[str, Any], file: Path, where: str, prefix: str = "") -> None:
         self.file = file
@@ -45,14 +45,14 @@ class TomlTable:
         return f"{self.file}: {self.where + ': ' if self.where else ''}{key}"
 
     def error(self, key: str, text: str) -> SequenceError:
-        """Error about a key."""
+        """Create an error about a key."""
         return SequenceError(f"{self.name(key)} {text}")
 
     def __contains__(self, key: str) -> bool:
         return key in self._values
 
     def take(self, key: str, kind: Any = object, default: Any = _REQUIRED) -> Any:
-        """The value of `key`.
+        """Read the value of `key`.
 
         Args:
             key: name of the key.
@@ -73,14 +73,14 @@ class TomlTable:
         if not isinstance(value, accepted) or (isinstance(value, bool) and bool not in kinds and object not in kinds):
             wanted = " or ".join(_KINDS[one] for one in kinds)
             raise self.error(key, f"is {shown(value)}, but must be {wanted}.")
-        # Numbers in nested tables are checked later, when they are taken, so that errors name their key.
+        # Numbers in nested tables are checked when they are read, so that errors name their key.
         has_tables = isinstance(value, dict) or (isinstance(value, list) and any(isinstance(v, dict) for v in value))
         if not has_tables and not all_finite(value):
             raise self.error(key, f"is {shown(value)}, but must be a finite number.")
         return value
 
     def take_choice(self, key: str, choices: tuple[str, ...], default: str) -> str:
-        """Take the text of `key`, one of `choices`."""
+        """Read the string of `key`, one of `choices`."""
         value = self.take(key, str, default)
         if value not in choices:
             raise self.error(
@@ -89,15 +89,15 @@ class TomlTable:
         return value
 
     def take_table(self, key: str) -> "TomlTable":
-        """The table `[key]`; empty if it is absent."""
+        """Read the table `[key]`; empty if absent."""
         place = f"{self.where}: " if self.where else ""
         return TomlTable(self.take(key, dict, {}), self.file, f"{place}[{self._prefix}{key}]")
 
     def take_tables(self, key: str) -> list["TomlTable"]:
-        """The array of tables `[[key]]`: at least one, each with a unique `name`."""
+        """Read the array of tables `[[key]]`: at least one table, each with a unique `name`."""
         values = self.take(key, list, [])
         if not values or not all(isinstance(value, dict) for value in values):
-            raise self.error(f"[[{key}]]", f"is missing. Describe at least one, under a line [[{key}]].")
+            raise self.error(f"[[{key}]]", f"is missing. Add at least one table [[{key}]].")
         tables: list[TomlTable] = []
         names: list[str] = []
         for number, value in enumerate(values, start=1):
@@ -112,12 +112,12 @@ class TomlTable:
         return tables
 
     def items(self) -> dict[str, Any]:
-        """All entries of a table whose keys are chosen by the user."""
+        """All entries of a table with user-defined keys."""
         self._known.extend(self._values)
         return dict(self._values)
 
     def path(self, value: str) -> Path:
-        """Absolute form of a path that is relative to the file's folder."""
+        """Absolute path of a path relative to the file's folder."""
         try:
             check_path(value)
             if "\0" in value:

@@ -1,6 +1,6 @@
-"""Video files as images of a camera. Frames are found by presentation time, never by counting while seeking.
+"""Video files as image sources. Frames are identified by presentation time, never by counting while seeking.
 
-Videos that are missing, too short or cannot be decoded raise `SequenceError`.
+Missing, too short and undecodable videos raise `SequenceError`.
 """
 
 import copy
@@ -36,7 +36,7 @@ _EXACT = ("mp4", "matroska")
 _COMPLETE = ("mp4",)
 """Exact containers whose packets have complete times and key frame flags."""
 _COMPARED = 16
-"""Number of positions, and of packets at each, at which the container's index is compared with the packets."""
+"""Number of positions, and of packets at each position, at which the container's index is compared with the packets."""
 _REMEMBERED = 32
 _OPTIONS = {
     "protocol_whitelist": "file",
@@ -44,7 +44,7 @@ _OPTIONS = {
     "probesize": str(32 * MIB),
     "max_streams": "32",
 }
-"""Options of FFmpeg: video containers only, no playlists, which would open other files."""
+"""Options of FFmpeg: video containers only, since playlists would open other files."""
 _SECONDS = 10.0
 """Timeout for opening and reading [s]."""
 
@@ -55,21 +55,21 @@ class VideoIndex:
 
     count: int
     pts: tuple[int, ...] | None
-    """Presentation time of every frame in units of `time_base`, increasing; None if not known."""
+    """Presentation time of every frame in units of `time_base`, increasing; None if unknown."""
     time_base: Fraction
-    """[s]"""
+    """Unit of `pts` [s]."""
     key_frames: tuple[tuple[int, int], ...]
-    """Frame number and seek time of each key frame; empty where seeking is not exact, so that frames are decoded in
-    order from the first."""
+    """Frame number and seek time of each key frame; empty if seeking is not exact, so that frames are decoded in order
+    from the first."""
 
     @property
     def timestamps(self) -> Float[np.ndarray, " frames"] | None:
-        """Presentation times [s]; the first is not always 0. None if not known."""
+        """Presentation times [s], of which the first is not always 0; None if unknown."""
         return None if self.pts is None else np.array(self.pts, np.float64) * float(self.time_base)
 
 
 def index_video(path: Path) -> VideoIndex:
-    """Index of a video file; cached until the file changes."""
+    """Create the index of a video file; cached until the file changes."""
     try:
         status = path.stat()
     except (OSError, ValueError) as error:
@@ -88,7 +88,8 @@ def open_video(path: Path, *, parsed: bool = True) -> tuple[InputContainer, Vide
 
     Args:
         path: video file.
-        parsed: whether packets are parsed for data missing in the container, which takes as long as reading them.
+        parsed: whether packets are parsed for data missing in the container, which takes as long as reading the
+            packets.
     """
     options = _OPTIONS if parsed else {**_OPTIONS, "fflags": "+noparse"}
     try:
@@ -109,7 +110,7 @@ def open_video(path: Path, *, parsed: bool = True) -> tuple[InputContainer, Vide
 
 
 def decoded_frames(container: InputContainer, stream: VideoStream) -> Iterator[VideoFrame]:
-    """Decode frames from the current position on; damaged ones are skipped."""
+    """Decode frames from the current position on; damaged frames are skipped."""
     packets = container.demux(stream)
     while True:
         try:
@@ -130,11 +131,11 @@ def _index(path: Path, modified: int, size: int) -> VideoIndex:
 
 
 def _by_table(path: Path) -> VideoIndex | None:
-    """Index from the container's own table, without reading all packets; None if the table is not reliable.
+    """Create the index from the container's table, without reading all packets; None if the table is not reliable.
 
     The table has decoding times, which are presentation times only if frames are presented in decoding order. It lacks
-    the frames of later fragments, and includes frames that are missing at a truncated end. Therefore packets at several
-    positions, and all from the last key frame on, are compared with it.
+    the frames of later fragments, and includes frames that are missing at a truncated end. Therefore the table is
+    compared with packets at several positions, and with all packets from the last key frame on.
     """
     container, stream = open_video(path, parsed=False)
     with container:
@@ -157,7 +158,7 @@ def _by_table(path: Path) -> VideoIndex | None:
 def _as_in_table(
     container: InputContainer, stream: VideoStream, entries: Sequence[IndexEntry], *, to_end: bool = False
 ) -> bool:
-    """Whether the packets from the first of these entries on match the entries."""
+    """Whether the packets match the given entries, from the first entry on."""
     try:
         container.seek(entries[0].timestamp, stream=stream)
         packets = (packet for packet in container.demux(stream) if packet.size)
@@ -171,7 +172,7 @@ def _as_in_table(
 
 
 def _by_packets(path: Path, *, parsed: bool) -> VideoIndex | None:
-    """Index from the packets; None if their times are not reliable."""
+    """Create the index from the packets; None if their times are not reliable."""
     container, stream = open_video(path, parsed=parsed)
     with container:
         if not parsed and not any(name in container.format.name for name in _COMPLETE):
@@ -183,15 +184,15 @@ def _by_packets(path: Path, *, parsed: bool) -> VideoIndex | None:
         try:
             for packet in container.demux(stream):
                 if packet.size == 0 or packet.is_discard or (vp8 and not bytes(packet)[0] & 0x10):
-                    continue  # The end, frames outside an edit list, and VP8's invisible reference frames.
+                    continue  # The end of the file, frames outside an edit list, or invisible reference frames of VP8.
                 shown.append(packet.pts)
                 if packet.is_keyframe:
                     keys.append((packet.pts, packet.dts))
         except FFmpegError:
-            pass  # The file is truncated here; the frames before are intact.
+            pass  # The file is truncated here; earlier frames are intact.
         time_base = stream.time_base
     pts = sorted(time for time in shown if time is not None)
-    # AVI counts packets, not pictures; the counts agree only if every frame is a key frame.
+    # AVI counts packets instead of pictures; the counts agree only if every frame is a key frame.
     exact |= len(keys) == len(shown)
     if not exact or not pts or len(set(pts)) != len(shown) or time_base is None:
         return None
@@ -201,7 +202,7 @@ def _by_packets(path: Path, *, parsed: bool) -> VideoIndex | None:
 
 
 def _by_decoding(path: Path) -> VideoIndex:
-    """Index from decoding the whole file in order."""
+    """Create the index by decoding the whole file."""
     container, stream = open_video(path)
     with container:
         times = [frame.pts for frame in decoded_frames(container, stream)]
@@ -232,17 +233,17 @@ _KEPT_BYTES = 32 * 2**20
 class Video:
     """Frames of a video file by number; thread-safe.
 
-    Decoding begins at the last key frame that is presented no later than the requested frame, and decoded frames are
-    identified by their presentation time. If seeking is inexact, decoding begins at an earlier key frame; if the
-    container's times are not reliable, at the first frame, which is slow but exact.
+    Decoding begins at the last key frame presented no later than the requested frame, and decoded frames are identified
+    by their presentation time. If seeking is inexact, decoding begins at an earlier key frame; if the container's times
+    are unreliable, decoding begins at the first frame, which is slow but exact.
 
-    Frames are rotated and mirrored by the file's display matrix, as in browsers. Of interlaced frames only the field
-    that is shown first is used, with missing rows interpolated; both fields together would show edges twice.
+    Frames are rotated and mirrored by the file's display matrix, as in browsers. Only the first field of interlaced
+    frames is used, with missing rows interpolated, since both fields together would show edges twice.
 
     Args:
         path: the video file.
-        numbers: number in the video, from 0 in presentation order, of each frame of the sequence.
-        deinterlace: False uses both fields of frames marked as interlaced, for videos that are marked so by mistake.
+        numbers: number of each frame of the sequence in the video, from 0, in presentation order.
+        deinterlace: False uses both fields of frames, for videos that are marked as interlaced by mistake.
     """
 
     def __init__(self, path: Path, numbers: tuple[int, ...], *, deinterlace: bool = True) -> None:
@@ -270,7 +271,7 @@ class Video:
         return f"{self.path}, frame number {self._numbers[index]}"
 
     def read(self, index: int) -> UInt8[np.ndarray, "height width 3"]:
-        """The image of the sequence's frame `index`, RGB, upright; `SequenceError` if the video is damaged there."""
+        """Image of the sequence's frame `index`, RGB, upright; `SequenceError` if the frame is damaged."""
         with self._lock:
             frame = self._frame(self._numbers[index])
             interlaced = self._deinterlace and frame.interlaced_frame
@@ -278,7 +279,7 @@ class Video:
             return np.ascontiguousarray(_rotated(image, _display_matrix(frame)))
 
     def fingerprint(self, index: int) -> str:
-        """SHA-256 of the file, with the number of the frame and whether fields are separated."""
+        """SHA-256 of the file, with the frame number and whether fields are separated."""
         try:
             status = self.path.stat()
             content = _file_digest(self.path, status.st_mtime_ns, status.st_size)
@@ -287,7 +288,7 @@ class Video:
         return f"{content} {self._numbers[index]} {self._deinterlace}"
 
     def remarks(self) -> tuple[str, ...]:
-        """Remarks on rotation, deinterlacing and pixels that are not square, from the first frame."""
+        """Remarks on rotation, deinterlacing and non-square pixels, from the first frame."""
         with self._lock:
             frame = self._frame(self._numbers[0])
             matrix, stream = _display_matrix(frame), None if self._open is None else self._open[1]
@@ -319,7 +320,7 @@ class Video:
         return frame
 
     def another(self) -> "Video":
-        """An independent reader of the same file, with its own position and cache."""
+        """Create an independent reader of the same file, with its own position and cache."""
         other = copy.copy(self)
         other._lock, other._kept = threading.Lock(), ByteCache(_KEPT_BYTES // 4, _frame_bytes)
         other._open, other._frames, other._last = None, iter(()), None
@@ -330,7 +331,7 @@ class Video:
         key, seek_to = self._key_frame_before(number)
         if self._last is None or not key - 1 <= self._last < number:
             while not self._jump(key, seek_to):
-                # The key frame is damaged, or seeking is inexact: begin at the key frame before.
+                # The key frame is damaged, or seeking is inexact: begin at the previous key frame.
                 self._key_frames = tuple(other for other in self._key_frames if other[0] != key)
                 key, seek_to = self._key_frame_before(number)
         for position, frame in self._frames:
@@ -344,12 +345,12 @@ class Video:
         return None
 
     def _key_frame_before(self, number: int) -> tuple[int, int | None]:
-        """Key frame from which decoding begins, and its seek time; None for the beginning of the file."""
+        """Key frame at which decoding begins, and its seek time; None for the beginning of the file."""
         row = bisect_right(self._key_frames, number, key=lambda entry: entry[0])
         return self._key_frames[row - 1] if row > 0 else (0, None)
 
     def _jump(self, key: int, seek_to: int | None) -> bool:
-        """Seek so that frame `key` or an earlier one comes next; False if that fails."""
+        """Seek so that frame `key` or an earlier frame is decoded next; False on failure."""
         self._last = None
         if self._open is None or seek_to is None:
             if self._open is not None:
@@ -381,12 +382,12 @@ def _file_digest(path: Path, modified: int, size: int) -> str:
 
 
 def _pixels(frame: VideoFrame) -> UInt8[np.ndarray, "height width 3"]:
-    # By default swscale starts threads for every frame, which takes 20 times as long.
+    # By default, swscale starts threads for every frame, which takes 20 times as long.
     return frame.to_ndarray(format="rgb24", threads=1)
 
 
 def _one_field(frame: VideoFrame, *, bottom: bool) -> UInt8[np.ndarray, "height width 3"]:
-    """One field of an interlaced frame at full height, missing rows interpolated."""
+    """One field of an interlaced frame at full height, with missing rows interpolated."""
     graph = av.filter.Graph()
     source = graph.add_buffer(
         width=frame.width, height=frame.height, format=frame.format, time_base=frame.time_base or Fraction(1, 1000)
@@ -417,7 +418,7 @@ def _display_matrix(frame: VideoFrame) -> Float[np.ndarray, "2 2"]:
 
 
 def _is_square(matrix: Float[np.ndarray, "2 2"]) -> bool:
-    """Whether the matrix only rotates by right angles and mirrors."""
+    """Whether the matrix is a combination of right-angle rotations and mirroring."""
     return np.array_equal(np.abs(matrix), np.eye(2)) or np.array_equal(np.abs(matrix), np.eye(2)[::-1])
 
 

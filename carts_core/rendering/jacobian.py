@@ -321,7 +321,7 @@ def move_along_normal(runs, point, normal, Ts, Ks, dTs, dKs, out):
 
 
 BEHIND = 0.01
-"""Least relative depth difference at an outline [1]; with less, folds of a surface count."""
+"""Minimum relative depth difference at an outline [1]; with less, folds of a surface count."""
 
 _BLUR = 1.5
 """Standard deviation of the blur from which normals of outlines are computed [px]."""
@@ -349,7 +349,7 @@ class Outline:
         return replace(self, position=self.position + self.normal * (step @ self.motion))
 
     def moved_by(self, step: Float[Tensor, " unknowns"]) -> float:
-        """Largest motion along the normal for a step of the unknowns [px]; 0 without outlines."""
+        """Maximum motion along the normal for a step of the unknowns [px]; 0 without outlines."""
         motion = step @ self.motion
         return float(motion.abs().max()) if len(motion) else 0.0
 

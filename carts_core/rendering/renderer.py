@@ -323,7 +323,7 @@ def pick_point(
     Args:
         renderer: renderer of a single camera of the scene, at full size.
         pixel: column and row, pixel centres at 0.5 [px].
-        radius: largest distance to the centre of the nearest pixel with an arm [px]; 0 for the given pixel only.
+        radius: maximum distance to the centre of the nearest pixel with an arm [px]; 0 for the given pixel only.
 
     Returns:
         The point, named after its link; None if no arm is within the radius.

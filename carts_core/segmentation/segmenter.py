@@ -14,7 +14,7 @@ from ..model.parts import COVERAGE, SURFACE_CHANNELS
 from ..networks import FeatureExtractor
 
 MOST_POINTS = 100
-"""Largest number of points in a prompt."""
+"""Maximum number of points in a prompt."""
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ _POINT, _AROUND = 0.006, 0.05
 """Radius in which a point determines the label, and in which a background point makes foreground uncertain, relative to
 the longer side of the image [1]."""
 _ALIKE = 25
-"""Largest colour difference in regions grown from points outside detections [grey levels]."""
+"""Maximum colour difference in regions grown from points outside detections [grey levels]."""
 _SMALLEST = 0.02
 """Minimum area of a connected component in a box, relative to the largest one [1]."""
 

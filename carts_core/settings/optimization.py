@@ -121,7 +121,7 @@ class SurfaceSolver(Ranged):
     stages: tuple[Stage, ...] = FRAME
     """Stages, in order of execution."""
     iterations: Annotated[int, Range(1, 10_000)] = 60
-    """Largest number of evaluations [1]; stages that are repeated from the start get the same number again."""
+    """Maximum number of evaluations [1]; stages that are repeated from the start get the same number again."""
     working_width: Annotated[int, Range(64, 4096, "px")] = 320
     """Width of the working image [px], to which the scales of stages refer."""
     noise: Annotated[float, Range(1e-3, 100)] = 1.33

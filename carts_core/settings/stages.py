@@ -45,7 +45,7 @@ class Descend(Ranged):
     """Scale of the robust weights (Geman-McClure): difference of surface maps beyond which a pixel is down-weighted
     [1]."""
     steps: Annotated[int, Range(1, 1000)] = 6
-    """Largest number of steps [1]."""
+    """Maximum number of steps [1]."""
     tolerance: Annotated[float, Range(0, 1, below=True)] = 1e-2
     """The stage ends when the predicted relative reduction of the objective is below this [1]."""
 
@@ -81,7 +81,7 @@ class SilhouetteSearch(Ranged):
     if_overlap: Share = 0.8
     """Dice of silhouettes and masks at the start above which the search is skipped [1]."""
     starts: Annotated[int, Range(1, 100)] = 4
-    """Largest number of searches [1]."""
+    """Maximum number of searches [1]."""
     rounds: Annotated[int, Range(1, 1000)] = 10
     """Rounds per search; each round draws around the best states of the previous one [1]."""
     candidates: Annotated[int, Range(20, 10_000)] = 48
@@ -103,7 +103,7 @@ class AlignEdges(Ranged):
     target, since they define the outlines."""
 
     steps: Annotated[int, Range(1, 1000)] = 24
-    """Largest number of steps [1]."""
+    """Maximum number of steps [1]."""
     weight: Annotated[float, Range(0, 100, above=True)] = 0.3
     """Weight of a squared distance to an edge, per outline pixel [1/px^2]."""
 

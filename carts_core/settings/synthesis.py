@@ -48,9 +48,9 @@ class MotionConfig(Ranged):
     reach: Annotated[tuple[float, float, float], Range(0, 0.1, "m")] = (0.016, 0.012, 0.009)
     """Half size of the box in which each tool tip moves: right, away from the viewer, up [m]."""
     wrist_range: Share = 0.35
-    """Largest deviation of roll and wrist joints from their central position [rad]."""
+    """Maximum deviation of roll and wrist joints from their central position [rad]."""
     jaw_range: tuple[float, float] = (0.0, 0.9)
-    """Smallest and largest jaw angle [rad]."""
+    """Minimum and maximum jaw angle [rad]."""
     clearance: Annotated[float, Range(0.0, 0.02)] = 0.0015
     """Minimum distance between the instruments, and between instrument and tissue [m]."""
 

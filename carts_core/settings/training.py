@@ -143,7 +143,7 @@ Interval = Annotated[tuple[float, float], Range(0)]
 """Lower and upper bound."""
 
 DARKEST_BRIGHTNESS = 0.65
-"""Smallest brightness factor of training images, since low light is an evaluation domain."""
+"""Minimum brightness factor of training images, since low light is an evaluation domain."""
 
 
 @dataclass(frozen=True)
@@ -171,7 +171,7 @@ class AppearanceRanges(Ranged):
     vignette: Interval = (0.0, 0.45)
     """Darkening in the image corners [1]."""
     unevenness: Share = 0.4
-    """Largest deviation of the logarithm of the illumination over the image [1]; its mean is unchanged."""
+    """Maximum deviation of the logarithm of the illumination over the image [1]; its mean is unchanged."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -87,7 +87,7 @@ def test_corrected_kinematics_decide_frames_and_masks(sequence: str, tmp_path: P
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--domain", "all"], "an export holds one"),
+        (["--domain", "all"], "an export has one domain"),
         (["--frames", "9"], "--frames 9: there is no '9'"),
         (["--frame-rate", "0"], "frame rate"),
         (["--kinematics", "missing.csv"], "missing.csv is not a readable kinematics table"),

@@ -78,7 +78,7 @@ def test_masks_of_a_folder_are_fitted_and_are_the_truth_where_the_recording_has_
     found = scores(sequence, "--observe", "masks", "--masks", str(theirs), "--mode", "sequence")
     assert found["observed"] == "masks" and found["masks"] == str(theirs)
     assert found["mean"]["dice_before"] < 0.95 and found["mean"]["dice_after"] > 0.97
-    assert "Dice is against the fitted masks where the recording has none" in said(capsys)
+    assert "Dice is computed with the fitted masks if the recording has no masks" in said(capsys)
 
 
 @pytest.mark.usefixtures("no_network")

@@ -187,8 +187,8 @@ def test_in_sequence_mode_one_changed_image_has_all_frames_redone(
     assert "3 of 3 frames redone: the images changed" in re.sub(r"\s+", " ", capsys.readouterr().out)
     main([*command, "--frames", "001-002"])
     printed = re.sub(r"\s+", " ", capsys.readouterr().out)
-    assert "2 of 2 frames redone: " in printed and "they were solved together with other frames" in printed
-    assert "1 frame outside of this run are outdated: they were solved together with other frames" in printed
+    assert "2 of 2 frames redone: " in printed and "the frames were solved together with other frames" in printed
+    assert "1 frame outside of this run are outdated: the frames were solved together with other frames" in printed
 
 
 def emptied(path: Path) -> None:
@@ -211,7 +211,7 @@ def test_a_damaged_mask_is_made_again(optimize: Outcome, tmp_path: Path) -> None
         damage(mask)
         printed = optimize()
         assert "2 of 3 frames already done" in printed, damage.__name__
-        assert "1 of 3 frames redone: their masks are missing or damaged" in printed, damage.__name__
+        assert "1 of 3 frames redone: the masks are missing or damaged" in printed, damage.__name__
         assert mask.read_bytes() == before, damage.__name__
 
 
@@ -220,11 +220,11 @@ def test_a_row_that_was_altered_and_results_of_unknown_origin_are_redone(optimiz
     folder = tmp_path / "out" / "regular" / "left"
     before = (folder / "kinematics.csv").read_bytes()
     replaced(folder / "kinematics.csv", "002,optimized,0.", "002,optimized,1.")
-    assert "1 of 3 frames redone: their rows in the table have changed" in optimize()
+    assert "1 of 3 frames redone: the rows in the table have changed" in optimize()
     assert (folder / "kinematics.csv").read_bytes() == before
     for content in ("", "[]", '{"format": "carts-results/1", "frames": {"001": {}}}'):
         (folder / "results.json").write_text(content)
-        assert "3 of 3 frames redone: their inputs are unknown" in optimize()
+        assert "3 of 3 frames redone: the inputs are unknown" in optimize()
 
 
 def test_overwriting_some_frames_removes_the_others_and_says_so(optimize: Outcome, tmp_path: Path) -> None:

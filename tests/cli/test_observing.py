@@ -11,7 +11,7 @@ import pytest
 from carts_core.cli.command_line import BAD_INPUT, main
 from carts_core.networks.extractor import FeatureExtractor
 
-CAUTION = "Dice is against the fitted masks"
+CAUTION = "Dice is computed with the fitted masks"
 
 
 @pytest.fixture

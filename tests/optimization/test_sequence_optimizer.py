@@ -278,7 +278,7 @@ def test_a_keyframe_needs_every_arm(truths: Truths) -> None:
     [
         ({}, "no frame was given"),
         ({0: 1.0, 1: 1.0}, "Times must increase"),
-        ({0: 5.0, 1: None}, "1 of 2 frames have no time; the first is frame 1. Give all frames times, or none"),
+        ({0: 5.0, 1: None}, "1 of 2 frames have no time; the first is frame 1. Give times for all frames or for none"),
     ],
 )
 def test_frames_and_times_that_do_not_fit_are_refused(truths: Truths, times: dict, message: str) -> None:

@@ -134,7 +134,7 @@ WRONG: list[tuple[Callable[[Path], object], list[str]]] = [
     (edit_file(lambda text: text.replace("[kinematics]", "[kinematics")), ["not readable TOML", "line 4"]),
     (
         edit_file(lambda text: text[: text.index("[[arms]]")] + text[text.index("[[cameras]]") :]),
-        ["[[arms]] is missing. Describe at least one"],
+        ["[[arms]] is missing. Add at least one"],
     ),
     *(
         (

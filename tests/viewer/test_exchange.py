@@ -369,7 +369,7 @@ def test_a_painted_mask_is_fitted_as_it_was_when_the_run_began(at_desk: Desk, re
 
 def test_what_cannot_be_fitted_is_said(at_desk: Desk) -> None:
     at_desk.do(intents.SetObserved("masks", "imported"))
-    with pytest.raises(CartsError, match=r"frame 001 has no imported mask of camera 'left' to fit\. Give one"):
+    with pytest.raises(CartsError, match=r"frame 001 has no imported mask of camera 'left' to fit\. Give a mask"):
         at_desk.do(intents.Run())
     at_desk.do(intents.SetObserved("masks", "recording"))
     with pytest.raises(CartsError, match=r"frame 001 has no mask of camera 'left'"):

@@ -290,7 +290,7 @@ _MATCH = (0.85, 1.15)
 """Range of the gain that matches the instrument's brightness to the room [1]."""
 
 _GAIN, _NOISE = 0.03, 1.5
-"""Largest relative change of brightness between frames [1], and sensor noise [grey levels]."""
+"""Maximum relative change of brightness between frames [1], and sensor noise [grey levels]."""
 
 
 class AlteredSequence(ABC):

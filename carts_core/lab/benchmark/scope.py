@@ -63,7 +63,7 @@ class Scope:
     crossing_errors_deg: tuple[float, ...] = (1.0, 2.0, 3.0)
     """Initial errors on synthetic frames whose arms cross, for the default solver and ACS [deg]."""
     consecutive: int = 30
-    """Largest number of frames, from the first on, that are corrected together in each sequence."""
+    """Maximum number of frames, from the first on, that are corrected together in each sequence."""
     consecutive_domains: tuple[str, ...] = DOMAINS
     """Domains of frames corrected together."""
     consecutive_errors_deg: tuple[float, ...] = (1.0, 2.0, 3.0)

@@ -119,7 +119,7 @@ DEPTH = (0.05, 0.25)
 FOCAL_LENGTH = (0.7, 2.0)
 """Range of the focal length, in image widths [1], from whole to enlarged endoscope images."""
 OUTSIDE = 0.12
-"""Largest distance of a wrist outside the image, relative to the image size [1]."""
+"""Maximum distance of a wrist outside the image, relative to the image size [1]."""
 ROBOT_DEPTH = (0.3, 2.0)
 """The same for robots that are no instruments [m]."""
 _TIP_AIMED = 0.25
@@ -321,7 +321,7 @@ def turned(vector: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
 
 
 _FRAMES = 200
-"""Largest number of frames with joint positions used from the recording."""
+"""Maximum number of frames with joint positions used from the recording."""
 _TURN = np.deg2rad(8.0)
 """Standard deviation of an arm's rotation in front of the camera [rad]."""
 _SHIFT = 0.06

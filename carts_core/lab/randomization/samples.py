@@ -306,7 +306,7 @@ SURFACE_UNIT = 127
 """Scale of surface maps stored as int8 in samples."""
 
 _LARGEST_ERROR = 3.0
-"""Largest scale of the error of the prior kinematics; 1 is about 3 degrees and 3 mm."""
+"""Maximum scale of the error of the prior kinematics; 1 is about 3 degrees and 3 mm."""
 
 _UNKNOWN = 0.08
 """Share of samples without prior kinematics."""

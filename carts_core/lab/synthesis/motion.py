@@ -247,7 +247,7 @@ _USUAL = 0.1
 """Distance of the camera in the reduced world [m]."""
 
 _FREE = 1.5
-"""Largest motion of a joint without limits, to either side [rad, m]."""
+"""Maximum motion of a joint without limits, to either side [rad, m]."""
 
 _ERROR = {"revolute": (0.02, 0.004, 0.0005), "prismatic": (0.002, 0.0004, 0.00005)}
 """Default bias, drift and noise of a joint [rad, m], used if the settings are those of an instrument."""

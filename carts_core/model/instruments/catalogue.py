@@ -25,7 +25,7 @@ class Instrument:
     tip: Tip | None
     """Shape of the tip; None for that of the shipped Large Needle Driver."""
     opening: float = 1.39626
-    """Largest angle between the jaws [rad]."""
+    """Maximum angle between the jaws [rad]."""
 
     @property
     def has_jaws(self) -> bool:

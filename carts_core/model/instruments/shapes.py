@@ -337,7 +337,7 @@ class ClipApplier:
     length: float = 22.2
     """Distance from the yaw axis to the end of the tip [mm]."""
     bow: float = 3.7
-    """Largest distance of an arm's outside from the middle [mm]."""
+    """Maximum distance of an arm's outside from the middle [mm]."""
     height: float = 1.15
     """Half the width of an arm across the opening plane [mm]."""
     hub: Hub = Hub()

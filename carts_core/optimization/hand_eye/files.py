@@ -70,8 +70,8 @@ class HandEyePrior:
 
 
 def read_prior(sequence: Sequence) -> HandEyePrior | None:
-    """Read the uncertainty of the hand-eye calibration that wrote a sequence file; None if there is none or base frames
-    changed.
+    """Read the uncertainty of the hand-eye calibration that wrote a sequence file; None without a hand-eye calibration
+    or if base frames have changed since.
 
     Raises:
         SettingsError: `hand_eye.json` beside the sequence file cannot be read.
@@ -150,7 +150,7 @@ def result_json(
 
 
 RESTING = 1e-3
-"""Largest difference between transforms of a mount that counts as stationary [rad, m]."""
+"""Maximum difference between transforms of a mount that counts as stationary [rad, m]."""
 
 
 def mounts_of_points(recording: Sequence, points: Rows[ImagePoint]) -> dict[str, Float[np.ndarray, "4 4"]]:
@@ -175,7 +175,8 @@ def mounts_of_points(recording: Sequence, points: Rows[ImagePoint]) -> dict[str,
 
 
 def moved_cameras(scene: Scene, mounts: Mapping[str, Float[np.ndarray, "4 4"]], *, back: bool = False) -> Scene:
-    """Scene with camera poses converted from mount to world coordinates (camera -> T_mount_world [m]), or `back`."""
+    """Convert camera poses from mount to world coordinates, given camera -> T_mount_world [m]; the inverse if
+    `back`."""
     steps = {camera: np.linalg.inv(T) if back else T for camera, T in mounts.items()}
     cameras = (
         replace(camera, T_camera_world=camera.T_camera_world @ steps.get(camera.name, np.eye(4)))

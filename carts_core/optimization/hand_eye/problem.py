@@ -31,7 +31,7 @@ class HandEyeSettings(Ranged):
 
 
 NEAREST = 1e-3
-"""Smallest depth in projections [m]; points behind the camera are projected at this depth."""
+"""Minimum depth in projections [m]; points behind the camera are projected at this depth."""
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,7 @@ class View:
     def distances(
         self, T_camera_base: Float[np.ndarray, "4 4"], intrinsics: Float[np.ndarray, "4"], side: int = 0
     ) -> Float[np.ndarray, "points 2"]:
-        """Distances of the landmarks from their clicked points [px]; for lines, the second number is 0.
+        """Distances of the landmarks from their clicked points [px]; the second number is 0 for lines.
 
         Args:
             intrinsics: fx, fy, cx, cy [px].
@@ -93,7 +93,7 @@ class View:
 def views_of(
     scene: Scene, measured: Mapping[str, Float[np.ndarray, "frames dofs"]], points: Sequence[ImagePoint]
 ) -> list[View]:
-    """Points by camera and arm, in the scene's order; `measured` has the joint positions of all frames [rad, m].
+    """Group points by camera and arm, in the scene's order; `measured` are the joint positions of all frames [rad, m].
 
     Raises:
         SettingsError: a point names a frame or a landmark that does not exist, or has no finite position.
@@ -158,8 +158,9 @@ def poses_of(
 ) -> list[tuple[float, Float[np.ndarray, "4 4"]]]:
     """Candidate poses T_camera_base with their costs, best first.
 
-    Perspective-n-point (SQPnP, EPnP) on all points, on all but one frame's, on all but one, and on random subsets, so
-    that some subset is free of outliers; each pose is rated by the robust cost of all points.
+    Perspective-n-point (SQPnP, EPnP) is applied to all points, to all points except those of one frame, to all except
+    one, and to random subsets, so that some subset is free of outliers. The cost of a pose is the robust cost of all
+    points.
 
     Args:
         intrinsics: fx, fy, cx, cy [px].
@@ -220,7 +221,7 @@ class HandEyeProblem:
     Attributes:
         scene: arms and cameras as given.
         settings: free parameters.
-        views: used points.
+        views: the points that are used, by camera and arm.
         missing: (camera, arm) -> number of points missing for a pose.
         focal: cameras with free focal lengths, whose logarithms are the last unknowns.
         middles: arm -> centroid of its points in its base frame [m].
@@ -267,10 +268,10 @@ class HandEyeProblem:
             )
 
     def _find_beginning(self, views: list[View], free: set[int]) -> None:
-        """Initialize base frames from the view with most points, then poses of free cameras."""
+        """Initialize base frames from the view with the most points, then poses of free cameras."""
         self._anchor = _anchor(views, free)
         unknown = free - {self._anchor}
-        # Known cameras first: base frames seen by them determine the poses of free cameras.
+        # Known cameras come first, since base frames in their view determine the poses of free cameras.
         for view in sorted(views, key=lambda view: (view.camera in unknown, -int(view.is_point.sum()))):
             count = int(view.is_point.sum())
             known = view.arm in self._T_world_base
@@ -295,7 +296,7 @@ class HandEyeProblem:
                 self._T_camera_world[view.camera] = T_camera_base @ np.linalg.inv(self._T_world_base[view.arm])
                 unknown.discard(view.camera)
         for key in [key for key in self.missing if key[1] in self._T_world_base and key[0] not in unknown]:
-            # The pose is determined by another camera or another arm, so these points are used as well.
+            # Another camera or arm determines the pose, so these points are used as well.
             del self.missing[key]
 
     def _refined(self, view: View, T: np.ndarray) -> tuple[float, np.ndarray]:
@@ -343,7 +344,7 @@ class HandEyeProblem:
 
 
 def moved(T: np.ndarray, step: np.ndarray, middle: np.ndarray) -> np.ndarray:
-    """T rotated about the image of `middle` by step[:3] [rad], and translated by step[3:] [m]."""
+    """Rotate T about the transformed point `middle` by step[:3] [rad], and translate it by step[3:] [m]."""
     turn = Rotation.from_rotvec(step[:3]).as_matrix()
     place = place_of(T, middle)
     moved = np.eye(4)
@@ -358,8 +359,8 @@ def place_of(T: np.ndarray, point: np.ndarray) -> np.ndarray:
 
 
 def _anchor(views: list[View], free: set[int]) -> int:
-    """Index of the camera whose pose is fixed: the known camera with most points, else a free one; -1 if none has
-    enough."""
+    """Index of the camera whose pose is fixed: the known camera with the most points, else a free camera; -1 if no
+    camera has enough points."""
     points: dict[int, int] = {}
     for view in views:
         if (count := int(view.is_point.sum())) >= FEWEST_POINTS:

@@ -64,7 +64,8 @@ class HandEyeResult:
     contradicting: tuple[int, ...]
     """Indices of outliers, which have little weight."""
     noise: float
-    """Standard deviation of a point per axis [px]: the expected one, or a larger one estimated from the residuals."""
+    """Standard deviation of a point per axis [px]: the expected value, or the estimate from the residuals if that is
+    larger."""
     missing: Mapping[tuple[str, str], int] = field(default_factory=dict)
     """(arm, camera) -> number of missing points, for poses that could not be estimated."""
 
@@ -76,7 +77,7 @@ class HandEyeResult:
 
 
 def result_of(problem: HandEyeProblem, fit: OptimizeResult, count: int) -> HandEyeResult:
-    """Result at a minimum; `SettingsError` if the points leave a direction undetermined."""
+    """Result at a minimum of the least-squares problem; `SettingsError` if it has undetermined directions."""
     bases, cameras, intrinsics = problem.poses(fit.x)
     distances = np.full(count, np.nan)
     for view, found in zip(problem.views, problem.distances(fit.x), strict=True):
@@ -110,7 +111,7 @@ def result_of(problem: HandEyeProblem, fit: OptimizeResult, count: int) -> HandE
 
 
 def _spare(problem: HandEyeProblem, fit: OptimizeResult) -> int:
-    """Degrees of freedom of the residuals, at least 1."""
+    """Number of residuals minus number of unknowns, at least 1."""
     return max(sum(2 if point else 1 for view in problem.views for point in view.is_point) - len(fit.x), 1)
 
 
@@ -180,9 +181,9 @@ def _differences(function: Callable[[np.ndarray], np.ndarray], at: np.ndarray, s
 _FOCAL_FACTORS = (1.0, 0.55, 0.75, 1.35, 1.8)
 """Initial values of the focal length, as factors of the given one."""
 _COMBINED = 4
-"""Largest number of views with edges for which all combinations of sides are tried."""
+"""Maximum number of views with edges for which all combinations of sides are tried."""
 _STEPS = 60
-"""Largest number of steps from each initial value."""
+"""Maximum number of steps from each initial value."""
 _TOLERANCE = 1e-12
 """Relative change at which the search ends."""
 
@@ -197,15 +198,15 @@ def solve_hand_eye(
 
     Minimizes the Cauchy loss of image distances divided by `pixel_error`, from several perspective-n-point solutions.
     Both sides of a shaft are tried for its edges. Joint positions are taken as measured. Base frames and the cameras in
-    `free_cameras` are estimated; if all cameras with points are free, the one with most points keeps its pose.
+    `free_cameras` are estimated; if all cameras with points are free, the camera with the most points keeps its pose.
 
     Args:
-        scene: arms and cameras; its base frames are only kept for arms without points.
+        scene: arms and cameras; its base frames are used only for arms without points.
         measured: arm -> joint positions of all frames [rad, m], as in `Sequence.measured`.
         points: three or more points in each of 3 to 6 frames are recommended; an arm needs 4 points in one camera.
 
     Raises:
-        SettingsError: no arm has enough points, all coincide, or a point names a missing frame or landmark.
+        SettingsError: no arm has enough points, all points coincide, or a point names a missing frame or landmark.
         RobotError: a point or `free_cameras` names an arm or a camera that does not exist.
     """
     settings = settings or HandEyeSettings()
@@ -222,7 +223,7 @@ def solve_hand_eye(
 
 
 def _minimum(problem: HandEyeProblem, start: np.ndarray, sides: Sequence[int] | None = None) -> OptimizeResult:
-    """Minimum near a start; `sides` as in `HandEyeProblem.distances`."""
+    """Least-squares solution from an initial value; `sides` as in `HandEyeProblem.distances`."""
     return least_squares(
         problem.residuals,
         start,
@@ -261,21 +262,20 @@ class PointAgreement:
     """Residuals of points before and after a calibration, with limits for the expected noise."""
 
     before: Float[np.ndarray, " points"]
-    """Residuals under the hand-eye calibration from the points Residuals under the calibration that is tested [px].;
-    NaN for unused points."""
+    """Residuals under the hand-eye calibration from the points [px]; NaN for unused points."""
     after: Float[np.ndarray, " points"]
-    """[px]"""
+    """Residuals under the tested calibration [px]; NaN for unused points."""
     limits: Float[np.ndarray, " points"]
-    """Largest residual explained by noise [px]; infinite for unused points and outliers."""
+    """Maximum residual explained by noise [px]; infinite for unused points and outliers."""
     rms_before: float
-    """RMS residual of the points with a finite limit [px]."""
+    """RMS of `before` over the points with a finite limit [px]."""
     rms_after: float
     rms_limit: float
-    """Largest RMS residual explained by noise [px]."""
+    """Maximum RMS residual explained by noise [px]."""
 
     @property
     def disagreeing(self) -> tuple[int, ...]:
-        """Points whose residual has grown beyond its limit."""
+        """Indices of the points whose residual has increased and exceeds its limit."""
         return tuple(np.flatnonzero((self.after > self.limits) & (self.after > self.before)).tolist())
 
     @property
@@ -294,10 +294,10 @@ def agreement_with_points(
     """Test a calibration against the clicked points.
 
     For a correct calibration, squared residuals divided by the variance of a point follow a chi-square distribution,
-    with two degrees of freedom for a point and one for a line. The variance is that of clicks and of measured joint
-    positions (`SurfaceSolver.frame_prior_deg`, as calibration assumes), which cannot be distinguished from pose errors
-    with few frames. Single points are tested at `_LEVEL` divided by the number of points (Bonferroni), and the sum over
-    all points at `_LEVEL`.
+    with two degrees of freedom for a point and one for a line. The variance includes errors of clicks and of measured
+    joint positions (`SurfaceSolver.frame_prior_deg`, as in calibration), since few frames cannot distinguish joint
+    errors from pose errors. Single points are tested at the level `_LEVEL` divided by the number of points
+    (Bonferroni), and the sum over all points at `_LEVEL`.
 
     Args:
         measured: arm -> joint positions of all frames [rad, m].

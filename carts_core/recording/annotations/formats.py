@@ -20,13 +20,13 @@ from ..images import read_labels
 from ..importing.found import MALFORMED, cause, well_formed
 
 MOST_LABELS = 255
-"""Largest number of labels of a layer, whose pixels have 8 bits."""
+"""Maximum number of labels of a layer, limited by its 8-bit pixels."""
 MOST_IMAGES = 100_000
-"""Largest number of images of a source."""
+"""Maximum number of images of a source."""
 MOST_SHAPES = 5_000
-"""Largest number of shapes of an image, and of polygons of an annotation."""
+"""Maximum number of shapes of an image, and of polygons of an annotation."""
 MOST_KEYPOINTS = 200
-"""Largest number of keypoints of an image."""
+"""Maximum number of keypoints of an image."""
 
 
 @dataclass(frozen=True)
@@ -36,8 +36,8 @@ class ForeignImage:
     name: str
     """File name in the source."""
     parts: Callable[[], Iterable[tuple[str, Bool[np.ndarray, "height width"]]]] = tuple
-    """Labels and their pixels, decoded on demand; later ones are on top. An empty label means that the rest is
-    unlabelled; an image without parts has no mask."""
+    """Labels and their pixels, decoded on demand; later parts cover earlier ones. An empty label marks unlabelled
+    pixels; an image without parts has no mask."""
     keypoints: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     """Name -> column and row [px], from the upper left corner of the image."""
     frame: str = ""
@@ -61,7 +61,7 @@ class FrameAnnotation:
 
 @dataclass(frozen=True, eq=False)
 class Annotations:
-    """Annotations of a source for a sequence. Frames are decoded while iterating, which is possible once."""
+    """Annotations of a source for a sequence. Frames are decoded during the iteration, which is possible once."""
 
     kind: str
     """Name of the source's format."""
@@ -69,17 +69,17 @@ class Annotations:
     label_names: list[str]
     """Names of the labels from 1; complete after the iteration."""
     unknown: list[str]
-    """Names of images that belong to no frame; complete after the iteration."""
+    """Names of images without a matching frame; complete after the iteration."""
     remarks: Counter[str] = field(default_factory=Counter)
     """Decisions on masks and reasons for omitted annotations, with their counts; complete after the iteration."""
 
 
 _BITS, _MORE, _SIGN, _FIRST = 5, 0x20, 0x10, 48
-"""COCO's run-length text: five bits a character, offset "0"."""
+"""Constants of COCO's run-length text: five bits per character, with offset "0"."""
 
 
 def runs_of_text(text: str) -> list[int]:
-    """COCO's compressed run lengths as numbers; `ValueError` for other texts."""
+    """Decode COCO's compressed run lengths; `ValueError` for other texts."""
     runs: list[int] = []
     value = place = 0
     for character in text:
@@ -110,7 +110,8 @@ def mask_of_runs(runs: Sequence[int], height: int, width: int, *, by_columns: bo
 def mask_of_polygon(
     points: Float[np.ndarray, "corners 2"], height: int, width: int
 ) -> Bool[np.ndarray, "height width"]:
-    """Pixels whose centres are inside a polygon, by the even-odd rule; corners from the upper left corner [px]."""
+    """Pixels whose centres are inside a polygon, by the even-odd rule; the origin of its corners is the upper left
+    corner of the image [px]."""
     flips = np.zeros((height, width + 1), np.int32)
     ends = np.roll(points, -1, axis=0)
     for (x0, y0), (x1, y1) in zip(points, ends, strict=True):
@@ -124,7 +125,7 @@ def mask_of_polygon(
 
 
 _LARGEST_SIDE = 16384
-"""Largest width or height of an image [px]."""
+"""Maximum width or height of an image [px]."""
 _FEWEST_CORNERS = 3
 
 
@@ -133,7 +134,7 @@ _EXPORT = "Export it again."
 
 
 def read_coco(path: Path, remarks: Counter[str]) -> Iterator[ForeignImage]:
-    """The images of a COCO file; reasons for omitted annotations are added to `remarks`."""
+    """Read the images of a COCO file; reasons for omitted annotations are added to `remarks`."""
     with well_formed(f"{path} is not a COCO file", _EXPORT):
         content = parse_json(read_text(path, VALUES))
         names = {int(entry["id"]): entry for entry in content["categories"]}
@@ -249,7 +250,7 @@ def _coco_keypoints(annotation: dict[str, Any], category: Any) -> dict[str, tupl
 
 
 def read_cvat(path: Path, remarks: Counter[str]) -> Iterator[ForeignImage]:
-    """The images of a CVAT file; reasons for omitted shapes are added to `remarks`."""
+    """Read the images of a CVAT file; reasons for omitted shapes are added to `remarks`."""
     with well_formed(f"{path} is not a CVAT file", _EXPORT):
         root = parse_xml(read_text(path, VALUES))
         if root.tag != "annotations" or root.find("image") is None:
@@ -315,7 +316,7 @@ def _cvat_keypoints(image: Element) -> Iterator[tuple[str, tuple[float, float]]]
 
 
 def read_surgpose(path: Path, remarks: Counter[str]) -> Iterator[ForeignImage]:
-    """The frames of a file of keypoints; without remarks."""
+    """Read the frames of a keypoint file; `remarks` stays unchanged."""
     del remarks
     with well_formed(f"{path} has no keypoints in the format of SurgPose", "Expected: {frame: {1: [x, y], ...}}."):
         content = parse_yaml(read_text(path, VALUES))
@@ -342,27 +343,27 @@ def _surgpose_points(points: dict) -> dict[str, tuple[float, float]]:
 
 _SUFFIXES = (".png", ".bmp")
 _OTHER_SUFFIXES = (".tif", ".tiff", ".jpg", ".jpeg")
-"""Suffixes that are used only if a folder has no files with the preferred ones, since it may contain images as well as
+"""Suffixes used only in folders without files of the preferred suffixes, since such a folder may contain images and
 masks."""
 _DEEPEST = 4
 _MEANINGS = ("labels.json", "mappings.json", "mapping.json", "instrument_type_mapping.json")
 _TOOL = "_labels"
 _INSTRUMENT = "instrument"
 _MOST_UNNAMED = 32
-"""Largest number of unnamed values in an image; more are artefacts of interpolation."""
+"""Maximum number of unnamed values in an image; more are artefacts of interpolation."""
 _BACKGROUND = ("background", "background-tissue")
 _SCENE_PARTS = ("instrument", "clasper", "wrist", "shaft")
 """Prefixes of EndoVis 2018 labels that belong to an instrument; all others are anatomy or thread."""
 
 
 def read_mask_folder(path: Path, remarks: Counter[str], *, confined: bool = False) -> Iterator[ForeignImage]:
-    """The images below a folder; files of the same name in sibling folders belong to the same frame.
+    """Read the mask images below a folder; files of the same name in sibling folders belong to the same frame.
 
     Args:
-        remarks: numbers of files with a change or decision are added while they are decoded.
+        remarks: counts of files with a change or decision, added during decoding.
         confined: whether links are ignored, and names of values are not searched for above the folder.
     """
-    # An export of carts has a folder with links, which are the finest labels.
+    # The folder with links in an export of carts has the finest labels.
     finest = path / "links" if (path / "labels.json").is_file() and (path / "links").is_dir() else path
     usable = [file for file in _files(finest) if not (confined and file.is_symlink())]
     files = [file for file in usable if file.suffix.lower() in _SUFFIXES] or usable
@@ -396,7 +397,7 @@ def _files(folder: Path) -> list[Path]:
 
 
 def _meaning_file(file: Path, top: Path, confined: bool) -> Path | None:
-    """File with the names of the values: in the mask's folder or above, up to the top."""
+    """File with the names of the values, in the mask's folder or a parent folder up to `top`."""
     for folder in file.parents:
         for name in _MEANINGS:
             if is_regular(folder / name) and not (confined and (folder / name).is_symlink()):
@@ -410,7 +411,7 @@ def _parts(file: Path, meaning: Any, remarks: Counter[str]) -> Iterator[_Part]:
     image = read_labels(file)
     tool = next((part.removesuffix(_TOOL) for part in file.parts[::-1] if part.endswith(_TOOL)), "")
     yield "", np.zeros(image.colours.shape[:2], bool)
-    with well_formed(f"the meanings of the values of {file} cannot be read", "Correct them."):
+    with well_formed(f"the label names for the values in {file} cannot be read", "Correct them."):
         if isinstance(meaning, list):
             yield from _by_colour(image.colours, meaning, file)
             return
@@ -456,7 +457,7 @@ def _by_value(image: np.ndarray, names: Mapping[int, str], tool: str, file: Path
 
 
 def _names(meaning: Any, folder: str) -> dict[int, str]:
-    """Grey value -> name, from a file that may list either first."""
+    """Grey value -> name, from a file with either values or names as keys."""
     if not isinstance(meaning, dict):
         return {}
     if isinstance(inner := meaning.get(folder), dict):

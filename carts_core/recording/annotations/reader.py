@@ -34,7 +34,7 @@ _FORMATS: dict[str, tuple[str, Callable[[Path, Counter[str]], Iterator[ForeignIm
     ".xml": ("CVAT for images", read_cvat),
     ".yaml": ("keypoints of SurgPose", read_surgpose),
 }
-"""Suffix -> name and reader of a format that is a file."""
+"""Suffix -> name and reader of a file format."""
 
 
 def read_annotations(
@@ -42,14 +42,14 @@ def read_annotations(
 ) -> Annotations:
     """Read masks and keypoints for the frames of a sequence.
 
-    Frames are found by their ids, or the numbers in the names of images; cameras by their names, or by left and right.
+    Frames are matched by their ids or by the numbers in image names, cameras by their names or by left and right.
     Annotations of images with distortion are undistorted, unless they were exported by carts.
 
     Args:
         source: a COCO file, a CVAT file, keypoints of SurgPose, a folder of masks, or the folder of an export.
         sequence: sequence with the frames.
         camera: camera of the images, if their names do not contain it.
-        confined: whether files beside the source and links in it are ignored.
+        confined: whether links, and files next to the source, are ignored.
 
     Raises:
         SequenceError: the source has another format or cannot be read; also raised while frames are iterated.
@@ -111,7 +111,7 @@ class _FrameReader:
                 done.add(at)
                 joined = []
             if found in done:
-                raise SequenceError(f"{image.name} is of an earlier frame. Name the images by their frames.")
+                raise SequenceError(f"{image.name} belongs to an earlier frame. Name the images by their frames.")
             at, joined = found, [*joined, image]
         if at is not None:
             yield self._joined(at, joined)

@@ -1,4 +1,4 @@
-"""Calibration files of other programs: cameras of ROS, OpenCV, Kalibr, camodocal and MATLAB, arm bases of the dVRK."""
+"""Readers of calibration files: cameras from ROS, OpenCV, Kalibr, camodocal and MATLAB, base frames from the dVRK."""
 
 import re
 from collections.abc import Mapping
@@ -45,15 +45,15 @@ class Calibration:
     T_right_left: Float[np.ndarray, "4 4"] | None = None
     """Pose of the left camera in the right one [m]; None if not given."""
     R: Float[np.ndarray, "3 3"] | None = None
-    """Rectification: from the camera's frame to the pair's common one."""
+    """Rectification: rotation from the camera's frame to the common frame of the pair."""
     P: Float[np.ndarray, "3 4"] | None = None
-    """Projection of the rectified camera [px], whose last column is -focal length * baseline [px m]."""
+    """Projection of the rectified camera [px]; its last column is -focal length * baseline [px m]."""
     remarks: tuple[str, ...] = ()
     """Decisions on the values, as sentences."""
 
 
 def read_calibration(path: Path, side: str) -> Calibration:
-    """The calibration of the left or right camera (`side`) in a file."""
+    """Read the calibration of the left or right camera (`side`) from a file."""
     if not is_regular(path):
         raise SequenceError(f"calibration {path} is missing. Correct the path.")
     try:
@@ -71,7 +71,7 @@ def read_calibration(path: Path, side: str) -> Calibration:
 
 
 def calibration_from_info(info: Any) -> Calibration | None:
-    """Calibration of a `sensor_msgs/CameraInfo`, None if uncalibrated; `ValueError` unless it is a pinhole."""
+    """Calibration from a `sensor_msgs/CameraInfo`, None if uncalibrated; `ValueError` unless the model is a pinhole."""
 
     def numbers(name: str) -> np.ndarray:
         return np.array(getattr(info, name.lower(), getattr(info, name, ())), np.float64).reshape(-1)
@@ -103,7 +103,7 @@ def _content(path: Path) -> Any:
     text = read_text(path, CALIBRATION)
     if suffix == ".xml" or text.lstrip().startswith("<"):
         return _opencv_xml(text)
-    # OpenCV's files begin with a directive that is not YAML, and tag their matrices.
+    # OpenCV's files begin with an invalid YAML directive, and have tagged matrices.
     return parse_yaml(re.sub(r"^%YAML.*$", "", text, flags=re.MULTILINE).replace("!!opencv-matrix", ""))
 
 
@@ -135,7 +135,7 @@ def _from_names(content: Mapping[str, Any], side: str) -> Calibration:
     suffixes = ("", "1" if side == "left" else "2", f"_{side}", "_l" if side == "left" else "_r", f"_{side[0].upper()}")
     K, D = _first(content, _MATRICES, suffixes), _first(content, _DISTORTIONS, suffixes)
     if K is None and (fc := _first(content, ("fc",), suffixes)) is not None:
-        # Bouguet's toolbox for MATLAB, whose pixels count from 0.
+        # Bouguet's toolbox for MATLAB counts pixels from 0.
         cc, D = _first(content, ("cc",), suffixes), _first(content, ("kc",), suffixes)
         K = np.array([*fc.reshape(-1)[:2], *np.asarray(cc).reshape(-1)[:2]])
     elif K is None and {"fx", "fy", "cx", "cy"} <= set(content):
@@ -156,7 +156,7 @@ def _from_names(content: Mapping[str, Any], side: str) -> Calibration:
 
 
 def _placed(found: Calibration, R: np.ndarray, T: np.ndarray, *remarks: str) -> Calibration:
-    """The calibration with an extrinsic rotation and translation [m]."""
+    """Copy of a calibration with an extrinsic rotation and translation [m]."""
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = np.asarray(R, np.float64).reshape(3, 3), np.asarray(T, np.float64).reshape(3)
     return replace(found, T_right_left=pose, remarks=(*found.remarks, *remarks))
@@ -182,7 +182,7 @@ def _from_camodocal(content: Mapping[str, Any]) -> Calibration:
 
 
 def _calibration(K: np.ndarray, D: np.ndarray | None, size: tuple[int, int] | None) -> Calibration:
-    """Calibration with a matrix of 9 numbers, or fx, fy, cx, cy; `ValueError` if it is not one of OpenCV's models."""
+    """Calibration from a matrix of 9 numbers, or fx, fy, cx, cy; `ValueError` for models that OpenCV does not have."""
     numbers, remarks = np.asarray(K, np.float64).reshape(-1), ()
     if numbers.size == 9:
         matrix = numbers.reshape(3, 3)
@@ -231,7 +231,7 @@ def _first(content: Mapping[str, Any], names: tuple[str, ...], suffixes: tuple[s
 
 
 def _rotation(values: np.ndarray | None) -> np.ndarray | None:
-    """Rectification; None for a zero matrix, which means none."""
+    """Rectification matrix; None for a zero matrix, which means no rectification."""
     return values.reshape(3, 3) if values is not None and values.size == 9 and np.abs(values).max() > 0 else None
 
 
@@ -240,7 +240,7 @@ def _projection(values: np.ndarray | None) -> np.ndarray | None:
 
 
 def _from_ini(path: Path, side: str) -> Calibration:
-    """The dVRK's stereo calibration from MATLAB: pixels count from 1, lengths are in millimetres."""
+    """Calibration from the dVRK's MATLAB stereo calibration: pixels are counted from 1, lengths are in millimetres."""
     parser = parse_ini(read_text(path, CALIBRATION))
     section = parser["StereoRight" if side == "right" else "StereoLeft"]
 
@@ -255,7 +255,7 @@ def _from_ini(path: Path, side: str) -> Calibration:
 
 
 def _from_matlab(content: Any, side: str) -> Calibration:
-    """MATLAB structs, whose pixels count from 1, or plain matrices, whose pixels count from 0."""
+    """Calibration from MATLAB structs, with pixels counted from 1, or plain matrices, with pixels counted from 0."""
     while len(content) == 1 and isinstance(only := next(iter(content.values())), dict):
         content = only
     right = side == "right"
@@ -282,7 +282,7 @@ def _from_matlab(content: Any, side: str) -> Calibration:
 
 
 def _from_one(found: Calibration) -> Calibration:
-    """Intrinsics with pixels from 0 (OpenCV) from those with pixels from 1 (MATLAB)."""
+    """Convert intrinsics with pixels counted from 1 (MATLAB) to pixels counted from 0 (OpenCV)."""
     fx, fy, cx, cy = found.intrinsics
     return replace(found, intrinsics=(fx, fy, cx - 1.0, cy - 1.0))
 
@@ -298,18 +298,19 @@ class DvrkBaseFrame:
     """Base frame of an arm."""
 
     arm: str
-    """Name of the arm; empty if neither the file nor its name gives it."""
+    """Name of the arm; empty if neither the file nor its name contains it."""
     reference: str
     """Name of the reference frame of the transform; empty if not given."""
     T_camera_base: Float[np.ndarray, "4 4"]
-    """Pose of the base in the camera, with OpenCV's axes [m]: `T_world_base` if the world is the camera's frame."""
+    """Pose of the base in the camera frame, with OpenCV's axes [m]; equals `T_world_base` if the camera frame is the
+    world."""
 
 
 def read_base_frames(path: Path, axes: Axes | None = None) -> tuple[DvrkBaseFrame, ...]:
-    """Base frames in a JSON file of the dVRK (see `_BASE_FRAME_KINDS`).
+    """Read base frames from a JSON file of the dVRK (see `_BASE_FRAME_KINDS`).
 
     Args:
-        axes: axes of the camera in the file; by default those of its format and name.
+        axes: axes of the camera in the file; by default those of the file's format and name.
     """
     content = read_json(path)
     found = _entries(content, path)

@@ -1,4 +1,4 @@
-"""Cameras of foreign recordings: folders of images and videos, and the calibrations that belong to them."""
+"""Cameras of foreign recordings: folders of images, videos, and their calibrations."""
 
 import os
 import re
@@ -18,11 +18,11 @@ from .calibrations import Calibration, calibration_from_info, read_calibration
 from .found import FoundCamera, Import, PartError
 
 _SAME_SHAPE = 0.01
-"""Largest difference of aspect ratios due to rounding of image sizes [1]."""
+"""Maximum difference of aspect ratios due to rounding of image sizes [1]."""
 
 
 def side_of(name: str) -> str | None:
-    """`left` or `right`, if part of the name of a topic or folder; else None."""
+    """Side of a camera, from the name of its topic or folder; None if it contains neither `left` nor `right`."""
     words = re.split(r"[^a-z0-9]+", re.sub(r"([a-z])([A-Z])", r"\1_\2", name).lower())
     for side in ("left", "right"):
         short = (side, f"{side}s", f"{side}img", f"img{side}", f"camera{side[0]}", f"cam{side[0]}", f"l{side}")
@@ -34,7 +34,8 @@ def side_of(name: str) -> str | None:
 
 
 def camera_from_info(camera: FoundCamera, info: Any, job: Import, *, rectified: bool) -> FoundCamera:
-    """The camera with the calibration of a `sensor_msgs/CameraInfo`; unchanged if that is None or uncalibrated."""
+    """Copy of a camera with the calibration of a `sensor_msgs/CameraInfo`; unchanged if that is None or
+    uncalibrated."""
     what = f"camera_info of {camera.name}"
     try:
         found = None if info is None else calibration_from_info(info)
@@ -45,7 +46,7 @@ def camera_from_info(camera: FoundCamera, info: Any, job: Import, *, rectified: 
 
 
 def calibration_of(camera: FoundCamera, job: Import) -> FoundCamera:
-    """The camera with the calibration given in the options."""
+    """Copy of a camera with the calibration given in the options."""
     path = job.options.calibration.get(camera.name)
     if path is None:
         if camera.intrinsics is not None:
@@ -66,14 +67,14 @@ def calibration_of(camera: FoundCamera, job: Import) -> FoundCamera:
 
 
 def _calibrated(camera: FoundCamera, found: Calibration, what: str, job: Import, *, rectified: bool) -> FoundCamera:
-    """A camera with a calibration, scaled to the size of its images."""
+    """Copy of a camera with a calibration, scaled to the size of its images."""
     for text in found.remarks:
         job.guessed(f"{what}: {text}", camera.name)
     intrinsics, distortion, R = found.intrinsics, found.distortion, found.R
     if rectified and found.P is not None:
         fx, _, cx, _, _, fy, cy, *_ = map(float, found.P.reshape(-1))
         intrinsics, distortion, R = (fx, fy, cx, cy), (), np.eye(3)
-        job.guessed(f"images are rectified, by their name; P of {what} is used.", camera.name)
+        job.guessed(f"images are rectified, according to their name; P of {what} is used.", camera.name)
     given = job.options.calibration_size.get(camera.name)
     size = found.size
     if given is not None:
@@ -92,7 +93,7 @@ def _calibrated(camera: FoundCamera, found: Calibration, what: str, job: Import,
 
 
 def _scaled(camera: FoundCamera, size: tuple[int, int], what: str, job: Import) -> FoundCamera:
-    """The camera with intrinsics for images of `size` scaled to its own images."""
+    """Copy of a camera whose intrinsics, given for images of `size`, are scaled to its own images."""
     if size == camera.size or min(size) < 1 or camera.intrinsics is None:
         return camera
     x, y = camera.size[0] / size[0], camera.size[1] / size[1]
@@ -125,8 +126,8 @@ def check_intrinsics(camera: FoundCamera, job: Import) -> None:
         return
     raise PartError(
         "calibration",
-        f"the calibration of {camera.name} has {problem}. Give another one, or the size of the images that were "
-        f"calibrated, from which it is scaled; with the size of these images ({camera.size[0]}x{camera.size[1]}) it is "
+        f"the calibration of {camera.name} has {problem}. Give another calibration, or the size of the calibration "
+        f"images, from which it is scaled; with the size of these images ({camera.size[0]}x{camera.size[1]}) it is "
         "accepted unchanged.",
         f"Options: --calibration {camera.name} FILE, --calibration-size {camera.name} WIDTHxHEIGHT.",
         about=camera.name,
@@ -134,11 +135,11 @@ def check_intrinsics(camera: FoundCamera, job: Import) -> None:
 
 
 def placed_cameras(cameras: tuple[FoundCamera, ...], job: Import) -> tuple[FoundCamera, ...]:
-    """Cameras with their poses; the world is the frame of the first camera, or of the left one of a pair.
+    """Cameras with their poses; the world is the frame of the first camera, or of the left camera of a pair.
 
-    If the pose of another one is not given, it follows from the rectification of both:
-    T_right_left = R_right^T [I | t] R_left, with t from the last column of P. A camera of unknown pose gets
-    the pose of the first one, which leaves it free in hand-eye calibration.
+    If the pose of another camera is not given, it follows from the rectification of both cameras:
+    T_right_left = R_right^T [I | t] R_left, with t from the last column of P. A camera of unknown pose gets the pose of
+    the first camera, and its pose is estimated by hand-eye calibration.
     """
     first = next((camera for camera in cameras if camera.name == "left"), cameras[0])
     return tuple(camera if camera is first else _placed(camera, first, job) for camera in cameras)
@@ -173,7 +174,7 @@ def _from_rectification(left: FoundCamera, right: FoundCamera) -> np.ndarray:
     shifts = [P[:2, 3] / P[[0, 1], [0, 1]] for P in (left.projection, right.projection)]
     T[:2, 3] = shifts[1] - shifts[0]
     if np.linalg.norm(T[:3, 3]) > 1.0:
-        T[:3, 3] *= 1e-3  # The board's squares were given in millimetres.
+        T[:3, 3] *= 1e-3  # The squares of the calibration board were given in millimetres.
     T[:3, :3] = right.rectification.T @ left.rectification
     T[:3, 3] = right.rectification.T @ T[:3, 3]
     return T
@@ -198,16 +199,17 @@ class Images:
     times: Float[np.ndarray, " frames"] | None = None
     """Presentation times of a video [s]."""
     bits: int | None = None
-    """Bit depth of images of 16 bits; None for 8."""
+    """Bit depth of 16-bit images; None for 8-bit images."""
     remarks: tuple[str, ...] = ()
     """Remarks on changes to stored images before they are used."""
 
 
 def entries(folder: Path) -> list[Path]:
-    """Entries of a folder by name, without hidden ones (`._001.jpg` of macOS); empty if it cannot be read."""
+    """Entries of a folder by name, without hidden files (such as `._001.jpg` of macOS); empty for unreadable
+    folders."""
     try:
         return sorted(path for path in folder.iterdir() if not path.name.startswith("."))
-    except (OSError, ValueError):  # ValueError: a name that no file can have.
+    except (OSError, ValueError):  # `ValueError` is raised for invalid file names.
         return []
 
 
@@ -222,7 +224,7 @@ def files_with(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:
 
 
 def image_files(folder: Path) -> list[Path]:
-    """Images directly in a folder, by name."""
+    """Image files directly in a folder, by name."""
     return files_with(folder, IMAGE_SUFFIXES)
 
 
@@ -247,7 +249,7 @@ def find_images(path: Path, only: str = "") -> Images:
 
 
 def _numbered(files: list[Path], folder: Path) -> tuple[str, tuple[str, ...]]:
-    """Pattern and ids of file names that differ in one number."""
+    """Find the pattern and the ids of file names that differ in one number."""
     kinds: dict[tuple[str, str], list[str]] = {}
     for file in files:
         match = _NUMBER.match(file.name.removesuffix(file.suffix))
@@ -266,7 +268,7 @@ def _numbered(files: list[Path], folder: Path) -> tuple[str, tuple[str, ...]]:
 
 
 def common_ids(images: Mapping[str, Images], path: Path) -> tuple[str, ...]:
-    """Ids of the frames that all cameras have, in the order of the first camera."""
+    """Ids of the frames with an image of every camera, in the order of the first camera."""
     first, *others = images.values()
     shared = set(first.ids).intersection(*(each.ids for each in others))
     if not shared and first.ids:

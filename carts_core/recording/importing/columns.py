@@ -36,7 +36,7 @@ _POSE = {
     **{f"rotation {axis}": f"q{axis}" for axis in "xyzw"},
 }
 _STATE = set("pos position q state observation measured actual rad deg angle value action".split())
-"""Words next to the name of a joint that describe the type of value."""
+"""Words that may accompany a joint name and describe the type of value."""
 _POSE_ORDER = ("x", "y", "z", "qx", "qy", "qz", "qw")
 _TIMES = (
     *("timestamp", "timestamp ns", "timestamp s", "timestamp ms", "time", "stamp", "t", "time s", "time ms", "time ns"),
@@ -46,10 +46,10 @@ _FRAMES = (
     *("picture", "file", "filename", "index", "id", ""),
 )
 _GENERAL = set("motor no nr number axis dof actuator encoder instrument tool robot arm arms channel ch".split())
-"""Words of numbered columns that can be joints of a PSM; other words are names of other robots."""
+"""Words of numbered columns that may be joints of a PSM; other words indicate other robots."""
 _PSM = set(JOINT_NAMES)
 _REACH = 0.5
-"""Largest distance of a tip from its base or camera [m]."""
+"""Maximum distance of a tip from its base or camera [m]."""
 
 
 @dataclass(frozen=True)
@@ -63,11 +63,12 @@ class ColumnMeanings:
     arms: dict[str, dict[str, str]]
     """Arm -> joint or part of a pose -> column."""
     stated: frozenset[str] = frozenset()
-    """Columns that were chosen, or whose names are unambiguous; other meanings are guesses."""
+    """Columns chosen by the user, or with unambiguous names; other meanings are guesses."""
 
 
 def guess_columns(table: ForeignTable, options: ImportOptions) -> ColumnMeanings:
-    """Guess the meanings of the columns of a table: from the user's choices, then names, then positions."""
+    """Determine the meanings of the columns of a table from the user's choices, then from names, then from
+    positions."""
     others = other_robots(options)
     known = [joint.name for joints in others.values() for joint in joints] or [*JOINT_NAMES, "jaw", *_POSE_ORDER]
     for meaning, column in options.columns.items():
@@ -109,14 +110,14 @@ def guess_columns(table: ForeignTable, options: ImportOptions) -> ColumnMeanings
 
 
 def other_robots(options: ImportOptions) -> dict[str, tuple[Joint, ...]]:
-    """Arm -> joints, of the given robots that are not PSMs."""
+    """Arm -> joints, for given robots other than PSMs."""
     given = {arm: joints_of(robot) for arm, robot in options.robot.items() if robot_file(robot).is_file()}
     return {arm: joints for arm, joints in given.items() if not {joint.name for joint in joints} >= set(JOINT_NAMES)}
 
 
 @lru_cache(maxsize=64)
 def order_of_names(names: tuple[str, ...], joints: tuple[str, ...] = JOINT_NAMES) -> tuple[int, ...] | None:
-    """Index of each joint in the names logged with positions, such as `outer_yaw`; None if names are not usable."""
+    """Index of each joint in the logged joint names, such as `outer_yaw`; None if the names are not usable."""
     meanings = [_meaning(_words(name), pose=False) for name in names]
     if set(joints) <= set(meanings):
         return tuple(meanings.index(joint) for joint in joints)
@@ -135,7 +136,7 @@ def order_of_names(names: tuple[str, ...], joints: tuple[str, ...] = JOINT_NAMES
 def track_of(
     groups: list[tuple[list[str], np.ndarray]], role: str, joints: tuple[str, ...] = JOINT_NAMES
 ) -> Track | None:
-    """Logged values of a topic, joint positions in the order of `joints`; None if empty.
+    """Logged values of a topic, with joint positions in the order of `joints`; None without messages.
 
     Args:
         groups: result of `decoders.bags.rows`: names in the messages, times and values.
@@ -158,13 +159,13 @@ def has_unknown_names(names: tuple[str, ...], joints: tuple[str, ...] = JOINT_NA
 
 
 def arm_in(text: str) -> str:
-    """Name of the PSM in a text, in capitals; empty if there is none."""
+    """Name of the PSM in a text, in capitals; empty if not found."""
     match = _ARM.search(text.replace("_", " "))
     return match.group(1).upper() if match else ""
 
 
 def _words(column: str) -> str:
-    """Words and numbers of a name in lower case; `camelCase` counts as two words."""
+    """Split a name into words and numbers in lower case; `camelCase` is two words."""
     return " ".join(re.findall(r"[a-z]+|\d+", re.sub(r"([a-z])([A-Z])", r"\1 \2", column).lower()))
 
 
@@ -192,7 +193,7 @@ def _joints_by_name(
 
 
 def _name_columns(table: ForeignTable) -> dict[str, re.Match[str]]:
-    """Columns `name_0`, `name_1` ... of a message with names beside its positions."""
+    """Columns `name_0`, `name_1` ... with the joint names of a message."""
     found = {}
     for column, cells in table.columns.items():
         match = re.fullmatch(r"(?i)(.*?)(?:joint_?)?names?([._ \[]*)(\d+)\]?", column)
@@ -209,8 +210,8 @@ def _named_places(table: ForeignTable) -> dict[str, str]:
         if len(names) != 1:
             raise PartError(
                 "columns",
-                f"{table.path}, column {column!r} has several names ({', '.join(sorted(names)[:3])}), so positions "
-                "change their meaning from row to row. Sort them, or choose columns of one order.",
+                f"{table.path}, column {column!r} has several names ({', '.join(sorted(names)[:3])}), so the meaning "
+                "of positions differs between rows. Reorder the positions, or choose columns with a constant order.",
                 "Option: --columns.",
             )
         place = re.compile(rf"(?i){re.escape(match[1])}(?:joint_?)?positions?[._ \[]*0*{int(match[3])}\]?")
@@ -232,7 +233,7 @@ def _file_names(table: ForeignTable) -> str | None:
 
 
 def samples(table: ForeignTable, most: int = 30) -> str:
-    """Columns of a table with a sample value of each, for errors."""
+    """Columns of a table with a sample value each, for errors."""
     columns = list(table.columns.items())
     text = ", ".join(f"{name} ({sample(values[0])})" for name, values in columns[:most])
     return f"{text} and {len(columns) - most} more" if len(columns) > most else text
@@ -244,7 +245,8 @@ def sample(value: object) -> str:
 
 
 def _numbered_family(words: dict[str, str], others: tuple[str | None, ...]) -> dict[str, dict[str, str]]:
-    """The only family of six or seven columns that differ only in a number, assumed to be joints."""
+    """Group of six or seven columns that differ only in a number, if there is exactly one; its columns are assumed to
+    be joints."""
     families: dict[str, dict[str, str]] = {}
     for column, text in words.items():
         number = re.fullmatch(r"(.*?)(\d+)(\D*)", text)
@@ -276,7 +278,7 @@ def _meaning(text: str, pose: bool) -> str | None:
 
 
 def _numbers_to_joints(found: dict[str, str]) -> dict[str, str]:
-    """Replace joint numbers, which begin with 0 or 1, by joint names."""
+    """Replace joint numbers, counted from 0 or 1, by joint names."""
     numbers = sorted(int(key[1:]) for key in found if key.startswith("#"))
     if not numbers:
         return found
@@ -285,7 +287,7 @@ def _numbers_to_joints(found: dict[str, str]) -> dict[str, str]:
     named = {key: column for key, column in found.items() if not key.startswith("#")}
     for number in numbers:
         if 0 <= number - start < len(names):
-            # Numbered joints come before names such as roll, which may be angles of the tip.
+            # Numbered joints take precedence over names such as roll, which may be angles of the tip.
             named[names[number - start]] = found[f"#{number}"]
     return named
 
@@ -298,12 +300,12 @@ def arm_log(
     job: Import,
     stated: frozenset[str] = frozenset(),
 ) -> ArmLog:
-    """The log of one arm, in radians and metres.
+    """Log of one arm, in radians and metres.
 
     Args:
         found: joint or part of a pose -> column.
         times: times of the rows, or indices of their images; NaN for rows without an image.
-        stated: columns whose meaning is not a guess.
+        stated: columns with a known meaning.
     """
     other = other_robots(job.options).get(arm)
     if other is None and not found.keys() >= _PSM:
@@ -329,7 +331,7 @@ def arm_log(
 def _pose_log(
     table: ForeignTable, arm: str, found: dict[str, str], times: np.ndarray, job: Import, stated: frozenset[str]
 ) -> ArmLog:
-    """The log of an arm from poses of its tip."""
+    """Log of an arm from poses of its tip."""
     columns, options = [found[name] for name in _POSE_ORDER], job.options
     values = np.stack([table.numbers(column).astype(np.float64) for column in columns], 1)
     named = " ".join(f"{column} {table.units.get(column, '')}" for column in columns[:3])

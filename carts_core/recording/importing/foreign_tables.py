@@ -1,4 +1,4 @@
-"""Tables of other programs (CSV, Parquet, NumPy) as named columns of numbers."""
+"""Tables of other programs (CSV, Parquet, NumPy), read as named columns of numbers."""
 
 import csv
 import re
@@ -17,10 +17,10 @@ from ...wording import shown
 from .found import PartError, well_formed
 
 _LONGEST_UNIT = 12
-"""Longest word that is accepted as a unit."""
+"""Maximum length of a unit [characters]."""
 _DATE = re.compile(r"\d{4}-\d\d-\d\d[T ]\d\d:\d\d:\d\d([.,]\d+)?(Z|[+-]\d\d:?\d\d)?")
 _LONGEST_NUMBER = 100
-"""Longest numeric cell [characters]; arrays of texts allocate the longest length for each cell."""
+"""Maximum length of a numeric cell [characters]; string arrays allocate the maximum length for each cell."""
 TABLE_SUFFIXES = (".csv", ".txt", ".tsv", ".parquet", ".npy", ".npz")
 
 
@@ -33,7 +33,7 @@ class ForeignTable:
     units: Mapping[str, str] = field(default_factory=dict)
     """Column -> unit, from a row of units."""
     dates: tuple[str, ...] = ()
-    """Columns of dates, as nanoseconds since 1970."""
+    """Columns of dates, converted to nanoseconds since 1970."""
     remarks: tuple[str, ...] = ()
     """Remarks on unusual content and its interpretation."""
     lines: tuple[int, ...] = ()
@@ -43,7 +43,7 @@ class ForeignTable:
         return len(next(iter(self.columns.values()))) if self.columns else 0
 
     def numbers(self, column: str) -> np.ndarray:
-        """A column as numbers [rows]; integers stay exact."""
+        """Column as numbers [rows]; integers stay exact."""
         if column not in self.columns:
             raise PartError("columns", f"{self.path} has no column {column!r}. It has: {', '.join(self.columns)}.")
         values = self.columns[column]
@@ -64,7 +64,7 @@ class ForeignTable:
 
 
 def read_foreign_table(path: Path) -> ForeignTable:
-    """Read a table of any known format."""
+    """Read a table of any supported format."""
     readers: dict[str, Callable[[Path], ForeignTable | dict[str, np.ndarray]]] = {
         ".parquet": _parquet,
         ".npy": _numpy,
@@ -96,7 +96,7 @@ def _csv(path: Path) -> ForeignTable:
     lines = text.splitlines()
     numbers = [number for number, line in enumerate(lines, start=1) if line.strip()]
     lines = [lines[number - 1] for number in numbers]
-    # Extracted dVRK topics begin with a marker, their name and type.
+    # Extracted dVRK topics begin with a marker, their name and their type.
     begin = 0
     while begin + 1 < len(lines) and re.match(r"\s*#", lines[begin]) and not re.match(r"\s*\d", lines[begin + 1]):
         begin += 1
@@ -128,12 +128,13 @@ def _csv(path: Path) -> ForeignTable:
         name for index, name in enumerate(header) if body and all(_DATE.fullmatch(row[index]) for row in body)
     )
     if empty := sum(not cell for row in body for cell in row):
-        remarks.append(f"{empty} empty cells; rows without a joint are left out")
+        remarks.append(f"{empty} empty cells; rows with a missing joint value are skipped")
     return ForeignTable(path, columns, units, dates, tuple(remarks), tuple(numbers))
 
 
 def _delimiter(lines: list[str]) -> str | None:
-    """Separator of cells; None for blanks. Semicolons and tabs come before commas, which may be decimal."""
+    """Separator of cells; None for blanks. Semicolons and tabs take precedence over commas, which may be decimal
+    commas."""
     for mark in ";\t":
         if all(mark in line for line in lines):
             return mark
@@ -141,7 +142,7 @@ def _delimiter(lines: list[str]) -> str | None:
 
 
 def _even(rows: list[list[str]], numbers: list[int]) -> tuple[list[list[str]], list[str]]:
-    """Rows of equal length, without empty trailing cells; and remarks."""
+    """Remove a trailing empty cell from rows and return them with remarks; `ValueError` if their lengths differ."""
     width, remarks = len(rows[0]), []
     if width > 1 and not rows[0][-1] and all(len(row) == width and not row[-1] for row in rows):
         rows, width = [row[:-1] for row in rows], width - 1
@@ -155,7 +156,7 @@ def _even(rows: list[list[str]], numbers: list[int]) -> tuple[list[list[str]], l
 
 
 def _is_row_of_units(row: list[str], after: list[str], commas: bool) -> bool:
-    """Whether a row under the header has units: words above numbers."""
+    """Whether a row below the header contains units: words above numbers."""
     numeric = [index for index, cell in enumerate(after) if cell and _is_number(cell, commas)]
     return (
         len(numeric) >= 0.5 * len(after)
@@ -184,7 +185,7 @@ def _typed(cells: list[str], commas: bool = False) -> np.ndarray:
 
 
 def _nanoseconds(cells: list[str]) -> np.ndarray:
-    """Dates as nanoseconds since 1970; without a zone they are in UTC."""
+    """Convert dates to nanoseconds since 1970; dates without a time zone are in UTC."""
     times = []
     for cell in cells:
         whole, _, rest = cell.replace("Z", "+00:00").replace(",", ".").partition(".")
@@ -205,7 +206,7 @@ def _is_number(cell: str, commas: bool = False) -> bool:
 
 
 def read_parquet(path: Path) -> dict[str, np.ndarray]:
-    """Columns of a Parquet file by name [rows]; [rows, values] if rows have equally many numbers."""
+    """Columns of a Parquet file by name: [rows], or [rows, values] if all rows have the same number of values."""
     require_package("pyarrow", "import")
     columns = decoded(tables.read_parquet, path)
     for name, values in columns.items():
@@ -232,7 +233,7 @@ def _numpy(path: Path) -> dict[str, np.ndarray]:
         if values.ndim == 1:
             columns[name] = values
         elif values.ndim >= 2:
-            # Position, velocity and effort of a joint state are concatenated; positions come first.
+            # Position, velocity and effort of a joint state are concatenated, positions first.
             flat = values[:, 0] if values.ndim == 3 else values
             columns.update({f"{name}_{index + 1}": flat[:, index] for index in range(flat.shape[1])})
     return columns

@@ -1,4 +1,4 @@
-"""Contents of a foreign recording before a sequence file is written, and the interface of their readers."""
+"""Content of a foreign recording before a sequence file is written, and interface of the readers."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
@@ -18,23 +18,24 @@ Part = Literal["images", "calibration", "kinematics", "columns", "recording"]
 
 
 def recording_name(path: Path) -> str:
-    """Default name of a recording: its folder's name, or its file's without the suffix."""
+    """Default name of a recording: the name of its folder, or of its file without the suffix."""
     path = path.absolute()
     return path.name if path.is_dir() else path.stem
 
 
 MALFORMED = (OSError, RecursionError, ValueError, TypeError, KeyError, AttributeError, IndexError)
-"""Errors of files that cannot be read, and of values of a wrong form."""
+"""Exceptions raised for unreadable files and malformed values."""
 
 
 def cause(error: Exception) -> str:
-    """Cause of one of the `MALFORMED` errors, in one line."""
+    """One-line description of a `MALFORMED` exception."""
     return f"{error} is missing" if isinstance(error, KeyError) else " ".join(str(error).split())
 
 
 @contextmanager
 def well_formed(requirement: str, remedy: str = "Copy it again.") -> Iterator[None]:
-    """Raise `SequenceError` for `MALFORMED` errors in the block: the violated requirement, the cause, and a remedy."""
+    """Convert `MALFORMED` exceptions in the block to `SequenceError` with the violated requirement, the cause and a
+    remedy."""
     try:
         yield
     except MALFORMED as error:
@@ -42,7 +43,7 @@ def well_formed(requirement: str, remedy: str = "Copy it again.") -> Iterator[No
 
 
 def read_json(path: Path) -> Any:
-    """Content of a JSON file of a recording."""
+    """Read a JSON file of a recording."""
     if not is_regular(path):
         raise SequenceError(f"{path} is missing. Correct the path.")
     with well_formed(f"{path} is not readable JSON"):
@@ -53,10 +54,10 @@ class PartError(SequenceError):
     """Unusable part of a recording.
 
     Attributes:
-        part: the part; `recording` for the whole.
-        problem: cause, and a remedy without options of the command line.
+        part: the part, or `recording`.
+        problem: cause and remedy, without command-line options.
         about: name of the camera; empty for all.
-        remedy: further sentence with options of the command line.
+        remedy: further sentence with command-line options.
     """
 
     def __init__(self, part: Part, problem: str, remedy: str = "", *, about: str = "") -> None:
@@ -67,19 +68,19 @@ class PartError(SequenceError):
 
 @dataclass(frozen=True)
 class Note:
-    """A line of the report; `str` gives it with options of the command line."""
+    """Line of the report; `str` includes the command-line options."""
 
     kind: NoteKind
     text: str
-    """Sentences without options of the command line."""
+    """Sentences without command-line options."""
     about: str = ""
     """Name of the camera or arm; empty for the recording."""
     option: str = ""
-    """Option of the command line that changes a guess, such as `--units yaw UNIT`."""
+    """Command-line option that changes a guess, such as `--units yaw UNIT`."""
     remedy: str = ""
-    """Further sentence with options of the command line."""
+    """Further sentence with command-line options."""
     placeholder: str = ""
-    """Field of the camera or arm that has a placeholder, such as `T_world_base`."""
+    """Field of the camera or arm with a placeholder value, such as `T_world_base`."""
 
     def __str__(self) -> str:
         text = f"{self.text.removesuffix('.')} (change: {self.option})." if self.option else self.text
@@ -88,13 +89,13 @@ class Note:
 
 @dataclass(frozen=True)
 class Import:
-    """An import in progress: its options, and the notes of its report in the order in which they were made."""
+    """Import in progress: options, and notes of the report in chronological order."""
 
     options: ImportOptions
     notes: list[Note] = field(default_factory=list)
 
     def found(self, text: str, about: str = "", option: str = "", *, given: bool = True) -> None:
-        """Add a note on a value of the recording, or on a guess of a value that is not `given`."""
+        """Add a note on a value of the recording; the value is a guess unless `given`."""
         self.notes.append(Note("found" if given else "guessed", text, about, option))
 
     def guessed(self, text: str, about: str = "", option: str = "") -> None:
@@ -110,7 +111,7 @@ class Import:
         self.notes.append(Note("warning", text, about, option, remedy))
 
     def with_options(self, **changes: Any) -> "Import":
-        """The same import with other options."""
+        """Copy of the import with other options."""
         return replace(self, options=replace(self.options, **changes))
 
     def arm_name(self, recorded: str) -> str | None:
@@ -128,7 +129,8 @@ class Import:
         times: Float[np.ndarray, " frames"] | None,
         **further: Any,
     ) -> "FoundRecording":
-        """The recording with the notes and the given time offset; `further` are other fields of `FoundRecording`."""
+        """Create the recording with the notes and the given time offset; `further` are other fields of
+        `FoundRecording`."""
         further = {"time_offset": self.options.time_offset or 0.0, **further}
         return FoundRecording(kind, name, tuple(cameras), tuple(arms), ids, times, tuple(self.notes), **further)
 
@@ -144,44 +146,43 @@ class Track:
 
 @dataclass(frozen=True, eq=False)
 class FoundCamera:
-    """A camera and the location of its images."""
+    """Camera and the location of its images."""
 
     name: str
     size: tuple[int, int]
     """Width and height of its images [px]."""
     images: Path
-    """Folder, video or bag; absolute."""
+    """Absolute path of the folder, video or bag."""
     pattern: str = ""
-    """File name pattern of a frame below `images`; empty for a video or bag."""
+    """File name pattern of the frames in `images`; empty for a video or bag."""
     intrinsics: tuple[float, float, float, float] | None = None
     """fx, fy, cx, cy [px]; None if not known."""
     pixel_center: float = 0.0
-    """Position of the first pixel's centre: 0 in OpenCV's convention, 0.5 in that of carts."""
+    """Coordinate of the first pixel's centre: 0 in OpenCV's convention, 0.5 in CaRTS."""
     distortion: tuple[float, ...] = ()
     """OpenCV's distortion coefficients."""
     T_camera_world: Float[np.ndarray, "4 4"] | None = None
-    """Extrinsics [m]; None if not known. The world is the frame of the first camera."""
+    """Extrinsics [m]; None if unknown. The world is the frame of the first camera."""
     rectification: Float[np.ndarray, "3 3"] | None = None
-    """R of ROS: from the camera's frame to the common frame of a rectified pair."""
+    """R of ROS: rotation from the camera's frame to the common frame of a rectified pair."""
     projection: Float[np.ndarray, "3 4"] | None = None
     """P of ROS [px]; its last column contains the baseline."""
     masks: str = ""
-    """File name pattern of its masks, below `images.parent` or absolute; empty without masks."""
+    """File name pattern of the masks, relative to `images.parent` or absolute; empty without masks."""
     sparse_masks: bool = False
     bits: int | None = None
-    """Bit depth of images of 16 bits; None for 8."""
+    """Bit depth of 16-bit images; None for 8-bit images."""
     crop: tuple[int, int, int, int] | None = None
-    """Left, top, width, height of its part of each image [px]; None for the whole image."""
+    """Left, top, width and height of the camera's part of each image [px]; None for the whole image."""
     topic: str = ""
     """Topic in a bag; empty for other sources."""
     numbers: Int[np.ndarray, " frames"] | None = None
-    """Video frame number, or record time of the message [ns], of every frame; None if frames are numbered
-    consecutively."""
+    """Video frame number or message record time [ns] of every frame; None for consecutive frames."""
 
 
 @dataclass(frozen=True, eq=False)
 class FoundArm:
-    """An arm and its joint positions."""
+    """Arm and its joint positions."""
 
     name: str
     columns: tuple[str, ...] = ()
@@ -192,11 +193,11 @@ class FoundArm:
     """Times in the recording's clock, increasing [s]; None if row n belongs to frame n."""
     robot: str = "builtin:psm_lnd"
     T_world_base: Float[np.ndarray, "4 4"] | None = None
-    """Base frame [m]; None if not known."""
+    """Base frame [m]; None if unknown."""
     base_from: str = ""
     """Source of the base frame, for the report."""
     beyond_limits: bool = False
-    """Whether positions exceed the robot's limits, so that the sequence file has to name their units."""
+    """Whether positions exceed the robot's limits, so that the sequence file must state their units."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -213,27 +214,26 @@ class FoundRecording:
     """Times in the recording's clock [s]; None if rows of the tables are frames."""
     notes: tuple[Note, ...] = ()
     time_offset: float = 0.0
-    """Time in the kinematics minus time of the image [s]."""
+    """Kinematics time minus image time [s]."""
     motion: Track | None = None
     """T_world_mount [m] of the mount that carries all cameras; None for static cameras."""
     domains: Mapping[str, str] = field(default_factory=dict)
-    """Domain -> value of {domain} in patterns; empty for one domain."""
+    """Domain -> value of {domain} in patterns; empty for a single domain."""
 
 
 @dataclass(frozen=True)
 class Source:
-    """A recording format that can be imported."""
+    """Supported recording format."""
 
     name: str
     """Value of `--source`."""
     label: str
     """Label of the format."""
     looked_for: str
-    """Files by which the format is detected, as a phrase."""
+    """Description of the files by which the format is detected."""
     detect: Callable[[Path], bool]
-    """Whether a path is of this format; quick, never raises."""
+    """Function that tests whether a path has this format; fast, never raises."""
     uses: tuple[str, ...]
-    """Names of the `ImportOptions` that it uses, besides those of arms, robots and calibrations, which all sources
-    use."""
+    """Names of the `ImportOptions` that the source uses, in addition to those of arms, robots and calibrations."""
     read: Callable[[Path, Import], FoundRecording]
-    """Reads the recording; raises a `CartsError` for damaged or contradictory content."""
+    """Function that reads the recording; raises a `CartsError` for damaged or contradictory content."""

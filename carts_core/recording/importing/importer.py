@@ -16,16 +16,16 @@ _UNFINISHED = {
     ".mcap.zstd": "the whole file is compressed. Decompress it with `zstd -d`, and import the result.",
     ".db3.zstd": "it is one file of a bag. Give the folder with its metadata.yaml.",
 }
-"""Suffixes of incomplete bags, which another program has to finish first."""
+"""Suffix of incomplete bags -> remedy."""
 
 
 def known_kinds() -> str:
-    """Known formats in order of detection, one per line."""
+    """List of supported formats in order of detection, one per line."""
     return "\n".join(f"  {source.name}: {source.label} ({source.looked_for})" for source in SOURCES)
 
 
 def detect(path: Path, name: str | None = None) -> Source:
-    """Format of a recording."""
+    """Detect the format of a recording."""
     kinds = known_kinds()
     if not path.exists():
         raise SequenceError(f"{path} is missing. Give the file or folder of a recording.")
@@ -45,7 +45,7 @@ def detect(path: Path, name: str | None = None) -> Source:
 
 
 def find(path: Path, options: ImportOptions | None = None) -> FoundRecording:
-    """Content of a recording, completed with defaults; nothing is written. `CartsError` for unusable content."""
+    """Read a recording and complete it with defaults; nothing is written. `CartsError` for unusable content."""
     options = _with_places(path.absolute(), options or ImportOptions())
     source = detect(path, options.source)
     parts: dict[str, Part] = {"images": "images", "kinematics": "kinematics"}
@@ -67,7 +67,7 @@ def find(path: Path, options: ImportOptions | None = None) -> FoundRecording:
 
 
 def _with_places(path: Path, options: ImportOptions) -> ImportOptions:
-    """Options with relative paths resolved against the working directory, else the recording."""
+    """Resolve relative paths in the options against the working directory, else against the recording."""
     folder = path if path.is_dir() else path.parent
 
     def placed(given: Path | str) -> str:
@@ -85,7 +85,7 @@ def _with_places(path: Path, options: ImportOptions) -> ImportOptions:
 
 
 def _check_names(recording: FoundRecording, options: ImportOptions) -> None:
-    """Check that all given names are those of found arms and cameras."""
+    """Check that all names in the options are names of arms and cameras of the recording."""
     arms = [arm.name for arm in recording.arms]
     cameras = [camera.name for camera in recording.cameras]
     for what, given, known in (
@@ -117,7 +117,8 @@ def _is_given(options: ImportOptions, name: str) -> bool:
 def import_recording(
     path: Path, folder: Path, options: ImportOptions | None = None, *, overwrite: bool = False
 ) -> tuple[Path, FoundRecording]:
-    """Write a sequence file and tables into a folder for a recording, which is not copied; returns the file and the
-    content. `CartsError` for an unknown format and damaged or contradictory content; nothing is written then."""
+    """Write the sequence file and tables of a recording into a folder, without copying images; returns the file and the
+    content. `CartsError` for an unknown format or damaged or contradictory content, in which case nothing is
+    written."""
     recording = find(path, options)
     return write_sequence(recording, folder, overwrite=overwrite), recording

@@ -1,4 +1,5 @@
-"""Conversion of logged joint positions to radians and metres: units given, named in columns, or fitting the limits."""
+"""Conversion of logged joint positions to radians and metres, with units that are given, named in columns, or plausible
+for the joint limits."""
 
 import re
 from collections.abc import Sequence
@@ -14,7 +15,7 @@ from ..kinematics_table import ANGLE_UNITS, FAR, LENGTH_UNITS, PERCENT, Joint, j
 from .found import FoundArm, Import, PartError
 
 _INSERTED = 0.03
-"""Insertion [m] that the insertion axis exceeds in most recordings, since the tip is in view."""
+"""Insertion that is exceeded in most recordings, since the tip is in view [m]."""
 
 
 def in_si(
@@ -26,11 +27,11 @@ def in_si(
     columns: Sequence[str] = (),
     instrument: bool = True,
 ) -> Float[np.ndarray, "rows joints"]:
-    """Logged positions of an arm in radians and metres, with the signs of the robot.
+    """Convert logged positions of an arm to radians and metres, with the signs of the robot.
 
     Args:
-        columns: names of a table's columns, whose units are guessed; empty for messages, which are in SI units.
-        instrument: whether angles can be guessed to be degrees; those of other robots may be percentages of their
+        columns: names of a table's columns, of which the units are guessed; empty for messages, which are in SI units.
+        instrument: whether large angles are assumed to be degrees; angles of other robots may be percentages of their
             range.
     """
     names, options = [joint.name for joint in joints], job.options
@@ -67,14 +68,14 @@ def in_si(
 
 
 def urdf_of(arm: str, robot: str) -> Path:
-    """URDF of the robot of an arm, which must exist."""
+    """Path of the URDF of an arm's robot; `SequenceError` if it is missing."""
     if not (urdf := robot_file(robot)).is_file():
         raise SequenceError(f"robot {robot} of {arm} is missing. Give the path of a URDF; carts robot generates one.")
     return urdf
 
 
 def psm_joints(arm: str, names: Sequence[str], job: Import) -> list[Joint]:
-    """Joints of the robot given for an arm, else of the default one; joints that it lacks have no limits."""
+    """Joints of the robot given for an arm, else of the default robot; joints that the robot lacks have no limits."""
     robot = job.options.robot.get(arm, FoundArm.robot)
     urdf_of(arm, robot)
     known = {joint.name: joint for joint in joints_of(robot)}
@@ -124,13 +125,13 @@ def _length_unit(values: np.ndarray, joints: Sequence[Joint], arm: str, columns:
 
 
 def named_length_unit(text: str) -> str | None:
-    """Unit of length other than metres in the names of columns; None if there is none."""
+    """Unit of length other than metres in the names of columns; None if not found."""
     units = [unit for unit in LENGTH_UNITS if unit != "m"]
     return next((unit for unit in units if re.search(rf"(?i)(^|[^a-z]){unit}([^a-z]|$)", text)), None)
 
 
 def length_unit(highest: float, limit: float, arm: str, what: str, orders: Sequence[str] = ()) -> str:
-    """The unit in which a length is plausible."""
+    """Unit in which a length is plausible; `PartError` if ambiguous."""
     if not np.isfinite(limit) or highest <= 1.5 * limit + 0.1:
         return "m"
     fitting = [unit for unit, factor in LENGTH_UNITS.items() if _INSERTED <= highest * factor <= 1.5 * limit]
@@ -174,17 +175,17 @@ def _beyond_limits(joints: Sequence[Joint], values: Float[np.ndarray, "rows join
 
 
 def _other_readings(joint: Joint, values: Float[np.ndarray, " rows"]) -> dict[str, str]:
-    """Signs and units that bring the positions of a joint within its limits, each with its option."""
+    """Descriptions of signs and units that bring the positions of a joint within its limits -> option."""
     found = {"the opposite sign": f"--flip {joint.name}"} if joint.fits(-values) else {}
     for unit, factor in joint.units.items():
         if factor != 1.0 and joint.fits(values * factor) and not (found and unit != "deg"):
-            text = f"{unit} (read as {values.min() * factor:.3g} to {values.max() * factor:.3g} {joint.unit})"
+            text = f"{unit} (interpreted as {values.min() * factor:.3g} to {values.max() * factor:.3g} {joint.unit})"
             found[text] = f"--units {joint.name} {unit}"
     return found
 
 
 def _column_orders(joints: Sequence[Joint], values: np.ndarray, wrong: list[int]) -> list[str]:
-    """Column orders that bring all positions within the limits, unless changed signs do."""
+    """Column orders that bring all positions within the limits; empty if changed signs suffice."""
     if not wrong or all(joints[index].fits(-values[:, index]) for index in wrong):
         return []
     names = [joint.name for joint in joints]

@@ -1,4 +1,4 @@
-"""Logs of arms and of the endoscope: joint positions with times, instrument and base frame."""
+"""Logs of arms and of the endoscope: joint positions with times, instruments and base frames."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -19,15 +19,15 @@ from .found import FoundArm, Import, PartError, Track
 from .joint_units import in_si, psm_joints
 
 SAME_CYCLE = 2e-3
-"""Largest time between rows of two topics of the same controller cycle [s]."""
+"""Maximum time between rows of two topics of the same controller cycle [s]."""
 
 
 def clock_offset(times: Float[np.ndarray, " rows"], other: Float[np.ndarray, " other_rows"]) -> float:
-    """Time stamp difference between rows of `times` and of `other` from the same cycle [s].
+    """Difference between the time stamps of rows of `times` and `other` from the same cycle [s].
 
-    Topics of one cycle are stamped one after the other, so their stamps differ by a constant that is not due to motion.
-    It is the median over rows that are within `SAME_CYCLE` of each other; 0 where fewer than half are, as between
-    topics of different rates.
+    Topics of one cycle are stamped one after the other, so their stamps differ by a constant. The result is the median
+    over rows within `SAME_CYCLE` of each other, or 0 if these are fewer than half of the rows, as for topics of
+    different rates.
     """
     difference = times - other[nearest(times, other)]
     same = np.abs(difference) <= SAME_CYCLE
@@ -35,25 +35,25 @@ def clock_offset(times: Float[np.ndarray, " rows"], other: Float[np.ndarray, " o
 
 
 def nearest(times: Float[np.ndarray, " rows"], other: Float[np.ndarray, " other_rows"]) -> Int[np.ndarray, " rows"]:
-    """For each of `times`, the row of `other` (increasing) that is nearest to it."""
+    """Index of the row of `other` (increasing) nearest to each of `times`."""
     before, after = neighbours(other, times)
     return np.where(np.abs(times - other[before]) <= np.abs(times - other[after]), before, after)
 
 
 ACCEPTED = 2e-5
-"""Largest deviation of the base for the right instrument, in the median row [m]."""
+"""Maximum median deviation of the base frame for the correct instrument [m]."""
 _AMBIGUOUS = 2.0
-"""Factor by which the best lengths must be better than the next ones."""
+"""Minimum ratio between the deviations of the second best and the best lengths."""
 _FEWEST_ROWS = 20
 
 WRIST_LENGTHS = (0.0091, 0.0093, 0.0100, 0.0107, 0.0112)
-"""Wrist length of wristed 8 mm instruments, from wrist pitch to wrist yaw [m]."""
+"""Wrist lengths of wristed 8 mm instruments, from wrist pitch to wrist yaw [m]."""
 
 CANDIDATES: Mapping[str, PsmGeometry] = {
     f"{1e3 * length:.1f} mm wrist": replace(CLASSIC, wrist_length=length) for length in WRIST_LENGTHS
 }
-"""Lengths of the known instruments on their own arm. Classic and Si are the same, since only shaft length minus
-distance to the remote centre counts (-15.6 mm for both)."""
+"""Lengths of the known instruments. Classic and Si are equivalent, since only shaft length minus distance to the remote
+centre matters (-15.6 mm for both)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,7 +63,7 @@ class BaseFrame:
     T_reference_base: Float[np.ndarray, "4 4"]
     """Base frame in the reference frame of the poses [m]."""
     deviation: float
-    """Distance of the base from the estimate in the median row [m]."""
+    """Median distance of the base in a row from the estimate [m]."""
 
 
 def fit_base_frame(
@@ -71,8 +71,8 @@ def fit_base_frame(
     joints: Float[np.ndarray, "rows 6"],
     geometry: PsmGeometry = CLASSIC,
 ) -> BaseFrame:
-    """Base frame that fits joints [rad, m] to poses of the tip [m] in the same rows; `CartsError` if no row has
-    both."""
+    """Estimate the base frame from joints [rad, m] and poses of the tip [m] in the same rows; `CartsError` if no row
+    has both."""
     known = np.isfinite(joints).all(1) & np.isfinite(Ts_reference_tip).all((1, 2))
     if not known.any():
         raise CartsError(
@@ -95,7 +95,8 @@ def fit_tool_point(
     joints: Float[np.ndarray, "rows 6"],
     geometry: PsmGeometry = CLASSIC,
 ) -> tuple[Float[np.ndarray, "3"], float]:
-    """Position in the tip's frame of the point that poses refer to, and deviation of the base in the median row [m].
+    """Estimate the point that poses refer to; returns its position in the tip frame and the median deviation of the
+    base [m].
 
     With T_reference_base = (R, p) and T_base_tip = (R_i, t_i), the positions of the point at offset d from the tip are
     p_i = R (R_i d + t_i) + p: R is the mean of the rotations, and d and p solve a linear least squares problem.
@@ -112,14 +113,14 @@ def fit_tool_point(
 
 @dataclass(frozen=True, eq=False)
 class InstrumentCheck:
-    """Fit of the known instruments to a recording."""
+    """Result of testing the known instruments on a recording."""
 
     fits: Mapping[str, BaseFrame]
-    """Name -> fit, the best first."""
+    """Name -> estimated base frame, the best first."""
 
     @property
     def best(self) -> str:
-        """Name of the best fitting instrument."""
+        """Name of the best instrument."""
         return next(iter(self.fits))
 
     def accepts(self, name: str) -> bool:
@@ -133,7 +134,7 @@ class InstrumentCheck:
         return self.accepts(self.best) and all(_AMBIGUOUS * deviations[0] < other for other in deviations[1:])
 
     def warning(self, name: str) -> str | None:
-        """Warning about a chosen instrument; None when it fits."""
+        """Warning about a chosen instrument; None if it is consistent with the recording."""
         fit = self.fits[name]
         if self.accepts(name):
             return None
@@ -153,11 +154,11 @@ def check_instrument(
     joints: Float[np.ndarray, "rows 6"],
     candidates: Mapping[str, PsmGeometry] = CANDIDATES,
 ) -> InstrumentCheck:
-    """Rank instruments (name -> lengths) by how constant the arm's base is with each.
+    """Rank instruments (name -> lengths) by the deviation of the arm's base from a constant frame.
 
     Args:
-        Ts_reference_tip: poses of the tip in any frame that is fixed relative to the base [m].
-        joints: joint positions at the same times [rad, m]; at least 20 rows must have both.
+        Ts_reference_tip: poses of the tip in any frame fixed relative to the base [m].
+        joints: joint positions at the same times [rad, m]; at least 20 rows must have joints and a pose.
     """
     rows = int((np.isfinite(joints).all(1) & np.isfinite(Ts_reference_tip).all((1, 2))).sum())
     if rows < _FEWEST_ROWS:
@@ -169,12 +170,12 @@ def check_instrument(
 
 
 _SAME_BASE = 1e-3
-"""Distance from the identity [m], [rad] below which a base frame counts as not set in the dVRK."""
+"""Distance from the identity [m], [rad] below which a base frame is considered not set in the dVRK."""
 _CHECKED_ROWS = 5000
 _FEWEST_REACHABLE = 0.5
 _ACCURACY = "; the error of set-up joints is about 5 cm unless they are registered."
 _SAME_POINT = 1e-4
-"""Distance from the tip below which a point counts as the tip [m]."""
+"""Distance from the tip below which a point is considered the tip [m]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -191,7 +192,7 @@ class ArmLog:
     local_poses: Track | None = None
     """Poses of the tip in the arm's base frame."""
     setup: Track | None = None
-    """Poses of the arm's base in the camera's frame, from set-up joints."""
+    """Poses of the arm's base in the camera frame, from set-up joints."""
     tool: str = ""
     """The dVRK's `tool_type`."""
     opencv_axes: bool = False
@@ -199,7 +200,7 @@ class ArmLog:
     names: tuple[str, ...] = ()
     """Names of the joints of a robot other than a PSM; empty for a PSM."""
     si: bool = False
-    """Whether given units and signs are already applied."""
+    """Whether joint positions are converted with the given units and signs."""
 
     @property
     def T_axes(self) -> Float[np.ndarray, "4 4"]:
@@ -208,7 +209,7 @@ class ArmLog:
 
 
 def track(times: ArrayLike, values: ArrayLike) -> Track | None:
-    """Rows sorted by time; rows that are not finite or repeat a time are dropped. None if no rows remain."""
+    """Sort rows by time, and remove rows that are not finite or repeat a time; None if no rows remain."""
     times, values = np.asarray(times, np.float64), np.asarray(values, np.float64)
     if not len(times) or values.ndim > 2:
         return None
@@ -220,7 +221,7 @@ def track(times: ArrayLike, values: ArrayLike) -> Track | None:
 
 
 def transforms(values: Float[np.ndarray, "rows 7"]) -> Float[np.ndarray, "rows 4 4"]:
-    """Matrices of x y z [m] and a quaternion x y z w; a quaternion of length 0 gives NaN."""
+    """Convert x y z [m] and a quaternion x y z w to matrices; NaN for a zero quaternion."""
     Ts = np.tile(np.eye(4), (len(values), 1, 1))
     Ts[:, :3, 3] = values[:, :3]
     good = np.linalg.norm(values[:, 3:7], axis=1) > 1e-6
@@ -231,7 +232,7 @@ def transforms(values: Float[np.ndarray, "rows 7"]) -> Float[np.ndarray, "rows 4
 
 
 def arm_from_log(log: ArmLog, job: Import) -> FoundArm:
-    """Joint positions and base frame of an arm; notes name their sources."""
+    """Determine joint positions and base frame of an arm; notes name their sources."""
     robot = job.options.robot.get(log.name, FoundArm.robot)
     if log.names:
         assert log.joints is not None
@@ -254,7 +255,7 @@ def arm_from_log(log: ArmLog, job: Import) -> FoundArm:
 
 
 def _in_si(log: ArmLog, job: Import) -> ArmLog:
-    """The log in SI units, by the given units and signs."""
+    """Convert a log to SI units with the given units and signs."""
 
     def applied(logged: Track | None, names: tuple[str, ...]) -> Track | None:
         if logged is None:
@@ -265,7 +266,7 @@ def _in_si(log: ArmLog, job: Import) -> ArmLog:
 
 
 def _checked_rows(log: ArmLog) -> tuple[np.ndarray, np.ndarray] | None:
-    """Poses and joints of sampled rows that have both; None if they are too few."""
+    """Poses and joints of sampled rows that have both; None if there are too few."""
     poses = log.poses or log.local_poses
     if log.joints is None or poses is None:
         return None
@@ -276,7 +277,7 @@ def _checked_rows(log: ArmLog) -> tuple[np.ndarray, np.ndarray] | None:
 
 
 def _joints_at(poses: Track, joints: Track) -> Float[np.ndarray, "rows 6"]:
-    """Joint positions in the controller cycles of the poses; NaN outside their range."""
+    """Joint positions in the controller cycles of the poses; NaN outside the range of the joint log."""
     return at_times(poses.times - clock_offset(poses.times, joints.times), joints.times, joints.values)
 
 
@@ -324,7 +325,7 @@ def _inverse_of(poses: Track | None) -> Track | None:
 
 
 def _geometry(log: ArmLog, job: Import) -> PsmGeometry:
-    """Lengths of the instrument: as given, as estimated from the recording, or those of a Large Needle Driver."""
+    """Lengths of the instrument: given, estimated from the recording, or of a Large Needle Driver."""
     if log.tool:
         job.found(f"tool_type is {log.tool}.", log.name)
     given = job.options.wrist_length
@@ -351,7 +352,7 @@ def _geometry(log: ArmLog, job: Import) -> PsmGeometry:
 
 
 def _base_frame(log: ArmLog, geometry: PsmGeometry, job: Import) -> tuple[np.ndarray | None, str]:
-    """Base frame of the arm in the camera with OpenCV's axes, and its source; None if not known."""
+    """Base frame of the arm in the camera frame with OpenCV's axes, and its source; None if unknown."""
     if (path := job.options.base.get(log.name)) is not None:
         frames = read_base_frames(path, job.options.axes)
         chosen = [frame for frame in frames if frame.arm == log.name] or ([frames[0]] if len(frames) == 1 else [])
@@ -388,7 +389,7 @@ def _own_base_frame(log: ArmLog, geometry: PsmGeometry) -> tuple[np.ndarray | No
 
 
 def _joints_from_poses(log: ArmLog, T_camera_base: np.ndarray | None, geometry: PsmGeometry, job: Import) -> Track:
-    """Joint positions from poses by inverse kinematics."""
+    """Compute joint positions from poses by inverse kinematics."""
     source = log.local_poses or log.poses
     if source is None:
         raise PartError(
@@ -398,7 +399,7 @@ def _joints_from_poses(log: ArmLog, T_camera_base: np.ndarray | None, geometry: 
         )
     Ts = transforms(source.values)
     if log.local_poses is None and T_camera_base is not None:
-        # measured_cp is in the camera's frame then, with the axes of the dVRK.
+        # In this case measured_cp is in the camera frame, with the axes of the dVRK.
         Ts = np.linalg.inv(T_camera_base) @ log.T_axes @ Ts
     found = inverse(Ts, geometry)
     reached = found.reachable
@@ -408,7 +409,7 @@ def _joints_from_poses(log: ArmLog, T_camera_base: np.ndarray | None, geometry: 
         raise PartError(
             "recording",
             f"{log.name}: {int((~reached).sum())} of {counted(len(Ts), 'pose')} are unreachable "
-            f"({found.unreachable[0].reason}). They are probably in another frame than that of the arm's base, or in "
+            f"({found.unreachable[0].reason}). They are probably in a frame other than the arm's base frame, or in "
             "another unit.",
             f"Give the base frame with --base {log.name} FILE, or record local/measured_cp.",
         )
@@ -417,14 +418,14 @@ def _joints_from_poses(log: ArmLog, T_camera_base: np.ndarray | None, geometry: 
 
 
 _MOVES = 5e-4, 0.1
-"""Motion [m], [deg] below which an endoscope counts as static."""
+"""Motion [m], [deg] below which an endoscope is considered static."""
 
 
 def endoscope_motion(poses: Track | None, joints: Track | None, start: float, job: Import) -> Track | None:
-    """Pose of the camera over time, in a world with its origin at the first image; None if it is static.
+    """Pose of the camera mount over time, in a world with its origin at the first image; None for a static endoscope.
 
-    The ECM's tip, from its poses or joints, is the camera mount; `carts calibrate` estimates the camera's pose relative
-    to it.
+    The camera mount is the ECM's tip, from logged poses or joints; `carts calibrate` estimates the camera's pose
+    relative to the mount.
 
     Args:
         start: time of the first image [s].

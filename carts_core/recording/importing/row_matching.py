@@ -1,8 +1,8 @@
 """Matching of log rows with images: by times, frame rate, file names, numbers or order.
 
-In order of precedence: times, a given frame rate, a column with the images' file names or numbers, and the order of
-rows if there are as many as images. A video's own times only reflect its nominal rate, so one row per image takes
-precedence over them. A note reports the method and omissions.
+The methods are, in order of precedence: times, a given frame rate, a column with the images' file names or numbers, and
+    the order of rows if the numbers of rows and images are equal. The times of a video only reflect its nominal rate,
+    so one row per image takes precedence over them. A note reports the method and omissions.
 """
 
 import re
@@ -21,34 +21,34 @@ from .foreign_tables import ForeignTable
 from .found import FoundArm, Import, PartError
 
 _STAMPED_DIGITS = 13
-"""Digits from which numbers in image names are times."""
+"""Minimum number of digits of numbers in image names that are times."""
 _LONGEST = 1e6
-"""Longest recording [s]."""
+"""Maximum duration of a recording [s]."""
 _LEAST: Mapping[Clock, tuple[float, float]] = {"ns": (1e17, 9e5), "us": (1e14, 9e2), "ms": (1e11, 0.9), "s": (1e8, 0.0)}
-"""Unit -> smallest time since 1970, and smallest spacing of rows, in that unit."""
+"""Unit -> minimum time since 1970, and minimum spacing of rows, in that unit."""
 _FEW = 0.1
-"""Share of rows without an image up to which a column of numbers counts as image numbers."""
+"""Maximum share of rows without an image for a column of image numbers."""
 _INDEX = ("index", "id", "", "unnamed 0", "row", "seq", "sequence")
-"""Names of columns that may count rows instead of images."""
+"""Names of columns that may contain row numbers instead of image numbers."""
 
 
 @dataclass(frozen=True, eq=False)
 class FrameTimes:
-    """Images of a recording and their times."""
+    """Frames of a recording and their times."""
 
     ids: tuple[str, ...]
     stems: tuple[str, ...]
-    """File names without suffix; the ids for a video."""
+    """File names without suffix; for a video, the ids."""
     times: Float[np.ndarray, " frames"] | None
-    """Time of each frame [s]; None if not known."""
+    """Time of each frame [s]; None if unknown."""
     source: str
     """Source of the times, for the report."""
     nominal: bool = False
     """Whether the times are those of a video's constant rate."""
     given: bool = False
-    """Whether the times are from the given frame rate."""
+    """Whether the times are computed from the given frame rate."""
     counted: bool = False
-    """Whether the ids are counted from 0, as those of a video, instead of read from names."""
+    """Whether the ids count from 0, as in a video, instead of being read from names."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,16 +56,16 @@ class RowMatch:
     """Result of matching rows with images."""
 
     rows: Float[np.ndarray, " rows"]
-    """Time of each row [s]; with `by_image` the index of its image, NaN for none."""
+    """Time of each row [s]; with `by_image`, index of the row's image, NaN without an image."""
     by_image: bool
     frame_times: Float[np.ndarray, " frames"] | None
     """Time of each frame [s]; None if rows are images and have no times."""
     time_offset: float = 0.0
-    """Time in the log minus time of the image [s]."""
+    """Log time minus image time [s]."""
 
 
 def frame_times(images: Images, ids: tuple[str, ...], job: Import) -> FrameTimes:
-    """Times of the frames `ids` of a camera: from image names, from the given frame rate, or from a video."""
+    """Determine the times of the frames `ids` of a camera from image names, the given frame rate, or a video."""
     rate = job.options.frame_rate
     stems = tuple(
         PureWindowsPath(images.pattern.format(frame=frame, domain="")).stem if images.pattern else frame
@@ -100,14 +100,14 @@ def frame_times(images: Images, ids: tuple[str, ...], job: Import) -> FrameTimes
 
 
 def _without_rate(found: FrameTimes, job: Import) -> FrameTimes:
-    """The times, with a warning that a given frame rate is ignored."""
+    """Return the times, and warn if a given frame rate is ignored."""
     if job.options.frame_rate is not None:
         job.warning(f"the given frame rate is not used, since the images have times ({found.source}).")
     return found
 
 
 def _numbered(ids: tuple[str, ...], job: Import) -> np.ndarray:
-    """Images counted from 0, with gaps where single numbers are missing in their names."""
+    """Image numbers from 0, with gaps where single numbers are missing from the image names."""
     numbers = np.array([int(frame) for frame in ids], np.float64)
     steps = np.diff(numbers)
     step = float(np.median(steps)) if len(steps) else 1.0
@@ -116,18 +116,21 @@ def _numbered(ids: tuple[str, ...], job: Import) -> np.ndarray:
         return np.arange(len(ids), dtype=float)
     if places[-1] != len(ids) - 1:
         missing = int(places[-1]) + 1 - len(ids)
-        job.guessed(f"{counted(missing, 'number')} missing in the names of the images; the others keep their times.")
+        job.guessed(
+            f"{counted(missing, 'number')} missing from the image names; the remaining images keep their times."
+        )
     return places
 
 
 def guess_clock(values: np.ndarray, span: float | None = None) -> Clock:
-    """Unit of times: by magnitude if they count from 1970, else by spacing and the images' duration `span` [s]."""
+    """Guess the unit of times: from their magnitude for times since 1970, else from their spacing and the images'
+    duration `span` [s]."""
     values = np.asarray(values, np.float64)
     values = values[np.isfinite(values)]
     largest = float(np.max(np.abs(values))) if len(values) else 0.0
     lasts = float(np.ptp(values)) if len(values) else 0.0
     for unit in _LEAST:
-        # A log of hours counts from its own start, in a smaller unit.
+        # A log longer than an hour is relative to its start, in a smaller unit.
         if largest >= _LEAST[unit][0] and lasts * SECONDS[unit] < _LONGEST:
             return unit
     step = float(np.median(np.diff(values))) if len(values) > 1 else 0.0
@@ -146,7 +149,7 @@ def guess_clock(values: np.ndarray, span: float | None = None) -> Clock:
 def row_seconds(
     table: ForeignTable, column: str | None, clock: Clock | None, job: Import, span: float | None = None
 ) -> Float[np.ndarray, " rows"] | None:
-    """Times of rows [s] from a column of a table; their unit is guessed if it is not given."""
+    """Times of rows [s] from a column of a table; the unit is guessed if not given."""
     if column is None:
         return None
     values = table.numbers(column)
@@ -266,7 +269,7 @@ def _by_image(
 
 
 def _named(frames: FrameTimes, table: ForeignTable, column: str, job: Import) -> Int[np.ndarray, " rows"] | None:
-    """Index of each row's image, -1 for none; None if fewer than half of the rows or images are matched."""
+    """Index of each row's image, -1 without an image; None if fewer than half of the rows or images are matched."""
     by_stem, cells = {stem: index for index, stem in enumerate(frames.stems)}, table.columns[column].tolist()
     exact = [by_stem.get(_stem(cell), -1) if isinstance(cell, str) else -1 for cell in cells]
     if max(exact, default=-1) < 0:
@@ -282,7 +285,7 @@ def _stem(cell: str) -> str:
 
 
 def _number(cell: object) -> int | None:
-    """A whole number, or the last number in a file name."""
+    """Parse a whole number, or the last number in a file name."""
     if isinstance(cell, str):
         found = re.findall(r"\d+", _stem(cell))
         return int(found[-1]) if found else None
@@ -296,7 +299,7 @@ def _numbers_to_positions(numbers: list[int | None], frames: FrameTimes, column:
     best, shift = sum(number in position for number in known), 0
     for other in (-1, 1):
         hits = sum(number + other in position for number in known)
-        # The column counts from 0 instead of 1, or the reverse, if only then every row has an image.
+        # If only a shift by one gives every row an image, the column counts from 0 instead of 1, or vice versa.
         if hits > best and hits == len(known) and min(known) + other == ids[0]:
             best, shift = hits, other
     if shift and frames.counted:
@@ -304,7 +307,7 @@ def _numbers_to_positions(numbers: list[int | None], frames: FrameTimes, column:
     elif shift:
         job.warning(
             f"{column} counts from {min(known)} and the images from {ids[0]}; its first row is assumed to be the first "
-            f"image. If it is not, rename the images so that they begin with {min(known)}."
+            f"image. Otherwise, rename the images so that they begin with {min(known)}."
         )
     return [-1 if number is None else position.get(number + shift, -1) for number in numbers]
 
@@ -312,13 +315,13 @@ def _numbers_to_positions(numbers: list[int | None], frames: FrameTimes, column:
 def by_rows(
     arms: Sequence[FoundArm], ids: Sequence[str], job: Import, times: Float[np.ndarray, " frames"] | None = None
 ) -> tuple[tuple[FoundArm, ...], tuple[str, ...], np.ndarray]:
-    """Arms whose times are indices into `ids`, restricted to the frames that all of them have.
+    """Restrict arms, whose times are indices into `ids`, to the frames with rows of all arms.
 
     Args:
-        times: times of the frames [s], assigned to the rows so that a delay can be estimated.
+        times: times of the frames [s], assigned to the rows so that a delay can be estimated later.
 
     Returns:
-        The arms, the ids that remain, and their indices in `ids`.
+        The arms, the remaining ids, and their indices in `ids`.
     """
     positions = {arm.name: np.asarray(arm.times, int) for arm in arms if arm.times is not None}
     keep = np.all([np.isin(np.arange(len(ids)), rows) for rows in positions.values()], axis=0) & np.ones(len(ids), bool)

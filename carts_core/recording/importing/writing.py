@@ -1,4 +1,4 @@
-"""Completion of a found recording by checks and defaults, and writing of its sequence file and tables."""
+"""Checks and defaults of an imported recording, and writing of its sequence file and tables."""
 
 import io
 import json
@@ -32,9 +32,10 @@ _ROWS = 200
 _NEAREST, _FARTHEST = 0.01, 0.6
 """Depths at which an endoscope sees an instrument [m]."""
 _BORDER = 0.5
-"""Share of the image's size by which a tip may be outside, since base frames are some centimetres off."""
+"""Margin around the image in which a tip still counts as in view, as a share of the image size; base frames have errors
+of centimetres."""
 _IN_VIEW, _OUT = 0.5, 0.1
-"""Share of rows with the tip in view that is sufficient, and share that is too small."""
+"""Share of rows with the tip in view that suffices, and share below which the base frame is doubted."""
 
 
 def tips_of(arm: FoundArm) -> Float[np.ndarray, "rows 3"]:
@@ -50,14 +51,15 @@ def tips_of(arm: FoundArm) -> Float[np.ndarray, "rows 3"]:
 
 
 def check_in_view(arm: FoundArm, camera: FoundCamera, job: Import) -> None:
-    """Warn if a base frame puts the tip out of view and another interpretation of it puts the tip in view."""
+    """Warn if a base frame puts the tip out of view, but another interpretation of the base frame puts the tip in
+    view."""
     if arm.values is None or arm.T_world_base is None or camera.intrinsics is None:
         return
     tips = tips_of(arm)[:: max(1, len(arm.values) // _ROWS)]
     if _in_view(tips, arm.T_world_base, camera) > _OUT:
         return
     readings = {
-        "its inverse (the camera in the base's frame)": np.linalg.inv(arm.T_world_base),
+        "its inverse (the camera in the base frame)": np.linalg.inv(arm.T_world_base),
         "the other camera axes": T_DVRK_OPENCV @ arm.T_world_base,
         "the inverse with the other axes": np.linalg.inv(T_DVRK_OPENCV @ arm.T_world_base),
         "millimetres for metres": arm.T_world_base * [1.0, 1.0, 1.0, 1e-3],  # The last row is not used.
@@ -83,7 +85,7 @@ def _in_view(tips: np.ndarray, T_camera_base: np.ndarray, camera: FoundCamera) -
 
 
 def check_pair(cameras: tuple[FoundCamera, ...], job: Import) -> None:
-    """Warn if the right camera of a pair is on the left of the left one."""
+    """Warn if the right camera of a pair is to the left of the left camera."""
     by_name = {camera.name: camera for camera in cameras}
     if not {"left", "right"} <= set(by_name):
         return
@@ -99,17 +101,17 @@ def check_pair(cameras: tuple[FoundCamera, ...], job: Import) -> None:
 
 _ENDOSCOPE = "the endoscope"
 MAX_GAP = 0.1
-"""Largest time between a frame and the rows used for it, as in the sequence format [s]."""
+"""Maximum time difference between a frame and the rows used for it, as in the sequence format [s]."""
 FOCAL_WIDTHS = 1.2
-"""Default focal length of an endoscope of about 45 degrees, in image widths."""
+"""Default focal length, in image widths; a field of view of about 45 degrees."""
 _DISTANCE = 0.12
 """Default distance from the camera to the tips [m]."""
 _BEHIND = -1.0
-"""Default position of an arm without kinematics: behind the camera, so that no image shows it [m]."""
+"""Default depth of an arm without kinematics: behind the camera, so that it is not visible [m]."""
 
 
 def completed(recording: FoundRecording, options: ImportOptions) -> FoundRecording:
-    """The recording restricted to frames with kinematics and completed with defaults; notes list them.
+    """Restrict a recording to frames with kinematics and complete it with defaults; notes list both.
 
     Joints are compared with the limits of their robots, and base frames with the view of the cameras.
     """
@@ -159,7 +161,7 @@ def _frames_with_kinematics(recording: FoundRecording, job: Import) -> FoundReco
         gaps = np.maximum(np.abs(wanted - times[before]), np.abs(times[after] - wanted))
         keep &= gaps <= MAX_GAP
         spacing = np.diff(times)
-        # A log with one row per image may have large gaps throughout.
+        # A log with one row per image may have large gaps everywhere.
         if len(spacing) and (long := spacing > max(MAX_GAP, 2.0 * float(np.median(spacing)))).any():
             where, about = (" of the endoscope", "") if name == _ENDOSCOPE else ("", name)
             job.warning(f"{counted(int(long.sum()), 'gap')} of up to {spacing.max():.3g} s in the log{where}.", about)
@@ -179,7 +181,7 @@ def _frames_with_kinematics(recording: FoundRecording, job: Import) -> FoundReco
     ids = tuple(frame for frame, kept in zip(recording.frame_ids, keep, strict=True) if kept)
     cameras = []
     for camera in recording.cameras:
-        # Videos with consecutively numbered frames need explicit numbers if some frames are omitted.
+        # Videos with consecutive frames need explicit frame numbers if frames are omitted.
         numbers = np.arange(len(keep)) if camera.numbers is None and not camera.pattern else camera.numbers
         cameras.append(replace(camera, numbers=None if numbers is None else numbers[keep]))
     return replace(recording, frame_ids=ids, frame_times=recording.frame_times[keep], cameras=tuple(cameras))
@@ -250,7 +252,7 @@ def write_sequence(recording: FoundRecording, folder: Path, *, overwrite: bool =
 
 
 def _place_of(error: TableError, recording: FoundRecording) -> str:
-    """Location of an error in the recording instead of a temporary table."""
+    """Location of an error in the recording, instead of the temporary table."""
     arm = next((arm for arm in recording.arms if error.path.name == _table_of(arm)), None)
     if error.row is None:
         return "" if arm is None else f": log of {arm.name}"
@@ -285,7 +287,7 @@ def _tables(recording: FoundRecording) -> dict[str, bytes]:
             if len(arm.values) != len(recording.frame_ids):
                 raise SequenceError(
                     f"{arm.name} has {len(arm.values)} rows of joint positions for {len(recording.frame_ids)} images. "
-                    "Each image needs one row. Remove the others, or give images and rows times."
+                    "Each image needs one row. Remove the other rows, or give times for images and rows."
                 )
             for name, values in zip(arm.columns, arm.values.T, strict=True):
                 frame_columns[f"{arm.name}.{name}"] = [f"{value:.9f}" for value in values]
@@ -302,7 +304,7 @@ def _tables(recording: FoundRecording) -> dict[str, bytes]:
 
 
 def _moves(recording: FoundRecording) -> bool:
-    """Whether camera motion is written, which needs logs with times."""
+    """Whether camera motion is written, which requires logs with times."""
     return recording.motion is not None and any(arm.times is not None for arm in recording.arms)
 
 
@@ -366,5 +368,5 @@ def _relative(path: Path, place: Path) -> str:
 
 
 def _text(value: object) -> str:
-    """Text, or a list of texts, as TOML, whose strings are those of JSON."""
+    """Format a string or a list of strings as TOML, with the syntax of JSON strings."""
     return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")

@@ -20,4 +20,4 @@ SOURCES: tuple[Source, ...] = (
     _datasets.JIGSAWS,
     _folder.SOURCE,
 )
-"""Sources in order of detection: the most specific first, the generic folder last."""
+"""Sources in order of detection, from the most specific to the generic folder."""

@@ -1,4 +1,4 @@
-"""ROS 1 and ROS 2 bags with topics of the dVRK: 1.x, 2.0, 2.2 and later, and of simulators that use CRTK."""
+"""ROS 1 and ROS 2 bags with topics of the dVRK (1.x, 2.0, 2.2 and later) or of simulators that use CRTK."""
 
 import os
 import re
@@ -24,7 +24,7 @@ _JOINTS = ("measured_js", "state_joint_current")
 
 
 def read_endoscope(bag: Bag, start: float, job: Import) -> Track | None:
-    """Motion of the endoscope, from the time of the first image [s]; None if it is static."""
+    """Motion of the endoscope, from the time of the first image [s]; None for a static endoscope."""
     topics = [topic for topic, _ in bag.topics if "/suj/" not in topic.casefold()]
     for role, names in (("poses", _POSES), ("joints", _JOINTS)):
         endings = [f"/ecm/{name}" for name in names]
@@ -37,7 +37,7 @@ def read_endoscope(bag: Bag, start: float, job: Import) -> Track | None:
 
 
 def _guessed_offset(times: Float[np.ndarray, " frames"], arms: list[FoundArm], job: Import) -> float:
-    """Time in the kinematics minus time of image files [s]: 0 for overlapping clocks, else with a common start."""
+    """Kinematics time minus time of image files [s]: 0 for overlapping clocks, else from a common start."""
     logs = [arm.times for arm in arms if arm.times is not None]
     apart = bool(logs) and (times[0] > max(log[-1] for log in logs) or times[-1] < min(log[0] for log in logs))
     offset = float(max(log[0] for log in logs) - times[0]) if apart else 0.0
@@ -49,7 +49,7 @@ def _guessed_offset(times: Float[np.ndarray, " frames"], arms: list[FoundArm], j
 def _separate_images(
     path: Path, topics: list[str], job: Import
 ) -> tuple[tuple[FoundCamera, ...], tuple[str, ...], Float[np.ndarray, " frames"]] | None:
-    """Cameras, frame ids and times [s] of images given as files; None if none are given or they are topics."""
+    """Cameras, frame ids and times [s] of images given as files; None if no files are given."""
     given, files = job.options.images, {}
     for name, image in given.items():
         beside = [place for place in (Path(image), path.parent / image) if os.path.exists(place)]
@@ -84,7 +84,7 @@ _PREFERRED = ("rect", "compressed", "")
 
 
 def read_arm_logs(bag: Bag, job: Import) -> list[ArmLog]:
-    """Logs of the arms in a bag by name; notes report joints in another order."""
+    """Read the logs of the arms in a bag; notes report joints in another order."""
     wanted: dict[str, tuple[str, str]] = {}
     names = {recorded.casefold(): name for name, recorded in job.options.arms.items()}
     seen: set[str] = set()
@@ -117,7 +117,7 @@ def read_arm_logs(bag: Bag, job: Import) -> list[ArmLog]:
 
 
 def _note_names(arm: str, names: tuple[str, ...], job: Import) -> None:
-    """Report joints that are in another order, or have other names."""
+    """Report joints in another order or with other names."""
     order = order_of_names(names)
     if order is not None and order != tuple(range(len(JOINT_NAMES))):
         job.found(f"joint positions are in the order {', '.join(names)}; joints are matched by name.", arm)
@@ -192,7 +192,7 @@ def _cameras(bag: Bag, job: Import) -> tuple[tuple[FoundCamera, ...], np.ndarray
 
 
 def _camera_info(bag: Bag, topic: str) -> Any:
-    """The camera_info of an image topic: of the same namespace, or of the same side; None if there is none."""
+    """The camera_info of an image topic, from the same namespace or of the same side; None if not found."""
     infos = [info for info, kind in bag.topics if kind == _INFO_TYPE]
     parents = [topic.rsplit("/", depth)[0] for depth in (1, 2, 3)]
     chosen = [info for parent in parents for info in infos if info.rsplit("/", 1)[0] == parent]

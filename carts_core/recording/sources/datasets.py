@@ -1,4 +1,4 @@
-"""Data sets with specific layouts: SurgPose, EndoVis 2017 and 2018, JIGSAWS, SurgSync, and those of CaRTS.
+"""Data sets with specific layouts: SurgPose, EndoVis 2017 and 2018, JIGSAWS, SurgSync, and the data sets of CaRTS.
 
 SurgPose      NNNNNN/{regular,green}/{left,right}_video.mp4, api_jp_data.yaml, StereoCalibrationDVRK.ini
 EndoVis       {instrument_dataset_N,seq_N}/{left_frames,right_frames}/frame000.png, camera_calibration.txt
@@ -35,10 +35,10 @@ from ..importing.row_matching import by_rows, frame_times
 
 _JIGSAWS_COLUMNS = 76
 _JIGSAWS_ARMS = {"PSM_left": 38, "PSM_right": 57}
-"""Arm -> its first column, from 0: x y z, R by rows, two velocities and the gripper's angle."""
+"""Arm -> index of its first column: x y z, R by rows, two velocities and the gripper angle."""
 _JIGSAWS_RATE = 30.0
 _LISTED = 12
-"""Largest number of trials listed in an error."""
+"""Maximum number of trials listed in an error."""
 _ENDOVIS_PART = (320, 28, 1280, 1024)
 """Left, top, width and height of the picture inside EndoVis frames of 1920 x 1080 [px]."""
 
@@ -59,7 +59,7 @@ def _read_surgpose(path: Path, job: Import) -> FoundRecording:
     cameras = cameras_of(images, job, dict.fromkeys(images, calibration) if calibration else {})
     ids = common_ids(images, path)
     file = min(path.rglob("api_jp_data.yaml"))
-    with well_formed(f"{file} is not a YAML file of frames with joints by arm"):
+    with well_formed(f"{file} does not map frames to the joint positions of each arm"):
         rows = {int(frame): dict(row) for frame, row in parse_yaml(read_text(file, VALUES)).items()}
     wanted = set(job.options.arms.values()) or {"PSM1", "PSM2", "PSM3"}
     names = sorted({str(arm) for row in rows.values() for arm in row} & wanted)
@@ -77,7 +77,7 @@ def _read_surgpose(path: Path, job: Import) -> FoundRecording:
     times = frame_times(images["left"], ids, job).times
     if len(rows) != len(ids):
         text = f"{file.name} has {len(rows)} rows, and the videos have {len(ids)} images."
-        job.warning(f"{text} Each row is assigned to the image of its number. Check the delay.")
+        job.warning(f"{text} Each row is assigned to the image with its number. Check the delay.")
     found, kept_ids, kept = by_rows(arms, ids, job, times)
     job.warning(
         "the kinematics of SurgPose need compensation, its base frames differ between trajectories, and the rows of "
@@ -128,7 +128,7 @@ def _endovis_calibration(camera: FoundCamera, file: Path, job: Import) -> FoundC
 
 
 def jigsaws_trials(folder: Path) -> tuple[Path, ...]:
-    """Kinematics of the JIGSAWS trials in the data set's root, a task or one of its folders, sorted by name."""
+    """Kinematics files of the JIGSAWS trials in the data set's root, a task or one of its folders, sorted by name."""
     levels = ("", "AllGestures", "kinematics/AllGestures", "*/kinematics/AllGestures", "*/*/kinematics/AllGestures")
     try:
         found = {file for level in levels for file in folder.glob(f"{level}/*.txt" if level else "*.txt")}
@@ -251,7 +251,7 @@ def _read_surgsync(path: Path, job: Import) -> FoundRecording:
 
 
 def _with_extrinsics(camera: FoundCamera, file: Path, job: Import) -> FoundCamera:
-    """The right camera at its pose of the stereo calibration, if the file has R and T."""
+    """Right camera with the pose of the stereo calibration, if the file has R and T."""
     if camera.name != "right":
         return camera
     content = read_json(file)
@@ -266,7 +266,7 @@ def _with_extrinsics(camera: FoundCamera, file: Path, job: Import) -> FoundCamer
 
 
 def _packed(path: Path, arm: str) -> dict[str, Any]:
-    """Time series of an arm by rows of its table; times are row numbers."""
+    """Time series of an arm from its table; times are row numbers."""
     file = path / f"{arm}.parquet"
     if not file.is_file():
         return dict.fromkeys(_TRACKS)
@@ -288,7 +288,7 @@ def _packed(path: Path, arm: str) -> dict[str, Any]:
 
 
 def _raw(path: Path, arm: str, ids: tuple[str, ...]) -> dict[str, Any]:
-    """Time series of an arm from a JSON file per frame; times are positions in `ids`."""
+    """Time series of an arm from one JSON file per frame; times are indices into `ids`."""
     folder = path / "kinematic" / arm
     rows: dict[str, list[tuple[float, ...]]] = {role: [] for role in _TRACKS}
     for position, frame in enumerate(ids):
@@ -300,7 +300,7 @@ def _raw(path: Path, arm: str, ids: tuple[str, ...]) -> dict[str, Any]:
             top = content[0] if isinstance(content, list) else content
             body = top["arm"]
             measured = body["measured_data"]
-            # Offline recordings keep the jaw inside the arm.
+            # Offline recordings store the jaw within the arm.
             jaw = top.get("jaw") or body.get("jaw") or {}
             values = {
                 "joints": _named_positions(measured.get("measured_js") or {}),
@@ -343,16 +343,16 @@ _AMBF_COLUMNS = 8
 _AMBF_FIELD_OF_VIEW = 1.2
 """Vertical field of view of the simulated camera [rad]."""
 _DECIMETRES_FROM = 0.3
-"""Insertion above which a simulation counts in decimetres [m]."""
+"""Insertion above which the lengths of a simulation are in decimetres [m]."""
 
 
 def _ordered(names: Iterable[str]) -> list[str]:
-    """Domains, the regular one first."""
+    """Sort domains, the regular domain first."""
     return sorted(names, key=lambda name: (name not in _FIRST, name))
 
 
 def _domain_images(path: Path, domains: list[str], folders: dict[str, str], job: Import) -> dict[str, Images]:
-    """Images of each camera in all domains under one pattern, with the frames that all domains have."""
+    """Images of each camera, with one pattern for all domains and the frames that all domains have."""
     images = {}
     for camera, folder in folders.items():
         if not all(image_files(path / domain / folder) for domain in domains):
@@ -375,7 +375,7 @@ def _domain_images(path: Path, domains: list[str], folders: dict[str, str], job:
 
 
 def _with_masks(camera: FoundCamera, folder: Path, ids: tuple[str, ...], job: Import) -> FoundCamera:
-    """The camera with the masks of a folder, if they are white on black."""
+    """Camera with the masks of a folder, if these are white on black."""
     if not image_files(folder):
         return camera
     masks = find_images(folder)
@@ -423,7 +423,8 @@ def _domains(names: list[str]) -> dict[str, str]:
 def _timed(
     arms: list[FoundArm], ids: tuple[str, ...], images: Images, job: Import
 ) -> tuple[tuple[FoundArm, ...], np.ndarray | None]:
-    """Arms with rows at the times of their images if a frame rate is given, and these times [s]."""
+    """Arms with rows at the times of their images, and these times [s]; None for the times without a given frame
+    rate."""
     times = frame_times(images, ids, job).times
     rows = np.arange(len(ids), dtype=float)
     found, _, _ = by_rows([replace(arm, times=rows) for arm in arms], ids, job, times)
@@ -431,7 +432,7 @@ def _timed(
 
 
 def _arm(name: str, values: np.ndarray, ids: tuple[str, ...], file: Path, job: Import) -> FoundArm:
-    """Joint positions of the frames: row n is frame n if no row is missing, else rows are matched in order."""
+    """Joint positions of the frames: row n is frame n if no rows are missing, else rows are matched in order."""
     if values.shape[1] < 6 or not np.isfinite(values).all():
         raise SequenceError(f"{file} does not have six finite joint positions per row. Copy it again.")
     numbers = np.array([int(frame) for frame in ids])

@@ -1,8 +1,8 @@
-"""Sessions of the dVRK's official recorder: index.json, videos with JSON sidecars, a ROS 2 bag or extracted CSV files.
+"""Sessions of the dVRK recorder: index.json, videos with JSON sidecars, and a ROS 2 bag or extracted CSV files.
 
-The time of a frame is that of its camera or of both (mono, else the mean of left and right, else left, else right),
-else the time at which the recorder received it. Frames are identified by number, never by time. The latency estimated
-in a sidecar is not applied to these times; it is proposed as the time offset.
+The time of a frame is the camera's time (mono, else the mean of left and right, else left, else right), else the time
+of reception. Frames are identified by number, never by time. The estimated latency of a sidecar is not applied to these
+times, but proposed as the time offset.
 """
 
 from dataclasses import dataclass, replace
@@ -31,12 +31,12 @@ _POSE_COLUMNS = (*(f"pose.position.{axis}" for axis in "xyz"), *(f"pose.orientat
 
 @dataclass(frozen=True, eq=False)
 class _Stream:
-    """A video and the times of its frames."""
+    """Video and the times of its frames."""
 
     video: Path
     name: str
     numbers: np.ndarray
-    """Frames of the video, from 0."""
+    """Number of each frame in the video, from 0."""
     times: np.ndarray
     """Time of each frame [s]."""
     side_by_side: str
@@ -98,7 +98,7 @@ def _stream(video: Path, sidecar: Path, job: Import) -> _Stream:
 
 
 def _frame_time(frame: dict[str, Any]) -> float:
-    """Time of a frame by the recorder's documentation [s]."""
+    """Time of a frame, as documented for the recorder [s]."""
     real = frame["cpu"]["realtime"]
 
     def known(key: str) -> int | None:
@@ -114,7 +114,7 @@ def _frame_time(frame: dict[str, Any]) -> float:
 
 
 def _checked(stream: _Stream, sidecar: Path, job: Import) -> _Stream:
-    """The stream without frames that are missing in the video, sorted by time."""
+    """Stream sorted by time, without frames that are missing in the video."""
     count = len(find_images(stream.video).ids)
     if stream.numbers.max() >= count or len(stream.numbers) < count:
         job.warning(
@@ -175,7 +175,7 @@ def _logs(path: Path, start: float, job: Import) -> tuple[list[ArmLog], Track | 
         "measured_cp": "poses",
     }
     found: dict[str, dict[str, Any]] = {}
-    # CSV files are named by topic, `_PSM1_measured_js.csv`.
+    # CSV files are named after their topic, such as `_PSM1_measured_js.csv`.
     for file in sorted(path.glob("*.csv")):
         recorded, _, topic = file.stem.strip("_").partition("_")
         if recorded.startswith("PSM") and topic in roles and (arm := job.arm_name(recorded)) is not None:

@@ -36,7 +36,7 @@ _CALIBRATION_WORDS = re.compile(
 
 
 def _folders(path: Path) -> list[Path]:
-    """Visible folders down to two levels below a folder, itself included."""
+    """A folder and its visible subfolders, down to two levels."""
     found, level = [path], [path]
     for _ in range(_DEPTH):
         level = sorted(each for folder in level for each in subfolders(folder))[:200]
@@ -82,7 +82,7 @@ def _images(path: Path, options: ImportOptions) -> dict[str, Images]:
 
 
 def _calibrations(path: Path, cameras: list[str], job: Import) -> dict[str, Path]:
-    """Calibration files of the cameras without a given one: of the same side, or the only one."""
+    """Calibration files for cameras without a given calibration: the file of the same side, or the only file."""
     files = [file for file in _files(path, _CALIBRATION_SUFFIXES) if _looks_like_calibration(file)]
     found: dict[str, Path] = {}
     for camera in cameras:
@@ -110,7 +110,7 @@ def _looks_like_calibration(file: Path) -> bool:
 
 
 def kinematics_table(path: Path, options: ImportOptions) -> ForeignTable | None:
-    """Find the table of kinematics: the given one, one with an arm, or else one with many numbers."""
+    """Find the kinematics table: the given table, a table with an arm, or else a table with many numbers."""
     if options.kinematics == NO_TABLE:
         return None
     if options.kinematics is not None:
@@ -133,7 +133,7 @@ def _is_wide(table: ForeignTable) -> bool:
 
 
 def _kinematics(path: Path, job: Import) -> list[tuple[ForeignTable, ColumnMeanings]]:
-    """Tables that contain an arm, each a different one, with the meanings of their columns."""
+    """Tables of different arms, with the meanings of their columns."""
     options = job.options
     if options.kinematics == NO_TABLE:
         return []
@@ -146,7 +146,7 @@ def _kinematics(path: Path, job: Import) -> list[tuple[ForeignTable, ColumnMeani
         if not any(meanings.arms for _, meanings in found):
             for file in _tables(path):
                 if file.suffix.lower() in (".csv", ".tsv", ".parquet"):
-                    read_foreign_table(file)  # Raises the error of an unreadable table.
+                    read_foreign_table(file)  # This raises the error of an unreadable table.
             found = [(table, meanings) for table, meanings in found if _is_wide(table)][:1]
     known: dict[str, ForeignTable] = {}
     chosen = []
@@ -176,7 +176,7 @@ def _kinematics(path: Path, job: Import) -> list[tuple[ForeignTable, ColumnMeani
 
 
 def _frames(path: Path, images: Images, ids: tuple[str, ...], kinematics: list[Path], job: Import) -> FrameTimes:
-    """Images with their times: from a table with as many rows as images, else from a video's rate."""
+    """Frames and their times, from a table with as many rows as images, else from the rate of a video."""
     for file in _tables(path):
         table = None if file in kinematics else _readable(file)
         if table is None:
@@ -236,7 +236,7 @@ def _note_missing_kinematics(path: Path, job: Import) -> None:
 def _matched(
     found: list[tuple[ForeignTable, ColumnMeanings]], frames: FrameTimes, job: Import
 ) -> tuple[tuple[FoundArm, ...], RowMatch]:
-    """Arms of all tables, and the common matching of their rows with images."""
+    """Arms of all tables, and the common matching of rows and images."""
     arms: list[FoundArm] = []
     matches: list[RowMatch] = []
     for table, meanings in found:

@@ -23,17 +23,17 @@ _EPISODE = re.compile(r"episode_(\d+)\.parquet$")
 
 @dataclass(frozen=True, eq=False)
 class _Episode:
-    """One episode: its rows, and its location in the videos."""
+    """Episode with its rows, and its location in the videos."""
 
     index: int
     table: ForeignTable
-    """The episode's rows."""
+    """Rows of the episode."""
     videos: dict[str, tuple[Path, int]]
-    """Feature -> video, and the number of the episode's first frame in it."""
+    """Feature -> video, and number of the episode's first frame in the video."""
 
 
 def _root(path: Path) -> Path:
-    """The data set's folder, also given one of its episode files."""
+    """Folder of the data set, given this folder or an episode file."""
     if path.is_file() and _EPISODE.search(path.name):
         return next((parent for parent in path.parents if (parent / "meta/info.json").is_file()), path)
     return path
@@ -63,7 +63,7 @@ def _read(path: Path, job: Import) -> FoundRecording:
 
 
 def _times(episode: _Episode, rate: float, job: Import) -> np.ndarray:
-    """Times of an episode's rows, which are its images [s]: from their column, else from the rate."""
+    """Times of the rows, and thereby images, of an episode [s]: from their column, else from the frame rate."""
     even = np.arange(len(episode.table)) / rate
     if "timestamp" not in episode.table.columns:
         return even
@@ -79,7 +79,7 @@ def _times(episode: _Episode, rate: float, job: Import) -> np.ndarray:
             "row n is assigned to image n of the episode."
         )
         return times
-    # Times in single precision are no more accurate than the rate.
+    # Single-precision times are not more accurate than the frame rate.
     return even
 
 
@@ -122,7 +122,7 @@ def _parquet(path: Path) -> ForeignTable:
 
 
 def _names(value: Any) -> list[str]:
-    """Names of a feature's columns, possibly nested in lists or under a key."""
+    """Column names of a feature, which may be nested in lists or under a key."""
     if isinstance(value, str):
         return [value]
     if isinstance(value, dict):
@@ -179,7 +179,7 @@ def _cameras(
         job.found(f"{key}, {images.size[0]} x {images.size[1]}.", name)
         numbers = start + kept
         if start == 0 and len(images.ids) > rows and images.times is not None:
-            # A video of this episode alone, with images that have no row.
+            # The video contains only this episode, with images that have no row.
             numbers = nearest(times, images.times - images.times[0])[kept]
             job.warning(f"{video.name} has {len(images.ids)} images for {rows} rows, which are matched by time.")
         camera = FoundCamera(name, images.size, video, numbers=numbers)

@@ -126,8 +126,8 @@ def rewritten(name: str, old: str, new: str) -> Callable[[Path], object]:
 
 
 MUTATIONS: dict[str, tuple[Callable[[Path], Path], Callable[[Path], object], str]] = {
-    "SurgPose, cut YAML": (surgpose, write("api_jp_data.yaml", "'0': {"), "is not a YAML file"),
-    "SurgPose, a list": (surgpose, write("api_jp_data.yaml", "[1]"), "is not a YAML file"),
+    "SurgPose, cut YAML": (surgpose, write("api_jp_data.yaml", "'0': {"), "does not map frames to"),
+    "SurgPose, a list": (surgpose, write("api_jp_data.yaml", "[1]"), "does not map frames to"),
     "SurgPose, no arms": (surgpose, write("api_jp_data.yaml", "'0': {}"), "no joint positions of"),
     "SurgPose, texts": (surgpose, write("api_jp_data.yaml", "'0': {PSM1: [a, b, c, d, e, f]}"), "are not numbers"),
     "SurgPose, five joints": (
