@@ -8,14 +8,14 @@ from typing import Any
 import numba
 
 _SAID = "CARTS_COMPILED_UNCACHED"
-"""Environment variable that tells child processes that the warning was printed."""
+"""Environment variable that suppresses the warning in child processes after it was printed."""
 
 
 def compiled(function: Callable[..., Any]) -> Any:
-    """`function` compiled by numba, with a cache on disk.
+    """Compile a function with numba, with a cache on disk.
 
-    If neither the module's folder nor the user's cache is writable, each process compiles it again, which takes some
-    seconds; a warning is printed once on standard error.
+    If neither the module's folder nor the user's cache is writable, each process compiles the function again, which
+    takes seconds; a warning is printed once on standard error.
     """
     options: dict[str, Any] = {"nogil": True, "fastmath": False, "error_model": "numpy"}
     try:

@@ -1,7 +1,7 @@
 """Console output that escapes markup and control characters in untrusted text.
 
-Names, paths and error messages may come from untrusted files. Square brackets in them are not interpreted as markup;
-characters that control the terminal or reverse the text direction are shown as escapes.
+Names, paths and error messages may come from untrusted files. Square brackets are not interpreted as markup, and
+characters that control the terminal or reverse the text direction are escaped.
 """
 
 import logging
@@ -38,7 +38,7 @@ _MARKDOWN = re.compile(r"([\\`*{}\[\]#|!]|(?<![A-Za-z0-9])_|_(?![A-Za-z0-9]))")
 
 
 def visible(text: str) -> str:
-    r"""`text` with control characters as escapes, such as `\x1b`."""
+    r"""Escape control characters in a string, such as `\x1b`."""
     if text.isascii() and text.isprintable():
         return text
     return "".join(
@@ -50,12 +50,12 @@ def visible(text: str) -> str:
 
 
 def in_markdown(text: str) -> str:
-    """`text` as one line of Markdown, escaped for Markdown and HTML."""
+    """Convert a string to one line of Markdown, escaped for Markdown and HTML."""
     return _MARKDOWN.sub(r"\\\1", visible(" ".join(text.split())).replace("&", "&amp;").replace("<", "&lt;"))
 
 
 class Terminal(Console):
-    """A console without markup, emoji codes or control characters."""
+    """Console without markup, emoji codes and control characters."""
 
     def render_str(self, text: str, **options: Any) -> Text:  # pyright: ignore[reportIncompatibleMethodOverride]
         """Convert a string to text without markup; overrides rich's method."""
@@ -75,7 +75,7 @@ class PlainColumn(TextColumn):
 
 
 class Bar(Progress):
-    """A progress bar on a `Terminal`."""
+    """Progress bar on a `Terminal`."""
 
     def __init__(self, *columns: str | ProgressColumn, console: Console | None = None, **options: Any) -> None:
         super().__init__(*columns, console=console or Terminal(), **options)
@@ -111,7 +111,7 @@ class Bar(Progress):
 def track(
     items: Iterable[T], description: str, *, console: Console, total: float | None = None, disable: bool = False
 ) -> Iterator[T]:
-    """Yield the items, showing a progress bar."""
+    """Yield the items and display a progress bar."""
     with Bar(console=console, disable=disable) as bar:
         yield from bar.track(items, total=total, description=description)
 

@@ -21,7 +21,7 @@ class RobotError(CartsError):
 
 
 class SequenceError(CartsError):
-    """A sequence file, or a file that it names, cannot be used."""
+    """A sequence file, or a file it refers to, cannot be used."""
 
 
 class WeightsError(CartsError):
@@ -29,7 +29,7 @@ class WeightsError(CartsError):
 
 
 class SettingsError(CartsError):
-    """A setting is out of range or contradicts another one."""
+    """A setting is out of range or contradicts another setting."""
 
 
 class ProjectError(CartsError):

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Cell:
-    """A cell of a table."""
+    """Cell of a table."""
 
     text: str
     note: str = ""
@@ -23,7 +23,7 @@ class Cell:
 
 @dataclass(frozen=True)
 class Table:
-    """A table of a report."""
+    """Table of a report."""
 
     title: str
     caption: str
@@ -32,7 +32,7 @@ class Table:
 
     @staticmethod
     def of(title: str, caption: str, rows: Sequence[Mapping[str, str | Cell]]) -> "Table | None":
-        """Table whose headings are the keys of its rows; None if there are no rows."""
+        """Table whose headings are the keys of its rows; None without rows."""
         if not rows:
             return None
         cells = (tuple(cell if isinstance(cell, Cell) else Cell(cell) for cell in row.values()) for row in rows)
@@ -40,13 +40,13 @@ class Table:
 
 
 def render_page(template: str, **values: object) -> str:
-    """Render a template, given by its file name, to a page."""
+    """Render a page from a template, given by its file name."""
     return _templates().get_template(template).render(values)
 
 
 @cache
 def _templates() -> "Environment":
-    # Imported late, because `carts view` does not need reports.
+    # Imported here, because `carts view` does not need reports.
     from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape  # noqa: PLC0415
 
     templates = Environment(

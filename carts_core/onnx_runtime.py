@@ -17,11 +17,11 @@ def inference_session(graph: bytes, threads: int | None = None, *, fold: bool = 
 
     Args:
         threads: number of threads per operator; None lets ONNX Runtime choose.
-        fold: fold constants when the graph is loaded; for an untrusted graph this may require unlimited memory.
+        fold: fold constants on loading; for an untrusted graph, this may require unlimited memory.
 
     Raises:
         ImportError: ONNX Runtime is not installed.
-        RuntimeError: it cannot load the graph.
+        RuntimeError: ONNX Runtime cannot load the graph.
     """
     # The library reads this variable when it is loaded.
     os.environ["ORT_DISABLE_TELEMETRY"] = "1"
@@ -33,11 +33,11 @@ def inference_session(graph: bytes, threads: int | None = None, *, fold: bool = 
         options.intra_op_num_threads, options.inter_op_num_threads = threads, 1
         # Spinning threads would compete for the cores with other work, such as torch's.
         options.add_session_config_entry("session.intra_op.allow_spinning", "0")
-    # Its memory pool keeps a block for every image size and never frees one.
+    # The memory pool would keep a block for every image size and never free it.
     options.enable_cpu_mem_arena = options.enable_mem_pattern = not memory_kept()
     options.log_severity_level = 3
     left_out = [] if fold else ["ConstantFolding"]
     try:
         return onnxruntime.InferenceSession(graph, options, ["CPUExecutionProvider"], disabled_optimizers=left_out)
-    except Exception as error:  # Its exceptions have no more specific base class.
+    except Exception as error:  # Exceptions of ONNX Runtime have no more specific base class.
         raise RuntimeError(str(error)) from error

@@ -12,10 +12,10 @@ _MMAP_THRESHOLD = 1 << 30
 """Allocations below this size come from the heap, which keeps freed memory [bytes]."""
 
 _TRIM_THRESHOLD = 1 << 28
-"""Free memory at the end of the heap beyond which it is returned to the system [bytes]."""
+"""Amount of free memory at the end of the heap above which memory is returned to the system [bytes]."""
 
 _ARENAS = 2
-"""Number of malloc arenas. By default there are up to 8 per core, and each keeps its peak size."""
+"""Number of malloc arenas. The default is up to 8 per core, each of which keeps its peak size."""
 
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD, _M_ARENA_MAX = -1, -3, -8
 """Parameter numbers from glibc's malloc.h."""
@@ -37,17 +37,17 @@ _TUNED = _Tuned()
 def tune_process() -> None:
     """Tune threads and memory of the process; called at program start, not by libraries.
 
-    Freed memory is kept for the next image, which is faster; a server releases it with `return_memory`.
+    Freed memory is kept for the next image, which is faster; a server returns memory with `return_memory`.
     """
     _leave_a_core_free()
     _keep_memory()
 
 
 def _leave_a_core_free() -> None:
-    """Limit torch to one thread fewer than there are cores, four at most, unless `OMP_NUM_THREADS` is set.
+    """Limit torch to one thread less than the number of cores, four at most, unless `OMP_NUM_THREADS` is set.
 
     Each parallel step waits for its slowest thread: with another process on one core, an iteration took 2.6 s instead
-    of 0.1 s.
+        of 0.1 s.
     """
     if "OMP_NUM_THREADS" not in os.environ:
         import torch  # noqa: PLC0415  child processes without torch import this module, too
@@ -72,7 +72,7 @@ def inference_threads() -> int:
 def _keep_memory() -> None:
     """Make glibc keep the memory of images instead of returning it to the system.
 
-    The system clears each new page on first access: with it, a rendering of 640x480 px took 29 ms instead of 16 ms.
+    The system clears each new page on first access, with which a rendering of 640x480 px took 29 ms instead of 16 ms.
     `MALLOC_...` variables of the environment take precedence.
     """
     mallopt = _of_malloc("mallopt")
@@ -89,7 +89,7 @@ def _keep_memory() -> None:
 
 
 def memory_kept() -> bool:
-    """Whether malloc keeps the memory of images, so that libraries need no pool of their own."""
+    """Whether malloc keeps the memory of images, so that libraries do not need their own memory pools."""
     return _TUNED.memory_kept
 
 

@@ -1,7 +1,7 @@
-"""Provenance of results: fingerprints of inputs, and checkpoints from which a stopped run resumes identically.
+"""Provenance of results: fingerprints of inputs, and checkpoints of intermediate results.
 
-The key of a checkpoint's entry is a hash of all inputs of its computation, so entries do not depend on the order of
-computation, and a changed input invalidates them. Truncated or altered lines are ignored.
+The key of an entry in a checkpoint is a hash of all inputs of the computation, so entries do not depend on the order of
+computation, and a changed input invalidates an entry. Truncated or altered lines are ignored.
 """
 
 import hashlib
@@ -49,7 +49,7 @@ def fingerprint(*parts: bytes | str | float | np.ndarray | Iterable) -> str:
 
 @cache
 def code_fingerprint(patterns: tuple[str, ...]) -> str:
-    """SHA-256 of modules of the package, given by patterns such as `rendering/**/*.py`."""
+    """SHA-256 of the source code of modules, given by patterns such as `rendering/**/*.py`."""
     package = Path(__file__).resolve().parent
     digest = hashlib.sha256()
     for pattern in patterns:
@@ -97,7 +97,7 @@ class Checkpoint:
 
     Args:
         made_with: fingerprint of the common inputs; a file with a different fingerprint is replaced.
-        classes: the frozen dataclasses that values may contain, besides numbers, lists and float64 arrays.
+        classes: frozen dataclasses that values may contain, in addition to numbers, lists and float64 arrays.
 
     Attributes:
         recalled: number of values read from the file.
@@ -138,7 +138,9 @@ class Checkpoint:
         try:
             lines = self._path.path.read_text(encoding="utf-8", errors="replace").splitlines()
         except OSError as error:
-            raise OutputError(f"{self._path} cannot be read ({error.strerror}). Remove it to start over.") from error
+            raise OutputError(
+                f"{self._path} cannot be read ({error.strerror}). Remove the file to start over."
+            ) from error
         if not lines or lines[0] != f"{_FORMAT} {self._made_with}":
             return {}
         entries = {}
@@ -160,7 +162,7 @@ class Checkpoint:
 
 
 def _encoded(value: Any) -> Any:
-    """The value as JSON; float64 values keep all bits."""
+    """Encode a value as JSON, with all bits of float64 values."""
     if isinstance(value, np.ndarray):
         assert value.dtype == np.float64
         return {"array": value.ravel().tolist(), "shape": value.shape}
@@ -190,7 +192,7 @@ class Record:
     verdict: str = ""
     """`good`, `doubtful` or `failed`; empty without an assessment."""
     reason: str = ""
-    """Reason for the verdict, one sentence."""
+    """Reason for the verdict, as a sentence."""
     probability: float | None = None
     """Probability that the mask is wrong [1]."""
     not_determined: Sequence[str] | None = None
@@ -205,8 +207,8 @@ def read_records(path: OutputPath | Path) -> dict[str, Record]:
         content = parse_json(read_bytes(as_output(path).path, TABLE), finite=False)
         if content["format"] != RESULTS_FORMAT:
             raise SettingsError(
-                f"{path} has the format {content['format']!r}; this version knows {RESULTS_FORMAT}. Use the version "
-                "that wrote it, or choose another folder with --output."
+                f"{path} has the format {content['format']!r}; this version supports {RESULTS_FORMAT}. Use the version "
+                "that wrote the file, or choose another folder with --output."
             )
         return typed(content["frames"], dict[str, Record])
     except (OSError, ValueError, TypeError, KeyError):

@@ -1,4 +1,4 @@
-"""Paths of shipped files, which are beside the packages in a checkout and inside `carts_core` in a wheel."""
+"""Paths of shipped files, which are next to the packages in a checkout and in `carts_core` in a wheel."""
 
 from pathlib import Path
 

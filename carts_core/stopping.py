@@ -30,10 +30,10 @@ _NEVER_CUT = (
     *("importlib.", "_frozen_importlib", "llvmlite.", "numba.", "weakref", "_weakref"),
     "carts_core.project.database",
 )
-"""Prefixes of modules in which no exception may be raised from a signal handler.
+"""Prefixes of modules in which a signal handler must not raise an exception.
 
 Numba loads kernels through LLVM, and a project is opened through SQLite; both call back into Python, where an exception
-is lost, and LLVM ends the process with SIGSEGV. Exceptions in finalizers are lost, too. A partially imported module is
+is lost, and LLVM ends the process with SIGSEGV. Exceptions in finalizers are also lost. A partially imported module is
 unusable.
 """
 _OURS = ("carts_core", "carts_viewer")
@@ -53,8 +53,8 @@ _POLL = 1.0
 def end_with_parent(parent: int, number: int = signal.SIGTERM) -> None:
     """Send a signal to this process when its parent exits, even through SIGKILL; immediately if it has already exited.
 
-    Linux sends the signal (`prctl(PR_SET_PDEATHSIG)`) when the thread that started this process ends. Elsewhere, a
-    thread checks once a second.
+    Linux sends the signal (`prctl(PR_SET_PDEATHSIG)`) when the thread that started this process ends. On other systems,
+    a thread checks for the parent once a second.
     """
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, number)
@@ -71,7 +71,7 @@ def _signal_at_end(parent: int, number: int) -> None:
 
 
 class _Unfinished:
-    """Number of active `finished_first` blocks, and the signal deferred until they end."""
+    """Number of active `finished_first` blocks, and signal that is deferred until the end of these blocks."""
 
     blocks = 0
     waiting: int | None = None
@@ -79,11 +79,11 @@ class _Unfinished:
 
 @contextmanager
 def stopped_by_signals() -> Iterator[None]:
-    """In the block, make SIGTERM, SIGHUP and Ctrl-C raise `Stopped` in the main thread.
+    """Make SIGTERM, SIGHUP and Ctrl-C raise `Stopped` in the main thread during the block.
 
-    A signal received in library code is deferred until that code returns, for two seconds at most; during an import,
-    the loading of a kernel or a finalizer it is deferred without limit. Ignored signals stay ignored, such as SIGHUP
-    under `nohup`. Child processes get the default handlers.
+    A signal received in library code is deferred until that code returns, for at most two seconds. During an import,
+    the loading of a kernel or a finalizer, the signal is deferred without a limit. Ignored signals stay ignored, such
+    as SIGHUP under `nohup`. Child processes have the default handlers.
     """
     if threading.current_thread() is not threading.main_thread():
         yield
@@ -120,11 +120,11 @@ def stopped_by_signals() -> Iterator[None]:
 
 
 class _Repeated:
-    """Resends pending signals to this process until their block ends."""
+    """Thread that resends pending signals to this process until the end of the block."""
 
     def __init__(self) -> None:
         self._lock, self._over = threading.Lock(), False
-        # A handler may run between any two instructions, so it must not wait for a lock; writing a byte is safe.
+        # A handler may run between any two instructions, so it must not wait for a lock, but writing a byte is safe.
         self._asked, self._ask = os.pipe()
         os.set_blocking(self._ask, False)
         threading.Thread(target=self._work, name="carts-signals", daemon=True).start()
@@ -158,7 +158,7 @@ def _may_be_cut(frame: FrameType | None, begin: FrameType) -> bool:
 
 
 def _is_ours(frame: FrameType | None) -> bool:
-    """Whether a stack frame runs code of this project or its caller, not of a library."""
+    """Whether a stack frame runs code of this project or of its caller, as opposed to library code."""
     if frame is None:
         return True
     package = str(frame.f_globals.get("__name__")).partition(".")[0]
@@ -167,7 +167,7 @@ def _is_ours(frame: FrameType | None) -> bool:
 
 @contextmanager
 def finished_first() -> Iterator[None]:
-    """Defer `Stopped` to the end of the block, which should take no longer than a write."""
+    """Defer `Stopped` to the end of the block, which should be as short as a write."""
     _Unfinished.blocks += 1
     try:
         yield
@@ -189,7 +189,7 @@ def message_if_stopped(what_is_kept: Callable[[], str] | str) -> Iterator[None]:
 
 
 def exit_status(stopped: KeyboardInterrupt) -> int:
-    """Exit status of a shell: 128 + the number of the signal."""
+    """Exit status as in a shell: 128 + signal number."""
     return 128 + (stopped.number if isinstance(stopped, Stopped) else signal.SIGINT)
 
 

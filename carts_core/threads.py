@@ -1,7 +1,7 @@
 """Single-threaded operations, whose results do not depend on torch's number of threads.
 
 Sums over whole images, and kernels that torch, oneDNN and MKL select by the number of threads, differ in their last
-bits, which could trigger a restart of an optimization. Only these operations run in one thread.
+bits, which may trigger a restart of an optimization. Only these operations run in a single thread.
 """
 
 from collections.abc import Iterator
@@ -13,7 +13,7 @@ from torch import Tensor
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """Run the block, or decorated function (`@one_thread()`), with one thread of torch."""
+    """Run the block, or the decorated function (`@one_thread()`), with one torch thread."""
     threads = torch.get_num_threads()
     if threads == 1:
         yield

@@ -9,12 +9,12 @@ _LONGEST_COMPARED, _MOST_COMPARED = 100, 200
 
 
 def counted(number: int, what: str) -> str:
-    """A number with its noun in singular or plural, such as `1 run` and `2 runs`."""
+    """Number with its noun in singular or plural, such as `1 run` and `2 runs`."""
     return f"{number} {what}{'' if number == 1 else 's'}"
 
 
 def spoken_time(seconds: float) -> str:
-    """A rounded duration, such as "40 s" or "3 min"."""
+    """Rounded duration, such as "40 s" or "3 min"."""
     return f"{seconds:.0f} s" if seconds < 100 else f"{seconds / 60:.0f} min"
 
 
@@ -27,7 +27,7 @@ def listed(names: Iterable[str], most: int = 40) -> str:
 
 
 def shortened(text: str, length: int = 200) -> str:
-    """A text whose middle is replaced by an ellipsis if it is longer than `length`."""
+    """Replace the middle of a string by an ellipsis if it is longer than `length`."""
     return text if len(text) <= length else f"{text[: length - 40]} ... {text[-35:]}"
 
 

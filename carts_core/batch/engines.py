@@ -15,7 +15,7 @@ from ..stopping import Stopped, end_with_parent, stopped_by_signals
 from .manifest import Job
 
 ATTEMPTS = 5
-"""Number of attempts at a job whose worker dies, before the job counts as failed."""
+"""Number of attempts at a job whose worker dies, after which the job is considered failed."""
 
 
 @dataclass(frozen=True)
@@ -24,7 +24,7 @@ class Outcome:
 
     job: str
     status: Literal["done", "known", "busy", "failed", "stopped"]
-    """`known`: already done earlier; `busy`: run by another process."""
+    """`known`: done earlier; `busy`: run by another process."""
     error: str = ""
     seconds: float = 0.0
 
@@ -104,7 +104,7 @@ class Pool:
 
 
 def _hand(worker: _Worker, waiting: deque[Job], attempts: dict[str, int]) -> None:
-    """Send a job to a worker; the death of a worker is detected when its answer is received."""
+    """Send a job to a worker; a dead worker is detected when its answer is received."""
     worker.job = waiting.popleft()
     attempts[worker.job.name] += 1
     with suppress(OSError):
@@ -122,7 +122,7 @@ def _end(worker: _Worker) -> None:
 
 @contextmanager
 def _threads_of_children(threads: int) -> Iterator[None]:
-    """Limit the threads of child processes by environment variables, which libraries read when they are loaded."""
+    """Limit the threads of child processes by environment variables, which libraries read on import."""
     before = {name: os.environ.get(name) for name in _THREADS}
     os.environ.update(dict.fromkeys(_THREADS, str(threads)))
     try:
@@ -167,7 +167,7 @@ class Cluster:
 
     def run(self, jobs: Sequence[Job]) -> Iterator[Outcome]:
         """Run all jobs; yields outcomes in order of completion. `SettingsError` if the scheduler does not answer."""
-        # Optional dependencies, which worker processes on this machine do not need.
+        # These optional dependencies are not needed by worker processes on this machine.
         import dask.config  # noqa: PLC0415
         from distributed import Client, KilledWorker, LocalCluster, as_completed  # noqa: PLC0415
 

@@ -1,4 +1,4 @@
-"""Folder of a batch: states of its jobs, their results, the summary of both, and projects for the review of a job."""
+"""Folder of a batch: states and results of its jobs, a summary, and projects for the review of jobs."""
 
 import json
 import os
@@ -38,7 +38,7 @@ class StepState:
     """State of a finished step."""
 
     key: str
-    """Fingerprint of the step's inputs; the step runs again if it changes."""
+    """Fingerprint of the step's inputs; the step runs again after a change."""
     seconds: float
     """Duration [s]."""
 
@@ -51,7 +51,7 @@ class JobState:
     steps: Mapping[str, StepState] = field(default_factory=dict)
     """Finished steps."""
     attempts: Annotated[int, msgspec.Meta(ge=0)] = 0
-    """Number of starts since the job last finished or failed; more than one if a worker was lost."""
+    """Number of starts since the job last finished or failed; more than 1 if a worker was lost."""
     error: str = ""
     """Reason of a failure."""
     worker: str = ""
@@ -84,7 +84,8 @@ def write_state(folder: OutputPath, state: JobState) -> None:
 
 
 def present_status(folder: OutputPath) -> tuple[str, JobState]:
-    """Current status and state of a job; `lost` if it is marked as running but no process holds its lock."""
+    """Current status and state of a job; the status is `lost` if the job is marked as running but no process holds its
+    lock."""
     state = read_state(folder)
     if state.status == "running":
         with suppress(BusyError), locked_folder(folder):
@@ -108,7 +109,7 @@ class RunningJob:
             self.state = JobState()
 
     def change(self, **values: object) -> None:
-        """Update fields of the state."""
+        """Update fields of the state on disk."""
         with self._changing:
             self.state = replace(self.state, heartbeat=time.time(), **values)  # pyright: ignore[reportArgumentType]
             write_state(self._folder, self.state)
@@ -160,7 +161,7 @@ class FrameFinding:
     probability: Annotated[float, msgspec.Meta(ge=0, le=1)]
     """Probability that the frame's mask is wrong [1]."""
     picture: str = ""
-    """Preview image in the job's folder; empty for frames that are not among the worst."""
+    """Preview image in the job's folder; empty except for the worst frames."""
 
 
 @dataclass(frozen=True)
@@ -172,14 +173,15 @@ class Findings:
     corrections: dict[str, list[float]] = field(default_factory=dict)
     """`ARM.JOINT` -> corrected minus measured position of each frame [deg, mm]."""
     deviations: dict[str, list[float]] = field(default_factory=dict)
-    """`ARM.JOINT` -> reported standard deviations of the frames that have one [deg, mm]."""
+    """`ARM.JOINT` -> reported standard deviations [deg, mm] of the frames with known standard deviations."""
     base_frames: dict[str, list[list[float]]] = field(default_factory=dict)
-    """`ARM in CAMERA` -> T_camera_base [4 x 4, m], from the calibration step if there is one."""
+    """`ARM in CAMERA` -> T_camera_base [4 x 4, m], calibrated if the job has a calibration step."""
     format: Literal["carts-findings/1"] = "carts-findings/1"
 
 
 def read_findings(folder: OutputPath) -> Findings | None:
-    """Results of the job in a folder; None before its end; `OSError` or `ValueError` if the file is damaged."""
+    """Read the results of the job in a folder; None before its end. `OSError` or `ValueError` if the file is
+    damaged."""
     path = folder / FINDINGS_FILE
     if not holds_file(path):
         return None
@@ -234,7 +236,7 @@ def _add_corrections(found: Findings, sequence: Sequence, rows: list[KinematicsR
 
 
 def _pictured(folder: OutputPath, sequence: Sequence, part: Path, frames: list[FrameFinding]) -> Iterator[FrameFinding]:
-    """Frames, the worst ones with preview images that show the mask's outline."""
+    """Yield the frames, with preview images of the worst frames that show the outline of the mask."""
     worst = sorted(frames, key=lambda frame: -frame.probability)[:_WORST]
     domain, first = part.parent.name, part.name.split("+")[0]
     masks = part / "masks" / first if "+" in part.name else part / "masks"
@@ -275,7 +277,7 @@ class KnownJob:
 
     @property
     def error(self) -> str:
-        """Last line of the job's error, or reason why its results cannot be read; empty if there is neither."""
+        """Last line of the job's error, or reason why its results cannot be read; empty without either."""
         lines = self.state.error.strip().splitlines()
         return lines[-1][:_LONGEST_ERROR] if lines else self.damage
 
@@ -303,7 +305,7 @@ def most_urgent_first(known: Rows[KnownJob]) -> list[KnownJob]:
 
 @dataclass(frozen=True)
 class _Batch:
-    """Content of the batch's file with the list of jobs."""
+    """Content of the file with the list of jobs."""
 
     format: Literal["carts-batch-jobs/1"]
     jobs: list[Job]
@@ -323,7 +325,8 @@ def is_batch(folder: Path) -> bool:
 
 
 def read_jobs(folder: Path) -> list[Job]:
-    """Jobs of a batch folder, without options; `SettingsError` if it is not a batch folder or its list is damaged."""
+    """Read the jobs of a batch folder, without options; `SettingsError` if the folder is not a batch folder or its list
+    is damaged."""
     try:
         jobs = typed(parse_json(read_bytes(folder / BATCH_FILE, VALUES)), _Batch).jobs
         for job in jobs:
@@ -338,7 +341,7 @@ def read_jobs(folder: Path) -> list[Job]:
 
 
 _MADE = {"calibrate": "calibration", "import": "recording"}
-"""Step -> folder of the sequence file that it writes; a job's results refer to the first of these that exists."""
+"""Step -> folder with its sequence file; the results of a job refer to the first existing file of these."""
 
 
 def sequence_file(folder: OutputPath, job: Job) -> Path:
@@ -348,7 +351,7 @@ def sequence_file(folder: OutputPath, job: Job) -> Path:
 
 
 def review_project(folder: OutputPath, job: Job) -> Path:
-    """Project for the review of a job, created if missing. New results get a new project; old projects are kept.
+    """Project for the review of a job, created if missing. New results have a new project; old projects are kept.
 
     Raises:
         CartsError: a table of results cannot be read.

@@ -29,19 +29,19 @@ class Job:
     camera: str
     """Name of a camera, or `all`."""
     domain: str
-    """Name of a domain; empty for the first one of the sequence."""
+    """Name of a domain; empty for the first domain of the sequence."""
     steps: tuple[Step, ...]
-    """Steps in order; each one uses the results of the previous ones."""
+    """Steps in order; each step uses the results of the previous steps."""
     options: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     """Step -> additional options of its command."""
 
 
 def read_manifest(path: Path, output: Path | None = None) -> list[Job]:
-    """Jobs of a manifest, in order.
+    """Read the jobs of a manifest, in order.
 
     Args:
         path: path of the manifest.
-        output: folder of the batch, if any; files in it are not matched by patterns.
+        output: folder of the batch, if any; patterns do not match files in this folder.
 
     Raises:
         SettingsError: the manifest cannot be read or has an invalid key, step or value, or a pattern matches no file.
@@ -124,7 +124,7 @@ def _name(recording: Path, domain: str, camera: str) -> str:
 
 
 def shard(jobs: list[Job], text: str) -> list[Job]:
-    """Shard `i/n` of the jobs: every n-th job from the i-th on, 1 <= i <= n; all shards contain every job once."""
+    """Shard `i/n` of the jobs: every n-th job from the i-th on, 1 <= i <= n. Each job is in exactly one shard."""
     first, _, count = text.partition("/")
     if not (first.isdecimal() and count.isdecimal() and 1 <= int(first) <= int(count)):
         raise SettingsError(f"--shard {text!r} is invalid. Give I/N with 1 <= I <= N, such as 2/8.")

@@ -122,7 +122,7 @@ def _worst(batch: OutputPath, folder: OutputPath, known: Sequence[KnownJob]) -> 
 
 
 def _drifts(known: Sequence[KnownJob]) -> list[dict[str, object]]:
-    """Change of each base frame since the previous job that has it, in the manifest's order."""
+    """Change of each base frame since the previous job with this base frame, in the order of the manifest."""
     found, before = [], {}
     for entry in known:
         for name, rows in (entry.findings.base_frames if entry.findings else {}).items():

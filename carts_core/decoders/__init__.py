@@ -1,1 +1,1 @@
-"""Decoders of foreign file formats that are based on libraries; they run in the child process of `files.decoding`."""
+"""Decoders of foreign file formats, based on libraries and run in the child process of `files.decoding`."""

@@ -13,7 +13,7 @@ from ..files.reading import BAG, GIB, check_regular
 LIBRARIES = dict.fromkeys(("topics", "rows", "image_times", "message"), ("rosbags.highlevel", "rosbags.typesys"))
 """Modules per function that are imported before the memory limit applies."""
 _SAMPLED = 20
-"""Number of image headers read from a bag that is too large to read all."""
+"""Number of image headers that are read from a large bag."""
 
 
 def topics(path: Path) -> list[tuple[str, str]]:
@@ -21,7 +21,7 @@ def topics(path: Path) -> list[tuple[str, str]]:
 
     Raises:
         OSError: a file of the bag is not a regular file.
-        Exception: the bag is damaged or of an unknown kind; the class depends on the storage format.
+        Exception: the bag is damaged or of an unknown type; the class depends on the storage format.
     """
     return [(connection.topic, connection.msgtype) for connection in _opened(path).connections]
 
@@ -31,13 +31,13 @@ def rows(path: Path, wanted: dict[str, tuple[str, str]]) -> dict[str, Any]:
 
     Args:
         path: path of the bag.
-        wanted: topic -> name of the result to which it contributes, and kind of its messages: `joints`, `jaw`, `pose`
-            or `text`.
+        wanted: topic -> name of the result to which the topic contributes, and type of its messages: `joints`, `jaw`,
+            `pose` or `text`.
 
     Returns:
-        For each name, the last text; or, for each list of joint names in the messages (empty except for `joints`), an
-        array [messages, 1 + values] of times [s] and joint positions, a jaw angle, or a pose (x y z, quaternion
-        x y z w).
+        For each name, the last text, or, for each list of joint names in the messages (empty except for `joints`), an
+        array [messages, 1 + values] of times [s] and joint positions, a jaw angle, or a pose (x y z, quaternion x y z
+        w).
 
     Raises:
         Exception: as `topics`.
@@ -92,7 +92,7 @@ def image_times(path: Path, topic: str) -> tuple[np.ndarray, np.ndarray]:
 
 
 def message(path: Path, topic: str, time: int | None = None) -> dict[str, Any] | None:
-    """Fields of a message by name; None if there is no message.
+    """Fields of a message by name; None without a message.
 
     Args:
         path: path of the bag.
@@ -112,7 +112,7 @@ def message(path: Path, topic: str, time: int | None = None) -> dict[str, Any] |
 
 @lru_cache(1)
 def _opened(path: Path) -> Any:
-    """Reader of a bag, kept open for further calls."""
+    """Reader of a bag, which is kept open for further calls."""
     from rosbags.highlevel import AnyReader  # noqa: PLC0415 - an extra
     from rosbags.typesys import Stores, get_typestore  # noqa: PLC0415
 
@@ -134,7 +134,7 @@ def _plain(value: Any) -> Any:
 
 
 def _stamp(decoded: Any, time: int) -> float:
-    """Time in a message's header, or the record time if there is none [s]."""
+    """Time in the header of a message, or the record time without a header [s]."""
     stamp = getattr(getattr(decoded, "header", None), "stamp", None)
     nanoseconds = time if stamp is None or stamp.sec == 0 else stamp.sec * 10**9 + stamp.nanosec
     return nanoseconds * 1e-9
@@ -154,7 +154,7 @@ def _values(decoded: Any, kind: str) -> tuple[float, ...]:
 
 def _header_time(raw: bytes, time: int) -> int:
     """Time stamp of a message that begins with a header [ns], read without decoding the message."""
-    start = 4  # Preceded by the sequence number in ROS 1, and by the encapsulation header in ROS 2.
+    start = 4  # The time is preceded by the sequence number in ROS 1, and by the encapsulation header in ROS 2.
     seconds = int.from_bytes(raw[start : start + 4], "little")
     nanoseconds = int.from_bytes(raw[start + 4 : start + 8], "little")
     return seconds * 10**9 + nanoseconds if seconds and nanoseconds < 10**9 else time

@@ -20,13 +20,13 @@ _IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 
 
 class _BesideTheMesh(FilePathResolver):
-    """Resolver of materials and textures of a mesh: regular files of limited size in its folder or below."""
+    """Resolver of a mesh's materials and textures, limited to small regular files in its folder or below."""
 
     def get(self, name: str) -> bytes:
         """Content of a file.
 
         Raises:
-            OSError, ValueError: the file is missing, outside the folder, or of a kind that is not read.
+            OSError, ValueError: the file is missing, outside of the folder, or of an unsupported type.
         """
         for candidate in (name.strip(), name.strip().lstrip("/"), os.path.split(name)[-1]):
             path = Path(self.absolute(candidate))
@@ -42,7 +42,7 @@ class _BesideTheMesh(FilePathResolver):
 def mesh_parts(
     path: Path, kind: str
 ) -> list[tuple[Float[np.ndarray, "V 3"], Int[np.ndarray, "F 3"], Float[np.ndarray, "3"] | None]]:
-    """Vertices, triangles, and colour or None, of each mesh in a file.
+    """Vertices, triangles, and colour (or None) of each mesh in a file.
 
     Args:
         path: path of the mesh file.

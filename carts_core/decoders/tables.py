@@ -15,9 +15,9 @@ LIBRARIES = {"read_parquet": ("pyarrow.parquet",), "read_matlab": ("scipy.io",)}
 
 
 def read_parquet(path: Path) -> dict[str, Any]:
-    """Columns of a Parquet file by name [rows]; [rows, values] for lists of numbers of equal length.
+    """Columns of a Parquet file by name: [rows], or [rows, values] for lists of numbers of equal length.
 
-    Columns of texts, and of lists of different lengths, are Python lists; a field of a struct is the column
+    Columns of strings, and of lists of different lengths, are Python lists. Fields of a struct are columns
     `struct.field`.
 
     Raises:
@@ -29,7 +29,7 @@ def read_parquet(path: Path) -> dict[str, Any]:
     try:
         file = pyarrow.parquet.ParquetFile(io.BytesIO(read_bytes(path, TABLE)))
         groups = [file.metadata.row_group(number) for number in range(file.metadata.num_row_groups)]
-        # A run of equal values takes few bytes at any length, so the file size does not limit the number of values.
+        # Runs of equal values take few bytes, so the file size does not limit the number of values.
         cells = sum(group.column(number).num_values for group in groups for number in range(group.num_columns))
         check_size(-(-cells // max(file.metadata.num_columns, 1)), file.metadata.num_columns)
         table = file.read()
@@ -47,7 +47,8 @@ def read_parquet(path: Path) -> dict[str, Any]:
 
 
 def _matrix(rows: list[list[Any] | None]) -> Any:
-    """Rows of numbers as an array, missing rows as NaN; the list itself if rows are not numeric or differ in length."""
+    """Convert rows of numbers to an array, with NaN for missing rows; returns the list if rows are not numeric or
+    differ in length."""
     lengths = {len(row) for row in rows if row is not None}
     if len(lengths) != 1:
         return rows
@@ -76,7 +77,7 @@ def read_matlab(path: Path) -> dict[str, Any]:
     """Variables of a MATLAB file (version 5) by name; structs are dictionaries.
 
     Raises:
-        OSError: the file is missing, not a regular file, or larger than a calibration can be.
+        OSError: the file is missing, not a regular file, or too large for a calibration.
         ValueError: the file is damaged or of another version.
     """
     from scipy.io import loadmat  # noqa: PLC0415
@@ -88,7 +89,7 @@ def read_matlab(path: Path) -> dict[str, Any]:
         variables = loadmat(io.BytesIO(content), simplify_cells=True)
     except MemoryError:
         raise
-    except Exception as error:  # scipy's readers raise many kinds of errors
+    except Exception as error:  # scipy's readers raise many types of exceptions
         raise ValueError(f"it is not a MATLAB 5 file ({error})") from error
     names = [_name_of_object(name, value) for name, value in variables.items()]
     if name := next(filter(None, names), ""):

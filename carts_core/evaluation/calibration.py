@@ -93,7 +93,7 @@ def calibration_json(before: Scene, result: CalibrationResult, residuals: Frames
 
 
 def moved_frames(before: Scene, after: Scene) -> list[tuple[str, float, float]]:
-    """Name, rotation [deg] and translation [mm] of each base frame and camera that moved."""
+    """Name, rotation [deg] and translation [mm] of each base frame and camera whose pose differs between two scenes."""
     poses = [
         (f"T_world_base of {old.name}", old.T_world_base, new.T_world_base)
         for old, new in zip(before.arms, after.arms, strict=True)
@@ -106,7 +106,7 @@ def moved_frames(before: Scene, after: Scene) -> list[tuple[str, float, float]]:
 
 
 def beyond_prior(before: Scene, result: CalibrationResult, known: Mapping[str, Float[np.ndarray, "6 6"]]) -> str | None:
-    """Warning about base frames that moved farther than the hand-eye calibration allows; None if there are none.
+    """Warning about base frames that moved farther than the hand-eye calibration allows; None without such base frames.
 
     Args:
         before: scene with the previous calibration.
@@ -127,7 +127,7 @@ def beyond_prior(before: Scene, result: CalibrationResult, known: Mapping[str, F
 def remark(before: Scene, result: CalibrationResult) -> str | None:
     """Warning about the use of a calibration; None if only intrinsics changed."""
     if not any(unknown.change for unknown in result.unknowns):
-        return "The initial calibration was kept: no other fits these frames better."
+        return "The initial calibration was kept, since no other calibration fits these frames better."
     if not moved_frames(before, result.scene):
         return None
     return (
@@ -160,7 +160,7 @@ def write_calibration(
         target: final location of the folder; paths in the sequence file are relative to it.
         sequence: sequence with the previous calibration.
         result: result of the new calibration.
-        residuals: residuals of its frames.
+        residuals: residuals of the frames.
     """
     text = calibrated_sequence_file(sequence.path, target, sequence.scene, result.scene)
     write_text(folder / "sequence.toml", text)
@@ -194,7 +194,7 @@ def _figure(width: float, height: float) -> "Figure":
     from matplotlib.figure import Figure  # noqa: PLC0415
 
     matplotlib.use("Agg")
-    # Names of frames and cameras must not be parsed as formulas.
+    # matplotlib must not parse names of frames and cameras as formulas.
     matplotlib.rcParams["text.parse_math"] = False
     return Figure(figsize=(width, height), layout="constrained")
 

@@ -41,10 +41,11 @@ def dice(a: Bool[np.ndarray, "h w"], b: Bool[np.ndarray, "h w"]) -> float:
 
 
 def normalized_surface_distance(a: Bool[np.ndarray, "h w"], b: Bool[np.ndarray, "h w"], tolerance: float) -> float:
-    """Normalized surface distance (NSD): share of both outlines within `tolerance` [px] of the other one, in [0, 1].
+    """Normalized surface distance (NSD): share of both outlines within `tolerance` [px] of the other outline, in [0,
+    1].
 
-    An outline consists of the mask's pixels with a 4-neighbour outside the mask. The image border does not count as
-    outline. For two masks without outline, the score is 1 if they are equal, else 0.
+    An outline consists of the mask's pixels with a 4-neighbour outside the mask, without the image border. For two
+    masks without outlines, the score is 1 if they are equal, else 0.
     """
     outlines = [_outline(mask) for mask in (a, b)]
     total = sum(int(outline.sum()) for outline in outlines)
@@ -89,7 +90,7 @@ def joint_mae_deg(
 def joint_std_deg(
     scene: Scene, joint_std: Mapping[str, Float[np.ndarray, " dofs"]], joints: Mapping[str, tuple[str, ...]]
 ) -> float | None:
-    """Mean standard deviation [deg] of the named revolute joints over all arms; None if none is known.
+    """Mean standard deviation [deg] of the named revolute joints over all arms; None if no standard deviation is known.
 
     Args:
         scene: scene with the arms.
@@ -179,19 +180,19 @@ def evaluate(
 
     Args:
         sequence: sequence with or without ground truth of masks and kinematics.
-        networks: networks or another predictor of surface maps.
+        networks: networks, or a predictor of surface maps.
         frames: indices in the sequence.
-        cameras: names of cameras, optimized one by one unless `together`.
+        cameras: names of cameras, optimized separately unless `together`.
         domains: names of domains.
         settings, free: settings and free parameters of the optimization.
         model: settings of sequence mode (see `SequenceOptimizer`); by default, frames are optimized separately.
-        perturb_deg: perturbation of each measured joint at the start, applied to the true joint positions (the measured
-            ones without ground truth); see `perturb`. 0 starts at the measured joint positions.
+        perturb_deg: perturbation of each measured joint at the start, relative to the true joint positions (measured
+            joint positions without ground truth); see `perturb`. 0 starts at the measured joint positions.
         seed: seed of the perturbation, which is the same for a frame in all cameras and domains. In sequence mode, it
             is the same for all frames, like a calibration error.
         together: optimize all cameras jointly; the time is divided equally among their scores.
-        given: masks to which `networks` fits. Their ignored pixels are not compared, and they are the ground truth of
-            cameras without masks in the sequence.
+        given: masks that are fitted. Their ignored pixels are not compared; they are the ground truth of cameras
+            without masks in the sequence.
     """
 
     for domain, group in product(domains, camera_groups(cameras, together)):
@@ -207,9 +208,9 @@ def evaluate(
 
 
 def _estimates(setup: "Setup", frames: Names[int]) -> Iterator[tuple[Frame, Estimate]]:
-    """Solved frames, with their initial joint positions as `measured`."""
+    """Solve frames; yields each frame, with its initial joint positions as `measured`, and its estimate."""
     if setup.model is None:
-        _ = setup.backgrounds  # Its computation is not part of a frame's time.
+        _ = setup.backgrounds  # The computation of the background is not part of a frame's time.
         for index in frames:
             frame, began = setup.frame(index), time.perf_counter()
             yield frame, Estimate.best(setup.solved(frame), time.perf_counter() - began)
@@ -261,14 +262,15 @@ def frame_score(
 
 
 def camera_groups(cameras: Names[str], together: bool) -> list[tuple[str, ...]]:
-    """Groups of jointly optimized cameras: one group of all, or one per camera."""
+    """Groups of jointly optimized cameras: one group of all cameras, or one group per camera."""
     return [tuple(cameras)] if together else [(camera,) for camera in cameras]
 
 
 def start_positions(
     sequence: Sequence, frame: Frame, perturb_deg: float, seed: int | tuple[int, ...]
 ) -> dict[str, np.ndarray]:
-    """Initial joint positions of a frame [rad, m]; see `evaluate`. A tuple as seed gives all frames equal signs."""
+    """Initial joint positions of a frame [rad, m]; see `evaluate`. With a tuple as seed, the signs are equal in all
+    frames."""
     if perturb_deg == 0:
         return frame.measured
     origin = {**frame.measured, **(frame.truth or {})}
@@ -292,9 +294,9 @@ def to_json(scores: Names[FrameScore]) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Setup:
-    """Solver with its settings, and the recording, domain and cameras of the frames that it gets.
+    """Solver with settings, and recording, domain and cameras of its frames.
 
-    Initial joint positions are the `measured` ones of its frames; see `evaluate` for arguments that are not explained.
+    Initial joint positions are the `measured` positions of the frames; see `evaluate` for other arguments.
     """
 
     sequence: Sequence
@@ -311,18 +313,18 @@ class Setup:
     """Frame index -> camera name -> pixels excluded from comparison."""
 
     def frame(self, index: int, cameras: Names[str] | None = None) -> Frame:
-        """Frame at an index of the sequence, with images of all cameras or the given ones."""
+        """Frame at an index of the sequence, with images of the given cameras (all by default)."""
         frame = self.sequence.frame(index, self.domain, self.cameras if cameras is None else cameras)
         seed = self.seed if self.model is None else (self.seed,)
         return replace(frame, measured=start_positions(self.sequence, frame, self.perturb_deg, seed))
 
     @property
     def backgrounds(self) -> Backgrounds:
-        """Mean backgrounds of the cameras; `SequenceError` if the solver requires one that cannot be estimated."""
+        """Mean backgrounds of the cameras; `SequenceError` if a required background cannot be estimated."""
         return Backgrounds.of(self.sequence, self.cameras, self.domain, required=self.settings.needs_background)
 
     def solved(self, frame: Frame) -> FrameOptimizer:
-        """Optimizer of a frame alone, run to its end."""
+        """Single-frame optimizer of a frame, run to its end."""
         optimizer = FrameOptimizer(
             self.sequence.scene,
             frame,
@@ -339,7 +341,7 @@ class Setup:
         return optimizer
 
     def sequence_optimizer(self, frames: Names[int], **more: Any) -> SequenceOptimizer:
-        """Optimizer of the given frames jointly; `more` are further arguments of `SequenceOptimizer`."""
+        """Joint optimizer of the given frames; `more` are further arguments of `SequenceOptimizer`."""
         stamps = self.sequence.timestamps
         return SequenceOptimizer(
             self.sequence.scene,

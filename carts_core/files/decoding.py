@@ -2,7 +2,7 @@
 
 Library decoders may need unlimited memory or time for a small file with repeated references, false sizes or
 compression. A decoder is a module-level function of this package that imports neither torch nor the rest of the
-application; it runs in a separate interpreter through `decoded`; its arguments and result are plain values, paths and
+application. It runs in a separate interpreter through `decoded`; its arguments and result are plain values, paths and
 arrays.
 
 The child exits when its parent does.
@@ -41,7 +41,8 @@ from .reading import GIB, MIB, RefusedFileError
 _SECONDS, _SECONDS_PER_MIB = 2.5, 0.2
 _MEMORY, _MEMORY_PER_BYTE = 320 * MIB, 8
 _COUNTED = 128 * MIB
-"""File size up to which the memory limit of a decoder grows with the file [bytes]; larger files are read in parts."""
+"""File size up to which the memory limit of a decoder grows with the file size [bytes]; larger files are read in
+parts."""
 _PATIENCE = 20
 """Wall-clock timeout as a multiple of the processor time limit, for busy machines."""
 _IDLE = 10.0
@@ -50,7 +51,7 @@ _LARGEST_FILE = GIB
 """Maximum temporary file of a library [bytes], in addition to a hundred times the size of the decoded file."""
 _ARRAY, _PATH = 1, 2
 _ENVIRONMENT = {
-    # Thread pools and arenas reserve address space, which would count as memory.
+    # Thread pools and arenas reserve address space, which counts as memory.
     **dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"),
     "ARROW_DEFAULT_MEMORY_POOL": "system",
     "MALLOC_ARENA_MAX": "2",
@@ -59,7 +60,7 @@ _ENVIRONMENT = {
 
 @dataclass(frozen=True)
 class Limits:
-    """Resource limits of one call, in addition to the usage of the interpreter and imported libraries."""
+    """Resource limits of a call, in addition to the resources of the interpreter and imported libraries."""
 
     seconds: float = _SECONDS
     """Processor time [s]."""
@@ -85,7 +86,7 @@ class DecodingLimitError(CartsError, ValueError):
 
 
 def decoded(function: Callable[..., Any], path: Path, *arguments: Any) -> Any:
-    """Run a decoder on a file in a child process, within `Limits.of` the file; returns its result.
+    """Run a decoder on a file in a child process within the limits `Limits.of(path)`; returns its result.
 
     Args:
         function: decoder, at module level in this package. The table `LIBRARIES` of its module maps function names to
@@ -95,14 +96,14 @@ def decoded(function: Callable[..., Any], path: Path, *arguments: Any) -> Any:
 
     Raises:
         OSError, CartsError: as raised by the decoder.
-        DecodingLimitError: it needs more memory or time than the limits.
+        DecodingLimitError: the decoder needs more memory or time than the limits.
         ValueError: any other error of the decoder.
     """
     return called(function, path, *arguments, limits=Limits.of(path))
 
 
 def called(function: Callable[..., Any], *arguments: Any, limits: Limits) -> Any:
-    """Like `decoded`, within given limits."""
+    """Like `decoded`, with given limits."""
     decoder = acquire()
     try:
         return decoder.call(function, *arguments, limits=limits)
@@ -126,20 +127,20 @@ def release(decoder: "Decoder") -> None:
 
 
 def prepare() -> None:
-    """Start a child process in advance."""
+    """Start a child process in advance, for a faster first call."""
     decoder = Decoder()
     decoder.start()
     release(decoder)
 
 
 class Decoder:
-    """Child process that runs decoders sequentially; started on the first call, and restarted after a failure.
+    """Child process that runs decoders sequentially. It is started on the first call, and restarted after a failure.
 
     Decoders may keep files open between calls. Not thread-safe.
     """
 
     def __init__(self, *, idle: float = _IDLE) -> None:
-        """`idle` is the time after which an idle child exits [s]."""
+        """`idle`: time after which an idle child exits [s]."""
         self._idle = idle
         self._process: subprocess.Popen[bytes] | None = None
         self._pipe: Connection | None = None
@@ -179,7 +180,8 @@ class Decoder:
             shutil.rmtree(folder, ignore_errors=True)
 
     def _reply(self, request: bytes, limits: Limits) -> Any:
-        """The child's reply; None if it exited before it received the request. Errors as in `decoded`."""
+        """Receive the child's reply; None if the child exited before it received the request. Errors as in
+        `decoded`."""
         self.start()
         assert self._process is not None and self._pipe is not None
         patience = limits.seconds * _PATIENCE
@@ -243,12 +245,12 @@ def _end() -> None:
 
 @cache
 def _spawner() -> ThreadPoolExecutor:
-    """Thread that starts children, since Linux terminates a child when the thread that started it ends."""
+    """Executor whose thread starts all children, since a child is terminated when the thread that started it ends."""
     return ThreadPoolExecutor(1, "carts-decoding")
 
 
 def _forget() -> None:
-    """After a fork, discard the parent's thread and children."""
+    """Discard the parent's thread and children after a fork."""
     _IDLE_DECODERS.clear()
     _spawner.cache_clear()
 
@@ -258,8 +260,8 @@ if hasattr(os, "register_at_fork"):
 
 
 def serve() -> None:
-    """Entry point of the child; command-line arguments are the parent's process id, a pipe and the longest idle time
-    [s].
+    """Entry point of the child; the command-line arguments are the parent's process id, a pipe and the maximum idle
+    time [s].
     """
     parent, descriptor, idle = sys.argv[1:4]
     end_with_parent(int(parent), signal.SIGKILL)
@@ -273,9 +275,9 @@ def serve() -> None:
 def _answer(request: bytes) -> bytes:
     folder, module, name, arguments, seconds, memory, written = _unpacked(request)
     try:
-        os.chdir(folder)  # Relative paths refer to the parent's folder.
+        os.chdir(folder)  # Relative paths refer to the working directory of the parent.
         for limit in (resource.RLIMIT_CPU, resource.RLIMIT_AS):
-            # Imports would count against the limits of the previous call.
+            # Without this reset, the limits of the previous call would apply to imports.
             _, most = resource.getrlimit(limit)
             resource.setrlimit(limit, (most, most))
         home = importlib.import_module(module)
@@ -288,7 +290,7 @@ def _answer(request: bytes) -> bytes:
 
 
 def _described(error: Exception) -> list[Any]:
-    """Class name and arguments of an error; errors of libraries become `ValueError`."""
+    """Class name and arguments of an exception; exceptions of libraries become `ValueError`."""
     # Extension modules that run out of memory may return without setting an exception, which causes a `SystemError`.
     if isinstance(error, MemoryError | SystemError) or (isinstance(error, OSError) and error.errno == errno.ENOMEM):
         return ["memory"]
@@ -305,7 +307,7 @@ def _limit(seconds: float, memory: int, written: int) -> None:
     used = int(time.process_time() + 1)
     resource.setrlimit(resource.RLIMIT_CPU, (used + int(seconds), resource.RLIM_INFINITY))
     resource.setrlimit(resource.RLIMIT_FSIZE, (written, resource.RLIM_INFINITY))
-    with contextlib.suppress(OSError, ValueError):  # Only Linux has this file, and limits address space.
+    with contextlib.suppress(OSError, ValueError):  # Only Linux has this file and limits the address space.
         pages = int(Path("/proc/self/statm").read_text().split()[0])
         resource.setrlimit(resource.RLIMIT_AS, (pages * resource.getpagesize() + memory, resource.RLIM_INFINITY))
 

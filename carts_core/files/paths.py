@@ -20,7 +20,7 @@ _REFUSED = re.compile(r"[/\\\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]")
 
 
 def home() -> Path:
-    """The user's home folder; the root folder, which is not written to, if the user has none."""
+    """The user's home folder; without one, the root folder, to which nothing is written."""
     try:
         return Path.home()
     except RuntimeError:
@@ -28,14 +28,14 @@ def home() -> Path:
 
 
 def name_fault(text: str, most_bytes: int = NAME_BYTES) -> str | None:
-    """Reason why a text is not allowed as a file name, as a clause that follows "is 'TEXT', "; None if it is allowed.
+    """Reason why a string is not allowed as a file name, as a clause that follows "is 'TEXT', "; None if allowed.
 
-    Letters of any script, spaces and most punctuation are allowed; paths, hidden names, control characters and overlong
-    names are not.
+    Letters of any script, spaces and most punctuation are allowed, but no paths, hidden names, control characters or
+    overlong names.
 
     Args:
         text: an untrusted name of a sequence, frame, camera, domain or arm.
-        most_bytes: its largest length in UTF-8.
+        most_bytes: maximum length in UTF-8.
     """
     if not text:
         return "which is empty"
@@ -67,17 +67,17 @@ def check_name(text: str, what: str, most_bytes: int = NAME_BYTES) -> str:
 
 @dataclass(frozen=True)
 class OutputPath(os.PathLike[str]):
-    """A file or folder to write. Created by `output_path` and `/`, which check every name.
+    """File or folder to write, created by `output_path` and `/`, which check every name.
 
-    Links are followed on the path to `folder`, which is given by the user, but not below it.
+    Links are followed on the path to `folder`, which is given by the user, but not below `folder`.
     """
 
     folder: Path
-    """Folder given by the user; it need not exist."""
+    """Folder given by the user, which need not exist."""
     names: tuple[str, ...] = ()
     """Path components below `folder`."""
     draft: bool = False
-    """Whether it is in an unpublished folder, whose files are written once and synchronized together."""
+    """Whether the path is in an unpublished folder, whose files are written once and synchronized together."""
 
     def __truediv__(self, name: str) -> "OutputPath":
         check_name(name, f"a file or folder in {self.path}", _FILE_BYTES)
@@ -91,17 +91,17 @@ class OutputPath(os.PathLike[str]):
 
     @property
     def path(self) -> Path:
-        """The path, for reading and messages."""
+        """Path for reading and for messages."""
         return self.folder.joinpath(*self.names)
 
     @property
     def name(self) -> str:
-        """The last component."""
+        """Last component."""
         return self.path.name
 
     @property
     def parent(self) -> "OutputPath":
-        """The parent folder."""
+        """Parent folder."""
         if self.names:
             return replace(self, names=self.names[:-1])
         return replace(self, folder=self.folder.parent)
@@ -111,8 +111,8 @@ def output_path(folder: Path, *names: str, draft: bool = False) -> OutputPath:
     """Create the path of a file or folder to write; all such paths are created here.
 
     Args:
-        folder: given by the user on the command line or in the environment; never by a recording.
-        names: components below it, which may be untrusted; `OutputError` unless each is a single name.
+        folder: folder given by the user on the command line or in the environment, never by a recording.
+        names: components below `folder`, which may be untrusted; `OutputError` unless each is a single name.
     """
     path = OutputPath(folder, draft=draft)
     for name in names:
@@ -130,13 +130,13 @@ def as_output(path: OutputPath | Path) -> OutputPath:
 
 
 def file_name(text: str) -> str:
-    """Convert an untrusted text to a valid file name; letters of any script are kept."""
+    """Convert an untrusted string to a valid file name; letters of any script are kept."""
     name = re.sub(r"[^\w.-]+", "_", text).lstrip(".")
     return name.encode(errors="ignore")[:NAME_BYTES].decode(errors="ignore") or "_"
 
 
 def unique_file_names(texts: list[str]) -> list[str]:
-    """`file_name` of each text, numbered where names would collide (also if case is ignored)."""
+    """`file_name` of each string, with numbers if names would collide (also if case is ignored)."""
     names: list[str] = []
     taken: set[str] = set()
     for text in texts:
@@ -155,13 +155,13 @@ _FOLDER = os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC
 
 @contextmanager
 def explained(path: object) -> Iterator[None]:
-    """Turn errors of the operating system into `OutputError`."""
+    """Convert errors of the operating system to `OutputError`."""
     try:
         yield
     except OSError as error:
         raise OutputError(
-            f"{path} cannot be written ({error.strerror or error}). "
-            "Nothing was changed there. Free disk space, or choose a writable folder."
+            f"{path} cannot be written ({error.strerror or error}). Nothing was changed there. Free disk space, or "
+            "choose a writable folder."
         ) from error
 
 
@@ -170,7 +170,7 @@ def opened_folder(path: OutputPath, *, make: bool = False) -> Iterator[int]:
     """Open the folder at `path`; yields its descriptor.
 
     Args:
-        path: links are followed only on the path to `path.folder`.
+        path: path of the folder; links are followed only up to `path.folder`.
         make: create missing folders.
 
     Raises:
@@ -229,7 +229,7 @@ def _step(folder: int, name: str, path: Path, make: bool) -> int:
 
 
 def _make(folder: Path) -> None:
-    """Create a folder and its missing parents, synchronized to disk."""
+    """Create a folder and its missing parents, and synchronize them to disk."""
     if folder.is_dir():
         return
     _make(folder.parent)

@@ -1,7 +1,7 @@
 """Reading of untrusted files: regular files of limited size and limited nesting, and headers of encoded images.
 
-Recordings, robots and weights are untrusted, and all are read through this module. Links are followed, since data are
-often linked; devices, pipes and sockets are refused, as are files above the size limit of their kind.
+Recordings, robots and weights are untrusted, and are read only through this module. Links are followed, since data are
+often linked. Devices, pipes and sockets are refused, as are files above the size limit of their kind.
 """
 
 import configparser
@@ -39,7 +39,7 @@ _START_OF_SCAN = 0xDA
 _NO_FRAME_HEADER = (0xC4, 0xC8, 0xCC)
 """Markers between 0xC0 and 0xCF that are not frame headers."""
 _MOST_SCANS = 200
-"""Maximum number of scans of a progressive JPEG, each of which is decoded."""
+"""Maximum number of scans of a progressive JPEG, since every scan is decoded."""
 _TIFF_TILE = (322, 323)
 _ORIENTATION = 0x0112
 _EXIF = b"Exif\0\0"
@@ -157,7 +157,7 @@ def _jpeg_size(content: bytes) -> tuple[int, int] | None:
     position = 2
     while (position := content.find(b"\xff", position)) >= 0 and position + 9 <= len(content):
         marker = content[position + 1]
-        if marker in (0x00, 0x01, 0xFF) or 0xD0 <= marker <= 0xD8:  # Fill byte, or a marker without payload.
+        if marker in (0x00, 0x01, 0xFF) or 0xD0 <= marker <= 0xD8:  # This is a fill byte, or a marker without payload.
             position += 1 if marker == 0xFF else 2
         elif marker == _START_OF_SCAN:
             return None
@@ -172,7 +172,7 @@ def _jpeg_size(content: bytes) -> tuple[int, int] | None:
 def _other_size(content: bytes) -> tuple[int, int] | None:
     from PIL import Image  # noqa: PLC0415 - most recordings never need it
 
-    # Pillow's warning concerns sizes that exceed our own limit anyway.
+    # Pillow warns about sizes that exceed the limit of this module anyway.
     warnings.filterwarnings("ignore", category=Image.DecompressionBombWarning)
     try:
         image = Image.open(io.BytesIO(content), formats=_OTHERS)
@@ -182,7 +182,7 @@ def _other_size(content: bytes) -> tuple[int, int] | None:
         return _FAR_TOO_LARGE
     except Exception:  # Pillow propagates any exception of its format readers.
         return None
-    # Tiles are decoded completely, even in small images.
+    # Tiles are decoded completely, even for small images.
     return max(image.width, tile_width), max(image.height, tile_height)
 
 
@@ -223,7 +223,7 @@ ROBOT = Kind("URDF", 16 * MIB)
 MESH = Kind("mesh", 128 * MIB)
 WEIGHTS = Kind("weights file", 512 * MIB)
 _POINTER = b"version https://git-lfs"
-"""First bytes of a Git LFS pointer, the placeholder of a file that was not fetched."""
+"""First bytes of a Git LFS pointer, the placeholder for a file that was not fetched."""
 _LARGEST_POINTER = 1024
 """Maximum size of a pointer [bytes]."""
 _POINTER_TEXT = "it is a Git LFS pointer without its content; run `git lfs pull` in its repository"
@@ -256,7 +256,7 @@ def open_regular(path: Path, kind: Kind) -> BufferedReader:
 
     Raises:
         FileNotFoundError, IsADirectoryError, OSError: as raised by the system.
-        RefusedFileError: it is not a regular file, is too large, or has an invalid name.
+        RefusedFileError: the path is not a regular file, the file is too large, or the name is invalid.
     """
     try:
         descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC | os.O_NOCTTY)
@@ -284,10 +284,10 @@ def check_regular(path: Path, kind: Kind) -> None:
 
 
 def read_bytes(path: Path, kind: Kind) -> bytes:
-    """Content of a file; errors as in `open_regular`."""
+    """Read a file; errors as in `open_regular`."""
     with open_regular(path, kind) as file:
         size = os.fstat(file.fileno()).st_size
-        content = file.read(size + 1)  # Reading allocates the requested size.
+        content = file.read(size + 1)  # Reading allocates memory of the requested size.
         if len(content) > size:
             content += file.read(kind.limit + 1 - len(content))
     if len(content) > kind.limit:
@@ -296,18 +296,20 @@ def read_bytes(path: Path, kind: Kind) -> bytes:
 
 
 def read_text(path: Path, kind: Kind) -> str:
-    """Content of a UTF-8 file without byte order mark; line ends are `\n`.
+    """Read a UTF-8 file without byte order mark; line ends are `\n`.
 
     Raises:
         FileNotFoundError, IsADirectoryError, OSError, RefusedFileError: as `open_regular`.
-        UnicodeDecodeError: it is not UTF-8.
+        UnicodeDecodeError: the file is not UTF-8.
     """
     return read_bytes(path, kind).decode("utf-8-sig").replace("\r\n", "\n").replace("\r", "\n")
 
 
 def parse_toml(text: str) -> dict[str, Any]:
-    """Parse TOML to dictionaries and lists; `ValueError` if it is invalid or exceeds the limits of this module."""
-    # The parser's time and memory grow quadratically with the parts of a key, so long keys are refused first.
+    """Parse TOML to dictionaries and lists; `ValueError` for invalid TOML, or if the limits of this module are
+    exceeded."""
+    # Time and memory of the parser grow quadratically with the number of parts of a key, so long keys are refused
+    # first.
     if _LONG_KEY.search(text):
         raise ValueError(f"a dotted key has more than {LARGEST_DEPTH} parts")
     try:
@@ -326,7 +328,7 @@ def parse_json(text: str | bytes, *, finite: bool = True) -> Any:
         finite: refuse `NaN` and `Infinity`.
 
     Raises:
-        ValueError: it is not JSON, or exceeds the limits of this module.
+        ValueError: the text is not JSON, or exceeds the limits of this module.
     """
     parts = text.count("[") + text.count("{") if isinstance(text, str) else text.count(b"[") + text.count(b"{")
     if parts > MOST_JSON_PARTS:
@@ -346,7 +348,7 @@ def parse_yaml(text: str) -> Any:
     """Parse YAML to dictionaries, lists, numbers and strings; dates and sexagesimal numbers stay strings.
 
     Raises:
-        ValueError: it is not YAML, has aliases or merge keys, or exceeds the limits of this module.
+        ValueError: the text is not YAML, has aliases or merge keys, or exceeds the limits of this module.
         CartsError: the YAML package is not installed.
     """
     require_package("yaml", "import")
@@ -368,7 +370,7 @@ def parse_yaml(text: str) -> Any:
         values = yaml.load(text, Loader=_plain_yaml(parser))
     except ValueError:
         raise
-    except Exception as error:  # value constructors raise many kinds of exceptions
+    except Exception as error:  # value constructors raise many types of exceptions
         raise ValueError(shortened(" ".join(str(error).split()))) from error
     _check_values(values)
     return values
@@ -380,7 +382,7 @@ def _plain_yaml(parser: Any) -> Any:
 
     class PlainLoader(parser):
         def flatten_mapping(self, node: Any) -> None:
-            """Keep merge keys, which then fail for lack of a constructor."""
+            """Leave merge keys, so that they fail for lack of a constructor."""
 
     def whole(loader: Any, node: Any) -> int | str:
         text = loader.construct_scalar(node).replace("_", "")
@@ -398,7 +400,7 @@ def _plain_yaml(parser: Any) -> Any:
 
 
 def parse_xml(text: str) -> ElementTree.Element:
-    """Parse XML and return the root; `ValueError` if it is invalid, or declares a document type or entities."""
+    """Parse XML and return the root; `ValueError` for invalid XML, and for document types and entities."""
     if "<!DOCTYPE" in text or "<!ENTITY" in text:
         raise ValueError("it declares a document type or entities")
     try:
@@ -408,12 +410,12 @@ def parse_xml(text: str) -> ElementTree.Element:
 
 
 def parse_ini(text: str) -> configparser.ConfigParser:
-    """Parse INI without interpolation; `ValueError` if it is invalid or has more than `MOST_INI_LINES` lines."""
+    """Parse INI without interpolation; `ValueError` for invalid INI and more than `MOST_INI_LINES` lines."""
     if text.count("\n") > MOST_INI_LINES:
         raise ValueError(f"it has more than {MOST_INI_LINES:,} lines")
     parser = configparser.ConfigParser(inline_comment_prefixes=(";", "#"), interpolation=None)
     try:
-        # The parser's time grows quadratically with the length of a run of blanks.
+        # The time of the parser grows quadratically with the length of a run of blanks.
         parser.read_string(re.sub(r"[^\S\n]+", " ", text))
     except configparser.Error as error:
         raise ValueError(shortened(" ".join(error.message.split()))) from error
@@ -446,7 +448,7 @@ def all_finite(root: Any) -> bool:
 
 
 def check_path(path: str | Path) -> None:
-    """Check the lengths of a path and of its components; `ValueError` if too long."""
+    """Check the lengths of a path and of its components; `ValueError` for excessive lengths."""
     text = str(path)
     if len(text) <= LARGEST_NAME and text.isascii():
         return

@@ -28,7 +28,7 @@ _FORMULA = ("=", "+", "-", "@", "\t", "\r")
 
 
 def csv_cell(text: str) -> str:
-    """Escape a text for a table cell: an apostrophe keeps spreadsheets from interpreting it as a formula.
+    """Escape a string for a table cell: an apostrophe prevents spreadsheets from interpreting the string as a formula.
 
     Numbers are not changed. `text_of_cell` is the inverse.
     """
@@ -37,7 +37,7 @@ def csv_cell(text: str) -> str:
 
 
 def text_of_cell(cell: str) -> str:
-    """Text of a cell written by `csv_cell`."""
+    """String of a cell written by `csv_cell`."""
     return cell.removeprefix("'")
 
 
@@ -53,25 +53,25 @@ _NEW = os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
 _MODE = 0o666
 _OWN_DESCRIPTORS = Path("/proc/self/fd")
 _NAMELESS = getattr(os, "O_TMPFILE", 0) if _OWN_DESCRIPTORS.is_dir() else 0
-"""Flag for unnamed temporary files, which are linked when complete, so that a kill leaves no file; 0 if not supported.
+"""Flag for unnamed temporary files, which are linked when complete, so that a kill leaves no file; 0 without support.
 """
 
 
 def write_bytes(path: OutputPath | Path, content: bytes) -> None:
     """Write a file atomically; missing folders are created.
 
-    Readers see either the complete old file or the complete new one, even after a crash of the process or machine. If
+    Readers see either the complete old or the complete new file, even after a crash of the process or machine. If
     the path is a link, the link is replaced and its target is unchanged.
 
     Raises:
-        OutputError: the file cannot be written; nothing is changed then.
+        OutputError: the file cannot be written, and nothing was changed.
     """
     with output_stream(path) as stream:
         stream.write(content)
 
 
 def write_text(path: OutputPath | Path, text: str) -> None:
-    """Write a text in UTF-8 with `write_bytes`; line ends are kept."""
+    """Write a string as UTF-8 with `write_bytes`; line ends are kept."""
     write_bytes(path, text.encode())
 
 
@@ -81,7 +81,7 @@ def write_new(path: OutputPath | Path, content: bytes) -> bool:
     Exactly one of several concurrent processes writes the file.
 
     Raises:
-        OutputError: it cannot be written; nothing is changed then.
+        OutputError: the file cannot be written, and nothing was changed.
     """
     output = as_output(path)
     with explained(output), opened_folder(output.parent, make=True) as folder:
@@ -136,12 +136,12 @@ def output_stream(path: OutputPath | Path) -> Iterator[BinaryIO]:
 
 
 def append_line(path: OutputPath | Path, line: bytes, *, sync: bool = True) -> None:
-    """Append a line to a file, created if missing, and if `sync` is set synchronize it to disk.
+    """Append a line to a file, created if missing, and synchronize the file to disk if `sync`.
 
-    An incomplete last line, left by a killed process, is terminated first.
+    An incomplete last line of a killed process is terminated first.
 
     Raises:
-        OutputError: it cannot be written, is a link, has a second hard link, or is not a regular file.
+        OutputError: the file cannot be written, is a link, has a second hard link, or is not a regular file.
     """
     output = as_output(path)
     flags = os.O_RDWR | os.O_APPEND | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
@@ -159,7 +159,8 @@ def append_line(path: OutputPath | Path, line: bytes, *, sync: bool = True) -> N
 
 
 def remove_file(path: OutputPath | Path) -> None:
-    """Remove a regular file if it exists; `OutputError` if it is a link, not a file, or cannot be removed."""
+    """Remove a regular file if it exists; `OutputError` for a link, for other kinds of files, and if the file cannot be
+    removed."""
     output = as_output(path)
     with explained(output):
         try:
@@ -178,7 +179,7 @@ def set_aside(path: OutputPath | Path) -> Path:
         New path of the file.
 
     Raises:
-        OutputError: it cannot be renamed.
+        OutputError: the file cannot be renamed.
     """
     output = as_output(path)
     with explained(output), opened_folder(output.parent) as folder:
@@ -190,7 +191,7 @@ def set_aside(path: OutputPath | Path) -> Path:
 
 
 def holds_file(path: OutputPath | Path) -> bool:
-    """Whether the path is a regular file, reached without a link."""
+    """Whether the path is a regular file, without following links below its folder."""
     output = as_output(path)
     try:
         with opened_folder(output.parent) as folder:
@@ -201,7 +202,7 @@ def holds_file(path: OutputPath | Path) -> bool:
 
 
 def check_own(folder: int, output: OutputPath) -> None:
-    """Check that writing or removing an entry changes no other file; `OutputError` otherwise."""
+    """Check that writing or removing an entry does not change another file; `OutputError` otherwise."""
     found = status(folder, output.name)
     if found is None or (stat.S_ISREG(found.st_mode) and found.st_nlink == 1):
         return
@@ -212,7 +213,7 @@ def check_own(folder: int, output: OutputPath) -> None:
 def _new_file(folder: int) -> tuple[int, str | None]:
     """Create an empty file in an open folder; returns its descriptor, and its name or None for an unnamed file."""
     if _NAMELESS:
-        # On file systems without support, the attempt with a name below succeeds or reports the error.
+        # Without support by the file system, the attempt with a name below succeeds or reports the error.
         with suppress(OSError):
             return os.open(".", _NAMELESS | os.O_RDWR | os.O_CLOEXEC, _MODE, dir_fd=folder), None
     name = _random_name()
@@ -240,14 +241,14 @@ class BusyError(OutputError):
 def locked_folder(path: OutputPath | Path, *, wait: bool = False) -> Iterator[None]:
     """Lock a folder, created if missing, against other CaRTS processes.
 
-    The lock is on the folder itself, so there is no lock file that could be deleted.
+    The folder itself is locked, so there is no lock file that could be deleted.
 
     Args:
         path: the folder.
         wait: wait until other processes have released the lock.
 
     Raises:
-        BusyError: another process holds it.
+        BusyError: another process holds the lock.
         OutputError: the folder cannot be created, or its file system does not support locks.
     """
     output = path if isinstance(path, OutputPath) else OutputPath(path)
@@ -289,7 +290,7 @@ class _Mark:
 
 @dataclass(frozen=True)
 class Staging:
-    """A locked staging folder."""
+    """Locked staging folder."""
 
     parent: int
     """Descriptor of the parent folder."""
@@ -319,11 +320,11 @@ class Staging:
 
 
 def make_staging(parent: int, output: str, key: str | None) -> Staging:
-    """Create a staging folder in an open folder; `OSError` if that fails."""
+    """Create a staging folder in an open folder; `OSError` on failure."""
     while True:
         name = f".carts-{secrets.token_hex(16)}"
         os.mkdir(name, 0o700, dir_fd=parent)
-        # Another process may remove it while it is empty and unlocked; then create another one.
+        # Another process may remove the folder while it is empty and unlocked; in this case create another folder.
         with suppress(FileNotFoundError):
             descriptor = open_below(parent, name)
             if try_lock(descriptor):
@@ -333,7 +334,7 @@ def make_staging(parent: int, output: str, key: str | None) -> Staging:
                     flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
                     with os.fdopen(os.open(_MARK, flags, 0o600, dir_fd=descriptor), "wb") as stream:
                         stream.write(json.dumps(asdict(mark)).encode())
-                except BaseException:  # For example, if the disk is full.
+                except BaseException:  # This happens if the disk is full, for example.
                     staging.remove()
                     staging.close()
                     raise
@@ -342,7 +343,8 @@ def make_staging(parent: int, output: str, key: str | None) -> Staging:
 
 
 def leftovers(parent: int, output: str, besides: Staging) -> Iterator[Staging]:
-    """Staging folders for the same output whose processes have ended, locked; `BusyError` if one is still running."""
+    """Yield the locked staging folders for the same output whose processes have ended; `BusyError` if a process is
+    still running."""
     for name in os.listdir(parent):
         if not _NAME.fullmatch(name) or name == besides.name:
             continue
@@ -352,7 +354,8 @@ def leftovers(parent: int, output: str, besides: Staging) -> Iterator[Staging]:
             continue
         mark = _read_mark(descriptor)
         if mark is None:
-            # The process was killed before marking it. Only empty folders, or those with an empty mark, are removed.
+            # The process was killed before marking the folder. Only empty folders, and folders with an empty mark, are
+            # removed.
             with suppress(OSError):
                 if try_lock(descriptor):
                     found = status(descriptor, _MARK)
@@ -379,7 +382,7 @@ def _remove(folder: int, name: str) -> None:
 
 
 def _read_mark(folder: int) -> _Mark | None:
-    """Read the mark in an open folder; None if there is no valid mark."""
+    """Read the mark in an open folder; None without a valid mark."""
     own = os.fstat(folder)
     try:
         descriptor = os.open(_MARK, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC, dir_fd=folder)
@@ -391,29 +394,29 @@ def _read_mark(folder: int) -> _Mark | None:
 
 
 MARKER = "export.json"
-"""File that marks a folder as an export; other folders are never replaced."""
+"""Name of the file that marks a folder as an export; other folders are never replaced."""
 _OLD = "carts-replaced"
-"""Temporary name of the replaced output between two renames."""
+"""Temporary name of the replaced output, between two renames."""
 
 
 @contextmanager
 def published(target: OutputPath | Path, *, overwrite: bool = False, key: str | None = None) -> Iterator[OutputPath]:
-    """Context manager for an output that replaces `target` when the block ends without an exception.
+    """Write an output that replaces `target` when the block ends without an exception.
 
     The output is written in a hidden folder with a random name beside `target`. If the block fails or is interrupted,
-    that folder is removed; if the process is killed, the next call for the same target removes it.
+    this folder is removed. If the process is killed, the next call for the same target removes the folder.
 
     Args:
-        target: file or folder to create; it must not be a link. An empty folder counts as absent.
+        target: file or folder to create, which must not be a link. An empty folder counts as absent.
         overwrite: replace an existing file, or a folder written by an export.
         key: fingerprint of the inputs. If given, partial output is kept if the block fails, and a later call with the
-            same key resumes from it.
+            same key continues with the partial output.
 
     Yields:
-        Path with the target's name, for a file or a folder; without `key` it does not exist yet.
+        Path with the target's name, for a file or a folder; it does not exist yet without `key`.
 
     Raises:
-        OutputError: the target exists and may not be replaced, another process writes it, or it cannot be written.
+        OutputError: the target exists and may not be replaced, another process is writing it, or it cannot be written.
     """
     output = as_output(target)
     with explained(output), opened_folder(output.parent, make=True) as folder:
@@ -442,12 +445,12 @@ def published_file(target: OutputPath | Path, *, overwrite: bool = False) -> Ite
 
 
 def _take_staging(folder: int, output: OutputPath, key: str | None) -> Staging:
-    """New staging folder, or one left over with the same key. Other leftovers are removed."""
+    """Create a staging folder, or take a remaining folder with the same key. Other remaining folders are removed."""
     taken = make_staging(folder, output.name, key)
     try:
         for left in leftovers(folder, output.name, taken):
             if status(left.descriptor, _OLD) is not None and status(folder, output.name) is None:
-                # If the process was killed between the two renames of `_move`, the earlier output is here.
+                # The earlier output is here if a process was killed between the two renames of `_move`.
                 os.rename(_OLD, output.name, src_dir_fd=left.descriptor, dst_dir_fd=folder)
             reused = key is not None and left.mark.key == key
             needless, taken = (taken, left) if reused else (left, taken)
@@ -494,7 +497,7 @@ def _below(folder: int, name: str) -> Iterator[int]:
 
 
 def _sync(folder: int, name: str) -> None:
-    """Synchronize an output in an open folder, including its contents, to disk."""
+    """Synchronize an output in an open folder to disk, including its content."""
     found = status(folder, name)
     if found is not None and not stat.S_ISDIR(found.st_mode):
         _sync_file(folder, name)

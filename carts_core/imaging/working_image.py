@@ -1,8 +1,8 @@
-"""Images at the working size: checks, stacking, filters, the compared window, and removal of smoke and haze.
+"""Images at the working size: checks, stacking, filters, windows, and removal of smoke and haze.
 
-Haze adds a grey that varies slowly over the image, and reduces contrast in proportion. Tissue reflects little in at
-least one colour, so the minimum over colours and nearby pixels estimates the added grey: the dark channel prior of
-He, Sun and Tang, "Single Image Haze Removal Using Dark Channel Prior" (CVPR 2009).
+Haze adds a grey value that varies slowly over the image, and reduces contrast in proportion. Tissue reflects little
+light in at least one colour, so the minimum over colours and nearby pixels is an estimate of the added value: the dark
+channel prior of He, Sun and Tang, "Single Image Haze Removal Using Dark Channel Prior" (CVPR 2009).
 """
 
 import math
@@ -37,8 +37,8 @@ class Window:
 
     @staticmethod
     def around(silhouette: Float[Tensor, "cameras h w"], margin: int, multiple: int, size: tuple[int, int]) -> "Window":
-        """Bounding box of all silhouettes with a margin, aligned to multiples of a size; the whole image if they are
-        empty."""
+        """Bounding box of all silhouettes with a margin, aligned to multiples of a size; the whole image for empty
+        silhouettes."""
         covered = silhouette.amax(0) > 0
         columns, rows = covered.any(0).nonzero()[:, 0], covered.any(1).nonzero()[:, 0]
         if not len(columns):
@@ -51,7 +51,7 @@ class Window:
         return Window(spans[0][0], spans[1][0], spans[0][1], spans[1][1])
 
     def holds(self, other: "Window") -> bool:
-        """Whether another window lies within this one."""
+        """Whether another window lies within this window."""
         return (
             self.left <= other.left
             and self.top <= other.top
@@ -60,14 +60,14 @@ class Window:
         )
 
     def intersection(self, other: "Window") -> "Window | None":
-        """Intersection with another window; None if it is empty."""
+        """Intersection with another window; None if empty."""
         left, top = max(self.left, other.left), max(self.top, other.top)
         right = min(self.left + self.width, other.left + other.width)
         bottom = min(self.top + self.height, other.top + other.height)
         return Window(left, top, right - left, bottom - top) if left < right and top < bottom else None
 
     def inside(self, outer: "Window") -> "Window":
-        """This window relative to one that contains it."""
+        """This window relative to a window that contains it."""
         return Window(self.left - outer.left, self.top - outer.top, self.width, self.height)
 
     def reduced(self, factor: int) -> "Window":
@@ -79,7 +79,7 @@ class Window:
         return image[..., self.top : self.top + self.height, self.left : self.left + self.width]
 
     def paste(self, part: Float[Tensor, "*batch h w"], whole: Float[Tensor, "*batch H W"]) -> Tensor:
-        """Replace this part of `whole` in place."""
+        """Replace this part of `whole` in place; returns `whole`."""
         self.of(whole)[...] = part
         return whole
 
@@ -126,7 +126,8 @@ def pixel_weights(
 
 
 def working_size(scene: Scene, width: int, stride: int) -> tuple[int, int]:
-    """Width and height [px] of the compared images: the first camera's aspect ratio, in multiples of the stride."""
+    """Width and height [px] of the compared images: multiples of the stride, with the aspect ratio of the first
+    camera."""
     camera = scene.cameras[0]
     width = max(round(min(width, camera.width) / stride), 1) * stride
     return width, max(round(width * camera.height / camera.width / stride), 1) * stride
@@ -174,16 +175,16 @@ def box_mean(image: Float[Tensor, "1 h w"], side: int) -> Float[Tensor, "1 h w"]
 
 
 def kernel_radius(deviation: float) -> int:
-    """Kernel radius of a blur of a standard deviation [px]."""
+    """Radius of the kernel of a Gaussian blur [px]."""
     return math.ceil(2.5 * deviation)
 
 
 def attention(silhouette: Float[Tensor, "*batch h w"], radius: int) -> Float[Tensor, "*batch h w"]:
-    """Att of the paper: the silhouette dilated by `radius` [px], without gradient."""
+    """Attention map (Att of the paper): silhouette dilated by `radius` [px], without gradient."""
     flat = silhouette.detach().reshape(-1, *silhouette.shape[-2:])
     size = 2 * radius + 1
     if flat.device.type == "cpu":
-        # The run time does not depend on the radius.
+        # The computation time of this dilation does not depend on the radius.
         square = np.ones((size, size), np.uint8)
         flat = torch.from_numpy(np.stack([cv2.dilate(image, square) for image in flat.contiguous().numpy()]))
     else:
@@ -199,7 +200,7 @@ _COARSER = 4
 """Downscaling factor for the estimate of haze [1]."""
 
 _AIRLIGHT = 0.75
-"""Value of opaque haze, in each colour [1]."""
+"""Colour value of opaque haze [1]."""
 
 _LEAST = 0.25
 """Minimum transmission [1]; dehazing amplifies noise by its inverse."""
@@ -227,7 +228,7 @@ def dehazed(images: Float[Tensor, "n 3 h w"], through: Float[Tensor, "n 1 h w"])
 
 
 def certainty(through: Float[Tensor, "n 1 h w"]) -> Float[Tensor, "n 1 h w"]:
-    """Information of each pixel of a dehazed image, relative to that without haze [1].
+    """Information of each pixel of a dehazed image, relative to an image without haze [1].
 
     Dehazing amplifies noise by the inverse of the transmission, and information is the inverse of its square.
     """

@@ -1,4 +1,4 @@
-"""Live tracking loop: takes the latest frame of a source, tracks it, and passes the result to sinks."""
+"""Live tracking loop: tracks the latest frame of a source and passes the result to sinks."""
 
 import time
 from collections import deque
@@ -13,16 +13,16 @@ from .messages import LatestFrame, Moment, ResultMessage, Source, encoded_masks
 from .tracker import LiveEstimate, LiveTracker, LiveVerdict
 
 _RECENT = 20
-"""Number of recent frames from which the processing time of the next one is predicted."""
+"""Number of recent frames from which the processing time of the next frame is predicted."""
 _USUAL = 75
-"""Percentile of recent processing times that is the predicted one."""
+"""Percentile of recent processing times that is used as prediction."""
 _FRESH = 0.01
 """Lower bound of the `patience` with which a frame is taken [s]."""
 
 
 @dataclass(frozen=True)
 class Tracked:
-    """A frame with its estimate and age."""
+    """Frame with its estimate and age."""
 
     moment: Moment
     estimate: LiveEstimate
@@ -31,7 +31,7 @@ class Tracked:
 
 
 Sink = Callable[[Tracked], None]
-"""Callback for each result, called on the tracker's thread."""
+"""Callback for results, called on the thread of the tracker."""
 
 
 @dataclass
@@ -76,13 +76,13 @@ class LiveStatistics:
 def follow(
     source: Source, tracker: LiveTracker, sinks: Sequence[Sink], statistics: LiveStatistics | None = None
 ) -> LiveStatistics:
-    """Track a stream until it ends, and close the source, even if the caller is interrupted.
+    """Track a stream until it ends; the source is always closed.
 
     Args:
         source: source of frames.
         tracker: tracker of the arms.
         sinks: callbacks that receive the results.
-        statistics: statistics of an earlier part of the stream, to be continued.
+        statistics: statistics of an earlier part of the stream, which are continued.
 
     Raises:
         CartsError: the stream failed, or a frame does not fit the scene.
@@ -115,7 +115,7 @@ class Results:
 
     Args:
         scene: scene with the tracked cameras.
-        masks: whether messages have masks; rendering them takes about 10 ms per camera.
+        masks: whether messages include masks, whose rendering takes about 10 ms per camera.
     """
 
     def __init__(self, scene: Scene, *, masks: bool = False) -> None:

@@ -1,4 +1,4 @@
-"""Messages of a stream, and the frames (`Moment`) that are assembled from them."""
+"""Messages of a stream, and frames (`Moment`) assembled from messages."""
 
 import math
 import socket
@@ -48,9 +48,9 @@ class FrameMessage(msgspec.Struct, tag="frame", forbid_unknown_fields=True):
     joints: dict[str, dict[str, float]] = {}
     """Arm -> joint -> position [rad, m]; omitted joints keep their value."""
     images: dict[str, ImageMessage] = {}
-    """Camera -> image; a message without images only changes joints."""
+    """Camera -> image; a message without images only updates joints."""
     camera_poses: dict[str, list[list[float]]] = {}
-    """Camera -> T_camera_world [4 x 4, m] of moving cameras; a pose is valid until the next one."""
+    """Camera -> T_camera_world [4 x 4, m] of moving cameras; a pose is valid until the next pose."""
     id: str = ""
     """Identifier that is returned with the result."""
 
@@ -85,7 +85,7 @@ _decoder = msgspec.msgpack.Decoder(FrameMessage)
 
 
 def packed(message: msgspec.Struct) -> bytes:
-    """Message with its length prefix, as sent over a socket."""
+    """Encode a message with its length prefix, for a socket."""
     content = msgspec.msgpack.encode(message)
     return _LENGTH.pack(len(content)) + content
 
@@ -113,7 +113,7 @@ def receive(connection: socket.socket) -> FrameMessage | None:
 
 
 def _exactly(connection: socket.socket, count: int) -> bytes | None:
-    """Receive exactly `count` bytes; None if the connection ends before."""
+    """Receive exactly `count` bytes; None if the connection ends earlier."""
     parts, missing = [], count
     while missing:
         part = connection.recv(min(missing, 1 << 20))
@@ -206,7 +206,7 @@ class Assembler:
         self._changing = threading.Lock()
 
     def moment(self, message: FrameMessage) -> Moment | None:
-        """Frame completed by a message; None if the message has no images, or not all joints are known yet.
+        """Frame completed by a message; None for a message without images, or before all joints are known.
 
         Raises:
             StreamError: the message has an unknown arm, joint or camera, lacks an image, or has an invalid image or
@@ -281,7 +281,7 @@ class Assembler:
 
 
 class LatestFrame:
-    """Buffer that keeps only the latest frame of a source, which is read on its own thread.
+    """Buffer with the latest frame of a source, which is read on a separate thread.
 
     Args:
         source: source that is read, and closed with the buffer.
@@ -303,7 +303,7 @@ class LatestFrame:
         """Wait for the latest frame; None at the end of the stream.
 
         Args:
-            patience: waiting time after which a frame is dropped, unless it is the last one [s].
+            patience: waiting time after which a frame is dropped, unless it is the last frame [s].
 
         Raises:
             CartsError: the source failed.

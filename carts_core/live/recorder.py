@@ -27,8 +27,8 @@ from .messages import mounts_of
 from .tracker import LiveVerdict
 
 _WAITING = 32
-"""Maximum number of frames waiting for the disk; further ones are not recorded."""
-_AGAIN = "Fit the frame again; live tracking had too little time."
+"""Maximum number of frames waiting for the disk; further frames are not recorded."""
+_AGAIN = "Fit the frame again without a time limit."
 _VERDICTS = {
     LiveVerdict.GOOD: FitVerdict("good", "Fitted live."),
     LiveVerdict.DOUBTFUL: FitVerdict(
@@ -38,19 +38,19 @@ _VERDICTS = {
         0.5,
     ),
     LiveVerdict.LOST: FitVerdict(
-        "failed", "The arms were lost during live tracking; joints are as measured.", _AGAIN, 1.0
+        "failed", "The arms were lost during live tracking; joints are the measured values.", _AGAIN, 1.0
     ),
 }
-"""Recorded verdicts; the probabilities are not calibrated, and serve only to sort the worst frames first."""
+"""Recorded verdicts; the probabilities are not calibrated and only used to sort the worst frames first."""
 
 
 class Recorder:
-    """Records results to disk on its own thread.
+    """Recorder that writes results to disk on a separate thread.
 
-    The folder gets `images/CAMERA/FRAME.png`, `kinematics.csv` with the measured joints, `corrected.csv` with the
-    corrected ones, `camera_CAMERA.csv` with the pose of each camera's mount, `sequence.toml`, and at the end the
-    project `sequence.carts`. Each frame is written with its row. Where the arms were lost, the measured joints are
-    written, and the verdict is *failed*.
+    The folder contains `images/CAMERA/FRAME.png`, `kinematics.csv` with the measured joints, `corrected.csv` with the
+    corrected joints, `camera_CAMERA.csv` with the poses of each camera mount, `sequence.toml`, and at the end the
+    project `sequence.carts`. Each image is written with its rows. If the arms are lost, the measured joints are written
+    with the verdict *failed*.
 
     Args:
         sequence: sequence with the arms and cameras.
@@ -98,7 +98,7 @@ class Recorder:
         if self._error is not None:
             raise self._error
         if not self._edits:
-            # Without frames the folder stays empty, so that the same command can be repeated.
+            # Without frames the folder remains empty, so that the same command can be repeated.
             remove_file(self._output / "sequence.toml")
             return None
         path = (self._output / "sequence.toml").path
@@ -115,7 +115,7 @@ class Recorder:
             if self._error is None:
                 try:
                     self._write_one(tracked)
-                except Exception as error:  # Reported at the end; the stream goes on.
+                except Exception as error:  # The error is reported at the end, and the stream continues.
                     self._error = error
 
     def _describe(self) -> None:
@@ -123,7 +123,7 @@ class Recorder:
         write_text(self._output / "sequence.toml", _sequence_file(self._sequence, self._scene, self._moving))
 
     def _write_mounts(self, number: int, name: str, tracked: Tracked) -> None:
-        """Write the mount pose of each camera, since any may begin to move."""
+        """Write the mount pose of each camera, since every camera may begin to move."""
         mounts = mounts_of(self._scene, tracked.moment.frame, tracked.moment.camera_poses)
         for camera in self._scene.cameras:
             path = self._output / _motion_file(camera.name)
@@ -169,7 +169,7 @@ def _motion_file(camera: str) -> str:
 
 
 def _sequence_file(sequence: Sequence, scene: Scene, moving: Collection[str]) -> str:
-    """Sequence file of the recording; its images are undistorted."""
+    """Content of the sequence file of the recording; images are undistorted."""
     folder = sequence.path.parent.resolve()
     described = parse_toml(read_text(sequence.path, SEQUENCE))["arms"]
     robots = {

@@ -34,16 +34,17 @@ from .messages import (
 
 HOST = "127.0.0.1"
 _WAITING = 8
-"""Maximum number of results waiting for a slow client; older ones are dropped."""
+"""Maximum number of results waiting for a slow client; older results are dropped."""
 _CLIENTS = 16
 _SILENCE = 10.0
-"""Idle time after which a client is disconnected in favour of a new one, if no more connections are allowed [s]."""
+"""Idle time after which a client may be disconnected in favour of a new client if the maximum number of connections is
+reached [s]."""
 _LINGER = 1.0
-"""Time for which a client still receives results after it has closed its side [s]."""
+"""Time for which a client receives results after closing its side of the connection [s]."""
 
 
 class _Client:
-    """One connection: queue of outgoing messages, and time of its last message [s]."""
+    """Connection with its queue of outgoing messages, and time of the client's last message [s]."""
 
     def __init__(self) -> None:
         self.waiting: queue.Queue[bytes | None] = queue.Queue(_WAITING)
@@ -52,11 +53,11 @@ class _Client:
 
 
 class StreamServer:
-    """Server on 127.0.0.1: a source of frames that returns results.
+    """Server on 127.0.0.1: source of frames, to whose clients results are sent.
 
     Args:
         assembler: assembler of messages.
-        port: port number; 0 chooses a free one.
+        port: port number; 0 chooses a free port.
 
     Attributes:
         port: port number of the server.
@@ -74,7 +75,7 @@ class StreamServer:
             self._listener = socket.create_server((HOST, port))
         except OSError as error:
             raise SettingsError(
-                f"port {port} of {HOST} cannot be used: {error}. Choose another, or 0 for a free one."
+                f"port {port} of {HOST} cannot be used: {error}. Choose another port, or 0 for a free port."
             ) from error
         self.port: int = self._listener.getsockname()[1]
         threading.Thread(target=self._accept, name="carts-live-accept", daemon=True).start()
@@ -85,7 +86,7 @@ class StreamServer:
             yield moment
 
     def send(self, result: ResultMessage) -> None:
-        """Send a result to all clients; slow clients miss some."""
+        """Send a result to all clients; slow clients miss results."""
         content = packed(result)
         with self._changing:
             for client in self._clients.values():
@@ -114,7 +115,7 @@ class StreamServer:
                 if not full:
                     self._clients[connection] = client
             if full:
-                text = f"{_CLIENTS} clients are connected, which is the limit. Close one and try again."
+                text = f"{_CLIENTS} clients are connected, which is the limit. Close a connection and try again."
                 with connection, suppress(OSError):
                     connection.sendall(packed(ErrorMessage(text)))
                 continue
@@ -123,7 +124,7 @@ class StreamServer:
             threading.Thread(target=self._write, args=(connection, client), daemon=True).start()
 
     def _has_room(self) -> bool:
-        """Whether another client may connect; disconnects the longest idle client if necessary."""
+        """Whether another client may connect; the longest idle client is disconnected if necessary."""
         if len(self._clients) < _CLIENTS:
             return True
         connection, longest = min(self._clients.items(), key=lambda each: each[1].heard)
@@ -162,7 +163,7 @@ class StreamServer:
 
 
 def _put_newest(waiting: queue.Queue, item: object) -> None:
-    """Put an item into a queue; drops the oldest one if it is full."""
+    """Put an item into a queue; the oldest item of a full queue is dropped."""
     while True:
         try:
             waiting.put_nowait(item)
@@ -199,7 +200,7 @@ class Replay(_Closable):
         sequence: the recording.
         cameras: cameras to replay.
         domain: domain to replay.
-        rate: frame rate [1/s]; as recorded if None.
+        rate: frame rate [1/s]; None for the recorded frame rate.
         loops: number of repetitions, with time stamps that continue to increase.
 
     Raises:
@@ -229,7 +230,7 @@ class Replay(_Closable):
                 due = loop * self._length + float(offset)
                 following = loop * self._length + float(np.append(self._times, self._length)[index + 1])
                 if time.monotonic() - began > following:
-                    continue  # The frame is late.
+                    continue  # The frame is late and is skipped.
                 frame = self._sequence.frame(index, self._domain, self._cameras)
                 if self._closed.wait(max(0.0, due - (time.monotonic() - began))):
                     return
@@ -240,7 +241,7 @@ class Camera(_Closable):
     """Camera device or video file read with OpenCV; joints come from another source.
 
     Args:
-        assembler: assembler that has the joints.
+        assembler: assembler with the joints.
         camera: name of the camera in the scene.
         device: number of a device, or path of a video file.
 
@@ -256,7 +257,7 @@ class Camera(_Closable):
             raise SettingsError(
                 f"OpenCV cannot open {device!r} as a camera or video. Give a device number or a video file."
             )
-        # A device sets its own rate; a file is throttled to its frame rate.
+        # A device has its own rate; a file is throttled to its frame rate.
         rate = self._capture.get(cv2.CAP_PROP_FPS) if isinstance(device, str) else 0.0
         self._gap = 1.0 / rate if rate > 0 else 0.0
 
@@ -279,9 +280,9 @@ class Camera(_Closable):
 
 
 class Folder(_Closable):
-    """Watched folder with `NAME.json` and `NAME.png`, or `NAME.CAMERA.png` for each of several cameras.
+    """Watched folder with files `NAME.json` and `NAME.png`, or `NAME.CAMERA.png` for each of several cameras.
 
-    The JSON file is a frame message without images, and is written last. If several frames are new, only the last is
+    The JSON file is a frame message without images and must be written last. Only the last of several new frames is
     read. Unusable frames are skipped with a warning.
 
     Args:
@@ -348,7 +349,7 @@ class Folder(_Closable):
 
 @dataclass(frozen=True)
 class OpenStream:
-    """A source with its optional server."""
+    """Source with its optional server."""
 
     source: Source
     server: StreamServer | None = None
@@ -379,7 +380,7 @@ def open_stream(
     Args:
         address: address of the source.
         sequence: sequence with the arms and cameras.
-        cameras: cameras that need an image in each frame; a device provides the first one.
+        cameras: cameras that need an image in each frame; a device is the first camera.
         domain: domain of a replay.
         rate: frame rate of a replay [1/s]; as recorded if None.
         loops: number of repetitions of a replay.

@@ -34,9 +34,9 @@ class LiveVerdict(StrEnum):
 
     GOOD = "good"
     DOUBTFUL = "doubtful"
-    """The image does not fit; the estimate is predicted from earlier frames."""
+    """The fit is bad; the estimate is predicted from earlier frames."""
     LOST = "lost"
-    """The arms are lost; the estimate is the measured values with the last known correction."""
+    """The arms are lost; the estimate consists of the measured values with the last known correction."""
 
 
 class Effort(StrEnum):
@@ -68,7 +68,7 @@ class LiveEstimate:
 
 
 CHANGED = 0.5
-"""Change of thumbnails above which they show different scenes; equivalent to a correlation of one half [1]."""
+"""Change of thumbnails above which the scene is considered different; equivalent to a correlation of one half [1]."""
 _SIZE = (32, 24)
 """Width and height of thumbnails [px]."""
 
@@ -83,7 +83,7 @@ def small_picture(frame: Frame) -> Picture:
 
 
 def change(before: Picture, now: Picture) -> float:
-    """Maximum change of a thumbnail over the cameras [1]; 0.7 for uncorrelated ones."""
+    """Maximum change of a thumbnail over the cameras [1]; 0.7 for uncorrelated thumbnails."""
     sizes = np.linalg.norm(before, axis=1) + np.linalg.norm(now, axis=1)
     return float((np.linalg.norm(now - before, axis=1) / (sizes + np.sqrt(before.shape[1]))).max())
 
@@ -96,7 +96,7 @@ _LOOKED = 1.0
 
 @dataclass(frozen=True)
 class _Attempt:
-    """One attempt to measure a frame."""
+    """Attempt to measure a frame."""
 
     effort: Effort
     time: float
@@ -111,33 +111,33 @@ class _Attempt:
 
 @dataclass(frozen=True)
 class _Recovery:
-    """An attempt on its own thread."""
+    """Attempt that runs on a separate thread."""
 
     attempt: _Attempt
     picture: Picture
-    """Thumbnail of its frame."""
+    """Thumbnail of the frame."""
     measurement: Future[Measurement]
     dropped: threading.Event
     """Event that cancels the attempt when set."""
 
 
 class LiveTracker:
-    """Tracks the arms of a scene frame by frame; frames may be dropped, and times need not be regular.
+    """Tracker of the arms of a scene, frame by frame; frames may be dropped, and times may be irregular.
 
     Args:
         scene: arms and cameras.
-        networks: the networks, or another predictor of surface maps.
+        networks: the networks, or a predictor of surface maps.
         settings: noise, weights and working size; the stages are those of `live`.
-        model: of the measurement error.
-        live: stages, and thresholds of bad fits.
+        model: model of the measurement error.
+        live: stages, and thresholds for lost arms.
         free: unknowns.
         backgrounds: backgrounds of the cameras; detections in them are false positives.
-        cameras: names of the cameras that take part, all by default.
-        concurrent: whether recovery runs on its own thread, while later frames are doubtful or lost; otherwise it
-            delays the result. `close` ends the thread.
+        cameras: names of the cameras to use, all by default.
+        concurrent: whether recovery runs on a separate thread, while later frames are doubtful or lost; otherwise
+            recovery delays the result. `close` ends the thread.
 
     Attributes:
-        verdict: verdict of the last frame; lost before the first one.
+        verdict: verdict of the last frame; lost before the first frame.
     """
 
     def __init__(
@@ -187,7 +187,7 @@ class LiveTracker:
         Args:
             frame: images, measured joint positions and time stamp.
             camera_poses: camera name -> T_camera_world [m], for cameras whose pose differs from that in the scene.
-                Backgrounds are then not used, since moving cameras have none.
+                In this case backgrounds are not used, since moving cameras have no background.
 
         Raises:
             SettingsError: an image is missing, or its size differs from that of its camera.
@@ -226,7 +226,7 @@ class LiveTracker:
     def _arm_is_elsewhere(
         self, frame: Frame, variables: Variables, correction: np.ndarray, loss: float, now: float
     ) -> bool:
-        """Whether an arm is out of view while one is predicted elsewhere; checked at intervals."""
+        """Whether an arm is out of view, but an arm is predicted elsewhere; checked at intervals."""
         if now - self._looked >= _LOOKED:
             solver = self._solvers[Effort.SMALL, self._moving]
             missing = solver.arms_out_of_view(variables, correction)
@@ -245,7 +245,7 @@ class LiveTracker:
     def _measured(
         self, frame: Frame, variables: Variables, errors: ErrorModel, now: float
     ) -> tuple[_Attempt, Measurement]:
-        """Measure with the smallest effort that fits, and start a recovery if none fits."""
+        """Measure with the smallest sufficient effort, and start a recovery if no effort gives a good fit."""
         small, full = (self._solvers[effort, self._moving] for effort in (Effort.SMALL, Effort.FULL))
         found = None
         self._drop_outdated(frame)
@@ -272,9 +272,9 @@ class LiveTracker:
         return found
 
     def _drop_outdated(self, frame: Frame) -> None:
-        """Cancel a search in a frame that no longer resembles the current one."""
+        """Cancel a search in a frame that no longer resembles the current frame."""
         running = self._recovery
-        # The search after a cancelled one runs to its end, so that fast motion cannot cancel all of them.
+        # A search after a cancelled search runs to its end, so that fast motion does not cancel all searches.
         if running is None or running.attempt.effort is not Effort.SEARCH or self._gave_up:
             return
         picture = small_picture(frame)
@@ -283,14 +283,15 @@ class LiveTracker:
             self._recovery, self._searched, self._gave_up = None, -math.inf, True
 
     def _further(self, now: float) -> Effort:
-        """Next effort for a frame that did not fit."""
+        """Next effort after a bad fit."""
         if self._filtered is not None and self.verdict is not LiveVerdict.LOST:
             return Effort.FULL
         early = self._filtered is not None and now - self._searched < self.live.search_seconds
         return Effort.SMALL if early else Effort.SEARCH
 
     def _take_recovered(self, errors: ErrorModel) -> Effort | None:
-        """Use the result of a finished recovery, unless a later frame fits; returns its effort if used."""
+        """Use the result of a finished recovery unless a later frame was fitted; returns the effort of a used
+        result."""
         if self._recovery is None or not self._recovery.measurement.done():
             return None
         attempt, future = self._recovery.attempt, self._recovery.measurement
@@ -302,9 +303,9 @@ class LiveTracker:
         return attempt.effort
 
     def _fits(self, attempt: _Attempt, measurement: Measurement) -> bool:
-        """Whether a measurement is reliable; without a filtered state only a search can be."""
+        """Whether a measurement is reliable; without a filtered state, only a search is reliable."""
         if attempt.effort is Effort.SEARCH:
-            # A search starts farther from the solution than tracking, and converges less closely.
+            # A search starts farther from the solution than tracking, and converges less accurately.
             return measurement.loss <= self.live.bad_loss
         usual = statistics.median(self._losses) if self._losses else math.inf
         worst = max(self.live.bad_factor * usual, 0.5 * self.live.bad_loss)
@@ -313,7 +314,7 @@ class LiveTracker:
         return self._filtered is not None and not measurement.information.contradicts(attempt.expected)
 
     def _take(self, errors: ErrorModel, attempt: _Attempt, measurement: Measurement) -> None:
-        """Update the filter with a good frame, weighted for its correlation with the previous one."""
+        """Update the filter with a good frame, weighted for the correlation with the previous frame."""
         share = math.tanh(0.5 * attempt.gap / self._model.correlation_seconds)
         self._filtered = errors.updated(attempt.state, measurement.information.scaled(share))
         self._seen = attempt.time

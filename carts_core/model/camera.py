@@ -20,12 +20,13 @@ DISTORTION_LENGTHS = (0, 4, 5, 8, 12, 14)
 RIGID_TOLERANCE = 1e-3
 """Maximum deviation of R^T R from the identity, per element [1]."""
 EXACT = 1e-9
-"""Deviation of R^T R from the identity [1] below which rotations are unchanged; others are projected onto SO(3)."""
+"""Deviation of R^T R from the identity [1] below which rotations are not changed; other matrices are projected onto
+SO(3)."""
 LAST_ROW_TOLERANCE = 1e-6
-"""Maximum deviation of the last row from 0, 0, 0, 1, for matrices in single precision [1]."""
+"""Maximum deviation of the last row from 0, 0, 0, 1, which allows for matrices in single precision [1]."""
 
 T_DVRK_OPENCV = np.diag([-1.0, -1.0, 1.0, 1.0])
-"""Transform from OpenCV's camera frame (x right, y down) to the dVRK's (x left, y up); its own inverse."""
+"""Transform from OpenCV's camera frame (x right, y down) to the dVRK's camera frame (x left, y up); its own inverse."""
 
 FOCAL_RANGE = 0.3, 20.0
 """Plausible focal lengths, relative to the image's longer side [1]: fields of view from 118 to 3 degrees."""
@@ -81,10 +82,10 @@ def rigid_transform(value: ArrayLike, what: str) -> Float[np.ndarray, "4 4"]:
 def implausible_intrinsics(
     width: int, height: int, intrinsics: tuple[float, float, float, float], distortion: tuple[float, ...] = ()
 ) -> str | None:
-    """Description of implausible intrinsics as a phrase that follows "it has"; None if they are plausible.
+    """Description of implausible intrinsics as a phrase that follows "it has"; None for plausible intrinsics.
 
     Args:
-        width, height: of the images [px].
+        width, height: image size [px].
         intrinsics: fx, fy, cx, cy [px].
     """
     fx, fy, cx, cy = intrinsics
@@ -123,7 +124,7 @@ def _folds(
     return bool((np.diff(distorted) <= 0).any())
 
 
-# Compared by identity, since element-wise comparison of arrays gives no single truth value.
+# Cameras are compared by identity, since element-wise comparison of arrays has no single truth value.
 @dataclass(frozen=True, eq=False)
 class Camera:
     """OpenCV pinhole camera (x right, y down, z forward) for undistorted images.
@@ -142,7 +143,7 @@ class Camera:
     T_camera_world: Float[np.ndarray, "4 4"]
     """Extrinsics [m] (C of the paper)."""
     distortion: tuple[float, ...] = ()
-    """OpenCV's distortion coefficients k1 k2 p1 p2 [k3 ...] of the recorded image; empty for none."""
+    """OpenCV's distortion coefficients k1 k2 p1 p2 [k3 ...] of the recorded image; empty without distortion."""
 
     def __post_init__(self) -> None:
         if self.width < 1 or self.height < 1:
@@ -167,18 +168,18 @@ class Camera:
 
     @property
     def K(self) -> Float[np.ndarray, "3 3"]:
-        """The intrinsic matrix [px], pixel centres at +0.5."""
+        """Intrinsic matrix [px], with pixel centres at +0.5."""
         fx, fy, cx, cy = self.intrinsics
         return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
 
     def undistort(self, image: np.ndarray, interpolation: int = cv2.INTER_LINEAR) -> np.ndarray:
-        """Undistort `image` [height, width, ...]; unchanged if the camera has no distortion.
+        """Undistort an image [height, width, ...]; unchanged if the camera has no distortion.
 
         Args:
-            image: recorded image, `uint8` or floating point, or a `bool` mask (nearest-neighbour interpolation).
+            image: recorded image, `uint8` or floating point, or mask, `bool` (nearest-neighbour interpolation).
 
         Raises:
-            SettingsError: the size of the image differs from the camera's.
+            SettingsError: the size of the image differs from that of the camera.
         """
         if image.shape[:2] != (self.height, self.width):
             raise SettingsError(
@@ -193,7 +194,7 @@ class Camera:
         return cv2.remap(image, *maps, interpolation)
 
     def resized(self, width: int, height: int) -> "Camera":
-        """The camera at another image resolution, without distortion."""
+        """Copy of the camera at another image resolution, without distortion."""
         x, y = width / self.width, height / self.height
         fx, fy, cx, cy = self.intrinsics
         # With pixel centres at +0.5 the image spans [0, width], so the principal point scales like the focal length.

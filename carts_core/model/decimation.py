@@ -1,7 +1,7 @@
 """Mesh decimation with a bound on the surface distance.
 
-Runs in a child process with limited CPU time, since the library ignores signals and takes very long for some meshes:
-more than ten minutes for 300,000 random triangles.
+Decimation runs in a child process with limited CPU time, since the library ignores signals and takes very long for some
+    meshes: more than ten minutes for 300,000 random triangles.
 """
 
 import numpy as np
@@ -15,17 +15,17 @@ LIBRARIES = {"fewest": ("fast_simplification", "scipy.spatial")}
 _SECONDS = 12.0
 """Constant part of the CPU time limit [s]."""
 _SECONDS_PER_FACE = 1e-4
-"""CPU time limit per triangle [s]; about five times what instrument meshes need."""
+"""CPU time limit per triangle [s], about five times the time for instrument meshes."""
 _MEMORY = 2 * GIB
 _FEWER = 0.6
 """Number of triangles of a trial, relative to the previous trial [1]."""
 _FEWEST = 8
 _CARE = 2
-"""Aggressiveness of the library, 0 to 10; at 7, its default, surfaces deviate ten times as much."""
+"""Aggressiveness of the library, 0 to 10; with the default of 7, surfaces deviate ten times as much."""
 _SAMPLES = 20_000
-"""Number of points on a surface at which the distance to the other is measured."""
+"""Number of points on a surface at which the distance to the other surface is measured."""
 _NEIGHBOURS = (6, 60)
-"""Number of nearest samples of the other surface whose triangles are tested: for each point, and for the worst
+"""Number of nearest samples of the other surface whose triangles are tested, for each point and for the worst
 points."""
 _WORST, _AT_ONCE = 2_000, 16
 _SEED = 1
@@ -38,7 +38,7 @@ class DecimationError(Exception):
 def decimated(
     vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"], tolerance: float
 ) -> tuple[Float[np.ndarray, "W 3"], Int[np.ndarray, "G 3"], float]:
-    """Decimate a mesh as far as a tolerance allows; returns vertices, faces and the largest deviation [m].
+    """Decimate a mesh as far as a tolerance allows; returns vertices, faces and the maximum deviation [m].
 
     Args:
         vertices: mesh vertices [m].
@@ -65,8 +65,8 @@ def deviation(
 ) -> float:
     """Symmetric Hausdorff distance of two surfaces [m], measured at samples.
 
-    A tolerance saves time: a result within the tolerance is then an upper bound, and a result above it is a lower
-    bound.
+    With a tolerance, the computation is faster: a result within the tolerance is an upper bound, and a larger result is
+        a lower bound.
     """
     first, second = vertices[faces], other_vertices[other_faces]
     moved = _farthest(first, second, tolerance)
@@ -126,7 +126,7 @@ def _samples(triangles: Float[np.ndarray, "F 3 3"]) -> tuple[Float[np.ndarray, "
 
 
 def _distances(points: Float[np.ndarray, "n 3"], triangles: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, " n"]:
-    """The distance of each point to its triangle (Ericson, Real-Time Collision Detection, 5.1.5)."""
+    """Distance of each point from its triangle (Ericson, Real-Time Collision Detection, 5.1.5)."""
     a, b, c = triangles.swapaxes(0, 1)
     best = np.minimum(_to_segments(points, a, b), np.minimum(_to_segments(points, b, c), _to_segments(points, c, a)))
     u, v, w = b - a, c - a, points - a
@@ -149,7 +149,7 @@ def _to_segments(points: np.ndarray, a: np.ndarray, b: np.ndarray) -> Float[np.n
 
 
 def fewest(vertices: np.ndarray, faces: np.ndarray, tolerance: float) -> tuple[np.ndarray, np.ndarray, float]:
-    """Vertices, triangles and deviation [m] of the mesh with the fewest triangles within a tolerance [m].
+    """Find the mesh with the fewest triangles within a tolerance [m]; returns vertices, triangles and deviation [m].
 
     The number of triangles is reduced step by step; the last mesh within the tolerance is returned.
     """

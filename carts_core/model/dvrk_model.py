@@ -1,8 +1,9 @@
 """Robots from the dVRK's model tree (jhu-dvrk/dvrk_model): an arm with one of its instruments as a plain URDF.
 
 The tree consists of xacro files for ROS, which are expanded without ROS. Links before the instrument's shaft are
-omitted, since an endoscope does not see them. The three joints that carry the shaft follow the dVRK's controller, as
-recordings do; the tree's linkage of the Si arm, made for visualization, is pitched by 9.3 degrees relative to it.
+omitted, since they are not visible in an endoscope. The three joints that carry the shaft are those of the dVRK's
+controller, as in recordings; the tree's linkage of the Si arm, made for visualization, is pitched by 9.3 degrees
+relative to these.
 """
 
 import os
@@ -24,7 +25,7 @@ from .xacro_guard import expanded
 PACKAGE = "dvrk_model"
 _PREFIX = "PSM1_"
 _FIRST_SEEN = "roll_link"
-"""First link that can be in view, followed by its descendants."""
+"""First link that can be in view."""
 _CARRIED_BY = "insertion_link"
 _TABLE = Path("urdf/common/instruments/instruments.yaml")
 
@@ -34,14 +35,14 @@ class Instrument:
     """Instrument in the model tree."""
 
     number: str
-    """Last six digits of its model number, such as `420093`."""
+    """Last six digits of the model number, such as `420093`."""
     name: str
     generation: str
     """Generation of the arm: `Classic` or `Si`."""
     tip: str
-    """Number of its tip, such as `093`."""
+    """Number of the tip, such as `093`."""
     has_tip: bool
-    """Whether the tree has the meshes of the tip; otherwise it uses boxes of 5 mm."""
+    """Whether the tree has the meshes of the tip; otherwise it has boxes of 5 mm."""
 
 
 def list_instruments(model: Path) -> dict[str, Instrument]:
@@ -78,7 +79,7 @@ def choose_instrument(model: Path, number: str) -> Instrument:
     """Find an instrument by its number, with or without the dots of a `tool_type`.
 
     Raises:
-        RobotError: the tree does not list it, or lacks the meshes of its tip.
+        RobotError: the tree does not list the instrument, or lacks the meshes of its tip.
     """
     instruments = list_instruments(model)
     if number not in instruments:
@@ -97,15 +98,15 @@ def choose_instrument(model: Path, number: str) -> Instrument:
 
 
 def dvrk_urdf(model: Path, number: str, folder: Path) -> str:
-    """URDF of an arm with an instrument, for a file in `folder`.
+    """Create the URDF of an arm with an instrument, for a file in `folder`.
 
-    Its root is the DH base of the arm, at the remote centre; joints are named as in the sequence format.
+    The root is the DH base of the arm, at the remote centre; joints are named as in the sequence format.
 
     Args:
         folder: folder of the URDF, to which mesh paths are relative; meshes are not copied.
 
     Raises:
-        RobotError: the tree or the instrument is not usable, a mesh is missing or was not fetched by Git LFS.
+        RobotError: the tree or the instrument is not usable, or a mesh is missing or was not fetched by Git LFS.
     """
     chosen = choose_instrument(model, number)
     root = ElementTree.fromstring(_expanded(model, chosen))
@@ -135,7 +136,7 @@ def _expanded(model: Path, chosen: Instrument) -> str:
 
 
 def _keep_what_is_seen(root: ElementTree.Element) -> None:
-    """Remove all but the links from the shaft on, with their joints and visuals."""
+    """Keep only the links from the shaft on, with their joints and visuals."""
     joints = {_link(joint, "child"): joint for joint in root.findall("joint")}
     if _FIRST_SEEN not in joints:
         raise RobotError(
@@ -148,7 +149,7 @@ def _keep_what_is_seen(root: ElementTree.Element) -> None:
             if name in joints:
                 root.remove(joints[name])
         for part in list(link):
-            # A box is a placeholder for a mesh that the tree lacks.
+            # Boxes are placeholders for missing meshes.
             if part.tag != "visual" or part.find("geometry/box") is not None:
                 link.remove(part)
     for parent in joints[_FIRST_SEEN].iter("parent"):

@@ -1,7 +1,7 @@
 """Forward kinematics of the dVRK's Endoscope Camera Manipulator (ECM).
 
-The chain, in modified Denavit-Hartenberg parameters (alpha [rad], a [m], theta [rad], d [m]), which are those of
-jhu-dvrk/sawIntuitiveResearchKit: share/kinematic/ecm.json and ecm-si.json:
+The chain, in the modified Denavit-Hartenberg parameters (alpha [rad], a [m], theta [rad], d [m]) of
+jhu-dvrk/sawIntuitiveResearchKit (share/kinematic/ecm.json and ecm-si.json):
 
     yaw           pi/2   0   q1 + pi/2   0
     pitch        -pi/2   0   q2 - pi/2   0

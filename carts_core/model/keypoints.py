@@ -17,7 +17,7 @@ from .robot import Robot
 from .scene import Arm, Scene, SceneState
 
 MOST_KEYPOINTS = 6
-"""Maximum number of keypoints of an arm; those nearest to the tip are kept."""
+"""Maximum number of keypoints of an arm; the keypoints nearest to the tip are kept."""
 _SAME_POINT = 5e-4
 """Distance below which joints are merged into one point [m]."""
 
@@ -38,8 +38,8 @@ class Keypoint:
 def keypoints(arm: Arm) -> tuple[Keypoint, ...]:
     """Keypoints of an arm, from the tip backwards: the tips of its last links, then the links' joints.
 
-    The shipped instrument has the tips of both jaws, the centre of the wrist's yaw joint (about which the jaws rotate)
-    and that of its pitch joint (where the shaft ends).
+    The keypoints of the shipped instrument are the tips of both jaws, the centre of the wrist's yaw joint (about which
+    the jaws rotate), and the centre of the pitch joint (where the shaft ends).
     """
     robot = arm.robot
     moved_by = _moved_by(robot)
@@ -57,7 +57,7 @@ def project_keypoints(
     """Projections of points into a camera's image [px], differentiable; NaN behind the camera.
 
     Raises:
-        RobotError: there is no such camera or arm.
+        RobotError: the camera or an arm does not exist.
     """
     view = scene.cameras.index(scene.camera(camera))
     arms = {arm.name: index for index, arm in enumerate(scene.arms)}
@@ -85,8 +85,8 @@ def _moved_by(robot: Robot) -> np.ndarray:
 
 
 def _joints(robot: Robot, depth: np.ndarray) -> list[tuple[int, str]]:
-    """Joint centres from the base on: the link to which each is fixed, and its name."""
-    # Not at 0, where joints may coincide that are apart in other configurations.
+    """Joint centres, starting at the base: the link to which each is fixed, and its name."""
+    # Positions other than 0 are used, since at 0 distinct joints may coincide.
     somewhere = torch.full((len(robot.joint_names),), 0.1, dtype=torch.float64)
     origins = robot.forward_kinematics(somewhere)[:, :3, 3].numpy()
     groups: list[list[int]] = []
@@ -98,7 +98,7 @@ def _joints(robot: Robot, depth: np.ndarray) -> list[tuple[int, str]]:
             group.append(link)
     named = []
     for group in groups:
-        # The end of the shaft is named after the wrist, and the axis of two jaws after the link that carries them.
+        # The end of the shaft is named after the wrist, and the axis of two jaws after their parent link.
         alone = [link for link in group if (depth[group] == depth[link]).sum() == 1]
         named.append((group[0], _named(robot, alone[-1] if alone else group[0])))
     return named
@@ -123,7 +123,7 @@ TIP = "tip"
 SHAFT_EDGE = "shaft edge"
 SHAFT_MIDDLE = "shaft middle"
 _OUTER_SHARE = 90
-"""Percentile of the distances of a shaft's vertices from its axis that is taken as its radius."""
+"""Percentile of the distances of a shaft's vertices from its axis that is used as the radius."""
 _LEAST_SLENDERNESS = 5.0
 """Minimum ratio of length to width of a shaft [1]."""
 
@@ -134,21 +134,22 @@ class LandmarkKind(StrEnum):
     POINT = "point"
     """The point projects to the marked position."""
     EDGE = "edge"
-    """One of the two outlines of a cylinder, either one, passes through the marked position."""
+    """One of the two outlines of a cylinder passes through the marked position."""
     AXIS = "axis"
     """The projected axis of a cylinder passes through the marked position, at any depth."""
 
 
 @dataclass(frozen=True)
 class Landmark:
-    """Landmark of an arm: a point, or a straight line with a thickness."""
+    """Landmark of an arm: a point, or the axis of a cylinder."""
 
     name: str
     kind: LandmarkKind
     hint: str
-    """Description of its position, for the page."""
+    """Description of the position, displayed in the page."""
     points: tuple[tuple[int, tuple[float, float, float]], ...]
-    """Link and position in its frame [m]; a point is the mean of all, and a line has the two ends of its axis."""
+    """Link and position in the link's frame [m]; a point is the mean of all positions, a line has two positions, the
+    ends of its axis."""
     radius: float = 0.0
     """Radius of the cylinder [m]."""
 
@@ -161,7 +162,8 @@ class Landmark:
 def landmarks(arm: Arm) -> Mapping[str, Landmark]:
     """Landmarks of an arm by name, in the recommended order of annotation.
 
-    Those of the shipped instrument are its tip, the two joints of the wrist, and the edges and axis of the shaft.
+    The landmarks of the shipped instrument are its tip, the two joints of the wrist, and the edges and axis of the
+    shaft.
     """
     points = keypoints(arm)
     tips = [point for point in points if point.name.endswith(" tip")]
@@ -196,14 +198,14 @@ def link_transforms(
 
 
 def _shaft(arm: Arm) -> tuple[int, tuple[float, float, float], tuple[float, float, float], float] | None:
-    """Link, two ends of the axis in the link's frame and radius [m] of the longest slender link; None if no link is
-    slender."""
+    """Longest slender link: index, two ends of its axis in the link's frame, and radius [m]; None without a slender
+    link."""
     best, longest = None, 0.0
     for link in range(len(arm.robot.link_names)):
         vertices = _vertices(arm.robot, link)
         centre = vertices.mean(0)
         _, _, directions = np.linalg.svd(vertices - centre, full_matrices=False)
-        # A tube's vertices are mainly at its ends, so the first direction is along its axis.
+        # Most vertices of a tube are at its ends, so the first principal direction is along the axis.
         along = (vertices - centre) @ directions[0]
         length = float(along.max() - along.min())
         around = np.linalg.norm((vertices - centre) - along[:, None] * directions[0], axis=-1)

@@ -27,7 +27,7 @@ def cache_dir() -> Path:
 
 
 def fingerprint(files: Iterable[Path], *settings: object) -> str:
-    """Key that changes when a file's content, a setting or the cache's format changes."""
+    """Key that depends on the content of files, on settings and on the format of the cache."""
     digest = hashlib.sha256(repr((_VERSION, settings)).encode())
     for file in files:
         digest.update(str(file.name).encode())
@@ -40,9 +40,9 @@ Made = tuple[tuple[LinkMesh, ...], Decimation]
 
 
 def kept(key: str, make: Callable[[], Made]) -> Made:
-    """The entry of `key`; a missing one is computed and stored.
+    """Return the entry of a key; a missing entry is computed and stored.
 
-    Concurrent processes wait for the one that computes it, unless the cache cannot be locked.
+    Concurrent processes wait for the process that computes the entry, unless the cache cannot be locked.
     """
     if (stored := read(key)) is not None:
         return stored
@@ -57,7 +57,7 @@ def kept(key: str, make: Callable[[], Made]) -> Made:
 
 
 def read(key: str) -> Made | None:
-    """The entry of `key`; None if it is missing or damaged."""
+    """Read the entry of a key; None for a missing or damaged entry."""
     try:
         with (
             open_regular(cache_dir() / f"{key}.npz", CACHED) as file,
@@ -74,7 +74,7 @@ def read(key: str) -> Made | None:
 
 
 def write(key: str, meshes: tuple[LinkMesh, ...], decimation: Decimation) -> None:
-    """Store `meshes` under `key`; a cache that cannot be written is not an error."""
+    """Store an entry; an unwritable cache is not an error."""
     arrays: dict[str, np.ndarray] = {
         "count": np.array(len(meshes)),
         "before": np.array(decimation.before),

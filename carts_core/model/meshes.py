@@ -33,11 +33,11 @@ _PACKAGE_LEVELS = 6
 
 
 def mesh_path(urdf_folder: Path, name: str) -> Path:
-    """Path of the file of a `<mesh filename=...>`; it need not exist.
+    """Path of the file of a `<mesh filename=...>`, which need not exist.
 
-    `package://NAME/REST` is searched in the layout of ROS packages: `REST` in the folder of the URDF or a parent of it
+    `package://NAME/REST` is resolved as in ROS packages: `REST` in the folder of the URDF or one of its parents
     (`NAME/urdf` beside `NAME/meshes`), or in a folder `NAME` in one of these. `file://` and plain paths are used
-    directly; relative paths start at the URDF's folder.
+    directly, relative to the folder of the URDF.
     """
     scheme, mark, rest = name.partition("://")
     if not mark:
@@ -58,7 +58,7 @@ def collada_asset(path: Path) -> tuple[float, str]:
     if path.suffix.lower() != ".dae" or not is_regular(path):
         return 1.0, ""
     with open_regular(path, MESH) as file:
-        # The document's own asset comes first.
+        # The first asset is that of the document.
         head = file.read(_HEAD)
     unit, axis = _UNIT.search(head), _UP_AXIS.search(head)
     metres = float(unit[1]) if unit is not None else 1.0
@@ -68,10 +68,11 @@ def collada_asset(path: Path) -> tuple[float, str]:
 def read_mesh(path: Path, scale: np.ndarray, named: str) -> list[tuple[trimesh.Trimesh, np.ndarray | None]]:
     """Read the triangle meshes of a file with their colours; COLLADA meshes are scaled by their unit.
 
-    The up axis of COLLADA files is not applied, as in RViz: a URDF's <origin> refers to the coordinates as stored.
+    The up axis of COLLADA files is not applied, as in RViz, since the <origin> of a URDF refers to the stored
+    coordinates.
 
     Raises:
-        RobotError: the file is missing or cannot be read, it has no or too many triangles, or coordinates are not
+        RobotError: the file is missing or cannot be read, it has no triangles or too many, or coordinates are not
             finite or too large.
     """
     allowed = f"Allowed: {', '.join(FORMATS).upper()} files."
@@ -80,7 +81,7 @@ def read_mesh(path: Path, scale: np.ndarray, named: str) -> list[tuple[trimesh.T
     kind = path.suffix.lower().removeprefix(".")
     if kind not in FORMATS:
         raise RobotError(f"mesh {path} has an unknown format, {shown(path.suffix)}. {allowed}")
-    limits = Limits.of(path.parent if kind == "gltf" else path)  # glTF stores its arrays in a separate file.
+    limits = Limits.of(path.parent if kind == "gltf" else path)  # glTF stores arrays in a separate file.
     try:
         parts = called(mesh_parts, path, kind, limits=limits)
     except RobotError:
@@ -130,7 +131,7 @@ _OPAQUE = 0.99
 _AT_ONCE = 4
 """Maximum number of meshes that are decimated concurrently; each may take much memory."""
 MOST_KEPT = 10
-"""Ratio of triangles to the requested number from which meshes are clustered first [1]."""
+"""Ratio of triangles to the requested number above which meshes are first clustered [1]."""
 _CLUSTERED = MOST_KEPT / 2
 """Maximum ratio of triangles to the requested number after clustering [1]."""
 _FIRST_CELL = 0.25
@@ -150,13 +151,13 @@ class LinkMesh:
     color: Float[np.ndarray, "3"]
     """Linear RGB in [0, 1]."""
     closed: bool
-    """Whether it encloses a volume, so that backs of triangles are never visible."""
+    """Whether the mesh encloses a volume, so that the backs of triangles are never visible."""
 
 
 def is_closed(vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]) -> bool:
-    """Whether each part of a mesh encloses a volume, with its normals outwards.
+    """Whether each part of a mesh encloses a volume, with outward normals.
 
-    Copies of a vertex at sharp edges count as one.
+    Copies of a vertex at sharp edges count as one vertex.
     """
     joined = trimesh.Trimesh(vertices, faces, process=False)
     joined.merge_vertices(merge_norm=True, digits_vertex=7)
@@ -169,7 +170,7 @@ def is_closed(vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"])
 
 
 def load_visual(visual: yourdfpy.Visual, folder: Path, materials: dict) -> list[tuple[trimesh.Trimesh, np.ndarray]]:
-    """Meshes of one URDF visual in its link's frame, each with its colour.
+    """Load the meshes of a URDF visual in the frame of its link, with their colours.
 
     Translucent visuals are markers (such as a ball at the remote centre) and are omitted.
 
@@ -220,14 +221,15 @@ def _geometry(geometry: yourdfpy.Geometry, folder: Path) -> list[tuple[trimesh.T
 def simplify(
     mesh: trimesh.Trimesh, tolerance: float | None
 ) -> tuple[Float[np.ndarray, "V 3"], Float[np.ndarray, "V 3"], Int[np.ndarray, "F 3"], float]:
-    """Vertices, vertex normals and faces of a mesh, decimated if a tolerance is given, and its largest deviation [m].
+    """Vertices, vertex normals and faces of a mesh, decimated if a tolerance is given, and maximum surface deviation
+    [m].
 
     Args:
         mesh: mesh in metres.
         tolerance: maximum deviation of its surface [m]; None for no decimation.
 
     Raises:
-        DecimationError: the mesh is degenerate, or so irregular that it takes too long.
+        DecimationError: the mesh is degenerate, or so irregular that decimation takes too long.
     """
     mesh = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
     mesh.merge_vertices(digits_vertex=7)
@@ -280,18 +282,18 @@ def build_link_meshes(
         tolerance: maximum deviation of a surface [m].
 
     Raises:
-        RobotError: a mesh is degenerate, or so irregular that it takes too long or keeps too many triangles.
+        RobotError: a mesh is degenerate, or so irregular that decimation takes too long or too many triangles remain.
     """
     before = sum(len(mesh.faces) for _, mesh, _ in parts)
     if before > MOST_FACES:
-        raise RobotError(f"the meshes have more than {MOST_FACES:,} triangles together. Export simpler meshes.")
+        raise RobotError(f"the meshes have more than {MOST_FACES:,} triangles in total. Export simpler meshes.")
     bound = tolerance if before > max_faces else None
     moved = [0.0] * len(parts)
     if before > MOST_KEPT * max_faces:
         progress(f"{before} triangles in {len(parts)} meshes: clustering their vertices first")
         parts, moved = _clustered_parts(parts, int(_CLUSTERED * max_faces), tolerance)
     result, deviations = [], [0.0]
-    # Each mesh is decimated in its own process, so threads suffice to use several cores.
+    # Since each mesh is decimated in its own process, threads suffice to use several cores.
     pool = ThreadPoolExecutor(min(os.cpu_count() or 1, _AT_ONCE), "decimation")
     try:
         bounds = [bound if bound is None else max(bound - each, bound / 2) for each in moved]
@@ -318,9 +320,9 @@ Parts = Sequence[tuple[int, trimesh.Trimesh, np.ndarray]]
 
 
 def _clustered_parts(parts: Parts, most: int, tolerance: float) -> tuple[Parts, list[float]]:
-    """Cluster meshes to a total number of triangles; also returns the largest vertex displacement of each [m].
+    """Cluster meshes to a total number of triangles; also returns the maximum vertex displacement of each mesh [m].
 
-    Cells grow until few enough triangles remain, so displacements may exceed the tolerance.
+    Cells grow until the number of triangles is small enough, so displacements may exceed the tolerance.
     """
     cell = _FIRST_CELL * tolerance
     while True:
@@ -336,10 +338,10 @@ def _clustered_parts(parts: Parts, most: int, tolerance: float) -> tuple[Parts, 
 def clustered(
     vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"], cell: float
 ) -> tuple[Float[np.ndarray, "W 3"], Int[np.ndarray, "G 3"], float]:
-    """Merge the vertices in each cell of a grid into their mean; also returns the largest displacement [m].
+    """Merge the vertices in each cell of a grid into their mean; also returns the maximum displacement [m].
 
-    Works for any triangles, in time proportional to their number (Rossignac and Borrel, Multi-resolution 3D
-    approximations for rendering complex scenes, 1993).
+    The method works for any triangles and takes time proportional to their number (Rossignac and Borrel,
+    Multi-resolution 3D approximations for rendering complex scenes, 1993).
 
     Args:
         vertices: mesh vertices [m].

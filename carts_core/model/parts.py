@@ -23,7 +23,7 @@ _PROBE = 0.1
 
 @dataclass(frozen=True)
 class PartClass:
-    """A part of an arm as a class of pixels."""
+    """Pixel class for a part of an arm."""
 
     number: int
     """Number of the class, from 1: 1 + 3 * index of the arm + index of the part."""
@@ -33,12 +33,12 @@ class PartClass:
 
     @property
     def name(self) -> str:
-        """Name shown in the page."""
+        """Display name."""
         return f"{self.arm} {self.part}"
 
 
 def part_classes(arms: Sequence[Arm]) -> tuple[PartClass, ...]:
-    """Classes of the parts of these arms that have a mesh."""
+    """Classes of all parts with a mesh, for these arms."""
     classes: list[PartClass] = []
     for index, arm in enumerate(arms):
         seen = link_parts(arm.robot)[[mesh.link for mesh in arm.robot.meshes]]
@@ -56,14 +56,14 @@ def link_parts(robot: Robot) -> Int[np.ndarray, " links"]:
     """Index into `PARTS` of each link with a mesh, from the number of degrees of freedom that move it.
 
     Links moved by all but the last two degrees of freedom are the wrist, links moved by more are the jaws with their
-    bearing, and all others belong to the shaft. For instruments without moving jaws (a hook), links that move with the
-    shaft (the longest mesh, if slender) do not count as wrist.
+    bearing, and all other links are the shaft. For instruments without moving jaws (such as a hook), links that move
+    with the shaft (the longest mesh, if slender) are not part of the wrist.
     """
     dofs = len(robot.joint_names)
     probes = torch.cat([torch.zeros(1, dofs), _PROBE * torch.eye(dofs)]).double()
     Ts = robot.forward_kinematics(probes)
     movers = ((Ts[1:] - Ts[:1]).abs().amax((-2, -1)) > 1e-9).sum(0).numpy()
-    # All links of a robot without a wrist are shaft.
+    # All links of a robot without a wrist belong to the shaft.
     wrist = max(movers.max() - 2, _shaft_movers(robot, movers) + 1)
     return (movers >= wrist).astype(int) + (movers >= wrist + 1)
 

@@ -28,7 +28,7 @@ def perturb(
     for arm in scene.arms:
         robot = arm.robot
         step = np.array([np.deg2rad(degrees) if kind == "revolute" else degrees / 1e3 for kind in robot.joint_types])
-        # Signs are drawn for every joint, so that they do not depend on the selection of joints.
+        # Signs are drawn for all joints, so that they do not depend on the selection.
         step = step * generator.choice((-1.0, 1.0), len(step))
         if joints is not None:
             step = step * [name in joints.get(arm.name, ()) for name in robot.joint_names]

@@ -10,8 +10,8 @@ The chain, in modified Denavit-Hartenberg parameters (alpha [rad], a [m], theta 
     wrist yaw    -pi/2   wrist_length  q6 - pi/2   0
     tip          -pi/2   0             pi/2        0
 
-The base frame is at the remote centre of motion. The tip frame is the dVRK's: its origin is on the wrist's yaw axis,
-and z is along the closed jaws. `tip_offset` converts poses that a controller reports for a point further out.
+The base frame is at the remote centre of motion. The tip frame is that of the dVRK: its origin is on the wrist's yaw
+axis, and z is along the closed jaws. `tip_offset` converts poses that a controller reports for a more distal point.
 """
 
 from dataclasses import dataclass, field
@@ -22,7 +22,7 @@ from jaxtyping import Bool, Float
 from ..errors import SettingsError
 
 JOINT_NAMES = ("yaw", "pitch", "insertion", "roll", "wrist_pitch", "wrist_yaw")
-"""Names of the joints, in the order of all arrays of this module."""
+"""Names of the joints, in the order of all arrays in this module."""
 
 ROLL = 3
 _SINGULAR = 1e-9
@@ -34,7 +34,7 @@ _LIMIT_TOLERANCE = 1e-9
 
 @dataclass(frozen=True)
 class PsmGeometry:
-    """Lengths and joint limits of one arm with one instrument.
+    """Lengths and joint limits of an arm with an instrument.
 
     Raises:
         SettingsError: a length is out of range.
@@ -69,19 +69,19 @@ class PsmGeometry:
 
 
 CLASSIC = PsmGeometry()
-"""A classic PSM with a Large Needle Driver."""
+"""Classic PSM with a Large Needle Driver."""
 
 SI = PsmGeometry(
     shaft_length=0.4670,
     remote_center=0.4826,
     limits=((-2.964, 2.964), (-1.265, 1.301), (0.0, 0.29), (-4.538, 4.538), (-1.396, 1.396), (-1.571, 1.571)),
 )
-"""An Si PSM with a Large Needle Driver."""
+"""Si PSM with a Large Needle Driver."""
 
 
 @dataclass(frozen=True)
 class Unreachable:
-    """Rows that are unreachable within the joint limits, for a common reason."""
+    """Rows that are unreachable within the joint limits, for the same reason."""
 
     rows: tuple[int, ...]
     """Row numbers from 0."""
@@ -96,7 +96,7 @@ class Unreachable:
 
 @dataclass(frozen=True, eq=False)
 class InverseKinematics:
-    """Joint positions found for a series of poses."""
+    """Joint positions for a series of poses."""
 
     joints: Float[np.ndarray, "rows 6"]
     """Joint positions [rad], [m]; NaN in unreachable rows."""
@@ -147,18 +147,19 @@ def inverse(
     continuous: bool = True,
     roll_near: float = 0.0,
 ) -> InverseKinematics:
-    """Inverse kinematics: joint positions for poses of the tip; nothing is clamped.
+    """Compute joint positions for poses of the tip, without clamping.
 
     A pose has up to two solutions with the wrist bent by less than 90 degrees. In one of them the wrist is behind the
-    remote centre, which requires an insertion below about 16 mm. The solution within the limits is returned; if both
-    are, which the wider yaw range of Si arms allows, the one that is not behind.
+    remote centre, which requires an insertion below about 16 mm. The solution within the limits is returned. If both
+    are within the limits, as the wider yaw range of Si arms allows, it is the solution with the wrist in front of the
+    remote centre.
 
     Args:
         Ts_base_tip: poses of the tip in the arm's base frame, translation in [m].
-        tip_offset: position of the poses' origin relative to the tip defined above, in the pose's axes [m].
-        continuous: whether rows are consecutive in time, so that the roll, whose range exceeds one revolution, must not
-            jump.
-        roll_near: if several revolutions are within the limits, the (mean) roll nearest to this is chosen [rad].
+        tip_offset: position of the poses' origin relative to the tip frame defined above, in the axes of the pose [m].
+        continuous: whether rows are consecutive in time, so that the roll, with a range of more than one revolution,
+            must not jump.
+        roll_near: if several revolutions are within the limits, the (mean) roll nearest to this value is chosen [rad].
 
     Raises:
         SettingsError: poses are not 4x4 matrices.
@@ -196,13 +197,14 @@ def inverse(
 
 def _solve(R: np.ndarray, tip: np.ndarray, geometry: PsmGeometry) -> np.ndarray:
     """Joint positions [rows, 6] with the roll in (-pi, pi]; NaN without a solution."""
-    # The wrist's link runs from the pitch axis to the tip. It is normal to the yaw axis, which is the pose's -x, and
-    # lies in the plane of the yaw axis and the shaft, in which the remote centre lies, too.
+    # The wrist link points from the pitch axis to the tip. It is normal to the yaw axis, which is -x of the pose, and
+    # lies in the plane of the yaw axis and the shaft, which also contains the remote centre.
     yaw_axis = -R[:, :, 0]
     link = tip - _dot(tip, yaw_axis)[:, None] * yaw_axis
     length = np.linalg.norm(link, axis=1)
     link = link / length[:, None]
-    # Less than 90 degrees between link and shaft leaves one direction of the shaft for each direction of the link.
+    # Since the angle between link and shaft is less than 90 degrees, each direction of the link has one direction of
+    # the shaft.
     outside = np.where(length >= geometry.wrist_length, 1.0, -1.0)
     first = _solve_link(R, tip, yaw_axis, link, outside, geometry)
     second = _solve_link(R, tip, yaw_axis, -link, -np.ones(len(tip)), geometry)
@@ -220,14 +222,15 @@ def _solve(R: np.ndarray, tip: np.ndarray, geometry: PsmGeometry) -> np.ndarray:
 def _solve_link(
     R: np.ndarray, tip: np.ndarray, yaw_axis: np.ndarray, link: np.ndarray, side: np.ndarray, geometry: PsmGeometry
 ) -> np.ndarray:
-    """Joint positions [rows, 6] for a direction of the wrist's link, the wrist before (1) or behind (-1) the centre."""
+    """Joint positions [rows, 6] for a direction of the wrist link, with the wrist in front of (1) or behind (-1) the
+    remote centre."""
     wrist = tip - geometry.wrist_length * link
     depth = side * np.linalg.norm(wrist, axis=1)
     shaft = wrist / depth[:, None]
     x, y, z = shaft.T
     q1, q2 = np.arctan2(x, -z), np.arctan2(-y, np.hypot(x, z))
     pitch_axis = np.cross(link, yaw_axis)
-    # Axes of the insertion frame, whose z is the shaft.
+    # Axes of the insertion frame; z is along the shaft.
     across = np.stack([-np.sin(q1) * np.sin(q2), -np.cos(q2), np.cos(q1) * np.sin(q2)], 1)
     beside = np.cross(shaft, across)
     q3 = depth + geometry.remote_center - geometry.shaft_length
@@ -238,7 +241,8 @@ def _solve_link(
 
 
 def _roll_turns(roll: np.ndarray, limits: tuple[float, float], continuous: bool, near: float) -> np.ndarray:
-    """The roll with full revolutions added: without jumps if `continuous`, within the limits if possible."""
+    """Add full revolutions to the roll, so that it is without jumps if `continuous`, and within the limits if
+    possible."""
     known = np.isfinite(roll)
     if not known.any():
         return roll

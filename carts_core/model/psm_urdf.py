@@ -8,7 +8,7 @@ from .psm_kinematics import PsmGeometry
 
 
 def quarter_turns(roll: int, pitch: int, yaw: int) -> str:
-    """Attribute `rpy` of a rotation by multiples of 90 degrees, in full precision."""
+    """URDF attribute `rpy` of a rotation by multiples of 90 degrees, in full precision."""
     return " ".join("0" if turns == 0 else repr(turns * math.pi / 2) for turns in (roll, pitch, yaw))
 
 
@@ -21,7 +21,7 @@ def joint(
     rpy: str = "0 0 0",
     limits: tuple[float, float] | None = None,
 ) -> ElementTree.Element:
-    """URDF joint about, or along, the z axis of its child."""
+    """Create a URDF joint about or along the z axis of its child."""
     element = ElementTree.Element("joint", name=name, type=kind)
     ElementTree.SubElement(element, "parent", link=parent)
     ElementTree.SubElement(element, "child", link=child)

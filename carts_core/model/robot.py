@@ -24,21 +24,21 @@ from . import mesh_cache
 from .instruments import robot_file
 from .meshes import MOST_KEPT, Decimation, LinkMesh, build_link_meshes, collada_asset, load_visual, mesh_path
 
-with deferred_import("matplotlib", "pyplot"):  # needed only to plot its solvers; 0.2 s
+with deferred_import("matplotlib", "pyplot"):  # The parser imports it only for plots; it takes 0.2 s.
     import pytorch_kinematics
 
 NO_LIMIT = 1e3
-"""Joint limit [rad], [m] above which a joint counts as unlimited."""
+"""Joint limit [rad], [m] above which a joint is considered unlimited."""
 _JOINT_PARTS = ("parent", "child", "origin", "axis", "mimic")
-"""Elements of a joint that define its motion; limits and dynamics have required attributes that many URDFs omit."""
+"""Elements of a joint that define its motion; limits and dynamics have required attributes, which many URDFs omit."""
 ROUND_OFF = 1e-5
 """Distance [rad] below which angles are set to a multiple of 90 degrees: URDF exporters print 1.5708 for pi/2."""
 
 
 def exact_right_angles(root: Element) -> None:
-    """Replace every `rpy` angle of a URDF that is a rounded multiple of pi/2 by the exact one.
+    """Replace every `rpy` angle of a URDF that is a rounded multiple of pi/2 by the exact value.
 
-    At an instrument's length the 3.7e-6 rad of "1.5708" are more than a micrometre at the tip.
+    For an instrument, the error of 3.7e-6 rad of "1.5708" is more than a micrometre at the tip.
     """
     for origin in root.iter("origin"):
         if rpy := origin.get("rpy"):
@@ -62,16 +62,16 @@ def _skeleton(urdf_text: str) -> str:
                 if part.tag not in _JOINT_PARTS:
                     child.remove(part)
             if child.find("axis") is None:
-                ElementTree.SubElement(child, "axis", xyz="1 0 0")  # URDF's default; the parser's is z
+                ElementTree.SubElement(child, "axis", xyz="1 0 0")  # URDF's default axis; the parser's default is z
     return ElementTree.tostring(root, encoding="unicode")
 
 
 class Kinematics:
-    """Computes transforms of a robot's links from its independent joint positions.
+    """Forward kinematics of a robot's links from its independent joint positions.
 
     Args:
         urdf_text: text of the URDF, with exact right angles.
-        base_link: reference frame of the transforms; it must not move with any joint.
+        base_link: reference frame of the transforms, which must not move with a joint.
     """
 
     def __init__(self, model: yourdfpy.URDF, urdf_text: str, base_link: str | None, source: Path) -> None:
@@ -114,7 +114,7 @@ class Kinematics:
         """Ts_base_link [m] of the named links; computed in double precision, returned in the precision of the input.
 
         Raises:
-            RobotError: the last dimension is not the number of degrees of freedom, or there is no such link.
+            RobotError: the last dimension is not the number of degrees of freedom, or a link does not exist.
         """
         dofs = len(self.joint_names)
         if joint_positions.shape[-1] != dofs:
@@ -136,7 +136,7 @@ def _limits(joint: yourdfpy.Joint) -> tuple[float, float]:
     limit = joint.limit
     if joint.type == "continuous" or limit is None or limit.lower is None or limit.upper is None:
         return -np.inf, np.inf
-    # Some URDFs have a huge number for an unlimited joint.
+    # Some URDFs have a huge limit for an unlimited joint.
     lower, upper = (
         math.copysign(math.inf, value) if abs(value) > NO_LIMIT else float(value)
         for value in (limit.lower, limit.upper)
@@ -166,7 +166,7 @@ _DEEPEST = 32
 _FARTHEST = 1e3
 """Maximum coordinate, size or angle of a robot [m], [rad]."""
 _LARGEST_FACTOR = 1e6
-"""Maximum scale of a mesh and factor of a mimic joint; the smallest is its inverse."""
+"""Maximum scale of a mesh and factor of a mimic joint; the minimum is its inverse."""
 _SHORTEST_AXIS = 1e-6
 _TYPES = ("revolute", "continuous", "prismatic", "fixed")
 _XACRO = "ros.org/wiki/xacro}"
@@ -176,7 +176,7 @@ def parsed_urdf(text: str, source: Path) -> Element:
     """Parse and check a URDF; returns its root element.
 
     Raises:
-        RobotError: the text is not a URDF, links and joints do not form one tree, or a number is not finite or out of
+        RobotError: the text is not a URDF, links and joints do not form a tree, or a number is not finite or out of
             range.
     """
     if "<!DOCTYPE" in text or "<!ENTITY" in text:
@@ -224,7 +224,7 @@ def _check_elements(root: Element, source: Path) -> None:
 
 
 def _check_tree(root: Element, source: Path) -> None:
-    """Check that names are unique, and that the joints connect all links to one tree."""
+    """Check that names are unique and that joints connect all links to one tree."""
     links, joints = root.findall("link"), root.findall("joint")
     if not 1 <= len(links) <= _MOST_LINKS or len(joints) > _MOST_LINKS:
         raise RobotError(f"robot {source} has {len(links)} links; allowed: 1 to {_MOST_LINKS}.")
@@ -245,7 +245,7 @@ def _check_tree(root: Element, source: Path) -> None:
     if len(roots) != 1:
         found = "no link without a parent" if not roots else f"several links without a parent: {listed(roots)}"
         raise RobotError(f"robot {source} has {found}. Its joints must connect all links to one tree.")
-    # There are as many joints as links below the root, and each link reaches the root, so there is no loop.
+    # Each link is the child of at most one joint, so links that do not reach the root form a loop.
     for start in parents:
         link = start
         for _ in range(len(parents)):
@@ -331,7 +331,7 @@ def _finite(words: list[str]) -> Iterator[float]:
 
 
 def _vector(element: Element, key: str, count: int, source: Path, smallest: float = -_FARTHEST) -> list[float]:
-    """Numbers of an attribute; empty if it is absent."""
+    """Numbers of an attribute; empty if absent."""
     values = _floats(element, key, source)
     if element.get(key) is not None and (
         len(values) != count or not smallest <= min(values) <= max(values) <= _FARTHEST
@@ -360,20 +360,20 @@ SLENDER = 0.1
 
 
 class Robot:
-    """Articulated robot with link meshes. Created by `Robot.load`.
+    """Articulated robot with link meshes, created by `Robot.load`.
 
     Attributes:
         name: the URDF's robot name.
         urdf: path of the URDF.
-        base_link: link that is the reference frame of link transforms.
-        joint_names: independent degrees of freedom; a mimic joint belongs to the joint that it follows.
+        base_link: reference frame of link transforms.
+        joint_names: independent degrees of freedom; a mimic joint belongs to the joint that it mimics.
         joint_types: "revolute" or "prismatic", per degree of freedom.
-        joint_limits: lower and upper limit per degree of freedom [dofs, 2], [rad] or [m]; infinite if not given.
+        joint_limits: lower and upper limit per degree of freedom [dofs, 2], [rad] or [m]; infinite without limits.
         link_names: links with a visual mesh.
         meshes: parts of these links; `LinkMesh.link` indexes `link_names`.
         decimation: summary of the decimation of the meshes.
-        remarks: sentences on changes to the files' meshes (scaling by their unit, simplification beyond the tolerance),
-            and on up axes, which are not applied.
+        remarks: sentences on changes to meshes (scaling by the file's unit, simplification beyond the tolerance), and
+            on ignored up axes.
     """
 
     def __init__(
@@ -415,15 +415,15 @@ class Robot:
 
         Args:
             urdf: path of the URDF, to which mesh paths are relative, or `builtin:NAME`.
-            base_link: reference frame of the link transforms; the URDF's root by default.
+            base_link: reference frame of the link transforms, by default the root of the URDF.
             max_faces: total number of triangles above which meshes are decimated.
             tolerance: largest surface deviation by decimation [m]; by default 0.2 mm for an instrument, which has a
                 slender shaft, and a thousandth of the reach for other robots.
 
         Raises:
-            RobotError: the URDF or one of its meshes is missing or broken, or `base_link` is not in it.
+            RobotError: the URDF or a mesh is missing or invalid, or `base_link` does not exist.
         """
-        # Resolved here, so that files beside the URDF are found even if the working directory changes later.
+        # An absolute path stays valid if the working directory changes.
         urdf = robot_file(urdf).absolute()
         report = progress or (lambda line: None)
         try:
@@ -438,7 +438,7 @@ class Robot:
             raise RobotError(f"robot {urdf} is missing. Give the path of a URDF file.") from error
         except RobotError:
             raise
-        except Exception as error:  # the URDF parser raises many types
+        except Exception as error:  # the parser raises many types of exceptions
             raise RobotError(f"robot {urdf} is not a readable URDF ({error}). Check it with a URDF viewer.") from error
         if not kinematics.joint_names:
             raise RobotError(
@@ -461,7 +461,7 @@ class Robot:
         """Ts_base_link [m] of the links in `link_names`, differentiable (f_FK of the paper).
 
         Raises:
-            RobotError: wrong number of joint positions.
+            RobotError: the number of joint positions is wrong.
         """
         return self._kinematics(joint_positions, self.link_names)
 
@@ -471,7 +471,7 @@ class Robot:
         """T_base_link [m] of any link of the URDF, with or without a mesh.
 
         Raises:
-            RobotError: wrong number of joint positions, or no such link.
+            RobotError: the number of joint positions is wrong, or the link does not exist.
         """
         return self._kinematics(joint_positions, (link_name,))[..., 0, :, :]
 
@@ -479,7 +479,7 @@ class Robot:
         """Index of a joint in `joint_names`.
 
         Raises:
-            RobotError: the robot has no such degree of freedom.
+            RobotError: the robot does not have this degree of freedom.
         """
         if joint_name not in self.joint_names:
             raise RobotError(
@@ -499,7 +499,7 @@ def _mesh_files(model: yourdfpy.URDF, urdf: Path) -> list[Path]:
 def _cache_key(model: yourdfpy.URDF, kinematics: Kinematics, urdf: Path, limits: tuple[int, float | None]) -> str:
     """Cache key of link meshes; `limits` are `max_faces` and `tolerance` of `Robot.load`."""
     files = _mesh_files(model, urdf)
-    # Units other than metres are part of the key, since older entries of the cache are not scaled by them.
+    # Units other than metres are part of the key, since older cache entries are not scaled.
     units = tuple(metres for file in files if (metres := collada_asset(file)[0]) != 1.0)
     settings = (kinematics.base_link, *limits, units) if units else (kinematics.base_link, *limits)
     return mesh_cache.fingerprint([urdf, *files], *settings)
@@ -549,7 +549,7 @@ def _prepared_meshes(
 def _tolerance(
     kinematics: Kinematics, link_names: tuple[str, ...], parts: list[tuple[int, trimesh.Trimesh, np.ndarray]]
 ) -> float:
-    """Maximum surface deviation [m]: below an endoscope's resolution, or a share of a robot's reach."""
+    """Maximum surface deviation [m]: `INSTRUMENT_TOLERANCE` for an instrument, else a share of the robot's reach."""
     if not parts:
         return INSTRUMENT_TOLERANCE
     longest = max((np.sort(mesh.extents) for _, mesh, _ in parts), key=lambda extents: extents[-1])

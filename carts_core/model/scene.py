@@ -1,4 +1,4 @@
-"""Scene of arms, cameras and a light, and the state that can be optimized."""
+"""Scene with arms, cameras and a light, and its optimizable state."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -17,7 +17,7 @@ from .robot import Robot
 
 @dataclass(frozen=True)
 class Arm:
-    """A robot with its base frame in the world."""
+    """Robot with its base frame in the world."""
 
     name: str
     robot: Robot
@@ -57,7 +57,7 @@ class SceneState:
     intrinsics: Float[Tensor, "*batch cameras 4"]
     """fx, fy, cx, cy of the full-size image [px]."""
     T_mount_world: Float[Tensor, "*batch cameras 4 4"]
-    """Measured poses of the camera mounts in this frame; the identity for fixed cameras."""
+    """Measured poses of the camera mounts in this frame; the identity for static cameras."""
 
     @property
     def T_view_world(self) -> Float[Tensor, "*batch cameras 4 4"]:
@@ -65,7 +65,7 @@ class SceneState:
         return self.T_camera_world @ self.T_mount_world
 
     def map(self, function) -> "SceneState":
-        """The state with `function` applied to every tensor."""
+        """Apply a function to every tensor."""
         return SceneState(
             tuple(function(value) for value in self.joint_positions),
             function(self.T_world_base),
@@ -75,17 +75,17 @@ class SceneState:
         )
 
     def detached(self) -> "SceneState":
-        """A copy that shares neither memory nor gradients with this state."""
+        """Copy that shares neither memory nor gradients with this state."""
         return self.map(lambda value: value.detach().clone())
 
     def to(self, device: str | torch.device) -> "SceneState":
-        """The state on another device."""
+        """Copy of the state on another device."""
         return self.map(lambda value: value.to(device))
 
 
 @dataclass(frozen=True)
 class Scene:
-    """Arms, cameras and the light, which are constant while a frame is optimized."""
+    """Arms, cameras and light, which are constant during the optimization of a frame."""
 
     arms: tuple[Arm, ...]
     cameras: tuple[Camera, ...]
@@ -116,11 +116,11 @@ class Scene:
         raise RobotError(f"there is no camera {name!r}. The cameras are: {', '.join(known)}.{closest(name, known)}")
 
     def with_cameras(self, names: Sequence[str] | None) -> "Scene":
-        """The scene with these cameras only (all of them for None), in this order."""
+        """Copy of the scene with only these cameras, in this order; None for all cameras."""
         return self if names is None else replace(self, cameras=tuple(self.camera(name) for name in names))
 
     def with_arms(self, names: Sequence[str] | None) -> "Scene":
-        """The scene with these arms only (all of them for None), in the scene's order."""
+        """Copy of the scene with only these arms, in the scene's order; None for all arms."""
         if names is None:
             return self
         wanted = {self.arm(name).name for name in names}
@@ -148,10 +148,10 @@ class Scene:
 
         Args:
             joint_positions: arm name -> values `[*batch, dofs]` in the order of `Robot.joint_names`.
-            mounts: camera name -> T_mount_world [m], of cameras that move.
+            mounts: camera name -> T_mount_world [m], for moving cameras.
 
         Raises:
-            RobotError: an arm has no joint positions, or the wrong number of them.
+            RobotError: an arm has no joint positions, or the wrong number of joint positions.
         """
         values = []
         for arm in self.arms:

@@ -1,4 +1,4 @@
-"""Safe xacro: evaluates expressions of a model without Python's `eval`, which would run any code in them.
+"""Safe expansion of xacro: expressions are evaluated without Python's `eval`, which would run arbitrary code.
 
 Xacro passes the content of `${...}` and `$(eval ...)` to `eval` with few restrictions. Here an expression consists of
 numbers, strings, lists, comparisons, properties and the functions of this module; everything else is rejected.
@@ -61,10 +61,10 @@ _MESSAGES = ("message", "warning", "error")
 
 
 def expanded(path: Path, packages: dict[str, str], arguments: dict[str, str]) -> str:
-    """Expand a model to a URDF; for a child process, since xacro is patched to use the expressions of this module.
+    """Expand a model to a URDF. Only for a child process, since xacro is patched to use the expressions of this module.
 
     Raises:
-        Exception: the model cannot be expanded; the class is that of xacro, or of `Expression.value`.
+        Exception: the model cannot be expanded; an exception of xacro or of `Expression.value`.
     """
     import xacro  # noqa: PLC0415 - an extra
     import xacrodoc  # noqa: PLC0415
@@ -74,7 +74,7 @@ def expanded(path: Path, packages: dict[str, str], arguments: dict[str, str]) ->
         if content is None:
             content = read_text(Path(xacro.root_dir or "", filename or ""), ROBOT)
         if not isinstance(content, str):
-            return content  # Already parsed.
+            return content  # The value is already parsed.
         if _DECLARES.search(content):
             raise RobotError(f"{filename or 'the model'} declares a document type or entities, which are not allowed")
         return minidom.parseString(content)
@@ -102,8 +102,8 @@ class Expression:
         """Evaluate an expression.
 
         Raises:
-            RobotError: the expression contains something that is not supported.
-            SyntaxError, TypeError, ValueError, ArithmeticError, LookupError: it is not a valid expression, or has no
+            RobotError: the expression contains an unsupported element.
+            SyntaxError, TypeError, ValueError, ArithmeticError, LookupError: the expression is invalid, or has no
                 value.
         """
         if len(text) > _LONGEST_EXPRESSION:
@@ -161,7 +161,8 @@ class Expression:
         return entries[name]
 
     def _first(self, values: list[ast.expr], wanted: bool) -> Any:
-        """First operand whose truth is `wanted`, else the last: the value of `or` (True) and `and` (False)."""
+        """First operand with the truth value `wanted`, else the last operand: the value of `or` (True) and `and`
+        (False)."""
         result: Any = None
         for value in values:
             result = self._of(value)
@@ -189,7 +190,7 @@ class Expression:
 
 
 def _binary(op: ast.operator, left: Any, right: Any) -> Any:
-    # Repetition and formatting are not allowed, since they could make a string arbitrarily long.
+    # Repetition and formatting are not allowed, since they can produce arbitrarily long strings.
     if not isinstance(op, ast.Add) and not (isinstance(left, int | float) and isinstance(right, int | float)):
-        raise TypeError(f"{type(op).__name__} is for numbers")
+        raise TypeError(f"{type(op).__name__} requires numbers")
     return _BINARY[type(op)](left, right)

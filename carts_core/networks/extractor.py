@@ -1,6 +1,6 @@
 """Frozen networks of the optimizer, hybrid images (the rendering over the mean background), and inference engines.
 
-The surface network runs in torch or ONNX Runtime; `auto` selects the faster one on this machine and stores the
+The surface network runs in torch or ONNX Runtime; `auto` selects the faster engine on this machine and stores the
 timing.
 """
 
@@ -68,7 +68,7 @@ class OnnxSurface:
         try:
             self._session = inference_session(read_bytes(path, WEIGHTS), inference_threads())
         except (OSError, RuntimeError, ValueError):
-            # The file does not exist yet, or is damaged.
+            # The file is missing or damaged.
             graph = _exported(network)
             self._session = inference_session(graph, inference_threads())
             with suppress(OutputError):
@@ -98,7 +98,7 @@ def _exported(network: AnySurfaceNetwork) -> bytes:
     stream, names = io.BytesIO(), ["images", "given", "maps"]
     logging.getLogger("torch.onnx").setLevel(logging.ERROR)
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # Sizes are checked in Python, so the graph needs no checks.
+        warnings.simplefilter("ignore")  # Sizes are checked in Python, so the graph requires no checks.
         torch.onnx.export(
             _Maps(network).eval(),
             example,
@@ -140,7 +140,7 @@ def surface_engine(
         fault = (
             f"{' and '.join(absent)} {'is' if len(absent) == 1 else 'are'} not installed"
             if absent
-            else f"it needs a CPU, and the device is {device}"
+            else f"it requires the device cpu; given: {device}"
         )
         return _without(wanted, fault)
     try:
@@ -186,7 +186,7 @@ def _difference(network: AnySurfaceNetwork, other: Surface) -> float:
 
 
 def _remembered(network: AnySurfaceNetwork, sha256: str, other: Surface) -> Engine:
-    """Faster engine, from a timing that is stored on this machine."""
+    """Faster engine, according to a timing stored on this machine."""
     versions = [version(name) for name in ("torch", "onnxruntime")]
     machine = platform.node(), platform.processor(), torch.get_num_threads(), inference_threads()
     key = fingerprint(_MEASUREMENT, sha256, versions, machine)[:32]
@@ -196,7 +196,7 @@ def _remembered(network: AnySurfaceNetwork, sha256: str, other: Surface) -> Engi
     seconds = _times(network, other)
     engine: Engine = "onnx" if seconds["onnx"] < _GAIN * seconds["torch"] else "torch"
     try:
-        # Processes that measure concurrently all use the result of the first one.
+        # Concurrent processes use the result of the first process.
         write_new(output_path(path.parent, path.name), json.dumps({"engine": engine, "seconds": seconds}).encode())
     except OutputError:
         return engine
@@ -235,25 +235,25 @@ def hybrid(
 ) -> Float[Tensor, "*batch 3 h w"]:
     """Hybrid image (BG_m + Î in the paper): rendering inside the silhouette, mean background outside.
 
-    Where the silhouette is between 0 and 1 (blurred, or for gradients), the background is blended in linearly.
+    At silhouette values between 0 and 1 (after a blur, or for gradients), both are blended linearly.
 
     Args:
         rendering_image: rendered arms, RGB in [0, 1], black where the silhouette is 0.
         silhouette: Ŝ in [0, 1].
-        background: mean background BG_m, RGB in [0, 1]; it may lack the leading dimensions.
+        background: mean background BG_m, RGB in [0, 1]; leading dimensions are optional.
     """
     return background * (1.0 - silhouette.unsqueeze(-3)) + rendering_image
 
 
 class FeatureExtractor:
-    """Trained feature and surface networks, frozen and folded. Created by `FeatureExtractor.load`.
+    """Trained feature and surface networks, frozen and folded; created by `FeatureExtractor.load`.
 
     Gradients are computed for images, not for weights.
 
     Attributes:
         weights: weights read from the files, by kind: "feature" and "surface".
         sha256: fingerprint of both networks.
-        working_size: width and height [px] of the images that the networks were trained for.
+        working_size: width and height [px] of the images for which the networks were trained.
         stride: width and height of an input must be multiples of this [px].
         channels: number of feature channels.
         device: device of the networks.
@@ -287,14 +287,15 @@ class FeatureExtractor:
     def load(
         *weights: Path | str, device: str | torch.device = "cpu", inference: Inference = "torch"
     ) -> "FeatureExtractor":
-        """Load networks from weights files; a network without a file has the shipped weights.
+        """Load networks from weights files; the shipped weights are used for a network without a file.
 
         Args:
-            inference: engine of the surface network; `auto` selects the faster one, timed once on each machine.
+            inference: engine of the surface network; `auto` selects the faster engine, timed once on each machine.
 
         Raises:
             SettingsError: `onnx` was requested but cannot be used.
-            WeightsError: a file is missing, is not safetensors or contains no network, or two contain the same kind.
+            WeightsError: a file is missing, is not safetensors or contains no network, or two files contain the same
+                kind of network.
         """
         read: dict[str, tuple[Path, Weights]] = {}
         for path in map(Path, weights):
@@ -322,7 +323,7 @@ class FeatureExtractor:
         return self._features.features(images.contiguous(memory_format=torch.channels_last))
 
     def probability(self, images: Float[Tensor, "batch 3 h w"]) -> Float[Tensor, "batch 1 h w"]:
-        """Probability that a pixel shows an instrument. Arguments and errors as `features`."""
+        """Probability of an instrument in each pixel. Arguments and errors as `features`."""
         return self._features.logits(images.contiguous(memory_format=torch.channels_last)).sigmoid()
 
     @torch.no_grad()

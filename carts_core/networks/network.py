@@ -35,7 +35,7 @@ class ImageNetwork(nn.Module):
         """Check the number of channels, and that the size is divisible by the stride.
 
         Raises:
-            SettingsError: one of them is wrong.
+            SettingsError: the number of channels or the size is wrong.
         """
         stride = self.architecture.stride
         if x.ndim != 4 or x.shape[1] != channels or x.shape[2] % stride or x.shape[3] % stride:
@@ -98,8 +98,8 @@ class UNet(ImageNetwork):
 class FeatureNetwork(UNet):
     """Feature network of the paper: mask logits are a linear function of its features, which ACS compares.
 
-    Images are standardised: their local mean is subtracted, and the difference is scaled to unit standard deviation.
-    The input is thus nearly invariant to exposure, colour casts and smooth haze, without training on such images.
+    Images are standardized: their local mean is subtracted, and the difference is scaled to unit standard deviation.
+    The input is therefore nearly invariant to exposure, colour casts and smooth haze, without training on such images.
     """
 
     kind = "feature"
@@ -120,7 +120,7 @@ class FeatureNetwork(UNet):
         return self.decoded(self.standardized(images))[0]
 
     def logits(self, images: Float[Tensor, "batch 3 h w"]) -> Float[Tensor, "batch 1 h w"]:
-        """Log odds that a pixel shows an instrument. Arguments and errors as `features`."""
+        """Log odds of an instrument in each pixel. Arguments and errors as `features`."""
         return self.head(self.features(images))
 
     def forward(self, images: Float[Tensor, "batch 3 h w"]) -> Float[Tensor, "batch 1 h w"]:
@@ -129,7 +129,7 @@ class FeatureNetwork(UNet):
 
 
 def channels_last(network: Network) -> Network:
-    """Network with weights in channels-last order, which is faster on CPUs and recent GPUs."""
+    """Convert the weights to channels-last order, which is faster on CPUs and recent GPUs; returns the network."""
     for parameter in network.parameters():
         if parameter.ndim == 4:
             parameter.data = parameter.data.contiguous(memory_format=torch.channels_last)
@@ -145,8 +145,8 @@ def standardize(
     Args:
         images: RGB in [0, 1]; h and w are multiples of `block`.
         block: block size of a local mean, smooth over about four blocks [px]; None subtracts the mean of the image.
-        local_contrast: exponent of the local standard deviation (over about six blocks) in the divisor; that of the
-            global one is `1 - local_contrast`.
+        local_contrast: exponent of the local standard deviation (over about six blocks) in the divisor; the exponent of
+            the global standard deviation is `1 - local_contrast`.
     """
     if block is None:
         detail = images - images.mean(dim=(2, 3), keepdim=True)

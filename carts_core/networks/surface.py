@@ -67,7 +67,7 @@ class InvertedResidual(nn.Module):
         self._skips = inputs == outputs and stride == 1
 
     def forward(self, x: Tensor) -> Tensor:
-        """Features of the next block."""
+        """Apply the block."""
         y = x if self.expand is None else functional.relu6(self.expand(x))
         y = self.project(functional.relu6(self.depthwise(y)))
         return x + y if self._skips else y
@@ -117,7 +117,7 @@ class SurfaceNetwork(ImageNetwork):
         self.reduce = nn.ModuleList(nn.Conv2d(*pair, 1, bias=False) for pair in ((at16, at8), (at8, at4), (at4, at2)))
         counts = reversed(self.architecture.convolutions)
         self.decoder = nn.ModuleList(_refining(width, n) for (width, _, _), n in zip(widths, counts, strict=True))
-        # Four pixels per position at stride 2.
+        # Each position at stride 2 has four pixels.
         self.out = nn.Conv2d(at2, 4 * _OUTPUTS, 1)
         self.gain = nn.Parameter(torch.tensor([_PRIOR] * _CLASSES + [1.0] * 3).view(1, _OUTPUTS, 1, 1))
 
@@ -169,8 +169,8 @@ _HIDDEN = 24
 
 
 class UNetSurface(UNet):
-    """Surface network of earlier versions, whose weights are still read: a U-Net on a standardised image and the prior
-    surface map.
+    """Surface network of earlier versions, whose weights are still supported: a U-Net on a standardized image and the
+    prior surface map.
     """
 
     kind: ClassVar[str] = "surface"
@@ -193,4 +193,4 @@ class UNetSurface(UNet):
 
 
 AnySurfaceNetwork = SurfaceNetwork | UNetSurface
-"""A surface network of this version or of earlier ones."""
+"""Surface network of this or an earlier version."""

@@ -1,6 +1,6 @@
 """Weights files: safetensors with the architecture and the training settings as metadata.
 
-Files of equal tensors and metadata are byte-identical.
+Files with equal tensors and metadata are byte-identical.
 """
 
 import hashlib
@@ -28,11 +28,11 @@ _LENGTH = 8
 
 
 def tensor_bytes(tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> bytes:
-    """Content of a safetensors file, reproducible, unlike that of `safetensors`, which varies the metadata's order.
+    """Reproducible content of a safetensors file, unlike that of the library, in which the order of metadata varies.
 
     Args:
         tensors: tensors by name.
-        metadata: texts for the header, in this order.
+        metadata: strings for the header, in this order.
     """
     content = save(dict(tensors))
     end = _LENGTH + int.from_bytes(content[:_LENGTH], "little")
@@ -50,17 +50,17 @@ _NETWORKS: dict[tuple[str, str], tuple[type[Architecture | SurfaceArchitecture],
 """Format and version -> architecture and network."""
 _TYPES = (torch.float32, torch.float64, torch.float16, torch.bfloat16, torch.int64)
 _LARGEST_SIDE = 4096
-_REMEDY = "Train weights with `carts train`, or reinstall carts to restore the shipped ones."
+_REMEDY = "Train weights with `carts train`, or reinstall carts to restore the shipped weights."
 
 
 @dataclass(frozen=True)
 class Weights:
-    """Contents of a weights file."""
+    """Content of a weights file."""
 
     network: ImageNetwork
-    """The trained network, in evaluation mode, not folded."""
+    """Trained network in evaluation mode, not folded."""
     working_size: tuple[int, int]
-    """Width and height [px] of the images that it was trained for."""
+    """Width and height [px] of the images for which the network was trained."""
     training: dict
     """Settings and metrics of the training run, as written by `carts train`."""
     sha256: str
@@ -71,7 +71,7 @@ def save_weights(network: ImageNetwork, path: Path, training: dict, working_size
     """Write a weights file atomically.
 
     Args:
-        network: network whose state is written, including batch norms, so that training can be continued.
+        network: network whose state is written, including batch norms, so that training can be resumed.
         path: path of the file, by convention `*.safetensors`; its folder is created.
         working_size: width and height [px] of the images for which the network was trained.
     """
@@ -91,7 +91,7 @@ def read_weights(path: Path) -> Weights:
 
     Raises:
         WeightsError: the file is missing, is not safetensors, was not written by `carts train`, or its tensors do not
-            fit the architecture it names.
+            fit its architecture.
     """
     metadata, shapes = _header(path)
     kind, make_network = _NETWORKS[metadata["format"], metadata["version"]]
@@ -149,8 +149,9 @@ def _filled(
     architecture: Architecture | SurfaceArchitecture,
     shapes: Mapping[str, tuple[int, ...]],
 ) -> ImageNetwork:
-    """Network with the tensors of the file."""
-    # Created without memory, so that nothing is allocated for an architecture that does not fit the file.
+    """Create the network with the tensors of the file."""
+    # The network is created without memory, so that nothing is allocated for an architecture that does not fit the
+    # file.
     with torch.device("meta"):
         wanted = {name: tuple(value.shape) for name, value in make_network(architecture).state_dict().items()}
     if wanted != shapes:

@@ -1,7 +1,7 @@
 """Derivatives of surface maps and of occluding contours with respect to the unknowns, without autograd.
 
-The occluding contour of a smooth surface moves along its normal as the surface does, so the motion of the visible
-surface point there is sufficient.
+The motion of an occluding contour of a smooth surface along its normal equals that of the surface, so the motion of the
+visible surface point on the contour is sufficient.
 """
 
 from dataclasses import dataclass, replace
@@ -21,8 +21,7 @@ _HALF = np.float32(0.5)
 
 @compiled
 def _move(pixel, begin, end, dT, dK, K, point, position, normal, left, top, width, height, velocity, turning):
-    """Fill velocity [2, rows, columns] and rotation of normals [3, rows, columns] of one view where one link is
-    visible."""
+    """Fill velocity [2, rows, columns] and rotation of normals [3, rows, columns] in the pixels of a link in a view."""
     for k in range(begin, end):
         x, y, z = point[0, k], point[1, k], point[2, k]
         dx = dT[0, 0] * x + dT[0, 1] * y + dT[0, 2] * z + dT[0, 3]
@@ -40,7 +39,7 @@ def _move(pixel, begin, end, dT, dK, K, point, position, normal, left, top, widt
 
 @compiled
 def _carry(maps, near, speed, down, right, out):
-    """Add to `out` the change by neighbours at offset (`down`, `right`) [px] that move at `speed`; see
+    """Add to `out` the change caused by neighbours at an offset (`down`, `right`) [px] that move at `speed`; see
     `carry_motion`."""
     channels, rows, columns = maps.shape
     for row in range(rows - down):
@@ -116,13 +115,13 @@ class Tangents:
 
 @dataclass(frozen=True)
 class JacobianBlock:
-    """Derivatives with respect to unknowns that move common links, in a window around these; zero elsewhere."""
+    """Derivatives with respect to unknowns that move common links, in a window around these links; zero elsewhere."""
 
     unknowns: Int[Tensor, " g"]
     """Indices of the unknowns."""
     left: int
     top: int
-    """Upper left corner of the window in the maps [px]."""
+    """Row of the upper left corner of the window in the maps [px]; `left` is its column."""
     values: Float[Tensor, "g cameras 6 rows columns"]
 
     def dense(self, unknowns: int, like: Float[Tensor, "cameras 6 height width"]) -> Tensor:
@@ -166,7 +165,7 @@ _Run = tuple[int, int, slice]
 
 
 def _families(points: VisiblePoints, tangents: Tangents) -> list[tuple[list[int], list[_Run]]]:
-    """Groups of unknowns that move common links, with all visible links that they move."""
+    """Groups of unknowns that move common links, with all visible links of a group."""
     moves = tangents.Ts_camera_link.abs().amax((-2, -1)) > 0
     moves |= (tangents.intrinsics.abs().amax(-1) > 0)[..., None]
     runs = points.runs()
@@ -231,11 +230,11 @@ def jacobian_of_box(
 
 @compiled
 def keep_outline(face_ids, inverse_depth, nearness, border):
-    """Keep `face_ids` of pixels with a much farther surface beside, above or below them; set the others to -1.
+    """Keep `face_ids` of pixels with a much farther surface to their left, right, above or below; set all others to -1.
 
     Args:
         face_ids, inverse_depth [cameras, height, width]: visible triangle, and 1 / depth [1/m].
-        nearness: share of a pixel's inverse depth below which a neighbour is much farther away [1].
+        nearness: share of a pixel's inverse depth below which a neighbour counts as much farther away [1].
         border: width of the image border that is omitted [px].
     """
     cameras, height, width = face_ids.shape
@@ -321,10 +320,10 @@ def move_along_normal(runs, point, normal, Ts, Ks, dTs, dKs, out):
 
 
 BEHIND = 0.01
-"""Minimum relative depth difference at an outline [1]; with less, folds of a surface count."""
+"""Minimum relative depth difference at an outline [1]; smaller values would include folds of a surface."""
 
 _BLUR = 1.5
-"""Standard deviation of the blur from which normals of outlines are computed [px]."""
+"""Standard deviation of the blur for the computation of outline normals [px]."""
 
 BORDER = 6
 """Distance to the image border below which outlines are omitted, since their normals are unknown there [px]."""
@@ -338,14 +337,14 @@ class Outline:
     position: Float[Tensor, "2 K"]
     """Position (x, y) [px]; the centre of the first pixel is (0, 0)."""
     normal: Float[Tensor, "2 K"]
-    """Unit normals, outwards."""
+    """Outward unit normals."""
     parts: Int[Tensor, " K"]
     """Index into `carts_core.model.parts.PARTS`."""
     motion: Float[Tensor, "unknowns K"]
     """Motion along the normal [px per unit of each unknown]."""
 
     def at(self, step: Float[Tensor, " unknowns"]) -> "Outline":
-        """Outlines after a small step of the unknowns."""
+        """Outlines moved by a small step of the unknowns."""
         return replace(self, position=self.position + self.normal * (step @ self.motion))
 
     def moved_by(self, step: Float[Tensor, " unknowns"]) -> float:
@@ -357,9 +356,9 @@ class Outline:
 def outline_faces(
     face_ids: Int[Tensor, "cameras height width"], inverse_depth: Float[Tensor, "cameras height width"]
 ) -> Int[Tensor, "cameras height width"]:
-    """Visible faces at pixels with a much farther surface beside, above or below them; -1 elsewhere.
+    """Visible faces at pixels with a much farther surface to their left, right, above or below; -1 elsewhere.
 
-    Pixels nearer than `BORDER` to the border of the image do not count.
+    Pixels within `BORDER` of the image border are excluded.
 
     Args:
         inverse_depth: 1 / depth [1/m], 0 for background.

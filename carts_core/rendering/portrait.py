@@ -16,11 +16,11 @@ _FOCAL_LENGTH = 2.4
 _MARGIN = 1.25
 _TILT = np.deg2rad(35.0)
 _OPEN = 0.45
-"""Joint position relative to the upper limit, so that jaws are open [1]."""
+"""Joint position of open jaws, relative to the upper limit [1]."""
 _SUPERSAMPLING = 2
 _GAMMA = 1 / 1.5
 _STEP = 0.1
-"""Motion of the last joint that identifies the links that it moves [rad]."""
+"""Motion of the last joint by which its moving links are identified [rad]."""
 
 
 def portrait(robot: Robot, width: int = 480, height: int = 320) -> UInt8[np.ndarray, "height width 3"]:
@@ -57,7 +57,7 @@ def portrait(robot: Robot, width: int = 480, height: int = 320) -> UInt8[np.ndar
 
 
 def _pose(robot: Robot) -> tuple[Float[torch.Tensor, " dofs"], Float[np.ndarray, "3"]]:
-    """Straight joint positions with open jaws, and the direction of motion of the links that the last joint moves."""
+    """Straight joint positions with open jaws, and direction of motion of the links moved by the last joint."""
     low, high = robot.joint_limits.double().clamp(-np.pi, np.pi).T
     joints = torch.zeros(len(low), dtype=torch.float64).clamp(low, high)
     moved = joints.clone()
@@ -78,7 +78,7 @@ def _points(robot: Robot, joints: torch.Tensor) -> list[Float[np.ndarray, "V 3"]
 
 
 def _side_view(along: Float[np.ndarray, "3"], opening: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
-    """R_camera_base of a view with the tip on the right, oblique to the plane in which jaws open."""
+    """R_camera_base of a view with the tip on the right, oblique to the opening plane of the jaws."""
     right = along / np.linalg.norm(along)
     across = opening - (opening @ right) * right
     across /= np.linalg.norm(across)

@@ -1,4 +1,4 @@
-"""Rasterization: triangles of a scene, their visibility, and visible surface points with their motion."""
+"""Rasterization: triangles of a scene, their visibility, and visible surface points."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,16 +19,17 @@ BACKGROUND = -1
 """Face index of a pixel without a triangle."""
 
 NEAR = 1e-3
-"""Depth of the near plane [m]; triangles that cross it are clipped, not dropped."""
+"""Depth of the near plane [m], at which triangles are clipped."""
 
 
 _WIDE = 8
-"""Width of a bounding box [px] from which the entry and exit of each row are computed."""
+"""Width of a bounding box [px] from which on the entry and exit of each row are computed."""
 
 
 @compiled
 def _first_and_last(value, slope, first, last):
-    """First and last step from 0 to `last` at which `value + slope * step` may be positive, with a margin of one."""
+    """First and last step from 0 to `last` at which `value + slope * step` may be positive, with a margin of one
+    step."""
     if slope > 0.0:
         first = max(first, int(min(-value / slope, last + 1.0)) - 1)
     elif slope < 0.0:
@@ -40,7 +41,7 @@ def _first_and_last(value, slope, first, last):
 
 @compiled
 def _fill_triangle(face, u, v, inverse_z, a, b, c, two_sided, face_ids, inverse_depth):
-    """Z-buffer one projected triangle (corners a, b, c of the points u, v with 1/z); its back only if two-sided."""
+    """Z-buffer a projected triangle (corners a, b, c of the points u, v with 1/z); its back only if `two_sided`."""
     area = (u[b] - u[a]) * (v[c] - v[a]) - (u[c] - u[a]) * (v[b] - v[a])
     # The image's y axis points down, so counterclockwise corners span a negative area.
     if area == 0.0 or (area > 0.0 and not two_sided):
@@ -102,7 +103,7 @@ def _clip(corners, inverse_z, vertices, fx, fy, cx, cy, clipped_u, clipped_v, cl
 
 @compiled
 def _opened(vertices, faces, surfaces, closed, inverse_z, fx, fy, cx, cy, width, height):
-    """Whether the near plane may cut each closed surface open within the image, from the bounds of the cut."""
+    """Whether the near plane may cut open each closed surface within the image, from the bounds of the cut."""
     u, v, inverse_near = np.empty(4), np.empty(4), np.empty(4)
     low, high = np.full((closed, 2), np.inf), np.full((closed, 2), -np.inf)
     for face in range(faces.shape[0]):
@@ -155,15 +156,15 @@ def rasterize(
     height: int,
     surfaces: Int[np.ndarray, " F"] | None = None,
 ) -> tuple[Int[np.ndarray, "height width"], Float[np.ndarray, "height width"]]:
-    """The nearest triangle at every pixel centre, and the inverse of its depth.
+    """Find the nearest triangle at every pixel centre, and its inverse depth.
 
     Args:
         vertices_camera: vertices in the camera's frame [m].
         intrinsics: fx, fy, cx, cy [px].
         width, height: size of the image [px].
-        surfaces: index of the closed surface of each triangle, -1 for none (the default). Its corners are
-            counterclockwise seen from outside. Unless the near plane cuts a surface open within the image, its front
-            hides its back, and the back is skipped, which saves time and does not change the result.
+        surfaces: index of the closed surface of each triangle, -1 for none (the default). Corners are counterclockwise
+            seen from outside. Unless the near plane cuts open a surface within the image, its front hides its back, and
+            the back is skipped, which saves time and does not change the result.
 
     Returns:
         `face_ids` (int32, `BACKGROUND` without a triangle) and `inverse_depth` (float32, [1/m], 0 there).
@@ -188,7 +189,7 @@ def visibility(
     width: int,
     height: int,
 ) -> tuple[Int[np.ndarray, "height width"], Float[np.ndarray, "height width"]]:
-    """The nearest triangle at every pixel centre, and its depth [m], 0 without a triangle; see `rasterize`."""
+    """Find the nearest triangle at every pixel centre, and its depth [m], 0 without a triangle; see `rasterize`."""
     face_ids, inverse_depth = rasterize(vertices_camera, faces, intrinsics, width, height)
     depth = np.zeros_like(inverse_depth)
     np.divide(1.0, inverse_depth, out=depth, where=face_ids >= 0)
@@ -197,7 +198,7 @@ def visibility(
 
 @dataclass(frozen=True)
 class SceneGeometry:
-    """All triangles of all arms. Links are numbered across all arms, and vertices are in the order of their links.
+    """Triangles of all arms. Links are numbered across all arms, and vertices are in the order of their links.
 
     Vectors are columns (`3 V`, not `V 3`), because products along a short last dimension are slow.
     """
@@ -213,12 +214,12 @@ class SceneGeometry:
     face_parts: Int[Tensor, " F"]
     """Index into `carts_core.model.parts.PARTS`."""
     face_surfaces: Int[Tensor, " F"]
-    """Index of the closed surface of each triangle, -1 for none; its back is invisible to a camera outside."""
+    """Index of the closed surface of each triangle, -1 for none; its back is not visible from outside."""
     face_colors: Float[Tensor, "3 F"]
     face_barycentric: Float[Tensor, "8 F"]
-    """Affine maps from a point on the triangle to its second and third barycentric coordinate, concatenated."""
+    """Affine maps from a point on a triangle to its second and third barycentric coordinates, concatenated."""
     face_normals: Float[Tensor, "9 F"]
-    """Unit vertex normals of each triangle's corners in its link's frame, concatenated."""
+    """Unit vertex normals at each triangle's corners in its link's frame, concatenated."""
 
     @staticmethod
     def of(scene: Scene, device: str | torch.device = "cpu") -> "SceneGeometry":
@@ -271,7 +272,7 @@ def _barycentric_maps(corners: np.ndarray) -> np.ndarray:
     a, ab, ac = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     cross = np.cross(ab, ac)
     squared = np.maximum((cross**2).sum(-1, keepdims=True), 1e-30)
-    # A coordinate grows in the plane along the normal of the edge opposite its corner.
+    # The gradient of a coordinate is normal to the edge opposite to its corner, in the plane of the triangle.
     maps = np.stack([np.cross(ac, cross) / squared, np.cross(cross, ab) / squared], 1)
     offsets = -np.einsum("fki,fi->fk", maps, a)
     return np.concatenate([maps, offsets[..., None]], -1)
@@ -281,7 +282,7 @@ def link_transforms(scene: Scene, state: SceneState) -> Float[Tensor, "*batch ca
     """Ts_camera_link of every link in every camera, differentiable (f_FK of the paper, then F_B and C)."""
     Ts_base_link: dict[int, Tensor] = {}
     for robot in {id(arm.robot): arm.robot for arm in scene.arms}.values():
-        # Forward kinematics of equal robots is batched, which takes as long for all as for one.
+        # Forward kinematics of equal robots is batched, which takes as long as for a single robot.
         same = [index for index, arm in enumerate(scene.arms) if arm.robot is robot]
         Ts = robot.forward_kinematics(torch.stack([state.joint_positions[index] for index in same]))
         Ts_base_link.update(zip(same, Ts, strict=True))
@@ -300,12 +301,12 @@ def vertices_in_camera(
 
 
 def as_array(values: Tensor) -> np.ndarray:
-    """A tensor as a C-ordered array on the CPU, copied only if necessary."""
+    """Convert a tensor to a C-ordered array on the CPU, copied only if necessary."""
     return values.contiguous().cpu().numpy()
 
 
 def unit(vectors: Float[Tensor, "3 K"]) -> Float[Tensor, "3 K"]:
-    """Columns scaled to length 1."""
+    """Normalize columns to unit length."""
     return vectors * vectors.square().sum(0).clamp(min=1e-24).rsqrt()
 
 
@@ -323,7 +324,7 @@ def phong(
     to_light = unit(points.new_tensor(light.position)[:, None] - points)
     to_camera = -unit(points)
     towards_camera = (normals * to_camera).sum(0)
-    # A surface seen from behind is lit from behind.
+    # A surface seen from its back is also lit from its back.
     side = torch.where(towards_camera.detach() < 0, -1.0, 1.0)
     cosine = (normals * to_light).sum(0) * side
     # The reflected light direction is 2 (n . l) n - l; only its cosine to the camera is needed.
@@ -337,7 +338,7 @@ def phong(
 def _gather(
     face_ids, inverse_depth, Ts_camera_link, intrinsics, face_links, barycentric, normals, starts, pixels, faces, out
 ):
-    """Fill pixels, faces and `out` (points, then normals) in runs of a view and a link that begin at `starts`."""
+    """Fill pixels, faces and `out` (points, then normals), in runs of a view and link that begin at `starts`."""
     views, height, width = face_ids.shape
     links = Ts_camera_link.shape[1]
     for view in range(views):
@@ -359,7 +360,7 @@ def _gather(
                 z = depth - T[2, 3]
                 for axis in range(3):
                     out[axis, k] = T[0, axis] * x + T[1, axis] * y + T[2, axis] * z
-                # A pixel at the edge of its triangle may be outside by a rounding error.
+                # Because of rounding, a pixel at the edge of its triangle may be outside.
                 b = _affine(barycentric[:4, face], out[:3, k])
                 c = _affine(barycentric[4:, face], out[:3, k])
                 n = normals[:, face]
@@ -374,7 +375,7 @@ def _gather(
 
 @compiled
 def _affine(coefficients, point):
-    """A barycentric coordinate of a point, in [0, 1]."""
+    """Barycentric coordinate of a point, clamped to [0, 1]."""
     value = coefficients[0] * point[0] + coefficients[1] * point[1] + coefficients[2] * point[2] + coefficients[3]
     return min(max(value, 0.0), 1.0)
 

@@ -36,7 +36,7 @@ class _CarryMotion(torch.autograd.Function):
         for axis, step, position, length in ((0, 1, column, width), (1, width, row, height)):
             for sign in (1, -1):
                 exists = position < length - 1 if sign > 0 else position > 0
-                # A pixel at the image's border is its own neighbour, which adds nothing.
+                # A pixel at the image border is its own neighbour, with no effect.
                 other = torch.where(exists, pixels + sign * step, pixels)
                 # Of two equally near points, the motion of the first one is used.
                 near = here_near >= nearness[other] if sign > 0 else here_near > nearness[other]
@@ -51,7 +51,7 @@ def carry_motion(
     pixels: Int[Tensor, " K"],
     inverse_depth: Float[Tensor, "views height width"],
 ) -> Float[Tensor, "channels views height width"]:
-    """Make the image's gradient depend on the motion of its visible points; its values are unchanged.
+    """Make the gradient of an image depend on the motion of its visible points, without changing its values.
 
     Args:
         image: rendered channels, which may carry gradients of their own (shading).
@@ -95,10 +95,10 @@ def scattered(
 
 @dataclass(frozen=True)
 class Rendering:
-    """Images of all cameras of all hypotheses."""
+    """Images of all cameras and hypotheses."""
 
     image: Float[Tensor, "*batch cameras 3 height width"]
-    """Linear RGB in [0, 1], black without a robot (Î of the paper)."""
+    """Linear RGB in [0, 1], black in the background (Î of the paper)."""
     silhouette: Float[Tensor, "*batch cameras height width"]
     """1 for robots, 0 for background (Ŝ of the paper); its gradient is that of the boundary."""
     face_ids: Int[Tensor, "*batch cameras height width"]
@@ -120,14 +120,14 @@ class Rendering:
 
 
 class Renderer:
-    """Renders the arms of a scene into its cameras.
+    """Renderer of the arms in a scene's cameras.
 
     Args:
-        width, height: size of the rendered images [px], by default that of the first camera. The intrinsics of a
-            state are those of the camera's own size and are scaled.
-        cameras: names of the cameras to render, in this order; all by default. States have all cameras of the scene, or
-            only these.
-        window: left, top, width and height [px] of the part of these images to render; all of it by default.
+        width, height: size of the rendered images [px], by default the size of the first camera. The intrinsics of a
+            state refer to the size of the camera and are scaled.
+        cameras: names of the cameras to render, in this order; all by default. States contain all cameras of the scene,
+            or only these.
+        window: left, top, width and height [px] of the rendered part of these images; the whole image by default.
         device: device of the images and of differentiable computations; visibility is always computed on the CPU.
     """
 
@@ -155,7 +155,7 @@ class Renderer:
         self._count = len(scene.cameras)
 
     def __call__(self, state: SceneState) -> Rendering:
-        """Render a state; gradients reach every tensor of the state."""
+        """Render a state, with gradients for every tensor of the state."""
         Ts, intrinsics = self._views(state)
         batch = Ts.shape[:-4]
         views_T, views_K = Ts.flatten(0, -4), intrinsics.flatten(0, -2)
@@ -180,14 +180,14 @@ class Renderer:
         )
 
     def segment(self, state: SceneState) -> Int[np.ndarray, "*batch cameras height width"]:
-        """Index of the visible arm per pixel, -1 for background; computes only visibility, and is faster than
-        rendering."""
+        """Index of the visible arm per pixel, -1 for background; faster than rendering, since only visibility is
+        computed."""
         return self._visible(state, self.geometry.face_arms)
 
     def segment_links(self, state: SceneState) -> Int[np.ndarray, "*batch cameras height width"]:
         """Index of the visible link per pixel, -1 for background.
 
-        Links are numbered across all arms: `Robot.link_names` of the first arm, then those of the second.
+        Links are numbered across all arms, first `Robot.link_names` of the first arm, then those of the second arm.
         """
         return self._visible(state, self.geometry.face_links)
 
@@ -195,7 +195,7 @@ class Renderer:
     def visibility(
         self, state: SceneState
     ) -> tuple[Int[Tensor, "*batch cameras h w"], Float[Tensor, "*batch cameras h w"]]:
-        """Only `face_ids` and `inverse_depth` of a `Rendering`."""
+        """Compute only `face_ids` and `inverse_depth` of a `Rendering`."""
         Ts, intrinsics = self._views(state)
         shape = (*Ts.shape[:-3], self.height, self.width)
         face_ids, inverse_depth = self._visibility(Ts.flatten(0, -4), intrinsics.flatten(0, -2))
@@ -204,12 +204,12 @@ class Renderer:
     def _visible(self, state: SceneState, face_labels: Int[Tensor, " F"]) -> np.ndarray:
         """Label of the visible triangle per pixel, -1 for background."""
         face_ids, _ = self.visibility(state)
-        # Background is face -1, which is the last label.
+        # The background is face -1, which indexes the last label.
         return np.append(face_labels.cpu().numpy(), -1)[face_ids.cpu().numpy()]
 
     @torch.no_grad()
     def surface_maps(self, state: SceneState) -> Float[Tensor, "*batch cameras 6 height width"]:
-        """Only the surface maps of all hypotheses; see `carts_core.model.parts`."""
+        """Compute only the surface maps of all hypotheses; see `carts_core.model.parts`."""
         Ts, intrinsics = self._views(state)
         views_T, views_K = Ts.flatten(0, -4), intrinsics.flatten(0, -2)
         face_ids, inverse_depth = self._visibility(views_T, views_K)
@@ -278,7 +278,7 @@ class Renderer:
     def _views(self, state: SceneState) -> tuple[Tensor, Tensor]:
         """Ts_camera_link [*batch, cameras, links, 4, 4] and scaled intrinsics of the rendered cameras."""
         if state.T_camera_world.shape[-3] == self._count and self._indices != list(range(self._count)):
-            # A state of the whole scene is reduced to the rendered cameras, in their order.
+            # If the state contains all cameras of the scene, the rendered cameras are selected.
             state = SceneState(
                 state.joint_positions,
                 state.T_world_base,

@@ -16,7 +16,7 @@ from .renderer import Renderer
 def main() -> None:
     """Render the shipped robot once, in a small picture, with derivatives."""
     robot = Robot.load(shipped_robot(), progress=print)
-    # The camera is slightly behind the base and looks along the instrument.
+    # The camera is slightly behind the base, with its axis along the instrument.
     T_camera_world = np.eye(4)
     T_camera_world[2, 3] = 0.05
     camera = Camera("camera", 64, 48, (64.0, 64.0, 32.0, 24.0), T_camera_world)
@@ -25,7 +25,7 @@ def main() -> None:
     around = scene.state({"arm": np.array([[0.0], [-step], [step]]) * np.ones(len(robot.joint_names))})
     renderer = Renderer(scene)
     rendering = renderer.surface(around, 2 * step)
-    assert rendering.jacobian, "an invisible scene compiles nothing"
+    assert rendering.jacobian, "an invisible scene would not compile the kernels"
     renderer.outline(around.map(lambda values: values[0]), renderer.tangents(around, 2 * step))
     image, pixel, samples = (np.zeros(shape, np.float32) for shape in ((1, 2, 2, 6), (2, 1), 3))
     nearest_edges(image, np.zeros(1, np.int64), pixel, pixel, samples, samples)

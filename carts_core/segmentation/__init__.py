@@ -1,4 +1,4 @@
-"""Interactive segmentation: a protocol for segmenters, and the built-in one.
+"""Interactive segmentation: protocol of segmenters, and the built-in segmenter.
 
 `onnx_segmenter` loads SAM-type models; only this module requires ONNX Runtime.
 """

@@ -1,7 +1,7 @@
 """SAM-type segmenters from user-provided files: an encoder and a decoder as ONNX graphs.
 
-An ONNX file describes a computation and executes no code of its own; PyTorch's `.pt` and `.pth` files can, and are
-rejected. Inputs and outputs are named as in the decoder export of Segment Anything and its successors.
+An ONNX file describes a computation and cannot execute code. PyTorch's `.pt` and `.pth` files can, and are rejected.
+Inputs and outputs are named as in the decoder export of Segment Anything and its successors.
 """
 
 from collections.abc import Mapping, Sequence
@@ -29,7 +29,7 @@ _REMEDY = (
     "Give two ONNX files, the encoder first, as written by Segment Anything's export_onnx_model.py or samexporter."
 )
 _KNOWN = {"point_coords", "point_labels", "mask_input", "has_mask_input", "orig_im_size"}
-"""Decoder inputs that are not outputs of the encoder."""
+"""Decoder inputs other than outputs of the encoder."""
 
 
 class OnnxSegmenter:
@@ -68,19 +68,19 @@ class OnnxSegmenter:
             or not isinstance(shape[2], int)
         ):
             raise WeightsError(
-                f"{encoder} has the inputs {_listed(images)}; an encoder has one, an image [1, 3, side, side]. "
+                f"{encoder} has the inputs {_listed(images)}; an encoder has one input, an image [1, 3, side, side]. "
                 f"{_REMEDY}"
             )
         names = {given.name for given in second.get_inputs()}
         offered = {found.name for found in first.get_outputs()}
         missing = {"point_coords", "point_labels"} - names
         foreign = names - offered - _KNOWN
-        # A single unmatched decoder input is matched with the encoder's single output, whatever its name.
+        # A single unmatched decoder input is matched with a single encoder output, regardless of their names.
         if missing or len(foreign) > 1 or (foreign and len(offered) != 1):
             raise WeightsError(
                 f"{decoder} has the inputs {_listed(second.get_inputs())}, and {encoder} the outputs "
-                f"{', '.join(sorted(offered))}; a decoder's inputs are its encoder's outputs, point_coords and "
-                f"point_labels. {_REMEDY}"
+                f"{', '.join(sorted(offered))}; the inputs of a decoder are the outputs of its encoder, point_coords "
+                f"and point_labels. {_REMEDY}"
             )
         if "masks" not in {found.name for found in second.get_outputs()}:
             raise WeightsError(f"{decoder} has the outputs {_listed(second.get_outputs())}, but no masks. {_REMEDY}")
@@ -136,7 +136,7 @@ class OnnxSegmenter:
 
 
 def _run(session: "InferenceSession", inputs: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Run a graph; returns all outputs by name."""
+    """Run a graph and return its outputs by name."""
     names = [found.name for found in session.get_outputs()]
     values = session.run(None, dict(inputs))
     return {name: np.asarray(value) for name, value in zip(names, values, strict=True)}
@@ -150,7 +150,7 @@ def _points(prompt: Prompt, scale: float) -> tuple[Float[np.ndarray, "points 2"]
         places += [prompt.box[:2], prompt.box[2:]]
         kinds += list(_CORNERS)
     else:
-        # SAM's decoder was trained with a padding point if there is no box.
+        # SAM's decoder was trained with a padding point for prompts without a box.
         places, kinds = [*places, (0.0, 0.0)], [*kinds, _PADDING]
     return np.array(places, np.float32) * np.float32(scale), np.array(kinds, np.float32)
 

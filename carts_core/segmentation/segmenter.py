@@ -22,8 +22,8 @@ class Prompt:
     """Prompt for an object in an image: foreground points, background points, and a box.
 
     Raises:
-        SettingsError: there is neither a foreground point nor a box, too many points, a non-finite coordinate, or an
-            empty box.
+        SettingsError: the prompt has neither a foreground point nor a box, or it has too many points, a non-finite
+            coordinate, or an empty box.
     """
 
     inside: tuple[tuple[float, float], ...] = ()
@@ -37,7 +37,7 @@ class Prompt:
         if not self.inside and self.box is None:
             raise SettingsError("a prompt needs a point on the object, or a box around it.")
         if len(self.inside) + len(self.outside) > MOST_POINTS:
-            raise SettingsError(f"a prompt has at most {MOST_POINTS} points. Start another prompt.")
+            raise SettingsError(f"a prompt may have at most {MOST_POINTS} points. Start another prompt.")
         numbers = [value for place in (*self.inside, *self.outside, self.box or ()) for value in place]
         if not np.isfinite(numbers).all():
             raise SettingsError("a position of a prompt is not finite.")
@@ -63,24 +63,24 @@ _LONGEST_SIDE = 640
 """Longer side of the image in which outlines are refined [px]."""
 _ROUNDS = 3
 _BAND, _WIDE = 0.005, 0.2
-"""Half-width of the band around the network's outline, or around the initial region of a box without detections, that
-is segmented by image content, relative to the longer side of the image [1]."""
+"""Half-width of the band that is segmented by image content, around the network's outline or around the initial region
+of a box without detections, relative to the longer side of the image [1]."""
 _POINT, _AROUND = 0.006, 0.05
-"""Radius in which a point determines the label, and in which a background point makes foreground uncertain, relative to
-the longer side of the image [1]."""
+"""Radius in which a point determines the label, and radius in which a background point makes foreground uncertain,
+relative to the longer side of the image [1]."""
 _ALIKE = 25
 """Maximum colour difference in regions grown from points outside detections [grey levels]."""
 _SMALLEST = 0.02
-"""Minimum area of a connected component in a box, relative to the largest one [1]."""
+"""Minimum area of a connected component in a box, relative to the largest component [1]."""
 
 Probability = Callable[[UInt8[np.ndarray, "height width 3"]], Float[np.ndarray, "height width"]]
 
 
 class NetworkSegmenter:
-    """Segments instruments with the network and GrabCut; implements `Segmenter`.
+    """Segmenter that uses the network and GrabCut; implements `Segmenter`.
 
     Args:
-        probability: predicts from an RGB image the probability that a pixel shows an instrument.
+        probability: predicts the probability of an instrument in each pixel of an RGB image.
     """
 
     def __init__(self, probability: Probability) -> None:
@@ -108,7 +108,8 @@ class NetworkSegmenter:
         return smooth > 0.5
 
     def _likely(self, image: np.ndarray) -> np.ndarray:
-        # Successive prompts usually concern the same image, and the network is the slowest part.
+        # The prediction is cached, since successive prompts usually refer to the same image, and the network is the
+        # slowest part.
         if self._last is None or self._last[0] is not image:
             self._last = image, self._probability(image)
         return self._last[1]
@@ -118,7 +119,7 @@ class NetworkSegmenter:
 def instrument_probability(
     extractor: FeatureExtractor, image: UInt8[np.ndarray, "height width 3"]
 ) -> Float[np.ndarray, "height width"]:
-    """Probability that a pixel shows an instrument: unconditioned coverage of the surface network."""
+    """Probability of an instrument in each pixel: unconditioned coverage of the surface network."""
     height, width = image.shape[:2]
     stride = extractor.stride
     scale = extractor.working_size[0] / width
@@ -168,7 +169,8 @@ class _Places:
         return inside
 
     def chosen(self, mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
-        """Connected components selected by the prompt: those with a foreground point, or all but tiny ones in a box."""
+        """Connected components selected by the prompt: components with a foreground point, or all except tiny
+        components in a box."""
         count, labels, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=8)
         kept = {int(labels[v, u]) for u, v in self.inside}
         if not self.inside and count > 1:
@@ -187,7 +189,7 @@ def _seeds(
         _, labels = cv2.connectedComponents(seen.astype(np.uint8))
         known = {int(labels[v, u]) for u, v in places.inside} - {0}
         missed = [(u, v) for u, v in places.inside if not labels[v, u]]
-        # An instrument can have several visible components, so all are selected if one is.
+        # An instrument may have several visible components, which are selected together.
         seeds = seen if known else np.zeros_like(seen)
         return (seeds | _alike(small, missed)) & places.boxed(), _BAND
     if seen.any():

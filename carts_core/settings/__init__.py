@@ -1,6 +1,6 @@
 """Settings as dataclasses with range checks.
 
-No module here imports torch, so that the command line starts quickly.
+No module of this package imports torch, so that the command line starts quickly.
 """
 
 from .interchange import FormatName as FormatName

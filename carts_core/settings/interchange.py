@@ -13,7 +13,7 @@ Clock = Literal["s", "ms", "us", "ns"]
 AngleUnit = Literal["rad", "deg", "percent"]
 LengthUnit = Literal["m", "dm", "cm", "mm"]
 Axes = Literal["opencv", "dvrk"]
-"""Camera axes: x right, y down (OpenCV), or x left, y up (dVRK); z points away from the viewer in both."""
+"""Camera axes: x right, y down (OpenCV), or x left, y up (dVRK); z is the viewing direction in both."""
 
 NO_TABLE = Path("none")
 """Value of `kinematics` for images without joint data."""
@@ -22,7 +22,7 @@ SECONDS: Mapping[Clock, float] = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 
 @dataclass(frozen=True)
 class ImportOptions:
-    """Options of an import, for information that the recording lacks."""
+    """Options of an import, for information that is missing in the recording."""
 
     source: str | None = None
     """Source format (listed by `carts import` without arguments); detected by default."""
@@ -42,13 +42,13 @@ class ImportOptions:
     length_unit: LengthUnit | None = None
     """Unit of lengths."""
     units: Mapping[str, str] = field(default_factory=dict)
-    """Joint -> unit, if it differs from that of the others."""
+    """Joint -> unit, if it differs from the unit of the other joints."""
     flip: tuple[str, ...] = ()
     """Joints with inverted sign."""
     clock: Clock | None = None
     """Unit of the table's times."""
     time_offset: float | None = None
-    """Time in the kinematics minus time of the image [s]."""
+    """Kinematics time minus image time [s]."""
     frame_rate: float | None = None
     """Frame rate of images without times, or replacement of a video's constant rate [1/s]."""
     arms: Mapping[str, str] = field(default_factory=dict)
@@ -56,10 +56,11 @@ class ImportOptions:
     robot: Mapping[str, str] = field(default_factory=dict)
     """Arm -> robot: a URDF, or `builtin:NAME`; `builtin:psm_lnd` by default."""
     wrist_length: float | None = None
-    """Distance between the wrist pitch and yaw axes [m], for inverse kinematics; by default that of the instrument,
-    else 0.0091."""
+    """Distance between the wrist pitch and yaw axes [m], for inverse kinematics; by default that of the instrument
+    identified from the recording, else 0.0091."""
     tool_point: float | None = None
-    """Distance along the tool from the dVRK's tip to the point described by tip poses [m]; estimated by default."""
+    """Distance along the tool from the dVRK's tip frame to the point described by tip poses [m]; estimated by
+    default."""
     base: Mapping[str, Path] = field(default_factory=dict)
     """Arm -> registration, configuration or set-up joint file of the dVRK that contains its base frame."""
     axes: Axes | None = None

@@ -13,20 +13,20 @@ class StreamKind(StrEnum):
     """Kind of frame source."""
 
     REPLAY = "replay"
-    """The recording, replayed in real time."""
+    """Replay of the recording in real time."""
     CAMERA = "camera"
     VIDEO = "video"
     FOLDER = "folder"
-    """A folder to which images are added."""
+    """Folder to which images are added."""
     SOCKET = "socket"
-    """A socket on 127.0.0.1."""
+    """Socket on 127.0.0.1."""
 
 
 KNOWN = "replay, camera:NUMBER, video:FILE, folder:PATH or socket:PORT"
 _PORTS = 2**16
 
 Seconds = Annotated[float, Range(0, 3600, "s")]
-"""A duration [s]."""
+"""Duration [s]."""
 
 
 @dataclass(frozen=True)
@@ -82,4 +82,4 @@ class LiveSettings(Ranged):
     search_seconds: Seconds = 0.4
     """Interval between searches for lost arms; frames in between are compared with the last known pose [s]."""
     oldest_seconds: Seconds = 0.1
-    """A frame whose result would be older, at the usual time for a frame, is dropped for the next one [s]."""
+    """Maximum age of a result [s]; a frame whose result is expected to be older is dropped."""

@@ -41,23 +41,23 @@ class SequenceSettings(Ranged):
     drift_seconds: Annotated[float, Range(1e-3, 1e6, "s")] = 4.0
     """Time constant of the drift's autocorrelation [s]."""
     jitter_deg: Annotated[float, Range(1e-3, 360, "deg")] = 0.05
-    """Standard deviation of the error that is independent in every frame [deg]."""
+    """Standard deviation of the independent error of each frame [deg]."""
     measurement_noise: Annotated[float, Range(1e-3, 100)] = 4.0
     """Like `SurfaceSolver.noise`, for a frame's measurement in the smoother [1]; larger, since errors of neighbouring
     pixels are correlated."""
     correlation_seconds: Annotated[float, Range(1e-6, 1e6, "s")] = 0.5
-    """Time constant of the autocorrelation of image errors [s]; more closely spaced frames have less weight for each
-    other."""
+    """Time constant of the autocorrelation of image errors [s]; frames that are closer in time have less weight for
+    each other."""
     shared_seconds: Annotated[float, Range(1e-6, 1e6, "s")] = 5.0
-    """Like `correlation_seconds`, for the reported standard deviations [s]; longer, since the network's errors persist
-    while an instrument is seen from one side."""
+    """Like `correlation_seconds`, for the reported standard deviations [s]; longer, since errors of the network persist
+    while an instrument is seen from the same side."""
     initial_frames: Annotated[int, Range(1, 20)] = 5
-    """Number of evenly spaced frames solved alone to find the start of the first frame; 1 uses the first frame only
-    [1]."""
+    """Number of evenly spaced frames that are solved individually to initialize the first frame; 1 uses only the first
+    frame [1]."""
     cold_factor: Annotated[float, Range(1, 100)] = 2.0
     """Multiple of the median loss above which a frame gets a cold start [1]."""
     direction: Direction = "forward"
-    """Direction of the first pass: from the first frame, or from the last one."""
+    """Direction of the first pass: from the first frame, or from the last frame."""
     frame_seconds: Annotated[float, Range(1e-6, 1e6, "s")] = 0.25
     """Time between frames if the sequence has no times [s]."""
     cold: tuple[Stage, ...] = COLD
@@ -102,15 +102,15 @@ class FreeParameters:
     intrinsics: bool = False
     """Focal lengths and principal points."""
     arms: tuple[str, ...] = ()
-    """Names of the free arms; all if empty."""
+    """Names of the free arms; empty for all arms."""
     locked_joints: tuple[str, ...] = ()
-    """Joints held fixed, as `joint` for every arm or `arm/joint` for one."""
+    """Fixed joints, as `joint` for every arm or `arm/joint` for one arm."""
     locked_cameras: tuple[str, ...] = ()
-    """Cameras whose extrinsics are held fixed."""
+    """Cameras with fixed extrinsics."""
 
     @property
     def joints_only(self) -> bool:
-        """Whether only joints are free, and no calibration shared by frames."""
+        """Whether only joints are free, without calibration parameters."""
         return not (self.base_frames or self.extrinsics or self.intrinsics)
 
 
@@ -121,7 +121,7 @@ class SurfaceSolver(Ranged):
     stages: tuple[Stage, ...] = FRAME
     """Stages, in order of execution."""
     iterations: Annotated[int, Range(1, 10_000)] = 60
-    """Maximum number of evaluations [1]; stages that are repeated from the start get the same number again."""
+    """Maximum number of evaluations [1]; stages that are repeated from the start may use the same number again."""
     working_width: Annotated[int, Range(64, 4096, "px")] = 320
     """Width of the working image [px], to which the scales of stages refer."""
     noise: Annotated[float, Range(1e-3, 100)] = 1.33
@@ -139,8 +139,8 @@ class SurfaceSolver(Ranged):
     reported standard deviations of motions along the line of sight."""
     start_share: Share = 0.1
     """Share of an error of the start that remains in the prediction of the network, which is conditioned on a rendering
-    of the start [1]. It increases the reported standard deviations and changes no estimate; it is not used with given
-    masks."""
+    of the start [1]. It increases the reported standard deviations, but does not change estimates; it is not used with
+    given masks."""
     prior_deg: Annotated[float, Range(1e-3, 360, "deg")] = 2.5
     """Expected error of a joint position at the start [deg]; `length_scale` converts it to metres."""
     frame_prior_deg: Annotated[float, Range(1e-3, 360, "deg")] = 0.5
@@ -148,7 +148,7 @@ class SurfaceSolver(Ranged):
     intrinsics_prior: Annotated[float, Range(1e-6, 1)] = 0.01
     """Expected error of focal lengths and principal points, as a share of the focal length [1]."""
     length_scale: Annotated[float, Range(1e-3, 10, "m")] = 0.15
-    """Translation equivalent to one radian [m]: about the distance from the remote centre to the tip."""
+    """Translation equivalent to one radian [m]: approximately the distance from the remote centre to the tip."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -224,7 +224,7 @@ class DescentSolver(Ranged):
 
 
 SolverSettings = SurfaceSolver | DescentSolver
-"""Settings of a solver of single frames."""
+"""Settings of a single-frame solver."""
 
 
 def surface_solver(settings: SolverSettings | None, what: str) -> SurfaceSolver:
@@ -232,8 +232,8 @@ def surface_solver(settings: SolverSettings | None, what: str) -> SurfaceSolver:
     if settings is None or isinstance(settings, SurfaceSolver):
         return settings or SurfaceSolver()
     raise SettingsError(
-        f"{what} requires the solver `surface`, not one for the loss {settings.loss.value!r}. "
-        "Use the default solver, or optimize each frame alone."
+        f"{what} requires the solver `surface`; given: a solver for the loss {settings.loss.value!r}. "
+        "Use the default solver, or optimize each frame individually."
     )
 
 
@@ -241,19 +241,19 @@ class SolverName(StrEnum):
     """Names of the solvers."""
 
     SURFACE = "surface"
-    """The default: `SurfaceSolver`."""
+    """`SurfaceSolver` (default)."""
     OCCLUDED = "occluded"
-    """`SurfaceSolver`, repeated without pixels that probably show an occluder."""
+    """`SurfaceSolver`, repeated without pixels of probable occluders."""
     ACS = "acs"
-    """Attentional cosine similarity, independent of the silhouette's size."""
+    """Attentional cosine similarity, normalized by the silhouette's size."""
     ACS_REFERENCE = "acs_reference"
     """ACS as in the released code."""
     PAPER = "paper"
     """The paper's loss and schedule."""
     L1 = "l1"
-    """Smooth L1 between predictions."""
+    """Smooth L1 difference of predictions."""
     NONE = "none"
-    """Only evaluates the start."""
+    """Evaluation of the start only."""
 
 
 def solver(name: SolverName | str) -> SolverSettings:
@@ -278,7 +278,7 @@ def _loss(value: Loss | str) -> Loss:
 
 
 CALIBRATION = FreeParameters(joints=False, base_frames=True, extrinsics=True)
-"""Free parameters of a calibration by default."""
+"""Default free parameters of a calibration."""
 
 CALIBRATION_SETTINGS = SurfaceSolver(
     stages=CALIBRATION_STAGES,

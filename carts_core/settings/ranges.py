@@ -20,7 +20,7 @@ class Range:
     """Whether `high` itself is excluded."""
 
     def holds(self, value: float) -> bool:
-        """Whether a value lies in the range; NaN does not."""
+        """Whether a value is in the range; False for NaN."""
         return (self.low < value if self.above else self.low <= value) and (
             value < self.high if self.below else value <= self.high
         )
@@ -35,13 +35,13 @@ class Range:
 
 
 Share = Annotated[float, Range(0, 1)]
-"""A number from 0 to 1."""
+"""Number from 0 to 1."""
 Count = Annotated[int, Range(1)]
-"""A positive integer."""
+"""Positive integer."""
 Positive = Annotated[float, Range(0, above=True)]
-"""A positive number."""
+"""Positive number."""
 NotNegative = Annotated[float, Range(0)]
-"""A nonnegative number."""
+"""Nonnegative number."""
 
 
 def require(condition: bool, name: str, value: object, allowed: object) -> None:

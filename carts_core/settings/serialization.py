@@ -27,7 +27,7 @@ def field_docstrings(kind: type) -> dict[str, str]:
 
 
 def described(kind: type) -> str:
-    """Description of a settings dataclass: its summary, and each field with default and meaning."""
+    """Description of a settings dataclass: summary, and each field with default and meaning."""
     lines = [f"{kind.__name__}: {inspect.getdoc(kind) or ''}"]
     texts = field_docstrings(kind)
     for field in fields(kind):

@@ -11,7 +11,7 @@ class Given(StrEnum):
     """State on whose rendering the network is conditioned."""
 
     START = "start"
-    """Start of the run."""
+    """Initial state of the run."""
     ESTIMATE = "estimate"
     """The current estimate."""
 
@@ -20,7 +20,7 @@ class Given(StrEnum):
 class Observe(Ranged):
     """Predict the surface map of the images: per pixel, the coverage of each part of the arms and the normal
     (`carts_core.model.parts`). `Descend` and `AlignEdges` do not run the network; `RandomRestart` and `PreferStart`
-    observe again, and verdicts (`OtherBackground`, `RejectFailed`) run it for their evidence.
+    make another observation, and verdicts (`OtherBackground`, `RejectFailed`) run the network for their evidence.
     """
 
     scale: Annotated[float, Range(0.1, 8)] = 1.5
@@ -30,7 +30,7 @@ class Observe(Ranged):
     margin: Annotated[int, Range(0, 1000, "px")] = 16
     """Margin of the network's input around the arms of that state [px]."""
     attention: Annotated[int, Range(1, 1000, "px")] = 8
-    """Distance from the arms of that state beyond which pixels are ignored, the paper's attention [px]."""
+    """Distance from the arms of that state beyond which pixels are ignored: the attention of the paper [px]."""
     haze: bool = True
     """Whether pixels under haze or smoke are weighted by its transmission. Searches work better with all pixels."""
 
@@ -51,23 +51,23 @@ class Descend(Ranged):
 
 
 FINEST = Descend(blur=0.8)
-"""The last descent; estimates are compared with its settings."""
+"""Settings of the final descent, also used to compare estimates."""
 
 
 @dataclass(frozen=True)
 class RandomRestart(Ranged):
-    """If the fit is bad or an arm was lost (it has left the image, or is where none was observed): draw random states,
-    compare them with the whole image, and descend again from the best."""
+    """If the fit is bad or an arm is lost (it has left the image, or no arm was observed at its position): draw random
+    states, compare them with the whole image, and descend again from the best state."""
 
     then: tuple["Stage", ...]
-    """Stages from the best state. Random states are compared as in the first `Descend` of these."""
+    """Stages from the best state. Random states are compared as in the first `Descend` of these stages."""
     if_loss: Annotated[float, Range(0, 10)] = 0.045
     """Cost per arm pixel, without the prior, above which a fit is bad [1]."""
     candidates: Annotated[int, Range(1, 10_000)] = 64
     """Number of random states per arm [1]."""
     deviation: Annotated[float, Range(0, 10, above=True)] = 1.8
-    """Standard deviation of the random states, in units of that of the prior (such as `SurfaceSolver.prior_deg`)
-    [1]."""
+    """Standard deviation of the random states, relative to the prior standard deviation (such as
+    `SurfaceSolver.prior_deg`) [1]."""
     scale: Annotated[float, Range(0.1, 8)] = 0.75
     """Scale of the whole image for the comparison, as in `Observe.scale` [1]."""
 
@@ -75,7 +75,8 @@ class RandomRestart(Ranged):
 @dataclass(frozen=True)
 class SilhouetteSearch(Ranged):
     """If given masks are the target and the start is far from them: draw states, compare silhouettes and masks by
-    distance, which requires no overlap, and continue from the nearest. Skipped if a network predicts the coverage.
+    distance, which requires no overlap, and continue from the nearest state. Skipped if a network predicts the
+    coverage.
     """
 
     if_overlap: Share = 0.8
@@ -83,16 +84,16 @@ class SilhouetteSearch(Ranged):
     starts: Annotated[int, Range(1, 100)] = 4
     """Maximum number of searches [1]."""
     rounds: Annotated[int, Range(1, 1000)] = 10
-    """Rounds per search; each round draws around the best states of the previous one [1]."""
+    """Rounds per search; each round draws states around the best states of the previous round [1]."""
     candidates: Annotated[int, Range(20, 10_000)] = 48
-    """States per round; the first round has more [1]."""
+    """Number of states per round, except for a larger first round [1]."""
     joints_deg: Annotated[float, Range(0, 90, "deg", above=True)] = 6.0
     """Standard deviation of joints in the first round [deg]; `length_scale` converts it to metres."""
     frames_deg: Annotated[float, Range(0, 90, "deg", above=True)] = 15.0
-    """Standard deviation of rotations of base frames and cameras in the first round [deg]; that of translations is half
-    this angle times the distance of the arms from the camera."""
+    """Standard deviation of rotations of base frames and cameras in the first round [deg]; the standard deviation of
+    translations is half this angle times the distance of the arms from the camera."""
     enough: Annotated[float, Range(0, 1000, "px")] = 1.5
-    """Distance of silhouettes and masks below which no further search starts [px of the compared images]."""
+    """Distance between silhouettes and masks below which no further search starts [px of the compared images]."""
     scale: Annotated[float, Range(0.1, 8)] = 0.5
     """Scale of the compared images, as in `Observe.scale` [1]."""
 
@@ -118,16 +119,16 @@ class PreferStart(Ranged):
     """Multiple of the estimate's cost above which the start is rejected [1]."""
     edges: Annotated[float, Range(1, 100)] = 1.12
     """Multiple of the estimate's edge distance above which the start is rejected [1]; exactly correct starts are below
-    it in 39 of 40 synthetic frames."""
+    this multiple in 39 of 40 synthetic frames."""
     overlap: Share = 0.9
-    """Dice of the silhouettes of start and estimate below which the start is not tried [1]."""
+    """Dice of the silhouettes of start and estimate below which the start is not considered [1]."""
 
 
 @dataclass(frozen=True)
 class OtherBackground:
     """If the fit has failed and the empty background is known: repeat it with the other background mode (replaced in
     the image, or subtracted from the predictions). The second run is kept if it has not failed and its arms overlap
-    more with the change relative to the background, which false detections do not increase."""
+    more with the change relative to the background, which false detections do not affect."""
 
     then: tuple["Stage", ...]
     """Stages from the start."""
@@ -139,7 +140,7 @@ class IgnoreOccluders:
     pixels."""
 
     then: tuple["Stage", ...]
-    """Stages from the start, if a mask was proposed."""
+    """Stages from the start, run if a mask was proposed."""
 
 
 @dataclass(frozen=True)
@@ -150,7 +151,7 @@ class Evaluate:
 @dataclass(frozen=True)
 class RejectFailed:
     """Assess the best point as good, doubtful or failed. Unless it is good, its standard deviations account for a wrong
-    fit. If it failed, return to the start, unless the image contradicts the start even more."""
+    fit. If it failed, return to the start, unless the start fits the image even less."""
 
 
 @dataclass(frozen=True)
@@ -181,12 +182,12 @@ Stage = (
 
 
 def first_descend(stages: tuple[Stage, ...]) -> Descend:
-    """First descent of a solver; `FINEST` if it has none."""
+    """First descent of a solver; `FINEST` without a descent."""
     return next((stage for stage in stages if isinstance(stage, Descend)), FINEST)
 
 
 def first_observe(stages: tuple[Stage, ...]) -> Observe:
-    """First observation of a solver; the default one if it has none."""
+    """First observation of a solver; the default observation if the solver has none."""
     return next((stage for stage in stages if isinstance(stage, Observe)), Observe())
 
 
@@ -206,10 +207,10 @@ _RESTART = RandomRestart(then=(Descend(blur=8.0), _FAR, Descend(blur=3.0)))
 
 SEARCH: tuple[Stage, ...] = (
     SilhouetteSearch(),
-    # A small image, for a fast first estimate.
+    # The first estimate uses a small image and is fast.
     Observe(scale=0.75, margin=27, attention=27, haze=False),
     _COARSE,
-    # Conditioned on the start again, so that an error of the first pass is not reinforced.
+    # The network is conditioned on the start again, so that errors of the first pass are not reinforced.
     Observe(given=Given.START, margin=27, attention=27, haze=False),
     _MEDIUM,
     _RESTART,
@@ -226,14 +227,14 @@ FRAME: tuple[Stage, ...] = (*_ALONE, OtherBackground(then=_ALONE), Evaluate(), R
 """Stages for a single frame (default).
 
 `SilhouetteSearch` acts only if given masks are the target, `RandomRestart` only if the fit is bad, and
-`OtherBackground` only if it has failed and the empty background is known. Once the budget of evaluations is spent, all
-stages except `RejectFailed` are skipped.
+`OtherBackground` only if the fit has failed and the empty background is known. Once the budget of evaluations is spent,
+all stages except `RejectFailed` are skipped.
 """
 
 OCCLUDED: tuple[Stage, ...] = (
     *(*_FITTED, IgnoreOccluders(then=_FITTED), AlignEdges(), PreferStart(), Evaluate(), RejectFailed()),
 )
-"""Stages for a single frame, repeated without pixels that probably show an occluder."""
+"""Stages for a single frame, repeated without pixels of probable occluders."""
 
 NONE: tuple[Stage, ...] = (Observe(), Evaluate(), RejectFailed())
 """Evaluation of the start only ("CaRTS without optimization")."""
@@ -245,7 +246,7 @@ _WIDE = Observe(margin=27, attention=27)
 """Observation with a larger margin around the arms."""
 
 WARM_WIDE: tuple[Stage, ...] = (_WIDE, Descend(blur=0.8, steps=2), AlignEdges())
-"""Like `WARM`, for a frame that may be farther from its prediction."""
+"""Like `WARM`, for a frame with a larger distance from its prediction."""
 
 WARM: tuple[Stage, ...] = (
     Observe(scale=0.6, margin=10, attention=10),
@@ -275,7 +276,8 @@ CALIBRATION_STAGES: tuple[Stage, ...] = (
 """Stages of a calibration over many frames."""
 
 FEATURES: tuple[Stage, ...] = (FirstOrder(attention=20, blur=1.6), FirstOrder())
-"""Stages for losses of image features: a wide attention first, the final one for the second half of the iterations."""
+"""Stages for losses of image features: a wide attention first, and the final attention for the second half of the
+iterations."""
 
 PAPER: tuple[Stage, ...] = (FirstOrder(share=1.0, blur=0.0),)
-"""The paper's stage: one attention, no blur."""
+"""Stage of the paper, with one attention and without blur."""

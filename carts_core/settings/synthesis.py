@@ -12,7 +12,7 @@ from ..resources import shipped_robot
 from .ranges import Range, Ranged, Share
 
 DOMAINS = ("regular", "low_brightness", "bleeding", "smoke", "background_change", "simulated_smoke")
-"""The counterfactual domains: the same motion under different conditions."""
+"""Counterfactual domains: the same motion under different conditions."""
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ class MeasurementError(Ranged):
     bias: tuple[float, ...] = (0.020, 0.020, 0.0012, 0.035, 0.035, 0.035, 0.035)
     """Magnitude of the constant offset; its sign and a factor from 0.6 to 1.2 are drawn for each joint."""
     drift: tuple[float, ...] = (0.004, 0.004, 0.0003, 0.008, 0.008, 0.008, 0.008)
-    """Amplitude of the slow drift about that offset."""
+    """Amplitude of the slow drift about the offset."""
     drift_period: Annotated[float, Range(0.1, 1e6)] = 20.0
     """Typical period of the drift [s]."""
     noise: tuple[float, ...] = (0.0004, 0.0004, 0.00004, 0.001, 0.001, 0.001, 0.001)
@@ -88,7 +88,7 @@ class RenderConfig(Ranged):
     """Settings of the path tracer."""
 
     samples: Annotated[int, Range(1, 4096)] = 8
-    """Paths per pixel; noise is inversely proportional to the square root."""
+    """Paths per pixel; noise is inversely proportional to the square root of this number."""
     bounces: Annotated[int, Range(2, 16)] = 3
     """Maximum path length in segments; 2 excludes interreflections between tissue and metal."""
     robot_faces: Annotated[int, Range(500, 1_000_000)] = 40_000
@@ -127,13 +127,13 @@ class DomainConfig(Ranged):
     """Strengths of the counterfactual conditions."""
 
     low_brightness: Share = 0.22
-    """Light of the low brightness domain relative to the regular one."""
+    """Light of the low brightness domain, relative to the regular domain."""
     blood_coverage: Share = 0.40
     """Fraction of the tissue covered with blood."""
     blood_on_tools: Share = 0.30
     """Fraction of the instruments' surface with a film or drops of blood."""
     smoke_density: Annotated[float, Range(0.0, 200.0)] = 8.0
-    """Mean extinction of the smoke [1/m]; at 8 and 0.1 m of depth, 55 % of the light is lost."""
+    """Mean extinction of the smoke [1/m]; with 8, 55 % of the light is lost at a depth of 0.1 m."""
     smoke_wavelength: Annotated[float, Range(0.002, 1.0)] = 0.042
     """Size of the largest eddies [m]."""
     smoke_speed: Share = 0.02
@@ -144,19 +144,19 @@ class DomainConfig(Ranged):
 
 @dataclass(frozen=True)
 class SynthesisConfig(Ranged):
-    """A synthetic sequence of two arms."""
+    """Synthetic sequence of two arms."""
 
     seed: Annotated[int, Range(0, 2**32 - 1)] = 7
     """Random seed of tissue, motion, errors and noise."""
     name: str = "synthetic"
     """Name of the sequence."""
     robot: Path = field(default_factory=shipped_robot)
-    """URDF, or `builtin:NAME`. With the joints of a PSM it is used for two arms, otherwise for a single arm."""
+    """URDF, or `builtin:NAME`. A robot with the joints of a PSM is used for two arms, other robots for a single arm."""
     tip_link: str = "tool_tip_link"
     """Link of the URDF whose origin is the point between the jaw tips; for robots other than the PSM, the last link
     with a mesh."""
     domains: tuple[str, ...] = DOMAINS
-    """The conditions to render."""
+    """Conditions to render."""
     endoscope: EndoscopeConfig = EndoscopeConfig()
     """Camera."""
     motion: MotionConfig = MotionConfig()
@@ -179,6 +179,7 @@ class SynthesisConfig(Ranged):
             )
 
     def rng(self, *purpose: str | int) -> np.random.Generator:
-        """Random generator for a purpose; each purpose has its own, so that changing one does not affect the others."""
+        """Random generator for a purpose. Each purpose has its own generator, so that changes in one do not affect the
+        others."""
         words = [zlib.crc32(part.encode()) if isinstance(part, str) else part for part in purpose]
         return np.random.default_rng([self.seed, *words])

@@ -14,26 +14,27 @@ from .ranges import Count, NotNegative, Positive, Range, Ranged, Share
 
 @dataclass(frozen=True)
 class ObjectiveWeights(Ranged):
-    """Weights of the terms of the training loss; zero leaves a term out."""
+    """Weights of the terms of the training loss; zero omits a term."""
 
     cross_entropy: NotNegative = 1.0
     """Binary cross-entropy of the instrument's probability, as in the paper."""
     dice: NotNegative = 0.5
-    """One minus soft Dice per image, so that small instruments count as much as large ones."""
+    """One minus soft Dice per image, so that small instruments have the same weight as large instruments."""
     consistency: NotNegative = 1.0
-    """Cosine similarity of features of an observed and a hybrid image: 1 for equal classes, 0 for different ones."""
+    """Cosine similarity of features of an observed and a hybrid image, with the target 1 for equal and 0 for different
+    classes."""
 
 
 @dataclass(frozen=True)
 class SurfaceWeights(Ranged):
-    """Weights of the terms of the surface network's loss; zero leaves a term out."""
+    """Weights of the terms of the surface network's loss; zero omits a term."""
 
     everywhere: NotNegative = 1.0
     """Cross-entropy of coverage over all pixels."""
     near: NotNegative = 1.0
     """Cross-entropy of coverage near instruments, where the optimizer compares maps."""
     dice: NotNegative = 0.5
-    """One minus soft Dice per image and part, so that small parts count as much as large ones."""
+    """One minus soft Dice per image and part, so that small parts have the same weight as large parts."""
     normals: NotNegative = 1.0
     """Smooth L1 of normals near instruments."""
 
@@ -48,14 +49,15 @@ class Architecture:
     widths: tuple[int, ...] = (12, 24, 48, 64, 96)
     """Channels per level, from full resolution down; each level halves the resolution."""
     encoder_convolutions: tuple[int, ...] = (1, 2, 2, 2, 2)
-    """3x3 convolutions per level of the encoder. Full resolution is the most expensive, so it has one."""
+    """3x3 convolutions per level of the encoder. Full resolution is the most expensive level and has one
+    convolution."""
     decoder_convolutions: tuple[int, ...] = (1, 1, 1, 1)
     """3x3 convolutions per level of the decoder, from full resolution down."""
     local_mean: bool = True
     """Subtract the local instead of the global image mean, which reduces the effect of smooth haze."""
     local_contrast: float = 0.0
-    """Weight of local versus global contrast normalization, from 0 (global) to 1 (local); requires `local_mean`. It
-    reduces the effect of local loss of contrast."""
+    """Weight of local versus global contrast normalization, from 0 (global) to 1 (local); requires `local_mean`. Local
+    normalization reduces the effect of local loss of contrast."""
 
     def __post_init__(self) -> None:
         levels = len(self.widths)
@@ -69,7 +71,7 @@ class Architecture:
                 raise SettingsError(f"{name} are {values}; give {count} counts of 1 to {_MOST_CONVOLUTIONS}.")
         if not 0 <= self.local_contrast <= float(self.local_mean):
             raise SettingsError(
-                f"local_contrast is {self.local_contrast}; give 0 to 1, and 0 without local_mean, which is "
+                f"local_contrast is {self.local_contrast}; give 0 to 1, or 0 without local_mean; given: local_mean "
                 f"{self.local_mean}."
             )
 
@@ -88,7 +90,7 @@ class Architecture:
 
         Raises:
             ValueError, TypeError, KeyError, AttributeError: the text is not an architecture.
-            SettingsError: the architecture is impossible.
+            SettingsError: the architecture is invalid.
         """
         values = parse_json(text)
         local_mean, local_contrast = bool(values.pop("local_mean")), float(values.pop("local_contrast", 0.0))
@@ -101,7 +103,8 @@ class Architecture:
 
 @dataclass(frozen=True)
 class SurfaceArchitecture:
-    """Architecture of the surface network, stored in the weights file: widths of what surrounds the pretrained encoder.
+    """Architecture of the surface network, stored in the weights file: widths of the decoder and conditioning of the
+    pretrained encoder.
 
     Multiples of 16 are fastest in ONNX Runtime.
     """
@@ -150,14 +153,15 @@ DARKEST_BRIGHTNESS = 0.65
 class AppearanceRanges(Ranged):
     """Ranges of the random image appearance of observed training images.
 
-    Smoke, blood and low light are deliberately excluded, since robustness to them is evaluated, not trained: nothing
-    red is drawn over an instrument, no part of the image is hidden, and `brightness` has a lower bound.
+    Smoke, blood and low light are deliberately excluded, since robustness to these conditions is evaluated instead of
+        trained: nothing red is drawn over an instrument, no part of the image is hidden, and `brightness` has a lower
+        bound.
     """
 
     brightness: Interval = (0.65, 1.35)
     """Factor for the whole image [1]; at least `DARKEST_BRIGHTNESS`."""
     contrast: Interval = (0.6, 1.3)
-    """Factor for the difference from the image's mean [1]."""
+    """Factor for the difference from the mean of the image [1]."""
     gamma: Interval = (0.8, 1.25)
     """Exponent of the tone curve [1]."""
     white_balance: Interval = (0.82, 1.2)
@@ -202,17 +206,17 @@ class ImageSettings(Ranged):
     same_kinematics: Share = 0.5
     """Share of pairs whose hybrid image has exactly the kinematics of the observed image."""
     same_background: Share = 0.7
-    """Share of pairs whose mean background is that of the observed image."""
+    """Share of pairs whose mean background is the background of the observed image."""
     occluded: Share = 0.4
     """Share of observed images with occluded arms; the occluded surface remains the label."""
     blood: Share = 0.0
     """Share of observed images with blood on background and arms."""
     crossing: Share = 0.5
-    """Share of the pairs of arms that cross in the image."""
+    """Share of pairs of arms that cross in the image."""
     chains: Share = 0.0
     """Share of scenes with a random serial robot instead of `robots`, .3 to 2 m from the camera."""
     enlarged: Share = 0.0
-    """Share of images at up to twice the working size, as used for the last look at an image."""
+    """Share of images at up to twice the working size, as in the final observation of a frame."""
     things: Share = 0.35
     """Share of observed images with objects (rods, plates, cables) behind the arms."""
     absent: Share = 0.1
@@ -253,21 +257,21 @@ class TrainingConfig(Ranged):
     robots: tuple[Path, ...] = field(default_factory=lambda: (shipped_robot(),))
     """URDF files of the robots in the training images, or `builtin:NAME`."""
     start: Path | None = None
-    """Weights file to start from, for fine-tuning; by default random weights. The architecture is that of these
-    weights."""
+    """Weights file to start from, for fine-tuning; by default random weights. The architecture of these weights is
+    used."""
     steps: Count = 4000
     """Optimizer steps."""
     minutes: Annotated[float | None, Range(0, unit="min", above=True)] = None
     """Processor time for training, per thread of the training process [min]; a run that would take longer has fewer
-    steps. Machine load does not change the number of steps."""
+    steps. Machine load does not affect the number of steps."""
     batch_size: Count = 8
     """Samples per step: a pair of an observed and a hybrid image, or one observed image."""
     reuse: Count = 2
     """Number of uses of each sample; repeats are mirrored at random. Generating a sample costs about as much as a
     training step."""
     cache: Path | None = None
-    """Folder of training images of the surface network, made before the first step unless it holds them; by default
-    images are made during training."""
+    """Folder of training images of the surface network; missing images are generated before the first step. By default,
+    images are generated during training."""
     cached: Count = 60_000
     """Number of images in `cache`."""
     learning_rate: Positive = 3e-3
@@ -283,8 +287,8 @@ class TrainingConfig(Ranged):
     validation_every: Count = 250
     """Steps between validations."""
     patience: Annotated[int | None, Range(1)] = None
-    """Early stopping: number of validations without improvement after which training stops; their weights are
-    discarded."""
+    """Early stopping: number of validations without improvement after which training stops; the weights of these
+    validations are discarded."""
     validation_samples: Count = 32
     """Samples of the fixed validation set."""
     checkpoint_every: Count = 100
@@ -313,7 +317,7 @@ class TrainingConfig(Ranged):
         if not self.robots:
             raise SettingsError("no robot was given; give at least one URDF file.")
         if self.cache is not None and self.network != "surface":
-            raise SettingsError("a cache of images serves the surface network only; leave `cache` out.")
+            raise SettingsError("an image cache is only supported for the surface network; leave out `cache`.")
         stride = (self.architecture if self.network == "feature" else self.surface_architecture).stride
         if self.images.width % stride or self.images.height % stride:
             raise SettingsError(
@@ -323,9 +327,10 @@ class TrainingConfig(Ranged):
 
 
 BaselineName = Literal["unet", "hrnet", "swin", "colleoni"]
-"""Baseline network. Three use only the image, Colleoni's also a rendering of the kinematics."""
+"""Baseline network. Three baselines use only the image; Colleoni's network also uses a rendering of the kinematics."""
 Augmentation = Literal["none", "smoke", "autoaugment", "elastic", "projective"]
-"""Augmentation of training images besides mirroring: simulated smoke (the paper), or those compared by SegSTRONG-C."""
+"""Augmentation of training images in addition to mirroring: simulated smoke (as in the paper), or an augmentation
+compared by SegSTRONG-C."""
 
 _ENCODERS: dict[BaselineName, str] = {
     "hrnet": "hrnet_w18_small",
@@ -343,13 +348,13 @@ class BaselineNetwork:
     name: BaselineName = "hrnet"
     """Baseline network."""
     encoder: str = ""
-    """Encoder name in timm; by default a small one of the architecture: `hrnet_w18_small`,
+    """Encoder name in timm; by default a small encoder of the architecture: `hrnet_w18_small`,
     `swin_tiny_patch4_window7_224` or `resnet10t` (two encoders, for Colleoni's). The paper uses `hrnet_w48`; the U-Net
     takes no encoder."""
     width: int | None = None
-    """Channels of the first stage of a Swin transformer; by default those of the encoder (96 for tiny)."""
+    """Channels of the first stage of a Swin transformer; by default as in the encoder (96 for tiny)."""
     decoder: tuple[int, ...] = (64, 48, 32, 24, 16)
-    """Channels of the decoder's five levels, from the coarsest up."""
+    """Channels of the decoder's five levels, starting with the coarsest."""
     unet: Architecture = field(default_factory=lambda: Architecture(local_mean=False))
     """Architecture of the U-Net."""
     size: tuple[int, int] = (256, 192)
@@ -385,7 +390,7 @@ class BaselineTraining(Ranged):
     augmentation: Augmentation = "smoke"
     """Augmentation of training images."""
     start: Path | None = None
-    """Safetensors file with encoder weights from timm, such as pretrained ones; for a U-Net, a file with a feature
+    """Safetensors file with encoder weights from timm, such as pretrained weights; for a U-Net, a file with a feature
     network. By default random weights."""
     frames: Annotated[int, Range(101)] = 3000
     """Number of synthetic frames; the last 100 are used for validation."""

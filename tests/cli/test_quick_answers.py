@@ -91,7 +91,7 @@ def test_help_is_given_without_heavy_imports() -> None:
         assert f"usage: carts {name}" in text
         if name in ("optimize", "evaluate", "render"):
             said = " ".join(text.replace("│", " ").split())
-            assert "from the true joint positions where the sequence has them" in said, name
+            assert "from the true joint positions, if known" in said, name
 
 
 def test_a_wrong_argument_is_reported_without_heavy_imports() -> None:

@@ -259,7 +259,7 @@ def test_locked_joints_stay_measured_and_have_no_deviation(truths: Truths) -> No
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"settings": DescentSolver()}, "requires the solver `surface`, not one for the loss 'acs'"),
+        ({"settings": DescentSolver()}, "requires the solver `surface`; given: a solver for the loss 'acs'"),
         ({"keyframes": {9: {ARM: np.zeros(7)}}}, "keyframe 9 is not among the frames"),
     ],
 )

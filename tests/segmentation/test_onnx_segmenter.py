@@ -131,7 +131,9 @@ def test_what_is_no_encoder_or_no_decoder_is_refused_with_what_it_takes(
     model: tuple[Path, Path], tmp_path: Path
 ) -> None:
     encoder, decoder = model
-    with pytest.raises(WeightsError, match=r"an encoder has one, an image .*Give two ONNX files, the encoder first"):
+    with pytest.raises(
+        WeightsError, match=r"an encoder has one input, an image .*Give two ONNX files, the encoder first"
+    ):
         OnnxSegmenter.load(decoder, encoder)
     with pytest.raises(WeightsError, match=r"inputs image .*point_coords and point_labels"):
         OnnxSegmenter.load(encoder, encoder)

@@ -1,1 +1,1 @@
-"""Baselines of the benchmark: segmentation networks with the image, or image and rendering, as input."""
+"""Baselines of the benchmark: segmentation networks whose input is the image, or image and rendering."""

@@ -1,6 +1,6 @@
 """Baseline networks and their weights files.
 
-A U-Net, HRNet and Swin from timm with a U-Net decoder, and Colleoni's two encoders.
+The networks are a U-Net, HRNet and Swin from timm with a U-Net decoder, and Colleoni's network with two encoders.
 """
 
 import hashlib
@@ -47,10 +47,11 @@ def segmentation_models() -> ModuleType:
 
 
 def _import_torchvision() -> None:
-    """Import torchvision, even with a build of torch that does not match it.
+    """Import torchvision, even if it does not match the build of torch.
 
-    PyPI provides torchvision for CUDA only. With a CPU build of torch, its compiled operators are not loaded, and the
-    import fails for those that it registers immediately, so their names are declared here. None of them is used.
+    PyPI provides torchvision only for CUDA. With a CPU build of torch, its compiled operators are not loaded, and the
+    import fails for operators that it registers immediately. The names of these operators are therefore declared; none
+    of them is used.
     """
     while True:
         try:
@@ -70,15 +71,15 @@ def _import_torchvision() -> None:
 _MEAN, _DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 """Channel mean and standard deviation of ImageNet, as expected by timm's weights."""
 _HEADS = (1, 2, 4, 8)
-"""Attention heads per stage of a Swin transformer of width 24; they scale with the width."""
+"""Attention heads per stage of a Swin transformer of width 24; the number is proportional to the width."""
 
 
 class Baseline(nn.Module):
     """Baseline segmentation network.
 
     Raises:
-        CartsError: the extra is not installed.
-        SettingsError: timm does not provide the encoder, or it does not fit.
+        CartsError: the optional dependencies are not installed.
+        SettingsError: timm does not provide the encoder, or the encoder does not suit the baseline.
     """
 
     mean: Tensor
@@ -121,9 +122,10 @@ class Baseline(nn.Module):
 
 
 class _TwoEncoders(nn.Module):
-    """Encoders of image and rendering, fused at every level, and one decoder, after Colleoni et al., arXiv 2007.09107.
+    """Network with encoders of image and rendering, fused at every level, and a decoder, after Colleoni et al., arXiv
+    2007.09107.
 
-    Their code is not public; layer sizes are our choice.
+    The code of Colleoni et al. is not public, so the layer sizes may differ.
     """
 
     def __init__(self, settings: BaselineNetwork) -> None:
@@ -166,12 +168,12 @@ def _made(settings: BaselineNetwork, make: Any) -> Any:
 
 FORMAT = "carts-baseline"
 _VERSION = "1"
-_REMEDY = "Train one with `carts baseline`."
+_REMEDY = "Train a baseline with `carts baseline`."
 
 
 @dataclass(frozen=True)
 class TrainedBaseline:
-    """Contents of a weights file."""
+    """Content of a weights file."""
 
     network: Baseline
     """Network in evaluation mode."""
@@ -201,7 +203,7 @@ def read_baseline(path: Path) -> TrainedBaseline:
     """Read and check a weights file.
 
     Raises:
-        CartsError: the extra is not installed.
+        CartsError: the optional dependencies are not installed.
         WeightsError: the file is missing, was not written by `carts baseline`, or its tensors do not fit.
     """
     try:
@@ -231,11 +233,11 @@ def read_baseline(path: Path) -> TrainedBaseline:
 
 
 def start_from(network: Baseline, path: Path) -> int:
-    """Load timm's weights, such as pretrained ones, into the image encoder; returns the number of fitting tensors.
+    """Load timm's weights, such as pretrained weights, into the image encoder; returns the number of fitting tensors.
 
     Raises:
-        WeightsError: the file is missing, is not safetensors, or contains no fitting tensor; for the U-Net, it is not a
-            feature network of the same architecture.
+        WeightsError: the file is missing, is not safetensors, or contains no fitting tensor; for the U-Net, the file
+            does not contain a feature network of the same architecture.
     """
     if isinstance(network.body, FeatureNetwork):
         trained = read_weights(path).network
@@ -253,10 +255,10 @@ def start_from(network: Baseline, path: Path) -> int:
     except (SafetensorError, OSError, ValueError) as error:
         raise WeightsError(
             f"weights file {path} cannot be read ({shortened(str(error))}). Give timm's weights of the encoder as "
-            "safetensors; pickles are not read."
+            "safetensors; pickles are not supported."
         ) from error
     own = network.state_dict()
-    # smp wraps timm's model, and the features of HRNet and Swin are wrapped twice, so names have different prefixes.
+    # smp wraps the models of timm once, and the features of HRNet and Swin twice, so the prefixes of names differ.
     ends = {name.split("model.", 1)[-1]: name for name in own if "rendering." not in name}
     fitting = {
         ends[name]: value for name, value in given.items() if name in ends and own[ends[name]].shape == value.shape

@@ -1,6 +1,6 @@
 """Training of a baseline on shared synthetic frames.
 
-The loss is that of the paper; augmentations are those of CaRTS and of SegSTRONG-C.
+The loss is that of the paper. Augmentations are those of CaRTS and SegSTRONG-C.
 """
 
 import json
@@ -35,13 +35,14 @@ Change = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
 """Augmentation of an image [3, h, w], uint8, and its mask [1, h, w]."""
 
 SMOKE_SHARE, SMOKE_STRENGTH = 0.2, 0.3
-"""Share of images with smoke, and its largest opacity: `p` and `smoke_aug` in the paper's released configuration."""
+"""Share of images with smoke, and maximum opacity of the smoke: `p` and `smoke_aug` in the released configuration of
+the paper."""
 _SMOKE_WHITE = 255.0
 _GEOMETRIC = {"ShearX", "ShearY", "TranslateX", "TranslateY", "Rotate"}
 
 
 def augmentation(name: Augmentation, rng: np.random.Generator) -> Change:
-    """Create the augmentation of a name; those of torchvision use torch's global random numbers."""
+    """Create an augmentation by name; augmentations of torchvision use torch's global random numbers."""
     match name:
         case "none":
             return lambda image, mask: (image, mask)
@@ -54,7 +55,7 @@ def augmentation(name: Augmentation, rng: np.random.Generator) -> Change:
 
 
 def smoked(image: UInt8[Tensor, "3 h w"], rng: np.random.Generator) -> UInt8[Tensor, "3 h w"]:
-    """Add a layer of diamond-square smoke to one fifth of the images on average."""
+    """Add a layer of diamond-square smoke to the image, with the probability `SMOKE_SHARE`."""
     if rng.random() >= SMOKE_SHARE:
         return image
     height, width = image.shape[1:]
@@ -73,7 +74,8 @@ def diamond_square(side: int, rng: np.random.Generator, roughness: float = 0.6) 
         corners = field[::step, ::step]
         squares = (corners[:-1, :-1] + corners[1:, :-1] + corners[:-1, 1:] + corners[1:, 1:]) / 4
         field[half::step, half::step] = squares + amplitude * rng.normal(size=squares.shape)
-        # Each diamond's centre is the mean of its neighbours at half a step; at the border there are only three.
+        # The centre of each diamond is the mean of its neighbours at half a step, of which there are only three at the
+        # border.
         padded = np.pad(field, half, constant_values=np.nan)
         for rows, columns in (
             (slice(0, None, step), slice(half, None, step)),
@@ -92,7 +94,7 @@ def diamond_square(side: int, rng: np.random.Generator, roughness: float = 0.6) 
 
 
 class _AutoAugment:
-    """torchvision's AutoAugment with ImageNet's policy; geometric changes apply to image and mask."""
+    """AutoAugment of torchvision with the policy for ImageNet; geometric transforms are applied to image and mask."""
 
     def __init__(self) -> None:
         segmentation_models()
@@ -135,9 +137,9 @@ def _warped(name: Augmentation) -> Change:
 
 
 SIZE = (256, 192)
-"""Width and height of a training frame [px], which is a whole image, not a crop."""
+"""Width and height of a training frame [px], which is a whole image."""
 IMAGES = ImageSettings(width=SIZE[0], height=SIZE[1], field_width=SIZE[0], occluded=0.0, things=0.0, absent=0.0)
-"""Settings of regular images: no smoke, blood, low light, occluders, distractors or absent arms."""
+"""Settings of regular images, without smoke, blood, low light, occluders, distractors and absent arms."""
 _SETTINGS = json.dumps(asdict(IMAGES))
 CHUNK = 250
 """Number of frames per file."""
@@ -177,7 +179,7 @@ class TrainingFrames:
 
 
 def make_chunk(folder: OutputPath, chunk: int, seed: int) -> None:
-    """Write one file of frames, which depends only on the seed and the file's number.
+    """Write one file of frames, which depends only on the seed and the number of the file.
 
     Raises:
         OutputError: the file cannot be written.
@@ -201,7 +203,7 @@ def _file(folder: OutputPath, chunk: int) -> OutputPath:
 
 WEIGHTS_FILE = "baseline.safetensors"
 VALIDATION = 100
-"""Number of frames at the end that are used for validation."""
+"""Number of frames, at the end, that are used for validation."""
 _MAY_CHANGE = ("steps", "minutes", "checkpoint_every", "threads", "device")
 _LOG_EVERY = 20
 
@@ -221,7 +223,7 @@ class BaselineResult:
 def prepare_frames(
     folder: OutputPath, training: BaselineTraining, say: Callable[[str], None] = lambda line: None
 ) -> TrainingFrames:
-    """Open training frames in a folder, which baselines can share; missing ones are generated.
+    """Open training frames in a folder, which baselines may share; missing frames are generated.
 
     Raises:
         OutputError: the folder cannot be written to.
@@ -249,7 +251,7 @@ def train_baseline(
         network, training: settings of the network and of its training.
         frames: training and validation frames.
         output: folder of `checkpoint.safetensors` and, at the end, `baseline.safetensors`.
-        say: called with each line of progress.
+        say: called with lines of progress.
 
     Raises:
         CartsError: the optional dependencies are not installed.
@@ -286,7 +288,7 @@ class _Run:
         self.loop = TrainingLoop(output, self.network, training, self.config, _MAY_CHANGE)
 
     def finish(self, say: Callable[[str], None]) -> BaselineResult:
-        """Do the remaining steps, validate, and write the weights."""
+        """Run the remaining steps, validate, and write the weights."""
         loop = self.loop
 
         def logged(means: dict[str, float], _: float) -> None:

@@ -1,4 +1,4 @@
-"""Benchmark: the paper's tables and figures on our data, and targets of the default solver."""
+"""Benchmark: tables and figures of the paper for our data, and targets of the default solver."""
 
 from .measurement import Measurement as Measurement
 from .measurement import ResultsFile as ResultsFile

@@ -22,7 +22,7 @@ SHARE = 0.3
 """Covered share of the visible pixels of the instruments [1]."""
 _SENSOR = dataclasses.replace(SensorConfig(), vignette=0.0)
 _SURROUNDINGS = 0.3
-"""Reflectance of the surroundings, from which the light is estimated."""
+"""Assumed reflectance of the surroundings, from which the light is estimated."""
 
 
 @dataclass(frozen=True)
@@ -40,9 +40,9 @@ def occlude(
     rng: np.random.Generator,
     share: float = SHARE,
 ) -> Occluded:
-    """Cover the instruments with one to three occluders of one kind, with folds, soft edges and a soft shadow.
+    """Cover the instruments with one to three occluders of the same kind, with folds, soft edges and a soft shadow.
 
-    `share` is the exact share of the visible pixels of the instruments that is covered.
+    `share` is the exact share of visible instrument pixels that are covered.
     """
     if not instruments.any():
         return Occluded(image, np.zeros_like(instruments))
@@ -103,7 +103,7 @@ def _gauze(shape: tuple[int, int], scale: float, normal: np.ndarray, rng: np.ran
 
 
 def _tissue(shape: tuple[int, int], scale: float, normal: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Reflectance of red to pink tissue with fat, and with highlights where it faces the lamp."""
+    """Reflectance of red to pink tissue with fat, and with highlights on surfaces facing the lamp."""
     fat = smoothstep(smooth_noise(shape, 70.0 * scale, rng, octaves=4), 0.2, 1.4)[..., None]
     red = np.array([0.50, 0.14, 0.11]) * rng.uniform(0.7, 1.3)
     flesh = red * (1.0 + 0.2 * smooth_noise(shape, 25.0 * scale, rng, octaves=4)[..., None])
@@ -124,7 +124,7 @@ _KINDS = (_gauze, _tissue, _cloth)
 CROSSING = "crossing arms"
 """Name of the domain."""
 _HIDDEN = 0.15, 0.9
-"""Range of the share of an arm that the other one hides [1]."""
+"""Range of the share of an arm that is occluded by the other arm [1]."""
 _SHOWN = 0.02, 0.25
 """Range of the share of the image that each arm covers [1]."""
 _TURN, _REACH = 0.2, 0.008
@@ -137,16 +137,16 @@ _BLUR, _NOISE = 0.65, 2.0
 
 
 def crossed(recording: Recording, index: int, camera: str, seed: int = 0) -> Frame:
-    """A frame of the regular domain with its arms moved so that one crosses the other.
+    """Frame of the regular domain with its arms moved so that they cross.
 
-    Measured joints keep the errors of the original frame. Arms may intersect where they cross.
+    Measured joints keep the errors of the original frame. The arms may intersect.
 
     Raises:
-        SettingsError: no random draw crosses, or the recording lacks two arms with known joints.
+        SettingsError: no random draw has crossing arms, or the recording does not have two arms with known joints.
     """
     frame, scene = recording.frame(index, "regular", [camera]), recording.scene.with_cameras([camera])
     if len(scene.arms) != 2 or not frame.truth:
-        raise SettingsError(f"{CROSSING} requires a recording of two arms with known joints; this is not one.")
+        raise SettingsError(f"{CROSSING} requires a recording of two arms with known joints. Choose such a recording.")
     rng = np.random.default_rng((seed, index))
     truth = _crossing_joints(scene, dict(frame.truth), rng)
     with_error = {name: truth[name] + frame.measured[name] - frame.truth[name] for name in truth}
@@ -165,7 +165,7 @@ def crossed(recording: Recording, index: int, camera: str, seed: int = 0) -> Fra
 
 
 def _crossing_joints(scene: Scene, around: dict[str, np.ndarray], rng: np.random.Generator) -> dict[str, np.ndarray]:
-    """Random joint positions of both arms near the given ones [rad, m] at which the arms cross."""
+    """Random joint positions of both arms near the given positions [rad, m] at which the arms cross."""
     width, height = _COARSE, round(_COARSE * scene.cameras[0].height / scene.cameras[0].width)
     both = Renderer(scene, width=width, height=height)
     alone = {arm.name: scene.with_arms([arm.name]) for arm in scene.arms}
@@ -195,25 +195,25 @@ OTHER_CAMERA = "image of another camera"
 OTHER_INSTRUMENT = "another instrument"
 WRONG = (NO_ARM, OTHER_FRAME, OTHER_CAMERA, OTHER_INSTRUMENT)
 _STAND_INS = ("double_fenestrated_grasper", "clip_applier", "maryland_bipolar_forceps", "curved_scissors")
-"""Built-in instruments rendered instead of the one in the image, alternating between frames."""
+"""Built-in instruments that are rendered instead of the instrument in the image, alternating between frames."""
 
 
 def wrong_inputs(frames: int, cameras: int, *, built_in: bool) -> tuple[str, ...]:
-    """Kinds of wrong inputs that a recording allows; `built_in` robots can be exchanged for other instruments."""
+    """Kinds of wrong inputs that a recording allows; `built_in` robots can be replaced by other instruments."""
     possible = (True, frames > 1, cameras > 1, built_in)
     return tuple(kind for kind, needed in zip(WRONG, possible, strict=True) if needed)
 
 
 def with_other_instruments(scene: Scene, index: int) -> Scene:
-    """Scene with the instruments exchanged for another built-in one, chosen by the frame index."""
+    """Scene with the instruments replaced by another built-in instrument, selected by the frame index."""
     robot = Robot.load(f"builtin:{_STAND_INS[index % len(_STAND_INS)]}")
     return replace(scene, arms=tuple(replace(arm, robot=robot) for arm in scene.arms))
 
 
 def misled(recording: Recording, kind: str, index: int, camera: str) -> Frame:
-    """Frame of the regular domain whose image contradicts its kinematics in one of the ways of `WRONG`.
+    """Frame of the regular domain whose image contradicts its kinematics, in a way of `WRONG`.
 
-    The masks match the image of the returned frame.
+    Masks match the image of the returned frame.
     """
     frame = recording.frame(index, "regular", [camera])
     match kind:

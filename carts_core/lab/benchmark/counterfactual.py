@@ -1,6 +1,6 @@
-"""Real frames under the conditions of the synthetic domains, altered in memory.
+"""Real frames, altered in memory to the conditions of the synthetic domains.
 
-Surfaces are derived from measured kinematics and the mask; replaced backgrounds are path-traced tissue.
+Surfaces are derived from measured kinematics and masks; replaced backgrounds are path-traced tissue.
 """
 
 import dataclasses
@@ -54,12 +54,13 @@ DISTANCE = EndoscopeConfig().distance
 class RealSurface:
     """Surface model of a real frame: instruments in front of a plane parallel to the image.
 
-    The world frame is as in synthesis: the plane is z = 0, and the camera looks straight down at the origin. The world
-    is scaled to the distance of the synthetic camera, on which smoke and the size of drops depend.
+    The world frame is as in synthesis: the plane is z = 0, and the camera is above the origin and looks straight down.
+        The world is scaled to the distance of the synthetic camera, since smoke and the size of drops depend on the
+        distance.
 
     Args:
         scene: scene with one camera.
-        recording: measured joint positions of frames, arm -> [dofs], which determine the plane's distance.
+        recording: measured joint positions of frames, arm -> [dofs], which determine the distance of the plane.
     """
 
     def __init__(self, scene: Scene, recording: Sequence[Mapping[str, np.ndarray]]) -> None:
@@ -85,7 +86,8 @@ class RealSurface:
         return dict(enumerate(self._T_world_camera @ Ts_camera_link))
 
     def of(self, mask: Bool[np.ndarray, "h w"], measured: Mapping[str, np.ndarray] | None) -> Surface:
-        """Surface of a frame: within the mask, that of the nearest pixel of the measured arms; elsewhere the plane.
+        """Surface of a frame: for pixels of the mask, the surface at the nearest pixel of the measured arms; the plane
+        elsewhere.
 
         `measured` maps arms to joint positions [rad, m]; None without arms.
         """
@@ -107,7 +109,7 @@ class RealSurface:
             return self._renderer(self._scene.state(measured))
 
     def _arms(self, measured: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Per pixel: scaled depth, normal in the world, and link of the arms; the link is -1 on the background."""
+        """Scaled depth, normal in the world, and link of the arms for each pixel; the link is -1 in the background."""
         state, geometry = self._scene.state(measured), self._renderer.geometry
         rendering = self._rendered(measured)
         face = rendering.face_ids[0].long()
@@ -125,17 +127,17 @@ _FRAME_INTERVAL = 0.25
 _REFLECTANCE = 0.3
 """Assumed reflectance of the background, from which the lamp's intensity is estimated."""
 _QUIET = SensorConfig(vignette=0.0, blur=0.0, sharpening=0.0, full_well=1e6, read_noise=0.0)
-"""Sensor without lens effects and noise, which real frames already contain."""
+"""Sensor without lens effects and noise, which real frames already have."""
 _NOISY = dataclasses.replace(SensorConfig(), vignette=0.0, blur=0.0, sharpening=0.0)
 """Sensor with noise but without lens effects, for low light."""
 _MOMENTS = 5
 
 
 class Counterfactual(AlteredSequence):
-    """Real sequence altered to all synthetic domains, with the synthesis code for blood, smoke and low light.
+    """Real sequence altered to all synthetic domains, with the code for blood, smoke and low light of the synthesis.
 
-    Blood and smoke use the depth of the measured arms, extended to the mask's pixels, and of a plane behind the deepest
-    tip. In `background_change`, the masked instrument is composited over `backdrop` [camera height, width, 3].
+    Blood and smoke use the depth of the measured arms, extended to the pixels of the mask, and of a plane behind the
+    deepest tip. In `background_change`, the masked instrument is composited over `backdrop` [camera height, width, 3].
     """
 
     def __init__(
@@ -160,7 +162,7 @@ class Counterfactual(AlteredSequence):
         self._backgrounds: dict[str, np.ndarray] = {}
 
     def frame(self, index: int, domain: str | None = None, cameras: Iterable[str] | None = None) -> Frame:
-        """Frame with its image altered to a domain; only the regular domain provides further cameras."""
+        """Frame with its image altered to a domain; other cameras are only available in the regular domain."""
         domain = domain or DOMAINS[0]
         if domain == DOMAINS[0]:
             return dataclasses.replace(self._sequence.frame(index, cameras=cameras or [self._camera]), domain=domain)
@@ -171,7 +173,7 @@ class Counterfactual(AlteredSequence):
         return dataclasses.replace(frame, domain=domain, images={self._camera: altered})
 
     def mean_background(self, camera: str, domain: str | None = None) -> MeanBackground:
-        """Mean background, averaged over several times under the domain's condition."""
+        """Mean background, averaged over several times under the condition of the domain."""
         domain, regular = domain or DOMAINS[0], self._sequence.mean_background(camera)
         if domain == DOMAINS[0]:
             return regular
@@ -195,7 +197,7 @@ class Counterfactual(AlteredSequence):
         times = self._sequence.timestamps
         time = index * _FRAME_INTERVAL if times is None else float(times[index] - times[0])
         if domain == "background_change":
-            # A soft edge, as produced by a lens.
+            # The edge is soft, like the edge in an image of a lens.
             cover = cv2.GaussianBlur(mask.astype(np.float32), (0, 0), 0.7)[..., None]
             return np.rint(cover * image + (1.0 - cover) * self._backdrop).astype(np.uint8)
         if domain == "simulated_smoke":
@@ -208,5 +210,5 @@ class Counterfactual(AlteredSequence):
 
 @cache
 def _relief(seed: int) -> Tissue:
-    """Invisible relief of the background, in whose hollows blood gathers."""
+    """Invisible relief of the background, in whose hollows blood collects."""
     return grow_tissue("muscle", 256, 1024, SynthesisConfig(seed=seed).rng("tissue"))

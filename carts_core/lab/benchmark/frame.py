@@ -60,7 +60,7 @@ class Truth:
     """Pixels of occluders, which are excluded from the comparison."""
 
     def score_mask(self, mask: Bool[np.ndarray, "h w"], seconds: float) -> Score:
-        """Score of a mask without kinematics."""
+        """Score a mask without kinematics."""
         return Score(None, *self._overlap(mask), None, None, None, seconds, self._wide(mask))
 
     def score(
@@ -104,7 +104,7 @@ class Truth:
         return replace(score, tip_depth_mm=depth, nsd_wide=self._wide(mask))
 
     def with_wide(self, score: Score, state: SceneState, renderer: Renderer) -> Score:
-        """Score of an estimate with the second surface distance added."""
+        """Add the second surface distance to the score of an estimate."""
         if score.nsd_wide is not None:
             return score
         return replace(score, nsd_wide=self._wide(renderer.segment(state.to("cpu"))[0] >= 0))
@@ -112,10 +112,11 @@ class Truth:
     def within(
         self, scene: Scene, found: Mapping[str, np.ndarray], std: Mapping[str, np.ndarray]
     ) -> tuple[int, int, int] | None:
-        """Number of joints with ground truth and standard deviation, and of errors within 1 and 2 sigma.
+        """Number of joints with ground truth and standard deviation, and numbers of errors within 1 and 2 standard
+        deviations.
 
-        `found` and `std` map arms to joint positions [rad, m] and their standard deviations, NaN where unknown. None if
-        there are no such joints.
+        `found` and `std` map arms to joint positions [rad, m] and their standard deviations, NaN if unknown. The result
+        is None without such joints.
         """
         ratios = []
         for arm in scene.arms:
@@ -142,7 +143,8 @@ class Truth:
 def visible_joints(
     known: Uncertainty | None, measured_joints: Mapping[str, tuple[str, ...]]
 ) -> Mapping[str, tuple[str, ...]] | None:
-    """Arm -> measured joints that the image determines ("visible joints" of the report); None if not reported."""
+    """Arm -> measured joints that are determined by the image ("visible joints" of the report); None if not
+    reported."""
     if known is None:
         return None
     return {
@@ -190,7 +192,8 @@ def start_of(scene: Scene, frame: Frame, run: Run, joints: Mapping[str, tuple[st
 def _followed(
     optimizer: FrameOptimizer, truth: Truth, renderer: Renderer, seconds: float
 ) -> tuple[list[Score], list[int], float]:
-    """Step the optimizer to the end; returns scores of all iterates, best index so far at each, and total time [s]."""
+    """Step the optimizer to the end; returns the scores of all iterates, for each the index of the best iterate so far,
+    and the total time [s]."""
     trace: list[Score] = []
     best: list[int] = []
 
@@ -231,18 +234,19 @@ def calibrated_scene(recording: Recording, camera: str, frames: int, extractor: 
 
 
 STEPS = 10
-"""Steps for each frame after the first. TC-CaRTS (arXiv 2212.00072) reports needing far fewer than CaRTS's 30."""
+"""Number of steps for each frame after the first. TC-CaRTS (arXiv 2212.00072) reports far fewer steps than the 30 of
+CaRTS."""
 _OCCLUDERS_SEED = 20
 
 
 def log(console: Console, line: str) -> None:
-    """Print a progress line if the output is a file or a pipe."""
+    """Print a progress line unless the output is a terminal."""
     if not console.is_terminal:
         console.print(line, soft_wrap=True, highlight=False, markup=False)
 
 
 class SourceBench:
-    """Measures runs on a source, which is opened at the first run.
+    """Benchmark of runs on a source, which is opened at the first run.
 
     `baselines` maps names in `scope.BASELINES` to networks.
     """
@@ -260,7 +264,7 @@ class SourceBench:
         self._machine = machine(extractor.device)
 
     def measure(self, runs: list[Run]) -> list[Measurement]:
-        """Measure one run, or all runs that a method corrects together."""
+        """Measure one run, or all runs whose frames a method corrects together."""
         method = METHODS[runs[0].method]
         if not method.as_sequence:
             return [self._measure_alone(runs[0])]
@@ -324,9 +328,9 @@ class SourceBench:
         )
 
     def _segment(self, run: Run, frame: Frame, truth: Truth) -> Measurement:
-        """Score a network's own mask of one image, predicted at the network's training resolution.
+        """Score the mask predicted by a network for one image, at the training resolution of the network.
 
-        Networks with kinematic input get the rendering at the measured joint positions.
+        The input of networks with kinematics includes the rendering at the measured joint positions.
         """
         extractor, trained = self._extractor, self._baselines.get(run.method)
         device, image = extractor.device, frame.images[truth.camera]
@@ -353,7 +357,7 @@ class SourceBench:
         return Measurement(run, score, "not iterative", self._machine)
 
     def _together(self, runs: list[Run]) -> list[Measurement]:
-        """Correct the frames of one domain and initial error in sequence mode, and score the final estimates.
+        """Correct the frames with the same domain and initial error in sequence mode, and score the final estimates.
 
         The time of a frame is the sum over all visits, including reading its image.
         """
@@ -390,11 +394,12 @@ class SourceBench:
         ]
 
     def _forwards(self, runs: list[Run], first: DescentSolver) -> list[Measurement]:
-        """Correct frames in order with ACS, each from its measured joints plus the correction of the previous frame.
+        """Correct frames in order with ACS; each frame starts at its measured joints plus the correction of the
+        previous frame.
 
-        This is the first of the three modules that TC-CaRTS adds (arXiv 2212.00072). The other two, a network
-        that corrects kinematics and a regularization, are not reproduced: only the abstract was available. `first`
-        holds the settings of the first frame; later frames take `STEPS` steps of the same schedule.
+        This is the first of the three modules of TC-CaRTS (arXiv 2212.00072). The other two modules, a network that
+        corrects kinematics and a regularization, are not reproduced, since only the abstract was available. `first` are
+        the settings of the first frame; later frames use `STEPS` steps of the same schedule.
         """
         renderer, cameras = self._renderer, [self._source.camera]
         scene, found, correction = renderer.scene, list[Measurement](), dict[str, np.ndarray]()

@@ -1,4 +1,5 @@
-"""Hand-eye calibration of a seven-joint robot that no network was trained on: success rate and detected failures."""
+"""Benchmark of the hand-eye calibration of a seven-joint robot absent from the training data: success rate and detected
+failures."""
 
 import json
 from collections import Counter
@@ -28,18 +29,18 @@ from .statistics import NOTHING, table_of
 from .targets import Target, target_of
 
 ARM = Path(__file__).with_name("seven_joint_arm.urdf")
-"""URDF of the robot, made of cylinders, spheres and boxes."""
+"""URDF of the robot, which consists of cylinders, spheres and boxes."""
 _COLOURS = ((0.85, 0.85, 0.83), (0.9, 0.45, 0.1))
 _SIZE, _FOCAL = (640, 480), 620.0
 _SAMPLES = 3
-"""Rays per pixel and axis; odd, so that thresholding coverage at 0.5 does not bias the mask."""
+"""Rays per pixel and axis; the number is odd, so that thresholding coverage at 0.5 does not bias the mask."""
 
 _HIDDEN = 0.25
 """Shading of surfaces seen edge-on, lit from the camera [1]."""
 
 
 def looking_at(eye: Float[np.ndarray, " 3"], target: Float[np.ndarray, " 3"]) -> Float[np.ndarray, "4 4"]:
-    """T_camera_world of a camera at `eye` that looks at `target` without roll (world z is up)."""
+    """T_camera_world of a camera at `eye` directed at `target`, without roll (world z is up)."""
     forward = (target - eye) / np.linalg.norm(target - eye)
     right = np.cross(forward, [0.0, 0.0, 1.0])
     right /= np.linalg.norm(right)
@@ -85,7 +86,7 @@ def arm_views(count: int, seed: int, room: UInt8[np.ndarray, "h w 3"] | None = N
 def _rays(
     robot: Robot, joints: Float[np.ndarray, " dofs"], camera: Camera
 ) -> tuple[Float[np.ndarray, "h w"], Float[np.ndarray, "h w 3"]]:
-    """Robot's coverage of each pixel, and its colour premultiplied by coverage."""
+    """Coverage of each pixel by the robot, and colour of the robot premultiplied by coverage."""
     Ts = robot.forward_kinematics(torch.tensor(joints)).numpy()
     parts, colours = [], []
     for mesh in robot.meshes:
@@ -120,7 +121,7 @@ _CODE = ("lab/benchmark/hand_eye.py", "lab/benchmark/seven_joint_arm.urdf", "lab
 
 @dataclass(frozen=True)
 class HandEyeCondition:
-    """Kind of start, with tolerances on the final base frame."""
+    """Initial errors, with tolerances of the final base frame."""
 
     name: str
     angle_deg: float
@@ -128,7 +129,7 @@ class HandEyeCondition:
     distance: float
     """Initial translation error of the base frame [m]."""
     masks: bool
-    """Whether masks are fitted; otherwise, network predictions."""
+    """Whether masks are fitted instead of network predictions."""
     most_deg: float
     most_distance: float
     """Tolerance of the translation error [m]."""
@@ -143,7 +144,7 @@ CONDITIONS = (
 
 @dataclass(frozen=True)
 class HandEyeRun:
-    """Result of one start."""
+    """Result for one start."""
 
     condition: str
     seed: int
@@ -163,7 +164,7 @@ def known_hand_eye(path: OutputPath, extractor: FeatureExtractor) -> list[HandEy
 def measure_hand_eye(
     path: OutputPath, extractor: FeatureExtractor, starts: int, say: Callable[[str], None] = lambda line: None
 ) -> list[HandEyeRun]:
-    """Run the calibrations of each condition that are not stored yet, and write each result to `path`."""
+    """Run the calibrations of each condition that are not yet stored, and write each result to `path`."""
     runs = known_hand_eye(path, extractor)
     done = {(run.condition, run.seed) for run in runs}
     for condition in CONDITIONS:

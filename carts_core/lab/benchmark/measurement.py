@@ -55,16 +55,16 @@ _MEASURED = (
 
 
 def code_fingerprint(patterns: tuple[str, ...] = _MEASURED) -> str:
-    """SHA-256 over modules of the package; by default, those that affect estimates and scores."""
+    """SHA-256 of modules of the package, by default of those that affect estimates and scores."""
     return provenance.code_fingerprint(patterns)
 
 
 def run_fingerprint(
     run: Run, scope: Scope, extractor: FeatureExtractor, source: str, baseline: str | None = None
 ) -> str:
-    """SHA-256 over all inputs of a run except the machine.
+    """SHA-256 of all inputs of a run except the machine.
 
-    `source` is the fingerprint of images and kinematics, `baseline` the SHA-256 of a baseline's weights.
+    `source` is the fingerprint of images and kinematics, and `baseline` the SHA-256 of a baseline's weights.
     """
     method = METHODS[run.method]
     settings = to_plain(method.settings(scope.steps(run))) if method.settings else {}
@@ -83,22 +83,23 @@ class Score:
     """Scores of an estimate."""
 
     loss: float | None
-    """Loss; None if the method has none or losses of iterates are not comparable."""
+    """Loss; None for methods without a loss, or if losses of iterates are not comparable."""
     dice: float
     nsd: float
     """Normalized surface distance within `TOLERANCE`."""
     joint_mae_deg: float | None
     """Mean absolute error of measured revolute joints [deg]; None without true joint positions."""
     visible_joint_mae_deg: float | None
-    """Mean absolute error of the joints that the image determines [deg]; None if the optimizer does not report them."""
+    """Mean absolute error of the joints that are determined by the image [deg]; None if the optimizer does not report
+    these joints."""
     tip_depth_mm: float | None
     """Mean absolute depth error of the jaw tips [mm]; None without true joint positions, and for intermediate
     iterates."""
     seconds: float
     """Wall time from the arrival of the frame to this estimate [s], without scoring."""
     nsd_wide: float | None = None
-    """Normalized surface distance within `WIDE_TOLERANCE`; None for intermediate iterates, except the best ones at the
-    end and after the step counts of `BEST_OF`."""
+    """Normalized surface distance within `WIDE_TOLERANCE`; None for intermediate iterates, except the best iterates at
+    the end and after the step counts of `BEST_OF`."""
 
 
 @dataclass(frozen=True)
@@ -113,22 +114,23 @@ class Measurement:
     machine: str
     """Description of the machine."""
     trace: tuple[Score, ...] = ()
-    """Scores of all iterates, beginning with the start; empty if the method does not iterate."""
+    """Scores of all iterates, beginning with the start; empty for methods without iterations."""
     best: tuple[int, ...] = ()
-    """For each iterate, the index of the optimizer's best one so far. It cannot be derived from the losses, because
-    losses of different stages are not comparable."""
+    """For each iterate, the index of the best iterate so far. It cannot be derived from the losses, since losses of
+    different stages are not comparable."""
     before: Score | None = None
-    """Score of the start, if the trace does not begin with it."""
+    """Score of the start, if the trace does not begin with the start."""
     verdict: str | None = None
     """`good`, `doubtful` or `failed`, if the method assesses its result."""
     probability: float | None = None
     """Probability that the mask is wrong [1]."""
     within: tuple[int, int, int] | None = None
-    """Number of joint positions with ground truth and standard deviation, and of errors within one and two of them."""
+    """Number of joint positions with ground truth and standard deviation, and numbers of errors within one and two
+    standard deviations."""
 
     @property
     def start(self) -> Score | None:
-        """Score of the initial estimate; None if the method has none."""
+        """Score of the initial estimate; None for methods without an initial estimate."""
         return self.before or (self.trace[0] if self.trace else None)
 
     @property
@@ -138,13 +140,13 @@ class Measurement:
 
     @property
     def made_worse(self) -> bool:
-        """Whether Dice fell by more than 0.01."""
+        """Whether Dice decreased by more than 0.01."""
         return self.start is not None and self.final.dice < self.start.dice - 0.01
 
     def best_of(self, iterations: int) -> Score | None:
-        """Best score within a number of steps; None if the run was cut off earlier.
+        """Score of the best iterate within a number of steps; None if the run was shorter because of its limit.
 
-        Its `seconds` cover all these steps.
+        The `seconds` of the score include all these steps.
         """
         if not self.trace or (iterations > self.iterations and self.stopped == "iterations"):
             return None
@@ -152,18 +154,18 @@ class Measurement:
         return replace(self.trace[self.best[last]], seconds=self.trace[last].seconds)
 
     def best_so_far(self) -> list[Score]:
-        """For each iterate, the score of the best one so far."""
+        """For each iterate, the score of the best iterate so far."""
         return [self.trace[place] for place in self.best]
 
     def to_json(self) -> dict[str, Any]:
-        """Measurement as JSON values; the trace is stored by column to keep the line short."""
+        """Convert the measurement to JSON values; the trace is stored by column, which shortens the line."""
         entry = _rounded(asdict(self))
         columns = {field.name: [score[field.name] for score in entry["trace"]] for field in fields(Score)}
         return entry | {"trace": columns}
 
     @staticmethod
     def from_json(line: Mapping[str, Any]) -> "Measurement":
-        """Measurement from the output of `to_json`.
+        """Convert the result of `to_json` to a measurement.
 
         Raises:
             KeyError, TypeError, ValueError: the line is not a measurement.
@@ -189,7 +191,7 @@ def _rounded(value: Any) -> Any:
 
 
 class ResultsFile:
-    """File of measurements, one JSON line each; a killed process loses at most the last line.
+    """File of measurements with one line of JSON each; a killed process loses at most the last line.
 
     Raises:
         CartsError: the file cannot be read.
@@ -199,7 +201,7 @@ class ResultsFile:
         self.path = path
         self._known: dict[tuple[Run, str], Measurement] = {}
         self.unreadable = 0
-        """Number of lines that are truncated or from another version."""
+        """Number of lines that are truncated or written by another version."""
         try:
             lines = read_bytes(path.path, TABLE).splitlines() if path.path.exists() else []
         except OSError as error:
@@ -219,7 +221,7 @@ class ResultsFile:
         return self._known.get((run, fingerprint))
 
     def append(self, measurement: Measurement, fingerprint: str, **also: str) -> None:
-        """Append a measurement, its fingerprint and informative fields, and flush them to disk.
+        """Append a measurement with its fingerprint and informative fields, and flush it to disk.
 
         Raises:
             OutputError: the file cannot be written.
@@ -227,7 +229,7 @@ class ResultsFile:
         entry = measurement.to_json()
         line = json.dumps({"fingerprint": fingerprint, **also, **entry}, separators=(",", ":"))
         append_line(self.path, line.encode())
-        # Rounded as in the file, so that a report does not depend on the time of writing.
+        # The values are rounded as in the file, so that a report is the same before and after reading the file.
         self._known[measurement.run, fingerprint] = Measurement.from_json(entry)
 
 
@@ -235,7 +237,7 @@ _CUDA = "cuda: "
 
 
 def machine(device: torch.device) -> str:
-    """Description of processor, cores, threads and, if used, the GPU."""
+    """Description of processor, number of cores and threads, and, if used, the GPU."""
     model = platform.processor() or platform.machine()
     cpuinfo = Path("/proc/cpuinfo")
     if cpuinfo.is_file():
@@ -251,7 +253,7 @@ def on_gpu(text: str) -> bool:
 
 
 def milliseconds(work: Callable[[], object], runs: int) -> float:
-    """Median duration of `work` [ms], after two warm-up calls."""
+    """Median duration of a function [ms], after two warm-up calls."""
     for _ in range(2):
         work()
     times = []
@@ -293,7 +295,8 @@ def render_figures(sequence: Sequence, runs: int) -> dict[str, float]:
 
 
 def optimizer_figures(sequence: Sequence, iterations: int) -> dict[str, float]:
-    """Timings of the optimizer on the first frame [ms]: the paper's loss, and the default solver from 2 degrees off."""
+    """Timings of the optimizer on the first frame [ms]: the paper's loss, and the default solver with an initial error
+    of 2 degrees."""
     camera = sequence.scene.cameras[0].name
     frame = sequence.frame(0, cameras=[camera])
     backgrounds = {camera: sequence.background(camera)}
@@ -322,7 +325,7 @@ _RUNS = 10
 
 
 def stored(path: OutputPath, name: str, of: list[str]) -> Any:
-    """Value `name` of a JSON file; None if it is missing or was written for other inputs `of`."""
+    """Value `name` of a JSON file; None if the file is missing or was written for other inputs `of`."""
     try:
         content = parse_json(read_bytes(path.path, VALUES))
         return content[name] if content["of"] == of else None
@@ -349,7 +352,7 @@ def measure_stages(path: OutputPath, extractor: FeatureExtractor) -> None:
 
 
 def network_figures(scene: Scene, extractor: FeatureExtractor) -> dict[str, float]:
-    """Timings of the networks on whole images at the optimizer's default resolutions [ms]."""
+    """Timings of the networks for whole images at the default resolutions of the optimizer [ms]."""
     settings = SurfaceSolver()
     scale = max(stage.scale for stage in settings.stages if isinstance(stage, Observe))
     width, height = working_size(scene, settings.working_width, extractor.stride)

@@ -25,7 +25,7 @@ from .tables import sections as sections_of
 from .targets import targets
 
 matplotlib.use("Agg")
-# Makes the SVG files reproducible.
+# This setting makes the SVG files reproducible.
 matplotlib.rcParams["svg.hashsalt"] = "carts"
 
 COLORS = {"paper": "#b3541e", "ours": "#1f5fa8"}
@@ -114,13 +114,13 @@ def _falls(measurement: Measurement) -> bool:
 
 
 def _loss_to_go(measurement: Measurement) -> list[float]:
-    """Losses scaled from 1 (first) to 0 (lowest), because the methods' losses differ in unit."""
+    """Losses scaled to the range from 1 (first) to 0 (lowest), since the units of losses differ between methods."""
     losses = [score.loss or 0.0 for score in measurement.best_so_far()]
     return [(loss - losses[-1]) / (losses[0] - losses[-1]) for loss in losses]
 
 
 def _padded(measurements: list[Measurement], steps: int, values: Callable[[Measurement], list[float]]) -> np.ndarray:
-    """Values as an array [runs, steps + 1]; runs that ended earlier keep their last value."""
+    """Values as an array [runs, steps + 1]; the last value of shorter runs is repeated."""
     rows = [values(measurement) for measurement in measurements]
     return np.array([row + [row[-1]] * (steps + 1 - len(row)) for row in rows])
 
@@ -146,7 +146,7 @@ def _errors(data: Measurements) -> Figure | None:
             known = [(e, float(np.mean(values)), float(np.std(values))) for e, values in found.items() if values]
             _with_bars(axes, known, color, "o-", SHORT_LABELS[method])
         points = [(float(error), scale * mean, scale * std) for error, (mean, std) in PAPER[table]["S-Reg"].items()]
-        _with_bars(axes, points, "#777", "x--", "paper's own numbers (S-Reg)")
+        _with_bars(axes, points, "#777", "x--", "numbers of the paper (S-Reg)")
     dice_axes.set(title="Dice", xlabel="initial error of every joint [deg]", ylabel="Dice")
     mae_axes.set(title="joint MAE", xlabel="initial error of every joint [deg]", ylabel="MAE [deg]")
     mae_axes.axline((0, 0), slope=1, color="#bbb", lw=1, ls=":", label="no change")
@@ -204,7 +204,7 @@ class Facts:
     scope: str
     """`quick` or `full`."""
     planned: int
-    """Number of planned runs, measured or not."""
+    """Number of planned runs, including runs that are not yet measured."""
     sources: dict[str, str]
     """Name -> description."""
     weights: str
@@ -223,8 +223,8 @@ def write_report(
 ) -> Path:
     """Write `report.html`, `figures/`, `results.json` and `results.csv`; returns the page's path.
 
-    `stages` maps stages of an iteration to milliseconds, `hand_eye` holds calibrations of another robot; both may be
-    empty.
+    `stages` maps stages of an iteration to milliseconds, and `hand_eye` contains calibrations of another robot; both
+    may be empty.
 
     Raises:
         CartsError: the folder cannot be written to.

@@ -1,4 +1,4 @@
-"""Backgrounds without instruments, synthetic or photographed, and compositing of recorded instruments."""
+"""Synthetic or photographed backgrounds without instruments, and compositing of recorded instruments."""
 
 import dataclasses
 import zlib
@@ -31,13 +31,13 @@ _PHOTOGRAPHS = (".jpg", ".jpeg", ".png")
 
 @dataclass(frozen=True)
 class Room:
-    """Background that replaces the recorded one."""
+    """Background that replaces the recorded background."""
 
     name: str
     half: Half
     """Whether the room may be used for tuning or is held out."""
     draw: Callable[[int, int], UInt8[np.ndarray, "h w 3"]]
-    """Draws the image of the room at a width and height [px]."""
+    """Function that draws the image of the room at a width and height [px]."""
 
     @property
     def domain(self) -> str:
@@ -46,7 +46,7 @@ class Room:
 
 
 def made_rooms() -> list[Room]:
-    """The synthetic rooms."""
+    """Synthetic rooms."""
     halves: list[tuple[Half, dict[str, Callable[..., Picture]]]] = [("tuning", _TUNING), ("held-out", _HELD_OUT)]
     return [
         Room(f"{kind} {seed}", half, partial(_made, kind, draw, seed))
@@ -57,7 +57,7 @@ def made_rooms() -> list[Room]:
 
 
 def photographs(folder: Path) -> list[Room]:
-    """Rooms from the photographs in a folder; in order of name, every other one is held out.
+    """Rooms from the photographs in a folder; every other photograph, by name, is held out.
 
     Raises:
         SettingsError: the folder contains no photograph.
@@ -79,7 +79,7 @@ def _made(kind: str, draw: Callable[..., Picture], seed: int, width: int, height
 
 
 def _photograph(path: Path, width: int, height: int) -> UInt8[np.ndarray, "h w 3"]:
-    """Central crop of a photograph, resized to `width` x `height` px."""
+    """Read a photograph and crop its centre, resized to `width` x `height` px."""
     whole = read_image(path)
     rows, columns, _ = whole.shape
     scale = max(width / columns, height / rows)
@@ -114,7 +114,7 @@ def _bar(
     color: np.ndarray,
     profile: np.ndarray,
 ) -> None:
-    """Draw a straight bar and its shadow; `profile` gives the brightness across the bar."""
+    """Draw a straight bar and its shadow; `profile` is the brightness across the bar."""
     along = np.array([np.cos(angle), np.sin(angle)])
     across = np.array([-along[1], along[0]])
 
@@ -148,7 +148,7 @@ def _somewhere(rng: np.random.Generator, width: int, height: int) -> tuple[float
 
 
 def _bench(rng: np.random.Generator, width: int, height: int) -> Picture:
-    """A table with boxes, tools and screws."""
+    """Table with boxes, tools and screws."""
     wood = np.array([0.55, 0.4, 0.27]) * rng.uniform(0.7, 1.4)
     picture = _plain(wood, width, height)
     rings = np.sin(np.linspace(0, 60, height)[:, None] + 4 * _grain(rng, width, height, width / 2))
@@ -233,7 +233,7 @@ def _rails(rng: np.random.Generator, width: int, height: int) -> Picture:
 
 
 def _ceramic(rng: np.random.Generator, width: int, height: int) -> Picture:
-    """A tiled wall with white cups, plates and tubes."""
+    """Tiled wall with white cups, plates and tubes."""
     picture = _plain(np.array([0.85, 0.86, 0.84]) * rng.uniform(0.7, 1.1), width, height)
     pitch = int(rng.integers(50, 110))
     picture[::pitch] = picture[1::pitch] = picture[:, ::pitch] = picture[:, 1::pitch] = rng.uniform(0.3, 0.6)
@@ -278,10 +278,10 @@ _HELD_OUT = {"plates": _plates, "rails": _rails, "ceramic": _ceramic, "cables": 
 
 
 _PARALLAX = 24
-"""Shift of the room between one camera and the next [px]."""
+"""Shift of the room between consecutive cameras [px]."""
 
 _RIM = 2
-"""Width of the rim whose colours are replaced from further inside, to remove the old background [px]."""
+"""Width of the rim whose colours are replaced by colours further inside, to remove the old background [px]."""
 
 _SEAM = 0.8
 """Standard deviation of the blur of the mask's edge [px]."""
@@ -306,11 +306,11 @@ class AlteredSequence(ABC):
 
     @abstractmethod
     def frame(self, index: int, domain: str | None = None, cameras: Iterable[str] | None = None) -> Frame:
-        """Frame with its images in a domain, by default the first one."""
+        """Frame with its images in a domain, by default the first domain."""
 
     @abstractmethod
     def mean_background(self, camera: str, domain: str | None = None) -> MeanBackground:
-        """Mean background and the pixels where it is known."""
+        """Mean background, and the pixels in which it is known."""
 
     def background(self, camera: str, domain: str | None = None) -> UInt8[np.ndarray, "h w 3"]:
         """Mean background in a domain."""
@@ -318,10 +318,10 @@ class AlteredSequence(ABC):
 
 
 class AnotherRoom(AlteredSequence):
-    """Real sequence with masks, composited over rooms; each domain is the room of that name.
+    """Real sequence with masks, composited over rooms; domains are the names of rooms.
 
-    The room is static; light and noise vary between frames, depending on the seed. The mean background is estimated as
-    for any recording: the median over frames, excluding pixels covered by the arms at their measured positions.
+    The room is static; light and noise vary between frames and depend on the seed. The mean background is estimated as
+    for recordings: the median over frames, excluding pixels covered by the arms at their measured positions.
     """
 
     def __init__(self, sequence: Sequence, rooms: Items[Room], seed: int) -> None:
@@ -331,7 +331,7 @@ class AnotherRoom(AlteredSequence):
         self._picture, self._background = lru_cache(8)(self._make_picture), lru_cache(8)(self._make_background)
 
     def frame(self, index: int, domain: str | None = None, cameras: Iterable[str] | None = None) -> Frame:
-        """Frame composited over a room, by default the first one."""
+        """Frame composited over a room, by default the first room."""
         room = domain or next(iter(self.rooms))
         frame = self._sequence.frame(index, cameras=cameras or self._cameras)
         assert frame.masks is not None
@@ -346,7 +346,7 @@ class AnotherRoom(AlteredSequence):
         return dataclasses.replace(frame, domain=room, images=images)
 
     def mean_background(self, camera: str, domain: str | None = None) -> MeanBackground:
-        """Mean background of the recording in a room, and the pixels where it is known."""
+        """Mean background of the recording in a room, and the pixels in which it is known."""
         return self._background(domain or next(iter(self.rooms)), camera)
 
     def _make_picture(self, room: str, camera: str) -> UInt8[np.ndarray, "h w 3"]:
@@ -370,7 +370,7 @@ def pasted(
     if not mask.any():
         return room.astype(np.float32)
     inside = np.asarray(binary_erosion(mask, iterations=_RIM), bool)
-    # Pixels near the rim take the colour of the nearest pixel well inside.
+    # The colour of pixels near the rim is that of the nearest pixel farther inside.
     nearest = distance_transform_edt(~(inside if inside.any() else mask), return_distances=False, return_indices=True)
     arm = image[tuple(np.asarray(nearest))].astype(np.float32)
     gain = np.clip(np.sqrt(max(float(np.median(room)), 1.0) / max(float(np.median(image)), 1.0)), *_MATCH)

@@ -1,4 +1,4 @@
-"""Plan of a benchmark's runs, and the runner that measures the missing ones."""
+"""Plan of the runs of a benchmark, and the runner that measures missing runs."""
 
 from collections.abc import Iterable, Mapping
 from collections.abc import Sequence as Items
@@ -23,10 +23,10 @@ _UNDER_OCCLUDERS = ("ours", "ours_given", "ours_proposed")
 
 
 def plan(scope: Scope, sources: Items[Source], baselines: Items[str] = ()) -> list[Run]:
-    """All runs, ordered by frame, so that a stopped benchmark has some measurements of every kind.
+    """Plan all runs, ordered by frame, so that a stopped benchmark has measurements of every kind.
 
     Frames with a subset of the methods follow, then frames corrected together, other rooms, and instruments absent from
-    the training data. `baselines` are the names in `scope.BASELINES` whose weights are given.
+    the training data. `baselines` are the names in `scope.BASELINES` with given weights.
     """
     rooms, families = ([s for s in sources if s.name.startswith(kind)] for kind in (ROOMS, FAMILY))
     sources = [source for source in sources if source not in (*rooms, *families)]
@@ -89,7 +89,7 @@ def _runs_of_frame(scope: Scope, source: Source, frame: int, baselines: Items[st
 
 def _runs_of_further_frame(scope: Scope, source: Source, frame: int) -> list[Run]:
     if source.name == REAL:
-        # One calibration is shared by the whole recording, and scoring it is cheap.
+        # The whole recording shares one calibration, and scoring takes little time.
         return [Run(source.name, "regular", frame, "calibrated")]
     return [
         Run(source.name, domain, frame, "ours", error)
@@ -99,10 +99,10 @@ def _runs_of_further_frame(scope: Scope, source: Source, frame: int) -> list[Run
 
 
 class Benchmark:
-    """Runs of a scope over sources, and the file of their results.
+    """Benchmark of the runs of a scope on sources, and file of results.
 
-    Runs are measured in the given order. `baselines` maps names in `scope.BASELINES` to networks and must contain those
-    that occur in the runs.
+    Runs are measured in the given order. `baselines` maps names in `scope.BASELINES` to networks and must contain all
+    baselines of the runs.
     """
 
     def __init__(
@@ -160,7 +160,7 @@ class Benchmark:
             bar.update(task, description="measured")
 
     def _group(self, run: Run) -> list[Run]:
-        """Runs measured together with this one."""
+        """Runs that are measured together with this run."""
         if not METHODS[run.method].as_sequence:
             return [run]
         return [other for other in self.runs if replace(other, frame=run.frame) == run]

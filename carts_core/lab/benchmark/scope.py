@@ -20,7 +20,7 @@ PAPERS_STEPS = 50
 
 @dataclass(frozen=True)
 class Run:
-    """One method on one frame from one start."""
+    """Application of a method to a frame from a start."""
 
     source: str
     """`synthetic`, `real`, `rooms` and a camera, or `family` and an instrument."""
@@ -32,7 +32,7 @@ class Run:
     """A name in `METHODS`."""
     error_deg: float | None = None
     """Initial error of every joint [deg; mm for prismatic joints] relative to the true joint positions if known, else
-    to the measured ones; None starts at the measured joint positions."""
+    to the measured joint positions; None starts at the measured joint positions."""
 
 
 @dataclass(frozen=True)
@@ -42,12 +42,12 @@ class Scope:
     frames: int = 8
     """Number of evenly spaced frames per sequence on which all methods are evaluated."""
     sequence_frames: int = 24
-    """Length of the synthetic sequence; the background is estimated from all its frames."""
+    """Number of frames of the synthetic sequence, from which the background is estimated."""
     samples: int = 8
     """Samples per pixel in path tracing of the synthetic sequence."""
     paper_iterations: int = 100
     """Steps in the paper's setting from the measured joint positions; at most `PAPERS_STEPS` from other starts. The
-    schedule does not depend on the number of steps, so a run contains all shorter ones."""
+    schedule does not depend on the number of steps, so a run contains all shorter runs."""
     error_domains: tuple[str, ...] = DOMAINS
     """Synthetic domains with initial errors."""
     errors_deg: tuple[float, ...] = (0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0)
@@ -59,15 +59,15 @@ class Scope:
     real_errors_deg: tuple[float, ...] = (1.0, 2.0, 3.0)
     """Initial errors on real frames in the regular domain, for both methods, relative to the measured joints [deg]."""
     hard_errors_deg: tuple[float, ...] = (2.0,)
-    """Initial errors on synthetic frames with occluders, and with all cameras at once [deg]."""
+    """Initial errors on synthetic frames with occluders, and for joint optimization of all cameras [deg]."""
     crossing_errors_deg: tuple[float, ...] = (1.0, 2.0, 3.0)
-    """Initial errors on synthetic frames whose arms cross, for the default solver and ACS [deg]."""
+    """Initial errors on synthetic frames with crossing arms, for the default solver and ACS [deg]."""
     consecutive: int = 30
-    """Maximum number of frames, from the first on, that are corrected together in each sequence."""
+    """Maximum number of frames that are corrected together in each sequence, starting with the first frame."""
     consecutive_domains: tuple[str, ...] = DOMAINS
     """Domains of frames corrected together."""
     consecutive_errors_deg: tuple[float, ...] = (1.0, 2.0, 3.0)
-    """Initial errors shared by all synthetic frames in those domains [deg]."""
+    """Initial errors of jointly corrected frames, equal in all frames [deg]."""
     calibration_frames: int = 20
     """Number of evenly spaced frames for the calibration of a real sequence."""
     room_frames: int = 2
@@ -75,7 +75,7 @@ class Scope:
     room_consecutive: int = 8
     """Number of frames corrected together in each room."""
     room_share: int = 1
-    """Every n-th room is measured."""
+    """Every n-th room is measured, where n is this number."""
     family_frames: int = 6
     """Number of frames of each instrument absent from the training data; may be 0."""
     hand_eye_starts: int = 10
@@ -89,7 +89,7 @@ class Scope:
         """Copy with another number of evaluated frames.
 
         Raises:
-            SettingsError: the number is below one or exceeds the length of the synthetic sequence.
+            SettingsError: the number is below 1 or exceeds the length of the synthetic sequence.
         """
         if not 1 <= frames <= self.sequence_frames:
             raise SettingsError(
@@ -129,8 +129,8 @@ class Method:
     label: str
     """Label in tables."""
     settings: Callable[[int], SolverSettings] | None
-    """Optimizer settings as a function of the number of steps in the paper's setting; None evaluates the network's own
-    mask, without kinematics."""
+    """Optimizer settings as a function of the number of steps in the paper's setting; None evaluates the mask predicted
+    by the network, without kinematics."""
     occluders_given: bool = False
     """Whether the pixels of occluders are given."""
     every_camera: bool = False
@@ -144,7 +144,7 @@ class Method:
     masks_given: bool = False
     """Whether given masks are fitted, without a network."""
     baseline: bool = False
-    """Whether it is a network from the literature, whose weights must be given."""
+    """Whether the method is a network from the literature, whose weights must be given."""
     image_alone: bool = False
     """Whether the image is the only input."""
 
@@ -196,5 +196,5 @@ METHODS |= BASELINES
 MAIN = ("unet", "start", "l1", "paper", "ours")
 """Methods of the main table, which treat each frame separately in one camera."""
 RENDERING = "surface"
-"""The surface network's mask from an image and the rendering at the measured joint positions, the inputs of Colleoni et
-al."""
+"""Mask of the surface network for an image and the rendering at the measured joint positions, which are the inputs of
+Colleoni et al."""

@@ -1,4 +1,4 @@
-"""Sources of frames: a held-out synthetic sequence, a real one if given, other rooms and instruments."""
+"""Sources of frames: a held-out synthetic sequence, a given real sequence, other rooms and instruments."""
 
 import hashlib
 from collections.abc import Callable, Iterable
@@ -38,7 +38,7 @@ Recording = Sequence | AlteredSequence
 
 @dataclass(frozen=True)
 class Source:
-    """Source of frames to evaluate, opened or rendered on demand by `open`."""
+    """Source of evaluated frames, opened or rendered on demand by `open`."""
 
     name: str
     """`synthetic`, `real`, or `rooms` and a camera."""
@@ -56,7 +56,7 @@ class Source:
     consecutive: list[int] = field(default_factory=list)
     """Indices of frames that are corrected together."""
     rooms: list[str] = field(default_factory=list)
-    """Names of the rooms, if the source has frames in other rooms."""
+    """Names of the rooms of a source with frames in other rooms."""
     domains: tuple[str, ...] = DOMAINS
     """Synthetic domains of the source."""
     length: int = 1
@@ -69,15 +69,15 @@ class Source:
 
 
 def synthetic_source(scope: Scope, seed: int = TEST_SEED) -> Source:
-    """Source with a synthetic sequence, rendered into the cache when it is first opened.
+    """Source with a synthetic sequence, which is rendered into the cache when first opened.
 
     Raises:
-        SettingsError: the seed is that of the shipped sequence.
+        SettingsError: the seed is the seed of the shipped sequence.
     """
     if seed == SynthesisConfig().seed:
         raise SettingsError(
-            f"--seed {seed} is the shipped sequence's, on which settings were tuned. Use any other seed; "
-            f"the default is {TEST_SEED}."
+            f"--seed {seed} is the seed of the shipped sequence, on which settings were tuned. Use another seed; the "
+            f"default is {TEST_SEED}."
         )
     frames = scope.sequence_frames
     config = _config(scope, seed, f"fresh {seed}", frames, endoscope=EndoscopeConfig(stereo=True))
@@ -122,7 +122,8 @@ def _config(scope: Scope, seed: int, name: str, frames: int, **settings: Any) ->
 
 
 def _made_once(config: SynthesisConfig) -> tuple[str, Callable[[Progress], Sequence]]:
-    """Fingerprint of a synthetic sequence, and a function that opens it and renders it into the cache if missing."""
+    """Fingerprint of a synthetic sequence, and a function that opens the sequence and, if missing, renders it into the
+    cache."""
     fingerprint = hashlib.sha256(repr((config, code_fingerprint(_SYNTHESIS))).encode()).hexdigest()[:32]
     folder = output_path(cache_dir(), "benchmark", f"sequence_{config.seed}_{fingerprint[:8]}")
 
@@ -154,7 +155,7 @@ def _add_frames(digest: "hashlib._Hash", sequence: Sequence, indices: Iterable[i
 
 
 def real_source(path: Path, scope: Scope, seed: int = TEST_SEED) -> Source:
-    """Source with the frames of a real sequence that have a mask in its first camera.
+    """Source with the frames of a real sequence that have a mask in the first camera.
 
     Raises:
         SequenceError: the sequence is not usable.
@@ -191,7 +192,7 @@ def real_source(path: Path, scope: Scope, seed: int = TEST_SEED) -> Source:
 
 
 def _rooms(folder: Path | None, scope: Scope, *parts: object) -> "tuple[list[Room], hashlib._Hash]":
-    """Rooms, and a hash over them and `parts`."""
+    """Rooms, and a hash of the rooms and `parts`."""
     rooms = (made_rooms() + (photographs(folder) if folder else []))[:: scope.room_share]
     digest = _digest(*parts, code_fingerprint(_ROOMS_CODE))
     for photograph in sorted(folder.glob("*")) if folder else []:
@@ -222,7 +223,8 @@ def synthetic_room_source(sequence: Source, folder: Path | None, scope: Scope, s
 
 
 def room_sources(path: Path, folder: Path | None, scope: Scope, seed: int = TEST_SEED) -> list[Source]:
-    """One source per camera with masks of a real sequence, its instruments composited over other backgrounds.
+    """Sources with the instruments of a real sequence composited over other backgrounds, one for each camera with
+    masks.
 
     Photographs in `folder` are used in addition to synthetic backgrounds; `seed` sets lighting and noise.
 

@@ -22,28 +22,28 @@ def read_table(name: str) -> dict[str, Any]:
 
 
 PAPER = read_table("paper.toml")
-"""Numbers from the paper, documented in the file."""
+"""Numbers of the paper, documented in the file."""
 TEXTS = read_table("tables.toml")
 """Titles and captions of tables, and captions of figures."""
 
 
 def table_of(name: str, rows: Sequence[Mapping[str, str | Cell]], /, **values: object) -> Table | None:
-    """Table with the title and caption of that name, formatted with `values`; None if there are no rows."""
+    """Table with the title and caption of a name, formatted with `values`; None without rows."""
     title, caption = (TEXTS[name][text].format(**values) for text in ("title", "caption"))
     return Table.of(title, caption, rows)
 
 
 def paper_column(source: str, domain: str) -> str:
-    """Column of the paper's table that corresponds to a source and domain; empty if there is none."""
+    """Column of the paper's table that corresponds to a source and domain; empty without such a column."""
     return PAPER["columns"].get(source, {}).get(domain, "")
 
 
 ANY = object()
-"""Matches every initial error."""
+"""Value that matches every initial error."""
 
 
 class Measurements:
-    """Measurements and selections of them."""
+    """Measurements and selections of measurements."""
 
     def __init__(self, measurements: Iterable[Measurement]) -> None:
         self.all = list(measurements)
@@ -71,7 +71,7 @@ class Measurements:
         ]
 
     def compared(self) -> "Measurements":
-        """Measurements on the frames on which all methods are evaluated."""
+        """Measurements of the frames on which all methods are evaluated."""
         frames = {(m.run.source, m.run.frame) for m in self.all if m.run.method in MAIN and m.run.error_deg is None}
         return Measurements(m for m in self.all if (m.run.source, m.run.frame) in frames)
 
@@ -84,12 +84,12 @@ class Measurements:
         return list(dict.fromkeys(measurement.run.domain for measurement in self.of(source=source)))
 
     def sources(self, kind: str = "") -> list[str]:
-        """Sources of a kind (`ROOMS` or `FAMILY`), or by default those of neither."""
+        """Sources of a kind (`ROOMS` or `FAMILY`), by default all other sources."""
         found = dict.fromkeys(measurement.run.source for measurement in self.all)
         return [source for source in found if (source.startswith(kind) if kind else _usual(source))]
 
     def in_rooms(self, source: str, half: Half, method: str) -> list[Measurement]:
-        """Measurements of a source's frames in the rooms of one half."""
+        """Measurements of the frames of a source in the rooms of one half."""
         runs = ((measurement, measurement.run) for measurement in self.all)
         return [m for m, run in runs if run.source == source and run.domain.startswith(half) and run.method == method]
 
@@ -127,14 +127,14 @@ class Figure:
         return [value for value in found if value is not None]
 
     def text(self, scores: Iterable[Score | None]) -> str:
-        """Mean ± standard deviation; the mean alone for a single value."""
+        """Mean ± standard deviation; only the mean for a single value."""
         if not (values := self.values(scores)):
             return NOTHING
         mean = f"{self.scale * np.mean(values):.{self.digits}f}"
         return mean if len(values) == 1 else f"{mean} ± {self.scale * np.std(values):.{self.digits}f}"
 
     def cell(self, scores: Iterable[Score | None], theirs: Sequence[float] | None = None, column: str = "") -> Cell:
-        """Table cell with the text and, below it, the paper's number and column."""
+        """Table cell with the text and, below, the number and column of the paper."""
         note = "" if theirs is None else f"{column} {theirs[0]:.1f} ± {theirs[1]:.1f}"
         return Cell(self.text(scores), note)
 
@@ -163,20 +163,20 @@ class Pair:
     source: str
     error_deg: float | None
     gained: bool
-    """Whether the paper's setting gained enough to compare."""
+    """Whether the gain of the paper's setting suffices for a comparison."""
     papers: float
     """Time in which the paper's setting reaches the Dice of its best iterate within `PAPERS_STEPS` steps [s]."""
     ours: float | None
-    """Time in which the default solver reaches that Dice [s]; None if it never does."""
+    """Time in which the default solver reaches the same Dice [s]; None if it does not."""
 
     @property
     def ratio(self) -> float:
-        """Speed-up of the default solver; 0 if it never reaches that Dice."""
+        """Speed-up of the default solver; 0 if it does not reach the same Dice."""
         return self.papers / self.ours if self.ours else 0.0
 
 
 def pairs(data: Measurements) -> list[Pair]:
-    """All pairs of runs from the same start, including those without gain in the paper's setting."""
+    """All pairs of runs from the same start, including pairs without gain in the paper's setting."""
     ours = {(m.run.source, m.run.domain, m.run.frame, m.run.error_deg): m for m in data.of(method="ours")}
     found = []
     for theirs in data.of(method="paper"):
@@ -192,6 +192,6 @@ def pairs(data: Measurements) -> list[Pair]:
 
 
 def _seconds_to(measurement: Measurement, dice: float) -> float | None:
-    """Time until the best iterate reaches this Dice [s]; None if it never does."""
+    """Time until the best iterate reaches a Dice [s]; None if it does not."""
     reached = zip(measurement.trace, measurement.best_so_far(), strict=True)
     return next((now.seconds for now, best in reached if best.dice >= dice), None)

@@ -1,4 +1,4 @@
-"""Tables of the report: one dict per row, heading -> text."""
+"""Tables of the report; each row is a dict heading -> text."""
 
 from collections.abc import Sequence
 from itertools import product
@@ -117,11 +117,12 @@ def error_tables(data: Measurements) -> list[Table]:
 
 
 def speed_table(data: Measurements) -> Table | None:
-    """Seconds per frame, and number of frames that each method made worse."""
+    """Seconds per frame, and number of frames made worse by each method."""
     rows = []
     for source, (method, entry) in product(data.sources(), METHODS.items()):
         chosen = data.of(source=source, method=method)
-        # Methods that correct frames together have other tables, because their time is not spent frame by frame.
+        # Methods that correct frames together have other tables, since their time is not spent separately on each
+        # frame.
         if not chosen or entry.as_sequence or entry.calibrated:
             continue
         steps, seconds = (
@@ -268,7 +269,7 @@ def sequence_table(data: Measurements) -> Table | None:
 
 
 def room_table(data: Measurements) -> Table | None:
-    """Scores in other rooms: the default solver on single frames and on sequences, and ACS."""
+    """Scores in other rooms of the default solver, for single frames and sequences, and of ACS."""
 
     def worse(runs: Sequence[Measurement]) -> Cell:
         return Cell(DICE.text(scores(runs)), f"worse than initially: {sum(m.made_worse for m in runs)} of {len(runs)}")
@@ -292,7 +293,7 @@ def room_table(data: Measurements) -> Table | None:
 
 
 def image_alone_table(data: Measurements) -> Table | None:
-    """For each domain, the best network with only the image as input, and the default solver."""
+    """Scores of the best network with only the image as input, and of the default solver, by domain."""
     rows = []
     for source in data.sources():
         dice, _ = image_alone(data, source)

@@ -1,4 +1,4 @@
-"""Performance targets of the default solver, and whether measurements meet them."""
+"""Performance targets of the default solver, compared with measurements."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ from .statistics import DOMAIN_LABELS, GAINED, JOINT_MAE, VISIBLE_MAE, Measureme
 RIGHT = 0.9
 """Minimum Dice of a correct mask."""
 NEAR_FINAL = 0.005
-"""Difference from the final Dice below which a run counts as converged."""
+"""Difference from the final Dice below which a run is considered converged."""
 _RECOVERED = 0.95
 _CONDITIONS = ("low_brightness", "bleeding", "smoke", "background_change")
 """Simulated conditions of real frames that have a target."""
@@ -30,13 +30,14 @@ _TARGETS = read_table("targets.toml")
 
 @dataclass(frozen=True)
 class Target:
-    """Target with its measured value and verdict."""
+    """Target with its measured value, and whether it is met."""
 
     what: str
     target: str
     reached: str
     met: bool | None
-    """Whether the target is met; None if undecided: nothing was measured, or only part of the runs, which meets it."""
+    """Whether the target is met; None if undecided, because no runs were measured, or because only some runs were
+    measured and these meet the target."""
     reference: str
     basis: str
     """Description of the data from which the value was computed."""
@@ -45,15 +46,15 @@ class Target:
 def target_of(
     name: str, value: float | None, basis: str, *, reference: str = "", complete: bool = True, **names: object
 ) -> Target:
-    """Create the target of a name in `targets.toml`, with its verdict.
+    """Create a target of `targets.toml`, and decide whether it is met.
 
     Args:
         name: name of the table in `targets.toml`.
         value: measured value; None if nothing was measured.
         basis: description of the data from which the value was computed.
-        reference: value to compare with, if it depends on the data.
+        reference: reference for the comparison, if it depends on the data.
         complete: whether all required runs were measured; otherwise the target can be missed but not met.
-        names: texts and numbers for the label.
+        names: strings and numbers for the label.
     """
     entry = _TARGETS[name]
     scale, form, most = entry.get("scale", 1), entry.get("text", "{:.3f}"), "most" in entry
@@ -178,7 +179,7 @@ def _real(data: Measurements) -> Iterator[Target]:
     }
     clean = means.pop("regular", None)
     worst, basis = _worst(means)
-    # Avoid -0.000 for a loss that rounds to zero.
+    # This avoids -0.000 for a loss that is rounded to zero.
     lost = None if clean is None or worst is None else clean - means[worst]
     lost = 0.0 if lost is not None and -0.0005 < lost < 0 else lost
     yield target_of("real_robustness", lost, basis, complete=len(means) == len(_CONDITIONS))
@@ -228,8 +229,8 @@ def _rooms(data: Measurements, source: str) -> Iterator[Target]:
 def image_alone(data: Measurements, source: str) -> tuple[dict[str, dict[str, float]], int]:
     """Mean Dice in percent by method and domain, and the number of frames.
 
-    Methods are the default solver, which comes first, and the measured networks with only the image as input, on frames
-    measured with the default solver and at least one of these.
+    Methods are the default solver (first) and the measured networks with only the image as input. Frames are those
+    measured with the default solver and at least one of these networks.
     """
     methods = ["ours", *(name for name, method in METHODS.items() if method.image_alone)]
     runs = {name: data.of(source=source, method=name, error_deg=None) for name in methods}
@@ -300,7 +301,8 @@ def called_good(runs: Iterable[Measurement]) -> list[Measurement]:
 
 
 def area(runs: Sequence[Measurement]) -> float | None:
-    """Area under the ROC curve of the probability of a wrong mask [1]; None without both right and wrong masks."""
+    """Area under the ROC curve of the probability of a wrong mask [1]; None unless there are correct and wrong
+    masks."""
     bad = np.array([run.final.dice < RIGHT for run in runs])
     if bad.all() or not bad.any():
         return None
@@ -309,7 +311,8 @@ def area(runs: Sequence[Measurement]) -> float | None:
 
 
 def within(runs: Iterable[Measurement]) -> tuple[int, float, float] | None:
-    """Number of joint positions with a standard deviation, and shares of errors within 1 and 2 sigma [1], or None."""
+    """Number of joint positions with a standard deviation, and shares of errors within 1 and 2 standard deviations [1];
+    None without such joint positions."""
     known = np.array([run.within for run in runs if run.within])
     if not len(known):
         return None

@@ -1,4 +1,4 @@
-"""Arms in training images: variants of colour and proportion, meshes, and poses, random or from a recording."""
+"""Arms in training images: variants of colours and proportions, meshes, and poses (random or from a recording)."""
 
 import copy
 from collections.abc import Sequence
@@ -18,10 +18,10 @@ from ...recording import Sequence as SequenceFile
 from ...rendering import Renderer
 
 THICKNESS = (0.88, 1.15)
-"""Range of the scale of link thickness, so that the network does not depend on one instrument's exact shape."""
+"""Range of the scale of link thickness, so that the network does not depend on the exact shape of an instrument."""
 
 PERFECT_MODEL = 0.5
-"""Share of scenes whose rendered arms have the exact proportions of the observed ones."""
+"""Share of scenes whose rendered arms have the exact proportions of the observed arms."""
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class Body:
     face_part: Int[np.ndarray, " F"]
     """Index of the part to which each triangle belongs."""
     shaft: int
-    """Index of the part with the material of a shaft (mostly dark); -1 if there is none."""
+    """Index of the part with the material of a shaft (mostly dark); -1 without a shaft."""
     shaft_axis: Float[np.ndarray, "3"]
     """Unit vector along the shaft in the frame of its link, pointing away from the tip."""
     shaft_end: Float[np.ndarray, "3"]
@@ -121,13 +121,13 @@ FOCAL_LENGTH = (0.7, 2.0)
 OUTSIDE = 0.12
 """Maximum distance of a wrist outside the image, relative to the image size [1]."""
 ROBOT_DEPTH = (0.3, 2.0)
-"""The same for robots that are no instruments [m]."""
+"""Range of the distance between the aimed point and the camera for robots other than instruments [m]."""
 _TIP_AIMED = 0.25
-"""Share of instruments placed by a point of their jaws, so that of long jaws only the tips are in view."""
+"""Share of instruments that are placed by a point of their jaws, so that only the tips of long jaws are in view."""
 _CROSSED = 0.05
-"""Distance from the wrist within which arms cross [m]."""
+"""Maximum distance of a crossing point from the wrist [m]."""
 _STIFF = 0.3
-"""Joint errors of other robots relative to those of instruments [1]."""
+"""Joint errors of other robots, relative to joint errors of instruments [1]."""
 ELEVATION = (-20.0, 60.0)
 """Range of the angle between shaft and image plane [deg]; positive if the shaft extends towards the camera."""
 
@@ -137,15 +137,16 @@ class Variant:
     """One or two arms with varied appearance, to be posed, shaded and rendered."""
 
     geometries: tuple[RobotGeometry, ...]
-    """Arms that the camera observes."""
+    """Observed arms."""
     rendered: tuple[RobotGeometry, ...]
-    """Arms of the optimizer's model: equal, or with slightly different proportions, as in real models."""
+    """Arms of the optimizer's model: equal to the observed arms, or with slightly different proportions, as in
+    reality."""
     renderer: Renderer
-    """Optimizer's renderer of `rendered`, for hybrid images."""
+    """Renderer of `rendered`, for hybrid images."""
 
 
 def random_variant(rng: np.random.Generator, robots: Sequence[Robot], arms: int, width: int, height: int) -> Variant:
-    """Scene of `arms` arms, each one of `robots` with random colours and thickness."""
+    """Scene with a number of arms, which are `robots` with random colours and thickness."""
     chosen = [robots[int(rng.integers(len(robots)))] for _ in range(arms)]
     observed = [_vary(rng, robot) for robot in chosen]
     rendered = observed if rng.random() < PERFECT_MODEL else [_vary(rng, robot) for robot in chosen]
@@ -216,11 +217,11 @@ def random_placement(
     height: int,
     near: Float[np.ndarray, "3"] | None = None,
 ) -> Placement:
-    """Random placement: an instrument with its wrist or tip in or near the image and its shaft crossing a border, or
-    another robot with any of its links in the image.
+    """Random placement of an instrument, with its wrist or tip in or near the image and its shaft crossing a border, or
+    of another robot, with any of its links in the image.
 
     Args:
-        near: point of another arm [m], in front of or behind which the arm is placed so that both cross.
+        near: point of another arm [m], in front of or behind which the arm is placed, so that the arms cross.
     """
     joints = _random_joints(rng, geometry)
     Ts_base_link = geometry.link_transforms(joints)
@@ -244,7 +245,7 @@ def random_placement(
         direction = np.array([np.cos(azimuth) * flat, np.sin(azimuth) * flat, -np.sin(elevation)])
         R = _frame(direction, rng.normal(size=3)) @ _frame(axis, rng.normal(size=3)).T
     else:
-        # The base is upright, or hangs from a ceiling.
+        # The robot stands upright, or hangs from a ceiling.
         tilt, roll = np.deg2rad(rng.uniform(-15, 70)), rng.normal(0, 0.15) + np.pi * (rng.random() < 0.1)
         level = np.array([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])
         R = turned(np.array([0, 0, roll])) @ turned(np.array([tilt, 0, 0])) @ level
@@ -257,21 +258,21 @@ def random_placement(
 def _some_point(
     rng: np.random.Generator, geometry: RobotGeometry, Ts_base_link: np.ndarray, wrist: np.ndarray, *, jaws: bool
 ) -> Float[np.ndarray, "3"]:
-    """Random vertex in the base frame [m]: of the jaws, or of what is within `_CROSSED` of an instrument's wrist."""
+    """Random vertex in the base frame [m], of the jaws, or within `_CROSSED` of an instrument's wrist."""
     posed = geometry.posed(Ts_base_link).vertices.astype(float)
     if jaws:
         chosen = geometry.part_class[geometry.vertex_part] == PARTS.index("jaws")
     elif geometry.instrument:
         chosen = np.linalg.norm(posed - wrist, axis=1) < _CROSSED
     else:
-        # Parts count equally, whatever their number of vertices.
+        # Parts are drawn with equal probability, independent of their number of vertices.
         chosen = geometry.vertex_part == rng.integers(len(geometry.part_link))
     points = posed[chosen] if chosen.any() else posed
     return points[rng.integers(len(points))]
 
 
 def perturbed(rng: np.random.Generator, geometry: RobotGeometry, placement: Placement, scale: float) -> Placement:
-    """Placement with simulated kinematic errors: joint errors of some degrees, and a small rotation and translation.
+    """Placement with simulated kinematic errors: joint errors of several degrees, and a small rotation and translation.
 
     A scale of 1 moves the wrist by about 3 mm and rotates joints by about 3 degrees.
     """
@@ -279,13 +280,13 @@ def perturbed(rng: np.random.Generator, geometry: RobotGeometry, placement: Plac
     for index, kind in enumerate(geometry.robot.joint_types):
         if kind == "revolute":
             joints[index] += rng.normal(0, np.deg2rad(3.0) * scale) * (1.0 if geometry.instrument else _STIFF)
-    # The arm rotates about its wrist, so that the error in the image does not grow with the arm's length.
+    # The arm rotates about its wrist, so that the error in the image does not increase with the length of the arm.
     shaft_link = geometry.part_link[geometry.shaft]
     T_camera_shaft = placement.T_camera_base @ geometry.link_transforms(placement.joint_positions)[shaft_link]
     T_camera_shaft_moved = placement.T_camera_base @ geometry.link_transforms(joints)[shaft_link]
     turn = turned(rng.normal(0, np.deg2rad(2.0) * scale, 3))
     wrist = T_camera_shaft[:3, :3] @ geometry.shaft_end + T_camera_shaft[:3, 3]
-    # At a larger distance, the same displacement in the image requires a larger one in space.
+    # At a larger distance, the same displacement in the image requires a larger displacement in space.
     wrist = wrist + rng.normal(0, 0.003 * scale, 3) * max(1.0, np.linalg.norm(wrist) / DEPTH[1])
     R = turn @ T_camera_shaft[:3, :3]
     T = np.eye(4)
@@ -298,13 +299,13 @@ def _random_joints(rng: np.random.Generator, geometry: RobotGeometry) -> np.ndar
     low = np.where(np.isfinite(limits[:, 0]), limits[:, 0], -np.pi)
     high = np.where(np.isfinite(limits[:, 1]), limits[:, 1], np.pi)
     anywhere = rng.uniform(low, high)
-    # Instruments are mostly nearly straight, with nearly closed jaws.
+    # Most instruments are nearly straight, with nearly closed jaws.
     straight = np.clip(rng.normal(0, 0.4, len(low)), low, high)
     return np.where(rng.random(len(low)) < 0.6, straight, anywhere)
 
 
 def _frame(axis: np.ndarray, helper: np.ndarray) -> np.ndarray:
-    """Rotation whose last column is `axis`; `helper` determines the angle about it."""
+    """Rotation whose last column is `axis`; `helper` determines the rotation about this axis."""
     x = np.cross(axis, helper)
     x /= np.linalg.norm(x)
     return np.stack([x, np.cross(axis, x), axis], axis=1)
@@ -321,7 +322,7 @@ def turned(vector: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
 
 
 _FRAMES = 200
-"""Maximum number of frames with joint positions used from the recording."""
+"""Maximum number of frames of the recording whose joint positions are used."""
 _TURN = np.deg2rad(8.0)
 """Standard deviation of an arm's rotation in front of the camera [rad]."""
 _SHIFT = 0.06
@@ -354,7 +355,7 @@ class RecordedPlacements:
     def __call__(
         self, rng: np.random.Generator, geometries: tuple[RobotGeometry, ...], size: tuple[int, int], field: int
     ) -> tuple[Intrinsics, list[Placement]]:
-        """Draw intrinsics and a placement for each robot, with part of the first one in the image.
+        """Draw intrinsics and a placement for each robot, with part of the first robot in the image.
 
         `size` is width and height [px] of the image, a crop of a camera image that is `field` px wide.
 

@@ -12,7 +12,7 @@ from ...files.reading import IMAGE, read_bytes, size_problem
 
 
 def smooth_noise(rng: np.random.Generator, width: int, height: int, cells: float, octaves: int = 3) -> np.ndarray:
-    """Multi-octave noise [height, width] of zero mean and about unit standard deviation.
+    """Multi-octave noise [height, width] with zero mean and approximately unit standard deviation.
 
     `cells` is the number of cells across the width in the coarsest octave.
     """
@@ -29,7 +29,7 @@ def smooth_noise(rng: np.random.Generator, width: int, height: int, cells: float
 
 
 def grain(rng: np.random.Generator, width: int, height: int) -> np.ndarray:
-    """Noise on a scale of some pixels, about unit standard deviation [height, width, 1]."""
+    """Noise with a wavelength of several pixels and approximately unit standard deviation [height, width, 1]."""
     texture = rng.standard_normal((height, width), np.float32)
     texture = cv2.GaussianBlur(texture, (0, 0), rng.uniform(0.5, 2.0))
     return (texture / (texture.std() + 1e-6))[..., None]
@@ -48,7 +48,7 @@ class Photographs:
     """Generator of random crops of the image files in a folder and its subfolders.
 
     Raises:
-        SettingsError: the folder has no image file, or one cannot be read.
+        SettingsError: the folder has no image file, or an image file cannot be read.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -63,12 +63,12 @@ class Photographs:
         return len(self._images)
 
     def __call__(self, rng: np.random.Generator, width: int, height: int) -> Image:
-        """Crop of a photograph, rotated, mirrored, enlarged and with changed colours; RGB in [0, 1]."""
+        """Random crop of a photograph, rotated, mirrored, enlarged and with modified colours; RGB in [0, 1]."""
         image = self._images[int(rng.integers(len(self._images)))]
         rows, columns = image.shape[:2]
         if rng.random() < 0.5:
             image = image[:, ::-1]
-        # The crop is at most as large as the photograph, so that its border is rarely visible.
+        # The crop is not larger than the photograph, so that the border of the photograph is rarely visible.
         largest = min(columns / width, rows / height)
         step = largest * np.exp(rng.uniform(np.log(0.3), 0.0))
         turn = rng.normal(0, 12) + 90 * int(rng.integers(4)) * (rng.random() < 0.3)
@@ -131,7 +131,7 @@ def plain(rng: np.random.Generator, width: int, height: int) -> Image:
 
 
 def foil(rng: np.random.Generator, width: int, height: int) -> Image:
-    """Crumpled metal foil or wet plastic: facets with brightness by random orientation to the light."""
+    """Crumpled metal foil or wet plastic: facets with random orientation to the light."""
     facets = np.zeros((height, width), np.float32)
     for _ in range(int(rng.integers(2, 5))):
         folded = np.abs(smooth_noise(rng, width, height, np.exp(rng.uniform(np.log(3), np.log(24))), 1))
@@ -146,7 +146,7 @@ def foil(rng: np.random.Generator, width: int, height: int) -> Image:
 
 
 def drape(rng: np.random.Generator, width: int, height: int) -> Image:
-    """Cloth in folds."""
+    """Folded cloth."""
     y, x = np.mgrid[:height, :width].astype(np.float32)
     angle, period = rng.uniform(0, np.pi), np.exp(rng.uniform(np.log(14), np.log(90)))
     warp = rng.uniform(0.2, 1.0) * period * smooth_noise(rng, width, height, rng.uniform(2, 6), 2)
@@ -157,7 +157,7 @@ def drape(rng: np.random.Generator, width: int, height: int) -> Image:
 
 
 def _color(rng: np.random.Generator) -> Float[np.ndarray, "3"]:
-    """Random display colour that is not dark: saturated, pale or grey."""
+    """Random saturated, pale or grey display colour that is not dark."""
     kind = rng.random()
     saturation = rng.uniform(0.5, 1.0) if kind < 0.4 else rng.uniform(0.1, 0.5) if kind < 0.7 else rng.uniform(0, 0.08)
     return np.array(colorsys.hsv_to_rgb(rng.random(), saturation, rng.uniform(0.4, 1.0)), np.float32)
@@ -190,7 +190,7 @@ def _panel(rng: np.random.Generator, image: Image) -> Image:
 
 
 def _holes(rng: np.random.Generator, image: Image) -> Image:
-    """Draw a regular grid of dark or light dots, as of a perforated board or a grating."""
+    """Draw a regular grid of dark or light dots, as on a perforated board or a grating."""
     height, width = image.shape[:2]
     y, x = np.mgrid[:height, :width].astype(np.float32)
     angle, period = rng.normal(0, 0.4), np.exp(rng.uniform(np.log(7), np.log(40)))
@@ -251,7 +251,7 @@ def _hand(rng: np.random.Generator, image: Image) -> Image:
 
 
 def _round(rng: np.random.Generator, t: np.ndarray, color: np.ndarray) -> Image:
-    """Colours across a dull or shiny cylinder, at `t` from -1 to 1, under a random light."""
+    """Colours across a matt or shiny cylinder, at `t` from -1 to 1, under a random light."""
     normal = np.sqrt(np.clip(1 - t * t, 0, 1))
     light = rng.uniform(-0.7, 0.7)
     facing = np.clip(light * t + np.sqrt(1 - light**2) * normal, 0, 1)
@@ -287,7 +287,7 @@ _BOARD = np.array(
 def random_background(rng: np.random.Generator, width: int, height: int) -> Image:
     """Random background without shadows, clutter or camera effects, RGB in [0, 1].
 
-    Its mean brightness is at least about 0.25, because training data exclude low light.
+    The mean brightness is at least about 0.25, since training data exclude low light.
     """
     name = rng.choice(list(_SHARES), p=list(_SHARES.values()))
     image = MAKERS[name](rng, width, height).astype(np.float32)
@@ -295,7 +295,7 @@ def random_background(rng: np.random.Generator, width: int, height: int) -> Imag
     mean = image.mean()
     if mean < 0.25:
         image = np.clip(image + (0.25 - mean), 0, 1)
-    # Uneven light: a broad spot and a gradient, never darker than about two thirds.
+    # The light is uneven: a broad spot and a gradient, with a minimum of about two thirds.
     y, x = np.mgrid[:height, :width].astype(np.float32)
     x, y = x / width - rng.uniform(0.1, 0.9), y / height - rng.uniform(0.1, 0.9)
     spot = np.exp(-(x * x + y * y) / (2 * rng.uniform(0.3, 0.9) ** 2))
@@ -333,7 +333,7 @@ def _tissue(rng: np.random.Generator, width: int, height: int) -> Image:
         image = _glare(rng, image)
     if rng.random() < 0.65:
         image = _wet_relief(rng, image)
-    elif rng.random() < 0.5:  # wet spots mirror the light
+    elif rng.random() < 0.5:  # wet spots reflect the light
         wet = smooth_noise(rng, width, height, rng.uniform(15, 45), 2) + 0.5 * relief
         spots = np.clip((wet - rng.uniform(2.0, 3.0)) * 2, 0, 1)[..., None]
         image = image + spots * (rng.uniform(0.7, 1.0) - image)
@@ -341,7 +341,7 @@ def _tissue(rng: np.random.Generator, width: int, height: int) -> Image:
 
 
 def _wet_relief(rng: np.random.Generator, image: np.ndarray) -> np.ndarray:
-    """Add folds lit by a lamp at the lens, with small and large white highlights of a wet surface."""
+    """Add folds illuminated by a lamp at the lens, with small and large white highlights of a wet surface."""
     height, width = image.shape[:2]
     relief = smooth_noise(rng, width, height, np.exp(rng.uniform(np.log(3), np.log(14))), int(rng.integers(1, 4)))
     if rng.random() < 0.4:  # creases
@@ -349,7 +349,7 @@ def _wet_relief(rng: np.random.Generator, image: np.ndarray) -> np.ndarray:
     if rng.random() < 0.5:
         folds = _folds(rng, width, height)
         relief = np.float32(rng.uniform(0.1, 0.5)) * relief + folds * np.float32(rng.uniform(1, 3))
-        image = image * (1 - rng.uniform(0, 0.5) * np.exp(-8 * folds))[..., None]  # dark between folds
+        image = image * (1 - rng.uniform(0, 0.5) * np.exp(-8 * folds))[..., None]  # areas between folds are dark
     steepness = rng.uniform(4, 14)
     slope_x, slope_y = (
         cv2.Sobel(relief, cv2.CV_32F, 1, 0) * steepness / 8,
@@ -358,7 +358,7 @@ def _wet_relief(rng: np.random.Generator, image: np.ndarray) -> np.ndarray:
     y, x = np.mgrid[:height, :width].astype(np.float32)
     focal = rng.uniform(0.8, 1.6) * width
     tilt_x, tilt_y = (x - rng.uniform(0.2, 0.8) * width) / focal, (y - rng.uniform(0.2, 0.8) * height) / focal
-    # The lamp is at the lens, so highlights are where the normal is parallel to the view ray.
+    # Since the lamp is at the lens, highlights are at normals parallel to the view ray.
     facing = (1 + slope_x * tilt_x + slope_y * tilt_y) / np.sqrt(
         (1 + slope_x**2 + slope_y**2) * (1 + tilt_x**2 + tilt_y**2)
     )
@@ -388,7 +388,7 @@ def _folds(rng: np.random.Generator, width: int, height: int) -> np.ndarray:
 
 
 def _glare(rng: np.random.Generator, image: np.ndarray) -> np.ndarray:
-    """Add the reflection of the lamp in a wet bulge: a bright patch, smooth or broken up by roughness, up to white."""
+    """Add the reflection of the lamp on a wet bulge: a bright patch, smooth or with rough edges, up to white."""
     height, width = image.shape[:2]
     y, x = np.mgrid[:height, :width].astype(np.float32)
     centre = rng.uniform(0, 1, 2) * (width, height)

@@ -13,7 +13,7 @@ _COLOR = np.array([0.42, 0.035, 0.03], np.float32)
 
 
 def bleed(rng: np.random.Generator, image: Image, coverage: Float[np.ndarray, "h w"]) -> Image:
-    """Image with blood: pools on the background, films and drops on everything.
+    """Add blood to an image: pools on the background, films and drops on background and arms.
 
     Args:
         image: display colours in [0, 1].
@@ -24,7 +24,7 @@ def bleed(rng: np.random.Generator, image: Image, coverage: Float[np.ndarray, "h
     depth = pools * np.exp(rng.uniform(np.log(0.5), np.log(6)))
     stained = _patches(rng, width, height, rng.uniform(0.0, 0.7), np.exp(rng.uniform(np.log(4), np.log(30))))
     films = stained * np.exp(rng.uniform(np.log(0.1), np.log(4)))
-    # An arm that dips into a pool is covered by it; mostly it is above.
+    # Pools cover arms that dip into them; most arms are above the pools.
     dips = rng.uniform(0.3, 1.0) if rng.random() < 0.2 else 0.0
     depth = depth * (1 - coverage * (1 - dips)) + films * coverage
     for _ in range(rng.choice([0, 3, 12], p=[0.4, 0.4, 0.2])):
@@ -38,14 +38,14 @@ def bleed(rng: np.random.Generator, image: Image, coverage: Float[np.ndarray, "h
 
 
 def _patches(rng: np.random.Generator, width: int, height: int, share: float, cells: float) -> np.ndarray:
-    """Smooth-edged patches that cover about a share of the image, in [0, 1]."""
+    """Patches with smooth edges that cover approximately a share of the image, in [0, 1]."""
     noise = smooth_noise(rng, width, height, cells, int(rng.integers(1, 4)))
     level = np.quantile(noise, 1 - share) if share > 0 else noise.max()
     return np.clip((noise - level) * np.float32(rng.uniform(1.5, 12)), 0, 1)
 
 
 def _drop(rng: np.random.Generator, depth: np.ndarray) -> np.ndarray:
-    """Add a drop or a run of blood."""
+    """Add a drop or a trickle of blood."""
     height, width = depth.shape
     layer = np.zeros_like(depth)
     start = rng.uniform(0, 1, 2) * (width, height)

@@ -1,4 +1,5 @@
-"""Random serial robots for training images: three to seven joints, links of cylinders, boxes and spheres, a gripper."""
+"""Random serial robots for training images, with three to seven joints, links of cylinders, boxes and spheres, and a
+gripper."""
 
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -34,7 +35,7 @@ def _urdf(rng: np.random.Generator) -> str:
     bent = rng.random() < 0.3
     for index in range(joints):
         axis = ("0 0 1", "0 1 0", "1 0 0")[0 if index % 2 == 0 else int(rng.integers(1, 3))]
-        # Some arms are offset sideways at their joints, as those of light robots are.
+        # Links of some arms are offset sideways at the joints, as in lightweight robots.
         aside = radii[index] * rng.uniform(-1.5, 1.5) if bent else 0.0
         shape = _visuals(rng, lengths[index + 1], radii[index + 1])
         if index == joints - 1:
@@ -49,7 +50,7 @@ def _urdf(rng: np.random.Generator) -> str:
 
 
 def _visuals(rng: np.random.Generator, length: float, radius: float) -> str:
-    """Shapes of a link along z: a joint housing, and a tube, box or pair of rails."""
+    """URDF visuals of a link along z: a joint housing, and a tube, box or pair of rails."""
     housing = radius * rng.uniform(1.0, 1.5)
     shapes = [f'<sphere radius="{housing:.4f}"/>', f'<cylinder radius="{housing:.4f}" length="{2 * housing:.4f}"/>']
     visuals = [_visual(shapes[int(rng.integers(2))], "0 0 0", "1.5708 0 0" if rng.random() < 0.5 else "0 0 0")]

@@ -1,7 +1,7 @@
 """Distractors of training images: solid objects, small items, occluders and shadows.
 
 Solid objects (rods, plates, cables, tools) are shaded like the arms, so that neither gloss nor shape alone identifies
-an instrument. The occluded surface of an arm remains the label.
+an instrument. The label remains the occluded surface of an arm.
 """
 
 import cv2
@@ -20,7 +20,7 @@ _DEPTH = (0.05, 0.40)
 
 
 def add_things(rng: np.random.Generator, image: Image, intrinsics: Intrinsics) -> Image:
-    """Draw one to four random objects on a background, with shadows beside them."""
+    """Draw one to four random objects and their shadows on a background."""
     height, width = image.shape[:2]
     things = [random_thing(rng) for _ in range(rng.choice([1, 2, 3, 4], p=[0.4, 0.3, 0.2, 0.1]))]
     posed = [_placed(rng, thing, intrinsics, width, height) for thing in things]
@@ -36,7 +36,7 @@ def add_things(rng: np.random.Generator, image: Image, intrinsics: Intrinsics) -
 
 
 def random_thing(rng: np.random.Generator) -> Body:
-    """Random rod, plate, rail, cable, tool or ring, some centimetres large and centred at its origin."""
+    """Random rod, plate, rail, cable, tool or ring with a size of several centimetres, centred at the origin."""
     kinds = [_rod, _plate, _rails, _cable, _tool, _ring]
     make = kinds[int(rng.choice(len(kinds), p=[0.3, 0.2, 0.12, 0.16, 0.14, 0.08]))]
     parts = make(rng)
@@ -87,7 +87,7 @@ def _plate(rng: np.random.Generator) -> list[Part]:
 
 
 def _rails(rng: np.random.Generator) -> list[Part]:
-    """Parallel bars, round or square, as of a frame or a rack."""
+    """Parallel bars, round or square, as in a frame or a rack."""
     radius, length, gap = _log_uniform(rng, 0.001, 0.008), rng.uniform(0.1, 0.5), _log_uniform(rng, 0.008, 0.05)
     square, parts = rng.random() < 0.5, []
     for index in range(int(rng.integers(2, 6))):
@@ -114,7 +114,7 @@ def _cable(rng: np.random.Generator) -> list[Part]:
 
 
 def _tool(rng: np.random.Generator) -> list[Part]:
-    """Two crossing bars, as of scissors, pliers and tweezers, often with finger rings."""
+    """Two crossing bars, as in scissors, pliers and tweezers, often with finger rings."""
     length, thickness = rng.uniform(0.06, 0.2), _log_uniform(rng, 0.0015, 0.005)
     opening, joint = rng.uniform(0.02, 0.35), rng.uniform(-0.4, 0.4) * length
     parts: list[Part] = []
@@ -187,7 +187,7 @@ def _box(extents: np.ndarray, centre: np.ndarray) -> Part:
 
 
 def _normals(vertices: np.ndarray, faces: np.ndarray) -> Float[np.ndarray, "V 3"]:
-    """Vertex normals: area-weighted means over adjacent triangles; their sign is irrelevant (see `render_gbuffer`)."""
+    """Vertex normals: area-weighted means over adjacent triangles, with irrelevant sign (see `render_gbuffer`)."""
     a, b, c = (vertices[faces[:, corner]] for corner in range(3))
     cross, normals = np.cross(b - a, c - a), np.zeros_like(vertices)
     for corner in range(3):
@@ -212,7 +212,8 @@ def _turn_about_y(angle: float) -> np.ndarray:
 
 
 def occlude(rng: np.random.Generator, image: Image, coverage: Float[np.ndarray, "h w"]) -> Image:
-    """Cover the arms with one to three ragged or smooth occluders of any texture but red; no change without arms."""
+    """Cover the arms with one to three ragged or smooth occluders without red texture; images without arms are
+    unchanged."""
     rows, columns = np.nonzero(coverage > 0.5)
     if not len(rows):
         return image
@@ -225,9 +226,10 @@ def occlude(rng: np.random.Generator, image: Image, coverage: Float[np.ndarray, 
 
 
 def _texture(rng: np.random.Generator, width: int, height: int) -> Image:
-    """Random texture without red: blood on instruments is part of the evaluation, so it is excluded from training."""
+    """Random texture without red, since training data exclude blood on instruments, which is part of the evaluation."""
     texture = random_background(rng, width, height).astype(np.float32) * rng.uniform(0.6, 1.2)
-    # Where red is the strongest channel, it is swapped with the second strongest; this leaves no visible edges.
+    # Where red is the strongest channel, it is swapped with the second strongest channel, which causes no visible
+    # edges.
     red, strongest = texture[..., 0].copy(), 1 + texture[..., 1:].argmax(2)[..., None]
     other = np.take_along_axis(texture, strongest, 2)[..., 0]
     texture[..., 0] = np.minimum(red, other)
@@ -260,22 +262,23 @@ def add_clutter(rng: np.random.Generator, image: Image) -> Image:
 
 
 def cast_shadow(rng: np.random.Generator, image: Image, coverage: Float[np.ndarray, "h w"]) -> Image:
-    """Darken the background by the arms' soft shadow: their silhouette, displaced, rotated and blurred.
+    """Darken the background by a soft shadow of the arms: the displaced, rotated and blurred silhouette.
 
-    The arms are composited later, so the shadow is visible only beside them.
+    The arms are composited later, so the shadow is visible only beside the arms.
     """
     width = coverage.shape[1]
     reach = np.exp(rng.uniform(np.log(0.01), np.log(0.35))) * width
     moved = _displaced(rng, coverage, reach, turn=6, scale=(0.9, 1.15))
     soft = cv2.GaussianBlur(moved, (0, 0), np.clip(reach * rng.uniform(0.03, 0.2), 0.6, 8))
-    # Close to the arm, a shadow can be nearly black.
+    # Close to an arm, a shadow may be nearly black.
     return _darken(rng, image, soft, 0.9 if reach < 0.08 * width else 0.6)
 
 
 def contact_shadow(
     rng: np.random.Generator, image: Image, coverage: Float[np.ndarray, "h w"], darkness: float
 ) -> Image:
-    """Draw a sharp shadow beside the arms, about as bright as the arms (`darkness` [1]): only its shape differs."""
+    """Draw a sharp shadow beside the arms, with a brightness similar to the arms (`darkness` [1]), so that only its
+    shape differs."""
     reach = np.exp(rng.uniform(np.log(0.006), np.log(0.06))) * coverage.shape[1]
     moved = _displaced(rng, coverage, reach, turn=2, scale=(1.0, 1.0))
     shape = cv2.GaussianBlur(moved, (0, 0), rng.uniform(0.4, 1.5))[..., None]
@@ -289,7 +292,8 @@ def contact_shadow(
 def _displaced(
     rng: np.random.Generator, coverage: np.ndarray, reach: float, turn: float, scale: tuple[float, float]
 ) -> np.ndarray:
-    """Silhouette shifted by `reach` [px] in a random direction, randomly rotated (std `turn` [deg]) and scaled."""
+    """Silhouette shifted by `reach` [px] in a random direction, rotated by a random angle (standard deviation `turn`
+    [deg]), and scaled."""
     height, width = coverage.shape
     heading = rng.uniform(0, 2 * np.pi)
     centre = rng.uniform(0, width), rng.uniform(0, height)
@@ -304,7 +308,7 @@ def _darken(rng: np.random.Generator, image: np.ndarray, shape: np.ndarray, stro
 
 
 def _streak(rng: np.random.Generator, image: np.ndarray) -> np.ndarray:
-    """Draw a tapered dark band with soft edges, through which the texture is visible: a shadow, not an instrument."""
+    """Draw a tapered dark band with soft edges and visible texture, which is a shadow instead of an instrument."""
     height, width = image.shape[:2]
     start, heading = rng.uniform(-0.1, 1.1, 2) * (width, height), rng.uniform(0, 2 * np.pi)
     length = rng.uniform(0.2, 1.3) * width
@@ -325,7 +329,7 @@ def _streak(rng: np.random.Generator, image: np.ndarray) -> np.ndarray:
 
 
 def _object(rng: np.random.Generator, image: np.ndarray) -> np.ndarray:
-    """Draw a small opaque object with some shading, such as a swab, clip or fold."""
+    """Draw a small opaque object with shading, such as a swab, clip or fold."""
     height, width = image.shape[:2]
     shape = np.zeros((height, width), np.float32)
     centre = rng.uniform(0, 1, 2) * (width, height)

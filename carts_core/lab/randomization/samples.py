@@ -45,7 +45,7 @@ _CONTACT = 0.4
 
 @dataclass(frozen=True)
 class Observation:
-    """Observed image with the scene that it was rendered from."""
+    """Observed image with its scene."""
 
     image: Float[np.ndarray, "h w 3"]
     """RGB in [0, 1]."""
@@ -53,12 +53,12 @@ class Observation:
     placements: list[Placement]
     """Poses of the arms."""
     claimed: list[Placement]
-    """Prior poses of the arms: equal to the true ones, except for absent arms."""
+    """Prior poses of the arms, equal to the true poses except for absent arms."""
     intrinsics: Intrinsics
     view: GBuffer
-    """Surfaces at the pixel centres."""
+    """Surface points at the pixel centres."""
     fine: GBuffer
-    """Surfaces at `SUPERSAMPLING` times the resolution."""
+    """Surface points at `SUPERSAMPLING` times the resolution."""
     coverage: Float[np.ndarray, "h w"]
     """Share of each pixel that shows an arm."""
     background: Float[np.ndarray, "h w 3"]
@@ -68,7 +68,7 @@ class Observation:
 
 
 class Observer:
-    """Generator of observed images; each depends only on the seed and its number."""
+    """Generator of observed images; an image depends only on the seed and its number."""
 
     def __init__(self, robots: Sequence[Robot], settings: ImageSettings, seed: int | Sequence[int]) -> None:
         self._seed = (seed,) if isinstance(seed, int) else tuple(seed)
@@ -81,7 +81,7 @@ class Observer:
         self._variants: dict[tuple[int, int], tuple[Variant, int]] = {}
 
     def __call__(self, number: int | None = None) -> Observation:
-        """Observation of a number, from 0; by default the next one."""
+        """Generate the observation with a number, from 0; by default the next observation."""
         number = self._next if number is None else number
         self._next = number + 1
         self.rng = np.random.default_rng((*self._seed, _OBSERVATIONS, number))
@@ -103,7 +103,7 @@ class Observer:
         )
 
     def _variant(self, arms: int, number: int) -> Variant:
-        """Scene from a small pool with gradual renewal, because building one costs as much as several images."""
+        """Scene from a small pool with gradual renewal, since creating a scene takes as long as several images."""
         place, settings = int(self.rng.integers(_VARIANTS)), self.settings
         # One entry of the pool is renewed at a time.
         life = number // _VARIANT_LIFE + place
@@ -118,7 +118,7 @@ class Observer:
         return variant
 
     def _visible_placements(self, variant: Variant) -> tuple[Intrinsics, list[Placement], GBuffer]:
-        """Draw placements until the visible area of the arms is within bounds, at most `_TRIES` times."""
+        """Draw placements until the visible area of the arms is within bounds, for at most `_TRIES` times."""
         settings, rng = self.settings, self.rng
         size = settings.width, settings.height
         tries = 0
@@ -232,14 +232,14 @@ class TrainingPair:
 
 
 class PairGenerator:
-    """Generator of training pairs; each depends only on the seed and its number."""
+    """Generator of training pairs; a pair depends only on the seed and its number."""
 
     def __init__(self, robots: Sequence[Robot], settings: ImageSettings, seed: int | Sequence[int]) -> None:
         self._observer = Observer(robots, settings, seed)
         self._settings = settings
 
     def __call__(self, number: int | None = None) -> TrainingPair:
-        """Training pair of a number, from 0; by default the next one."""
+        """Generate the training pair with a number, from 0; by default the next pair."""
         seen = self._observer(number)
         rng, settings = self._observer.rng, self._settings
         rendered = seen.placements
@@ -258,7 +258,7 @@ class PairGenerator:
         )
 
     def _mean_background(self, background: np.ndarray, camera_seed: int) -> np.ndarray:
-        """Mean background BG_m: the scene without arms and camera noise; sometimes another scene."""
+        """Mean background BG_m: the scene without arms and camera noise, or sometimes another scene."""
         rng, appearance = self._observer.rng, self._settings.appearance
         if rng.random() < self._settings.same_background:
             image = photograph(np.random.default_rng(camera_seed), background, appearance)
@@ -292,11 +292,11 @@ class PairGenerator:
 
 
 def _classes(variant: Variant, view: GBuffer, mask: np.ndarray | None) -> np.ndarray:
-    """Class per pixel; with `mask`, an antialiased instrument mask, classes are adapted to it."""
+    """Class per pixel, adapted to `mask` (an antialiased instrument mask) if given."""
     shafts = np.array([geometry.shaft for geometry in variant.geometries])
     classes = view.image(np.where(view.part == shafts[view.arm], SHAFT, HEAD).astype(np.uint8))
     if mask is not None:
-        # A pixel in the mask whose centre is not covered takes the class of a neighbour.
+        # Pixels of the mask with an uncovered centre have the class of a neighbour.
         grown = cv2.dilate(classes, np.ones((3, 3), np.uint8))
         classes = np.where(mask, np.where(classes > 0, classes, np.maximum(grown, SHAFT)), BACKGROUND).astype(np.uint8)
     return classes
@@ -325,17 +325,17 @@ class SurfaceSample:
 
 
 class SurfaceGenerator:
-    """Generator of surface samples; each depends only on the seed and its number."""
+    """Generator of surface samples; a sample depends only on the seed and its number."""
 
     def __init__(self, robots: Sequence[Robot], settings: ImageSettings, seed: int | Sequence[int]) -> None:
         self._observer = Observer(robots, settings, seed)
 
     def __call__(self, number: int | None = None) -> SurfaceSample:
-        """Surface sample of a number, from 0; by default the next one."""
+        """Generate the surface sample with a number, from 0; by default the next sample."""
         return self.samples(number, 1)[0]
 
     def samples(self, number: int | None, priors: int) -> list[SurfaceSample]:
-        """Samples of one image with `priors` different prior surface maps."""
+        """Generate samples of one image with `priors` different prior surface maps."""
         seen = self._observer(number)
         size = self._observer.settings.width, self._observer.settings.height
         image, surface = to_uint8(seen.image), _surface(seen.variant.geometries, seen.fine, size)

@@ -1,6 +1,7 @@
 """Deferred shading of observed training images: G-buffer, microfacet highlights, lights, environment, lens.
 
-It intentionally differs from the optimizer's Phong shading, so that the network does not overfit to one shader.
+The shading intentionally differs from the optimizer's Phong shading, so that the network does not overfit to one
+shader.
 """
 
 from collections.abc import Sequence
@@ -32,7 +33,7 @@ class GBuffer:
     normals: Float[np.ndarray, "n 3"]
     """Unit normals in the camera frame, pointing towards the camera."""
     points_link: Float[np.ndarray, "n 3"]
-    """Surface points in the frame of their link, for textures that move with it [m]."""
+    """Surface points in the frame of their link, for textures that are fixed to the link [m]."""
 
     def image(self, values: np.ndarray, empty: float = 0.0) -> np.ndarray:
         """Scatter per-pixel values [n, ...] into an image [height, width, ...]."""
@@ -83,7 +84,7 @@ def _barycentric(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     wu, wv = _dot(w, u), _dot(w, v)
     scale = 1.0 / np.maximum(uu * vv - uv * uv, 1e-24)
     s, t = (vv * wu - uv * wv) * scale, (uu * wv - uv * wu) * scale
-    # Avoids extrapolated normals due to round-off on sliver triangles.
+    # This avoids extrapolated normals because of rounding for sliver triangles.
     s, t = np.clip(s, 0, 1), np.clip(t, 0, 1)
     return np.stack([np.clip(1 - s - t, 0, 1), s, t], axis=1).astype(np.float32)
 
@@ -92,13 +93,14 @@ Image = Float[np.ndarray, "h w 3"]
 
 
 def photograph(rng: np.random.Generator, image: Image, ranges: AppearanceRanges) -> Image:
-    """Apply random vignette, blur, exposure, colour, noise and JPEG artefacts from `ranges`; result in [0, 1]."""
+    """Apply random vignette, blur, exposure, colour, noise and JPEG artefacts within `ranges`; the result is in [0,
+    1]."""
     height, width = image.shape[:2]
     image = image * _vignette(rng, width, height, ranges)
     sigma = rng.uniform(*ranges.blur)
     if sigma > 0.2:
         image = cv2.GaussianBlur(image, (0, 0), sigma)
-    if rng.random() < 0.25:  # sharpening by the camera, which leaves bright seams along dark shafts
+    if rng.random() < 0.25:  # sharpening by the camera, which causes bright seams along dark shafts
         image = image + rng.uniform(0.2, 1.0) * (image - cv2.GaussianBlur(image, (0, 0), rng.uniform(0.7, 1.5)))
     image = tone(rng, image, ranges)
     sigma = rng.uniform(*ranges.noise)
@@ -121,7 +123,7 @@ def photograph(rng: np.random.Generator, image: Image, ranges: AppearanceRanges)
 
 
 def tone(rng: np.random.Generator, image: Image, ranges: AppearanceRanges) -> Image:
-    """Apply random exposure, white balance, contrast and tone curve only."""
+    """Apply only random exposure, white balance, contrast and tone curve."""
     factor = rng.uniform(*ranges.brightness) * rng.uniform(*ranges.white_balance, size=3)
     # The brightness floor applies to the whole image, before white balance.
     factor *= max(1.0, ranges.brightness[0] / factor.mean())
@@ -139,7 +141,7 @@ def _vignette(rng: np.random.Generator, width: int, height: int, ranges: Appeara
         light = light * np.exp(
             rng.uniform(0, ranges.unevenness) * smooth_noise(rng, width, height, rng.uniform(2, 5), 1)
         )
-        # The mean brightness is kept, because training data exclude low light.
+        # The mean brightness is unchanged, since training data exclude low light.
         light = light / light.mean()
     return np.clip(light, 0.35, 1.6)[..., None]
 
@@ -150,7 +152,7 @@ _GAMMA = 1 / 2.2
 
 @dataclass(frozen=True)
 class _Surface:
-    """Material of each of n pixels."""
+    """Material of n pixels."""
 
     albedo: Float[np.ndarray, "n 3"]
     roughness: Float[np.ndarray, " n"]
@@ -160,7 +162,7 @@ class _Surface:
 def shade(
     rng: np.random.Generator, gbuffer: GBuffer, geometries: Sequence[Body], ambience: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "n 3"]:
-    """Display colours in [0, 1] of the pixels of `gbuffer`, with random materials, lights and environment.
+    """Shade the pixels of `gbuffer` with random materials, lights and environment; returns display colours in [0, 1].
 
     The arms reflect `ambience`, the mean colour of the background.
     """
@@ -182,7 +184,8 @@ def shade(
 
 
 def _light(gbuffer, view, n_v, roughness, base, body, position, radiance) -> np.ndarray:
-    """Cook-Torrance with the GGX distribution, Schlick's Fresnel and Smith's shadowing in Karis' short form."""
+    """Cook-Torrance shading with the GGX distribution, Schlick's Fresnel term and Smith's shadowing in Karis'
+    approximation."""
     to_light = position - gbuffer.points
     distance = np.linalg.norm(to_light, axis=1, keepdims=True)
     light = to_light / distance
@@ -202,7 +205,7 @@ def _light(gbuffer, view, n_v, roughness, base, body, position, radiance) -> np.
 
 
 def _random_lights(rng: np.random.Generator, distance: float) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Positions [m] and radiances of one or two lights at the lens and others on the camera's side."""
+    """Positions [m] and radiances of one or two lights at the lens, and of further lights on the camera's side."""
     lights = []
     at_lens = rng.integers(1, 3)
     for index in range(at_lens + rng.integers(0, 3)):
@@ -229,7 +232,7 @@ def _reflections(rng, gbuffer, view, n_v, roughness, base, body, ambience) -> np
 
 
 def _random_environment(rng: np.random.Generator, ambience: np.ndarray) -> np.ndarray:
-    """Random environment map: a floor in the background's colour and some bright windows, whose reflections in a
+    """Random environment map: a floor with the colour of the background, and bright windows, whose reflections in a
     cylinder are the long highlights of a shaft."""
     rows, columns = _ENVIRONMENT
     level = rng.uniform(0.1, 0.7)
@@ -249,7 +252,7 @@ def _look_up(environment: np.ndarray, direction: np.ndarray) -> np.ndarray:
     rows, columns = environment.shape[:2]
     u = (np.arctan2(direction[:, 0], direction[:, 2]) / (2 * np.pi) + 0.5) * (columns - 1)
     v = (np.arcsin(np.clip(direction[:, 1], -1, 1)) / np.pi + 0.5) * (rows - 1)
-    # OpenCV's remap limits an image to 32,767 rows, so the list of pixels is reshaped to a square.
+    # OpenCV's remap supports at most 32,767 rows, so the list of pixels is reshaped to a square.
     side = int(np.ceil(np.sqrt(len(u))))
     grid = np.zeros((2, side * side), np.float32)
     grid[0, : len(u)], grid[1, : len(v)] = u, v
@@ -308,7 +311,7 @@ def _random_metal(rng: np.random.Generator) -> tuple[np.ndarray, float, float]:
 
 
 def _grime(rng: np.random.Generator, points: np.ndarray) -> np.ndarray:
-    """Smooth noise over the surface, zero mean, about unit standard deviation."""
+    """Smooth noise on the surface with zero mean and approximately unit standard deviation."""
     noise = np.zeros(len(points), np.float32)
     for _ in range(4):
         wave = rng.normal(size=3)

@@ -70,7 +70,7 @@ class Bleeding:
                 depth[there] = self._film((surface.position[there] - T_world_link[:3, 3]) @ T_world_link[:3, :3])
         pooled = smoothstep(depth, 0.00002, 0.00025)
 
-        # Pools hide the highlights of the surface below.
+        # Pools cover the highlights of the surface below.
         dull = np.minimum(light, 1.3 * cv2.GaussianBlur(light.astype(np.float32), (0, 0), light.shape[1] / 100))
         base = light + (dull - light) * (pooled * on_tissue)[..., None]
         through = np.exp(-2.0 * depth[..., None] * _ABSORPTION)
@@ -84,7 +84,8 @@ class Bleeding:
 
         normal = self._wet_normal(surface, x, y)
         aligned = np.clip((normal * to_eye).sum(axis=-1), 0.0, 1.0)
-        # The light is beside the lens, so the half vector is the view direction: D of a Blinn lobe, Fresnel of water.
+        # Since the light is beside the lens, the half vector is the view direction: distribution of a Blinn lobe,
+        # Fresnel term of water.
         lobe = np.where(on_tissue, 350.0, 60.0)
         glint = 0.025 * (lobe + 2.0) / (8.0 * np.pi) * aligned**lobe * lamp / distance**2 * pooled
         return (base * through + own + glint[..., None]).astype(np.float32)
@@ -95,7 +96,7 @@ class Bleeding:
         return _FILM_DEPTH * (0.25 * smoothstep(above, -0.05, 0.10) + smoothstep(above, 0.0, 1.0))
 
     def _wet_normal(self, surface: Surface, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """Normals of the blood's surface, which is flatter than the tissue below and has small waves."""
+        """Normals of the blood surface, which is flatter than the tissue below and has small waves."""
         slope = np.stack([sample(self._waves[..., axis], x, y) for axis in (0, 1)], axis=-1)
         waves = np.concatenate([-0.35 * slope, np.zeros((*slope.shape[:-1], 1))], axis=-1)
         soft = cv2.GaussianBlur(surface.normal.astype(np.float32), (0, 0), surface.normal.shape[1] / 60)
@@ -104,7 +105,7 @@ class Bleeding:
 
 
 def _level_of(field: np.ndarray, share: float) -> float:
-    """Threshold exceeded by a share of the field's values; above its maximum for a share of 0."""
+    """Threshold that is exceeded by a share of the values of a field; above their maximum for a share of 0."""
     return float(np.quantile(field, 1.0 - share)) if share > 0 else float(field.max()) + 10.0
 
 
@@ -115,7 +116,7 @@ _CONTRAST = 0.95
 _BACKSCATTER = 0.024
 """Share of the extinguished light scattered back to the lens, including multiple scattering [1/sr]."""
 _LAMP_SIZE = 0.060
-"""Distance below which the falloff of light is softened from the inverse square law by scattering [m]."""
+"""Distance below which scattering softens the inverse square law of light [m]."""
 
 
 class Smoke:
@@ -129,7 +130,7 @@ class Smoke:
     def density(self, points: Float[np.ndarray, "*n 3"], time: float) -> Float[np.ndarray, "*n"]:
         """Extinction coefficient [1/m] at points [m] and a time [s]."""
         config = self._config
-        # Two noise fields move in different directions; smoke is dense where both are high, so its shape varies.
+        # Two noise fields move in different directions. Smoke is dense where both values are high, so its shape varies.
         total = np.zeros(points.shape[:-1], dtype=np.float32)
         for field, wind in zip(self._fields, self._winds, strict=True):
             places = (points - wind * config.smoke_speed * time) * (_SMOKE_GRID / 3 / config.smoke_wavelength)
@@ -155,8 +156,9 @@ class Smoke:
         """
         height, width = light.shape[:2]
         small = (max(width // 3, 1), max(height // 3, 1))
-        # Smoke is smooth, so a third of the resolution suffices, but depth must stay sharp at instruments: rays are
-        # marched at the coarse resolution up to the farthest point, and each pixel is evaluated at its own distance.
+        # A third of the resolution suffices, since smoke is smooth, but depth must remain sharp at instruments. Rays
+        # are marched at the coarse resolution up to the farthest point, and each pixel is evaluated at its own
+        # distance.
         offsets = positions - lens
         distance = np.linalg.norm(offsets, axis=-1).astype(np.float32)
         rays = cv2.resize((offsets / distance[..., None]).astype(np.float32), small, interpolation=cv2.INTER_AREA)
@@ -175,13 +177,13 @@ class Smoke:
             optical += share * cv2.resize(slab, (width, height), interpolation=cv2.INTER_CUBIC)
             glow += share * cv2.resize(slab_glow.astype(np.float32), (width, height), interpolation=cv2.INTER_CUBIC)
             depth_so_far += slab
-        # Light crosses the smoke twice, but forward-scattered light is not lost: hence a factor below 2.
+        # Light crosses the smoke twice, but forward-scattered light is not lost, so the factor is below 2.
         seen = light * np.exp(-1.2 * optical)[..., None]
         return seen + glow[..., None] * np.array([0.98, 1.0, 1.02], np.float32)
 
 
 class SmokeOverlay:
-    """Smooth white pattern blended over the final image, independent of depth: the usual augmentation."""
+    """Smooth white pattern blended over the final image, independent of depth, as in common augmentations."""
 
     def __init__(self, opacity: float, rng: np.random.Generator) -> None:
         self._opacity = opacity
@@ -189,7 +191,7 @@ class SmokeOverlay:
         self._drift = rng.normal(size=2)
 
     def over(self, image: UInt8[np.ndarray, "h w 3"], time: float = 0.0) -> UInt8[np.ndarray, "h w 3"]:
-        """Image blended with the pattern, which moves by about 5 % of the width per second."""
+        """Blend an image with the pattern, which moves by about 5 % of the width per second."""
         height, width = image.shape[:2]
         shift = np.asarray(self._drift, np.float32) * 25.0 * time
         rows, columns = np.indices((height, width), dtype=np.float32) * (512.0 / width)
@@ -224,7 +226,7 @@ def expose(
     """
     height, width = light.shape[:2]
     scale = width / 640.0
-    image = np.minimum(light, 30.0).astype(np.float32)  # the brightest glints would otherwise bloom over the image
+    image = np.minimum(light, 30.0).astype(np.float32)  # the brightest glints would bloom over the image
     y, x = np.indices((height, width), dtype=np.float32) + 0.5
     radius = np.hypot(x - width / 2, y - height / 2) / np.hypot(width / 2, height / 2)
     image = image * (1.0 - config.vignette * radius**2.4)[..., None]
@@ -252,10 +254,10 @@ def linear(image: UInt8[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w 3"]:
 
 
 def _motion_blur(image: np.ndarray, motion: np.ndarray, taps: int = 5) -> np.ndarray:
-    """Average the image along each pixel's motion; the motion field is dilated so that edges are blurred, too."""
+    """Average the image along the motion of each pixel; the motion field is dilated, so that edges are also blurred."""
     if np.abs(motion).max() < 0.25:
         return image
-    # A moving instrument also blurs the tissue beside it, so its motion must extend beyond its outline.
+    # A moving instrument also blurs the adjacent tissue, so its motion must extend beyond its outline.
     speed = np.hypot(motion[..., 0], motion[..., 1])
     reach = int(np.ceil(min(speed.max(), 12.0))) * 2 + 1
     kernel = np.ones((reach, reach), np.uint8)
@@ -287,7 +289,7 @@ def _noisy(image: np.ndarray, config: SensorConfig, rng: np.random.Generator) ->
 
 @dataclass(frozen=True)
 class View:
-    """View of one frame in one camera, before any condition is applied."""
+    """View of a frame in a camera, without any condition."""
 
     frame: int
     time: float
@@ -299,7 +301,7 @@ class View:
     lamp: float
     """Radiant intensity of the light at the lens, in the unit of `light` times square metres."""
     other_light: Float[np.ndarray, "h w 3"] | None
-    """Linear RGB with the other background; None if that domain is not rendered."""
+    """Linear RGB with the other background; None if the domain is not rendered."""
     surface: Surface
     motion: Float[np.ndarray, "h w 2"] | None
     """Image motion while the shutter is open [px]."""
@@ -309,7 +311,7 @@ class View:
 
 
 class Conditions:
-    """Renders all domains of a view; `tissue` is the regular background, which bleeds."""
+    """Renderer of all domains of a view; blood is on `tissue`, the regular background."""
 
     def __init__(self, config: SynthesisConfig, tissue: Tissue) -> None:
         self._config = config

@@ -1,8 +1,8 @@
-"""Placement and smooth motion of the arms, in view and above the tissue, and simulated measurement errors.
+"""Placement and smooth motion of the arms in view and above the tissue, and simulated measurement errors.
 
 Tissue, light, smoke and blood are designed for an endoscope at a distance of 0.1 m. Distant cameras, for other robots,
-are rendered at that scale with a miniature of the arm; poses are written at full scale, since images do not determine
-scale.
+are rendered at this scale with a miniature of the arm. Poses are written at full scale, since images do not determine
+the scale.
 """
 
 from collections import Counter
@@ -34,7 +34,8 @@ def measure(
     """Measured joint positions T_m = T + bias + drift(t) + noise(t), [rad] or [m] per joint as in `truth`.
 
     Raises:
-        SettingsError: the error has neither one value per joint nor one more, for the jaws that some tools lack.
+        SettingsError: the number of values in the error is neither the number of joints nor one more (jaws, which some
+            tools lack).
     """
     dofs = truth.shape[-1]
     if len(error.bias) not in (dofs, dofs + 1):
@@ -55,20 +56,21 @@ _LIMIT_MARGIN = 0.05
 _NUDGE = 1e-6
 _NEWTON_STEPS = 12
 _CONVERGED = 1e-9
-"""Newton step [rad, m] below which the next one, by quadratic convergence, is below floating-point precision."""
+"""Newton step [rad, m] after which the next step is below floating-point precision, because of quadratic
+convergence."""
 _BORDER = 0.08
 """Minimum distance of the tips from the image border, as a share of the image size [1]."""
 _MARGIN = 0.1
 """Margin around the image within which collisions are checked, as a share of the image size [1]."""
 _INWARDS = (np.array([0.55, 0.45, -0.70]), np.array([-0.60, 0.35, -0.72]))
-"""Direction of the jaws at mid-range in the world, per arm: towards the other arm and down."""
+"""Direction of the jaws in the world, with joints at mid-range, per arm: towards the other arm and down."""
 
 
 Motion = TypeVar("Motion")
 
 
 class Rejected(Exception):
-    """A random motion cannot be used; the message gives the reason."""
+    """A random motion cannot be used; the message is the reason."""
 
 
 def plan_motion(
@@ -76,7 +78,7 @@ def plan_motion(
 ) -> tuple[Float[np.ndarray, "frames dofs"], ...]:
     """True joint positions of each arm [rad, m].
 
-    Random splines are drawn until one stays within the joint limits, in view, and free of collisions.
+    Random splines are drawn until a motion is within the joint limits, in view, and free of collisions.
 
     Raises:
         SettingsError: no motion that satisfies the settings was found.
@@ -93,7 +95,7 @@ def plan_motion(
 
 
 def random_motion(draw: Callable[[np.random.Generator], Motion], config: SynthesisConfig) -> Motion:
-    """Draw random motions until one is not rejected.
+    """Draw random motions until a motion is not rejected.
 
     `draw` returns a motion or raises `Rejected`.
 
@@ -129,10 +131,10 @@ def _spline(config: SynthesisConfig, rng: np.random.Generator, spread: np.ndarra
 def reach_tip(
     arm: Arm, tip_link: str, targets_world: Float[np.ndarray, "n 3"], joints: Float[np.ndarray, "n dofs"]
 ) -> Float[np.ndarray, "n dofs"]:
-    """Inverse kinematics: yaw, pitch and insertion that bring the tip to each target; other joints are fixed.
+    """Inverse kinematics: yaw, pitch and insertion with the tip at each target; other joints are fixed.
 
-    Newton's method on the forward kinematics. The three joints are the shaft's spherical coordinates about the
-    remote centre, so it converges in a few steps from a nearby start.
+    Newton's method on the forward kinematics. The three joints are the spherical coordinates of the shaft about the
+    remote centre, so the method converges in a few steps from a nearby start.
     """
     solution = torch.from_numpy(joints.copy())
     goals = torch.from_numpy((targets_world - arm.T_world_base[:3, 3]) @ arm.T_world_base[:3, :3])
@@ -174,7 +176,8 @@ def _draw(
 
 
 def _wrist_middle(arm: Arm, number: int, config: SynthesisConfig, rng: np.random.Generator) -> Float[np.ndarray, " 3"]:
-    """Roll, wrist pitch and wrist yaw [rad] that point the jaws inwards and down: the best of many random samples."""
+    """Roll, wrist pitch and wrist yaw [rad] with the jaws pointing inwards and down: the best of many random
+    samples."""
     joints = np.zeros((600, len(arm.robot.joint_names)))
     joints[:, 2] = 0.14
     joints[:, 3] = rng.uniform(-1.8, 1.8, len(joints))
@@ -193,7 +196,7 @@ def _wrist_middle(arm: Arm, number: int, config: SynthesisConfig, rng: np.random
 def check_clearance(
     clouds: Sequence[list[np.ndarray]], tissues: Sequence[Tissue], camera: Camera, clearance: float
 ) -> None:
-    """Raise `Rejected` if visible instruments come too close to each other or to the tissue in any frame."""
+    """Raise `Rejected` if visible instruments are too close to each other or to the tissue in a frame."""
     for frame in zip(*clouds, strict=True):
         seen = [points[_seen(points, camera, _MARGIN)] for points in frame]
         for points in seen:
@@ -211,7 +214,7 @@ def in_view(tips_world: np.ndarray, camera: Camera) -> bool:
 
 
 def _seen(points_world: Float[np.ndarray, "n 3"], camera: Camera, margin: float) -> Bool[np.ndarray, " n"]:
-    """Whether each point is in the image, enlarged by `margin` as a share of its size."""
+    """Whether each point is in the image, enlarged by `margin` as a share of the image size."""
     T, (fx, fy, cx, cy) = camera.T_camera_world, camera.intrinsics
     x, y, z = (points_world @ T[:3, :3].T + T[:3, 3]).T
     z_or_near = np.maximum(z, NEAR)
@@ -241,7 +244,7 @@ def clouds(arm: Arm, positions: np.ndarray, body: list[np.ndarray]) -> list[np.n
 ARM_NAME = "arm"
 
 INSTRUMENT_DISTANCE = 0.3
-"""Distance of the camera up to which the world is rendered at its true scale [m]."""
+"""Camera distance up to which the world is rendered at its true scale [m]."""
 
 _USUAL = 0.1
 """Distance of the camera in the reduced world [m]."""
@@ -253,16 +256,17 @@ _ERROR = {"revolute": (0.02, 0.004, 0.0005), "prismatic": (0.002, 0.0004, 0.0000
 """Default bias, drift and noise of a joint [rad, m], used if the settings are those of an instrument."""
 
 _TURN = 0.6
-"""Random spread of the direction from which the arm enters the image (three standard deviations) [rad]."""
+"""Random range (three standard deviations) of the direction from which the arm enters the image [rad]."""
 
 
 def enlargement(config: EndoscopeConfig) -> float:
-    """Scale of the world relative to the rendered one [1]."""
+    """Scale of the world, relative to the rendered world [1]."""
     return config.distance / _USUAL if config.distance > INSTRUMENT_DISTANCE else 1.0
 
 
 def measurement_error(robot: Robot, error: MeasurementError) -> MeasurementError:
-    """Measurement error as set; typical values for the robot's joint types if the settings are an instrument's."""
+    """Given measurement error; typical values for the robot's joint types if the settings are those of an
+    instrument."""
     if error != MeasurementError():
         return error
     values = [_ERROR[kind] for kind in robot.joint_types]
@@ -273,14 +277,14 @@ def measurement_error(robot: Robot, error: MeasurementError) -> MeasurementError
 def plan_arm(
     robot: Robot, tissues: Sequence[Tissue], camera: Camera, config: SynthesisConfig, scale: float
 ) -> tuple[Arm, Float[np.ndarray, "frames dofs"]]:
-    """Pose of the arm and its true joint positions [rad, m], with the tip near the image centre.
+    """Plan the pose of an arm and its true joint positions [rad, m], with the tip near the image centre.
 
     Args:
         robot: robot of the arm.
         tissues: tissues that the arm must not touch, in the reduced world.
         camera: camera in the reduced world.
         config: motion and seed.
-        scale: scale of the world relative to the reduced one [1].
+        scale: scale of the world, relative to the reduced world [1].
 
     Raises:
         SettingsError: no motion that satisfies the settings was found.
@@ -318,7 +322,7 @@ def _draw_arm(robot: Robot, config: SynthesisConfig, rng: np.random.Generator) -
 
 
 def _placed(robot: Robot, tip: Float[np.ndarray, "3"], camera: Camera, rng: np.random.Generator, scale: float) -> Arm:
-    """Arm whose tip, given in the base frame [m], is at the work point, and which enters from beside the camera."""
+    """Arm that enters from beside the camera, with its tip, given in the base frame [m], at the work point."""
     right, down, forward = camera.T_camera_world[:3, :3]
     side = rng.choice((-1.0, 1.0))
     direction = -side * right - 0.5 * down + 0.35 * forward + rng.normal(0.0, _TURN / 3, 3)

@@ -1,4 +1,4 @@
-"""Path-traced radiance (Mitsuba 3, `scalar_rgb`), independent of the optimizer's renderer."""
+"""Path tracing with Mitsuba 3 (`scalar_rgb`), independent of the optimizer's renderer."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,9 +19,9 @@ from ...settings import RenderConfig
 from .scene import Tissue
 
 LIGHTS_CAMERA = ((-0.0042, -0.0030, 0.0), (0.0042, -0.0030, 0.0))
-"""Ends of the two light guides beside the lens, in the camera frame [m]."""
+"""Positions of the two light guides beside the lens, in the camera frame [m]."""
 INTENSITY = 0.0055
-"""Radiant intensity of each light [1/sr]; only ratios matter, since exposure is adjusted."""
+"""Radiant intensity of each light [1/sr]; only ratios matter, since the exposure is adjusted."""
 _TINT = (1.02, 1.0, 0.94)
 NEAR = 0.002
 """Distance of the near plane [m]."""
@@ -46,7 +46,7 @@ class Part:
     """Posed mesh of an instrument."""
 
     link: int
-    """Index of the link, counted over all arms, for `Surface.link`."""
+    """Index of the link over all arms, for `Surface.link`."""
     vertices: Float[np.ndarray, "v 3"]
     """Vertices in the world [m]."""
     normals: Float[np.ndarray, "v 3"]
@@ -70,7 +70,7 @@ class Surface:
 
 
 class PathTracer:
-    """Renders instruments over a patch of tissue, with the lights beside the first camera.
+    """Renderer of instruments over a patch of tissue, with the lights beside the first camera.
 
     Raises:
         CartsError: Mitsuba is not installed.
@@ -101,7 +101,7 @@ class PathTracer:
         scene = self._instruments(parts) | self._tissue
         integrator = {"type": "path", "max_depth": self._config.bounces, "rr_depth": 16}
         samples = -(-self._config.samples // len(LIGHTS_CAMERA))
-        # One light at a time: random light selection would dominate the image noise.
+        # The lights are rendered separately, since random light selection would dominate the image noise.
         total = np.zeros((camera.height, camera.width, 3), np.float32)
         for number, place in enumerate(LIGHTS_CAMERA):
             light = {
@@ -115,7 +115,7 @@ class PathTracer:
     def coverage(self, parts: Sequence[Part], camera: Camera, samples: int = 16) -> Float[np.ndarray, "h w"]:
         """Share of each pixel that instruments cover in front of the tissue, in [0, 1].
 
-        Instruments are rendered black against luminous tissue and surroundings, so that both sides of a mesh count.
+        Instruments are rendered in black over luminous tissue and surroundings, so that both sides of a mesh count.
         """
         scene = self._instruments(parts, _BLACK)
         glow = {"type": "area", "radiance": {"type": "rgb", "value": 1.0}}
@@ -138,7 +138,7 @@ class PathTracer:
         return Surface(position, normal, links[shape], depth)
 
     def _instruments(self, parts: Sequence[Part], material: dict[str, Any] | None = None) -> dict[str, Any]:
-        """Mitsuba shapes of the parts, all with `material` or each with its own."""
+        """Mitsuba shapes of the parts, with `material` or their own materials."""
         meshes = {
             f"a_part_{number:03d}": self._mesh(
                 f"part{number}", part.vertices, part.faces, material or part.material, normals=part.normals
@@ -185,7 +185,7 @@ class PathTracer:
         self, scene: dict[str, Any], integrator: dict[str, Any], camera: Camera, samples: int, seed: int
     ) -> np.ndarray:
         fx, _, cx, cy = camera.intrinsics
-        # Mitsuba's camera has x to the left and y up; ours has x to the right and y down.
+        # In Mitsuba's camera frame, x is left and y up; in ours, x is right and y down.
         T_world_sensor = np.linalg.inv(camera.T_camera_world) @ np.diag([-1.0, -1.0, 1.0, 1.0])
         scene = scene | {
             "integrator": integrator,
@@ -236,7 +236,7 @@ def _without_specks(image: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w
 
 
 _DARK = 0.3
-"""Brightness below which parts are rendered as plastic, like the longest part of the shaft [1]."""
+"""Brightness below which parts are rendered as plastic, as is the longest part of the shaft [1]."""
 
 
 @dataclass(frozen=True)
@@ -248,16 +248,16 @@ class Stage:
 
     arms: tuple[Arm, ...]
     joints: tuple[Float[np.ndarray, "frames dofs"], ...]
-    """True joint positions [rad, m], one table per arm."""
+    """True joint positions of each arm [rad, m]."""
     times: Float[np.ndarray, " frames"]
     """Time of each frame [s]."""
     scale: float = 1.0
-    """Scale of the arms and their world relative to the rendered world [1]."""
+    """Scale of the arms and their world, relative to the rendered world [1]."""
     painted: bool = False
-    """Whether to render the robots' own colours instead of an instrument's materials."""
+    """Whether the robots are rendered in their own colours instead of with the materials of an instrument."""
 
     def Ts_world_link(self, frame: int, time_offset: float = 0.0) -> dict[int, Float[np.ndarray, "4 4"]]:
-        """Pose of every link at a frame, shifted by `time_offset` [s]."""
+        """Pose of every link at the time of a frame plus `time_offset` [s]."""
         transforms = []
         for arm, joints in zip(self.arms, self.joints, strict=True):
             positions = joints[frame]

@@ -35,7 +35,7 @@ def smooth_noise(
     frequency = np.sqrt(sum(axis**2 for axis in np.meshgrid(*axes, indexing="ij", sparse=True)))
     response = np.zeros_like(frequency)
     for octave in range(octaves):
-        # Each band has the same energy at any wavelength, since the number of modes grows as f^dimensions.
+        # The number of modes is proportional to f^dimensions, so each band has the same energy at any wavelength.
         center = 2.0**octave / wavelength
         band = np.exp(-0.5 * ((frequency - center) / (0.35 * center)) ** 2)
         energy = np.sqrt((band**2).sum())
@@ -60,14 +60,14 @@ JOINT_TYPES = ("revolute", "revolute", "prismatic", "revolute", "revolute", "rev
 """Types of yaw, pitch, insertion, roll, wrist pitch, wrist yaw and jaw; instruments without jaws lack the last."""
 
 _REMOTE_CENTRES_CAMERA = ((-0.092, 0.062, 0.006), (0.098, -0.010, 0.002))
-"""Points at which the instruments pass the body wall, in the frame of the left camera [m]."""
+"""Points at which the instruments pass through the body wall, in the frame of the left camera [m]."""
 
 WORK_POINTS = ((-0.011, -0.001, 0.014), (0.012, 0.002, 0.014))
 """World points at which the instruments point with centred joints [m]."""
 
 
 def place_cameras(config: EndoscopeConfig) -> tuple[Camera, ...]:
-    """Left camera and, if set, the right one beside it."""
+    """Left camera and, in stereo, right camera."""
     forward = np.array([0.0, np.cos(config.elevation), -np.sin(config.elevation)])
     right = np.array([1.0, 0.0, 0.0])
     rotation = np.stack([right, np.cross(forward, right), forward])
@@ -94,7 +94,7 @@ def load_robot(config: SynthesisConfig) -> Robot:
 
 
 def is_instrument(robot: Robot) -> bool:
-    """Whether the joints are those of a PSM: all seven, or all but the last."""
+    """Whether the joints are the joints of a PSM: all seven, or all except the last."""
     return robot.joint_types in (JOINT_TYPES, JOINT_TYPES[:-1])
 
 
@@ -157,12 +157,13 @@ _KINDS = {
     "fat": _Kind((0.56, 0.36, 0.145), (0.46, 0.20, 0.085), (0.45, 0.15, 0.11), 0.26, 0.0022, 0.0016, 9, 0.38),
 }
 KINDS = tuple(_KINDS)
-"""Names of the kinds of tissue, for `grow_tissue`."""
+"""Kinds of tissue, for `grow_tissue`."""
 
 
 @dataclass(frozen=True)
 class Tissue:
-    """Patch of tissue around the world origin, z up; rows and columns of fields are y and x from -EXTENT / 2."""
+    """Patch of tissue around the world origin, z up; rows and columns of fields are y and x, starting at -EXTENT /
+    2."""
 
     heights: Float[np.ndarray, "n n"]
     """Height above z = 0 at the grid points [m]."""
@@ -205,7 +206,7 @@ def grow_tissue(kind: str, resolution: int, texels: int, rng: np.random.Generato
 
     patches = paint.grown(0.060, 0.003, octaves=4, gain=0.42)
     patch = smoothstep(patches, *np.quantile(patches, [1.0 - look.patch_share - 0.12, 1.0 - look.patch_share + 0.10]))
-    crests = np.exp(-((paint.grown(0.040, 0.005) / 0.5) ** 2))  # along the zero crossings
+    crests = np.exp(-((paint.grown(0.040, 0.005) / 0.5) ** 2))  # vessels are along the zero crossings
     folds = crests * smoothstep(paint.noise(0.080), -0.6, 1.0)
     lobules = np.minimum(np.abs(paint.grown(0.011, 0.002)), 1.2)
     vessels = paint.vessels(look.vessels)
@@ -225,7 +226,7 @@ def grow_tissue(kind: str, resolution: int, texels: int, rng: np.random.Generato
     color *= 1.0 + 0.05 * paint.noise(0.0012, octaves=2)[..., None]
 
     roughness = look.roughness + 0.05 * paint.noise(0.012, octaves=2) + 0.10 * patch
-    # Walls around the centre, so that the tissue fills every image.
+    # The tissue rises around the centre, so that it fills every image.
     unit = np.linspace(-EXTENT / 2, EXTENT / 2, resolution)
     radius = np.hypot(*np.meshgrid(unit, unit))
     cavity = (6.0 * np.maximum(radius - 0.050, 0.0) ** 2).astype(np.float32)
@@ -237,7 +238,7 @@ def grow_tissue(kind: str, resolution: int, texels: int, rng: np.random.Generato
 
 
 class _Canvas:
-    """Random patterns over the patch of tissue; lengths in metres."""
+    """Random patterns on the patch of tissue, with lengths in metres."""
 
     def __init__(self, texels: int, rng: np.random.Generator) -> None:
         self._texels, self._rng = texels, rng
@@ -249,7 +250,7 @@ class _Canvas:
         return smooth_noise((self._texels,) * 2, wavelength * self.scale, self._rng, octaves=octaves, gain=gain)
 
     def grown(self, wavelength: float, amount: float, octaves: int = 1, gain: float = 0.5) -> np.ndarray:
-        """Domain-warped noise, which yields organic shapes."""
+        """Domain-warped noise, which has organic shapes."""
         rows, columns = np.indices((self._texels,) * 2, dtype=np.float32)
         shift = np.float32(amount * self.scale)
         columns, rows = columns + shift * self._warp[0], rows + shift * self._warp[1]

@@ -1,4 +1,4 @@
-"""Synthesis of a sequence, written to disk."""
+"""Synthesis of a sequence on disk."""
 
 import csv
 import hashlib
@@ -26,7 +26,7 @@ from .path_tracer import INTENSITY, LIGHTS_CAMERA, PathTracer, Stage
 from .scene import KINDS, Tissue, grow_tissue, is_instrument, load_robot, place_arms, place_cameras
 
 Progress = Callable[[str, int, int], None]
-"""Called with a description, the number of finished steps, and the total."""
+"""Callback with a description, the number of finished steps, and the total."""
 
 
 def write_table(
@@ -49,12 +49,12 @@ def write_table(
 def synthesize(config: SynthesisConfig, output: OutputPath | Path | str, progress: Progress | None = None) -> Path:
     """Render a sequence of two instruments, or of one arm of another robot, in all domains of the settings.
 
-    Files are written to a folder beside `output` and moved there at the end. A stopped run resumes if it is started
-    again with the same settings.
+    Files are written to a folder beside `output`, which is renamed at the end. A stopped run is resumed by a call with
+    the same settings.
 
     Args:
         config: settings of the synthesis.
-        output: folder of the sequence; it must be missing or empty.
+        output: folder of the sequence, which must be missing or empty.
         progress: called after each frame.
 
     Returns:
@@ -130,7 +130,7 @@ def _robot_reference(robot: Path, output: Path) -> str:
 
 
 class _Tracing:
-    """Renders frames one by one into the work folder."""
+    """Renderer of single frames into the work folder."""
 
     def __init__(
         self, config: SynthesisConfig, stage: Stage, cameras: tuple[Camera, ...], tissue: Tissue, other: Tissue
@@ -160,7 +160,7 @@ class _Tracing:
     def _view(self, frame: int, number: int) -> tuple[View, np.ndarray]:
         camera, stage = self._cameras[number], self._stage
         if not self._gains:
-            # The first frame determines the exposure of the sequence, as for a camera without automatic exposure.
+            # The first frame determines the exposure of the sequence, as with a camera without automatic exposure.
             first = [self._radiance(tracer, 0, 0) for tracer in self._tracers]
             self._gains = [exposure_gain(radiance, self._config.sensor) for radiance in first]
         light = [
@@ -191,7 +191,7 @@ class _Tracing:
 
 
 def _grow_tissues(config: SynthesisConfig) -> tuple[Tissue, Tissue]:
-    """Regular background, and another one of a different kind."""
+    """Regular background, and a background of a different kind."""
     kinds = config.rng("kinds").permutation(KINDS)[:2]
     size = config.render.tissue_resolution, config.render.texture_resolution
     regular, other = (grow_tissue(kind, *size, config.rng("tissue", i)) for i, kind in enumerate(kinds))
@@ -199,7 +199,7 @@ def _grow_tissues(config: SynthesisConfig) -> tuple[Tissue, Tissue]:
 
 
 def _name(frame: int) -> str:
-    """Id of a frame: 001 for the first."""
+    """Id of a frame, starting at 001."""
     return f"{frame + 1:03d}"
 
 

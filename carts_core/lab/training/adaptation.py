@@ -29,7 +29,7 @@ from ..randomization.samples import Observer, to_uint8
 from .training import TrainingResult
 
 JUDGING_STREAM = 2
-"""Random stream of the synthetic images for comparison; 0 and 1 are those of training and validation."""
+"""Random stream of the synthetic images for comparison; streams 0 and 1 are used for training and validation."""
 _SIZE = (320, 240)
 """Width and height of a synthetic image [px]."""
 _OFF_DEG = 2.0
@@ -41,17 +41,17 @@ _MOVED = 3.0
 """Tip displacement in the recording beyond which edge support must increase [px]."""
 
 Progress = Callable[[str, int, int], None]
-"""Called with a description, the number of finished fits, and the total."""
+"""Callback with a description, the number of finished fits, and the total."""
 
 
 @dataclass(frozen=True)
 class Fits:
-    """Metrics of fits to synthetic images with known joints, and to frames of the recording."""
+    """Metrics of fits to synthetic images with known joints and to frames of the recording."""
 
     dice: float
     """Mean Dice of synthetic images [1]."""
     made_parts: float
-    """Mean share of true instrument pixels in synthetic images at which the fit shows the correct part [1]."""
+    """Mean share of true instrument pixels in synthetic images with the correct part in the fit [1]."""
     made_tips: float
     """Mean tip error in synthetic images [px]."""
     good: int
@@ -59,14 +59,15 @@ class Fits:
     edges: float
     """Mean image gradient along the outlines of arms and parts, relative to that of the whole images [1]."""
     parts: float
-    """Mean over frames of the smaller of the shares of rendered wrist and jaw pixels predicted as that part [1]."""
+    """Mean over frames of the smaller of two shares: rendered wrist pixels predicted as wrist, and rendered jaw pixels
+    predicted as jaws [1]."""
     tips: tuple[Float[np.ndarray, "tips 2"], ...]
-    """Tips of each frame in the first camera [px]; NaN outside the image."""
+    """Positions of the tips in the first camera, by frame [px]; NaN outside the image."""
 
 
 @dataclass(frozen=True)
 class Judgement:
-    """Comparison of fits with the initial and with the adapted weights, on the same images."""
+    """Comparison of fits with the initial and the adapted weights, for the same images."""
 
     before: Fits
     after: Fits
@@ -80,7 +81,7 @@ class Judgement:
         return float(known.mean()) if len(known) else 0.0
 
     def worse(self) -> list[str]:
-        """Metrics that are worse with the adapted weights; empty if the weights may be offered."""
+        """Metrics that are worse with the adapted weights; empty if the weights are acceptable."""
         was, now, moved = self.before, self.after, self.tips_moved
         pixels, steady = "of the pixels", _EDGES * was.edges <= now.edges <= was.edges
         checks = {
@@ -110,13 +111,13 @@ class Judgement:
 def judge(
     config: TrainingConfig, before: Path, after: Path, *, made: int, own: int, progress: Progress = lambda *_: None
 ) -> Judgement:
-    """Compare fits to synthetic images and to frames of the recording with two weights files.
+    """Compare fits to synthetic images and frames of the recording between two weights files.
 
     Args:
         config: settings of the adaptation run, with its recording, robots and images.
         before, after: weights files of the surface network.
         made, own: number of synthetic images, and of evenly spaced frames of the recording.
-        progress: called before every fit.
+        progress: called before each fit.
 
     Raises:
         SequenceError: the recording cannot be read.
@@ -150,7 +151,7 @@ class MadeImage:
 
     scene: Scene
     frame: Frame
-    """Frame whose measured joint positions are the perturbed true ones."""
+    """Frame whose measured joint positions are the perturbed true joint positions."""
 
     def score(self, network: FeatureExtractor) -> tuple[float, float, float]:
         """Fit the image; returns Dice, share of correct parts, and mean tip error [px]."""
@@ -167,7 +168,8 @@ class MadeImage:
 
 
 def made_images(config: TrainingConfig, number_of_images: int) -> Iterator[MadeImage]:
-    """Uncropped images without occluders from the training distribution, used in neither training nor validation."""
+    """Uncropped images without occluders from the training distribution, which are not used in training or
+    validation."""
     width, height = _SIZE
     images = replace(
         config.images, width=width, height=height, field_width=width, occluded=0.0, absent=0.0, coverage=(0.02, 0.5)
@@ -242,12 +244,12 @@ def _tips_in_view(scene: Scene, state: SceneState) -> Float[np.ndarray, "tips 2"
 
 
 STEPS = 400
-"""Default number of steps, if neither steps nor time are given."""
+"""Default number of steps if neither steps nor time are given."""
 _VALIDATION_EVERY = 40
 BACKGROUNDS = "backgrounds"
 """Name of the run's folder with backgrounds of the recording, without arms."""
 _FROM_RECORDING = 0.5
-"""Share of training backgrounds that are crops of these."""
+"""Share of training backgrounds that are crops of backgrounds of the recording."""
 _LEARNING_RATE = 6e-4
 _WARMUP = 15
 _AVERAGE = 0.97
@@ -258,7 +260,7 @@ _PATIENCE = 5
 FITS = "fits.json"
 """File name of the report that compares fits with the initial and the adapted weights."""
 REFUSED = "refused.safetensors"
-"""File name of weights that are not offered, because a metric became worse."""
+"""File name of weights that are not offered because a metric is worse."""
 
 
 @dataclass(frozen=True)
@@ -266,9 +268,9 @@ class Offer:
     """Adapted weights with the result of the comparison."""
 
     weights: Path
-    """Weights file, renamed if a metric became worse."""
+    """Weights file, renamed if a metric is worse."""
     worse: list[str]
-    """Metrics that became worse; empty if the weights are offered."""
+    """Metrics that are worse; empty if the weights are offered."""
     lines: list[str]
     """Summary of the metrics before and after."""
 
@@ -276,12 +278,12 @@ class Offer:
 def adapted_to(recording: Path, output: Path, given: TrainingConfig) -> TrainingConfig:
     """Settings that adapt the surface network to a recording, whose backgrounds are written to `output`.
 
-    Robots, initial weights, steps and time are taken from `given` unless they have default values there.
+    Robots, initial weights, steps and time are those of `given`, except for values equal to the defaults.
 
     Args:
-        recording: sequence file; only the background without arms is used from its images.
+        recording: sequence file; its images are only used for the background without arms.
         output: folder of the run, created after the recording was read.
-        given: settings for everything else.
+        given: all other settings.
 
     Raises:
         SequenceError: the recording cannot be read.
@@ -317,7 +319,7 @@ def adapted_to(recording: Path, output: Path, given: TrainingConfig) -> Training
 
 
 def _write_backgrounds(sequence: Sequence, output: Path) -> int:
-    """Write the backgrounds without arms of a sequence's cameras; returns the number that could be estimated."""
+    """Write the backgrounds without arms of a sequence's cameras; returns the number of estimated backgrounds."""
     found = 0
     for camera in sequence.scene.cameras:
         background = sequence.mean_background(camera.name)
@@ -329,7 +331,7 @@ def _write_backgrounds(sequence: Sequence, output: Path) -> int:
 
 
 def gain(before: dict[str, float], now: dict[str, float]) -> str:
-    """Summary of a run's progress from two validations of the surface network."""
+    """Summary of the improvement between two validations of the surface network."""
     share = (1 - now["dice"]) / (1 - before["dice"]) if before["dice"] < 1 else np.nan
     dice = f"Dice {before['dice']:.3f} -> {now['dice']:.3f}, remaining error {share:.0%}"
     parts = ", ".join(f"{part} {before[f'dice_{part}']:.3f} -> {now[f'dice_{part}']:.3f}" for part in PARTS)
@@ -339,9 +341,9 @@ def gain(before: dict[str, float], now: dict[str, float]) -> str:
 
 
 def offer(config: TrainingConfig, result: TrainingResult, progress: Progress, made: int, own: int) -> Offer:
-    """Compare fits with the initial and with the adapted weights; adapted weights with a worse metric are set aside.
+    """Compare fits with the initial and the adapted weights; adapted weights with a worse metric are set aside.
 
-    `config` is the result of `adapted_to`, `result` that of the run; other arguments as in `judge`.
+    `config` is the result of `adapted_to`, `result` the result of the run; other arguments are those of `judge`.
     """
     assert config.start is not None
     aside = output_path(result.weights.parent, REFUSED)
@@ -353,7 +355,7 @@ def offer(config: TrainingConfig, result: TrainingResult, progress: Progress, ma
     report = {"worse": worse, "gain": gained, "figures": judgement.lines(), "made": made, "own": own}
     write_text(output_path(result.weights.parent, "report") / FITS, json.dumps(report, indent=1))
     if worse:
-        # The page and later commands load weights only under the usual name.
+        # The page and later commands load only weights with the usual name.
         write_bytes(aside, read_bytes(result.weights, WEIGHTS))
         remove_file(output_path(result.weights.parent, result.weights.name))
     return Offer(aside.path if worse else result.weights, worse, judgement.lines())

@@ -1,4 +1,4 @@
-"""Training images of the surface network on disk: made once, by several processes, and read in random order.
+"""Training images of the surface network on disk, generated once by several processes and read in random order.
 
 A shard is a safetensors file of compressed samples: an image (PNG), its true surface map, and several prior surface
 maps from different kinematic errors.
@@ -48,7 +48,7 @@ class ImageCache:
                 self._files.append(safe_open(path, framework="pt"))
             except (SafetensorError, OSError) as error:
                 raise WeightsError(
-                    f"shard {path} cannot be read ({error}). Delete it, and it is made again."
+                    f"shard {path} cannot be read ({error}). Delete the file to generate it again."
                 ) from error
         self._offsets = [file.get_tensor("offsets").numpy() for file in self._files]
 
@@ -73,10 +73,10 @@ class ImageCache:
 def make_cache(
     folder: Path, config: TrainingConfig, progress: Callable[[int, int], None] = lambda done, total: None
 ) -> None:
-    """Make the missing shards of a folder with `config.workers` processes.
+    """Generate the missing shards of a folder with `config.workers` processes.
 
     Args:
-        progress: called with the numbers of finished and of all images.
+        progress: called with the number of finished images and the total.
     """
     wanted = shards(config.cached)
     missing = [index for index in range(wanted) if not _path(folder, index).exists()]
@@ -93,7 +93,7 @@ def make_cache(
 
 
 def shards(images: int) -> int:
-    """Number of shards of a number of images."""
+    """Number of shards for a number of images."""
     return -(-images // SHARD)
 
 
@@ -128,7 +128,7 @@ def _make(folder: Path, config: TrainingConfig, index: int) -> None:
 
 
 def augmented(rng: np.random.Generator, image: np.ndarray) -> np.ndarray:
-    """Image uint8 with other contrast, exposure and white balance; sometimes grey."""
+    """Randomize contrast, exposure and white balance of an image uint8, and sometimes convert it to grey."""
     values = image.astype(np.float32)
     mean = values.mean((0, 1), keepdims=True)
     values = mean + (values - mean) * np.float32(rng.uniform(*_CONTRAST))

@@ -29,10 +29,10 @@ _MEMORY = 300
 
 
 class _Samples(Dataset):
-    """Data set of training samples by number, so that a resumed run uses the same samples as an uninterrupted one.
+    """Data set of training samples by number, so that a resumed run uses the same samples as an uninterrupted run.
 
-    One of `reuse` samples is generated; the others are drawn from the newest `_MEMORY` generated ones and mirrored at
-    random. Batches are distributed over the workers in turn, and each worker draws from its own samples.
+    One of `reuse` samples is generated; the other samples are drawn from the newest `_MEMORY` generated samples and
+    mirrored at random. Batches are distributed over the workers in turn, and each worker draws from its own samples.
     """
 
     def __init__(self, config: TrainingConfig) -> None:
@@ -55,7 +55,7 @@ class _Samples(Dataset):
         return task.tensors(task.flipped(sample, bool(rng.integers(2)), bool(rng.integers(2))))
 
     def _sample(self, lane: int, number: int, newest: int) -> Any:
-        """Generated sample; regenerated if it was made before the run was interrupted."""
+        """Return a generated sample; samples from before an interruption are generated again."""
         key = lane, number
         if key not in self._made:
             if lane not in self._generators:
@@ -76,7 +76,8 @@ class _Samples(Dataset):
 
 
 class _CachedSamples(Dataset):
-    """Samples drawn from a cache by number: an image, one of its priors, mirrored and with other colours at random."""
+    """Data set of samples drawn from a cache by number: an image with one of its priors, mirrored and with modified
+    colours at random."""
 
     def __init__(self, config: TrainingConfig, shards: int) -> None:
         self._config, self._shards = config, shards
@@ -97,7 +98,8 @@ class _CachedSamples(Dataset):
 
 
 def share_processor() -> None:
-    """One thread and a lower priority than the training process, since the processes occupy all cores."""
+    """Limit this process to one thread and a lower priority than the training process, since the processes occupy all
+    cores."""
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
     os.nice(_NICENESS)
@@ -119,11 +121,11 @@ def _outlive_signals(closing: Event, parent: int, worker: int) -> None:
 
 @contextmanager
 def training_batches(config: TrainingConfig, first_step: int) -> Iterator[Iterator[Batch]]:
-    """Context manager of an endless stream of the task's batches; its exit ends the workers.
+    """Context manager with an endless stream of the task's batches; its exit ends the workers.
 
-    A batch depends on the seed, the number of workers and its number only, not on the first step.
+    A batch depends only on the seed, the number of workers and the number of the batch, not on the first step.
     """
-    # A forked child hangs in OpenMP as soon as the parent has used threads.
+    # A forked child would hang in OpenMP after the parent has used threads.
     spawning = multiprocessing.get_context("spawn")
     closing = spawning.Event()
     loader = DataLoader(

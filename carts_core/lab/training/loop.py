@@ -1,6 +1,6 @@
 """Training loop: optimizer steps with a learning-rate schedule, a time limit, a history, and checkpoints.
 
-A checkpoint is one safetensors file with the whole state of a run; it is replaced atomically.
+A checkpoint is a safetensors file with the complete state of a run, replaced atomically.
 """
 
 import json
@@ -32,7 +32,7 @@ class History:
     """Losses, validations and times of a run."""
 
     losses: list[dict[str, float]] = field(default_factory=list)
-    """One entry per logged step: `step`, `loss` and each term, averaged since the last entry."""
+    """One entry per logged step: `step`, and means of `loss` and its terms since the previous entry."""
     validations: list[dict[str, float]] = field(default_factory=list)
     """One entry per validation: `step` and the metrics of the task."""
     seconds: float = 0.0
@@ -42,7 +42,7 @@ class History:
 
     @property
     def first(self) -> dict[str, float] | None:
-        """The first validation; None before it."""
+        """First validation; None without validations."""
         return next(iter(self.validations), None)
 
 
@@ -65,7 +65,7 @@ def save_checkpoint(
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """State of a run as read from its checkpoint."""
+    """State of a run, read from its checkpoint."""
 
     step: int
     config_json: str
@@ -89,7 +89,7 @@ class Checkpoint:
 
 
 def load_checkpoint(folder: Path) -> Checkpoint | None:
-    """Read the checkpoint of a run; None if there is none yet.
+    """Read the checkpoint of a run; None without a checkpoint.
 
     Raises:
         WeightsError: the file exists but cannot be read.
@@ -115,7 +115,7 @@ Batch = TypeVar("Batch")
 
 
 class TrainingLoop:
-    """Trains a network with AdamW, or resumes the run whose checkpoint is in `output`.
+    """Loop that trains a network with AdamW, or resumes the run whose checkpoint is in `output`.
 
     Args:
         output: folder for the checkpoint.
@@ -123,11 +123,11 @@ class TrainingLoop:
         settings: steps, time limit and learning rate.
         config_json: settings of the run, stored in the checkpoint.
         may_change: names in `config_json` that may differ when the run is resumed.
-        further: further modules whose state is stored, by name.
+        further: other modules whose state is stored, by name.
 
     Raises:
         SettingsError: the folder holds a run with other settings.
-        WeightsError: its checkpoint cannot be read.
+        WeightsError: the checkpoint cannot be read.
     """
 
     def __init__(
@@ -180,11 +180,11 @@ class TrainingLoop:
 
         Args:
             batches: training batches.
-            loss: batch -> the weighted loss, and each term before weighting.
+            loss: batch -> weighted loss, and each term before weighting.
             log_every: steps between entries of the history.
-            logged: called with the mean loss and terms since the last entry, and the wall time per step [s].
+            logged: called with the means of loss and terms since the previous entry, and the wall time per step [s].
             updated: called after each optimizer step.
-            ends: called after each step with whether it is the last planned one; returns whether the run ends.
+            ends: called after each step, with True at the last planned step; returns whether the run ends.
         """
         sums: dict[str, float] = {}
         count, last = 0, False
@@ -223,7 +223,7 @@ class TrainingLoop:
 
     @property
     def planned(self) -> int:
-        """Total number of steps: as set, or fewer if the time limit requires it at the present speed."""
+        """Total number of steps: the given number, or less if the time limit requires it at the current speed."""
         if self._settings.minutes is None or self.step == 0:
             return self._settings.steps
         seconds = self.history.processor_seconds + self._processor_seconds()
@@ -231,7 +231,7 @@ class TrainingLoop:
         return min(self._settings.steps, max(self.step, allowed))
 
     def save(self) -> None:
-        """Write a checkpoint if there are steps since the last one; used when a run is stopped between two steps."""
+        """Write a checkpoint unless the last checkpoint is current; used when a run is stopped between two steps."""
         if self.step > self._saved:
             self._take_time()
             self._checkpoint()
@@ -254,7 +254,7 @@ class TrainingLoop:
 
 
 def _groups(network: nn.Module, settings: TrainingConfig | BaselineTraining) -> list[dict[str, Any]]:
-    """Parameters with the factor of their learning rate: a pretrained encoder learns more slowly."""
+    """Parameter groups with learning-rate factors, which are smaller for a pretrained encoder."""
     if not (isinstance(network, SurfaceNetwork) and isinstance(settings, TrainingConfig)):
         return [{"params": list(network.parameters()), "factor": 1.0}]
     encoder = list(network.encoder.parameters())

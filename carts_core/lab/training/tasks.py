@@ -40,7 +40,7 @@ def dice(predicted: Tensor, truth: Tensor) -> Tensor:
 def pooled_dice(predicted: Bool[Tensor, "n h w"], truth: Bool[Tensor, "n h w"]) -> float:
     """Dice over the pixels of all images together; 1 if both masks are empty.
 
-    A mean over images would be dominated by those without an arm: their Dice is 1, or 0 if a single pixel is wrong.
+    A mean over images would be dominated by images without an arm, whose Dice is 1, or 0 if a single pixel is wrong.
     """
     return float(dice(predicted.flatten(0, 1), truth.flatten(0, 1)))
 
@@ -66,9 +66,9 @@ def consistency_loss(
 ) -> Float[Tensor, ""]:
     """Loss on the cosine similarity of features near the instruments, where ACS compares them.
 
-    Targets of the cosine: 1 where both images show the same class; at most 0 where one shows background and the other
-    an instrument; at most 0.6 where one shows the shaft and the other the head. The terms are averaged separately,
-    since background would otherwise outweigh instruments.
+    Targets of the cosine are 1 for pixels with the same class in both images, at most 0 for background and instrument,
+    and at most 0.6 for shaft and head. The terms are averaged separately, since background would otherwise outweigh
+    instruments.
     """
     overlap = (features_a * features_b).sum(1)
     similarity = overlap * torch.rsqrt(features_a.square().sum(1) * features_b.square().sum(1) + _TINY)
@@ -98,12 +98,12 @@ def _weighted(terms: dict[str, Tensor], weights: object) -> Tensor:
 
 
 def weighted_mean(values: Tensor, weights: Tensor) -> Tensor:
-    """Weighted mean; about zero if all weights are zero."""
+    """Weighted mean; approximately zero if all weights are zero."""
     return (values * weights).sum() / (weights.sum() + 1)
 
 
 class FeatureTask:
-    """Training task of the feature network; stateless, so that each worker can create its own.
+    """Training task of the feature network; stateless, so that each worker can create an instance.
 
     A batch consists of images [batch, 2, 3, h, w] and classes [batch, 2, h, w] of observed and hybrid images, as bytes.
     """
@@ -116,7 +116,7 @@ class FeatureTask:
     }
     """Validation metrics: name -> heading in the report."""
     score: ClassVar[str] = "dice_observed"
-    """Name of the metric by which networks are compared; higher is better."""
+    """Name of the metric by which networks are compared, of which higher values are better."""
 
     def network(self, config: TrainingConfig) -> FeatureNetwork:
         """Network with random weights."""
@@ -132,7 +132,7 @@ class FeatureTask:
         return TrainingPair(*(flips(part, horizontally, vertically) for part in parts))
 
     def tensors(self, sample: Any) -> Batch:
-        """Pair as byte tensors."""
+        """Convert a pair to byte tensors."""
         images = np.stack([sample.observed, sample.hybrid]).transpose(0, 3, 1, 2)
         classes = np.stack([sample.observed_classes, sample.hybrid_classes])
         return torch.from_numpy(np.ascontiguousarray(images)), torch.from_numpy(np.ascontiguousarray(classes))
@@ -156,7 +156,8 @@ class FeatureTask:
         """Validation metrics of a folded network, by the names in `columns`.
 
         `dice_*`: Dice of the predicted mask. `similarity_aligned`: cosine similarity of the features of observed and
-        hybrid image where both show an instrument; `similarity_misaligned`: where only one of them does.
+        hybrid image in pixels where both show an instrument; `similarity_misaligned`: in pixels where only one shows an
+        instrument.
         """
         dices, aligned, misaligned = [], [], []
         device = next(network.parameters()).device
@@ -177,7 +178,7 @@ class FeatureTask:
         }
 
     def worse(self, now: dict[str, float], first: dict[str, float]) -> bool:
-        """Whether a metric other than `score` is worse than at the start; the weights are then rejected."""
+        """Whether a metric other than `score` is worse than at the start, so that the weights are rejected."""
         return False
 
     @torch.no_grad()
@@ -224,7 +225,7 @@ class SurfaceTask:
     columns: ClassVar[dict[str, str]] = {
         "dice": "Dice of the arms",
         "dice_given": "Dice of the given kinematics",
-        "part_accuracy": "pixels with the right part",
+        "part_accuracy": "part accuracy of pixels",
         **{f"dice_{part}": f"Dice of the part {part}" for part in PARTS},
         "tip_error": "error of tips [px]",
         "normal_error_deg": "error of normals [deg]",
@@ -250,7 +251,7 @@ class SurfaceTask:
         return SurfaceSample(observed, given * turn, surface * turn)
 
     def tensors(self, sample: Any) -> Batch:
-        """Sample as byte tensors."""
+        """Convert a sample to byte tensors."""
         return byte_tensor(sample.observed), byte_tensor(sample.given), byte_tensor(sample.surface)
 
     def loss(self, config: TrainingConfig, network: Any, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
@@ -292,7 +293,7 @@ class SurfaceTask:
 
     def worse(self, now: dict[str, float], first: dict[str, float]) -> bool:
         """Whether the Dice of a part or the tip error is worse than at the start."""
-        # Runs of earlier versions lack these metrics.
+        # Runs of earlier versions do not have these metrics.
         names = [name for name in (f"dice_{part}" for part in PARTS) if name in first]
         parts = any(now[name] < first[name] - _PART_WORSE for name in names)
         return parts or now["tip_error"] > first.get("tip_error", math.inf) + _TIP_WORSE
@@ -350,7 +351,7 @@ def _floats(batch: Batch) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _seen(network: AnySurfaceNetwork, images: Tensor, given: Tensor) -> Tensor:
-    """Predicted surface maps of many images, on the images' device; the network may be on another device."""
+    """Predicted surface maps of many images, on the device of the images; the network may be on another device."""
     device = next(network.parameters()).device
     parts = zip(images.split(_AT_ONCE), given.split(_AT_ONCE), strict=True)
     return torch.cat([network(image.to(device), known.to(device)).map().to(images.device) for image, known in parts])

@@ -1,4 +1,4 @@
-"""Training of the networks: `train` runs, resumes and reports."""
+"""Training of the networks: `train` runs or resumes a training and writes a report."""
 
 import json
 import math
@@ -43,7 +43,7 @@ class TrainingProgress:
     validation: dict[str, float] | None
     """Metrics of the latest validation."""
     first: dict[str, float] | None
-    """Metrics of the first validation of the run, including resumed parts."""
+    """Metrics of the run's first validation, including resumed parts."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ class TrainingResult:
 matplotlib.use("Agg")
 
 Panels = list[list[tuple[str, np.ndarray]]]
-"""Titled images per sample; images without colour channels have values from -1 to 1."""
+"""Images with titles, by sample; images without colour channels have values from -1 to 1."""
 
 
 def write_report(folder: OutputPath, config: dict, history: History, columns: dict[str, str], examples: Panels) -> Path:
@@ -165,7 +165,7 @@ def train(
 
 
 class _Run:
-    """Training run: training loop, exponential moving average of the weights, and validations of that average."""
+    """Training run: training loop, exponential moving average of the weights, and validations of the average."""
 
     def __init__(self, config: TrainingConfig, output: Path) -> None:
         torch.manual_seed(config.seed)
@@ -179,7 +179,7 @@ class _Run:
         self.history = self.loop.history
 
     def finish(self, progress: Callable[[TrainingProgress], None]) -> TrainingResult:
-        """Do the remaining steps, validate, and write weights and report."""
+        """Run the remaining steps, validate, and write weights and report."""
         samples = validation_set(self.config)
         validation, loop = None, self.loop
         if self.config.patience is not None and not self.history.validations:
@@ -202,7 +202,7 @@ class _Run:
     def _train(
         self, samples: Batch, validation: dict[str, float] | None, progress: Callable[[TrainingProgress], None]
     ) -> dict[str, float] | None:
-        """Train to the end; returns the latest validation, or `validation` if there was none."""
+        """Train to the end; returns the latest validation, or `validation` without a new one."""
 
         def loss(batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
             return self.task.loss(self.config, self.network, tuple(part.to(self.config.device) for part in batch))
@@ -232,9 +232,9 @@ class _Run:
         return validation
 
     def kept(self) -> str:
-        """Terminal message on the files of a stopped run."""
+        """Message on the files of a stopped run."""
         if self.loop.step == 0:
-            return f"no step was made; any weights in {self.output} are the initial ones"
+            return f"no step was made; any weights in {self.output} are the initial weights"
         return f"{self.output} holds {counted(self.loop.step, 'step')}; rerun the command to resume"
 
     def _averaged(self) -> ImageNetwork:
@@ -243,7 +243,8 @@ class _Run:
         return network
 
     def _score(self, entry: dict[str, float]) -> float:
-        """Score of a validation, higher is better; minus infinity if a metric is worse than at the start."""
+        """Score of a validation, of which higher values are better; minus infinity if a metric is worse than at the
+        start."""
         worse = self.history.first is not None and self.task.worse(entry, self.history.first)
         return -math.inf if worse else entry[self.task.score]
 
@@ -256,7 +257,7 @@ class _Run:
         return validation
 
     def _has_ended_gaining(self) -> bool:
-        """Whether none of the latest `patience` validations is better than the best one before them."""
+        """Whether none of the latest `patience` validations is better than the best earlier validation."""
         patience = self.config.patience
         scores = [self._score(entry) for entry in self.history.validations]
         if patience is None or len(scores) <= patience:
@@ -265,7 +266,7 @@ class _Run:
 
     def _save(self, validation: dict[str, float]) -> None:
         training = {"step": self.loop.step, "validation": validation, "config": json.loads(config_json(self.config))}
-        # The camera's image is 4:3, as of an endoscope; training images are crops of it.
+        # The aspect ratio of the camera image is 4:3, as for an endoscope; training images are crops.
         field, stride = self.config.images.field_width, self._averaged().architecture.stride
         size = tuple(stride * max(round(side / stride), 1) for side in (field, 0.75 * field))
         save_weights(self._averaged(), weights_file(self.config, self.output), training, size)
@@ -278,7 +279,7 @@ def _first_network(config: TrainingConfig) -> ImageNetwork:
     if network.kind != config.network:
         raise SettingsError(
             f"{config.start} holds a {network.kind} network, but a {config.network} network is to be trained. Give "
-            "weights of that kind, or start from random weights."
+            "weights of this kind, or start from random weights."
         )
     return network
 
@@ -296,7 +297,7 @@ def weights_file(config: TrainingConfig, output: Path) -> Path:
 
 
 def config_json(config: TrainingConfig) -> str:
-    """Settings as JSON, with files by name only, so that a run's files can be moved."""
+    """Settings as JSON, with only the names of files, so that the files of a run can be moved."""
     settings = asdict(config)
     settings["start"] = config.start.name if config.start else None
     settings["robots"] = [path.name for path in config.robots]

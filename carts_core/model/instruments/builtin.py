@@ -1,7 +1,7 @@
 """`builtin:NAME`: the shipped robot and the built-in instruments as URDFs with meshes.
 
-Meshes are generated on demand and cached; the shaft, and the wrist and the jaws of the Large Needle Driver, are those
-of the shipped robot.
+Meshes are generated on demand and cached. The shaft, and the wrist and jaws of the Large Needle Driver, are those of
+the shipped robot.
 """
 
 from collections.abc import Iterator
@@ -26,19 +26,19 @@ from .shapes import CHEEK_OUTSIDE, FIRST, SECOND, Electrode, Jaws, Solid, cylind
 
 SCHEME = "builtin:"
 SHIPPED = "psm_lnd"
-"""Name of the robot that is shipped as files."""
+"""Name of the robot whose files are shipped."""
 
 METAL, CARBIDE, TUBE, CABLE, COLLAR = "metal", "carbide", "tube", "cable", "collar"
 _COLORS = {METAL: 0.60, CARBIDE: 0.50, TUBE: 0.20, CABLE: 0.05, COLLAR: 0.35}
 _SLIM_WRIST = 9.1
 _JAW_LOWEST = -0.349066
-"""Lower limit of jaws [rad]; measured angles are negative while they grasp."""
+"""Lower limit of the jaw angle [rad], which is measured as negative while grasping."""
 _TURNED_JAW = 'xyz="0 0 -2.5e-05" rpy="0 3.141592653589793 0"'
 """Pose of the first jaw's mesh in the second jaw of the shipped robot."""
 
 
 def builtin_names() -> tuple[str, ...]:
-    """Names that can follow `builtin:`."""
+    """Names of the built-in robots."""
     return (SHIPPED, *(name + suffix for name in BY_NAME for suffix in ("", SI_SUFFIX)))
 
 
@@ -54,7 +54,7 @@ def robot_file(robot: Path | str) -> Path:
 
 @cache
 def builtin_urdf(name: str) -> Path:
-    """URDF file of a built-in robot; its files are generated in the cache, where differing ones are replaced.
+    """URDF file of a built-in robot. The files are generated in the cache, and differing files are replaced.
 
     Raises:
         RobotError: there is no such robot.
@@ -68,7 +68,7 @@ def builtin_urdf(name: str) -> Path:
     try:
         return _written(name, folder)
     except OutputError:
-        # A cache that cannot be written is not an error.
+        # An unwritable cache is not an error.
         return _written(name, Path(_scratch().name) / name)
 
 
@@ -98,7 +98,7 @@ def _written(name: str, folder: Path) -> Path:
 
 
 def _parts(instrument: Instrument) -> Iterator[tuple[str, str, str, str | Solid]]:
-    """Name, link, material and shape of every mesh: the name of a shipped file, or a solid."""
+    """Name, link, material and shape of every mesh; a shape is the name of a shipped file, or a solid."""
     yield "shaft_tube", "roll_link", TUBE, "shaft_tube"
     yield "shaft_clevis", "roll_link", METAL, "shaft_clevis"
     yield "shaft_cables", "roll_link", CABLE, "shaft_cables"

@@ -1,6 +1,6 @@
-"""The built-in instruments: their names, their published kinematics, and the shapes of their tips.
+"""Built-in instruments: names, published kinematics, and shapes of the tips.
 
-Wrist lengths are those of the dVRK's tool files. Shapes are simplified, with approximately the right sizes.
+Wrist lengths are those of the dVRK's tool files. Shapes are simplified and of approximately correct size.
 """
 
 from dataclasses import dataclass
@@ -23,13 +23,13 @@ class Instrument:
     wrist_length: float
     """Distance from the pitch axis to the yaw axis [mm]."""
     tip: Tip | None
-    """Shape of the tip; None for that of the shipped Large Needle Driver."""
+    """Shape of the tip; None for the shape of the shipped Large Needle Driver."""
     opening: float = 1.39626
     """Maximum angle between the jaws [rad]."""
 
     @property
     def has_jaws(self) -> bool:
-        """Whether there is a joint `jaw`."""
+        """Whether the instrument has a joint `jaw`."""
         return not isinstance(self.tip, Electrode)
 
     @property
@@ -181,6 +181,6 @@ INSTRUMENTS = (
     Instrument("clip_applier", "Clip applier", "230 327", 10.7, ClipApplier(), 0.733),
     Instrument("small_clip_applier", "Small clip applier", "003", 9.1, ClipApplier(18.5, 2.7, 0.9, _SLIM), 0.733),
 )
-"""Built-in instruments, in the order in which they are listed."""
+"""Built-in instruments, in the order of lists."""
 
 BY_NAME = {instrument.name: instrument for instrument in INSTRUMENTS}

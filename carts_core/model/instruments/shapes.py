@@ -1,9 +1,9 @@
 """Shapes of the built-in instruments [mm]: closed meshes from cross-sections, the wide wrist, and the tips.
 
-Meshes of an instrument may overlap, since the renderer shows the outside of their union. The wrist is in the wrist
-pitch link's frame: x to the tip, the pitch axis along z through the origin, the yaw axis parallel to y at x = the
-wrist's length. Tips are in the jaw link's frame: y to the tip, the yaw axis along z; the sign of a jaw is that of its x
-coordinates, and its gripping face is near x = 0.
+Meshes of an instrument may overlap, since the renderer shows the outside of their union. The wrist is in the frame of
+the wrist pitch link: x points to the tip, the pitch axis is z, and the yaw axis is parallel to y at x = wrist length.
+Tips are in the frame of the jaw link: y points to the tip, and the yaw axis is z. The side of a jaw is the sign of its
+x coordinates, and its gripping face is near x = 0.
 """
 
 import itertools
@@ -26,13 +26,13 @@ class Solid:
     """Vertex indices, counter-clockwise seen from outside."""
 
     def mirrored(self, axis: int) -> "Solid":
-        """The solid mirrored along one axis."""
+        """Copy mirrored along one axis."""
         vertices = self.vertices.copy()
         vertices[:, axis] *= -1
         return Solid(vertices, self.faces[:, ::-1])
 
     def moved(self, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> "Solid":
-        """The solid translated by (x, y, z) [mm]."""
+        """Copy translated by (x, y, z) [mm]."""
         return Solid(self.vertices + np.array([x, y, z]), self.faces)
 
 
@@ -66,7 +66,7 @@ def loft(rings: Float[np.ndarray, "rings n 3"]) -> Solid:
 
 
 def turned(profile: Sequence[tuple[float, float]], axis: str, segments: int = 28) -> Solid:
-    """Solid of revolution from a profile of (radius, height) [mm]; heights increase, radii are positive."""
+    """Create a solid of revolution from a profile of (radius, height) [mm]; heights increase, radii are positive."""
     angles = np.arange(segments) * (2 * np.pi / segments)
     circle = np.stack([np.cos(angles), np.sin(angles), np.zeros(segments)], axis=1)
     rings = [circle * (radius, radius, 0.0) + (0.0, 0.0, height) for radius, height in profile]
@@ -74,7 +74,7 @@ def turned(profile: Sequence[tuple[float, float]], axis: str, segments: int = 28
 
 
 def cylinder(radius: float, low: float, high: float, axis: str, segments: int = 28) -> Solid:
-    """A cylinder from `low` to `high` [mm] along an axis, with a small bevel."""
+    """Create a cylinder from `low` to `high` [mm] along an axis, with a small bevel."""
     bevel = min(0.12, 0.2 * radius, 0.2 * (high - low))
     profile = [(radius - bevel, low), (radius, low + bevel), (radius, high - bevel), (radius - bevel, high)]
     return turned(profile, axis, segments)
@@ -101,7 +101,7 @@ def plate(outline: Sequence[tuple[float, float]], low: float, high: float, axis:
 
 
 def wire(path: Float[np.ndarray, "n 3"], radii: float | Sequence[float], sides: int = 12) -> Solid:
-    """A round wire along a polyline [mm]; its cross-section is carried along without twist."""
+    """Create a round wire along a polyline [mm], with a cross-section that does not twist."""
     points = np.asarray(path, dtype=float)
     steps = np.diff(points, axis=0)
     steps /= np.linalg.norm(steps, axis=1, keepdims=True)
@@ -119,7 +119,7 @@ def wire(path: Float[np.ndarray, "n 3"], radii: float | Sequence[float], sides: 
 
 
 def bar(stations: Float[np.ndarray, "n 5"], roundness: float = 0.35) -> Solid:
-    """A bar along y with a rounded rectangle as its cross-section.
+    """Create a bar along y with a rounded rectangle as cross-section.
 
     Args:
         stations: y, lower and upper x, lower and upper z [mm] of each cross-section, with increasing y.
@@ -171,7 +171,7 @@ def wide_body(length: float) -> Solid:
 
 
 def _block(length: float) -> Solid:
-    """Block that carries the cheeks: as wide as they are, and tapered towards the jaws."""
+    """Block that carries the cheeks, equally wide and tapered towards the jaws."""
     rings = []
     for x, y, z in ((2.9, 3.6, 2.9), (3.3, 4.0, 3.3), (length - 5.8, 4.0, 3.4), (length - 5.0, 3.4, 2.6)):
         half = np.array([(1, 0.55), (0.8, 1), (-0.8, 1), (-1, 0.55), (-1, -0.55), (-0.8, -1), (0.8, -1), (1, -0.55)])
@@ -180,7 +180,7 @@ def _block(length: float) -> Solid:
 
 
 def _cheek(length: float, side: float) -> Solid:
-    """Plate beside the tip's hub, with straight flanks, rounded about the yaw axis and domed outside."""
+    """Cheek beside the tip's hub: a plate with straight flanks, rounded about the yaw axis and domed outside."""
     angles = np.deg2rad(np.linspace(-75, 75, 11))
     nose = np.stack([length + _END * np.cos(angles), 3.95 * np.sin(angles)], axis=1)
     flank = np.array([(6.0, 3.45), (3.6, 3.3), (2.7, 2.6), (2.5, 1.2)])
@@ -201,7 +201,7 @@ def wide_cables(length: float) -> Solid:
 
 
 Table = tuple[tuple[float, float], ...]
-"""Pairs of a position along the blade, 0 at its root and 1 at its end, and a length [mm]."""
+"""Pairs of a position along the blade (0 at the root, 1 at the end) and a length [mm]."""
 
 FIRST, SECOND = -1, 1
 """Sides of the jaws `jaw_1_link` and `jaw_2_link`."""
@@ -214,7 +214,7 @@ class Hub:
     radius: float = 3.4
     """Radius of the discs [mm]."""
     height: float = 2.6
-    """Half the height of both discs together [mm]."""
+    """Half the total height of both discs [mm]."""
 
 
 @dataclass(frozen=True)
@@ -233,9 +233,9 @@ class Jaws:
     arch: float = 0.0
     """Lateral bend of the blades' middle [mm]."""
     turn: float = 0.0
-    """Lateral bend of their ends [mm]."""
+    """Lateral bend of the blades' ends [mm]."""
     windows: tuple[tuple[float, float], ...] = ()
-    """Openings in a blade: start and end, as positions along it from 0 to 1."""
+    """Openings in a blade: start and end, as positions along the blade from 0 to 1."""
     rim: float = 0.75
     """Width of the rim beside a window [mm]."""
     insert: float = 0.0
@@ -244,12 +244,12 @@ class Jaws:
     """Distance of the jaws' axis beyond the yaw axis [mm]."""
 
     def jaw(self, side: int) -> Solid:
-        """The metal part of one jaw."""
+        """Metal part of one jaw."""
         first = self.root - self.pivot
         parts = [_hub(self.hub, side, self.pivot), _neck(self, side)]
         edges = [0.0, *(edge for window in self.windows for edge in window), 1.0]
         for number, (start, stop) in enumerate(itertools.pairwise(edges)):
-            # Neighbours overlap a little, so that no gap shows between them.
+            # Neighbouring parts overlap slightly, so that no gap is visible.
             places = np.linspace(max(start - 0.005, 0.0), min(stop + 0.005, 1.0), 7)
             table = self._stations(side, places, first)
             if number % 2 == 0:
@@ -271,7 +271,7 @@ class Jaws:
         return merged([cylinder(self.hub.radius, -self.hub.height, self.hub.height, "z", 32), bridge])
 
     def inserted(self, side: int) -> Solid | None:
-        """Insert of one jaw; None if it has none."""
+        """Insert of one jaw; None without an insert."""
         if not self.insert:
             return None
         table = self._stations(side, np.linspace(0.3, 0.985, 8), self.root - self.pivot)
@@ -284,7 +284,7 @@ class Jaws:
         places = np.sort(np.concatenate([places, [0.96, 0.985]])) if places[-1] == 1.0 else places
         y = first + places * (self.length - self.pivot - first)
         width, thickness = _at(self.widths, places), _at(self.thickness, places)
-        # The end is rounded off.
+        # The end is rounded.
         taper = np.interp(places, [0.9, 0.96, 0.985, 1.0], [1.0, 0.86, 0.66, 0.3])
         middle = self.turn * places**2 + 4 * self.arch * places * (1 - places)
         outer = side * thickness * np.minimum(1.0, taper + 0.25)
@@ -318,7 +318,7 @@ class Scissors:
         width = _at(self.widths, places) * np.interp(places, [0.9, 0.96, 1.0], [1.0, 0.8, 0.35])
         middle = self.turn * places**2
         y = self.root + places * (self.length - self.root)
-        # The cutting edge reaches a little over the middle.
+        # The cutting edge extends slightly beyond the middle.
         edge, back = -side * 0.25 * np.minimum(width, 1.0), side * (2 * width - 0.25 * np.minimum(width, 1.0))
         x = np.sort(np.stack([edge, back], axis=1), axis=1)
         z = (0.03, self.blade) if side == FIRST else (-self.blade, -0.03)
@@ -326,7 +326,7 @@ class Scissors:
         return merged([_hub(self.hub, side, 0.0), bar(table, 0.15)])
 
     def inserted(self, side: int) -> Solid | None:
-        """None: a blade is made of one material."""
+        """None, since a blade consists of one material."""
         return None
 
 
@@ -337,7 +337,7 @@ class ClipApplier:
     length: float = 22.2
     """Distance from the yaw axis to the end of the tip [mm]."""
     bow: float = 3.7
-    """Maximum distance of an arm's outside from the middle [mm]."""
+    """Maximum distance of the outside of an arm from the middle [mm]."""
     height: float = 1.15
     """Half the width of an arm across the opening plane [mm]."""
     hub: Hub = Hub()
@@ -356,7 +356,7 @@ class ClipApplier:
         inner = side * np.interp(places, [0, 0.2, 0.85, 1.0], [0.45, 1.7, 0.7, 0.7])
         x = np.sort(np.stack([inner, outer], axis=1), axis=1)
         y = near - 1.5 + places * (far - near + 1.5)
-        # At its foot the arm is as high as the base, which is off-centre.
+        # The foot of the arm is as high as the base, which is off-centre.
         foot = (places < 0.2).astype(float)
         below = -self.height + foot * min(0.0, low + self.height)
         above = self.height + foot * max(0.0, high - self.height)
@@ -367,13 +367,13 @@ class ClipApplier:
         return merged(parts)
 
     def inserted(self, side: int) -> Solid | None:
-        """None: an arm is made of one material."""
+        """None, since an arm consists of one material."""
         return None
 
 
 @dataclass(frozen=True)
 class Electrode:
-    """A tip without jaws: a bent wire, or a paddle, on an insulated collar."""
+    """Tip without jaws: a bent wire, or a paddle, on an insulated collar."""
 
     path: tuple[tuple[float, float], ...]
     """Centre line of the wire from the collar on, (x, y) [mm]."""
@@ -394,7 +394,7 @@ class Electrode:
         return merged([hub, *(part.moved(z=self.height) for part in collar)])
 
     def electrode(self) -> Solid:
-        """Wire, with its paddle if it has one."""
+        """Wire, with its paddle if any."""
         path = np.array([(x, y, self.height) for x, y in self.path])
         parts = [wire(path, [self.radius] * (len(path) - 1) + [0.7 * self.radius])]
         if self.paddle:
@@ -417,13 +417,13 @@ def _at(table: Sequence[tuple[float, float]], places: np.ndarray) -> np.ndarray:
 
 
 def _hub(hub: Hub, side: int, pivot: float) -> Solid:
-    """One jaw's half of the hub, above or below the other's; a jaw with a pivot has a lug instead."""
+    """Half of the hub for one jaw, above or below the other half; a lug for a jaw with a pivot."""
     low, high = (0.03, hub.height) if side == FIRST else (-hub.height, -0.03)
     return cylinder(0.6 * hub.radius if pivot else hub.radius, low, high, "z", 32)
 
 
 def _neck(tip: Jaws, side: int) -> Solid:
-    """Transition from a jaw's half of the hub, which is off-centre, to its centred blade."""
+    """Transition from a jaw's off-centre half of the hub to its centred blade."""
     first = tip.root - tip.pivot
     width, thickness = tip.widths[0][1], tip.thickness[0][1]
     low, high = (0.05, tip.hub.height - 0.1) if side == FIRST else (0.1 - tip.hub.height, -0.05)
@@ -432,7 +432,7 @@ def _neck(tip: Jaws, side: int) -> Solid:
     for y, share in ((0.0, 0.0), (0.45 * first, 0.0), (0.8 * first, 0.5), (first + 0.3, 1.0)):
         inner, outer = sorted((side * max(0.06, tip.insert) * share, side * (radius + share * (thickness - radius))))
         if share < 1.0:
-            # Behind the blade the neck is about the hub's middle.
+            # Behind the blade, the neck is centred on the hub.
             inner, outer = (inner - 0.5, outer) if side == SECOND else (inner, outer + 0.5)
         rows.append((y, inner, outer, low + share * (-width - low), high + share * (width - high)))
     return bar(np.array(rows))

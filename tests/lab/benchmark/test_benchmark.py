@@ -175,4 +175,4 @@ def test_a_report_of_nothing_says_what_to_do(tmp_path: Path, capsys: pytest.Capt
 def test_the_shipped_sequences_seed_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as stop:
         main(["bench", "--quick", "--seed", "7", "--report-only"])
-    assert stop.value.code == BAD_INPUT and "--seed 7 is the shipped sequence's" in capsys.readouterr().err
+    assert stop.value.code == BAD_INPUT and "--seed 7 is the seed of the shipped sequence" in capsys.readouterr().err

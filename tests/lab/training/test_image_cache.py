@@ -67,7 +67,7 @@ def test_a_surface_network_learns_from_a_cache_and_goes_on_with_the_same_batches
 
 
 def test_a_cache_is_refused_for_the_feature_network(tmp_path: Path):
-    with pytest.raises(SettingsError, match="surface network only"):
+    with pytest.raises(SettingsError, match="only supported for the surface network"):
         config(tmp_path, network="feature")
 
 

@@ -229,4 +229,4 @@ def test_a_surface_network_learns_and_reports(tmp_path: Path):
     history = json.loads(json.dumps(load_checkpoint(tmp_path).history.losses))  # pyright: ignore
     assert history[-1]["loss"] < history[0]["loss"]
     assert read_weights(result.weights).network.kind == "surface"
-    assert "pixels with the right part" in result.report.read_text()
+    assert "part accuracy of pixels" in result.report.read_text()

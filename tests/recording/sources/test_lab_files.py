@@ -465,7 +465,7 @@ JOINTS: dict[str, tuple[Callable[[Path], dict], Check | str]] = {
     "negative insertion, turned": (joint_table(negative_insertion, flip=("insertion",)), of_each_row()),
     "L20 a jaw of 5.4 rad": (
         joint_table(jaw_in_degrees),
-        lambda found: says(found, "jaw is from 5.4 to 5.4 rad", "deg (read as 0.0942", "--units jaw deg"),
+        lambda found: says(found, "jaw is from 5.4 to 5.4 rad", "deg (interpreted as 0.0942", "--units jaw deg"),
     ),
     "a jaw in degrees, said": (
         joint_table(jaw_in_degrees, units={"jaw": "deg"}),
