@@ -38,7 +38,7 @@ class Background:
     ) -> None:
         self._context = context = Context(state, session, renderer)
         self._propagating = PropagatingHandler(context, optimizers)
-        self._exporting = ExportingHandler(context, deliver)
+        self._exporting = ExportingHandler(context, optimizers, deliver)
         self._jobs = JobsHandler(context, optimizers, self._propagating, self._exporting)
 
     @property

@@ -9,6 +9,7 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 import torch
+from jaxtyping import Bool
 
 from carts_core.errors import SettingsError
 from carts_core.model.scene import Arm, SceneState
@@ -305,6 +306,18 @@ class Maps:
 
 
 @dataclass(frozen=True)
+class RefinedMasks:
+    """Refined masks of the shown frame at a pose."""
+
+    frame: Frame
+    pose: SceneState
+    ignored: Mapping[str, IgnoreRegion | None]
+    """Camera name -> ignored pixels, which stay as rendered."""
+    masks: Mapping[str, Bool[np.ndarray, "height width"]]
+    """Camera name -> mask."""
+
+
+@dataclass(frozen=True)
 class RunState:
     """State of the run on the shown frame."""
 
@@ -415,6 +428,8 @@ class ViewState:
     keypoints: KeypointState = field(default_factory=KeypointState)
     brush: Brush = field(default_factory=Brush)
     maps: Maps | None = None
+    refined: RefinedMasks | None = None
+    """Masks for the layer *Refined mask*; outdated after a change of frame or pose, see `refined_mask`."""
     """Maps of the shown pose, frame and domain; None until needed."""
     scores: Scores | None = None
     """Scores of the shown pose; None until computed, after its picture was sent."""
@@ -488,6 +503,13 @@ class ViewState:
     def mask_correction(self) -> MaskCorrection | None:
         """Mask correction of the shown frame and camera."""
         return self.mask_correction_of(self.camera)
+
+    def refined_mask(self, pose: SceneState, camera: str) -> Bool[np.ndarray, "height width"] | None:
+        """Refined mask of the shown frame at a pose; None where it is not computed."""
+        known = self.refined
+        if known is None or known.frame is not self.frame or known.pose is not pose:
+            return None
+        return known.masks.get(camera) if known.ignored.get(camera) is self.ignore_region_of(camera) else None
 
     @property
     def ignore_region(self) -> IgnoreRegion | None:

@@ -1,6 +1,6 @@
 """`carts render` writes images of the arms; `carts export` writes frames in the formats of other tools."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -8,10 +8,10 @@ import tyro
 
 from ..console import Bar, Terminal, track
 from ..errors import SettingsError
-from ..settings import FormatName, Images, Parts
+from ..settings import FormatName, Images, Masks, Parts
 from ..stopping import message_if_stopped
 from ..wording import counted
-from .options import FromProject, Perturbation, Selection, SequencePath, output_folder
+from .options import FromProject, Network, Perturbation, Selection, SequencePath, output_folder
 
 if TYPE_CHECKING:
     from ..export import ExportFrame
@@ -92,6 +92,11 @@ class Export:
     voc, yolo) get copies; `copied`: copies for every format; `none`: no images. Copies are bit-identical."""
     frame_rate: float | None = None
     """Frame rate of a video [1/s]; by default the frame rate of the recording, or 25 without times."""
+    masks: Masks = "auto"
+    """Masks of the formats masks, coco, yolo, voc, cvat and datumaro: `rendered` at the corrected pose, or `refined`
+    near their outline by the network; `auto` refines where the verdict is *good*. Rendered masks of refined views are
+    in the folder `rendered`."""
+    network: Annotated[Network, tyro.conf.arg(name="")] = field(default_factory=Network)
     overwrite: bool = False
     """Replace an earlier export."""
     select: Annotated[Selection, tyro.conf.arg(name="")] = field(default_factory=Selection)
@@ -116,7 +121,13 @@ class Export:
             parts=self.parts,
             images=self.images,
             frame_rate=self.frame_rate,
+            masks=self.masks,
         )
+        refines = FORMATS[self.format].refines and (
+            self.masks == "refined" or (self.masks == "auto" and any(frame.verdict == "good" for frame in frames))
+        )
+        if refines:
+            dataset = replace(dataset, networks=self.network.load())
         with Bar(console=console) as bar:
             task = bar.add_task(f"{self.format}, {counted(len(frames), 'frame')}", total=None)
             progress = ExportProgress(lambda done, total: bar.update(task, completed=done, total=total))
@@ -126,6 +137,10 @@ class Export:
             cameras_named = ", ".join(dataset.remade_cameras)
             reason = "they are undistorted, cropped, rotated, or from a video or bag, so labels match no recorded file"
             console.print(f"images of {cameras_named} are written as PNG: {reason}", soft_wrap=True)
+        if refines:
+            sources = [dataset.mask_source(frame, camera) for _, frame, camera in dataset.steps]
+            number = f"{sources.count('refined')} of {counted(len(sources), 'mask')}"
+            console.print(f"{number} refined near the outline; the folder rendered has them as rendered")
         console.print(f"wrote {path}")
 
     def _frames(

@@ -97,7 +97,7 @@ def write_annotations(
                 "frame": view.frame.frame_id,
                 "camera": view.camera.name,
                 "source": view.frame.source,
-                **({"painted": True} if view.painted else {}),
+                **({view.mask: True} if view.mask != "rendered" else {}),
             }
         )
         for annotation in annotate(view):

@@ -7,7 +7,7 @@ from collections.abc import Sequence as Items
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path, PurePath
-from typing import TypeVar
+from typing import Literal, TypeVar
 
 import numpy as np
 from jaxtyping import Bool, Int, UInt, UInt8
@@ -20,13 +20,15 @@ from ..files.reading import IMAGE, read_bytes
 from ..model.camera import Camera
 from ..model.parts import link_classes, part_classes
 from ..model.scene import Scene, SceneState
+from ..networks import FeatureExtractor
+from ..optimization import Backgrounds, MaskRefiner, NetworkPredictor
 from ..project import Key, MaskCorrection, ProjectState, Source
 from ..project.state import corrected_state, source_of
 from ..recording import Sequence
 from ..rendering import Renderer
-from ..settings import Images, Parts
+from ..settings import Images, Masks, Parts
 from ..wording import counted
-from .encodings import image_png
+from .encodings import image_png, mask_png
 from .kinematics import KinematicsRow
 
 
@@ -46,6 +48,8 @@ class ExportFrame(KinematicsRow):
     """Camera -> painted part class number (`carts_core.model.parts.PartClass`) per pixel, 0 if not painted. Painted
     classes override rendered classes, and painted pixels belong to the mask.
     """
+    ignored: Mapping[str, Bool[ndarray, "height width"]] = field(default_factory=dict, kw_only=True)
+    """Camera -> pixels that show an occluder, where masks are not refined."""
 
 
 def measured_frames(sequence: Sequence, indices: Iterable[int]) -> list[ExportFrame]:
@@ -126,6 +130,7 @@ def project_frame(
     known = {name: value.standard_deviations for name, value in project.joints(index).items()}
     painted = {camera: project.get(Key.mask_correction(index, camera)) for camera in cameras}
     labels = {camera: project.get(Key.part_labels(index, camera)) for camera in cameras}
+    regions = {camera: project.get(Key.ignore_region(index, camera)) for camera in cameras}
     verdict, figures = project.verdict(index), project.figures(index)
     return ExportFrame(
         frame.frame_id,
@@ -140,6 +145,7 @@ def project_frame(
         review=project.review(index).state.value,
         dice=None if figures is None else figures.dice,
         part_labels={name: value.labels() for name, value in labels.items() if value is not None},
+        ignored={name: value.region() for name, value in regions.items() if value is not None},
         masks=_CorrectedMasks(render, pose, {name: p for name, p in painted.items() if p is not None}),
     )
 
@@ -197,11 +203,13 @@ class View:
     """View name, unique in the export; the stem of all files of this view."""
     link_ids: Int[np.ndarray, "height width"]
     """Index of the visible link per pixel, numbered over all arms; -1 for background."""
+    mask: "MaskSource"
+    """Source of the mask."""
 
-    @property
-    def painted(self) -> bool:
-        """Whether the view has painted masks or parts, so that its labels do not follow from joint positions alone."""
-        return self.camera.name in self.frame.masks or self.camera.name in self.frame.part_labels
+
+MaskSource = Literal["rendered", "refined", "painted"]
+"""How the mask of a view was made: rendered at the joint positions, rendered and refined by the network, or rendered
+and corrected by hand (or given)."""
 
 
 @dataclass(frozen=True)
@@ -221,6 +229,12 @@ class Dataset:
     """
     frame_rate: float | None = None
     """Frame rate of a video [1/s]; None for the recorded rate."""
+    masks: Masks = "rendered"
+    """Which masks are refined; masks that were painted or given stay as they are."""
+    networks: FeatureExtractor | None = None
+    """Networks that refine masks; without them, masks are rendered."""
+    rendered_folder: OutputPath | None = None
+    """Folder for the rendered masks of refined views."""
 
     def __post_init__(self) -> None:
         if not self.frames:
@@ -281,6 +295,13 @@ class Dataset:
         """State of the scene in a frame, with its joint positions and camera poses."""
         return self.scene.state(frame.joint_positions, mounts=self.sequence.mounts(frame.index))
 
+    def mask_source(self, frame: ExportFrame, camera: Camera) -> MaskSource:
+        """Source of the mask of a view."""
+        if camera.name in frame.masks or camera.name in frame.part_labels:
+            return "painted"
+        wanted = self.masks == "refined" or (self.masks == "auto" and frame.verdict == "good")
+        return "refined" if wanted and self.networks is not None else "rendered"
+
     def views(self, progress: ExportProgress) -> Iterator[View]:
         """Yield the labelled views of all frames and cameras, one `progress` step each.
 
@@ -295,7 +316,23 @@ class Dataset:
                 link_ids = labelled(mask if painted is None else mask & (painted == 0), rendered, where)
             if painted is not None:
                 link_ids = painted_links(painted, link_ids, rendered, self.link_classes, where)
-            yield View(number, frame, camera, name, link_ids)
+            source = self.mask_source(frame, camera)
+            if source == "refined":
+                link_ids = labelled(self._refined(frame, camera, rendered >= 0), rendered, where)
+                if self.rendered_folder is not None:
+                    write_bytes(self.rendered_folder / f"{name}.png", mask_png(rendered >= 0))
+            yield View(number, frame, camera, name, link_ids, source)
+
+    def _refined(
+        self, frame: ExportFrame, camera: Camera, rendered: Bool[ndarray, "height width"]
+    ) -> Bool[ndarray, "height width"]:
+        assert self.networks is not None
+        refiner = MaskRefiner(
+            NetworkPredictor(self.networks), Backgrounds.of(self.sequence, (camera.name,), self.domain)
+        )
+        recorded = self.sequence.frame(frame.index, self.domain, [camera.name])
+        masks = refiner.refine(self.scene, recorded, self.state(frame), {camera.name: rendered}, frame.ignored)
+        return masks[camera.name]
 
     def label_image(self, view: View, parts: Parts | None = None) -> UInt[np.ndarray, "height width"]:
         """Label image: category id per pixel, 0 for background; 8 bits if sufficient for all categories, else 16."""

@@ -3,7 +3,7 @@
 import json
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -141,17 +141,19 @@ class ExportFormat:
     """Suffix of the file; empty for a folder."""
     images: bool = False
     """Whether the format refers to images."""
+    refines: bool = False
+    """Whether masks can be refined; other formats describe poses, whose masks are rendered."""
 
 
 FORMATS: dict[FormatName, ExportFormat] = {
-    "masks": ExportFormat("PNG masks", write_masks),
-    "coco": ExportFormat("COCO", write_coco, images=True),
+    "masks": ExportFormat("PNG masks", write_masks, refines=True),
+    "coco": ExportFormat("COCO", write_coco, images=True, refines=True),
     "coco-keypoints": ExportFormat("COCO keypoints", write_coco_keypoints, images=True),
     "bop": ExportFormat("BOP poses", write_bop, images=True),
-    "yolo": ExportFormat("YOLO segmentation", write_yolo, images=True),
-    "voc": ExportFormat("Pascal VOC", write_voc, images=True),
-    "cvat": ExportFormat("CVAT for images", write_cvat, images=True),
-    "datumaro": ExportFormat("Datumaro", write_datumaro, images=True),
+    "yolo": ExportFormat("YOLO segmentation", write_yolo, images=True, refines=True),
+    "voc": ExportFormat("Pascal VOC", write_voc, images=True, refines=True),
+    "cvat": ExportFormat("CVAT for images", write_cvat, images=True, refines=True),
+    "datumaro": ExportFormat("Datumaro", write_datumaro, images=True, refines=True),
     "csv": ExportFormat("Kinematics, CSV", write_kinematics_csv, ".csv"),
     "npz": ExportFormat("Kinematics, NumPy", write_kinematics_npz, ".npz"),
     "json": ExportFormat("Kinematics, JSON", write_kinematics_json, ".json"),
@@ -194,6 +196,9 @@ def export(
             chosen.write(dataset, path, progress or ExportProgress())
         return Path(output)
     with published(output, overwrite=overwrite) as path:
+        dataset = replace(
+            dataset, networks=dataset.networks if chosen.refines else None, rendered_folder=path / "rendered"
+        )
         chosen.write(dataset, path, progress or ExportProgress())
         write_text(path / MARKER, _summary(dataset, name))
     return Path(output)
@@ -213,6 +218,7 @@ def _summary(dataset: Dataset, name: FormatName) -> str:
             "not_determined": frame.undetermined(dataset.scene),
             "review": frame.review,
             "dice": frame.dice,
+            "mask": dataset.mask_source(frame, camera),
         }
         for (name, frame, camera), file in zip(dataset.steps, dataset.files, strict=True)
     ]

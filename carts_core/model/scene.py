@@ -74,6 +74,15 @@ class SceneState:
             function(self.T_mount_world),
         )
 
+    def with_camera(self, index: int) -> "SceneState":
+        """The state of the scene with one of its cameras only."""
+        return replace(
+            self,
+            T_camera_world=self.T_camera_world[..., index : index + 1, :, :],
+            intrinsics=self.intrinsics[..., index : index + 1, :],
+            T_mount_world=self.T_mount_world[..., index : index + 1, :, :],
+        )
+
     def detached(self) -> "SceneState":
         """Copy that shares neither memory nor gradients with this state."""
         return self.map(lambda value: value.detach().clone())

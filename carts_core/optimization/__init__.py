@@ -31,6 +31,7 @@ from .predictor import ImagePredictor as ImagePredictor
 from .predictor import MaskPredictor as MaskPredictor
 from .predictor import NetworkPredictor as NetworkPredictor
 from .predictor import SurfacePredictor as SurfacePredictor
+from .refinement import MaskRefiner as MaskRefiner
 from .sequence import SequenceOptimizer as SequenceOptimizer
 from .stages import StopReason as StopReason
 from .verdict import Assessment as Assessment

@@ -5,6 +5,7 @@ No module of this package imports torch, so that the command line starts quickly
 
 from .interchange import FormatName as FormatName
 from .interchange import Images as Images
+from .interchange import Masks as Masks
 from .interchange import Parts as Parts
 from .optimization import CALIBRATION as CALIBRATION
 from .optimization import CALIBRATION_SETTINGS as CALIBRATION_SETTINGS

@@ -19,8 +19,10 @@ from carts_core.project import ProjectState, ReviewState, frames_in, import_anno
 from carts_core.project.state import calibrated_scene
 from carts_core.project.values import UNREVIEWED
 from carts_core.recording.annotations import read_annotations
+from carts_core.settings import Masks
 from carts_viewer.actions import intents
 from carts_viewer.actions.context import Context, Handler
+from carts_viewer.jobs.optimizers import OptimizerFactory
 from carts_viewer.picture.layers import Layer
 from carts_viewer.state import ExportState
 
@@ -33,6 +35,8 @@ FRAME_CHOICES = {
     "Unreviewed": UNREVIEWED,
 }
 """Choices of the frames to export, as review states."""
+MASKS_CHOICES: tuple[Masks, ...] = ("auto", "refined", "rendered")
+"""Choices of the masks to refine."""
 PARTS_CHOICES: tuple[Parts, ...] = ("arms", "parts", "links")
 """Choices of the granularity of categories."""
 _STEMS = {
@@ -55,9 +59,9 @@ Deliver = Callable[[int, str, bytes], None]
 class ExportingHandler(Handler):
     """Handler of exports and downloads."""
 
-    def __init__(self, context: Context, deliver: Deliver) -> None:
+    def __init__(self, context: Context, optimizers: OptimizerFactory, deliver: Deliver) -> None:
         super().__init__(context)
-        self._deliver = deliver
+        self._optimizers, self._deliver = optimizers, deliver
         self._job: CooperativeThread[Path] | None = None
         self._intent: intents.Export | None = None
 
@@ -102,8 +106,9 @@ class ExportingHandler(Handler):
     def _on_Export(self, intent: intents.Export) -> None:
         if self._job is not None:
             raise CartsError("An export is already running. Wait, or cancel it first.")
-        if intent.format not in FORMATS or intent.frames not in FRAME_CHOICES or intent.parts not in PARTS_CHOICES:
-            raise SettingsError(f"Unsupported export: {intent.frames!r} as {intent.format!r} by {intent.parts!r}.")
+        known = intent.format in FORMATS and intent.frames in FRAME_CHOICES and intent.parts in PARTS_CHOICES
+        if not known or intent.masks not in MASKS_CHOICES:
+            raise SettingsError(f"Unsupported export: {intent}.")
         self._context.end_run("Stopped: an export was started")
         self._context.save()
         make, count = self._dataset(intent)
@@ -136,18 +141,30 @@ class ExportingHandler(Handler):
         cameras = [state.camera] if intent.shown_camera else [camera.name for camera in session.scene.cameras]
         scene = calibrated_scene(session.scene, view).with_cameras(cameras)
         renderer, sequence, images = self._context.renderer, session.sequence, "copied" if intent.images else "named"
+        good = any(_is_good(view, index) for index in chosen)
+        refines = FORMATS[intent.format].refines and (intent.masks == "refined" or (intent.masks == "auto" and good))
+        networks = self._optimizers.prepare() if refines else None
 
         def make(progress: ExportProgress) -> Dataset:
             indices = ExportProgress(cancelled=progress.cancelled).track(chosen)
             frames = tuple(project_frame(sequence, view, index, cameras, renderer.mask) for index in indices)
-            return Dataset(sequence, frames, scene, state.domain, parts=intent.parts, images=images)
+            return Dataset(
+                sequence,
+                frames,
+                scene,
+                state.domain,
+                parts=intent.parts,
+                images=images,
+                masks=intent.masks,
+                networks=networks,
+            )
 
         return make, len(chosen)
 
     def _log(self, intent: intents.Export, path: Path) -> None:
         project, export_state = self._session.editor.project, self._context.state.export
         if project.writable and export_state is not None:
-            settings = {"frames": intent.frames, "parts": intent.parts, "images": intent.images}
+            settings = {"frames": intent.frames, "parts": intent.parts, "images": intent.images, "masks": intent.masks}
             if intent.range is not None:
                 settings["range"] = list(intent.range)
             project.log_export(intent.format, path, export_state.frames, settings)
@@ -156,6 +173,12 @@ class ExportingHandler(Handler):
     def _report(self, **changes: object) -> None:
         if self._context.state.export is not None:
             self._context.change(export=replace(self._context.state.export, **changes))
+
+
+def _is_good(project: ProjectState, index: int) -> bool:
+    """Whether a frame has the verdict *good*."""
+    verdict = project.verdict(index) if index in project.records else None
+    return verdict is not None and verdict.verdict == "good"
 
 
 def frames_within(project: ProjectState, frames: str, part: tuple[int, int] | None) -> list[int]:

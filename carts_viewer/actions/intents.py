@@ -9,7 +9,7 @@ from typing import Any, ClassVar, Literal
 
 from carts_core.export import FormatName, Parts
 from carts_core.project import ReviewState
-from carts_core.settings import Direction
+from carts_core.settings import Direction, Masks
 from carts_viewer.picture.layers import Layer
 from carts_viewer.picture.strokes import Stroke, Target, Tool
 from carts_viewer.state import Against, Reach
@@ -533,6 +533,8 @@ class Export(Exporting):
     """Only the shown camera."""
     range: tuple[int, int] | None = None
     """First and last frame, both exported; None for the whole sequence."""
+    masks: Masks = "auto"
+    """Which masks are refined, where the format allows it."""
 
 
 class CancelExport(Exporting):

@@ -4,7 +4,7 @@ from dataclasses import replace
 from typing import Any
 
 from carts_core.errors import CartsError, SettingsError
-from carts_core.optimization import Iterate
+from carts_core.optimization import Backgrounds, Iterate, MaskRefiner, NetworkPredictor
 from carts_core.project import Edits, FitVerdict, Key
 from carts_core.settings import SolverName, SurfaceSolver
 from carts_core.settings import solver as named_solver
@@ -14,7 +14,7 @@ from carts_viewer.actions.context import Context, Handler
 from carts_viewer.jobs.comparison import FitCheck
 from carts_viewer.jobs.optimizers import ActiveRun, FrameTask, OptimizerFactory, scene_at
 from carts_viewer.picture.layers import Layer
-from carts_viewer.state import NETWORK, PRESETS, Curves, Maps, Observed, Phase, RunState, Scores
+from carts_viewer.state import NETWORK, PRESETS, Curves, Maps, Observed, Phase, RefinedMasks, RunState, Scores
 
 _REASONS = {
     "iterations": "Done: the best iteration is the result",
@@ -73,12 +73,14 @@ class OptimizingHandler(Handler):
         self._before = None
 
     def map(self) -> None:
-        """Compute the maps of the chosen layer, if they are missing.
+        """Compute the maps or refined masks of the chosen layer, if they are missing.
 
         Raises:
             CartsError: it cannot be computed.
         """
         state = self._context.state
+        if state.layer is Layer.REFINED:
+            self._refine()
         if state.layer not in (Layer.ATTENTION, Layer.SIMILARITY):
             return
         if state.maps is not None and state.camera in state.maps.cameras:
@@ -91,6 +93,27 @@ class OptimizingHandler(Handler):
             self._context.change(layer=Layer.MASK)
             raise
         self._context.change(maps=None if iterate is None else Maps(iterate, run.cameras, of_run=False), busy=None)
+
+    def _refine(self) -> None:
+        """Refine the rendered masks of the shown cameras."""
+        state, context = self._context.state, self._context
+        pose, frame = state.pose.scene, state.frame
+        cameras = [state.camera] if not state.beside else [*frame.images]
+        if all(state.refined_mask(pose, camera) is not None for camera in cameras):
+            return
+        try:
+            predictor = NetworkPredictor(self._optimizers.prepare())
+        except CartsError:
+            context.change(layer=Layer.MASK)
+            raise
+        ignored = {camera: state.ignore_region_of(camera) for camera in cameras}
+        regions = {camera: region.region() for camera, region in ignored.items() if region is not None}
+        masks = {}
+        for camera in cameras:
+            refiner = MaskRefiner(predictor, Backgrounds.of(self._session.sequence, (camera,), state.domain))
+            rendered = {camera: context.renderer.mask(pose, camera)}
+            masks |= refiner.refine(scene_at(self._session.scene, pose), frame, pose, rendered, regions)
+        context.change(refined=RefinedMasks(frame, pose, ignored, masks), busy=None)
 
     # ---- Intents ---------------------------------------------------------------------------------------------------
 

@@ -15,6 +15,7 @@ from carts_core.errors import CartsError
 from carts_core.export import FORMATS, FormatName, Parts
 from carts_core.files import output_path, write_text
 from carts_core.files.reading import Kind, parse_json, read_text, typed
+from carts_core.settings import Masks
 from carts_viewer.jobs.companions import Decisions, damage
 
 _KEPT = 50
@@ -86,6 +87,7 @@ class ExportOptions:
     images: bool = False
     shown_camera: bool = False
     range: tuple[int, int] | None = None
+    masks: Masks = "auto"
 
 
 Options = SolveOptions | OptimizeOptions | CalibrateOptions | AdaptOptions | ExportOptions

@@ -12,7 +12,7 @@ from carts_viewer.actions import intents
 from carts_viewer.actions.browsing import SPEEDS
 from carts_viewer.actions.frame_filter import SOLVED, copied
 from carts_viewer.panels.inputs import PanelPage, humanized, swatch, write
-from carts_viewer.picture.layers import ARM_COLORS, TRUTH_COLORS, Layer, label_color
+from carts_viewer.picture.layers import ARM_COLORS, RENDERED_COLOR, TRUTH_COLORS, Layer, label_color
 from carts_viewer.picture.overlay import with_imported
 from carts_viewer.session import Session
 from carts_viewer.state import Against, Scores, ViewState
@@ -167,10 +167,11 @@ class OverlayPanel:
         self._legend.content = f'<div class="carts-legend">{self._explain(state)}</div>'
 
     def _explain(self, state: ViewState) -> str:
-        if state.layer in (Layer.MASK, Layer.CONTOUR):
-            return " ".join(
-                swatch(ARM_COLORS[number % len(ARM_COLORS)], name) for number, name in enumerate(self._arms)
-            )
+        if state.layer in (Layer.MASK, Layer.CONTOUR, Layer.REFINED):
+            swatches = [swatch(ARM_COLORS[number % len(ARM_COLORS)], name) for number, name in enumerate(self._arms)]
+            if state.layer is Layer.REFINED:
+                swatches.append(swatch(RENDERED_COLOR, "Outline of the rendered mask"))
+            return " ".join(swatches)
         if state.layer is Layer.PARTS:
             return " ".join(swatch(label_color(one.number), one.name) for one in self._classes)
         if state.layer is Layer.TRUTH:

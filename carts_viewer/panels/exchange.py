@@ -12,12 +12,13 @@ from carts_viewer.state import ViewState
 from carts_viewer.transport.document import escaped
 
 _PARTS = {"Arm": "arms", "Part": "parts", "Link": "links"}
+_MASKS = {"Refined if good": "auto", "Refined": "refined", "As rendered": "rendered"}
 _DVRK = ("dvrk", "dvrk-2.3", "dvrk-suj")
 _WITHOUT_PARTS = ("masks", "coco-keypoints", "bop", "csv", "npz", "json", *_DVRK, "video")
 """Formats that have no categories, or always both kinds."""
 _WRITTEN = (
     "Masks, keypoints and poses are those of the arms at the current joint positions; masks include "
-    "painted corrections. The recording's own masks are not exported."
+    "painted corrections, and may be refined. The recording's own masks are not exported."
 )
 _NOT_KEPT = "This project is temporary: download its exports before the viewer is closed."
 
@@ -41,6 +42,11 @@ class ExportPanel:
             self._within = gui.add_checkbox("Only the range", True, visible=False)
             self._cameras = gui.add_dropdown("Cameras", ["All", "Shown one"], visible=cameras > 1)
             self._parts = gui.add_dropdown("Category per", list(_PARTS))
+            self._masks = gui.add_dropdown(
+                "Masks",
+                list(_MASKS),
+                hint="Refined: corrected near the outline by the network. If good: in frames whose verdict is good",
+            )
             self._images = gui.add_checkbox("Copy images", False)
             self._count = gui.add_html("")
             self._export = page.button("Export", lambda _: self._intent(), icon=viser.Icon.FILE_EXPORT, color="teal")
@@ -58,6 +64,7 @@ class ExportPanel:
         """Update the widgets."""
         name = self._formats.get(self._format.value)
         self._parts.visible = name not in _WITHOUT_PARTS
+        self._masks.visible = name is not None and FORMATS[name].refines
         self._images.visible = name is not None and (FORMATS[name].images or name == "masks")
         self._within.visible = state.range is not None
         self._range = state.range if self._within.value else None
@@ -88,6 +95,7 @@ class ExportPanel:
             bool(self._images.value),
             self._cameras.value == "Shown one",
             self._range,
+            _MASKS.get(self._masks.value, self._masks.value),  # type: ignore[arg-type]
         )
 
     def _show_count(self, state: ViewState) -> None:

@@ -94,6 +94,8 @@ class PageDisplay:
         def at(scene: SceneState, maps: Maps | None) -> Rgba:
             if state.layer is Layer.IMPORTED and not state.streaming:
                 return self._imported(state, camera)
+            if state.layer is Layer.REFINED:
+                return self._renderer.refined(scene, camera, state.refined_mask(scene, camera), state.opacity)
             if state.layer is Layer.PARTS:
                 painted = state.part_labels_of(camera)
                 return parts(self._renderer.classes(scene, camera, correction, painted), state.opacity)
@@ -144,7 +146,7 @@ def _picture(state: ViewState) -> tuple:
     entries = state.project.records.get(state.index)
     layers = [] if entries is None else [e for key, e in entries.entries.items() if key.kind in keys]
     painted = layers, brush.tool is Tool.OFF, brush.target, brush.painted
-    return state.layer, state.opacity, id(state.maps), state.beside, state.compare, painted
+    return state.layer, state.opacity, id(state.maps), id(state.refined), state.beside, state.compare, painted
 
 
 def _draw_paint(

@@ -101,6 +101,15 @@ class OverlayRenderer:
             return layers.heat(values[maps.cameras.index(camera)], 0.0, 1.0, size, opacity)
         return layers.nothing(*size)
 
+    def refined(
+        self, state: SceneState, camera: str, mask: Bool[np.ndarray, "height width"] | None, opacity: float
+    ) -> layers.Rgba:
+        """Refined mask by arm, with the outline of the rendered one; the rendered mask where it is None."""
+        rendered = self.arm_ids(state, camera)
+        if mask is None or not (rendered >= 0).any():
+            return layers.mask(rendered, opacity)
+        return layers.refined(labelled(mask, rendered, camera), rendered, opacity)
+
     def pick(self, state: SceneState, camera: str, pixel: tuple[float, float], radius: float) -> Keypoint | None:
         """The visible point of an arm at a pixel, or the nearest within `radius` [px]; None without one."""
         return pick_point(self._scene, self._renderer(camera), state.to("cpu"), pixel, radius)

@@ -1,5 +1,6 @@
 """Data sets of exports: labels, images and cancellation."""
 
+import json
 import os
 import threading
 from dataclasses import replace
@@ -24,7 +25,9 @@ from carts_core.export import (
 from carts_core.export.dataset import labelled
 from carts_core.files import file_name, unique_file_names
 from carts_core.model.parts import part_classes
+from carts_core.networks import FeatureExtractor
 from carts_core.recording import Sequence
+from carts_core.recording.images import read_mask
 from carts_core.rendering import Renderer
 
 
@@ -149,3 +152,29 @@ def test_a_cancelled_export_leaves_nothing(dataset: Dataset, name: FormatName, t
         export(dataset, name, folder / "out", progress=ExportProgress(progress, cancel.is_set))
     assert steps == [(1, len(dataset.scene.arms) if name.startswith("dvrk") else 3)]
     assert os.listdir(folder) == []
+
+
+def test_masks_of_good_frames_are_refined_with_the_rendered_ones_beside_them(
+    sample_sequence_path: Path, tmp_path: Path
+) -> None:
+    sequence = Sequence.open(sample_sequence_path)
+    first, second, third = measured_frames(sequence, range(3))
+    scene = sequence.scene.with_cameras(["left"])
+    camera = scene.cameras[0]
+    given = {"left": np.zeros((camera.height, camera.width), bool)}
+    frames = (replace(first, verdict="good"), replace(second, verdict="doubtful"), replace(third, verdict="good"))
+    frames = (*frames[:2], replace(frames[2], masks=given))
+    rendered = Dataset(sequence, frames, scene, "regular")
+    dataset = replace(rendered, masks="auto", networks=FeatureExtractor.load())
+    folders = [export(each, "masks", tmp_path / str(number)) for number, each in enumerate((rendered, dataset))]
+    sources = [view["mask"] for view in json.loads((folders[1] / "export.json").read_text())["views"]]
+    assert sources == ["refined", "rendered", "painted"]
+    name = all_views(rendered)[0].name
+    before, after = (read_mask(folder / "binary" / f"{name}.png") for folder in folders)
+    assert 0 < (before != after).mean() < 0.02
+    (beside,) = (folders[1] / "rendered").iterdir()
+    assert beside.name == f"{name}.png"
+    np.testing.assert_array_equal(read_mask(beside), before)
+    poses = export(dataset, "bop", tmp_path / "bop")
+    sources = [view["mask"] for view in json.loads((poses / "export.json").read_text())["views"]]
+    assert sources == ["rendered", "rendered", "painted"]

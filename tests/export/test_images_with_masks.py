@@ -148,6 +148,7 @@ def test_a_folder_says_what_it_holds(dataset: Dataset, tmp_path: Path) -> None:
         "not_determined": [],
         "review": "accepted",
         "dice": 0.93,
+        "mask": "painted",
     }
     assert [summary["views"][0][key] for key in ("verdict", "review", "dice")] == [None] * 3
 

@@ -203,6 +203,24 @@ def test_maps_are_there_without_a_run_when_they_are_looked_at(desk: Desk, layer:
     assert picture[..., 3].all() and np.unique(picture[..., :3].reshape(-1, 3), axis=0).shape[0] > 1
 
 
+def test_a_refined_mask_follows_the_pose_and_shows_the_rendered_outline(desk: Desk) -> None:
+    desk.do(intents.ShowLayer(Layer.REFINED))
+    desk.controller.map()
+    before = desk.state.refined_mask(desk.state.pose.scene, "left")
+    assert before is not None
+    rendered = desk.renderer.mask(desk.state.pose.scene, "left")
+    assert 0 < (before != rendered).mean() < 0.1
+    picture = desk.renderer.refined(desk.state.pose.scene, "left", before, 0.5)
+    white = (picture == 255).all(-1)
+    assert white.any() and not (white & ~rendered).any()
+    np.testing.assert_array_equal(picture[..., 3] > 0, before | white)
+    desk.do(intents.Perturb(4.0, 3))
+    assert desk.state.refined_mask(desk.state.pose.scene, "left") is None
+    desk.controller.map()
+    after = desk.state.refined_mask(desk.state.pose.scene, "left")
+    assert after is not None and (after != before).any()
+
+
 def test_the_exported_mask_is_what_is_shown(desk: Desk) -> None:
     desk.do(intents.Perturb(4.0, 3), intents.ShowCamera("right"), intents.ExportMask(7))
     client, name, content = desk.delivered[0]

@@ -32,6 +32,7 @@ from carts_core.project import (
 )
 from carts_core.recording import Sequence
 from carts_core.recording.annotations import read_annotations
+from carts_core.settings import Masks
 from carts_viewer.actions import exchange as exporting
 from carts_viewer.actions import intents
 from carts_viewer.app import ViewerApp
@@ -102,6 +103,15 @@ def test_an_export_says_what_the_project_knows_of_each_frame(desk: Desk) -> None
     header, *rows = exported(desk, intents.Export("csv", "All")).read_text().splitlines()
     assert header.endswith(",verdict,not_determined")
     assert [row.rsplit(",", 2)[1] for row in rows] == ["", "doubtful", ""]
+
+
+@pytest.mark.parametrize(("masks", "count"), [("auto", 2), ("refined", 6), ("rendered", 0)])
+def test_masks_of_good_or_all_frames_are_refined(desk: Desk, masks: Masks, count: int) -> None:
+    desk.session.editor.project.record_verdict(0, FitVerdict("good", "", "", 0.01))
+    desk.session.editor.project.record_verdict(1, FitVerdict("doubtful", "", "", 0.4))
+    folder = exported(desk, intents.Export("masks", "All", masks=masks))
+    sources = [view["mask"] for view in json.loads((folder / "export.json").read_text())["views"]]
+    assert len(sources) == 6 and sources.count("refined") == count == len([*folder.glob("rendered/*.png")])
 
 
 def test_only_frames_of_the_timelines_range_are_written(desk: Desk) -> None:
