@@ -1,7 +1,6 @@
 """What a program of ours asks of the machine."""
 
 import os
-import platform
 import subprocess
 import sys
 from pathlib import Path
@@ -12,61 +11,6 @@ import torch
 from carts_core.model.mesh_cache import cache_dir, read
 from carts_core.process import tune_process
 from carts_core.project.identity import data_dir
-
-PAGE_FAULTS = """
-import os, resource, threading
-import numpy as np
-{tune}
-def faults(repetitions):
-    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
-    for _ in range(repetitions):
-        [np.zeros((4, 640, 480), np.float32) + index for index in range(8)]
-    return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
-faults(10)
-print(faults(10))
-"""
-RETURNED = """
-from carts_core.process import return_memory
-def resident():
-    return int(open("/proc/self/statm").read().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
-def work(done, end):
-    images = [np.ones(10_000) for _ in range(500)]
-    del images
-    done.release()
-    end.wait()
-return_memory()
-start, done, end = resident(), threading.Semaphore(0), threading.Event()
-threads = [threading.Thread(target=work, args=(done, end)) for _ in range(8)]
-for thread in threads:
-    thread.start()
-    done.acquire()
-print(resident() - start)
-last = [np.ones(10_000) for _ in range(2000)][-1]
-return_memory()
-print(resident() - start)
-end.set()
-"""
-
-
-def printed(code: str, **environment: str) -> list[float]:
-    """Numbers that a process prints whose environment tunes nothing else."""
-    kept = {name: value for name, value in os.environ.items() if not name.startswith(("MALLOC_", "OMP_"))}
-    ran = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=True, env=kept | environment
-    )
-    return [float(word) for word in ran.stdout.split()]
-
-
-@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="only glibc's allocator can be told to keep memory")
-def test_memory_of_images_is_kept_shared_by_threads_and_returned_on_request() -> None:
-    # Untuned, glibc asks for anything from none to all of it anew, as the heap happens to end; this has it ask for all.
-    (anew,) = printed(PAGE_FAULTS.format(tune=""), MALLOC_MMAP_THRESHOLD_="131072")
-    assert anew > 50_000
-    tune = "from carts_core.process import tune_process\ntune_process()"
-    again, kept, returned = printed(PAGE_FAULTS.format(tune=tune) + RETURNED, OMP_NUM_THREADS="1")
-    assert again < 0.02 * anew
-    # Each of the eight threads has used 40 MB, one after the other.
-    assert kept < 160 and returned < 20
 
 
 @pytest.mark.parametrize(("given", "expected"), [("2", 2), (None, max(1, min((os.cpu_count() or 2) - 1, 4)))])

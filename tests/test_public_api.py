@@ -45,19 +45,6 @@ def _imports(tree: ast.AST) -> Iterator[tuple[str, int]]:
             yield node.module, node.lineno
 
 
-def _public_definitions(body: list[ast.stmt], prefix: str = "") -> Iterator[tuple[str, ast.AST]]:
-    """Public functions and classes, and the public methods of those classes, but no overloads or setters."""
-    for node in body:
-        if not isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef) or node.name.startswith("_"):
-            continue
-        decorators = {ast.unparse(decorator) for decorator in node.decorator_list}
-        if any(name.endswith(("overload", "override", ".setter")) for name in decorators):
-            continue
-        yield prefix + node.name, node
-        if isinstance(node, ast.ClassDef):
-            yield from _public_definitions(node.body, f"{prefix}{node.name}.")
-
-
 # One test for all files, not one for each: a test costs more than the look at a file.
 
 
@@ -67,30 +54,6 @@ def test_every_module_imports_with_all_its_public_names() -> None:
         imported = importlib.import_module(module)
         missing += [f"{module}.{name}" for name in getattr(imported, "__all__", ()) if not hasattr(imported, name)]
     assert not missing, f"named in __all__ and not there: {', '.join(missing)}"
-
-
-def test_every_name_that_a_package_imports_is_re_exported_on_purpose() -> None:
-    """`from ._x import Y as Y` or `__all__` says that a name is public; a plain import leaves it open."""
-    left_open = []
-    for path in (path for path in SOURCES if path.name == "__init__.py"):
-        declared = set(getattr(importlib.import_module(_module(path)), "__all__", ()))
-        for node in _tree(path).body:
-            for alias in node.names if isinstance(node, ast.ImportFrom) else ():
-                name = alias.asname or alias.name
-                on_purpose = alias.asname == alias.name or name in declared or name.startswith("_")
-                if alias.name == "*" or not on_purpose:
-                    left_open.append(f"{_module(path)}.{name}")
-    assert not left_open, f"imported without saying whether it is public: {', '.join(left_open)}"
-
-
-def test_every_public_function_class_and_method_has_a_docstring() -> None:
-    missing = [
-        f"{_named(path)}:{node.lineno} {name}"
-        for path in SOURCES
-        for name, node in _public_definitions(_tree(path).body)
-        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef) and not ast.get_docstring(node)
-    ]
-    assert not missing, "without a docstring: " + ", ".join(missing)
 
 
 def test_the_core_does_not_know_the_viewer() -> None:

@@ -54,12 +54,6 @@ def test_no_module_imports_itself_through_others() -> None:
     assert cycle(graph) == []
 
 
-def test_every_test_module_has_a_name_of_its_own() -> None:
-    paths = [path for path in (ROOT / "tests").rglob("*.py") if not (path.parent / "__init__.py").exists()]
-    names = [path.name for path in paths if path.name != "conftest.py"]
-    assert [name for name in set(names) if names.count(name) > 1] == []  # pytest would stop at the second one
-
-
 def test_onnx_runtime_is_imported_only_where_its_telemetry_is_switched_off() -> None:
     found = []
     for name, path in _sources().items():

@@ -352,11 +352,6 @@ def test_a_mask_with_many_holes_takes_little_memory_and_comes_back() -> None:
     np.testing.assert_array_equal(filled, mask)
 
 
-def test_every_part_is_one_polygon() -> None:
-    mask = _blobs(1)
-    assert len(polygons(mask)) == cv2.connectedComponents(mask.astype(np.uint8), connectivity=8)[0] - 1
-
-
 @pytest.mark.parametrize(
     "mask",
     [

@@ -40,12 +40,6 @@ def test_csv_comes_back(dataset: Dataset, tmp_path: Path) -> None:
     np.testing.assert_allclose(std, _std(dataset), rtol=0, atol=1e-6)
 
 
-def test_csv_has_no_columns_of_deviations_that_nobody_knows(dataset: Dataset) -> None:
-    plain = [replace(frame, joint_std=None) for frame in dataset.frames]
-    header = next(csv.reader(kinematics_csv(dataset.scene, plain).splitlines()))
-    assert header == ["frame", "source", *joint_columns(dataset.scene)]
-
-
 @pytest.mark.parametrize("with_std", [True, False])
 def test_verdicts_come_back_with_the_kinematics(dataset: Dataset, tmp_path: Path, with_std: bool) -> None:
     verdicts = ["good", None, "failed"]
@@ -131,14 +125,6 @@ def test_json_comes_back_with_null_for_what_is_not_known(dataset: Dataset, tmp_p
     deviations = [[frame["joint_std"][column] for column in columns] for frame in content["frames"]]
     assert deviations[0] == [None] * len(columns)
     np.testing.assert_array_equal(np.array(deviations, dtype=float), _std(dataset))
-
-
-def test_npz_and_json_have_the_verdict_of_every_frame(dataset: Dataset, tmp_path: Path) -> None:
-    judged = replace(dataset, frames=(replace(dataset.frames[0], verdict="good"), *dataset.frames[1:]))
-    with np.load(export(judged, "npz", tmp_path / "out.npz"), allow_pickle=False) as archive:
-        assert archive["verdict"].tolist() == ["good", "", ""]
-    content = json.loads(export(judged, "json", tmp_path / "out.json").read_text(encoding="utf-8"))
-    assert [frame["verdict"] for frame in content["frames"]] == ["good", None, None]
 
 
 def test_a_file_gets_the_suffix_of_its_format(dataset: Dataset, tmp_path: Path) -> None:

@@ -5,7 +5,6 @@ import io
 import os
 import signal
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +13,7 @@ import pytest
 from processes import eventually
 
 from carts_core.decoders import tables
-from carts_core.files.decoding import Decoder, Limits, called, decoded
+from carts_core.files.decoding import Decoder, Limits, decoded
 from carts_core.files.reading import parse_ini, parse_yaml
 
 SMALL = Limits(seconds=1, memory=100 * 2**20)
@@ -82,12 +81,6 @@ def test_a_child_that_has_ended_for_lack_of_work_is_replaced():
     eventually(lambda: not os.path.exists(f"/proc/{first}/exe"))
     assert decoder.call(os.getpid, limits=SMALL) != first
     decoder.close()
-
-
-def test_a_child_is_used_from_thread_to_thread():
-    with ThreadPoolExecutor(1) as one, ThreadPoolExecutor(1) as other:
-        numbers = [threads.submit(called, os.getpid, limits=SMALL).result() for threads in (one, other)]
-    assert numbers == [called(os.getpid, limits=SMALL)] * 2
 
 
 @pytest.mark.parametrize(

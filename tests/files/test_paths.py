@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from carts_core.errors import OutputError
-from carts_core.files import check_name, file_name, name_fault, output_path, unique_file_names
+from carts_core.files import check_name, name_fault, output_path, unique_file_names
 
 
 @pytest.mark.parametrize("name", ["001", "linke Kamera (ü)", "手術", "a..b", "a.", " ", "PSM 1 & <b>", "x" * 200, "~"])
@@ -66,7 +66,3 @@ def test_any_text_becomes_a_name_of_its_own(texts: list[str]) -> None:
     names = unique_file_names(texts)
     assert len({name.casefold() for name in names}) == len(texts)
     assert all(name_fault(name, 255 - len(".png")) is None for name in names)
-
-
-def test_long_texts_are_cut_between_two_letters() -> None:
-    assert file_name("ü" * 300) == "ü" * 100

@@ -59,16 +59,6 @@ def test_what_exists_is_replaced_on_request_only(tmp_path: Path) -> None:
     assert _names(tmp_path) == ["out", "out.csv"]
 
 
-def test_a_folder_is_replaced_also_where_two_cannot_change_places(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(sys, "platform", "darwin")
-    _make(tmp_path / "out", "old")
-    with published(tmp_path / "out", overwrite=True) as path:
-        _make(path, "new")
-    assert _names(tmp_path) == ["out"] and (tmp_path / "out" / MARKER).read_text() == "new"
-
-
 def test_what_a_kill_between_two_renames_took_away_comes_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     _make(tmp_path / "out", "old")
     rename = os.rename
@@ -151,11 +141,6 @@ def test_a_kill_in_the_middle_changes_nothing_and_the_next_export_works(tmp_path
     with published(target, overwrite=True) as path:
         _make(path, "new")
     assert _names(tmp_path) == ["out"] and (target / MARKER).read_text() == "new"
-
-
-def test_names_are_random_and_hidden(tmp_path: Path) -> None:
-    first, second = _kill(tmp_path / "a"), _kill(tmp_path / "b")
-    assert first.name != second.name and first.name.startswith(".carts-") and len(first.name) == 39
 
 
 def test_what_was_planted_beside_an_output_stays(tmp_path: Path) -> None:
@@ -242,13 +227,6 @@ def test_everything_is_on_disk_before_it_gets_its_name(tmp_path: Path, monkeypat
     assert synced[-1] == str(tmp_path)
 
 
-def test_a_draft_is_told_apart(tmp_path: Path) -> None:
-    with published(tmp_path / "a") as path, published(tmp_path / "b", key="k") as resumable:
-        assert isinstance(path, OutputPath) and path.draft and not resumable.draft
-        write_text(path, "a")
-        write_text(resumable, "b")
-
-
 def test_a_kill_at_any_moment_of_tidying_up_leaves_nothing_for_good(tmp_path: Path) -> None:
     unlink, rmdir = os.unlink, os.rmdir
 
@@ -273,15 +251,6 @@ def test_a_kill_at_any_moment_of_tidying_up_leaves_nothing_for_good(tmp_path: Pa
         assert os.listdir(tmp_path) == ["out"], kills
     # The old export's file and folder, the mark, and the staging folder.
     assert kills >= 4
-
-
-def test_what_was_killed_while_it_was_marked_is_tidied_up(tmp_path: Path) -> None:
-    left = tmp_path / f".carts-{'f' * 32}"
-    left.mkdir()
-    (left / "carts-unfinished.json").touch()
-    with published(tmp_path / "out") as path:
-        write_text(path / MARKER, "new")
-    assert os.listdir(tmp_path) == ["out"]
 
 
 def test_a_full_disk_leaves_no_staging_folder(tmp_path: Path) -> None:

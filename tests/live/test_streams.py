@@ -296,16 +296,6 @@ def _accepted(server: StreamServer) -> bool:
         return isinstance(next(_answers(client), None), ResultMessage)
 
 
-def test_connections_that_were_closed_before_the_first_result_keep_no_places(assembler: Assembler) -> None:
-    server = StreamServer(assembler, 0)
-    try:
-        for _ in range(40):
-            connected(server).close()
-        eventually(lambda: _accepted(server))
-    finally:
-        server.close()
-
-
 def test_silent_clients_make_room_when_all_places_are_taken(
     assembler: Assembler, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -3,7 +3,6 @@
 import time
 from collections.abc import Callable, Iterator
 from collections.abc import Sequence as Items
-from concurrent.futures import CancelledError
 from copy import copy
 from dataclasses import replace
 from pathlib import Path
@@ -14,7 +13,6 @@ import numpy as np
 import pytest
 import torch
 
-from carts_core.errors import SettingsError
 from carts_core.evaluation import dice
 from carts_core.imaging.working_image import Window
 from carts_core.live import Effort, LiveTracker, LiveVerdict
@@ -163,14 +161,6 @@ def test_a_camera_that_moves_is_followed(stream: Stream) -> None:
     np.testing.assert_allclose(found.state.T_view_world[0].numpy(), T_moved @ T, atol=1e-6)
 
 
-def test_before_anything_is_seen_the_verdict_is_lost_and_values_are_as_measured(stream: Stream) -> None:
-    stream.predictor.hidden = True
-    verdict, effort, _ = stream.next()
-    frame: Frame = stream.sequence.frame(stream.count % 2)
-    assert verdict is LiveVerdict.LOST and effort is Effort.SEARCH
-    np.testing.assert_allclose(stream.estimate.joint_positions["PSM1"], frame.measured["PSM1"], atol=1e-6)
-
-
 @pytest.fixture
 def concurrent(tiny_sequence: Callable[..., Path]) -> Iterator[Stream]:
     stream = Stream(tiny_sequence(frames=2, width=160, height=128), concurrent=True)
@@ -218,62 +208,6 @@ def test_an_arm_that_jumps_is_found_again_beside_the_stream(concurrent: Stream) 
     concurrent.come_round(0.02)
     after = [concurrent.next() for _ in range(10)]
     assert after[-1][0] is LiveVerdict.GOOD and concurrent.overlap() > 0.97
-
-
-def test_a_search_in_a_picture_that_is_gone_is_given_up_for_the_next_one(
-    concurrent: Stream, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    begun: list[float] = []
-    given_up: list[float] = []
-    cold = FrameSolver.cold
-
-    def noted(self: FrameSolver, frame: Frame, *arguments: Any, cancelled: Callable[[], bool]) -> Measurement:
-        begun.append(frame.timestamp or 0.0)
-        hidden = concurrent.predictor.hidden
-        # A search among nothing takes until somebody gives it up.
-        while hidden and not cancelled():
-            time.sleep(0.01)
-        try:
-            return cold(self, frame, *arguments, cancelled=cancelled)
-        except CancelledError:
-            given_up.append(frame.timestamp or 0.0)
-            raise
-
-    def until(verdict: LiveVerdict) -> None:
-        for _ in range(400):
-            if concurrent.next(0.02)[0] is verdict:
-                return
-            time.sleep(0.02)
-        pytest.fail(f"never {verdict}")
-
-    monkeypatch.setattr(FrameSolver, "cold", noted)
-    until(LiveVerdict.GOOD)
-    concurrent.predictor.hidden = True
-    until(LiveVerdict.LOST)
-    begun.clear()
-    given_up.clear()
-    while not begun:
-        concurrent.next(0.02)
-    concurrent.come_round(0.02)
-    concurrent.predictor.hidden, concurrent.slip = False, float(np.deg2rad(4.0))
-    shown = concurrent.time
-    until(LiveVerdict.GOOD)
-    assert given_up == begun[:1] and given_up[0] <= shown
-    concurrent.come_round(0.02)
-    after = [concurrent.next() for _ in range(10)]
-    assert after[-1][0] is LiveVerdict.GOOD and concurrent.overlap() > 0.97
-
-
-def test_what_goes_wrong_in_a_search_beside_the_stream_is_raised(
-    concurrent: Stream, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def broken(*_: Any, **options: Any) -> Measurement:
-        raise SettingsError("no such weights")
-
-    monkeypatch.setattr(FrameSolver, "cold", broken)
-    with pytest.raises(SettingsError, match="no such weights"):
-        for _ in range(200):
-            concurrent.next()
 
 
 def test_an_arm_that_is_out_of_view_and_yet_in_the_image_is_not_called_good(sample_sequence_path: Path) -> None:

@@ -49,14 +49,6 @@ def test_without_distortion_an_image_stays_as_it_is():
     assert camera(distortion=(0.0,) * 5).undistort(image) is image
 
 
-def test_an_undistorted_mask_is_still_a_mask():
-    mask = spot_image(100, 75) > 100
-    undistorted = camera(distortion=BARREL).undistort(mask)
-    assert undistorted.dtype == bool
-    assert 0 < undistorted.sum() < mask.size
-    assert (undistorted != mask).any()
-
-
 def test_an_image_of_another_size_is_not_undistorted():
     with pytest.raises(SettingsError, match=r"'left' is 128 x 96 but the image is 64 x 48"):
         camera(distortion=BARREL).undistort(np.zeros((48, 64, 3), np.uint8))

@@ -1,13 +1,10 @@
 """Named points of an arm."""
 
-from pathlib import Path
-
 import numpy as np
 import torch
 from tiny import tiny_scene
 
-from carts_core.decoders.meshes import MOST_FACES
-from carts_core.model.keypoints import MOST_KEYPOINTS, keypoints, project_keypoints
+from carts_core.model.keypoints import keypoints, project_keypoints
 from carts_core.model.robot import Robot
 from carts_core.model.scene import Arm
 
@@ -27,12 +24,6 @@ def test_keypoints_are_where_the_urdf_has_them(shipped_psm: Robot) -> None:
     assert [np.linalg.norm(place - tool_tip) < 1.2e-3 for place in places] == [True, True, False, False]
     for place, link in zip(places[2:], ("wrist_yaw_link", "wrist_pitch_link"), strict=True):
         assert np.allclose(place, shipped_psm.link_transform(joints, link)[:3, 3].numpy(), atol=1e-9)
-
-
-def test_another_robot_has_between_two_and_six_keypoints_of_different_names(shared_dir: Path) -> None:
-    robot = Robot.load(shared_dir / "robots" / "psm_classic_lnd" / "psm.urdf", max_faces=MOST_FACES)
-    names = [point.name for point in keypoints(Arm("PSM1", robot, np.eye(4)))]
-    assert 2 <= len(names) <= MOST_KEYPOINTS and len(set(names)) == len(names)
 
 
 def test_projection_agrees_with_the_camera_matrix_and_is_nan_behind_it(shipped_psm: Robot) -> None:

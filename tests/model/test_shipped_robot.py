@@ -7,10 +7,8 @@ import pytest
 import torch
 import trimesh
 import yourdfpy
-from manifold3d import Manifold
 from scipy.spatial import KDTree
 
-from carts_core.errors import RobotError
 from carts_core.model.robot import Robot
 from carts_core.rendering import visibility
 from carts_core.resources import shipped_robot
@@ -66,44 +64,6 @@ def test_meshes_are_small_and_closed() -> None:
         mesh = _load(path)
         assert mesh.is_watertight, path.name
         assert mesh.volume > 0, path.name
-
-
-def test_the_robot_is_loaded_without_decimation() -> None:
-    robot = Robot.load(shipped_robot())
-    shipped = sum(len(_load(path).faces) * (2 if "jaw" in path.name else 1) for path in MESHES)
-    loaded = sum(len(mesh.faces) for mesh in robot.meshes)
-    assert 8_000 < loaded < 14_000
-    assert loaded == shipped
-    assert robot.joint_names == JOINTS
-
-
-def test_each_jaw_turns_by_half_the_opening(model: yourdfpy.URDF) -> None:
-    model.update_cfg({"jaw": 0.8})
-    for link, angle in (("jaw_1_link", 0.4), ("jaw_2_link", -0.4)):
-        T_yaw_jaw = model.get_transform(link, "wrist_yaw_link")
-        assert np.arctan2(T_yaw_jaw[1, 0], T_yaw_jaw[0, 0]) == pytest.approx(angle)
-
-
-def test_closed_jaws_meet_face_to_face() -> None:
-    insert = _load(shipped_robot().parent / "meshes" / "jaw_insert.ply")
-    # The gripping faces lie on the plane x = 0, the teeth of either reach into the other's.
-    assert 0.0 < insert.bounds[1, 0] < 1e-4
-    roots = insert.vertices[:, 0][insert.vertices[:, 0] < 0.0].max()
-    assert -2e-4 < roots < 0.0
-
-
-def test_overall_dimensions_are_those_of_the_instrument() -> None:
-    size = {path.stem: _load(path).extents * 1e3 for path in MESHES}
-    assert size["shaft_tube"][:2] == pytest.approx(8.4, abs=0.02)
-    assert size["shaft_clevis"][:2] == pytest.approx(8.4, abs=0.05)
-    assert size["wrist_body"] == pytest.approx([13.6, 6.3, 6.3], abs=0.1)
-    assert size["jaw_body"][1] == pytest.approx(12.1, abs=0.1)
-
-
-def test_a_part_that_is_empty_is_reported_by_name() -> None:
-    part = cad.Part("left_out", "roll_link", cad.METAL, lambda: Manifold.cube((1, 1, 1)) - Manifold.cube((2, 2, 2)))
-    with pytest.raises(RobotError, match=r"left_out.*not a closed solid"):
-        cad.to_mesh(part)
 
 
 def _silhouette(robot: Robot, q: np.ndarray, T_camera_base: np.ndarray) -> np.ndarray:

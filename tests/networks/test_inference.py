@@ -11,7 +11,7 @@ import torch
 
 from carts_core.errors import SettingsError
 from carts_core.networks import FeatureExtractor
-from carts_core.networks.extractor import TOLERANCE, OnnxSurface, _times
+from carts_core.networks.extractor import TOLERANCE
 from carts_core.networks.surface import UNetSurface
 from carts_core.networks.weights import save_weights
 from carts_core.settings import Architecture
@@ -74,13 +74,6 @@ def test_the_number_of_threads_changes_no_bit(weights: Path) -> None:
     assert torch.equal(*found)
 
 
-def test_a_wrong_size_is_the_same_error_whoever_runs_the_network(weights: Path) -> None:
-    for engine in ("torch", "onnx"):
-        extractor = FeatureExtractor.load(weights, inference=engine)
-        with pytest.raises(SettingsError, match="multiples of"):
-            extractor.surface(torch.rand(1, 3, 33, 48), torch.rand(1, 6, 33, 48))
-
-
 def test_the_graph_is_exported_once_and_again_where_it_was_damaged(
     weights: Path, cache: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -117,13 +110,6 @@ def test_the_faster_engine_is_measured_once_and_remembered(
     assert json.loads(remembered.read_text())["engine"] == engine
     monkeypatch.setattr("carts_core.networks.extractor._times", lambda network, other: pytest.fail("measured again"))
     assert FeatureExtractor.load(weights, inference="auto").engine == engine
-
-
-def test_times_are_measured(weights: Path) -> None:
-    extractor = FeatureExtractor.load(weights)
-    network = extractor._surface
-    times = _times(network, OnnxSurface(network, extractor.weights["surface"].sha256))
-    assert set(times) == {"torch", "onnx"} and all(0 < value < 10 for value in times.values())
 
 
 def test_where_onnx_runtime_is_missing_torch_runs_and_asking_for_it_is_an_error(

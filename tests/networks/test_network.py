@@ -6,11 +6,6 @@ from carts_core.networks.network import FeatureNetwork, standardize
 from carts_core.settings import Architecture
 
 
-def test_features_have_the_size_of_the_image_and_the_first_levels_channels(small_network: FeatureNetwork):
-    assert small_network.features(torch.rand(2, 3, 32, 48)).shape == (2, 4, 32, 48)
-    assert small_network.logits(torch.rand(2, 3, 32, 48)).shape == (2, 1, 32, 48)
-
-
 def test_any_multiple_of_the_stride_is_a_valid_size():
     network = FeatureNetwork().eval()
     assert network.architecture.stride == 16

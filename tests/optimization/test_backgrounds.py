@@ -1,6 +1,5 @@
 """Empty backgrounds: false detections, and the other background mode."""
 
-import weakref
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -72,11 +71,6 @@ def _outline(found: FrameImages, place: tuple[slice, slice]) -> float:
     return float(found.images[0, :, rows, place[1]].diff(dim=1).abs().max())
 
 
-def test_without_a_background_all_that_the_network_sees_counts(scene: Scene) -> None:
-    found, seen = _seen(scene, _with_arm(_room()), None)
-    assert found.explained is None and seen[BAR].all() and seen[ARM].all()
-
-
 @pytest.mark.parametrize("gain, haze", [(1.0, 0.0), (0.8, 0.0), (1.15, 0.0), (0.7, 60.0)])
 def test_what_is_in_the_background_too_is_no_arm_in_any_light(scene: Scene, gain: float, haze: float) -> None:
     image = np.clip(gain * _with_arm(_room()).astype(float) + haze, 0, 255).astype(np.uint8)
@@ -133,17 +127,6 @@ def test_arms_that_never_leave_say_so_once_and_nothing_is_explained_away(tiny_se
     assert "camera 'left'" in problem and "hardly move" in problem and "`background` image" in problem
     assert Backgrounds.of(sequence, ["left"], "regular") is backgrounds
     assert set(Backgrounds.of(sequence, ["left"], "regular", required=True).images) == {"left"}
-
-
-def test_backgrounds_of_few_sizes_and_predictors_are_kept(scene: Scene) -> None:
-    backgrounds, predictors = Backgrounds({"left": _room()}), [DarkIsArm() for _ in range(20)]
-    made = [
-        weakref.ref(backgrounds.at(scene, (16 * width, 192), 0.0, predictor))
-        for width, predictor in enumerate(predictors, start=4)
-    ]
-    kept = [number for number, one in enumerate(made) if one() is not None]
-    assert 0 < len(kept) < 10 and kept[-1] == 19
-    assert backgrounds.at(scene, (16 * 23, 192), 0.0, predictors[-1]) is made[-1]()
 
 
 def test_a_real_instrument_is_found_in_a_room_that_deceives_the_network(shared_dir: Path) -> None:

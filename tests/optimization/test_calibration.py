@@ -274,13 +274,6 @@ def test_the_schur_complement_solves_what_the_whole_system_solves() -> None:
     torch.testing.assert_close(torch.linalg.inv(curvature), torch.linalg.inv(whole)[:shared, :shared])
 
 
-def test_nothing_own_leaves_a_model_as_it_is() -> None:
-    gradient, curvature = torch.tensor([1.0, 2.0]), torch.tensor([[2.0, 0.5], [0.5, 3.0]])
-    model = eliminate(gradient, curvature, 0)
-    assert torch.equal(model.gradient, gradient.double()) and torch.equal(model.curvature, curvature.double())
-    assert model.own_step(gradient).shape == (0,)
-
-
 def test_frames_are_trusted_by_their_loss_beside_the_median() -> None:
     weights = frame_weights(torch.tensor([0.1, 0.1, 0.12, 0.0, 1.5], dtype=torch.float64))
     assert weights[:4].tolist() == [1.0] * 4 and float(weights[4]) == pytest.approx(0.01)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 from jaxtyping import Float
-from perfect_predictor import PerfectPredictor, with_stage, without
+from perfect_predictor import with_stage, without
 from torch import Tensor
 from torch.nn import functional
 
@@ -80,19 +80,6 @@ def test_outlines_come_to_lie_on_the_edges_of_the_image(sequence: Sequence) -> N
     assert (drawn.edges.gradient + held).abs().max() < 0.1 * pulled
 
 
-def test_moving_outlines_as_they_say_is_as_good_as_rendering_them(
-    sequence: Sequence, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    rendered, render = [], Renderer.outline
-    monkeypatch.setattr(Renderer, "outline", lambda *given: rendered.append(render(*given)) or rendered[-1])
-    moved = align(sequence)
-    few = len(rendered)
-    monkeypatch.setattr("carts_core.optimization.image_factors._RENDERED_ANEW", 0.0)
-    always = align(sequence)
-    assert few < 0.8 * (len(rendered) - few)
-    assert (moved.offsets - always.offsets)[:2].abs().max() < 0.05 * OFF.max()
-
-
 def test_where_there_is_no_edge_nothing_moves(sequence: Sequence) -> None:
     drawn = align(sequence, np.full((480, 640, 3), 128, np.uint8))
     assert drawn.offsets.abs().max() == 0
@@ -118,38 +105,6 @@ def test_edges_behind_haze_count_by_the_square_of_what_comes_through(
     clear, hazy = found
     assert clear.abs().max() > 0
     torch.testing.assert_close(hazy, 0.25 * clear)
-
-
-def test_edges_where_the_network_sees_no_arm_do_not_count(sequence: Sequence) -> None:
-    drawn = align(sequence, seen=torch.zeros(1, 360, 480))
-    assert drawn.offsets.abs().max() == 0
-
-
-def test_edges_further_away_than_they_are_looked_for_do_not_pull(sequence: Sequence) -> None:
-    image = sequence.frame(0).images["left"].copy()
-    far = np.roll(image, (40, 40), (0, 1))
-    near = align(sequence)
-    drawn = align(sequence, far)
-    assert drawn.edges.hessian.diagonal().sum() < 0.5 * near.edges.hessian.diagonal().sum()
-
-
-def test_the_last_iterate_is_the_one_on_edges(tiny_sequence: Callable[..., Path]) -> None:
-    sequence = Sequence.open(tiny_sequence(frames=1, cameras=("left",), width=320, height=240))
-    frame = sequence.frame(0)
-    predictor = PerfectPredictor(sequence, sequence.scene.state(frame.truth or {}))
-
-    def run(settings: SurfaceSolver) -> FrameOptimizer:
-        optimizer = FrameOptimizer(sequence.scene, frame, {}, predictor, settings=settings)
-        list(optimizer)
-        return optimizer
-
-    plain, drawn = run(without(AlignEdges)), run(SurfaceSolver())
-    assert drawn.stop_reason == plain.stop_reason
-    assert drawn.best is not None and drawn.best.index == len(drawn.history) - 1
-    assert plain.best is not None
-    np.testing.assert_allclose(drawn.best.joint_std()[ARM], plain.best.joint_std()[ARM], rtol=0.2)
-    short = run(SurfaceSolver(iterations=3))
-    assert short.stop_reason == "iterations" and len(short.history) == 3, "no step more than was asked for"
 
 
 @pytest.mark.parametrize(

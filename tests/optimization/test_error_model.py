@@ -9,7 +9,6 @@ from carts_core.optimization.error_model import (
     ErrorModel,
     Gaussian,
     Information,
-    combined,
     information_shares,
     remove_measurement,
 )
@@ -103,23 +102,6 @@ def test_the_mahalanobis_distance_is_about_one_where_the_model_holds_however_muc
     far = Information(precision, precision @ np.full(N, 0.9))
     assert far.mahalanobis(expected) > 50 and far.contradicts(expected)
     assert Information.nothing(N).mahalanobis(expected) == 0
-
-
-def test_a_combination_is_the_weighted_mean() -> None:
-    prior = Gaussian(np.array([0.1]), np.array([[0.01]]))
-    found = combined(prior, Information(np.array([[300.0]]), np.array([300.0 * 0.3])))
-    assert found.mean[0] == pytest.approx((100 * 0.1 + 300 * 0.3) / 400)
-    assert found.covariance[0, 0] == pytest.approx(1 / 400)
-
-
-def test_information_with_less_weight_says_the_same_less_firmly() -> None:
-    seen = information(2, 2)
-    less = seen.scaled(0.25)
-    prior = Gaussian(np.zeros(N), 1e6 * np.eye(N))
-    free, held = combined(prior, less), combined(prior, seen)
-    shown = seen.precision @ np.linalg.pinv(seen.precision)
-    np.testing.assert_allclose(shown @ free.mean, shown @ held.mean, rtol=1e-3, atol=1e-6)
-    np.testing.assert_allclose(less.precision, 0.25 * seen.precision)
 
 
 def test_shares_of_correlated_errors_are_what_their_mean_becomes_certain_by() -> None:

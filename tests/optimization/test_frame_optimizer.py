@@ -12,7 +12,6 @@ from carts_core.errors import SettingsError
 from carts_core.evaluation import dice
 from carts_core.networks import FeatureExtractor
 from carts_core.optimization import DescentSolver, FrameOptimizer, FreeParameters, Iterate, SurfaceSolver
-from carts_core.optimization.predictor import predictor_of
 from carts_core.recording import Frame, Sequence
 from carts_core.rendering import Renderer
 from carts_core.settings import Loss
@@ -68,25 +67,6 @@ def test_the_first_step_in_the_papers_setting_is_a_milliradian_or_a_tenth_of_a_m
     assert np.delete(step, insertion).max() == pytest.approx(1e-3, rel=1e-2)
 
 
-def test_loss_falls_and_dice_rises(sequence: Sequence, descended: tuple[FrameOptimizer, list[Iterate]]) -> None:
-    optimizer, (first, *_) = descended
-    assert optimizer.best is not None
-    assert optimizer.best.loss < first.loss
-    mask = (sequence.frame(0).masks or {})["left"]
-    renderer = Renderer(sequence.scene, cameras=["left"])
-    before, after = (dice(renderer.segment(iterate.state)[0] >= 0, mask) for iterate in (first, optimizer.best))
-    assert after > before
-
-
-def test_two_cameras_share_one_objective(sequence: Sequence, extractor: FeatureExtractor) -> None:
-    iterate = optimizer_of(sequence, extractor).step()
-    assert iterate is not None
-    assert iterate.silhouette.shape == (2, 240, 320)
-    assert iterate.image.shape == (2, 240, 320, 3)
-    assert iterate.attention.shape == iterate.similarity.shape == (2, 240, 320)
-    assert iterate.similarity.max() <= 1.0 + 1e-5
-
-
 def test_reset_goes_back_to_the_start(sequence: Sequence, extractor: FeatureExtractor) -> None:
     optimizer = optimizer_of(sequence, extractor, cameras=["left"])
     losses = [iterate.loss for iterate in optimizer]
@@ -123,15 +103,6 @@ def test_joints_are_the_same_wherever_the_network_runs(sequence: Sequence) -> No
         for device in ("cpu", "cuda")
     )
     assert np.allclose(here.joint_positions()["PSM1"], there.joint_positions()["PSM1"], atol=1e-3)
-
-
-def test_rendering_and_solving_stay_on_the_cpu_where_the_network_is_elsewhere(sequence: Sequence) -> None:
-    elsewhere = FeatureExtractor.load(device="meta")
-    assert elsewhere.device.type == "meta"
-    assert predictor_of(elsewhere).device.type == "cpu"
-    # A network on this device computes nothing: all goes well until what it says is to come back.
-    with pytest.raises(NotImplementedError, match="Cannot copy out of meta tensor"):
-        list(optimizer_of(sequence, elsewhere, settings=SurfaceSolver()))
 
 
 def test_an_occluder_that_is_known_is_left_out(sequence: Sequence, extractor: FeatureExtractor) -> None:

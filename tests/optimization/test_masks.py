@@ -16,12 +16,10 @@ from carts_core.imaging.working_image import Window
 from carts_core.model.parts import COVERAGE
 from carts_core.model.perturbation import perturb
 from carts_core.optimization import (
-    Backgrounds,
     CalibrationOptimizer,
     FrameOptimizer,
     MaskPredictor,
     SequenceOptimizer,
-    SurfaceSolver,
 )
 from carts_core.recording import Frame, Sequence
 from carts_core.rendering import Renderer
@@ -66,14 +64,6 @@ def test_a_mask_with_holes_and_soft_edges_is_fitted(sequence: Sequence) -> None:
     mask = cv2.GaussianBlur((frame.masks or {})["left"].astype(np.float32), (0, 0), 1.5)
     mask *= np.kron(rng.random((12, 16)) >= 0.2, np.ones((20, 20))).astype(np.float32)
     assert dice_of(sequence, frame, MaskPredictor(masks=lambda _: {"left": mask}), live=False) > 0.97
-
-
-def test_parts_normals_and_the_background_do_not_count(sequence: Sequence) -> None:
-    frame, found = sequence.frame(0), []
-    for weight, backgrounds in ((0.0, Backgrounds({})), (100.0, Backgrounds(frame.images))):
-        settings = SurfaceSolver(parts_weight=weight, normals_weight=weight, iterations=6)
-        found.append(dice_of(sequence, frame, MaskPredictor(), settings=settings, backgrounds=backgrounds, live=False))
-    assert found[0] == found[1]
 
 
 def test_pixels_that_are_ignored_do_not_count(sequence: Sequence) -> None:

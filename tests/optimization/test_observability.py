@@ -44,11 +44,6 @@ def test_errors_turn_out_as_large_as_what_the_image_has_corrected() -> None:
         assert abs(expected_scale(moved, information, prior) - size) < 0.2 * size
 
 
-def test_an_image_that_determines_nothing_leaves_errors_as_large_as_expected() -> None:
-    nothing, prior = torch.zeros(7), torch.eye(7) / 0.04**2
-    assert expected_scale(nothing, torch.zeros(7, 7), prior) == 1.0
-
-
 def test_errors_lie_within_the_deviations_however_far_off_the_start_was(variables: Variables) -> None:
     generator = torch.Generator().manual_seed(7)
     joints, expected, start_share = len(variables.names), 0.04, 0.1

@@ -18,13 +18,11 @@ from carts_core.optimization import (
     SequenceSettings,
     SurfaceSolver,
 )
-from carts_core.optimization.error_model import Gaussian
-from carts_core.optimization.measurement import FrameEstimate, FrameSolver, Measurement
+from carts_core.optimization.measurement import FrameEstimate, FrameSolver
 from carts_core.optimization.sequence import initial_correction
 from carts_core.optimization.variables import Variables
 from carts_core.recording import Frame
 from carts_core.rendering import Renderer
-from carts_core.settings.stages import WARM_WIDE, AlignEdges
 
 WRIST_PITCH = 4
 
@@ -100,16 +98,6 @@ def test_a_joint_that_is_hidden_now_and_then_is_carried_by_the_other_frames(trut
         expected = known.expected[known.names.index(f"{ARM}/wrist_pitch")]
         seen = estimates[0].joint_std[ARM][WRIST_PITCH]
         assert 0.99 * seen < estimates[index].joint_std[ARM][WRIST_PITCH] < expected
-
-
-def test_a_frame_in_which_nothing_is_seen_takes_its_neighbours_correction(truths: Truths) -> None:
-    truths.blind = {3}
-    # This predictor has no errors that frames could share.
-    sequence = optimizer(truths, model=SequenceSettings(correlation_seconds=0.01))
-    list(sequence)
-    found = error(truths, 3, sequence.estimates[3].joint_positions)
-    assert found[:2].max() < np.deg2rad(0.25)
-    assert sequence.estimates[3].loss > 3 * sequence.estimates[2].loss
 
 
 def test_a_keyframe_stays_as_given_and_draws_the_others(truths: Truths) -> None:
@@ -207,18 +195,6 @@ def test_where_it_starts_suits_all_frames_that_were_solved_alone(truths: Truths,
     assert np.array_equal(found, wrong if jumped else right)
 
 
-def test_a_keyframe_counts_for_the_start_wherever_it_is(truths: Truths) -> None:
-    given = {ARM: (truths.sequence.frame(3).truth or {})[ARM]}
-    # The others see nothing, so only the person's word can tell where to start.
-    truths.blind = set(range(FRAMES)) - {1, 3}
-    sequence = optimizer(truths, model=SequenceSettings(initial_frames=2), keyframes={3: given})
-    alone = [step for _ in range(3) if (step := sequence.step()) is not None]
-    assert [(step.index, step.start) for step in alone] == [(0, "cold"), (3, "keyframe"), (5, "cold")]
-    assert np.array_equal(alone[1].joint_positions[ARM], given[ARM])
-    list(sequence)
-    assert np.array_equal(sequence.estimates[3].joint_positions[ARM], given[ARM])
-
-
 def test_backward_begins_at_the_last_frame_and_ends_alike(
     truths: Truths, forward: tuple[SequenceOptimizer, list[FrameEstimate]]
 ) -> None:
@@ -292,27 +268,3 @@ def test_frames_and_times_that_do_not_fit_are_refused(truths: Truths, times: dic
 def test_settings_out_of_range_are_named(name: str, value: object) -> None:
     with pytest.raises(SettingsError, match=f"{name} is {value!r}; allowed:"):
         SequenceSettings(**{name: value})  # pyright: ignore[reportArgumentType]
-
-
-def test_a_measurement_informs_others_as_firmly_as_its_noise_says(truths: Truths) -> None:
-    frame = truths.load(0)
-    scene, settings = truths.sequence.scene, SurfaceSolver()
-    start = {ARM: (frame.truth or {})[ARM]}
-
-    def measure(model: SequenceSettings) -> Measurement:
-        variables = Variables(scene, scene.state(start), FreeParameters(), settings.length_scale)
-        solver = FrameSolver(scene, truths, settings, model, lambda _: {})
-        expected = Gaussian(np.zeros(len(variables)), np.eye(len(variables)) * np.deg2rad(1.5) ** 2)
-        seen = solver.warm(frame, variables, expected, np.deg2rad([0.2, -0.2, 0.0, 0.0, 0.0, 0.0, 0.0]))
-        return solver.warm(frame, variables, expected, seen.correction)
-
-    model = SequenceSettings(measurement_noise=settings.noise, warm=WARM_WIDE)
-    firm, loose = (measure(replace(model, measurement_noise=factor * settings.noise)) for factor in (1, 2))
-    np.testing.assert_allclose(firm.correction, loose.correction, atol=1e-6)
-    precision = firm.information.precision
-    np.testing.assert_allclose(precision, 4.0 * loose.information.precision, rtol=1e-3, atol=1e-3 * precision.max())
-    # Edges of so small an image lie elsewhere.
-    warm = tuple(stage for stage in model.warm if not isinstance(stage, AlignEdges))
-    surface = measure(replace(model, warm=warm))
-    assert np.abs(surface.correction[:2]).max() < 0.3 * np.deg2rad(0.2), "the truth is at 0"
-    assert precision[0, 0] > 1.05 * surface.information.precision[0, 0], "edges inform others, too"

@@ -45,11 +45,6 @@ def test_asking_in_between_changes_nothing() -> None:
         assert_same(found, expected[index])
 
 
-def test_before_the_first_frame_the_prior_is_expected() -> None:
-    assert_same(Smoother(MODEL, GAPS, MEMORY, ()).expected(4), MODEL.correction(MODEL.initial()))
-    assert Smoother(MODEL, GAPS, MEMORY, ()).smoothed() == {}
-
-
 @pytest.mark.parametrize("asked", [False, True])
 def test_after_a_restart_neither_side_informs_the_other(asked: bool) -> None:
     smoother = Smoother(MODEL, GAPS, MEMORY, ())

@@ -15,12 +15,12 @@ from carts_core.optimization import FreeParameters
 from carts_core.optimization.factors import FirstOrderDescent
 from carts_core.optimization.frame_problem import FrameProblem
 from carts_core.optimization.observability import Evaluation
-from carts_core.optimization.stages import Fit, StopReason, run_stage, run_stages, start_explains_as_well
+from carts_core.optimization.stages import Fit, StopReason, run_stages, start_explains_as_well
 from carts_core.optimization.variables import Variables
 from carts_core.recording import Sequence
 from carts_core.settings import DescentSolver, SurfaceSolver
 from carts_core.settings import FreeParameters as Free
-from carts_core.settings.stages import AlignEdges, Descend, Evaluate, Given, Observe, PreferStart, RandomRestart, Stage
+from carts_core.settings.stages import Descend, Evaluate, Given, Observe, PreferStart, RandomRestart, Stage
 
 
 class Bowl:
@@ -82,11 +82,6 @@ def test_a_descent_never_passes_a_joint_limit(variables: Variables) -> None:
     torch.testing.assert_close(fit.offsets, variables.upper)
 
 
-def test_what_is_no_stage_is_refused(variables: Variables) -> None:
-    with pytest.raises(TypeError, match="is not a stage"):
-        run_stage("dance", Fit(bowl(variables, 1.0), torch.zeros_like(variables.lower), 60))
-
-
 def frame_fit(tiny_sequence: Callable[..., Path], free: Free, off: np.ndarray) -> Fit:
     sequence = Sequence.open(tiny_sequence(frames=1, cameras=("left",), width=320, height=240))
     frame, scene = sequence.frame(0), sequence.scene
@@ -97,15 +92,6 @@ def frame_fit(tiny_sequence: Callable[..., Path], free: Free, off: np.ndarray) -
     variables = Variables(scene, state, free, settings.length_scale)
     problem = FrameProblem(scene, frame.images, predictor, variables, settings, live=False)
     return Fit(problem, problem.start, settings.iterations)
-
-
-def test_only_observe_calls_the_predictor(tiny_sequence: Callable[..., Path], monkeypatch: pytest.MonkeyPatch) -> None:
-    calls = []
-    predict = PerfectPredictor.predict
-    monkeypatch.setattr(PerfectPredictor, "predict", lambda *given: calls.append(1) or predict(*given))
-    fit = frame_fit(tiny_sequence, Free(), np.zeros(7))
-    list(run_stages((Observe(), Descend(3.0), Descend(1.6), AlignEdges(), Evaluate()), fit))
-    assert len(calls) == 1
 
 
 def test_a_network_can_be_conditioned_on_the_start_or_on_the_estimate(

@@ -8,10 +8,9 @@ import pytest
 import torch
 from perfect_predictor import PerfectPredictor, with_stage, without
 
-from carts_core.errors import SettingsError
 from carts_core.imaging.working_image import Window
 from carts_core.networks import FeatureExtractor
-from carts_core.optimization import DescentSolver, FrameOptimizer, FreeParameters, SurfaceSolver
+from carts_core.optimization import FrameOptimizer, FreeParameters, SurfaceSolver
 from carts_core.optimization.factors import Prior
 from carts_core.optimization.frame_problem import FrameProblem
 from carts_core.optimization.image_factors import SurfaceFactor
@@ -89,14 +88,6 @@ def test_keeping_the_start_or_not_with_the_shipped_network() -> None:
     history = [progress.loss for progress in compared.history]
     compared.reset()
     assert [iterate.loss for iterate in compared] == history, "and a reset observes again"
-
-
-def test_a_calibration_that_is_free_is_not_kept(sequence: Sequence, predictor: PerfectPredictor) -> None:
-    frame = sequence.frame(0)
-    free = FreeParameters(base_frames=True)
-    optimizer = FrameOptimizer(sequence.scene, frame, {}, predictor, start=frame.truth, free=free)
-    list(optimizer)
-    assert optimizer.stop_reason != "start kept"
 
 
 def test_nobody_watching_changes_no_step(sequence: Sequence, predictor: PerfectPredictor) -> None:
@@ -225,18 +216,6 @@ def test_further_factors_are_added_to_the_objective(sequence: Sequence, predicto
         assert optimizer.best is not None
         found.append(optimizer.best.joint_positions()["PSM1"][roll] - start["PSM1"][roll])
     assert abs(found[0]) < 0.02 and found[1] == pytest.approx(known, abs=2e-3)
-
-
-def test_a_descent_of_features_refuses_further_factors(sequence: Sequence, predictor: PerfectPredictor) -> None:
-    with pytest.raises(SettingsError, match="does not support further factors"):
-        FrameOptimizer(
-            sequence.scene,
-            sequence.frame(0),
-            {},
-            predictor,
-            settings=DescentSolver(),
-            factors=lambda variables: [Prior.around_start(torch.ones(len(variables)))],
-        )
 
 
 def test_images_are_enlarged_up_to_the_cameras_and_weigh_the_same(

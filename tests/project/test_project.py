@@ -24,17 +24,10 @@ from carts_core.project import (
     Review,
     ReviewState,
     Source,
-    TimeOffset,
 )
 
 JOINTS = JointCorrection((0.1, 0.2, 0.03), HAND)
 ACCEPTED = Review(ReviewState.ACCEPTED, "clean")
-
-
-def test_a_new_project_says_what_the_sequence_says(project: Project) -> None:
-    assert project.writable and project.read_only_reason is None
-    assert project.state.joints(0) == {} and project.state.review(0) == Review()
-    assert project.undo() is None and project.redo() is None and project.history() == ()
 
 
 def test_values_keep_every_bit_and_who_made_them(project: Project, project_path: Path) -> None:
@@ -47,19 +40,6 @@ def test_values_keep_every_bit_and_who_made_them(project: Project, project_path:
     assert np.array_equal(found.joint_positions, positions)
     assert found.standard_deviations == (1e-5, None, None)
     assert found.provenance == OPTIMIZER
-
-
-def test_a_time_offset_holds_for_all_frames_and_makes_their_figures_void(project: Project, project_path: Path) -> None:
-    project.record_figures({0: Figures(dice=0.5)}, project.state)
-    project.apply("Time offset", {Key.time_offset(): TimeOffset(-0.035)})
-    assert project.state.figures(0) is None
-    project.close()
-    with Project(IDENTITY, project_path) as again:
-        assert again.state.get(Key.time_offset()) == TimeOffset(-0.035)
-        again.undo()
-        assert again.state.get(Key.time_offset()) is None and again.state.figures(0) == Figures(dice=0.5)
-    with pytest.raises(ProjectError, match="the time offset are"):
-        TimeOffset(np.nan)
 
 
 def test_a_gesture_over_many_frames_is_one_step_of_undo_even_after_a_restart(tmp_path: Path) -> None:
@@ -98,16 +78,6 @@ def test_figures_that_come_too_late_are_not_given_to_another_state(project: Proj
     project.record_figures({0: Figures(loss=0.5), 1: Figures(loss=0.25)}, old)
     assert project.state.figures(0) is None
     assert project.state.figures(1) == Figures(loss=0.25)
-
-
-def test_exports_are_logged_and_not_undone(project: Project, project_path: Path) -> None:
-    project.log_export("coco", Path("out/masks.json"), 30, {"states": ["accepted"]})
-    assert project.undo() is None
-    project.close()
-    with Project(IDENTITY, project_path) as again:
-        (record,) = again.state.exports
-        assert (record.format, record.path, record.frames) == ("coco", "out/masks.json", 30)
-        assert record.settings == '{"states": ["accepted"]}'
 
 
 def test_layers_come_back_pixel_for_pixel(project: Project, project_path: Path) -> None:

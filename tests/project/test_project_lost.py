@@ -102,15 +102,6 @@ def test_a_loss_is_noticed_and_rescued_without_an_edit(project: Project, project
         assert again.state.review(0).note == "a"
 
 
-def test_the_last_moment_counts_too(project: Project, project_path: Path) -> None:
-    project.apply("Note", {Key.review(0): Review(note="a")})
-    project_path.unlink()
-    project.close()
-    assert project.path != project_path and project.incident is not None
-    with Project(IDENTITY, project.path, read_only=True) as again:
-        assert again.state.review(0).note == "a"
-
-
 def test_without_any_place_for_a_rescue_it_says_so_and_tries_again(
     project: Project, project_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

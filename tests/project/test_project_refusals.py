@@ -7,11 +7,11 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from project_model import HAND, IDENTITY
+from project_model import IDENTITY
 from sql_file import edit_file
 
 from carts_core.errors import ProjectError
-from carts_core.project import JointCorrection, Key, Project, Review, ReviewState
+from carts_core.project import Key, Project, Review, ReviewState
 
 ACCEPTED = Review(ReviewState.ACCEPTED, "clean")
 
@@ -108,31 +108,6 @@ def test_a_project_of_another_sequence_is_refused_and_left_alone(
         with pytest.raises(ProjectError, match=f"belongs to another sequence .*{difference}. Nothing was changed"):
             Project(replace(IDENTITY, **changed), project_path, read_only=read_only)
     assert project_path.read_bytes() == before
-
-
-@pytest.mark.parametrize(
-    "damage",
-    [
-        "UPDATE changes SET value = '{' WHERE kind = 'review'",
-        "UPDATE changes SET value = '{\"state\": \"splendid\"}' WHERE kind = 'review'",
-        "UPDATE changes SET kind = 'opinion'",
-        "UPDATE changes SET frame = 77",
-        "UPDATE changes SET value = x'00' WHERE kind = 'joints'",
-        "DELETE FROM steps",
-        "DELETE FROM project",
-        "UPDATE project SET position = 7",
-        "UPDATE project SET identity = '[]'",
-    ],
-)
-def test_a_damaged_project_is_a_clear_error(project_path: Path, damage: str) -> None:
-    with Project(IDENTITY, project_path) as project:
-        joints = JointCorrection((0.0, 0.0), HAND)
-        project.apply("Accept", {Key.review(0): ACCEPTED, Key.joints(0, "PSM2"): joints})
-    edit_file(project_path, damage)
-    damaged = project_path.read_bytes()
-    with pytest.raises(ProjectError, match=r"small\.carts is damaged: .* not changed.* Restore a backup"):
-        Project(IDENTITY, project_path)
-    assert project_path.read_bytes() == damaged
 
 
 def test_a_file_that_was_cut_off_is_a_clear_error(project_path: Path) -> None:

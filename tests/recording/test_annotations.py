@@ -13,7 +13,7 @@ from carts_core.errors import SequenceError
 from carts_core.export import Dataset, FormatName, export, measured_frames
 from carts_core.model.camera import Camera
 from carts_core.recording import Sequence
-from carts_core.recording.annotations import FrameAnnotation, read_annotations
+from carts_core.recording.annotations import read_annotations
 from carts_core.recording.annotations.formats import mask_of_polygon, mask_of_runs, runs_of_text
 
 HEIGHT, WIDTH = 72, 96
@@ -261,12 +261,6 @@ def test_masks_in_folders_called_left_and_right_find_their_cameras(sequence: Seq
     frames, labels, unknown = all_of(tmp_path / "marked", sequence)
     assert set(frames) == {(0, "left"), (0, "right"), (1, "left"), (1, "right")} and labels == ["instrument"]
     assert np.array_equal(frames[1, "right"].labels > 0, disc(2)) and len(unknown) == 2
-
-
-def test_an_empty_mask_says_that_nothing_is_there(sequence: Sequence, tmp_path: Path) -> None:
-    write_png(tmp_path / "left" / "001.png", np.zeros((HEIGHT, WIDTH), np.uint8))
-    found: FrameAnnotation = all_of(tmp_path / "left", sequence)[0][0, "left"]
-    assert found.labels is not None and not found.labels.any()
 
 
 @pytest.mark.parametrize(

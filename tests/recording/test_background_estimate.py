@@ -9,9 +9,7 @@ from carts_core.recording.background import (
     background_of_recording,
     fill,
     filled_in,
-    spread,
     uncovered_median,
-    widen,
 )
 from carts_core.resources import sample_sequence
 
@@ -41,12 +39,6 @@ def test_the_median_leaves_out_an_uncovered_outlier():
     assert np.array_equal(estimated(given), SCENE)
 
 
-def test_an_even_number_of_views_gives_the_mean_of_the_middle_two():
-    values = [10, 20, 31, 200]
-    given = [(np.full((4, 4, 3), value, np.uint8), np.zeros((4, 4), bool)) for value in values]
-    assert (estimated(given) == 26).all()
-
-
 def test_what_is_never_uncovered_is_filled_in_smoothly():
     x = np.linspace(40, 200, 80)
     ramp = np.tile(np.rint(x).astype(np.uint8)[None, :, None], (60, 1, 3))
@@ -68,20 +60,6 @@ def test_an_arm_that_shows_beside_what_is_always_covered_leaves_no_line():
 def test_a_scene_that_is_always_covered_is_refused():
     with pytest.raises(SequenceError, match=r"cover every pixel of every frame. Check T_camera_world"):
         estimated([(SCENE, np.ones((60, 80), bool))])
-
-
-def test_a_silhouette_is_widened_by_a_share_of_the_width():
-    dot = np.zeros((480, 640), bool)
-    dot[240, 320] = True
-    rows, columns = np.nonzero(widen(dot))
-    assert (np.ptp(rows), np.ptp(columns)) == (30, 30)
-
-
-def test_frames_are_spread_from_the_first_to_the_last():
-    assert spread(5) == [0, 1, 2, 3, 4]
-    assert spread(1) == [0]
-    chosen = spread(1000)
-    assert (len(chosen), chosen[0], chosen[-1]) == (30, 0, 999)
 
 
 def test_where_arms_are_near_it_is_known_only_if_views_agree():

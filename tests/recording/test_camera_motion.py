@@ -47,13 +47,6 @@ def test_each_frame_knows_where_the_mount_of_its_camera_was(moving: Path) -> Non
         assert np.allclose(state.T_view_world[0].numpy(), expected, atol=1e-6)
 
 
-def test_a_camera_that_stays_has_no_mount(tiny_sequence: Callable[..., Path]) -> None:
-    sequence = Sequence.open(tiny_sequence())
-    assert not sequence.moving_cameras and not sequence.frame(0).mounts
-    state = sequence.scene.state(sequence.frame(0).measured)
-    assert np.array_equal(state.T_view_world.numpy(), state.T_camera_world.numpy())
-
-
 def test_poses_of_the_camera_in_the_world_may_be_given_the_other_way_round_and_in_millimetres(moving: Path) -> None:
     Ts = np.linalg.inv(swing(FRAMES).Ts_world_mount)
     Ts[:, :3, 3] *= 1000.0
@@ -156,11 +149,3 @@ def test_an_impossible_motion_is_refused_with_what_to_do(
 def test_a_wrong_description_of_the_motion_is_refused(moving: Path, lines: str, message: str) -> None:
     with pytest.raises(SequenceError, match=message):
         Sequence.open(with_motion(moving, lines))
-
-
-def test_joints_of_the_ecm_in_degrees_are_noticed(moving: Path) -> None:
-    rows = [["frame", *"abcd"], *([str(n + 1), "35", "-20", "0.1", "0"] for n in range(FRAMES))]
-    with (moving.parent / "ecm.csv").open("w", newline="") as handle:
-        csv.writer(handle).writerows(rows)
-    with pytest.raises(SequenceError, match=r"has yaw at 35; 12\.6 is allowed. Give \[rad\] and \[m\]"):
-        Sequence.open(with_motion(moving, 'motion = { table = "ecm.csv", ecm_joints = ["a", "b", "c", "d"] }'))

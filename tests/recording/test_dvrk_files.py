@@ -78,8 +78,3 @@ def test_other_files_are_refused_in_words(tmp_path, content, message):
     path.write_text(content)
     with pytest.raises(SequenceError, match=message):
         read_base_frames(path)
-
-
-def test_a_missing_file_is_said(tmp_path):
-    with pytest.raises(SequenceError, match="is missing"):
-        read_base_frames(tmp_path / "none.json")

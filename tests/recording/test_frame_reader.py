@@ -94,29 +94,6 @@ def test_the_neighbours_are_those_in_the_direction_of_travel(watched, reader, pa
     assert watched.ahead == planned
 
 
-def test_a_jump_makes_the_plan_void(watched, reader):
-    watched.held = {12}
-    reader.frame(10, "regular", "left")
-    reader.frame(11, "regular", "left")
-    assert watched.reached.wait(30)
-    reader.frame(40, "regular", "left")
-    watched.go_on.set()
-    finish(reader)
-    # Frame 11 may have been under way for frame 10; of what followed 12, nothing was read.
-    assert watched.ahead[watched.ahead.index(12) :] == [12, *range(41, 49), 39]
-
-
-def test_there_is_one_thread_and_who_asks_does_not_wait_for_it(watched, reader):
-    watched.held = {12}
-    reader.frame(11, "regular", "left")
-    assert watched.reached.wait(30)
-    for index in (30, 31, 32, 5):
-        assert reader.frame(index, "regular", "left").index == index
-    assert len(watched.threads) == 1
-    watched.go_on.set()
-    finish(reader)
-
-
 def test_an_error_is_for_who_asks_for_that_frame(watched, reader):
     image = watched.sequence.path.parent / "regular/left/022.png"
     content = image.read_bytes()

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from carts_core.errors import CartsError
-from carts_core.model.psm_kinematics import CLASSIC, SI, forward, inverse
+from carts_core.model.psm_kinematics import CLASSIC, forward, inverse
 from carts_core.recording.importing import CANDIDATES, at_times, check_instrument, clock_offset, fit_base_frame
 
 
@@ -83,11 +83,6 @@ def test_the_base_frame_is_found_and_wrong_wrists_and_shafts_are_refused(base):
     wrong_shaft = check_instrument(base @ forward(joints, replace(CLASSIC, shaft_length=0.4670)), joints)
     assert not wrong_shaft.accepts(wrong_shaft.best)
     assert "No known instrument fits" in (wrong_shaft.warning("9.1 mm wrist") or "")
-
-
-def test_an_si_arm_and_a_classic_one_are_the_same_to_this_check(base):
-    joints = motion()
-    assert check_instrument(base @ forward(joints, SI), joints).best == "9.1 mm wrist"
 
 
 def test_an_arm_that_does_not_move_decides_nothing(base):

@@ -64,13 +64,6 @@ def test_the_nearest_row_is_taken_as_it_is(timed):
     assert yaw(sequence) == pytest.approx(SPEED * np.array([0.40, 0.50, 1.11]), abs=1e-12)
 
 
-def test_the_offset_is_added_to_the_time_of_the_image(timed):
-    sequence = Sequence.open(timed('table = "frames.csv"\ntime_offset = 0.25'))
-    assert yaw(sequence) == pytest.approx(SPEED * (SHOWN + 0.25), abs=1e-12)
-    assert sequence.matching is not None and sequence.matching.time_offset == 0.25
-    assert sequence.frame(0).timestamp == SHOWN[0]
-
-
 def test_another_offset_can_be_tried_without_touching_the_file(timed):
     path = timed()
     before = path.read_text()

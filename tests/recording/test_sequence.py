@@ -154,26 +154,6 @@ def test_one_column_may_have_its_own_unit_scale_and_offset(tiny_sequence):
     assert Sequence.open(path).measured["PSM1"][:, -1] == pytest.approx(0.1 - np.pi / 6)
 
 
-def test_an_arm_may_have_tables_of_its_own(tiny_sequence):
-    path = tiny_sequence(edit=replaced("[arms.joints]", 'table = "truth.csv"\n[arms.joints]'))
-    sequence = Sequence.open(path)
-    assert sequence.truth is not None
-    assert np.array_equal(sequence.measured["PSM1"], sequence.truth["PSM1"])
-
-
-def test_two_arms_of_one_urdf_share_the_robot(tiny_sequence):
-    def twice(text: str) -> str:
-        arm = text[text.index("[[arms]]") : text.index("[[cameras]]")]
-        base = "T_world_base = [[1, 0, 0, 0.1], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]"
-        second = arm.replace('"PSM1"', '"PSM2"').replace("[arms.joints]", f"{base}\n[arms.joints]")
-        return text.replace("[[cameras]]", second + "[[cameras]]")
-
-    scene = Sequence.open(tiny_sequence(edit=twice)).scene
-    assert [arm.name for arm in scene.arms] == ["PSM1", "PSM2"]
-    assert scene.arms[0].robot is scene.arms[1].robot
-    assert scene.arms[1].T_world_base[0, 3] == 0.1
-
-
 def test_calibration_may_be_taken_out_of_a_json_file(tiny_sequence):
     expected = Sequence.open(tiny_sequence()).scene.cameras[0]
 
@@ -256,15 +236,6 @@ def test_a_given_background_is_used_and_an_estimated_one_shows_no_arm(tiny_seque
     cv2.imwrite(str(path.parent / "empty.png"), np.full((120, 160, 3), 77, np.uint8))
     path.write_text(path.read_text().replace('images = "', 'background = "empty.png"\nimages = "'))
     assert (Sequence.open(path).background("left") == 77).all()
-
-
-def test_a_background_is_estimated_once_per_camera_and_domain(tiny_sequence, monkeypatch):
-    sequence = Sequence.open(tiny_sequence(domains=("regular", "dark")))
-    regular, dark = sequence.background("left"), sequence.background("left", "dark")
-    assert dark.mean() < 0.7 * regular.mean()
-    monkeypatch.setattr("carts_core.recording.sequence.background_of_recording", None)
-    regular[:] = 0
-    assert sequence.background("left").any()
 
 
 def test_the_real_recording_opens_with_thirty_stereo_frames(shared_dir):
@@ -352,49 +323,3 @@ def test_the_array_that_was_not_used_for_longest_goes_first():
     assert [key for key in "abcd" if key in cache] == ["a", "c", "d"]
     cache.get("e", make(90))
     assert [key for key in "abcde" if key in cache] == ["e"]
-
-
-def test_threads_that_ask_for_one_array_share_it():
-    cache, started, go_on = ByteCache(100), threading.Event(), threading.Event()
-    got: list[np.ndarray] = []
-
-    def slow() -> np.ndarray:
-        started.set()
-        assert go_on.wait(30)
-        return np.ones(4)
-
-    first = threading.Thread(target=lambda: got.append(cache.get("a", slow)))
-    second = threading.Thread(target=lambda: got.append(cache.get("a", never)))
-    first.start()
-    assert started.wait(30)
-    second.start()
-    assert cache.get("b", make(1)).size == 1  # Others are not held up.
-    go_on.set()
-    first.join(30)
-    second.join(30)
-    assert len(got) == 2 and got[0] is got[1]
-
-
-def test_an_error_goes_to_its_maker_and_the_next_one_tries_again():
-    cache, started, go_on = ByteCache(100), threading.Event(), threading.Event()
-    caught: list[Exception] = []
-    got: list[np.ndarray] = []
-
-    def broken() -> np.ndarray:
-        started.set()
-        assert go_on.wait(30)
-        raise ValueError("no disk")
-
-    def first() -> None:
-        with pytest.raises(ValueError, match="no disk") as error:
-            cache.get("a", broken)
-        caught.append(error.value)
-
-    threads = [threading.Thread(target=first), threading.Thread(target=lambda: got.append(cache.get("a", make(3))))]
-    threads[0].start()
-    assert started.wait(30)
-    threads[1].start()
-    go_on.set()
-    for thread in threads:
-        thread.join(30)
-    assert len(caught) == 1 and got[0].size == 3

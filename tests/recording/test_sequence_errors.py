@@ -230,13 +230,6 @@ def test_an_image_or_mask_of_another_size_is_named_with_both_sizes(tiny_sequence
         sequence.frame(1)
 
 
-def test_a_background_of_another_size_is_refused(tiny_sequence):
-    path = tiny_sequence(edit=lambda text: text.replace('images = "', 'background = "bg.png"\nimages = "'), masks=False)
-    cv2.imwrite(str(path.parent / "bg.png"), np.zeros((10, 10, 3), np.uint8))
-    with pytest.raises(SequenceError, match=r"background .*bg.png has 10 x 10 pixels, but camera 'left' has 96 x 72"):
-        Sequence.open(path).background("left")
-
-
 def test_unknown_frames_domains_and_cameras_are_named_with_those_that_exist(tiny_sequence):
     sequence = Sequence.open(tiny_sequence())
     with pytest.raises(SequenceError, match="no frame number 3; its frames are 0 to 2"):

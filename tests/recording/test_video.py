@@ -6,12 +6,10 @@ import av
 import cv2
 import numpy as np
 import pytest
-from av.video.frame import PictureType
 from videos import write_timed_video
 
 from carts_core.errors import SequenceError
 from carts_core.recording import Sequence
-from carts_core.recording.images import read_image
 from carts_core.recording.video import Video, _by_packets, _by_table, index_video, open_video
 
 FRAMES = 60
@@ -83,16 +81,6 @@ def timed_video(request, tmp_path_factory) -> Path:
     return write_numbered(tmp_path_factory.mktemp("video") / request.param, *TIMED[request.param])
 
 
-def test_a_timed_video_is_what_its_name_says(timed_video):
-    with av.open(str(timed_video)) as container:
-        packets = [packet.pts or 0 for packet in container.demux(video=0) if packet.size]
-    with av.open(str(timed_video)) as container:
-        kinds = {frame.pict_type for frame in container.decode(video=0)}
-    assert (PictureType.B in kinds) == (timed_video.suffix != ".webm")
-    if timed_video.suffix in (".mp4", ".mkv"):
-        assert packets != sorted(packets) and packets[0] > 0
-
-
 @pytest.mark.parametrize("kept_bytes", [1, 32 * 2**20])
 def test_with_reordered_frames_each_is_the_one_asked_for(timed_video, kept_bytes, monkeypatch):
     monkeypatch.setattr("carts_core.recording.video._KEPT_BYTES", kept_bytes)
@@ -124,20 +112,6 @@ def test_frames_that_an_edit_list_cuts_away_are_not_counted(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("codec", "options"),
-    [
-        ("libx264", {"bf": "3", "g": "12", "x264-params": "open-gop=1"}),
-        ("libx265", {"g": "12"}),
-        ("mpeg4", {"bf": "2"}),
-    ],
-)
-def test_an_mp4_has_the_same_index_whether_its_packets_are_looked_into_or_not(codec, options, tmp_path):
-    path = write_numbered(tmp_path / "left.mp4", codec, options)
-    unparsed, parsed = _by_packets(path, parsed=False), _by_packets(path, parsed=True)
-    assert unparsed is not None and unparsed == parsed and unparsed.count == FRAMES
-
-
-@pytest.mark.parametrize(
     ("codec", "options", "times"),
     [
         ("libx264", {"bf": "0", "g": "12"}, TIMES),
@@ -151,10 +125,6 @@ def test_an_mp4_without_reordered_frames_has_the_index_of_its_table(codec, optio
     by_table = _by_table(path)
     assert by_table is not None and by_table == _by_packets(path, parsed=True)
     assert by_table == index_video(path) and by_table.count == FRAMES
-
-
-def test_a_table_that_does_not_say_all_is_not_relied_on(timed_video):
-    assert _by_table(timed_video) is None
 
 
 @pytest.mark.parametrize("flags", ["frag_keyframe+empty_moov", "frag_keyframe", "frag_keyframe+empty_moov+dash"])
@@ -200,18 +170,6 @@ def test_frames_of_vp8_that_are_only_referred_to_are_not_counted(tmp_path):
     video = Video(path, tuple(range(len(expected))))
     for index in (56, 24, 2, 3, 46, 45):
         assert number_of(video.read(index)) == expected[index]
-
-
-def test_a_jump_decodes_from_the_last_key_frame_and_not_from_the_start(tmp_path, monkeypatch):
-    video = Video(write_numbered(tmp_path / "left.mp4", "libx264", {"bf": "3", "g": "10"}), tuple(range(FRAMES)))
-    decoded = []
-    keep = video._kept.add
-    monkeypatch.setattr(video._kept, "add", lambda number, frame: (decoded.append(number), keep(number, frame)))
-    video.read(50)
-    assert len(decoded) <= 10
-    decoded.clear()
-    video.read(49)
-    assert decoded == []
 
 
 def test_a_video_that_seeks_to_the_wrong_frame_is_decoded_from_its_start(tmp_path, monkeypatch):
@@ -269,12 +227,6 @@ def test_a_damaged_key_frame_spoils_its_own_group_only(tmp_path):
     assert [number for number, _ in video._key_frames] == [0, 5, 15]
 
 
-def test_a_colour_survives_the_way_into_a_video_and_back(tmp_path):
-    picture = np.full((SIZE[1], SIZE[0], 3), (200, 60, 40), np.uint8)
-    path = write_timed_video(tmp_path / "left.mp4", [picture], [0], options={"crf": "5"})
-    assert np.abs(Video(path, (0,)).read(0).astype(int) - picture).max() <= 4
-
-
 def test_a_playlist_that_calls_itself_a_video_fetches_nothing(tmp_path):
     path = tmp_path / "left.mp4"
     path.write_text("#EXTM3U\n#EXT-X-TARGETDURATION:1\n#EXTINF:1,\nhttp://127.0.0.1:9/left.ts\n#EXT-X-ENDLIST\n")
@@ -311,21 +263,6 @@ def test_a_truncated_video_is_an_error_where_it_ends(tmp_path):
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
     with pytest.raises(SequenceError, match=r"left.avi"):
         Video(path, tuple(range(FRAMES))).read(FRAMES - 1)
-
-
-def test_a_sequence_can_be_made_of_a_video(tiny_sequence):
-    def as_video(text: str) -> str:
-        return text.replace('images = "{domain}/{camera}/{frame}.png"', 'images = "{domain}/{camera}.avi"')
-
-    path = tiny_sequence(edit=lambda text: text)
-    expected = Sequence.open(path).frame(2).images["left"]
-    writer = cv2.VideoWriter(str(path.parent / "regular/left.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 25.0, SIZE)
-    for row in (1, 2, 3):
-        writer.write(np.ascontiguousarray(read_image(path.parent / f"regular/left/{row:03d}.png")[..., ::-1]))
-    writer.release()
-    path.write_text(as_video(path.read_text()))
-    image = Sequence.open(path).frame(2).images["left"]
-    assert np.abs(image.astype(int) - expected).mean() < 4
 
 
 @pytest.mark.parametrize("value", ["1.5", "-1"])

@@ -12,7 +12,7 @@ from carts_core.model.scene import Scene, SceneState
 from carts_core.optimization import FreeParameters
 from carts_core.optimization.variables import DIFFERENCE_SPAN, Variables
 from carts_core.rendering import Outline, Renderer
-from carts_core.rendering.jacobian import BORDER, outline_position
+from carts_core.rendering.jacobian import outline_position
 
 WIDTH, HEIGHT, FINER = 640, 480, 4
 
@@ -82,16 +82,6 @@ def test_outlines_move_as_they_say(free: str, scene_and_state: tuple[Scene, Scen
     assert np.abs(seen).max() > 1.0
     assert np.median(np.abs(predicted - seen)) < 0.5 / FINER
     assert np.corrcoef(predicted, seen)[0, 1] > 0.97
-
-
-def test_what_is_little_further_away_is_no_outline_and_the_border_has_none() -> None:
-    depth = torch.full((1, 40, 50), 0.1)
-    depth[:, :, 20:30] = 0.0995
-    assert not outline_pixels_ref(1.0 / depth).any(), "half a percent"
-    depth[:, :, 20:30] = 0.09
-    found = outline_pixels_ref(1.0 / depth)[0].nonzero()
-    assert set(found[:, 1].tolist()) == {20, 29}, "of the nearer surface only"
-    assert found[:, 0].min() == BORDER and found[:, 0].max() == 39 - BORDER
 
 
 def test_a_straight_outline_is_between_its_pixels() -> None:

@@ -58,12 +58,6 @@ def test_points_lie_where_their_pixels_look(views: tuple[SceneGeometry, Tensor, 
     torch.testing.assert_close(row, (inside // WIDTH).float(), atol=1e-3, rtol=0)
 
 
-def test_vertices_of_many_views_move_as_each_alone(views: tuple[SceneGeometry, Tensor, Tensor, Tensor, Tensor]) -> None:
-    geometry, Ts = views[0], views[3]
-    link_by_link = torch.stack([vertices_in_camera(geometry, T) for T in Ts])
-    torch.testing.assert_close(vertices_in_camera(geometry, Ts), link_by_link)
-
-
 def test_nothing_is_seen_where_nothing_is(views: tuple[SceneGeometry, Tensor, Tensor, Tensor, Tensor]) -> None:
     geometry, *rest = views
     face_ids, inverse_depth, Ts, intrinsics = (value[2:] for value in rest)

@@ -15,11 +15,6 @@ from carts_core.rendering import Renderer
 from carts_core.resources import shipped_robot
 
 
-def test_parts_are_told_by_what_moves_them(shipped_psm: Robot) -> None:
-    named = {name: PARTS[part] for name, part in zip(shipped_psm.link_names, link_parts(shipped_psm), strict=True)}
-    assert named["roll_link"] == "shaft" and named["wrist_pitch_link"] == "wrist" and named["jaw_1_link"] == "jaws"
-
-
 def test_an_instrument_whose_jaws_do_not_move_has_a_shaft_and_a_wrist_all_the_same(tmp_path: Path) -> None:
     urdf = shipped_robot().read_text()
     urdf = urdf.replace('filename="', f'filename="{shipped_robot().parent}/')

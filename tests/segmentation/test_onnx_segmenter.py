@@ -8,7 +8,6 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from carts_core.cli.view import View
 from carts_core.errors import WeightsError
 from carts_core.segmentation import Prompt
 from carts_core.segmentation.onnx_segmenter import OnnxSegmenter
@@ -118,13 +117,6 @@ def test_files_of_pytorch_are_refused_before_anything_of_them_is_run(model: tupl
         save(path)
         with pytest.raises(WeightsError, match=rf"{name} is a PyTorch file, .*Export it as ONNX"):
             OnnxSegmenter.load(path, model[1])
-
-
-def test_the_command_refuses_such_files_before_it_opens_anything(model: tuple[Path, Path], tmp_path: Path) -> None:
-    text = tmp_path / "text.onnx"
-    text.write_text("no graph")
-    with pytest.raises(WeightsError, match="not an executable ONNX graph"):
-        View(tmp_path / "none.toml", segmenter=(text, model[1])).run()
 
 
 def test_what_is_no_encoder_or_no_decoder_is_refused_with_what_it_takes(

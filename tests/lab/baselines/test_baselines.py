@@ -10,7 +10,7 @@ from safetensors.torch import save_file
 
 from carts_core.errors import SettingsError, WeightsError
 from carts_core.files import output_path
-from carts_core.lab.baselines.networks import Baseline, read_baseline, save_baseline, start_from
+from carts_core.lab.baselines.networks import Baseline, read_baseline, save_baseline
 from carts_core.lab.baselines.training import TrainingFrames, make_chunk, prepare_frames, train_baseline
 from carts_core.settings import Architecture
 from carts_core.settings.training import BaselineName, BaselineNetwork, BaselineTraining
@@ -113,19 +113,6 @@ def test_weights_of_something_else_are_refused_in_words(tmp_path: Path) -> None:
     save_baseline(network, output_path(tmp_path, "n.safetensors"), {"augmentation": "smoke"})
     with pytest.raises(WeightsError, match="not finite"):
         read_baseline(tmp_path / "n.safetensors")
-
-
-def test_an_encoder_starts_from_a_file_with_timms_names_and_refuses_one_of_another(tmp_path: Path) -> None:
-    import timm  # noqa: PLC0415
-
-    theirs = timm.create_model("hrnet_w18_small", pretrained=False).state_dict()
-    save_file({name: value.contiguous() for name, value in theirs.items()}, tmp_path / "h.safetensors")
-    network = Baseline(_smallest("hrnet"))
-    assert start_from(network, tmp_path / "h.safetensors") > 300
-    assert any(torch.equal(value, theirs["conv1.weight"]) for value in network.state_dict().values())
-    save_file({"something.weight": torch.zeros(3)}, tmp_path / "x.safetensors")
-    with pytest.raises(WeightsError, match="no tensors of the encoder 'hrnet_w18_small'"):
-        start_from(network, tmp_path / "x.safetensors")
 
 
 @pytest.mark.parametrize(

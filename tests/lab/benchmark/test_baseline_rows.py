@@ -4,16 +4,13 @@ import json
 from collections.abc import Callable
 from pathlib import Path
 
-from handmade import make_measurement
-
 from carts_core.console import Terminal
 from carts_core.files import output_path
 from carts_core.lab.baselines.networks import Baseline, read_baseline, save_baseline
-from carts_core.lab.benchmark import Benchmark, Measurement, Target, plan, targets
+from carts_core.lab.benchmark import Benchmark, plan
 from carts_core.lab.benchmark.scope import BASELINES
 from carts_core.lab.benchmark.statistics import Measurements
 from carts_core.lab.benchmark.tables import main_tables
-from carts_core.lab.synthesis import DOMAINS
 from carts_core.settings import Architecture
 from carts_core.settings.training import BaselineNetwork
 
@@ -50,31 +47,3 @@ def test_rows_of_baselines_are_planned_where_weights_are_given_measured_and_in_t
     ]
     assert all(rows[:2] == ["U-Net, no augmentation", "Colleoni's, no augmentation"] for rows in labels.values())
     assert json.loads(json.dumps(measured[0].to_json()))["final"]["nsd_wide"] == measured[0].final.nsd_wide
-
-
-def _rows_of_two(networks: float, ours: float, least: float) -> list[Measurement]:
-    """A U-Net, a Swin that is worse, Colleoni's, which sees a rendering, and ours; other figures under blood."""
-    found = []
-    for domain in DOMAINS:
-        blood = domain == "bleeding"
-        others = {"unet": networks, "swin_smoke": networks - 0.1, "colleoni_none": 0.999}
-        for method, dice in (others | {"ours": ours}).items():
-            value = least if blood and method == "unet" else dice
-            found.append(make_measurement((0.5, value), method=method, domain=domain))
-    return found
-
-
-def test_how_far_ours_is_ahead_is_that_of_the_worst_shifted_domains() -> None:
-    def target(*rows: Measurement) -> Target:
-        (found,) = [one for one in targets(Measurements(rows)) if "best image-only network" in one.what]
-        return found
-
-    ahead = target(*_rows_of_two(0.98, 0.965, 0.6))
-    # Of the networks Swin has the best worst domain; a network that is given a rendering does not count.
-    assert (ahead.reached, ahead.met) == ("8.5 Dice points", True)
-    against = "96.5 (CaRTS, ours, low brightness) against 88.0 (Swin, simulated smoke, low brightness)"
-    assert ahead.basis == f"{against}; 1 frame, 2 networks"
-    assert target(*_rows_of_two(0.98, 0.92, 0.6)).met is False
-    some = [row for row in _rows_of_two(0.98, 0.965, 0.6) if row.run.domain != "smoke"]
-    assert target(*some).met is None
-    assert target(make_measurement((0.5, 0.9))).reached == "not measured"

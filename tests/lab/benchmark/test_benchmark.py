@@ -14,11 +14,7 @@ from carts_core.lab.benchmark import (
     Benchmark,
     Facts,
     Measurement,
-    ResultsFile,
     Run,
-    frame,
-    plan,
-    synthetic_room_source,
     write_report,
 )
 from carts_core.lab.benchmark.conditions import NO_ARM, OTHER_INSTRUMENT, WRONG
@@ -97,42 +93,6 @@ def test_every_method_is_scored_in_every_domain_although_stopped_once_and_a_furt
     facts = Facts("quick", RUNS, {"synthetic": "tiny"}, "w", "c", "0")
     page = write_report(output_path(tmp_path, "bench"), measurements, facts, {}, [])
     assert f"{RUNS} of {RUNS}" in page.read_text() and "TC-CaRTS" in page.read_text()
-
-
-def test_synthetic_instruments_are_measured_in_other_rooms_with_joints_and_verdicts(
-    tiny_benchmark: Callable[..., Benchmark], tmp_path: Path
-) -> None:
-    tiny = tiny_benchmark()
-    rooms = synthetic_room_source(tiny.sources["synthetic"], None, tiny.scope)
-    results = ResultsFile(output_path(tmp_path, "rooms.jsonl"))
-    benchmark = Benchmark(tiny.scope, [rooms], tiny.extractor, results, plan(tiny.scope, [rooms]))
-    benchmark.run(QUIET)
-    by_method = {m.run.method: m for m in benchmark.measurements()}
-    assert set(by_method) == {"ours", "acs", "sequence"}
-    for measurement in by_method.values():
-        assert measurement.run.source == "rooms synthetic" and measurement.run.domain == rooms.rooms[0]
-        assert measurement.final.joint_mae_deg is not None and measurement.start is not None
-    assert by_method["ours"].verdict is not None and by_method["ours"].within is not None
-
-
-def test_a_calibration_is_found_once_and_holds_for_every_frame(
-    tiny_benchmark: Callable[..., Benchmark], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    calls: list[int] = []
-    found = frame.calibrated_scene
-
-    def counting(recording, camera: str, frames: int, extractor):
-        calls.append(frames)
-        return found(recording, camera, frames, extractor)
-
-    monkeypatch.setattr(frame, "calibrated_scene", counting)
-    runs = [Run("real", "regular", 0, method) for method in ("start", "calibrated", "calibrated_ours")]
-    benchmark = tiny_benchmark(name="real", runs=runs)
-    benchmark.run(QUIET)
-    plain, calibrated, corrected = benchmark.measurements()
-    assert calls == [2]
-    assert calibrated.final.dice != plain.final.dice
-    assert corrected.start is not None and corrected.start.dice == calibrated.final.dice
 
 
 def test_frames_of_a_sequence_are_measured_together_also_where_some_are_known(

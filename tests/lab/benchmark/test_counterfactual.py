@@ -1,15 +1,10 @@
 """Recorded frames under other conditions: what changes, and what must not."""
 
-from collections.abc import Callable
-from pathlib import Path
-
 import cv2
 import numpy as np
 import pytest
 
-from carts_core.errors import SettingsError
-from carts_core.lab.benchmark import QUICK, real_source, sources
-from carts_core.lab.benchmark.counterfactual import DISTANCE, Counterfactual, RealSurface
+from carts_core.lab.benchmark.counterfactual import Counterfactual
 from carts_core.lab.synthesis import DOMAINS
 from carts_core.recording import Sequence
 
@@ -50,37 +45,3 @@ def test_another_background_leaves_the_instrument(sequence: Sequence, counterfac
     image = _image(counterfactual, 0, "background_change")
     assert inside.any() and np.abs(image - _image(sequence, 0))[inside].max() <= 1
     assert outside.any() and np.abs(image - (40, 160, 90))[outside].max() <= 1
-
-
-def test_the_surface_lies_on_the_arm_in_the_mask_and_on_the_plane_elsewhere(sequence: Sequence) -> None:
-    frame = sequence.frame(0)
-    assert frame.masks is not None
-    mask = frame.masks["left"]
-    found = RealSurface(sequence.scene, [frame.measured])
-    surface = found.of(mask, frame.measured)
-    assert (surface.link[mask] >= 0).all() and (surface.link[~mask] == -1).all()
-    assert np.allclose(surface.position[~mask][:, 2], 0.0, atol=1e-9)
-    assert (surface.depth[mask] < DISTANCE).all()
-    assert np.allclose(surface.position[..., 2], DISTANCE - surface.depth)
-    assert np.allclose(np.linalg.norm(surface.normal, axis=-1), 1.0, atol=1e-4)
-    on_link = np.linalg.inv(found.Ts_world_link(frame.measured)[int(surface.link[mask][0])])
-    point = on_link @ np.append(surface.position[mask][0], 1.0)
-    assert np.linalg.norm(point[:3]) < 0.6
-
-
-def test_a_recording_without_masks_cannot_be_measured(tiny_sequence: Callable[..., Path]) -> None:
-    with pytest.raises(SettingsError, match="no masks for camera 'left'"):
-        real_source(tiny_sequence(frames=1, masks=False, **SIZE), QUICK)
-
-
-def test_a_recording_opens_as_a_source_with_its_masked_frames(
-    tiny_sequence: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(sources, "backdrop", lambda width, height, seed: np.zeros((height, width, 3), np.uint8))
-    path = tiny_sequence(frames=3, **SIZE)
-    source = real_source(path, QUICK)
-    assert source.frames == [0, 2] and source.camera == "left" and source.consecutive == [0, 1, 2]
-    recording = source.open(lambda what, done, total: None)
-    assert recording.frame(2, "smoke", ["left"]).domain == "smoke"
-    path.write_text(path.read_text().replace('name = "tiny"', 'name = "other"', 1))
-    assert real_source(path, QUICK).fingerprint != source.fingerprint

@@ -6,12 +6,8 @@ import pytest
 
 from carts_core.files import output_path
 from carts_core.lab.benchmark import hand_eye
-from carts_core.lab.benchmark.hand_eye import CONDITIONS, HandEyeRun, hand_eye_targets, known_hand_eye, measure_hand_eye
+from carts_core.lab.benchmark.hand_eye import CONDITIONS, known_hand_eye, measure_hand_eye
 from carts_core.networks.extractor import FeatureExtractor
-
-
-def runs(count: int, angle_deg: float, verdict: str, condition: int = 0) -> list[HandEyeRun]:
-    return [HandEyeRun(CONDITIONS[condition].name, seed, angle_deg, 1e-3, verdict) for seed in range(count)]
 
 
 def test_one_start_is_measured_kept_and_not_measured_again(
@@ -27,9 +23,3 @@ def test_one_start_is_measured_kept_and_not_measured_again(
     assert measure_hand_eye(file, extractor, 1, said.append) == [run] and len(said) == 1
     file.path.write_text(file.path.read_text().replace(extractor.fingerprint, "other weights"))
     assert known_hand_eye(file, extractor) == []
-
-
-def test_nine_of_ten_starts_meet_the_target_and_eight_do_not() -> None:
-    for wrong, met in ((1, True), (2, False)):
-        target, *others = hand_eye_targets([*runs(10, 0.1, "good")[wrong:], *runs(wrong, 40.0, "doubtful")])
-        assert target.met is met and all(other.met is None for other in others)

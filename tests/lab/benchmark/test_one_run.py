@@ -29,19 +29,6 @@ def test_a_measurement_survives_its_json_line_also_without_iterates() -> None:
     assert alone.start is None and alone.best_of(30) is None and not alone.made_worse and alone.iterations == 0
 
 
-def test_the_best_of_some_steps_has_the_time_of_all_of_them() -> None:
-    measurement = make_measurement((0.5, 0.9, 0.6, 0.95))
-    best = measurement.best_of(2)
-    assert best is not None and best.dice == 0.9 and best.seconds == 3.0
-    assert [score.dice for score in measurement.best_so_far()] == [0.5, 0.9, 0.9, 0.95]
-
-
-def test_a_run_that_was_cut_says_nothing_of_more_steps_but_one_that_converged_does() -> None:
-    assert make_measurement((0.5, 0.9), stopped="iterations").best_of(2) is None
-    converged = make_measurement((0.5, 0.9), stopped="converged").best_of(100)
-    assert converged is not None and converged.dice == 0.9
-
-
 def test_the_depth_of_the_tips_is_compared_along_the_cameras_axis(shipped_psm: Robot) -> None:
     tiny = tiny_scene(shipped_psm, 1, ("left",), 96, 72)
     truth = {"PSM1": tiny.truth[0]}

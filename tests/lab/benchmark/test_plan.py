@@ -40,16 +40,6 @@ def test_frame_comes_after_frame_so_that_a_stopped_benchmark_has_some_of_everyth
     assert runs[: len(first)] == first
 
 
-def test_several_cameras_and_calibration_are_planned_where_there_is_something_to_measure() -> None:
-    runs = plan(QUICK, BOTH)
-    assert {run.source for run in runs if run.method in ("stereo", "stereo_posed")} == {"real"}
-    assert {run.source for run in runs if run.method.startswith("calibrated")} == {"real"}
-    for method in ("ours", "ours_given", "ours_proposed"):
-        assert Run("synthetic", "occlusion", 0, method, 2.0) in runs and Run("real", "occlusion", 5, method) in runs
-    assert [run.frame for run in runs if (run.source, run.method) == ("real", "sequence")] == [0, 1]
-    assert Run("synthetic", "regular", 1, "sequence", 2.0) in runs
-
-
 @pytest.mark.parametrize("frames", [0, 25])
 def test_more_frames_than_there_are_is_an_error_that_says_how_many_may_be_asked_for(frames: int) -> None:
     with pytest.raises(SettingsError, match=f"--frames is {frames}; .* Give 1 to {FULL.sequence_frames}"):

@@ -9,16 +9,11 @@ import pytest
 from handmade import make_measurement
 
 from carts_core.files import output_path
-from carts_core.lab.benchmark import Facts, Measurement, Run, Score, targets, write_report
+from carts_core.lab.benchmark import Facts, Measurement, Run, Score, write_report
 from carts_core.lab.benchmark.hand_eye import HandEyeRun
 from carts_core.lab.benchmark.statistics import Measurements
 from carts_core.lab.benchmark.tables import (
-    calibration_table,
-    camera_table,
-    error_tables,
     main_tables,
-    occlusion_table,
-    sequence_table,
 )
 from carts_core.lab.synthesis import DOMAINS
 
@@ -116,42 +111,3 @@ def test_the_main_table_has_mean_and_deviation_and_the_papers_number() -> None:
     assert paper[1].text == "92.0 ± 2.0" and paper[1].note == "S-Reg 96.6 ± 2.7"
     real = next(t for t in main_tables(Measurements(_measurements())) if t.title == "Real frames: Dice")
     assert real.rows[0][1].note == "R-Reg 95.0 ± 2.7"
-
-
-def test_errors_are_tabled_over_frames_that_all_methods_know_and_count_for_targets_on_the_others_too() -> None:
-    main = [make_measurement((0.5, 0.8), method=method) for method in ("paper", "ours")]
-    errors = [make_measurement((0.5, 0.9), method=method, error_deg=2.0) for method in ("paper", "ours")]
-    further = make_measurement((0.5, 0.7), frame=1, error_deg=2.0)
-    data = Measurements([*main, *errors, further])
-    (row,) = [row for row in error_tables(data.compared())[0].rows if row[0].text == "ours"]
-    assert row[2].text == "90.0"
-    (target,) = [t for t in targets(data) if t.what.startswith("synthetic, 2° off, each frame alone: mean")]
-    assert target.reached == "0.800" and "2 frames" in target.basis
-
-
-def test_occluders_cameras_calibration_and_sequence_have_tables_over_common_frames() -> None:
-    data = Measurements(
-        [
-            *_measurements(),
-            *(make_measurement((0.7, 0.9), domain="occlusion", frame=frame) for frame in range(2)),
-            *(make_measurement((0.7, 0.96), domain="occlusion", method=m) for m in ("ours_given", "ours_proposed")),
-            make_measurement((0.8, 0.97), source="real", method="stereo"),
-            make_measurement((0.8, 0.98), source="real", method="stereo_posed"),
-            make_measurement((0.95,), source="real", method="calibrated"),
-            make_measurement((0.95, 0.98), source="real", method="calibrated_ours"),
-            *(make_measurement((0.9, 0.95), method="sequence", frame=frame, stopped="warm") for frame in range(5)),
-        ]
-    )
-    tables = [occlusion_table(data), camera_table(data), calibration_table(data), sequence_table(data)]
-    texts = [[[cell.text for cell in row] for row in table.rows] for table in tables if table]
-    occlusion, camera, calibration, sequence = texts
-    assert [row[1] for row in occlusion] == ["1"] * 4
-    assert [row[4] for row in occlusion] == ["70.0", "90.0", "96.0", "96.0"]
-    assert [row[4] for row in camera] == ["80.0", "90.0", "97.0", "98.0"]
-    assert [row[4] for row in calibration] == ["80.0", "90.0", "95.0", "98.0"]
-    assert sequence[0][2:5] == ["as measured", "ours, sequence mode", "5"] and sequence[0][-3:] == [
-        "2",
-        "92.0 ± 2.0",
-        "95.0 ± 0.0",
-    ]
-    assert not any(table(Measurements(_measurements())) for table in (occlusion_table, camera_table, sequence_table))

@@ -1,10 +1,8 @@
 """Verdicts are computed from measurements, both ways."""
 
-from dataclasses import replace
-
 from handmade import make_measurement, target_of
 
-from carts_core.lab.benchmark import Measurement, targets
+from carts_core.lab.benchmark import targets
 from carts_core.lab.benchmark.statistics import Measurements
 from carts_core.lab.synthesis import DOMAINS
 
@@ -52,26 +50,3 @@ def test_real_frames_are_compared_with_their_clean_form() -> None:
     assert same.reached == "0.000"
     lost = target_of("real frames under", clean, near, far)
     assert lost.met is False and lost.reached == "0.065" and "bleeding" in lost.basis
-
-
-def test_pictures_with_occluders_count_for_occlusion_and_for_frames_made_worse_and_nowhere_else() -> None:
-    covered = make_measurement((0.7, 0.6), domain="occlusion", error_deg=2.0)
-    assert target_of("synthetic, 2° off, each frame alone: mean Dice", covered).met is None
-    assert target_of("seconds per frame", covered).reached == "not measured"
-    assert target_of("frames worse than initially", covered).reached == "100.0 %"
-    plain = [make_measurement((0.9, dice), domain="occlusion", frame=i) for i, dice in enumerate((0.95, 0.97))]
-    given = make_measurement((0.9, 0.99), domain="occlusion", method="ours_given")
-    reached = target_of("30 % of the visible instrument", *plain, given)
-    assert reached.reached == "0.960" and reached.met is True and "occluder given 0.990" in reached.basis
-    real = make_measurement((0.9, 0.94), domain="occlusion", source="real")
-    assert target_of("30 % of the visible instrument", *plain, real).met is False
-
-
-def test_sequence_mode_counts_warm_frames_on_cpu_and_gpu_apart() -> None:
-    def frame(seconds: float, stopped: str, machine: str) -> Measurement:
-        return replace(make_measurement((0.97,), method="sequence", seconds=seconds, stopped=stopped), machine=machine)
-
-    cold, warm, card = frame(3.0, "cold", "a CPU"), frame(0.25, "warm", "a CPU"), frame(0.02, "warm", "cuda: a card")
-    assert target_of("sequence mode, seconds", cold, warm, card).reached == "0.25 s"
-    assert target_of("sequence mode, frames per second", cold, warm).reached == "not measured"
-    assert target_of("sequence mode, frames per second", cold, warm, card).reached == "50.0"

@@ -6,19 +6,15 @@ from pathlib import Path
 import numpy as np
 from handmade import make_measurement, target_of
 
-from carts_core.lab.benchmark import FULL, QUICK, Measurement, family_sources, plan, synthetic_source
+from carts_core.lab.benchmark import Measurement
 from carts_core.lab.benchmark.conditions import (
     NO_ARM,
-    OTHER_CAMERA,
-    OTHER_FRAME,
-    OTHER_INSTRUMENT,
     misled,
     with_other_instruments,
     wrong_inputs,
 )
-from carts_core.lab.benchmark.sources import HELD_OUT, synthetic_room_source
 from carts_core.lab.benchmark.statistics import Measurements
-from carts_core.lab.benchmark.tables import deviation_table, family_table, verdict_table
+from carts_core.lab.benchmark.tables import deviation_table, verdict_table
 from carts_core.recording import Sequence
 
 
@@ -52,30 +48,6 @@ def test_the_verdict_table_has_a_row_per_condition_and_one_of_all() -> None:
     assert rows["synthetic: no arm"] == ["1", "1", "0", "0", "0", "–"]
     deviations = deviation_table(Measurements(FRAMES))
     assert deviations is not None and [cell.text for cell in deviations.rows[0][2:]] == ["70 %", "90 %"]
-
-
-def test_other_instruments_have_a_table_and_targets_and_count_nowhere_else() -> None:
-    scissors = _judged(0.94, "good", 0.02, source="family curved_scissors")
-    data = Measurements([*FRAMES, scissors])
-    assert data.sources() == ["synthetic"] and scissors not in data.of(method="ours")
-    table = family_table(data)
-    assert table is not None
-    assert [cell.text for cell in table.rows[0]] == ["curved_scissors", "regular", "1", "85.0", "94.0"]
-    assert target_of("curved_scissors", *data.all).met is False
-
-
-def test_rooms_and_other_instruments_are_planned_without_real_frames() -> None:
-    made = synthetic_source(QUICK)
-    sources = [made, synthetic_room_source(made, None, QUICK), *family_sources(QUICK)]
-    runs = plan(QUICK, sources)
-    rooms = [run for run in runs if run.source == "rooms synthetic"]
-    assert {run.method for run in rooms} == {"ours", "acs"} and {run.domain for run in rooms} == set(sources[1].rooms)
-    families = [run for run in runs if run.source.startswith("family")]
-    assert {run.source for run in families} == {f"family {name}" for name in HELD_OUT}
-    assert {run.domain for run in families} == {"regular", "smoke"} and {run.error_deg for run in families} == {2.0}
-    assert {run.domain for run in runs} >= {NO_ARM, OTHER_FRAME, OTHER_CAMERA, OTHER_INSTRUMENT}
-    assert len(set(runs)) == len(runs)
-    assert len(family_sources(FULL)[0].frames) == FULL.family_frames
 
 
 def test_what_is_wrong_about_an_input_is_what_its_name_says(tiny_sequence) -> None:

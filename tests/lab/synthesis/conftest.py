@@ -13,7 +13,7 @@ from carts_core.lab.synthesis import (
     SynthesisConfig,
     synthesize,
 )
-from carts_core.lab.synthesis.scene import EXTENT, Tissue
+from carts_core.lab.synthesis.scene import Tissue
 
 
 @pytest.fixture(scope="session")
@@ -42,9 +42,3 @@ def flat_tissue() -> Tissue:
         albedo=np.full((64, 64, 3), 0.4, np.float32),
         roughness=np.full((64, 64), 0.6, np.float32),
     )
-
-
-@pytest.fixture(scope="session")
-def half_extent() -> float:
-    """Half the side of the square of tissue [m]."""
-    return EXTENT / 2

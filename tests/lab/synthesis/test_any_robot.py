@@ -6,15 +6,12 @@ import numpy as np
 import pytest
 import torch
 
-from carts_core.errors import RobotError, SettingsError
+from carts_core.errors import SettingsError
 from carts_core.evaluation import dice
 from carts_core.lab.benchmark.hand_eye import ARM
 from carts_core.lab.synthesis import EndoscopeConfig, MotionConfig, RenderConfig, SynthesisConfig, synthesize
-from carts_core.lab.synthesis.motion import measurement_error
-from carts_core.model.robot import Robot
 from carts_core.recording import Sequence
 from carts_core.rendering import Renderer
-from carts_core.settings import MeasurementError
 
 DISTANCE = 1.6
 
@@ -57,18 +54,6 @@ def test_one_arm_is_seen_from_so_far_and_its_masks_are_those_of_the_true_joints(
         assert 0.5 * DISTANCE < (T_camera_base @ tip)[2, 3] < 1.4 * DISTANCE, "in metres, and not in the small world's"
 
 
-def test_joints_of_each_kind_have_errors_of_their_own(tmp_path: Path) -> None:
-    robot = Robot.load(ARM)
-    assert measurement_error(robot, MeasurementError()).bias == (0.02,) * 7
-    chosen = MeasurementError(bias=(0.1,) * 7, drift=(0.0,) * 7, noise=(0.0,) * 7)
-    assert measurement_error(robot, chosen) is chosen
-
-
 def test_an_instrument_is_not_looked_at_from_a_metre_away(tmp_path: Path) -> None:
     with pytest.raises(SettingsError, match=r"surgical instrument\. The limit for instruments is 0\.3 m"):
         synthesize(_config(SynthesisConfig().robot), tmp_path / "sequence")
-
-
-def test_a_tip_that_the_robot_lacks_is_named(tmp_path: Path) -> None:
-    with pytest.raises(RobotError, match="no_such_link"):
-        synthesize(_config(ARM, tip_link="no_such_link"), tmp_path / "sequence")

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from carts_core.lab.synthesis import DomainConfig, SensorConfig
-from carts_core.lab.synthesis.domains import Bleeding, Smoke, SmokeOverlay, expose
+from carts_core.lab.synthesis.domains import Bleeding, Smoke, expose
 from carts_core.lab.synthesis.path_tracer import Surface
 from carts_core.lab.synthesis.scene import Tissue, grow_tissue
 
@@ -48,13 +48,6 @@ def test_what_is_farther_away_loses_more_contrast_in_smoke() -> None:
         seen = smoke.haze(light, depth * rays, np.zeros(3), 10.0, 0.0)[..., 0]
         contrast.append((seen[board == 1].mean() - seen[board == 0].mean()) / seen.mean())
     assert contrast[0] > 1.2 * contrast[1] > 1.2 * 1.1 * contrast[2]
-
-
-def test_the_overlay_is_blind_to_depth_but_smooth_and_never_dark() -> None:
-    overlay, black = SmokeOverlay(0.5, np.random.default_rng(1)), np.zeros((HEIGHT, WIDTH, 3), np.uint8)
-    layer = overlay.over(black)
-    assert 60 < layer.mean() < 150 and layer.std() > 10 and np.array_equal(layer, overlay.over(black))
-    assert np.array_equal(overlay.over(np.full_like(black, 205)), np.full_like(black, 205))
 
 
 def looking_down(link: int, shift: float = 0.0) -> Surface:

@@ -76,11 +76,6 @@ def test_a_motion_that_cannot_be_done_says_why(arms: tuple[Arm, ...], camera: Ca
         plan_motion(arms, [flat_tissue], camera, config)
 
 
-def test_another_number_of_joints_is_refused_with_both_numbers() -> None:
-    with pytest.raises(SettingsError, match="7 values per kind, but the robot has 3 joints"):
-        measure(np.zeros((4, 3)), np.arange(4.0), MeasurementError(), np.random.default_rng(0))
-
-
 def test_a_measurement_has_a_constant_bias_and_independent_noise() -> None:
     times, truth = np.arange(400) / 20.0, np.random.default_rng(9).normal(size=(400, 2))
     error = MeasurementError(bias=(0.02, 0.0), drift=(0.0, 0.0), noise=(0.0, 0.001))

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from carts_core.errors import RobotError
 from carts_core.lab.synthesis import EndoscopeConfig, SynthesisConfig
 from carts_core.lab.synthesis.scene import EXTENT, KINDS, Tissue, grow_tissue, is_instrument, load_robot, place_cameras
 from carts_core.model.camera import Camera
@@ -54,10 +53,3 @@ def test_a_robot_that_is_not_a_psm_is_no_instrument(tmp_path, shipped_psm: Robot
     urdf = tmp_path / "two.urdf"
     urdf.write_text(ARM_URDF)
     assert is_instrument(shipped_psm) and not is_instrument(load_robot(SynthesisConfig(robot=urdf)))
-
-
-def test_a_robot_that_cannot_move_is_refused(tmp_path) -> None:
-    urdf = tmp_path / "stiff.urdf"
-    urdf.write_text(ARM_URDF.replace('type="revolute"', 'type="fixed"'))
-    with pytest.raises(RobotError, match="no movable joint"):
-        load_robot(SynthesisConfig(robot=urdf))

@@ -28,17 +28,6 @@ def _overlap(sequence: Sequence, frame: int, camera: str, positions: dict[str, n
     return dice(renderer.segment(sequence.scene.state(positions))[0] >= 0, masks[camera])
 
 
-def test_the_sequence_opens_with_all_domains_both_cameras_and_truth(small_sequence: Path) -> None:
-    sequence = Sequence.open(small_sequence)
-    assert sequence.domains == DOMAINS
-    assert [camera.name for camera in sequence.scene.cameras] == ["left", "right"]
-    assert len(sequence) == 2
-    assert sequence.measured_joints == dict.fromkeys(("psm1", "psm2"), sequence.scene.arms[0].robot.joint_names)
-    frame = sequence.frame(1)
-    assert frame.timestamp == pytest.approx(0.5)
-    assert frame.truth is not None
-
-
 def test_truth_masks_are_those_of_the_true_kinematics_and_measured_ones_are_off(small_sequence: Path) -> None:
     sequence = Sequence.open(small_sequence)
     for index in range(len(sequence)):

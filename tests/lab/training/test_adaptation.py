@@ -17,7 +17,6 @@ from carts_core.lab.training.adaptation import (
     Fits,
     Judgement,
     adapted_to,
-    gain,
     made_images,
 )
 from carts_core.lab.training.loop import load_checkpoint
@@ -136,22 +135,8 @@ def test_a_run_ends_when_it_no_longer_gains_and_leaves_its_best_weights(
     assert again.first == result.first == checkpoint.history.validations[0]
 
 
-def test_what_is_left_of_the_error_is_said():
-    rest = {**dict.fromkeys(("dice_shaft", "dice_wrist", "dice_jaws"), 0.7), "tip_error": 2.0}
-    text = gain({"dice": 0.8, "normal_error_deg": 20.0, **rest}, {"dice": 0.9, "normal_error_deg": 10.0, **rest})
-    assert "Dice 0.800 -> 0.900, remaining error 50%" in text and "tips 2.0 -> 2.0 px" in text
-
-
 FIGURES = {"dice": 0.8, "dice_given": 0.5, "part_accuracy": 0.9, "normal_error_deg": 20.0, "tip_error": 2.7}
 FIGURES |= dict.fromkeys(("dice_shaft", "dice_wrist", "dice_jaws"), 0.7)
-
-
-@pytest.mark.parametrize(
-    ("later", "worse"),
-    [({"dice": 0.9}, False), ({"tip_error": 10.9}, True), ({"dice_jaws": 0.6}, True), ({"dice_wrist": 0.6}, True)],
-)
-def test_weights_that_see_parts_or_tips_worse_are_rejected(later: dict[str, float], worse: bool):
-    assert SurfaceTask().worse({**FIGURES, **later}, FIGURES) is worse
 
 
 @pytest.mark.parametrize(("tip_error", "kept"), [(2.7, 1), (10.9, 0)])

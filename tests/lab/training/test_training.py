@@ -13,7 +13,7 @@ import torch
 
 from carts_core.errors import SettingsError, WeightsError
 from carts_core.lab.randomization import ImageSettings
-from carts_core.lab.training.loader import training_batches, validation_set
+from carts_core.lab.training.loader import training_batches
 from carts_core.lab.training.loop import CHECKPOINT_FILE, load_checkpoint, schedule
 from carts_core.lab.training.training import TrainingProgress, train
 from carts_core.networks import FeatureExtractor
@@ -119,13 +119,6 @@ def test_going_on_with_other_settings_is_refused_by_name(tmp_path: Path):
         train(small_config(steps=10, learning_rate=0.5), tmp_path)
 
 
-def test_fine_tuning_starts_from_the_given_weights(tmp_path: Path, small_weights: Path):
-    result = train(small_config(start=small_weights, steps=1, learning_rate=1e-9, average=0.0), tmp_path)
-    given = dict(read_weights(small_weights).network.named_parameters())
-    for name, value in read_weights(result.weights).network.named_parameters():
-        torch.testing.assert_close(value, given[name], atol=1e-6, rtol=1e-4)
-
-
 def test_fine_tuning_takes_the_architecture_of_the_weights(tmp_path: Path, small_weights: Path):
     config = small_config(start=small_weights, architecture=Architecture(), steps=1)
     train(config, tmp_path)
@@ -179,16 +172,6 @@ def test_a_run_in_parts_ends_with_the_bytes_of_one_in_one_go(tmp_path: Path):
     assert stopped is not None and stopped.step == 10
     parts = train(config, tmp_path / "parts")
     assert parts.weights.read_bytes() == whole.weights.read_bytes()
-
-
-def test_the_validation_set_is_always_the_same_and_not_the_training_stream():
-    config = small_config()
-    images, _ = validation_set(config)
-    again, _ = validation_set(config)
-    assert torch.equal(images, again)
-    with training_batches(config, first_step=0) as batches:
-        first, _ = next(batches)
-    assert not torch.equal(first[0], images[0])
 
 
 def test_the_learning_rate_rises_and_then_falls_to_a_hundredth():

@@ -89,28 +89,6 @@ def test_every_guess_can_be_changed(folder):
     assert [camera.name for camera in find(folder, ImportOptions(images=images)).cameras] == ["scope"]
 
 
-@pytest.mark.parametrize(
-    ("header", "given", "guessed"),
-    [
-        (["image", *(f"Joint{n} [deg]" for n in range(1, 7))], (), ["joints are", "kinematics:", "each row"]),
-        (["image", *(f"Joint{n} [deg]" for n in range(1, 7))], ("columns",), ["kinematics:", "each row"]),
-        (["image", *(f"Joint{n} [deg]" for n in range(1, 7))], ("kinematics", "frame"), ["joints are"]),
-        (["image", *(f"{name} [deg]" for name in JOINT_NAMES)], ("kinematics", "frame"), []),
-    ],
-)
-def test_what_was_given_or_named_is_not_called_guessed(folder, header, given, guessed):
-    table = folder / "log.csv"
-    text = table.read_text().splitlines(keepends=True)
-    table.write_text("".join([",".join(header) + "\n", *text[1:]]))
-    columns: dict[str, str] = dict(zip(map(str, JOINT_NAMES), header[1:], strict=True)) if "columns" in given else {}
-    columns |= {"frame": "image"} if "frame" in given else {}
-    calibration = {name: folder / f"{name}.yaml" for name in ("left", "right")}
-    kinematics = table if "kinematics" in given else None
-    found = find(folder, ImportOptions(columns=columns, kinematics=kinematics, calibration=calibration))
-    notes = [str(note) for note in found.notes if note.kind == "guessed" and "angles are in" not in str(note)]
-    assert len(notes) == len(guessed) and all(any(text in note for note in notes) for text in guessed), notes
-
-
 @pytest.mark.parametrize("header", [["x", "y", "z"], ["px", "py", "pz", "rx"]])
 def test_a_table_that_is_no_pose_is_named_with_its_columns(tmp_path, header):
     write_images(tmp_path / "rec/left", FRAMES)
@@ -303,14 +281,6 @@ def test_six_columns_that_differ_in_a_number_are_joints_whatever_they_are_called
     found = find(tmp_path / "rec")
     assert found.arms[0].values is not None and np.abs(found.arms[0].values - q).max() < 1e-9
     assert any("joints are Motor no. 0, Motor no. 1" in str(note) for note in found.notes)
-
-
-def test_a_sign_can_be_turned_round(folder):
-    before, after = find(folder).arms[0].values, find(folder, ImportOptions(flip=("yaw", "roll"))).arms[0].values
-    assert before is not None and after is not None
-    assert np.array_equal(after, before * [-1, 1, 1, -1, 1, 1])
-    with pytest.raises(CartsError, match=r"knee is not a joint. Joints are: yaw"):
-        find(folder, ImportOptions(flip=("knee",)))
 
 
 def test_the_default_output_has_the_whole_name_of_a_folder_with_a_dot(folder, tmp_path, monkeypatch):
