@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import torch
 from tiny import tiny_scene
-from videos import write_timed_video
+from videos import write_video
 
 from carts_core.model.robot import Robot
 from carts_core.rendering import Renderer
@@ -46,7 +46,7 @@ def write_swaying(folder: Path, robot: Robot, seed: int = 1, seconds: float = 10
         arm = 255 * rendering.image[0].permute(1, 2, 0).numpy()
         image = cover * arm + (1 - cover) * background + rng.normal(0, _NOISE, background.shape)
         images.append(image.clip(0, 255).astype(np.uint8))
-    write_timed_video(folder / "left.mp4", images, [round(1000 * time) for time in times])
+    write_video(folder / "left.mp4", images, milliseconds=[round(1000 * time) for time in times])
     write_log(folder / "log.csv", robot, seed, seconds)
     columns = "\n".join(f'{name} = "{name}"' for name in robot.joint_names)
     (folder / "sequence.toml").write_text(

@@ -8,11 +8,11 @@ from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-import av
 import cv2
 import numpy as np
 import torch
 import trimesh
+from videos import write_video
 
 from carts_core.batch.manifest import read_manifest
 from carts_core.cli.options import SolverOptions
@@ -107,7 +107,7 @@ def make_folder(folder: Path) -> None:
         cv2.imwrite(str(folder / f"masks/{frame:03d}.png"), mask)
     cv2.imwrite(str(folder / "image.jpg"), image)
     cv2.imwrite(str(folder / "image.tiff"), image)
-    _write_video(folder / "video.mp4", image)
+    write_video(folder / "video.mp4", [np.roll(image, shift, 1) for shift in range(FRAMES * 3)], 10)
     sphere = trimesh.creation.icosphere(subdivisions=2, radius=10.0)
     for suffix in ("obj", "stl", "ply"):
         sphere.export(folder / f"ball.{suffix}")
@@ -129,16 +129,6 @@ def make_folder(folder: Path) -> None:
     picture = (folder / "image.jpg").read_bytes()
     sent = FrameMessage(0.5, {"PSM1": {"yaw": 0.1}}, {"left": ImageMessage(picture)}, {"left": np.eye(4).tolist()})
     (folder / "message.bin").write_bytes(packed(sent))
-
-
-def _write_video(path: Path, image: np.ndarray) -> None:
-    with av.open(str(path), "w") as container:
-        stream = container.add_stream("libx264", rate=10)
-        stream.width, stream.height, stream.pix_fmt = image.shape[1], image.shape[0], "yuv420p"  # pyright: ignore
-        for shift in range(FRAMES * 3):
-            frame = av.VideoFrame.from_ndarray(np.roll(image, shift, 1), format="rgb24")
-            container.mux(stream.encode(frame))  # pyright: ignore
-        container.mux(stream.encode())  # pyright: ignore
 
 
 def _corrected(sequence: Sequence) -> str:

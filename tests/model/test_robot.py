@@ -1,5 +1,6 @@
 """Robots from URDF files: forward kinematics, mimic joints, meshes, errors."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -11,20 +12,12 @@ import yourdfpy
 from carts_core.decoders.meshes import MOST_FACES
 from carts_core.errors import RobotError
 from carts_core.model.decimation import deviation
+from carts_core.model.psm_kinematics import JOINT_NAMES
 from carts_core.model.robot import Robot
 from carts_core.resources import shipped_robot
 
 LENGTH_RCC, LENGTH_TOOL, PITCH_TO_YAW, YAW_TO_TIP = 0.4318, 0.4162, 0.0091, 0.0102
 HALF = np.pi / 2
-
-PSM_SURROL_JOINTS = (
-    "psm_yaw_joint",
-    "psm_pitch_back_joint",
-    "psm_main_insertion_joint",
-    "psm_tool_roll_joint",
-    "psm_tool_pitch_joint",
-    "psm_tool_yaw_joint",
-)
 
 
 def dh_row(alpha: float, a: float, d: float, theta: float) -> np.ndarray:
@@ -70,21 +63,25 @@ def largest_error(robot: Robot, joints: tuple[str, ...], tip_link: str, dtype: t
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_forward_kinematics_of_the_shipped_psm_is_the_dh_formula(shipped_psm: Robot, dtype: torch.dtype) -> None:
-    joints = ("yaw", "pitch", "insertion", "roll", "wrist_pitch", "wrist_yaw")
-    assert largest_error(shipped_psm, joints, "tool_tip_link", dtype) < 1e-6
+    assert largest_error(shipped_psm, JOINT_NAMES, "tool_tip_link", dtype) < 1e-6
 
 
-def test_forward_kinematics_of_the_classic_psm_is_the_dh_formula(shared_dir: Path) -> None:
-    urdf = shared_dir / "robots/psm_classic_lnd/psm.urdf"
-    robot = Robot.load(urdf, base_link="PSM1_base_link", max_faces=MOST_FACES)
-    joints = ("yaw", "pitch", "insertion", "roll", "wrist_pitch", "wrist_yaw")
-    assert largest_error(robot, joints, "PSM1_tool_tip_link", torch.float32) < 1e-6
+SURROL = tuple(f"psm_{name}_joint" for name in ("yaw", "pitch_back", "main_insertion"))
+SURROL += tuple(f"psm_tool_{name}_joint" for name in ("roll", "pitch", "yaw"))
 
 
-def test_forward_kinematics_of_the_surrol_psm_is_the_dh_formula(shared_dir: Path) -> None:
-    urdf = shared_dir / "robots/psm_surrol/psm.urdf"
-    robot = Robot.load(urdf, base_link="psm_remote_center_link", max_faces=MOST_FACES)
-    assert largest_error(robot, PSM_SURROL_JOINTS, "psm_tool_tip_link", torch.float32) < 1e-6
+@pytest.mark.parametrize(
+    ("name", "base_link", "joints", "tip_link"),
+    [
+        ("psm_classic_lnd", "PSM1_base_link", JOINT_NAMES, "PSM1_tool_tip_link"),
+        ("psm_surrol", "psm_remote_center_link", SURROL, "psm_tool_tip_link"),
+    ],
+)
+def test_forward_kinematics_of_other_models_is_the_dh_formula(
+    shared_dir: Path, name: str, base_link: str, joints: tuple[str, ...], tip_link: str
+) -> None:
+    robot = Robot.load(shared_dir / f"robots/{name}/psm.urdf", base_link=base_link, max_faces=MOST_FACES)
+    assert largest_error(robot, joints, tip_link, torch.float32) < 1e-6
 
 
 def test_mimic_joints_are_folded_into_the_joint_that_they_follow(shipped_psm: Robot) -> None:
@@ -105,14 +102,17 @@ def test_batches_of_any_shape_agree_with_single_configurations(shipped_psm: Robo
     assert torch.allclose(batch[1, 2], shipped_psm.forward_kinematics(q[1, 2]))
 
 
-def test_wrong_number_of_joint_positions_names_the_degrees_of_freedom(shipped_psm: Robot) -> None:
-    with pytest.raises(RobotError, match="got 5 joint positions for a robot with 7 degrees of freedom: yaw, pitch"):
-        shipped_psm.forward_kinematics(torch.zeros(5))
-
-
-def test_an_unknown_joint_lists_the_joints(shipped_psm: Robot) -> None:
-    with pytest.raises(RobotError, match=r"has no joint 'elbow'.*yaw, pitch, insertion"):
-        shipped_psm.joint_index("elbow")
+@pytest.mark.parametrize(
+    ("ask", "message"),
+    [
+        (lambda robot: robot.forward_kinematics(torch.zeros(5)), "got 5 joint positions .* 7 degrees of freedom: yaw"),
+        (lambda robot: robot.joint_index("elbow"), r"has no joint 'elbow'.*yaw, pitch, insertion"),
+        (lambda robot: robot.link_transform(torch.zeros(7), "tip"), r"no link 'tip'\. Its links: .*tool_tip_link"),
+    ],
+)
+def test_what_a_robot_lacks_is_said_with_what_it_has(shipped_psm: Robot, ask: Callable, message: str) -> None:
+    with pytest.raises(RobotError, match=message):
+        ask(shipped_psm)
 
 
 def test_a_missing_mesh_names_the_file_and_the_remedy(tmp_path: Path) -> None:
@@ -200,11 +200,6 @@ def test_a_urdf_that_xacro_made_is_no_xacro_though_it_declares_the_namespace(tmp
     expanded = shipped_robot().read_text().replace("<robot ", '<robot xmlns:xacro="http://www.ros.org/wiki/xacro" ')
     (tmp_path / "arm.urdf").write_text(expanded.replace("meshes/", f"{shipped_robot().parent}/meshes/"))
     assert len(Robot.load(tmp_path / "arm.urdf").meshes) == len(Robot.load(shipped_robot()).meshes)
-
-
-def test_a_link_that_is_not_there_is_said_with_those_that_are(shipped_psm: Robot) -> None:
-    with pytest.raises(RobotError, match=r"no link 'tip'\. Its links: .*tool_tip_link"):
-        shipped_psm.link_transform(torch.zeros(len(shipped_psm.joint_names)), "tip")
 
 
 BRANCHED = """<robot name="branched">

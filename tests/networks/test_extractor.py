@@ -1,5 +1,6 @@
 """Feature extractor, weights files and hybrid images."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -10,7 +11,7 @@ from carts_core.errors import WeightsError
 from carts_core.networks import FeatureExtractor, hybrid
 from carts_core.networks.network import FeatureNetwork
 from carts_core.networks.surface import UNetSurface
-from carts_core.networks.weights import read_weights, save_weights
+from carts_core.networks.weights import save_weights
 from carts_core.settings import Architecture
 
 FORMAT = "carts-feature-network"
@@ -53,71 +54,44 @@ def test_the_gradient_agrees_with_finite_differences(small_weights: Path):
     torch.testing.assert_close((gradient * direction).sum(), numeric, rtol=1e-3, atol=1e-6)
 
 
-def test_missing_weights_name_the_file_and_the_remedy(tmp_path: Path):
-    with pytest.raises(WeightsError, match=r"none\.safetensors is missing.*carts train.*reinstall"):
-        FeatureExtractor.load(tmp_path / "none.safetensors")
+def _saved(weight: float | None = None, **metadata: str) -> Callable[[Path, FeatureNetwork], object]:
+    """Writes the network with other metadata, or with this weight in its head."""
+
+    def write(path: Path, network: FeatureNetwork) -> None:
+        architecture = network.architecture.to_json()
+        known = {"format": FORMAT, "version": "1", "architecture": architecture, "working_size": "[320, 240]"}
+        if weight is not None:
+            torch.nn.init.constant_(network.head.weight, weight)
+        save_file(network.state_dict(), path, {**known, "training": "{}", **metadata})
+
+    return write
 
 
-def test_a_file_of_another_kind_is_refused_by_name(tmp_path: Path):
-    path = tmp_path / "notes.safetensors"
-    path.write_text("these are not weights")
-    with pytest.raises(WeightsError, match=r"notes\.safetensors is not a readable safetensors file"):
-        FeatureExtractor.load(path)
+def _cut(path: Path, network: FeatureNetwork) -> None:
+    save_weights(network, path, {}, (320, 240))
+    path.write_bytes(path.read_bytes()[:-100])
 
 
-def test_truncated_weights_are_refused(small_weights: Path):
-    small_weights.write_bytes(small_weights.read_bytes()[:-100])
-    with pytest.raises(WeightsError, match="not a readable safetensors file"):
-        FeatureExtractor.load(small_weights)
-
-
-def test_safetensors_of_another_program_are_refused_with_what_is_allowed(tmp_path: Path):
-    path = tmp_path / "other.safetensors"
-    save_file({"x": torch.zeros(3)}, path)
-    with pytest.raises(WeightsError, match=f"format None.*allowed: '{FORMAT}', version '1' or "):
-        FeatureExtractor.load(path)
-
-
-def _save(path: Path, network: FeatureNetwork, **metadata: str) -> None:
-    known = {
-        "format": FORMAT,
-        "version": "1",
-        "architecture": network.architecture.to_json(),
-        "working_size": "[320, 240]",
-        "training": "{}",
-    }
-    save_file(network.state_dict(), path, known | metadata)
-
-
-def test_weights_of_another_shape_say_which_tensor_differs(small_network: FeatureNetwork, tmp_path: Path):
-    path = tmp_path / "wide.safetensors"
-    _save(path, small_network, architecture=Architecture().to_json())
-    with pytest.raises(WeightsError, match=r"wide\.safetensors does not fit its .*widths=\(12, 24"):
-        FeatureExtractor.load(path)
-
-
-@pytest.mark.parametrize("architecture", ["{}{", '{"depth": [3]}', "[1, 2]", '{"widths": [1]}', '{"widths": ["a"]}'])
-def test_unreadable_metadata_is_refused(architecture: str, small_network: FeatureNetwork, tmp_path: Path):
-    path = tmp_path / "odd.safetensors"
-    _save(path, small_network, architecture=architecture)
-    with pytest.raises(WeightsError, match="unreadable metadata"):
-        FeatureExtractor.load(path)
-
-
-def test_a_working_size_that_does_not_fit_is_refused(small_network: FeatureNetwork, tmp_path: Path):
-    path = tmp_path / "size.safetensors"
-    _save(path, small_network, working_size="[321, 240]")
-    with pytest.raises(WeightsError, match=r"\(321, 240\).*multiples of 4"):
-        FeatureExtractor.load(path)
-
-
-def test_weights_that_are_not_finite_are_refused(small_network: FeatureNetwork, tmp_path: Path):
-    with torch.no_grad():
-        small_network.head.weight.fill_(float("nan"))
-    path = tmp_path / "nan.safetensors"
-    _save(path, small_network)
-    with pytest.raises(WeightsError, match="not finite"):
-        read_weights(path)
+@pytest.mark.parametrize(
+    ("write", "message"),
+    [
+        (lambda path, network: None, r"x\.safetensors is missing.*carts train.*reinstall"),
+        (lambda path, network: path.write_text("no weights"), r"x\.safetensors is not a readable safetensors file"),
+        (_cut, "not a readable safetensors file"),
+        (lambda path, network: save_file({"x": torch.zeros(3)}, path), f"format None.*'{FORMAT}', version '1' or "),
+        (_saved(architecture=Architecture().to_json()), r"x\.safetensors does not fit its .*widths=\(12, 24"),
+        (_saved(architecture="{}{"), "unreadable metadata"),
+        (_saved(architecture='{"widths": ["a"]}'), "unreadable metadata"),
+        (_saved(working_size="[321, 240]"), r"\(321, 240\).*multiples of 4"),
+        (_saved(weight=float("nan")), "not finite"),
+    ],
+)
+def test_files_that_are_no_weights_are_refused_in_words(
+    small_network: FeatureNetwork, tmp_path: Path, write: Callable[[Path, FeatureNetwork], object], message: str
+):
+    write(tmp_path / "x.safetensors", small_network)
+    with pytest.raises(WeightsError, match=message):
+        FeatureExtractor.load(tmp_path / "x.safetensors")
 
 
 def test_a_surface_network_takes_the_place_of_the_shipped_one(tmp_path: Path, small_architecture: Architecture):

@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 import roma
 import torch
-from torch.nn import functional
+from perfect_predictor import NumberedTruths, numbered
 
 from carts_core.errors import RobotError, SettingsError
-from carts_core.imaging.working_image import Window
 from carts_core.model.scene import Scene
 from carts_core.optimization import (
     CALIBRATION,
@@ -21,7 +20,6 @@ from carts_core.optimization import (
     CalibrationOptimizer,
     DescentSolver,
     FreeParameters,
-    ImagePredictor,
     StopReason,
     Verdict,
 )
@@ -39,23 +37,6 @@ DESCENTS = (Descend(6.0), Descend(2.0), Descend(0.8))
 SETTINGS = replace(CALIBRATION_SETTINGS, frame_prior_deg=10.0, stages=(FAR, *DESCENTS), dehaze=0.0)
 
 
-class PerfectPredictor(ImagePredictor):
-    """Knows a frame by its images' colour, and predicts the surface map of its truth."""
-
-    device = torch.device("cpu")
-    stride = 16
-
-    def __init__(self, scene: Scene, frames: list[Frame]) -> None:
-        renderer = Renderer(scene, width=2 * SIZE[0], height=2 * SIZE[1])
-        self.maps = [
-            functional.avg_pool2d(renderer.surface(scene.state(frame.truth or {})).maps, 2) for frame in frames
-        ]
-
-    def predict(self, images: torch.Tensor, given: torch.Tensor, window: Window) -> torch.Tensor:
-        """The truth of the frame whose images these are."""
-        return window.of(self.maps[round(255 * float(images[0, 0, 0, 0]))])[: len(images)]
-
-
 @pytest.fixture(scope="module")
 def sequence(shared_sequence: Callable[..., Path]) -> Sequence:
     return Sequence.open(shared_sequence(frames=FRAMES, cameras=("left", "right"), width=SIZE[0], height=SIZE[1]))
@@ -63,22 +44,16 @@ def sequence(shared_sequence: Callable[..., Path]) -> Sequence:
 
 @pytest.fixture(scope="module")
 def frames(sequence: Sequence) -> list[Frame]:
-    """Frames whose joints are measured without an error; their images are as bright as their number."""
-    return [
-        replace(
-            frame, measured=frame.truth or {}, images={c: np.full_like(i, frame.index) for c, i in frame.images.items()}
-        )
-        for frame in map(sequence.frame, range(FRAMES))
-    ]
+    return [numbered(sequence.frame(index)) for index in range(FRAMES)]
 
 
 @pytest.fixture(scope="module")
-def made_predictor(sequence: Sequence, frames: list[Frame]) -> PerfectPredictor:
-    return PerfectPredictor(sequence.scene, frames)
+def made_predictor(sequence: Sequence, frames: list[Frame]) -> NumberedTruths:
+    return NumberedTruths(sequence.scene, frames)
 
 
 @pytest.fixture
-def predictor(made_predictor: PerfectPredictor) -> PerfectPredictor:
+def predictor(made_predictor: NumberedTruths) -> NumberedTruths:
     return copy(made_predictor)
 
 
@@ -117,7 +92,7 @@ def worst_error(scene: Scene, truth: Scene, joint_positions: np.ndarray) -> tupl
 
 
 def test_a_wrong_base_frame_and_a_wrong_camera_come_back(
-    sequence: Sequence, frames: list[Frame], predictor: PerfectPredictor
+    sequence: Sequence, frames: list[Frame], predictor: NumberedTruths
 ) -> None:
     wrong = with_wrong_right_camera(with_wrong_base(sequence.scene))
     optimizer = CalibrationOptimizer(wrong, frames, predictor, settings=SETTINGS)
@@ -140,7 +115,7 @@ def test_a_wrong_base_frame_and_a_wrong_camera_come_back(
 
 
 def test_a_calibration_that_fits_is_good_and_one_that_cannot_fit_keeps_its_start(
-    sequence: Sequence, frames: list[Frame], predictor: PerfectPredictor
+    sequence: Sequence, frames: list[Frame], predictor: NumberedTruths
 ) -> None:
     wrong = with_wrong_base(sequence.scene)
     right = CalibrationOptimizer(wrong, frames, predictor, settings=SETTINGS)
@@ -157,7 +132,7 @@ def test_a_calibration_that_fits_is_good_and_one_that_cannot_fit_keeps_its_start
 
 
 def test_deviations_of_one_frame_and_of_few_are_not_those_of_independent_pixels(
-    sequence: Sequence, frames: list[Frame], predictor: PerfectPredictor
+    sequence: Sequence, frames: list[Frame], predictor: NumberedTruths
 ) -> None:
     free = FreeParameters(joints=False, base_frames=True)
 
@@ -178,7 +153,7 @@ def test_deviations_of_one_frame_and_of_few_are_not_those_of_independent_pixels(
 
 @pytest.mark.parametrize("count", [1, 3])
 def test_few_frames_bring_a_base_frame_back_as_near_as_their_deviations_say(
-    sequence: Sequence, frames: list[Frame], predictor: PerfectPredictor, count: int
+    sequence: Sequence, frames: list[Frame], predictor: NumberedTruths, count: int
 ) -> None:
     free = FreeParameters(joints=False, base_frames=True)
     wrong, truth = (scene.with_cameras(["left"]) for scene in (with_wrong_base(sequence.scene), sequence.scene))
@@ -192,7 +167,7 @@ def test_few_frames_bring_a_base_frame_back_as_near_as_their_deviations_say(
 
 
 def test_what_differs_from_the_empty_background_counts_in_a_calibration(
-    sequence: Sequence, frames: list[Frame], predictor: PerfectPredictor
+    sequence: Sequence, frames: list[Frame], predictor: NumberedTruths
 ) -> None:
     renderer = Renderer(sequence.scene, cameras=["left"])
     bright = []
@@ -217,7 +192,7 @@ def test_what_differs_from_the_empty_background_counts_in_a_calibration(
 
 
 def test_lightly_freed_joints_take_what_differs_from_frame_to_frame(
-    sequence: Sequence, frames: list[Frame], predictor: PerfectPredictor
+    sequence: Sequence, frames: list[Frame], predictor: NumberedTruths
 ) -> None:
     signs = np.random.default_rng(1).choice([-1.0, 1.0], (FRAMES, 2))
     shaken = [
@@ -239,7 +214,7 @@ def test_lightly_freed_joints_take_what_differs_from_frame_to_frame(
 
 
 def test_a_frame_with_wrong_kinematics_hardly_matters(
-    sequence: Sequence, frames: list[Frame], predictor: PerfectPredictor
+    sequence: Sequence, frames: list[Frame], predictor: NumberedTruths
 ) -> None:
     broken = {"PSM1": frames[0].measured["PSM1"] + np.deg2rad([4, -4, 0, 0, 0, 0, 0])}
     mixed = [replace(frames[0], measured=broken), *frames[1:]]
@@ -289,7 +264,7 @@ def test_the_first_camera_stays_where_only_products_can_be_seen(sequence: Sequen
 
 
 def test_the_best_calibration_is_kept_when_it_is_cancelled(
-    sequence: Sequence, frames: list[Frame], predictor: PerfectPredictor
+    sequence: Sequence, frames: list[Frame], predictor: NumberedTruths
 ) -> None:
     optimizer = CalibrationOptimizer(with_wrong_base(sequence.scene), frames[:1], predictor, settings=SETTINGS)
     first, second = optimizer.step(), optimizer.step()
@@ -312,14 +287,14 @@ def test_the_best_calibration_is_kept_when_it_is_cancelled(
     ],
 )
 def test_what_makes_no_calibration_is_refused(
-    sequence: Sequence, frames: list[Frame], predictor: PerfectPredictor, changes: dict, message: str
+    sequence: Sequence, frames: list[Frame], predictor: NumberedTruths, changes: dict, message: str
 ) -> None:
     with pytest.raises(SettingsError, match=message):
         CalibrationOptimizer(sequence.scene, frames, predictor, **changes)
 
 
 def test_no_frame_and_unknown_cameras_are_refused(
-    sequence: Sequence, frames: list[Frame], predictor: PerfectPredictor
+    sequence: Sequence, frames: list[Frame], predictor: NumberedTruths
 ) -> None:
     with pytest.raises(SettingsError, match="no frame was given"):
         CalibrationOptimizer(sequence.scene, [], predictor)

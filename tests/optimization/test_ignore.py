@@ -36,21 +36,16 @@ def test_a_gap_in_the_arm_and_what_sticks_out_of_it_are_proposed_at_the_cameras_
     assert not mask[240, 20] and mask.mean() < 0.05
 
 
-def test_a_thin_rim_is_an_arm_that_is_off_and_no_occluder(scene: Scene) -> None:
+@pytest.mark.parametrize(
+    ("rows", "columns"),
+    [(slice(97, 101), slice(200)), (slice(180, 220), slice(250, 300)), (slice(95, 145), slice(150))],
+    ids=["a thin rim", "apart from the arm", "most of the arm"],
+)
+def test_what_may_be_a_wrong_estimate_or_another_object_is_not_proposed(
+    scene: Scene, rows: slice, columns: slice
+) -> None:
     silhouette, similarity = _arm()
-    similarity[0, 97:101, :200] = 0.0
-    assert propose_ignore(scene, silhouette, similarity) == {}
-
-
-def test_what_does_not_touch_the_arm_is_somebody_elses(scene: Scene) -> None:
-    silhouette, similarity = _arm()
-    similarity[0, 180:220, 250:300] = 0.0
-    assert propose_ignore(scene, silhouette, similarity) == {}
-
-
-def test_where_most_of_the_arm_contradicts_the_estimate_is_wrong_and_nothing_is_proposed(scene: Scene) -> None:
-    silhouette, similarity = _arm()
-    similarity[0, 95:145, :150] = 0.0
+    similarity[0, rows, columns] = 0.0
     assert propose_ignore(scene, silhouette, similarity) == {}
 
 

@@ -6,9 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from moving import let_camera_move, swing
-from perfect_predictor import PerfectPredictor
+from perfect_predictor import NumberedTruths, PerfectPredictor, numbered
 
 from carts_core.errors import SettingsError
 from carts_core.evaluation.evaluate import dice
@@ -90,34 +89,23 @@ def test_frames_of_a_moving_camera_are_corrected_together(moving: Sequence) -> N
         assert overlap(moving, moving.frame(index), estimate.state) > 0.985
 
 
-class Together(Truths):
-    """Predicts for each frame its own truth, by the brightness of its images."""
-
-    def predict(self, images: torch.Tensor, given: torch.Tensor, window) -> torch.Tensor:
-        """The truth in a window."""
-        self.maps = self.all[round(255 * float(images[0, 0, 0, 0]))]
-        return super().predict(images, given, window)
-
-
 def test_a_camera_that_moves_is_calibrated_on_its_mount(moving: Sequence) -> None:
     """The hand-eye transform of the endoscope comes back."""
-    frames = [
-        replace(frame, measured=frame.truth or {}, images={"left": np.full_like(frame.images["left"], frame.index)})
-        for frame in map(moving.frame, range(FRAMES))
-    ]
+    frames = [numbered(moving.frame(index)) for index in range(FRAMES)]
+    predictor = NumberedTruths(moving.scene, frames)
     (camera,) = moving.scene.cameras
     T = np.eye(4)
     T[:3, 3] = 0.002, -0.001, 0.0015
     wrong = replace(moving.scene, cameras=(replace(camera, T_camera_world=T @ camera.T_camera_world),))
     optimizer = CalibrationOptimizer(
-        wrong, frames, Together(moving), free=FreeParameters(joints=False, extrinsics=True), settings=BY_COLOUR
+        wrong, frames, predictor, free=FreeParameters(joints=False, extrinsics=True), settings=BY_COLOUR
     )
     for _ in optimizer:
         pass
     found = optimizer.result().scene.cameras[0].T_camera_world
     assert np.linalg.norm(found[:3, 3] - camera.T_camera_world[:3, 3]) < 0.0005
     both = FreeParameters(joints=False, base_frames=True, extrinsics=True)
-    assert CalibrationOptimizer(wrong, frames, Together(moving), free=both).free == both
+    assert CalibrationOptimizer(wrong, frames, predictor, free=both).free == both
     assert with_fixed_gauge(wrong, both).locked_cameras == ("left",)
 
 

@@ -5,7 +5,7 @@ import pytest
 import torch
 from tiny import tiny_scene
 
-from carts_core.errors import RobotError, SettingsError
+from carts_core.errors import CartsError
 from carts_core.model.robot import Robot
 from carts_core.model.scene import Scene
 from carts_core.optimization import FreeParameters
@@ -79,16 +79,14 @@ def test_a_start_outside_the_limits_may_stay(scene: Scene) -> None:
     assert float(parameters.clamp(torch.ones(7))[-1]) == 0.0
 
 
-def test_nothing_free_is_an_error(scene: Scene) -> None:
-    with pytest.raises(SettingsError, match="no parameter is free"):
-        vector(scene, FreeParameters(joints=False))
-
-
-def test_an_unknown_locked_joint_lists_the_joints(scene: Scene) -> None:
-    with pytest.raises(SettingsError, match=r"'elbow' does not exist.*insertion"):
-        vector(scene, FreeParameters(locked_joints=("elbow",)))
-
-
-def test_an_unknown_arm_lists_the_arms(scene: Scene) -> None:
-    with pytest.raises(RobotError, match=r"there is no arm 'PSM9'. The arms are: PSM1"):
-        vector(scene, FreeParameters(arms=("PSM9",)))
+@pytest.mark.parametrize(
+    ("free", "message"),
+    [
+        (FreeParameters(joints=False), "no parameter is free"),
+        (FreeParameters(locked_joints=("elbow",)), r"'elbow' does not exist.*insertion"),
+        (FreeParameters(arms=("PSM9",)), r"there is no arm 'PSM9'. The arms are: PSM1"),
+    ],
+)
+def test_impossible_unknowns_are_refused_in_words(scene: Scene, free: FreeParameters, message: str) -> None:
+    with pytest.raises(CartsError, match=message):
+        vector(scene, free)

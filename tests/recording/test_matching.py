@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from videos import write_timed_video
+from videos import write_video
 
 from carts_core.errors import SequenceError
 from carts_core.recording import Sequence
@@ -161,10 +161,10 @@ def test_with_frames_of_their_own_rows_need_times_and_no_ids(timed):
 MILLISECONDS = np.array([300, 520, 830, 1900])
 
 
-def write_video(path: Path) -> None:
+def write_brightening(path: Path) -> None:
     """A video whose frame n is as bright as 60 n."""
     images = [np.full((72, 96, 3), 60 * number, np.uint8) for number in range(len(MILLISECONDS))]
-    write_timed_video(path, images, MILLISECONDS, options={"bf": "2", "crf": "5"})
+    write_video(path, images, milliseconds=MILLISECONDS, options={"bf": "2", "crf": "5"})
 
 
 def as_video(text: str) -> str:
@@ -174,7 +174,7 @@ def as_video(text: str) -> str:
 
 def test_a_video_may_say_which_frames_there_are_and_when(timed):
     path = timed('video = "left.mp4"\ntime_offset = -0.2', edit=as_video)
-    write_video(path.parent / "left.mp4")
+    write_brightening(path.parent / "left.mp4")
     sequence = Sequence.open(path)
     assert sequence.frame_ids == ("000", "001", "002", "003")
     assert sequence.timestamps == pytest.approx(MILLISECONDS / 1000, abs=1e-6)
@@ -185,7 +185,7 @@ def test_a_video_may_say_which_frames_there_are_and_when(timed):
 
 def test_a_table_may_pick_frames_of_a_video(timed):
     path = timed('table = "frames.csv"\nvideo_frame = "number"', edit=as_video)
-    write_video(path.parent / "left.mp4")
+    write_brightening(path.parent / "left.mp4")
     (path.parent / "frames.csv").write_text("frame,timestamp,number\n1,0.52,1\n2,1.9,3\n")
     sequence = Sequence.open(path)
     assert [round(sequence.frame(index).images["left"].mean() / 60) for index in (0, 1)] == [1, 3]

@@ -8,7 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from videos import write_timed_video
+from videos import write_video
 
 from carts_core.recording import Sequence
 from carts_core.recording.matching import TimeMatching
@@ -96,7 +96,7 @@ def test_the_complete_example_opens_and_means_what_its_comments_say(complete_exa
 
 def test_the_example_with_a_log_of_its_own_reads_it_at_the_times_of_the_video(tmp_path):
     (tmp_path / "sequence.toml").write_text(example(2))
-    write_timed_video(tmp_path / "left.mp4", [IMAGE[:480, :640]] * 3, [1500, 1540, 1640])
+    write_video(tmp_path / "left.mp4", [IMAGE[:480, :640]] * 3, milliseconds=[1500, 1540, 1640])
     stamps = np.arange(1.0, 2.0, 0.01)
     rows = [f"{stamp!r},{stamp!r},0.1,0.15,0.1,0.1,0.1" for stamp in stamps.tolist()]
     (tmp_path / "measured_js.csv").write_text("\n".join(["stamp,q1,q2,q3,q4,q5,q6", *rows]))

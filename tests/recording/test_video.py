@@ -6,7 +6,7 @@ import av
 import cv2
 import numpy as np
 import pytest
-from videos import write_timed_video
+from videos import write_video
 
 from carts_core.errors import SequenceError
 from carts_core.recording import Sequence
@@ -26,7 +26,7 @@ def number_of(image: np.ndarray) -> int:
     return sum(int(value > 127) << bit for bit, value in enumerate(image[SIZE[1] // 2, 6::12, 1]))
 
 
-def write_video(path: Path, codec: str, frames: int = FRAMES) -> Path:
+def write_opencv(path: Path, codec: str, frames: int = FRAMES) -> Path:
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*codec), 25.0, SIZE)
     if not writer.isOpened():
         pytest.skip(f"OpenCV cannot write {codec} here")
@@ -41,14 +41,14 @@ ORDERS = [range(FRAMES), np.random.default_rng(0).integers(0, FRAMES, 40).tolist
 
 @pytest.mark.parametrize(("codec", "suffix"), [("mp4v", ".mp4"), ("MJPG", ".avi"), ("VP80", ".webm"), ("PIM1", ".mpg")])
 def test_frames_are_right_in_any_order(tmp_path, codec, suffix):
-    path = write_video(tmp_path / f"left{suffix}", codec)
+    path = write_opencv(tmp_path / f"left{suffix}", codec)
     for order in ORDERS:
         video = Video(path, tuple(range(FRAMES)))
         assert [number_of(video.read(index)) for index in order] == list(order)
 
 
 def test_a_fingerprint_is_of_the_file_and_the_frame(tmp_path):
-    video_file = write_video(tmp_path / "left.avi", "MJPG", 5)
+    video_file = write_opencv(tmp_path / "left.avi", "MJPG", 5)
     video = Video(video_file, tuple(range(5)))
     known = video.fingerprint(1)
     assert known == Video(video_file, (1,)).fingerprint(0) != video.fingerprint(2)
@@ -73,7 +73,7 @@ TIMED = {
 
 def write_numbered(path: Path, codec: str, options: dict[str, str], times: np.ndarray = TIMES) -> Path:
     """Frame n shows its number from `times[n]` [ms] on."""
-    return write_timed_video(path, map(numbered, range(len(times))), times, codec, options)
+    return write_video(path, map(numbered, range(len(times))), codec=codec, options=options, milliseconds=times)
 
 
 @pytest.fixture(scope="module", params=list(TIMED))
@@ -235,13 +235,13 @@ def test_a_playlist_that_calls_itself_a_video_fetches_nothing(tmp_path):
 
 
 def test_a_column_may_say_which_video_frame_a_row_is(tmp_path):
-    video = Video(write_video(tmp_path / "left.avi", "MJPG"), (50, 20, 40))
+    video = Video(write_opencv(tmp_path / "left.avi", "MJPG"), (50, 20, 40))
     assert [number_of(video.read(index)) for index in (0, 1, 2)] == [50, 20, 40]
     assert video.name(1).endswith("left.avi, frame number 20")
 
 
 def test_a_video_that_is_too_short_is_refused(tmp_path):
-    path = write_video(tmp_path / "left.avi", "MJPG", frames=10)
+    path = write_opencv(tmp_path / "left.avi", "MJPG", frames=10)
     with pytest.raises(SequenceError, match=r"left.avi has 10 frames, .* frame number 10 .*video_frame"):
         Video(path, tuple(range(11)))
 
@@ -259,7 +259,7 @@ def test_a_file_that_is_no_video_is_refused(tmp_path):
 
 
 def test_a_truncated_video_is_an_error_where_it_ends(tmp_path):
-    path = write_video(tmp_path / "left.avi", "MJPG")
+    path = write_opencv(tmp_path / "left.avi", "MJPG")
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
     with pytest.raises(SequenceError, match=r"left.avi"):
         Video(path, tuple(range(FRAMES))).read(FRAMES - 1)

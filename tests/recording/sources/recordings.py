@@ -3,13 +3,12 @@
 import atexit
 import shutil
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any
 
-import av
 import cv2
 import numpy as np
 import pytest
@@ -56,6 +55,32 @@ def image(number: int, camera: str = "left") -> np.ndarray:
     picture = np.full((SIZE[1], SIZE[0], 3), 60 if camera == "left" else 120, np.uint8)
     picture[:, : 8 * (number % 10) + 8, 0] = 200
     return picture
+
+
+def ros_yaml(
+    R: np.ndarray | None = None,
+    P: np.ndarray | None = None,
+    *,
+    size: tuple[int, int] = SIZE,
+    K: np.ndarray = K,
+    D: Sequence[float] = (-0.1, 0.02, 0, 0, 0),
+    name: str = "left",
+    more: str = "",
+) -> str:
+    """A calibration as ROS writes it, with a rectification on request."""
+
+    def matrix(values: np.ndarray) -> str:
+        rows, columns = values.shape
+        return f"{{rows: {rows}, cols: {columns}, data: {values.reshape(-1).tolist()}}}"
+
+    return (
+        f"image_width: {size[0]}\nimage_height: {size[1]}\ncamera_name: {name}\ncamera_matrix: {matrix(K)}\n"
+        + ("" if "model" in more else "distortion_model: plumb_bob\n")
+        + f"distortion_coefficients: {matrix(np.array([D]))}\n"
+        + ("" if R is None else f"rectification_matrix: {matrix(R)}\n")
+        + ("" if P is None else f"projection_matrix: {matrix(P)}\n")
+        + more
+    )
 
 
 def write_images(folder: Path, count: int, name: str = "{:04d}.png", camera: str = "left") -> None:
@@ -229,19 +254,6 @@ def _image_messages(make: Any, header: Any, time: int, frame: int, camera: str, 
     roi = make("sensor_msgs/msg/RegionOfInterest", x_offset=0, y_offset=0, height=0, width=0, do_rectify=False)
     info = make("sensor_msgs/msg/CameraInfo", header=header, binning_x=0, binning_y=0, roi=roi, **values)
     yield time, f"/stereo/{camera}/camera_info", info
-
-
-def write_video(path: Path, pictures: list[np.ndarray], rate: int = 25, codec: str = "libx264") -> Path:
-    """A video of RGB pictures."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with av.open(str(path), "w") as container:
-        stream: Any = container.add_stream(codec, rate=rate)
-        stream.height, stream.width = pictures[0].shape[:2]
-        stream.pix_fmt = "yuv420p"
-        for picture in pictures:
-            container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, "rgb24")))
-        container.mux(stream.encode())
-    return path
 
 
 def assert_refused(path: Path, message: str) -> None:

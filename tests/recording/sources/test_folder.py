@@ -10,8 +10,9 @@ import numpy as np
 import pyarrow
 import pyarrow.parquet
 import pytest
-from recordings import SIZE, START, K, copied, image, joints_at, pose_of, write, write_images, write_video
+from recordings import SIZE, START, K, copied, image, joints_at, pose_of, ros_yaml, write, write_images
 from scipy.io import savemat
+from videos import write_video
 
 from carts_core.cli import main
 from carts_core.errors import CartsError
@@ -22,15 +23,6 @@ from carts_core.recording.importing.writing import write_sequence
 from carts_core.settings.interchange import ImportOptions
 
 FRAMES = 5
-ROS_YAML = f"""image_width: {SIZE[0]}
-image_height: {SIZE[1]}
-camera_name: left
-rectification_matrix: {{rows: 3, cols: 3, data: [1, 0, 0, 0, 1, 0, 0, 0, 1]}}
-projection_matrix: {{rows: 3, cols: 4, data: [110, 0, 47.5, 0, 0, 110, 35.5, 0, 0, 0, 1, 0]}}
-camera_matrix: {{rows: 3, cols: 3, data: {K.reshape(-1).tolist()}}}
-distortion_model: plumb_bob
-distortion_coefficients: {{rows: 1, cols: 5, data: [-0.1, 0.02, 0, 0, 0]}}
-"""
 
 
 def write_csv(path: Path, header: list[str], rows: np.ndarray, delimiter: str = ",") -> None:
@@ -56,10 +48,9 @@ def lab(source: Path) -> Path:
         ["image", *(f"Joint{n} [deg]" for n in range(1, 7))],
         np.column_stack([range(FRAMES), scaled]),
     )
-    (source / "left.yaml").write_text(ROS_YAML)
-    (source / "right.yaml").write_text(
-        ROS_YAML.replace("left", "right").replace("[110, 0, 47.5, 0,", "[110, 0, 47.5, -0.55,")
-    )
+    for side, shift in (("left", 0.0), ("right", -0.55)):
+        P = np.column_stack([K, [shift, 0, 0]])
+        (source / f"{side}.yaml").write_text(ros_yaml(np.eye(3), P, name=side))
     return source
 
 
@@ -99,18 +90,15 @@ def test_a_table_that_is_no_pose_is_named_with_its_columns(tmp_path, header):
     assert not [note for note in left_out.notes if "no table" in str(note)]
 
 
-@pytest.mark.parametrize("unit", ["s", "ms", "us", "ns"])
-def test_a_log_with_times_is_matched_with_a_table_of_image_times(tmp_path, unit):
-    factor = {"s": 1e-9, "ms": 1e-6, "us": 1e-3, "ns": 1}[unit]
+def test_a_log_with_times_is_matched_with_a_table_of_image_times(tmp_path):
     write_images(tmp_path / "rec/left", FRAMES)
     stamps = START + np.arange(-3, 60) * 10_000_000
-    times = [f"{stamp * factor:.9f}" if factor < 1 else str(stamp) for stamp in stamps]
-    rows = np.column_stack([times, joints_at((stamps - START) * 1e-9).astype(str)])
+    rows = np.column_stack([stamps.astype(str), joints_at((stamps - START) * 1e-9).astype(str)])
     write_csv(tmp_path / "rec/psm.csv", ["stamp", *(f"PSM2_q{n}" for n in range(6))], rows)
     frame_times = START + np.arange(FRAMES) * 100_000_000
     write_csv(tmp_path / "rec/frames.csv", ["frame", "timestamp_ns"], np.column_stack([np.arange(FRAMES), frame_times]))
     file, found = import_recording(tmp_path / "rec", tmp_path / "out")
-    assert any(f"are in {unit} (change: --clock)" in str(note) for note in found.notes)
+    assert any("are in ns (change: --clock)" in str(note) for note in found.notes)
     sequence = Sequence.open(file)
     assert np.abs(sequence.frame(3).measured["PSM2"][:6] - joints_at(0.3)).max() < 1e-5
 
@@ -213,19 +201,14 @@ MUTATIONS: dict[str, tuple[Callable[[Path], object], dict, str]] = {
     "binary table": (write("log.csv", b"\xff\xfe"), {"kinematics": Path("log.csv")}, "cannot be read"),
     "missing table": (lambda folder: None, {"kinematics": Path("none.csv")}, "none.csv is missing"),
     "wrong column": (lambda folder: None, {"columns": {"yaw": "q9"}}, "has no column 'q9'. It has: image"),
-    "fisheye": (rewrite("left.yaml", "plumb_bob", "equidistant"), {}, "distortion model 'equidistant'"),
     "broken YAML": (rewrite("left.yaml", "{rows", "{{{{rows"), {}, "cannot be used"),
-    "nested lists": (write("left.yaml", "camera_matrix: " + "[" * 50_000), {}, "nested more than 32 deep"),
-    "nested dashes": (write("left.yaml", "camera_matrix:\n  " + "- " * 50_000), {}, "nested more than 32 deep"),
     "no matrix": (rewrite("left.yaml", "data:", "values:"), {}, "cannot be used"),
-    "other size": (rewrite("left.yaml", "image_height: 72", "image_height: 20"), {}, "another aspect ratio"),
     "missing folder": (
         lambda folder: None,
         {"images": {"left": "nothing"}},
         "nothing is neither a video nor",
     ),
     "cut image": (write("imgs_left/img_0000.png", b"\x89PNG\r\n\x1a\n123"), {}, "damaged"),
-    "names without numbers": (write("imgs_left/last.png", b""), {}, ""),
     "no common frames": (
         lambda f: [p.rename(p.with_name(f"img_9{p.name[4:]}")) for p in (f / "imgs_left").iterdir()],
         {},
@@ -239,9 +222,6 @@ MUTATIONS: dict[str, tuple[Callable[[Path], object], dict, str]] = {
 def test_a_broken_folder_is_an_error_in_words_and_leaves_nothing(folder, tmp_path, name):
     mutate, options, message = MUTATIONS[name]
     mutate(folder)
-    if not message:
-        assert len(find(folder).frame_ids) == FRAMES
-        return
     with pytest.raises(CartsError, match=message):
         import_recording(folder, tmp_path / "out", ImportOptions(**options))
     assert [entry.name for entry in tmp_path.iterdir()] == [folder.name]

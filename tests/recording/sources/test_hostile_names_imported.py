@@ -11,17 +11,10 @@ import numpy as np
 import pytest
 from hostile_recording import hostile_names
 from planted import contents, treasure
-from recordings import SIZE, K, joints_at, write_images
+from recordings import joints_at, ros_yaml, write_images
 
 from carts_core.cli.command_line import BAD_INPUT, main
 
-YAML = f"""image_width: {SIZE[0]}
-image_height: {SIZE[1]}
-camera_name: NAME
-camera_matrix: {{rows: 3, cols: 3, data: {K.reshape(-1).tolist()}}}
-distortion_model: plumb_bob
-distortion_coefficients: {{rows: 1, cols: 5, data: [0, 0, 0, 0, 0]}}
-"""
 FRAMES = 2
 
 
@@ -33,7 +26,7 @@ def write_source(folder: Path, *, camera: str = "left", columns: tuple[str, str]
         writer.writerow([columns[0], *(f"{columns[1]}{number}" for number in range(1, 7))])
         for frame, q in enumerate(joints_at(np.arange(FRAMES) / 10)):
             writer.writerow([row if frame == 0 else frame, *map(float, q)])
-    text = YAML.replace("NAME", json.dumps(camera, ensure_ascii=False))
+    text = ros_yaml(name=json.dumps(camera, ensure_ascii=False))
     (folder / "left.yaml").write_text(text, encoding="utf-8", errors="replace")
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from recordings import BagKind, write_bag
+from recordings import BagKind, ros_yaml, write_bag
 from scipy.io import savemat
 from scipy.spatial.transform import Rotation
 
@@ -40,19 +40,8 @@ def said(recording: FoundRecording) -> str:
     return "\n".join(str(note) for note in recording.notes)
 
 
-def ros(R: np.ndarray | None = None, P: np.ndarray | None = None, size: tuple[int, int] = SIZE, more: str = "") -> str:
-    def matrix(values: np.ndarray) -> str:
-        rows, columns = values.shape
-        return f"{{rows: {rows}, cols: {columns}, data: {values.reshape(-1).tolist()}}}"
-
-    return (
-        f"image_width: {size[0]}\nimage_height: {size[1]}\ncamera_name: stereo\ncamera_matrix: {matrix(K)}\n"
-        + ("" if "model" in more else "distortion_model: plumb_bob\n")
-        + f"distortion_coefficients: {matrix(np.array([D]))}\n"
-        + ("" if R is None else f"rectification_matrix: {matrix(R)}\n")
-        + ("" if P is None else f"projection_matrix: {matrix(P)}\n")
-        + more
-    )
+def ros(*rectification: np.ndarray | None, more: str = "") -> str:
+    return ros_yaml(*rectification, size=SIZE, K=K, D=D, more=more)
 
 
 def stereo_pair() -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:

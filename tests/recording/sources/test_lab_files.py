@@ -9,11 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 from lab_robots import PANDA, SO101, write_urdf
-from recordings import START, T_CAMERA_BASE, BagKind, image, joints_at, pose_of, write_bag, write_images, write_video
+from recordings import START, T_CAMERA_BASE, BagKind, image, joints_at, pose_of, write_bag, write_images
 from test_carts_layouts import cts
 from test_datasets import surgpose
 from test_lerobot import dataset, write_parquet
 from test_surgsync import clip, episode
+from videos import write_video
 
 from carts_core.cli import main
 from carts_core.errors import CartsError

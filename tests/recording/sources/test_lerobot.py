@@ -8,7 +8,8 @@ import numpy as np
 import pyarrow
 import pyarrow.parquet
 import pytest
-from recordings import assert_refused, copied, cut, image, jaw_at, joints_at, pose_of, remove, write, write_video
+from recordings import assert_refused, copied, image, jaw_at, joints_at, pose_of, remove, write
+from videos import write_video
 
 from carts_core.cli import main
 from carts_core.errors import CartsError
@@ -135,8 +136,6 @@ MUTATIONS: dict[str, tuple[Callable[[Path], object], str]] = {
         "neither six joints of a PSM",
     ),
     "no episode": (remove(FIRST), "has no episode 0"),
-    "cut table": (cut(FIRST, 100), "cannot be read"),
-    "pointer instead of a table": (write(FIRST, "version https://git-lfs"), "Git LFS pointer"),
     "no rows": (lambda p: write_parquet(p / FIRST, {"observation.state": pyarrow.array([], "float32")}), "no rows"),
     "missing column": (lambda p: write_parquet(p / FIRST, {"state": [1.0]}), "has no feature observation.state"),
     "ragged rows": (lambda p: write_parquet(p / FIRST, {"observation.state": [[1.0], [1.0, 2.0]]}), "differ in length"),
@@ -145,7 +144,6 @@ MUTATIONS: dict[str, tuple[Callable[[Path], object], str]] = {
         lambda p: write_video(p / VIDEO, [image(0), image(1)], 30),
         "has 2 frames, but episode 0 is frames 0 to 3",
     ),
-    "cut video": (cut(VIDEO, 300), r"episode_000000\.mp4"),
     "poses elsewhere": (
         lambda p: write_parquet(p / FIRST, {"observation.state": [[1.0, 2, 3, 0, 0, 0, 1, 0]] * 4}),
         "the unit of the tip.s position is ambiguous",
