@@ -99,8 +99,9 @@ def test_a_perturbation_keeps_to_the_limits_and_the_chosen_joints(shipped_psm: R
     assert only.tolist() == [True, False, False, False, False, False, False]
 
 
-@pytest.mark.parametrize("together", [False, True])
-@pytest.mark.parametrize(("model", "frames"), [(None, [0]), (SequenceSettings(), [0, 1])])
+@pytest.mark.parametrize(
+    ("model", "frames", "together"), [(None, [0], False), (None, [0], True), (SequenceSettings(), [0, 1], False)]
+)
 def test_every_camera_has_its_scores(
     tiny_sequence: Callable[..., Path], model: SequenceSettings | None, frames: list[int], together: bool
 ) -> None:

@@ -5,6 +5,7 @@ import os
 import threading
 from dataclasses import replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -38,14 +39,15 @@ def test_masks_of_measured_frames_are_those_of_the_renderer(dataset: Dataset) ->
     assert set(np.unique(arm_ids)) == {-1, 0, 1}, "the scene must show both arms"
 
 
-def test_links_of_an_arm_make_up_the_arm(dataset: Dataset) -> None:
-    by_link = replace(dataset, parts="links")
-    view = all_views(dataset)[0]
-    links = list(by_link.instances(view))
-    assert len(links) > len(ARMS) and all(category.name.startswith(f"{category.arm}.") for category, _ in links)
+@pytest.mark.parametrize("parts", ["links", "parts"])
+def test_links_and_parts_of_an_arm_make_up_the_arm(dataset: Dataset, parts: Literal["links", "parts"]) -> None:
+    view, divided = all_views(dataset)[0], replace(dataset, parts=parts)
+    pieces = list(divided.instances(view))
+    assert len(pieces) > len(ARMS) and all(category.name.startswith(f"{category.arm}.") for category, _ in pieces)
     for category, mask in dataset.instances(view):
-        parts = [part for link, part in links if link.arm == category.name]
-        np.testing.assert_array_equal(np.sum(parts, axis=0), mask)
+        np.testing.assert_array_equal(
+            np.sum([one for piece, one in pieces if piece.arm == category.name], axis=0), mask
+        )
 
 
 def test_a_corrected_mask_decides_where_arms_are_and_the_rendering_whose_they_are(dataset: Dataset) -> None:
@@ -104,17 +106,6 @@ def test_rows_of_unknown_or_repeated_frames_are_refused(sequence: Sequence) -> N
         corrected_frames(sequence, range(3), [row, row])
     with pytest.raises(SequenceError, match=r"'999', which .* does not have"):
         corrected_frames(sequence, range(3), [replace(row, frame_id="999")])
-
-
-def test_parts_of_an_arm_make_up_the_arm(dataset: Dataset) -> None:
-    by_part = replace(dataset, parts="parts")
-    names = {category.name for category in by_part.categories}
-    assert names == {f"{arm}.{part}" for arm in ARMS for part in ("shaft", "wrist", "jaws")}
-    view = all_views(dataset)[0]
-    parts = list(by_part.instances(view))
-    for category, mask in dataset.instances(view):
-        own = [part for one, part in parts if one.arm == category.name]
-        np.testing.assert_array_equal(np.sum(own, axis=0), mask)
 
 
 def test_a_painted_class_belongs_to_its_part_whatever_is_rendered_there(dataset: Dataset) -> None:

@@ -33,7 +33,7 @@ SYNTHESIS = replace(
     SYNTHESIS,
     endoscope=replace(SYNTHESIS.endoscope, width=64, height=48, stereo=False),
     motion=replace(SYNTHESIS.motion, frames=2),
-    render=replace(SYNTHESIS.render, samples=1, robot_faces=4000, tissue_resolution=64, texture_resolution=64),
+    render=replace(SYNTHESIS.render, samples=1, tissue_resolution=64, texture_resolution=64),
 )
 
 

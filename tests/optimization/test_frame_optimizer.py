@@ -148,12 +148,6 @@ def test_an_image_of_another_size_is_named(sequence: Sequence, extractor: Featur
         optimizer_of(sequence, extractor, frame=frame, cameras=["left"])
 
 
-def test_a_missing_image_is_named(sequence: Sequence, extractor: FeatureExtractor) -> None:
-    frame = sequence.frame(0, cameras=["left"])
-    with pytest.raises(SettingsError, match="image of camera 'right' is missing; given: left"):
-        optimizer_of(sequence, extractor, frame=frame)
-
-
 def test_losses_of_all_iterates_compare_in_the_end(sequence: Sequence, extractor: FeatureExtractor) -> None:
     optimizer = FrameOptimizer(sequence.scene, sequence.frame(0), {}, extractor, settings=SurfaceSolver())
     iterates = list(optimizer)

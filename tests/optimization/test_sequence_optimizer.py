@@ -148,20 +148,6 @@ def test_cancelling_keeps_what_is_there(truths: Truths) -> None:
     assert error(truths, 1, sequence.estimates[1].joint_positions)[:2].max() < np.deg2rad(0.25)
 
 
-def test_a_few_frames_are_solved_alone_before_the_first_one(truths: Truths) -> None:
-    sequence = optimizer(truths, model=SequenceSettings(initial_frames=4))
-    alone = [step for _ in range(4) if (step := sequence.step()) is not None]
-    assert [(step.index, step.start) for step in alone] == [(index, "cold") for index in (0, 2, 3, 5)]
-    assert sequence.progress == (0, FRAMES) and sequence.estimates == {} and sequence.frames_per_second == 0
-    first = sequence.step()
-    assert first is not None and (first.index, first.start) == (0, "cold")
-    # They count as time and steps of the first frame, which starts near its end.
-    assert first.seconds > sum(step.seconds for step in alone)
-    assert 0 < first.iterations - sum(step.iterations for step in alone) <= 2
-    list(sequence)
-    assert sequence.progress == (FRAMES, FRAMES) and sequence.seconds_left == 0
-
-
 def test_a_frame_that_cannot_be_read_is_told_when_its_turn_comes(truths: Truths) -> None:
     def load(index: int) -> Frame:
         if index == FRAMES - 1:

@@ -44,13 +44,6 @@ def test_a_file_that_is_no_image_is_an_error(tmp_path, content, message):
         read_image(path)
 
 
-def test_sixteen_bits_and_grey_become_eight_bit_rgb(tmp_path):
-    cv2.imwrite(str(tmp_path / "deep.png"), PICTURE[..., ::-1].astype(np.uint16) * 257)
-    assert np.array_equal(read_image(tmp_path / "deep.png"), PICTURE)
-    cv2.imwrite(str(tmp_path / "grey.png"), PICTURE[..., 0])
-    assert np.array_equal(read_image(tmp_path / "grey.png"), np.repeat(PICTURE[..., :1], 3, -1))
-
-
 def test_a_mask_is_what_is_at_least_half_bright(tmp_path):
     values = np.array([[0, 127, 128, 255]], np.uint8)
     cv2.imwrite(str(tmp_path / "mask.png"), values)

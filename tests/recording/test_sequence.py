@@ -15,7 +15,6 @@ from carts_core.model.camera import Camera
 from carts_core.model.robot import Robot
 from carts_core.recording import Sequence
 from carts_core.recording.images import read_image
-from carts_core.recording.sequence import ByteCache
 from carts_core.resources import shipped_robot
 
 DVRK = Path(__file__).parents[1] / "sequences" / "dvrk_stereo.toml"
@@ -304,22 +303,3 @@ def test_meshes_are_found_as_ros_lays_packages_out(robot_folder: Path, monkeypat
     (folder / "arm.urdf").write_text(text.replace('"meshes/', f'"{start}'))
     monkeypatch.chdir(folder.parent)
     assert Robot.load(f"{folder.name}/arm.urdf").meshes
-
-
-def make(size: int):
-    return lambda: np.zeros(size, np.uint8)
-
-
-def never() -> np.ndarray:
-    raise AssertionError("this array should have been kept")
-
-
-def test_the_array_that_was_not_used_for_longest_goes_first():
-    cache = ByteCache(100)
-    for key in "abc":
-        cache.get(key, make(30))
-    cache.get("a", never)
-    cache.get("d", make(30))
-    assert [key for key in "abcd" if key in cache] == ["a", "c", "d"]
-    cache.get("e", make(90))
-    assert [key for key in "abcde" if key in cache] == ["e"]

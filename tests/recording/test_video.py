@@ -227,13 +227,6 @@ def test_a_damaged_key_frame_spoils_its_own_group_only(tmp_path):
     assert [number for number, _ in video._key_frames] == [0, 5, 15]
 
 
-def test_a_playlist_that_calls_itself_a_video_fetches_nothing(tmp_path):
-    path = tmp_path / "left.mp4"
-    path.write_text("#EXTM3U\n#EXT-X-TARGETDURATION:1\n#EXTINF:1,\nhttp://127.0.0.1:9/left.ts\n#EXT-X-ENDLIST\n")
-    with pytest.raises(SequenceError, match=r"left.mp4 cannot be decoded"):
-        Video(path, (0,))
-
-
 def test_a_column_may_say_which_video_frame_a_row_is(tmp_path):
     video = Video(write_opencv(tmp_path / "left.avi", "MJPG"), (50, 20, 40))
     assert [number_of(video.read(index)) for index in (0, 1, 2)] == [50, 20, 40]
@@ -246,16 +239,22 @@ def test_a_video_that_is_too_short_is_refused(tmp_path):
         Video(path, tuple(range(11)))
 
 
-def test_a_missing_video_is_named(tmp_path):
-    with pytest.raises(SequenceError, match=r"video .*left.mp4 is missing"):
+PLAYLIST = b"#EXTM3U\n#EXT-X-TARGETDURATION:1\n#EXTINF:1,\nhttp://127.0.0.1:9/left.ts\n#EXT-X-ENDLIST\n"
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (None, "is missing"),
+        (b"hello" * 1000, "cannot be decoded .*Convert it"),
+        pytest.param(PLAYLIST, "cannot be decoded", id="a playlist, from which nothing is fetched"),
+    ],
+)
+def test_what_is_no_video_is_refused(tmp_path, content, message):
+    if content:
+        (tmp_path / "left.mp4").write_bytes(content)
+    with pytest.raises(SequenceError, match=rf"left.mp4 {message}"):
         Video(tmp_path / "left.mp4", (0,))
-
-
-def test_a_file_that_is_no_video_is_refused(tmp_path):
-    path = tmp_path / "left.mp4"
-    path.write_bytes(b"hello" * 1000)
-    with pytest.raises(SequenceError, match=r"left.mp4 cannot be decoded .*Convert it"):
-        Video(path, (0,))
 
 
 def test_a_truncated_video_is_an_error_where_it_ends(tmp_path):

@@ -19,8 +19,7 @@ from carts_core.settings import (
     SynthesisConfig,
     solver,
 )
-from carts_core.settings.serialization import changed, to_plain
-from carts_core.settings.stages import COLD, Descend, FirstOrder, Observe, RandomRestart, reduced
+from carts_core.settings.stages import COLD, FirstOrder, Observe, reduced
 
 
 @pytest.mark.parametrize("name", list(SolverName))
@@ -100,15 +99,6 @@ def test_a_smaller_preset_observes_smaller_images_and_changes_nothing_else() -> 
     assert [type(stage) for stage in small] == [type(stage) for stage in COLD]
 
 
-def test_nested_stages_keep_their_kind() -> None:
-    plain = to_plain(SurfaceSolver())
-    restart = next(stage for stage in plain["stages"] if stage["stage"] == "RandomRestart")
-    assert [stage["stage"] for stage in restart["then"]] == ["Descend", "Observe", "Descend"]
-    back = changed(DescentSolver(), {"iterations": 3}, "[solver]")
-    assert back.iterations == 3
-    assert RandomRestart(then=(Descend(1.0),)).then[0] == Descend(1.0)
-
-
 @pytest.mark.parametrize(
     ("make", "text"),
     [
@@ -126,10 +116,3 @@ def test_nested_stages_keep_their_kind() -> None:
 def test_a_setting_out_of_range_is_refused_by_name(make, text: str) -> None:
     with pytest.raises(SettingsError, match=text):
         make()
-
-
-def test_each_purpose_has_random_numbers_of_its_own() -> None:
-    config = SynthesisConfig(seed=1)
-    draws = {config.rng(*purpose).integers(2**60) for purpose in (("motion",), ("motion", 1), ("tissue", 1))}
-    assert len(draws) == 3
-    assert config.rng("motion").integers(2**60) in draws

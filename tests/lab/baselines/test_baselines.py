@@ -1,7 +1,6 @@
 """Networks of others: built, trained for a step, written, read, and put into the benchmark."""
 
 from pathlib import Path
-from typing import get_args
 
 import numpy as np
 import pytest
@@ -40,7 +39,9 @@ class _Frames(TrainingFrames):
         self._given[:, 0, 60:120, 80:160] = 127
 
 
-@pytest.mark.parametrize("name", get_args(BaselineName))
+@pytest.mark.parametrize(
+    "name", ["colleoni", *(pytest.param(name, marks=pytest.mark.slow) for name in ("unet", "hrnet", "swin"))]
+)
 def test_each_network_learns_for_some_steps_and_is_the_same_after_it_was_written_and_read(
     name: BaselineName, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -97,13 +97,6 @@ def test_json_and_csv_have_a_row_per_run_and_the_same_verdicts_as_the_page(folde
     assert not list(folder.rglob(".*"))
 
 
-def test_the_same_measurements_give_the_same_report_byte_by_byte(folder: Path, tmp_path: Path) -> None:
-    write_report(output_path(tmp_path), _measurements(), FACTS, {"render forward": 3.25}, HAND_EYE)
-    files = [path.relative_to(folder) for path in folder.rglob("*") if path.is_file()]
-    assert len(files) == 7
-    assert all((folder / path).read_bytes() == (tmp_path / path).read_bytes() for path in files)
-
-
 def test_the_main_table_has_mean_and_deviation_and_the_papers_number() -> None:
     table = main_tables(Measurements(_measurements()))[0]
     assert table.title == "Synthetic frames: Dice" and len(table.rows) == 6

@@ -23,7 +23,7 @@ def small_config() -> SynthesisConfig:
         seed=3,
         endoscope=EndoscopeConfig(width=96, height=72, stereo=True),
         motion=MotionConfig(frames=2, frame_rate=2.0),
-        render=RenderConfig(samples=2, robot_faces=4000, tissue_resolution=96, texture_resolution=256),
+        render=RenderConfig(samples=2, tissue_resolution=96, texture_resolution=256),
         sensor=SensorConfig(jpeg_quality=95),
     )
 

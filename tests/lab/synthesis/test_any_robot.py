@@ -23,7 +23,7 @@ def _config(robot: Path, **settings) -> SynthesisConfig:
         domains=("regular", "smoke"),
         endoscope=EndoscopeConfig(width=96, height=72, distance=DISTANCE),
         motion=MotionConfig(frames=2, frame_rate=2.0),
-        render=RenderConfig(samples=1, robot_faces=4000, tissue_resolution=64, texture_resolution=128),
+        render=RenderConfig(samples=1, tissue_resolution=64, texture_resolution=128),
         **settings,
     )
 

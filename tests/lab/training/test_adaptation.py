@@ -1,5 +1,6 @@
 """`carts train --for`: a network is adapted to the robots, cameras and distances of a recording."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -26,7 +27,7 @@ from carts_core.model.robot import Robot
 from carts_core.networks.weights import read_weights
 from carts_core.recording import Sequence
 from carts_core.resources import sample_sequence, shipped_weights
-from carts_core.settings import TrainingConfig
+from carts_core.settings import ImageSettings, TrainingConfig
 
 ARM = """<robot name="arm"><link name="base"/>
 <link name="upper"><visual><origin xyz="0 0 0.3"/><geometry><box size="0.1 0.1 0.6"/></geometry></visual></link>
@@ -51,6 +52,9 @@ robot = "arm.urdf"
 shoulder = "shoulder"
 elbow = "elbow"
 """
+
+
+SMALL = ImageSettings(width=64, height=48, field_width=80)
 
 
 @pytest.fixture
@@ -114,13 +118,19 @@ def test_a_recording_that_is_not_there_is_named_and_leaves_no_folder(
     assert "none.toml is missing" in " ".join(capsys.readouterr().err.split())
 
 
+@pytest.fixture
+def config(tiny_sequence: Callable[..., Path], tmp_path: Path) -> TrainingConfig:
+    """A run of one step that is adapted to a tiny recording."""
+    given = TrainingConfig(workers=0, threads=1, batch_size=1, validation_samples=1, steps=1, images=SMALL)
+    return adapted_to(tiny_sequence(), tmp_path / "adapted", given)
+
+
 def test_a_run_ends_when_it_no_longer_gains_and_leaves_its_best_weights(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    config: TrainingConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.setattr(SurfaceTask, "worse", lambda *_: False)
-    config = adapted_to(sample_sequence(), tmp_path, TrainingConfig(workers=0, threads=1, batch_size=1))
     # At so small a rate only the batch statistics change.
-    config = replace(config, learning_rate=1e-12, weight_decay=0.0, validation_samples=2, patience=2, average=0.0,
+    config = replace(config, steps=STEPS, learning_rate=1e-12, weight_decay=0.0, patience=2, average=0.0,
                      validation_every=1)  # fmt: skip
     result = train(config, tmp_path)
     checkpoint = load_checkpoint(tmp_path)
@@ -139,24 +149,23 @@ FIGURES = {"dice": 0.8, "dice_given": 0.5, "part_accuracy": 0.9, "normal_error_d
 FIGURES |= dict.fromkeys(("dice_shaft", "dice_wrist", "dice_jaws"), 0.7)
 
 
-@pytest.mark.parametrize(("tip_error", "kept"), [(2.7, 1), (10.9, 0)])
-def test_weights_with_better_masks_and_worse_tips_are_not_kept(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, tip_error: float, kept: int
+@pytest.mark.parametrize(("worse", "kept"), [({}, 1), ({"tip_error": 10.9}, 0), ({"dice_jaws": 0.6}, 0)])
+def test_weights_with_better_masks_and_worse_tips_or_parts_are_not_kept(
+    config: TrainingConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, worse: dict[str, float], kept: int
 ):
-    figures = iter([FIGURES, {**FIGURES, "dice": 0.9, "tip_error": tip_error}])
+    figures = iter([FIGURES, {**FIGURES, "dice": 0.9, **worse}])
     monkeypatch.setattr(SurfaceTask, "validate", lambda *_: next(figures))
-    config = adapted_to(sample_sequence(), tmp_path, TrainingConfig(workers=0, threads=1, batch_size=1, steps=1))
-    result = train(replace(config, validation_samples=1), tmp_path)
+    result = train(config, tmp_path)
     assert result.validation["step"] == kept
     assert read_weights(result.weights).training["step"] == kept
 
 
-def test_a_busy_machine_takes_no_steps_from_a_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_a_busy_machine_takes_no_steps_from_a_run(
+    config: TrainingConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
     clock = iter(range(0, 10**9, 1000))
     monkeypatch.setattr("carts_core.lab.training.loop.time.perf_counter", lambda: float(next(clock)))
-    given = TrainingConfig(workers=0, threads=1, batch_size=1, steps=3, minutes=5.0)
-    config = replace(adapted_to(sample_sequence(), tmp_path, given), validation_samples=1)
-    train(config, tmp_path)
+    train(replace(config, steps=3, minutes=5.0), tmp_path)
     checkpoint = load_checkpoint(tmp_path)
     assert checkpoint is not None and checkpoint.step == 3
     assert checkpoint.history.seconds > 60 * 5.0 > checkpoint.history.processor_seconds > 0.0
@@ -199,12 +208,16 @@ def test_what_is_worse_is_named(judgement: Judgement, worse: list[str]):
 
 @pytest.mark.parametrize("tips", [2.0, 10.9])
 def test_weights_are_offered_only_where_nothing_is_worse(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tips: float
+    tiny_sequence: Callable[..., Path],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    tips: float,
 ):
     monkeypatch.setattr("carts_core.lab.training.adaptation.judge", lambda *_, **__: _judgement(made_tips=tips))
-    small = "--steps 1 --batch-size 1 --workers 0 --threads 1 --validation-samples 1".split()
-    command = ["train", str(tmp_path / "run"), "--for", str(sample_sequence()), *small]
-    main(command)
+    small = "--steps 1 --batch-size 1 --workers 0 --threads 1 --validation-samples 1"
+    small += " --images.width 64 --images.height 48 --images.field-width 80"
+    main(["train", str(tmp_path / "run"), "--for", str(tiny_sequence()), *small.split()])
     said = " ".join(capsys.readouterr().out.split())
     assert (tmp_path / "run" / "surface.safetensors").is_file() == (tips == 2.0)
     assert (tmp_path / "run" / "refused.safetensors").is_file() == (tips == 10.9)

@@ -68,7 +68,9 @@ with stopped_by_signals():
 """
 
 
-@pytest.mark.parametrize(("sent", "workers"), [(signal.SIGKILL, 0), (signal.SIGTERM, 1)])
+@pytest.mark.parametrize(
+    ("sent", "workers"), [(signal.SIGKILL, 0), pytest.param(signal.SIGTERM, 1, marks=pytest.mark.slow)]
+)
 def test_a_run_goes_on_where_its_last_checkpoint_was_after_a_signal_to_its_processes(
     tmp_path: Path, sent: signal.Signals, workers: int
 ):
@@ -114,7 +116,7 @@ def test_a_run_ends_in_time_with_its_learning_rate_down_and_is_not_gone_on_with(
 
 
 def test_going_on_with_other_settings_is_refused_by_name(tmp_path: Path):
-    train(small_config(steps=5), tmp_path)
+    train(small_config(steps=1), tmp_path)
     with pytest.raises(SettingsError, match=r"learning_rate was 0\.01 and is 0\.5.*another output folder"):
         train(small_config(steps=10, learning_rate=0.5), tmp_path)
 
@@ -140,7 +142,8 @@ def test_a_broken_checkpoint_is_named_with_the_remedy(tmp_path: Path):
 
 
 @pytest.mark.parametrize(
-    ("workers_before", "workers", "reuse"), [(0, 0, 1), (0, 1, 3), pytest.param(2, 2, 3, marks=pytest.mark.slow)]
+    ("workers_before", "workers", "reuse"),
+    [(0, 0, 3), *(pytest.param(*given, 3, marks=pytest.mark.slow) for given in ((0, 1), (2, 2)))],
 )
 def test_the_stream_of_batches_goes_on_where_a_run_was_stopped(workers_before: int, workers: int, reuse: int):
     # One worker process makes what none makes.
@@ -204,7 +207,7 @@ def test_settings_out_of_range_are_refused(changes: dict):
 
 def test_a_surface_network_learns_and_reports(tmp_path: Path):
     architecture = SurfaceArchitecture(decoder=(4, 4, 4, 4), conditioning=(4, 4, 4))
-    config = small_config(network="surface", surface_architecture=architecture, learning_rate=3e-3, steps=40)
+    config = small_config(network="surface", surface_architecture=architecture, learning_rate=3e-3, steps=15)
     result = train(config, tmp_path)
     assert result.weights.name == "surface.safetensors"
     parts = {"dice_shaft", "dice_wrist", "dice_jaws", "tip_error"}
