@@ -14,9 +14,7 @@ from carts_core.project.identity import data_dir
 
 
 @pytest.mark.parametrize(("given", "expected"), [("2", 2), (None, max(1, min((os.cpu_count() or 2) - 1, 4)))])
-def test_a_core_is_left_to_others_unless_the_environment_says_how_many(
-    given: str | None, expected: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_core_is_left_to_others(given: str | None, expected: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
     if given:
         monkeypatch.setenv("OMP_NUM_THREADS", given)

@@ -126,9 +126,7 @@ def test_every_camera_has_its_scores(
 
 
 @pytest.mark.parametrize("model", [None, SequenceSettings()])
-def test_the_start_of_a_moving_camera_is_compared_from_the_cameras_pose(
-    tiny_sequence: Callable[..., Path], model: SequenceSettings | None
-) -> None:
+def test_scores_use_the_moving_cameras_pose(tiny_sequence: Callable[..., Path], model: SequenceSettings | None) -> None:
     path = let_camera_move(tiny_sequence(frames=2), Motion(swing(4).Ts_world_mount[1:3]))
     (path.parent / "kinematics.csv").write_bytes((path.parent / "truth.csv").read_bytes())
     found = evaluate(

@@ -103,9 +103,7 @@ def test_copies_have_the_bytes_of_the_recording(
     assert not (without / folder).exists()
 
 
-def test_images_that_are_no_files_of_the_recording_are_written_as_the_labels_see_them(
-    own_dataset: Dataset, tmp_path: Path
-) -> None:
+def test_undistorted_images_are_written_with_the_labels(own_dataset: Dataset, tmp_path: Path) -> None:
     path = own_dataset.sequence.path
     path.write_text(
         path.read_text().replace('"regular/left/*.png"', '"regular/left/*.png"\ndistortion = [0.1, 0, 0, 0]')
@@ -119,9 +117,7 @@ def test_images_that_are_no_files_of_the_recording_are_written_as_the_labels_see
         np.testing.assert_array_equal(read_image(folder / "images" / image["file_name"]), dataset.image(view))
 
 
-def test_images_outside_the_folder_of_the_sequence_are_named_from_the_folder_that_holds_all_of_them(
-    own_dataset: Dataset, tmp_path: Path
-) -> None:
+def test_images_elsewhere_are_named_relative_to_their_folder(own_dataset: Dataset, tmp_path: Path) -> None:
     path = own_dataset.sequence.path
     (path.parent / "away").mkdir()
     moved = path.rename(path.parent / "away" / path.name)

@@ -174,9 +174,7 @@ POINTER = "version https://git-lfs.github.com/spec/v1\noid sha256:4d7a214614ab\n
         ("masks.json", lambda path: next(read_coco(path, Counter()))),
     ],
 )
-def test_pointers_of_git_lfs_are_recognized_in_every_kind_of_file(
-    tmp_path: Path, name: str, read: Callable[[Path], object]
-):
+def test_git_lfs_pointers_are_recognized_everywhere(tmp_path: Path, name: str, read: Callable[[Path], object]):
     (tmp_path / name).write_text(POINTER)
     with pytest.raises(CartsError, match=r"a Git LFS pointer.*run `git lfs pull`"):
         read(tmp_path / name)

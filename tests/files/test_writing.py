@@ -43,9 +43,7 @@ def _umask() -> int:
 
 
 @pytest.mark.parametrize("nameless", [True, False])
-def test_a_failure_keeps_the_old_file_and_leaves_nothing(
-    tmp_path: Path, nameless: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_failed_write_keeps_the_old_file(tmp_path: Path, nameless: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     if not nameless:
         monkeypatch.setattr("carts_core.files.writing._NAMELESS", 0)
     write_text(tmp_path / "a", "old")

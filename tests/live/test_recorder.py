@@ -46,9 +46,7 @@ def record(
     return Sequence.open(path)
 
 
-def test_a_camera_that_begins_to_move_is_recorded_with_where_it_was(
-    tiny_sequence: Callable[..., Path], tmp_path: Path
-) -> None:
+def test_the_motion_of_a_camera_is_recorded(tiny_sequence: Callable[..., Path], tmp_path: Path) -> None:
     sequence = Sequence.open(tiny_sequence(frames=FRAMES))
     T = sequence.scene.cameras[0].T_camera_world
     mounts = np.linalg.inv(swing(FRAMES).Ts_world_mount)
@@ -71,9 +69,7 @@ def test_a_camera_that_stays_is_recorded_without_a_motion(tiny_sequence: Callabl
     assert not found.moving_cameras and len(found) == 2
 
 
-def test_verdicts_are_recorded_and_what_was_lost_is_as_measured(
-    tiny_sequence: Callable[..., Path], tmp_path: Path
-) -> None:
+def test_verdicts_are_recorded(tiny_sequence: Callable[..., Path], tmp_path: Path) -> None:
     sequence = Sequence.open(tiny_sequence(frames=3))
     said = (LiveVerdict.GOOD, LiveVerdict.DOUBTFUL, LiveVerdict.LOST)
     found = record(sequence, tmp_path / "recorded", [{}, {}, {}], said)

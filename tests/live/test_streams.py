@@ -99,9 +99,7 @@ def picture(sequence: Sequence, encoding: str = "png") -> ImageMessage:
     return ImageMessage(cv2.imencode(f".{encoding}", image[..., ::-1])[1].tobytes(), encoding)  # pyright: ignore
 
 
-def test_a_replay_goes_at_the_speed_of_the_clock_and_skips_what_is_late(
-    sequence: Sequence, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_replay_runs_in_real_time(sequence: Sequence, monkeypatch: pytest.MonkeyPatch) -> None:
     replay, now = Replay(sequence, ("left",), "regular", loops=2), [5.0]
 
     def wait(seconds: float) -> bool:
@@ -134,9 +132,7 @@ def test_a_slow_tracker_gets_the_newest_frame_and_the_others_are_dropped(sequenc
 
 
 @pytest.mark.parametrize(("seconds", "waited"), [(0.0, 100.0), (20.0, 15.0)])
-def test_a_frame_whose_result_would_be_too_old_is_not_tracked(
-    sequence: Sequence, seconds: float, waited: float
-) -> None:
+def test_a_frame_that_would_be_too_old_is_not_tracked(sequence: Sequence, seconds: float, waited: float) -> None:
     """Because it has waited for longer than it may, or for longer than the tracker usually leaves."""
     tracker, frame = Repeater(sequence, seconds), sequence.frame(0)
     late = Moment(replace(frame, frame_id="late"), arrived=time.monotonic() - waited)
@@ -163,9 +159,7 @@ def test_what_ends_a_source_is_raised_where_frames_are_taken(sequence: Sequence)
 
 
 @pytest.mark.parametrize("encoding", ["png", "rgb8"])
-def test_an_image_and_joints_make_a_frame_and_joints_stay(
-    sequence: Sequence, assembler: Assembler, encoding: str
-) -> None:
+def test_an_image_and_joints_make_a_frame(sequence: Sequence, assembler: Assembler, encoding: str) -> None:
     image = {"left": picture(sequence, encoding)}
     assert assembler.moment(FrameMessage(0.0, images=image)) is None, "no joints yet"
     assert assembler.moment(FrameMessage(0.1, joints=JOINTS)) is None, "no image"
@@ -253,9 +247,7 @@ def test_every_client_of_the_socket_gets_every_result(sequence: Sequence, assemb
         (struct.pack(">I", 2) + msgspec.msgpack.encode({"a": 1})[:2], "a message cannot be read"),
     ],
 )
-def test_a_sender_of_nonsense_is_told_why_and_others_stay_connected(
-    assembler: Assembler, content: bytes, message: str
-) -> None:
+def test_invalid_messages_are_answered_with_an_error(assembler: Assembler, content: bytes, message: str) -> None:
     server = StreamServer(assembler, 0)
     try:
         other, sender = connected(server), connected(server)
@@ -296,9 +288,7 @@ def _accepted(server: StreamServer) -> bool:
         return isinstance(next(_answers(client), None), ResultMessage)
 
 
-def test_silent_clients_make_room_when_all_places_are_taken(
-    assembler: Assembler, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_silent_clients_are_replaced_by_new_ones(assembler: Assembler, monkeypatch: pytest.MonkeyPatch) -> None:
     server = StreamServer(assembler, 0)
     monkeypatch.setattr("carts_core.live.sources._SILENCE", 1000.0)
     silent = [connected(server) for _ in range(16)]
@@ -319,9 +309,7 @@ def test_silent_clients_make_room_when_all_places_are_taken(
             each.close()
 
 
-def test_a_sender_that_has_ended_its_side_gets_the_result_of_its_last_frame(
-    assembler: Assembler, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_half_closed_sender_gets_its_last_result(assembler: Assembler, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("carts_core.live.sources._LINGER", 1000.0)
     server = StreamServer(assembler, 0)
     try:
@@ -354,9 +342,7 @@ def put(folder: Path, name: str, content: str, image: np.ndarray | None = None) 
     (folder / "part").rename(folder / f"{name}.json")
 
 
-def test_a_folder_that_fills_is_followed_from_name_to_name(
-    sequence: Sequence, assembler: Assembler, tmp_path: Path
-) -> None:
+def test_a_growing_folder_is_followed(sequence: Sequence, assembler: Assembler, tmp_path: Path) -> None:
     source, found = Folder(assembler, ("left",), tmp_path), list[Frame]()
 
     def fill() -> None:
@@ -398,9 +384,7 @@ def test_what_cannot_be_used_in_a_folder_is_left_out(
     assert "no image 000.left.png or 000.png" in said[0] and "PSM9" in said[2]
 
 
-def test_a_video_is_shown_at_its_own_rate_with_joints_from_elsewhere(
-    sequence: Sequence, assembler: Assembler, tmp_path: Path
-) -> None:
+def test_a_video_is_replayed_at_its_own_rate(sequence: Sequence, assembler: Assembler, tmp_path: Path) -> None:
     path = str(tmp_path / "video.avi")
     writer = cv2.VideoWriter(path, cv2.VideoWriter.fourcc(*"MJPG"), 20.0, (160, 128))
     for _ in range(6):

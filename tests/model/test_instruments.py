@@ -58,9 +58,7 @@ def test_an_instrument_has_the_joints_and_the_kinematics_of_its_arm(name: str) -
 
 
 @pytest.mark.parametrize("instrument", INSTRUMENTS, ids=lambda instrument: instrument.name)
-def test_meshes_are_closed_few_and_as_long_as_is_said_and_links_have_parts_and_keypoints(
-    instrument: Instrument,
-) -> None:
+def test_meshes_are_closed_small_and_of_the_stated_length(instrument: Instrument) -> None:
     robot = loaded(instrument.name)
     assert all(mesh.closed for mesh in robot.meshes)
     assert 3_000 < sum(len(mesh.faces) for mesh in robot.meshes) < 12_000

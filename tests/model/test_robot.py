@@ -164,9 +164,7 @@ def instrument_of(urdf: Path, *meshes: str) -> Path:
     return urdf
 
 
-def test_decimation_keeps_to_the_tolerance_of_an_instrument_and_says_what_was_lost(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_decimation_keeps_to_the_tolerance_of_an_instrument(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("CARTS_CACHE", str(tmp_path))
     urdf = instrument_of(tmp_path / "instrument.urdf", "shaft_tube", "shaft_clevis")
     whole = Robot.load(urdf)
@@ -254,9 +252,7 @@ TETRAHEDRON = """<?xml version="1.0"?>
 
 @pytest.mark.parametrize("axis", ["Y_UP", "Z_UP"])
 @pytest.mark.parametrize(("metres", "unit"), [("0.001", "mm"), ("0.0254", "inch"), ("1", "m")])
-def test_meshes_of_collada_are_scaled_by_their_unit_and_the_up_axis_is_said(
-    tmp_path: Path, metres: str, unit: str, axis: str
-) -> None:
+def test_collada_units_are_applied_and_up_axes_reported(tmp_path: Path, metres: str, unit: str, axis: str) -> None:
     size = 0.03 / float(metres)
     (tmp_path / "tip.dae").write_text(TETRAHEDRON.format(metres=metres, axis=axis, size=size))
     (tmp_path / "robot.urdf").write_text(

@@ -74,9 +74,7 @@ def test_the_number_of_threads_changes_no_bit(weights: Path) -> None:
     assert torch.equal(*found)
 
 
-def test_the_graph_is_exported_once_and_again_where_it_was_damaged(
-    weights: Path, cache: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_damaged_graph_is_exported_again(weights: Path, cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     FeatureExtractor.load(weights, inference="onnx")
     (graph,) = cache.glob("surface-*.onnx")
     whole = graph.read_bytes()
@@ -112,9 +110,7 @@ def test_the_faster_engine_is_measured_once_and_remembered(
     assert FeatureExtractor.load(weights, inference="auto").engine == engine
 
 
-def test_where_onnx_runtime_is_missing_torch_runs_and_asking_for_it_is_an_error(
-    weights: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_without_onnx_runtime_torch_runs(weights: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("carts_core.networks.extractor.find_spec", lambda name: None)
     assert FeatureExtractor.load(weights, inference="auto").engine == "torch"
     with pytest.raises(SettingsError, match="onnxruntime and onnx are not installed"):

@@ -171,9 +171,7 @@ class SeesArmsAsideBeforeRooms(ImagePredictor):
 
 
 @pytest.mark.parametrize("again", [True, False])
-def test_what_overlaps_more_with_the_change_against_the_background_is_kept(
-    tiny_sequence: Callable[..., Path], again: bool
-) -> None:
+def test_the_fit_that_overlaps_more_with_the_change_is_kept(tiny_sequence: Callable[..., Path], again: bool) -> None:
     sequence = Sequence.open(tiny_sequence(frames=1, **SIZE))
     scene, frame = sequence.scene.with_cameras(["left"]), sequence.frame(0, cameras=["left"])
     assert frame.truth is not None

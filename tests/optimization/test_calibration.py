@@ -91,9 +91,7 @@ def worst_error(scene: Scene, truth: Scene, joint_positions: np.ndarray) -> tupl
     return max(angles), max(distances)
 
 
-def test_a_wrong_base_frame_and_a_wrong_camera_come_back(
-    sequence: Sequence, frames: list[Frame], predictor: NumberedTruths
-) -> None:
+def test_base_frame_and_camera_are_found(sequence: Sequence, frames: list[Frame], predictor: NumberedTruths) -> None:
     wrong = with_wrong_right_camera(with_wrong_base(sequence.scene))
     optimizer = CalibrationOptimizer(wrong, frames, predictor, settings=SETTINGS)
     list(optimizer)
@@ -114,9 +112,7 @@ def test_a_wrong_base_frame_and_a_wrong_camera_come_back(
         assert distance < 4 * np.hypot(deviation.sideways_mm, deviation.depth_mm) < 40
 
 
-def test_a_calibration_that_fits_is_good_and_one_that_cannot_fit_keeps_its_start(
-    sequence: Sequence, frames: list[Frame], predictor: NumberedTruths
-) -> None:
+def test_failed_calibrations_keep_the_start(sequence: Sequence, frames: list[Frame], predictor: NumberedTruths) -> None:
     wrong = with_wrong_base(sequence.scene)
     right = CalibrationOptimizer(wrong, frames, predictor, settings=SETTINGS)
     list(right)
@@ -131,9 +127,7 @@ def test_a_calibration_that_fits_is_good_and_one_that_cannot_fit_keeps_its_start
     assert np.array_equal(result.scene.arms[0].T_world_base, wrong.arms[0].T_world_base)
 
 
-def test_deviations_of_one_frame_and_of_few_are_not_those_of_independent_pixels(
-    sequence: Sequence, frames: list[Frame], predictor: NumberedTruths
-) -> None:
+def test_deviations_of_few_frames_are_wider(sequence: Sequence, frames: list[Frame], predictor: NumberedTruths) -> None:
     free = FreeParameters(joints=False, base_frames=True)
 
     def found(count: int) -> tuple[UnknownChange, ...]:
@@ -152,7 +146,7 @@ def test_deviations_of_one_frame_and_of_few_are_not_those_of_independent_pixels(
 
 
 @pytest.mark.parametrize("count", [1, 3])
-def test_few_frames_bring_a_base_frame_back_as_near_as_their_deviations_say(
+def test_few_frames_within_deviations(
     sequence: Sequence, frames: list[Frame], predictor: NumberedTruths, count: int
 ) -> None:
     free = FreeParameters(joints=False, base_frames=True)
@@ -166,9 +160,7 @@ def test_few_frames_bring_a_base_frame_back_as_near_as_their_deviations_say(
     assert angle < 4 * known.rotation_deg and distance < 4 * np.hypot(known.sideways_mm, known.depth_mm)
 
 
-def test_what_differs_from_the_empty_background_counts_in_a_calibration(
-    sequence: Sequence, frames: list[Frame], predictor: NumberedTruths
-) -> None:
+def test_backgrounds_count_in_a_calibration(sequence: Sequence, frames: list[Frame], predictor: NumberedTruths) -> None:
     renderer = Renderer(sequence.scene, cameras=["left"])
     bright = []
     for frame in frames:
@@ -191,9 +183,7 @@ def test_what_differs_from_the_empty_background_counts_in_a_calibration(
     assert overlap is not None and overlap > 0.9
 
 
-def test_lightly_freed_joints_take_what_differs_from_frame_to_frame(
-    sequence: Sequence, frames: list[Frame], predictor: NumberedTruths
-) -> None:
+def test_freed_joints_absorb_frame_errors(sequence: Sequence, frames: list[Frame], predictor: NumberedTruths) -> None:
     signs = np.random.default_rng(1).choice([-1.0, 1.0], (FRAMES, 2))
     shaken = [
         replace(frame, measured={"PSM1": frame.measured["PSM1"] + np.deg2rad([*sign, 0, 0, 0, 0, 0])})
@@ -213,9 +203,7 @@ def test_lightly_freed_joints_take_what_differs_from_frame_to_frame(
     assert loss(FreeParameters(joints=True, base_frames=True)) < 0.5 * held
 
 
-def test_a_frame_with_wrong_kinematics_hardly_matters(
-    sequence: Sequence, frames: list[Frame], predictor: NumberedTruths
-) -> None:
+def test_outlier_frames_hardly_matter(sequence: Sequence, frames: list[Frame], predictor: NumberedTruths) -> None:
     broken = {"PSM1": frames[0].measured["PSM1"] + np.deg2rad([4, -4, 0, 0, 0, 0, 0])}
     mixed = [replace(frames[0], measured=broken), *frames[1:]]
     free = FreeParameters(joints=False, base_frames=True)
@@ -263,9 +251,7 @@ def test_the_first_camera_stays_where_only_products_can_be_seen(sequence: Sequen
         assert with_fixed_gauge(scene, free) == free
 
 
-def test_the_best_calibration_is_kept_when_it_is_cancelled(
-    sequence: Sequence, frames: list[Frame], predictor: NumberedTruths
-) -> None:
+def test_cancelling_keeps_the_best(sequence: Sequence, frames: list[Frame], predictor: NumberedTruths) -> None:
     optimizer = CalibrationOptimizer(with_wrong_base(sequence.scene), frames[:1], predictor, settings=SETTINGS)
     first, second = optimizer.step(), optimizer.step()
     optimizer.cancel()
@@ -288,7 +274,7 @@ def test_the_best_calibration_is_kept_when_it_is_cancelled(
         ({"free": replace(CALIBRATION, locked_cameras=("third",))}, "there is no camera 'third'"),
     ],
 )
-def test_what_makes_no_calibration_is_refused(
+def test_invalid_calibrations_are_refused(
     sequence: Sequence, frames: list[Frame], predictor: NumberedTruths, changes: dict, message: str
 ) -> None:
     with pytest.raises(CartsError, match=message):

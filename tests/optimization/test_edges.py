@@ -91,9 +91,7 @@ def test_edges_of_an_occluder_do_not_count(sequence: Sequence) -> None:
     assert drawn.offsets.abs().max() == 0
 
 
-def test_edges_behind_haze_count_by_the_square_of_what_comes_through(
-    sequence: Sequence, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_edges_are_weighted_by_squared_transmission(sequence: Sequence, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("carts_core.optimization.image_factors.dehazed", lambda images, _: images)
     found = []
     for through in (1.0, 0.5):

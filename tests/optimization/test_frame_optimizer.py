@@ -44,9 +44,7 @@ def descended(sequence: Sequence, extractor: FeatureExtractor) -> tuple[FrameOpt
     return optimizer, list(optimizer)
 
 
-def test_the_first_iterate_stays_the_start_and_the_last_one_says_why_it_stopped(
-    sequence: Sequence, descended: tuple[FrameOptimizer, list[Iterate]]
-) -> None:
+def test_a_descent_runs_to_its_last_step(sequence: Sequence, descended: tuple[FrameOptimizer, list[Iterate]]) -> None:
     optimizer, iterates = descended
     assert [iterate.index for iterate in iterates] == list(range(21))
     measured = sequence.frame(0).measured["PSM1"]
@@ -57,9 +55,7 @@ def test_the_first_iterate_stays_the_start_and_the_last_one_says_why_it_stopped(
     assert optimizer.step() is None
 
 
-def test_the_first_step_in_the_papers_setting_is_a_milliradian_or_a_tenth_of_a_millimetre(
-    sequence: Sequence, extractor: FeatureExtractor
-) -> None:
+def test_the_first_step_of_the_papers_settings(sequence: Sequence, extractor: FeatureExtractor) -> None:
     first, second = optimizer_of(sequence, extractor, cameras=["left"], settings=DescentSolver.paper(1))
     step = np.abs(second.joint_positions()["PSM1"] - first.joint_positions()["PSM1"])
     insertion = sequence.scene.arms[0].robot.joint_names.index("insertion")

@@ -138,9 +138,7 @@ def test_a_known_camera_keeps_its_pose_or_the_one_with_most_points(
     assert np.abs(right @ np.linalg.inv(left) - scene.cameras[1].T_camera_world).max() < 1e-6
 
 
-def test_the_focal_length_is_found_on_request_with_a_deviation_that_is_true(
-    scene: Scene, measured: dict[str, np.ndarray]
-) -> None:
+def test_the_focal_length_is_estimated_on_request(scene: Scene, measured: dict[str, np.ndarray]) -> None:
     one = scene.with_arms(["PSM1"])
     views = tuple(replace(view, intrinsics=(1.4 * FOCAL, 1.4 * FOCAL, 325.0, 236.0)) for view in one.cameras)
     start = replace(unknown(one), cameras=views)
@@ -285,9 +283,7 @@ def test_a_refinement_keeps_to_what_the_points_left_open_and_to_known_cameras(
     ("turn_deg", "noise", "agrees"),
     [(0.0, 2.0, True), (0.0, 5.0, True), (4.0, 2.0, False), (0.02, 0.1, True)],
 )
-def test_points_agree_with_the_truth_and_speak_against_another_calibration(
-    scene: Scene, turn_deg: float, noise: float, agrees: bool
-) -> None:
+def test_points_reject_another_calibration(scene: Scene, turn_deg: float, noise: float, agrees: bool) -> None:
     scene = scene.with_arms(["PSM1"])
     measured = {"PSM1": joints()}
     turn = np.eye(4)

@@ -41,18 +41,14 @@ def test_a_gap_in_the_arm_and_what_sticks_out_of_it_are_proposed_at_the_cameras_
     [(slice(97, 101), slice(200)), (slice(180, 220), slice(250, 300)), (slice(95, 145), slice(150))],
     ids=["a thin rim", "apart from the arm", "most of the arm"],
 )
-def test_what_may_be_a_wrong_estimate_or_another_object_is_not_proposed(
-    scene: Scene, rows: slice, columns: slice
-) -> None:
+def test_wrong_estimates_and_other_objects_are_not_proposed(scene: Scene, rows: slice, columns: slice) -> None:
     silhouette, similarity = _arm()
     similarity[0, rows, columns] = 0.0
     assert propose_ignore(scene, silhouette, similarity) == {}
 
 
 @pytest.mark.slow
-def test_a_frame_is_solved_again_without_what_contradicts_and_reset_forgets_it(
-    sample_sequence_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_proposed_occluders_are_ignored(sample_sequence_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     sequence, extractor = Sequence.open(sample_sequence_path), FeatureExtractor.load()
     frame = sequence.frame(0, cameras=["left"])
     height, width = frame.images["left"].shape[:2]

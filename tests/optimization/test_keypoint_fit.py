@@ -34,9 +34,7 @@ def _perturbed(tiny: TinyScene, degrees: float, seed: int):
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
 @pytest.mark.parametrize("cameras", [("left",), ("left", "right")])
-def test_exact_pixels_of_four_keypoints_bring_the_joints_back(
-    tiny: TinyScene, seed: int, cameras: tuple[str, ...]
-) -> None:
+def test_four_exact_keypoints_determine_the_joints(tiny: TinyScene, seed: int, cameras: tuple[str, ...]) -> None:
     pins = [pin for camera in cameras for pin in _pins(tiny, camera)]
     fit = fit_keypoints(tiny.scene, _perturbed(tiny, 2.0, seed), pins)
     error = fit.state.joint_positions[0].numpy() - TRUTH

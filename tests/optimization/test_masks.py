@@ -43,10 +43,6 @@ def dice_of(sequence: Sequence, frame: Frame, predictor: MaskPredictor, *, degre
     return dice(Renderer(scene).segment(optimizer.best.state)[0] >= 0, (frame.masks or {})["left"])
 
 
-def test_a_frames_mask_is_fitted_without_a_network(sequence: Sequence) -> None:
-    assert dice_of(sequence, sequence.frame(0), MaskPredictor(), live=False) > 0.985
-
-
 def test_a_mask_that_the_start_does_not_touch_is_found(sequence: Sequence) -> None:
     frame = sequence.frame(0)
     truth = (frame.truth or {})["PSM1"]

@@ -156,7 +156,7 @@ def test_a_base_frame_that_no_joint_can_replace_is_suspected(sequence: Sequence,
     assert freed.best.loss < 0.5 * suspected.best.loss, "freeing them more than halves it indeed"
 
 
-def test_joints_that_explain_the_image_leave_base_frames_unsuspected(
+def test_base_frames_are_not_suspected_where_joints_explain_all(
     sequence: Sequence, predictor: PerfectPredictor
 ) -> None:
     frame = sequence.frame(0)

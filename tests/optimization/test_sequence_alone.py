@@ -53,9 +53,7 @@ def test_a_frame_that_fails_among_others_is_solved_alone(truths: Off) -> None:
         assert estimate.start is Origin.COLD
 
 
-def test_frames_that_fail_alone_as_well_keep_what_was_measured_and_are_not_all_tried(
-    truths: Off, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_frames_that_fail_alone_too_keep_the_measured_joints(truths: Off, monkeypatch: pytest.MonkeyPatch) -> None:
     tried = watched(monkeypatch)
     sequence = finished(truths, settings=SurfaceSolver(stages=NONE))
     assert tried == [0, 1, 2, 3, 4] and FRAMES > len(tried)
@@ -66,9 +64,7 @@ def test_frames_that_fail_alone_as_well_keep_what_was_measured_and_are_not_all_t
 
 
 @pytest.mark.parametrize("kind", ["keyframe", "base frames"])
-def test_what_other_frames_depend_on_is_not_left_to_one_alone(
-    truths: Off, monkeypatch: pytest.MonkeyPatch, kind: str
-) -> None:
+def test_frames_with_dependents_are_not_solved_alone(truths: Off, monkeypatch: pytest.MonkeyPatch, kind: str) -> None:
     tried = watched(monkeypatch)
     if kind == "keyframe":
         sequence = finished(truths, keyframes={0: dict(truths.load(0).measured)})

@@ -94,9 +94,7 @@ def frame_fit(tiny_sequence: Callable[..., Path], free: Free, off: np.ndarray) -
     return Fit(problem, problem.start, settings.iterations)
 
 
-def test_a_network_can_be_conditioned_on_the_start_or_on_the_estimate(
-    tiny_sequence: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_conditioning_on_start_or_estimate(tiny_sequence: Callable[..., Path], monkeypatch: pytest.MonkeyPatch) -> None:
     given = []
     predict = PerfectPredictor.predict
 
@@ -121,9 +119,7 @@ def test_a_random_restart_happens_only_where_the_fit_is_bad(tiny_sequence: Calla
     assert again.restarts == 1
 
 
-def test_a_start_that_edges_contradict_is_not_preferred_however_little_the_network_says(
-    tiny_sequence: Callable[..., Path],
-) -> None:
+def test_a_start_that_edges_contradict_is_not_preferred(tiny_sequence: Callable[..., Path]) -> None:
     def kept(off: np.ndarray, edges: float) -> bool:
         fit = frame_fit(tiny_sequence, Free(), off)
         assert isinstance(fit.problem, FrameProblem)

@@ -105,9 +105,7 @@ def test_nobody_watching_changes_no_step(sequence: Sequence, predictor: PerfectP
     assert np.array_equal(ends[0].silhouette, ends[1].silhouette)
 
 
-def test_an_arm_that_the_first_observations_miss_is_searched_in_the_whole_image(
-    sequence: Sequence, predictor: PerfectPredictor
-) -> None:
+def test_a_missed_arm_is_searched_in_the_whole_image(sequence: Sequence, predictor: PerfectPredictor) -> None:
     frame = sequence.frame(0)
     truth = (frame.truth or {})["PSM1"]
     start = {"PSM1": truth + np.deg2rad([7.0, -7.0, 0.0, 0.0, 0.0, 0.0, 0.0])}
@@ -218,9 +216,7 @@ def test_further_factors_are_added_to_the_objective(sequence: Sequence, predicto
     assert abs(found[0]) < 0.02 and found[1] == pytest.approx(known, abs=2e-3)
 
 
-def test_images_are_enlarged_up_to_the_cameras_and_weigh_the_same(
-    sequence: Sequence, predictor: PerfectPredictor
-) -> None:
+def test_enlarged_working_images_weigh_the_same(sequence: Sequence, predictor: PerfectPredictor) -> None:
     problem = problem_of(sequence, predictor, SurfaceSolver(working_width=160))
     off = problem.start
     off[0] = 0.03

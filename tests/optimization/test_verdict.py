@@ -123,9 +123,7 @@ _WRONG = {"loss": 0.056, "residual": 0.228, "agreement": 0.846, "unconditioned":
     ],
     ids=["Dice .988", "Dice .990, smoke", "Dice .882", "Dice .892, smoke"],
 )
-def test_fits_of_instruments_that_no_training_has_are_doubtful_where_they_are_wrong(
-    seen: dict[str, float | None], wanted: Verdict
-) -> None:
+def test_wrong_fits_of_unknown_instruments_are_doubtful(seen: dict[str, float | None], wanted: Verdict) -> None:
     found = assess(replace(CONVINCING, **seen))
     assert found.verdict is wanted and Verdict.of(found.probability) is wanted
 
@@ -155,9 +153,7 @@ def test_a_doubtful_fit_widens_the_deviations_and_of_a_failed_one_the_expected_o
 
 
 @pytest.mark.parametrize("shown", ["black", "background"])
-def test_where_no_arm_is_seen_the_measured_joints_are_kept_and_the_frame_is_marked(
-    shipped: Sequence, extractor: FeatureExtractor, shown: str
-) -> None:
+def test_without_an_arm_in_view_the_frame_fails(shipped: Sequence, extractor: FeatureExtractor, shown: str) -> None:
     frame, scene = shipped.frame(0, cameras=["left"]), shipped.scene.with_cameras(["left"])
     empty = shipped.background("left")
     image = np.zeros_like(empty) if shown == "black" else empty
@@ -204,9 +200,7 @@ def test_hints_name_frames_reasons_and_what_to_try() -> None:
     assert verdict_hints("left", {"002": assess(CONVINCING)}) == []
 
 
-def test_an_arm_behind_another_one_is_in_view_and_one_outside_the_image_has_left(
-    shipped_psm: Robot, tiny_sequence: Callable[..., Path]
-) -> None:
+def test_a_hidden_arm_is_in_view(shipped_psm: Robot, tiny_sequence: Callable[..., Path]) -> None:
     tiny = tiny_scene(shipped_psm, 3, ("left",), 320, 240)
     camera, arm = tiny.scene.cameras[0], tiny.scene.arms[0]
     scene = replace(tiny.scene, arms=(arm, replace(arm, name="PSM2")))
@@ -242,9 +236,7 @@ class _FirstArm(ImagePredictor):
         return maps
 
 
-def test_an_arm_too_small_to_be_assessed_alone_is_so_whatever_the_number_of_cameras(
-    shipped_psm: Robot, tiny_sequence: Callable[..., Path]
-) -> None:
+def test_small_arms_are_assessed_per_camera(shipped_psm: Robot, tiny_sequence: Callable[..., Path]) -> None:
     tiny = tiny_scene(shipped_psm, 3, ("left",), 320, 240)
     camera, arm = tiny.scene.cameras[0], tiny.scene.arms[0]
     frame = Sequence.open(tiny_sequence(frames=1, width=320, height=240)).frame(0)

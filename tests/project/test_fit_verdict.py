@@ -74,9 +74,7 @@ def test_a_check_is_no_step_and_its_verdict_comes_and_goes_with_the_pose(project
         (Key.time_offset(), TimeOffset(0.5)),
     ],
 )
-def test_a_step_that_is_taken_back_alone_brings_verdict_and_figures_back_and_doing_it_again_does_not(
-    project: Project, key: Key, value: object
-) -> None:
+def test_reverting_a_step_restores_verdict_and_figures(project: Project, key: Key, value: object) -> None:
     project.apply("Optimize", {Key.joints(0, "PSM1"): _joints(0.1), Key.verdict(0): GOOD}, {0: Figures(0.4, 0.9)})
     project.apply("Edit", {key: value})
     project.apply("Accept", {Key.review(1): Review(ReviewState.ACCEPTED)})

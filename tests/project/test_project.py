@@ -131,9 +131,7 @@ def test_listeners_hear_of_every_save_after_it_is_done_and_cannot_spoil_it(proje
         (replace(Key.base_frame("PSM1"), frame=0), None, "applies to all frames"),
     ],
 )
-def test_an_edit_that_does_not_fit_the_sequence_is_refused_whole(
-    project: Project, key: Key, value: object, message: str
-) -> None:
+def test_invalid_edits_are_refused_as_a_whole(project: Project, key: Key, value: object, message: str) -> None:
     with pytest.raises(ProjectError, match=message):
         project.apply("Wrong", {Key.review(0): ACCEPTED, key: value})
     assert project.history() == () and project.state.review(0) == Review()

@@ -167,9 +167,7 @@ def test_the_seal_is_about_everything(project: Project, project_path: Path) -> N
 
 @pytest.mark.parametrize("suffix", ["", "-wal", "-journal"])
 @pytest.mark.parametrize("make", ["link", "dangling link", "hard link", "pipe", "folder"])
-def test_nothing_is_followed_or_written_that_is_planted_where_a_project_writes(
-    tmp_path: Path, suffix: str, make: str
-) -> None:
+def test_planted_links_and_special_files_are_refused(tmp_path: Path, suffix: str, make: str) -> None:
     victim, planted = tmp_path / "victim", tmp_path / f"small.carts{suffix}"
     victim.write_text("precious")
     if suffix:

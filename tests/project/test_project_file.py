@@ -84,9 +84,7 @@ def test_a_link_to_the_folder_of_a_project_leads_to_the_same_project(project: Pr
         assert not second.writable and second.path == project.path
 
 
-def test_the_project_lies_beside_its_sequence_which_is_never_written_to(
-    tiny_sequence: Callable[..., Path], tmp_path: Path
-) -> None:
+def test_the_project_is_created_beside_its_sequence(tiny_sequence: Callable[..., Path], tmp_path: Path) -> None:
     sequence = Sequence.open(tiny_sequence())
     before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
     joints = JointCorrection(tuple(sequence.measured["PSM1"][0]), HAND)
@@ -100,9 +98,7 @@ def test_the_project_lies_beside_its_sequence_which_is_never_written_to(
     assert {path: after[path] for path in before} == before
 
 
-def test_a_project_survives_moving_its_folder_and_correcting_the_sequence_file(
-    tiny_sequence: Callable[..., Path], tmp_path: Path
-) -> None:
+def test_a_project_survives_moving_its_folder(tiny_sequence: Callable[..., Path], tmp_path: Path) -> None:
     path = tiny_sequence()
     with Project.open(Sequence.open(path)) as project:
         project.apply("Accept", {Key.review(0): ACCEPTED})
@@ -117,7 +113,7 @@ def test_a_project_survives_moving_its_folder_and_correcting_the_sequence_file(
         Project.open(Sequence.open(file))
 
 
-def test_the_shipped_sequence_has_its_project_among_the_users_data(
+def test_the_project_of_the_shipped_sequence_is_in_the_user_data(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert default_path(sample_sequence()).parent == Path(os.environ["CARTS_DATA"])
@@ -126,9 +122,7 @@ def test_the_shipped_sequence_has_its_project_among_the_users_data(
     assert default_path(sample_sequence()).parent == tmp_path / "xdg" / "carts"
 
 
-def test_sequences_of_one_name_in_read_only_folders_have_projects_of_their_own(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_sequences_in_read_only_folders_have_own_projects(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     # The superuser may write anywhere, so the system's answer is replaced.
     monkeypatch.setattr(os, "access", lambda path, mode: False)
     first, second = (default_path(tmp_path / folder / "sequence.toml") for folder in ("a", "b"))

@@ -134,9 +134,7 @@ def test_touching_a_project_is_no_loss(project: Project, project_path: Path) -> 
     assert project.incident is None and project.path == project_path
 
 
-def test_what_is_left_of_a_project_that_was_deleted_does_not_become_part_of_the_next(
-    project: Project, project_path: Path
-) -> None:
+def test_the_log_of_a_deleted_project_is_not_replayed(project: Project, project_path: Path) -> None:
     project.apply("Note", {Key.review(0): Review(note="a")})
     project_path.unlink()
     project.check()

@@ -33,7 +33,7 @@ UPDATE changes SET value = json_set(value, '$.note', 'migrated') WHERE kind = 'r
 """
 
 
-def test_an_older_project_is_migrated_when_it_is_opened_for_writing(
+def test_older_projects_are_migrated_when_opened_for_writing(
     project_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with Project(IDENTITY, project_path) as project:

@@ -98,9 +98,7 @@ def test_a_file_that_is_no_project_is_refused_and_left_alone(project_path: Path,
         ({"kinematics_sha256": "1" * 64}, "the kinematics tables differ"),
     ],
 )
-def test_a_project_of_another_sequence_is_refused_and_left_alone(
-    project_path: Path, changed: dict, difference: str
-) -> None:
+def test_a_project_of_another_sequence_is_refused(project_path: Path, changed: dict, difference: str) -> None:
     with Project(IDENTITY, project_path) as project:
         project.apply("Accept", {Key.review(0): ACCEPTED})
     before = project_path.read_bytes()

@@ -64,9 +64,7 @@ def test_a_polygon_covers_the_pixels_whose_centres_are_inside() -> None:
 
 
 @pytest.mark.parametrize(("kind", "file"), [("coco", ""), ("cvat", ""), ("masks", ""), ("masks", "binary")])
-def test_what_carts_exports_comes_back_pixel_by_pixel(
-    sequence: Sequence, tmp_path: Path, kind: FormatName, file: str
-) -> None:
+def test_exported_masks_come_back(sequence: Sequence, tmp_path: Path, kind: FormatName, file: str) -> None:
     parts = "links" if kind != "masks" else "arms"
     dataset = Dataset(sequence, tuple(measured_frames(sequence, range(3))), sequence.scene, "regular", parts=parts)
     folder = export(dataset, kind, tmp_path / "exported")
@@ -122,9 +120,7 @@ def test_run_lengths_of_coco_that_are_not_compressed_are_read(sequence: Sequence
         ({"annotations": 5}, "is not a COCO file"),
     ],
 )
-def test_a_wrong_coco_file_is_refused_with_what_is_wrong(
-    sequence: Sequence, tmp_path: Path, changes: dict, message: str
-) -> None:
+def test_invalid_coco_files_are_refused(sequence: Sequence, tmp_path: Path, changes: dict, message: str) -> None:
     path = write_coco(tmp_path / "labels.json", **changes)
     with pytest.raises(SequenceError, match=message):
         all_of(path, sequence)
@@ -155,9 +151,7 @@ def test_polygons_masks_and_points_of_cvat_are_read_in_their_order(sequence: Seq
         ("<annotations/>", "there is no <image>"),
     ],
 )
-def test_a_wrong_cvat_file_is_refused_with_what_is_wrong(
-    sequence: Sequence, tmp_path: Path, text: str, message: str
-) -> None:
+def test_invalid_cvat_files_are_refused(sequence: Sequence, tmp_path: Path, text: str, message: str) -> None:
     path = tmp_path / "annotations.xml"
     path.write_text(text)
     with pytest.raises(SequenceError, match=message):
@@ -172,9 +166,7 @@ def test_a_wrong_cvat_file_is_refused_with_what_is_wrong(
         ('<polygon label="a" points="1,nan;2,3;4,5"/>', "a point is not finite or far outside"),
     ],
 )
-def test_a_wrong_shape_of_cvat_is_left_out_and_named(
-    sequence: Sequence, tmp_path: Path, shape: str, message: str
-) -> None:
+def test_invalid_cvat_shapes_are_skipped(sequence: Sequence, tmp_path: Path, shape: str, message: str) -> None:
     (tmp_path / "annotations.xml").write_text(CVAT.format(more=""))
     wanted, _, _ = all_of(tmp_path / "annotations.xml", sequence)
     (tmp_path / "annotations.xml").write_text(CVAT.format(more=shape))
@@ -204,9 +196,7 @@ TRIANGLE = [10, 10, 40, 10, 40, 40]
         ({"keypoints": [1, 2]}, "its keypoints have 2 numbers"),
     ],
 )
-def test_a_wrong_annotation_of_coco_is_left_out_and_named(
-    sequence: Sequence, tmp_path: Path, wrong: dict, message: str
-) -> None:
+def test_invalid_coco_annotations_are_skipped(sequence: Sequence, tmp_path: Path, wrong: dict, message: str) -> None:
     good = {"id": 1, "image_id": 7, "category_id": 3, "segmentation": [[50, 50, 60, 50, 60, 60]]}
     marked = [good, {"id": 52, "image_id": 7, "category_id": 3, **wrong}]
     found = read_annotations(write_coco(tmp_path / "labels.json", annotations=marked), sequence)

@@ -63,12 +63,9 @@ def test_a_file_that_does_not_say_its_axes_is_asked_about(tmp_path):
     ("content", "message"),
     [
         ("[1, 2", "not readable JSON"),
-        ("[]", "has no base frame"),
         ("[" * 100_000, "not readable JSON"),
         ('{"arms": []}', "has no base frame"),
-        ('{"arms": {"name": "PSM1"}}', "has no base frame"),
         ('{"arms": [{"name": "PSM1", "base_frame": 5}]}', "shape"),
-        ('{"arms": [{"name": "PSM1", "measured_cp": [[1, 0], [0, 1]]}]}', "4 rows of 4"),
         ('{"arms": [{"name": "PSM1", "base_frame": {"reference_frame": "left"}}]}', "4 rows of 4"),
         (json.dumps({"arms": [{"name": "PSM1", "measured_cp": (10 * np.eye(4)).tolist()}]}), "not rigid"),
     ],

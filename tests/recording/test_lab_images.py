@@ -181,9 +181,7 @@ def test_labels_keep_their_values_and_are_no_mask(
         read_mask(place / "001.png")
 
 
-def test_labels_that_were_resized_with_interpolation_are_refused(
-    tiny_sequence: Callable[..., Path], tmp_path: Path
-) -> None:
+def test_interpolated_labels_are_refused(tiny_sequence: Callable[..., Path], tmp_path: Path) -> None:
     place = tmp_path / "others" / "left"
     place.mkdir(parents=True)
     (place / "001.png").write_bytes(png(cv2.GaussianBlur((LABELS * 30).astype(np.uint8), (0, 0), 3)))

@@ -17,8 +17,6 @@ from carts_core.recording import Sequence
 from carts_core.recording.images import read_image
 from carts_core.resources import shipped_robot
 
-DVRK = Path(__file__).parents[1] / "sequences" / "dvrk_stereo.toml"
-
 
 def replaced(old: str, new: str):
     """An edit of a sequence file that fails the test when there is nothing to edit."""
@@ -235,21 +233,6 @@ def test_a_given_background_is_used_and_an_estimated_one_shows_no_arm(tiny_seque
     cv2.imwrite(str(path.parent / "empty.png"), np.full((120, 160, 3), 77, np.uint8))
     path.write_text(path.read_text().replace('images = "', 'background = "empty.png"\nimages = "'))
     assert (Sequence.open(path).background("left") == 77).all()
-
-
-def test_the_real_recording_opens_with_thirty_stereo_frames(shared_dir):
-    sequence = Sequence.open(DVRK)
-    assert len(sequence) == 30
-    assert sequence.frame_ids[0] == "001"
-    assert [camera.name for camera in sequence.scene.cameras] == ["left", "right"]
-    assert sequence.measured_joints["PSM1"] == ("yaw", "pitch", "insertion", "roll", "wrist_pitch", "wrist_yaw")
-    for index in range(len(sequence)):
-        frame = sequence.frame(index)
-        assert frame.masks is not None
-        for camera in ("left", "right"):
-            assert frame.images[camera].shape == (480, 640, 3)
-            assert frame.masks[camera].shape == (480, 640)
-            assert 0.005 < frame.masks[camera].mean() < 0.5
 
 
 @pytest.fixture

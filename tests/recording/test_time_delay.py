@@ -97,9 +97,7 @@ def test_a_small_difference_is_not_worth_a_change() -> None:
     assert near.proposed is None and uncertain.proposed is None
 
 
-def test_the_command_proposes_and_writes_where_it_is_asked_to(
-    late: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_command_proposes_and_writes(late: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     before = late.read_text()
     main(["time-offset", str(late), "-o", str(tmp_path / "shifted")])
     assert "Proposed: time_offset" in capsys.readouterr().out

@@ -8,9 +8,7 @@ from carts_core.model.scene import Scene, SceneState
 from carts_core.rendering import Renderer, pick_point
 
 
-def test_the_point_under_a_pixel_is_of_the_visible_link_and_projects_onto_that_pixel(
-    scene_and_state: tuple[Scene, SceneState],
-) -> None:
+def test_a_picked_point_projects_onto_its_pixel(scene_and_state: tuple[Scene, SceneState]) -> None:
     scene, state = scene_and_state
     renderer = Renderer(scene)
     links = renderer.segment_links(state)[0]
@@ -24,9 +22,7 @@ def test_the_point_under_a_pixel_is_of_the_visible_link_and_projects_onto_that_p
         assert project_keypoints(scene, state, [point], "left")[0].tolist() == pytest.approx(pixel, abs=1e-2)
 
 
-def test_beside_the_arm_the_nearest_point_counts_as_far_as_the_radius_reaches(
-    scene_and_state: tuple[Scene, SceneState],
-) -> None:
+def test_beside_the_arm_the_nearest_point_in_the_radius_is_picked(scene_and_state: tuple[Scene, SceneState]) -> None:
     scene, state = scene_and_state
     renderer = Renderer(scene)
     rows, columns = np.nonzero(renderer.segment_links(state)[0] >= 0)

@@ -63,9 +63,7 @@ def smooth_weights(size: tuple[int, int]) -> torch.Tensor:
 
 
 @pytest.mark.parametrize("what", ["silhouette", "image"])
-def test_gradients_agree_with_finite_differences_for_every_kind_of_parameter(
-    what: str, scene_and_state: tuple[Scene, SceneState]
-) -> None:
+def test_gradients_agree_with_finite_differences(what: str, scene_and_state: tuple[Scene, SceneState]) -> None:
     """Within 5 % for each kind of parameter, over several functionals of the picture."""
     scene, state = scene_and_state
     fine = Renderer(scene, width=SUPERSAMPLING * WIDTH, height=SUPERSAMPLING * HEIGHT)

@@ -88,9 +88,7 @@ def _dice(one: np.ndarray, other: np.ndarray) -> float:
     return float(2 * (one & other).sum() / (one.sum() + other.sum()))
 
 
-def test_points_and_boxes_reach_the_decoder_in_its_pixels_and_the_mask_comes_back_in_ours(
-    model: tuple[Path, Path],
-) -> None:
+def test_prompts_are_scaled_to_the_decoder_and_masks_back(model: tuple[Path, Path]) -> None:
     segmenter, image = OnnxSegmenter.load(*model), _half_bright()
     bright = np.zeros((48, 96), bool)
     bright[:, 48:] = True
@@ -119,9 +117,7 @@ def test_files_of_pytorch_are_refused_before_anything_of_them_is_run(model: tupl
             OnnxSegmenter.load(path, model[1])
 
 
-def test_what_is_no_encoder_or_no_decoder_is_refused_with_what_it_takes(
-    model: tuple[Path, Path], tmp_path: Path
-) -> None:
+def test_other_models_are_refused_with_the_expected_inputs(model: tuple[Path, Path], tmp_path: Path) -> None:
     encoder, decoder = model
     with pytest.raises(
         WeightsError, match=r"an encoder has one input, an image .*Give two ONNX files, the encoder first"

@@ -42,9 +42,7 @@ class _Frames(TrainingFrames):
 @pytest.mark.parametrize(
     "name", ["colleoni", *(pytest.param(name, marks=pytest.mark.slow) for name in ("unet", "hrnet", "swin"))]
 )
-def test_each_network_learns_for_some_steps_and_is_the_same_after_it_was_written_and_read(
-    name: BaselineName, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_networks_train_save_and_load(name: BaselineName, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("carts_core.lab.baselines.training.VALIDATION", 4)
     training = BaselineTraining(augmentation="none", frames=104, steps=2, batch_size=2, warmup=0, threads=1)
     lines: list[str] = []

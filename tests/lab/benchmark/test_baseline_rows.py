@@ -20,9 +20,7 @@ SMALLEST = {
 }
 
 
-def test_rows_of_baselines_are_planned_where_weights_are_given_measured_and_in_the_table(
-    tiny_benchmark: Callable[..., Benchmark], tmp_path: Path
-) -> None:
+def test_baselines_with_weights_are_measured(tiny_benchmark: Callable[..., Benchmark], tmp_path: Path) -> None:
     found = {}
     for name in ("unet", "colleoni"):
         path = output_path(tmp_path, f"{name}.safetensors")

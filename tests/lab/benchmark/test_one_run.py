@@ -45,9 +45,7 @@ def test_the_depth_of_the_tips_is_compared_along_the_cameras_axis(shipped_psm: R
     )
 
 
-def test_frames_corrected_together_begin_with_one_error_and_frames_alone_each_with_its_own(
-    tiny_sequence: Callable[..., Path],
-) -> None:
+def test_sequence_mode_starts_with_one_error_for_all_frames(tiny_sequence: Callable[..., Path]) -> None:
     sequence = Sequence.open(tiny_sequence(frames=4))
     errors = {}
     for method in ("ours", "sequence"):

@@ -33,20 +33,3 @@ def test_the_worst_domain_decides_on_dice() -> None:
     assert missed.met is False
     missed = target_of("synthetic, 2° off, each frame alone: mean Dice", bad, *good)
     assert missed.met is False and missed.reached == "0.970" and "regular" in missed.basis
-
-
-def test_real_frames_are_compared_with_their_clean_form() -> None:
-    clean = make_measurement((0.87, 0.965), source="real")
-    near = make_measurement((0.87, 0.958), source="real", domain="smoke")
-    far = make_measurement((0.87, 0.9), source="real", domain="bleeding")
-    assert target_of("real frames, each alone", clean).met is True
-    assert target_of("real frames under", clean, near).met is None
-    others = [
-        make_measurement((0.87, 0.965), source="real", domain=domain)
-        for domain in ("low_brightness", "bleeding", "background_change")
-    ]
-    assert target_of("real frames under", clean, near, *others).met is True
-    same = target_of("real frames under", clean, *others)
-    assert same.reached == "0.000"
-    lost = target_of("real frames under", clean, near, far)
-    assert lost.met is False and lost.reached == "0.065" and "bleeding" in lost.basis

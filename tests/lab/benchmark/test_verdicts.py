@@ -13,8 +13,6 @@ from carts_core.lab.benchmark.conditions import (
     with_other_instruments,
     wrong_inputs,
 )
-from carts_core.lab.benchmark.statistics import Measurements
-from carts_core.lab.benchmark.tables import deviation_table, verdict_table
 from carts_core.recording import Sequence
 
 
@@ -38,16 +36,6 @@ def test_the_area_under_the_roc_is_how_often_a_wrong_mask_is_held_for_less_likel
     assert target_of("verdict against Dice", *FRAMES).reached == "0.750"
     assert target_of("verdict against Dice", *FRAMES[:3]).met is True
     assert target_of("verdict against Dice", FRAMES[0], FRAMES[3]).met is None, "nothing was wrong about any input"
-
-
-def test_the_verdict_table_has_a_row_per_condition_and_one_of_all() -> None:
-    table = verdict_table(Measurements(FRAMES))
-    assert table is not None
-    rows = {row[0].text: [cell.text for cell in row[1:]] for row in table.rows}
-    assert rows["all"] == ["4", "2", "2", "1", "1", "0.750"]
-    assert rows["synthetic: no arm"] == ["1", "1", "0", "0", "0", "–"]
-    deviations = deviation_table(Measurements(FRAMES))
-    assert deviations is not None and [cell.text for cell in deviations.rows[0][2:]] == ["70 %", "90 %"]
 
 
 def test_what_is_wrong_about_an_input_is_what_its_name_says(tiny_sequence) -> None:

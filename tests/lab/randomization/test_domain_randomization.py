@@ -121,9 +121,7 @@ def test_a_folder_without_readable_photographs_is_refused(tmp_path: Path, conten
         (ImageSettings(occluded=0.0), ImageSettings(occluded=1.0)),
     ],
 )
-def test_neither_things_nor_occluders_are_part_of_what_is_to_be_learnt(
-    shipped_psm: Robot, settings: tuple[ImageSettings, ImageSettings]
-):
+def test_occluders_are_not_part_of_the_labels(shipped_psm: Robot, settings: tuple[ImageSettings, ImageSettings]):
     bare, full = (SurfaceGenerator([shipped_psm], images, 5)() for images in settings)
     assert (bare.observed != full.observed).any()
     assert np.array_equal(bare.surface, full.surface)

@@ -41,9 +41,7 @@ def _truth(stage: Stage, camera: Camera, arms: tuple[Arm, ...]) -> np.ndarray:
     return renderer.segment(renderer.scene.state({arm.name: JOINTS[0] for arm in arms}))[0] >= 0
 
 
-def test_the_surface_behind_each_pixel_projects_back_to_that_pixel(
-    tracer: PathTracer, stage: Stage, camera: Camera
-) -> None:
+def test_each_surface_point_projects_onto_its_pixel(tracer: PathTracer, stage: Stage, camera: Camera) -> None:
     surface = tracer.surface(stage.parts(0), camera, seed=0)
     T, (fx, fy, cx, cy) = camera.T_camera_world, camera.intrinsics
     x, y, z = np.moveaxis(surface.position @ T[:3, :3].T + T[:3, 3], -1, 0)
@@ -67,9 +65,7 @@ def test_without_mitsuba_the_error_says_what_to_install(monkeypatch: pytest.Monk
         path_tracer._mitsuba.cache_clear()
 
 
-def test_the_motion_in_the_picture_is_that_of_the_joints(
-    tracer: PathTracer, shipped_psm: Robot, camera: Camera
-) -> None:
+def test_image_motion_follows_the_joints(tracer: PathTracer, shipped_psm: Robot, camera: Camera) -> None:
     arms = place_arms(shipped_psm, "tool_tip_link", camera)
     moving = np.concatenate([JOINTS, JOINTS])
     moving[1, 2] += 0.004

@@ -52,9 +52,7 @@ def test_each_domain_is_what_its_name_says(small_sequence: Path) -> None:
         assert redness[hazy] < 0.9 * redness["regular"]
 
 
-def test_a_stopped_run_of_one_domain_goes_on_and_gives_the_files_of_all_domains_byte_by_byte(
-    small_config: SynthesisConfig, small_sequence: Path, tmp_path: Path
-) -> None:
+def test_a_stopped_synthesis_is_resumed(small_config: SynthesisConfig, small_sequence: Path, tmp_path: Path) -> None:
     config, output = dataclasses.replace(small_config, domains=("smoke",)), tmp_path / "sequence"
     calls: list[tuple[str, int]] = []
 
@@ -86,9 +84,7 @@ def test_a_folder_with_something_in_it_is_never_touched(small_config: SynthesisC
     assert [path.name for path in tmp_path.iterdir()] == ["mine.txt"]
 
 
-def test_the_shipped_sequence_is_complete_small_and_shows_the_shipped_robot_at_its_true_joints(
-    sample_sequence_path: Path,
-) -> None:
+def test_the_shipped_sequence_is_complete_and_its_masks_fit_the_truth(sample_sequence_path: Path) -> None:
     sequence, folder = Sequence.open(sample_sequence_path), sample_sequence_path.parent
     assert sequence.domains == DOMAINS and len(sequence) >= 24
     assert sum(path.stat().st_size for path in folder.rglob("*") if path.is_file()) < 9_000_000

@@ -109,9 +109,7 @@ def test_settings_come_from_the_recording_and_the_shipped_weights_unless_they_ar
     assert (config.minutes, config.learning_rate, config.start) == (3.0, 1e-4, Path("other.safetensors"))
 
 
-def test_a_recording_that_is_not_there_is_named_and_leaves_no_folder(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-):
+def test_a_missing_recording_is_named_and_leaves_no_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     with pytest.raises(SystemExit) as ended:
         main(["train", str(tmp_path / "run"), "--for", str(tmp_path / "none.toml")])
     assert ended.value.code == BAD_INPUT and not (tmp_path / "run").exists()
@@ -125,9 +123,7 @@ def config(tiny_sequence: Callable[..., Path], tmp_path: Path) -> TrainingConfig
     return adapted_to(tiny_sequence(), tmp_path / "adapted", given)
 
 
-def test_a_run_ends_when_it_no_longer_gains_and_leaves_its_best_weights(
-    config: TrainingConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_early_stopping_keeps_the_best_weights(config: TrainingConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(SurfaceTask, "worse", lambda *_: False)
     # At so small a rate only the batch statistics change.
     config = replace(config, steps=STEPS, learning_rate=1e-12, weight_decay=0.0, patience=2, average=0.0,
@@ -160,9 +156,7 @@ def test_weights_with_better_masks_and_worse_tips_or_parts_are_not_kept(
     assert read_weights(result.weights).training["step"] == kept
 
 
-def test_a_busy_machine_takes_no_steps_from_a_run(
-    config: TrainingConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_minutes_are_processor_time(config: TrainingConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     clock = iter(range(0, 10**9, 1000))
     monkeypatch.setattr("carts_core.lab.training.loop.time.perf_counter", lambda: float(next(clock)))
     train(replace(config, steps=3, minutes=5.0), tmp_path)

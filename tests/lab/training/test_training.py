@@ -71,9 +71,7 @@ with stopped_by_signals():
 @pytest.mark.parametrize(
     ("sent", "workers"), [(signal.SIGKILL, 0), pytest.param(signal.SIGTERM, 1, marks=pytest.mark.slow)]
 )
-def test_a_run_goes_on_where_its_last_checkpoint_was_after_a_signal_to_its_processes(
-    tmp_path: Path, sent: signal.Signals, workers: int
-):
+def test_a_killed_run_resumes_from_its_last_checkpoint(tmp_path: Path, sent: signal.Signals, workers: int):
     arguments = [sys.executable, "-c", _RUN, str(tmp_path), str(Path(__file__).parent), str(workers)]
     process = subprocess.Popen(arguments, start_new_session=True)
     try:

@@ -227,23 +227,6 @@ def test_a_broken_folder_is_an_error_in_words_and_leaves_nothing(folder, tmp_pat
     assert [entry.name for entry in tmp_path.iterdir()] == [folder.name]
 
 
-def test_real_stereo_frames_given_as_a_folder_are_imported(shared_dir, tmp_path):
-    source = tmp_path / "rec"
-    source.mkdir()
-    for side in ("left", "right"):
-        (source / side).symlink_to(shared_dir / "data/dvrk_stereo" / side)
-    with (shared_dir / "data/dvrk_stereo/kinematics.csv").open() as stream:
-        rows = list(csv.DictReader(stream))
-    values = np.array([[float(row[name]) for name in JOINT_NAMES] for row in rows])
-    scaled = np.column_stack([np.arange(1, 31), values * np.where(np.arange(6) == 2, 1e3, 180 / np.pi)])
-    write_csv(source / "angles.csv", ["picture_index", *(f"axis_{n}" for n in range(1, 7))], scaled)
-    columns = {name: f"axis_{number}" for number, name in enumerate(JOINT_NAMES, start=1)}
-    file, _ = import_recording(source, tmp_path / "out", ImportOptions(columns={**columns, "frame": "picture_index"}))
-    sequence = Sequence.open(file)
-    assert len(sequence) == 30 and len(sequence.scene.cameras) == 2
-    assert np.abs(sequence.frame(29).measured["PSM1"][:6] - values[29]).max() < 1e-8
-
-
 def test_degrees_of_a_small_motion_are_degrees_since_no_wrist_turns_that_far_in_radians(tmp_path):
     write_images(tmp_path / "rec/images", FRAMES)
     angles = np.linspace(-3.5, 3.5, FRAMES)[:, None] * np.ones(6)

@@ -277,9 +277,7 @@ WRONG: list[tuple[str, Any, str]] = [
 
 
 @pytest.mark.parametrize(("name", "content", "message"), WRONG, ids=[name for name, _, _ in WRONG])
-def test_a_calibration_that_cannot_be_right_is_an_error_that_names_file_or_camera(
-    tmp_path: Path, name: str, content: Any, message: str
-) -> None:
+def test_impossible_calibrations_are_refused(tmp_path: Path, name: str, content: Any, message: str) -> None:
     path = tmp_path / name
     if callable(content):
         content(path)
@@ -310,9 +308,7 @@ def test_the_size_of_the_calibrated_images_answers_what_a_file_does_not_state(tm
         (np.eye(3), [0.0048, 0, 0], "swapped, or the calibration is the inverse"),
     ],
 )
-def test_a_pair_in_millimetres_or_the_wrong_way_round_is_said(
-    tmp_path: Path, R: np.ndarray, T: list[float], message: str
-) -> None:
+def test_millimetres_and_swapped_sides_are_said(tmp_path: Path, R: np.ndarray, T: list[float], message: str) -> None:
     path = tmp_path / "stereo.json"
     path.write_text(json.dumps({"K1": K.tolist(), "K2": K.tolist(), "R": R.tolist(), "T": T}))
     found = imported(tmp_path, {"left": path, "right": path})

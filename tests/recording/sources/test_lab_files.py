@@ -546,9 +546,7 @@ def test_poses_of_another_tool_point_are_brought_to_the_tip_and_said(tmp_path: P
 
 
 @pytest.mark.parametrize("make", [surgpose, clip, episode, cts], ids=["surgpose", "clip", "episode", "cts"])
-def test_rows_of_images_get_times_so_that_their_delay_can_be_changed(
-    tmp_path: Path, make: Callable[[Path], Path]
-) -> None:
+def test_rows_of_images_get_times_for_a_time_offset(tmp_path: Path, make: Callable[[Path], Path]) -> None:
     path = make(tmp_path / "rec")
     at_once = find(path, ImportOptions(frame_rate=30))
     assert at_once.frame_times is not None and np.diff(at_once.frame_times) == pytest.approx(1 / 30)
@@ -577,9 +575,7 @@ def test_rows_of_images_get_times_so_that_their_delay_can_be_changed(
         ({"robot": {"PSM1": "none.urdf"}}, "robot none.urdf of PSM1 is missing"),
     ],
 )
-def test_options_for_names_that_are_not_there_are_refused_with_those_that_are(
-    tmp_path: Path, options: dict, message: str
-) -> None:
+def test_options_for_unknown_names_list_the_known_ones(tmp_path: Path, options: dict, message: str) -> None:
     counted_from(1, 1)(tmp_path / "rec")
     with pytest.raises(CartsError, match=message):
         find(tmp_path / "rec", ImportOptions(**options))
