@@ -1,9 +1,19 @@
-"""Names that try to lead elsewhere, and a recording that carries one."""
+"""Names that try to lead elsewhere, a recording that carries one, and commands that are run with them."""
 
 import json
+import os
 import random
-from collections.abc import Iterator
+import shutil
+from collections.abc import Callable, Iterator
 from pathlib import Path
+
+import pytest
+from planted import contents, treasure
+
+from carts_core.cli.command_line import BAD_INPUT, main
+
+Attack = Callable[[Path, int, str], tuple[list[list[str]], tuple[str, ...]]]
+"""Prepares a working folder with a numbered hostile name; gives command lines, and where they may write."""
 
 PARTS = [
     *("..", ".", "/", "//", "\\", "~", "home", "out", "tmp", "\0", "\n", "\t", "\x1b[2J", "\x7f", "\u2028", "\u202e"),
@@ -36,3 +46,29 @@ def with_name(text: str, where: str, name: str) -> str:
     }[where]
     assert before in text
     return text.replace(before, after).replace('"{domain}/{camera}/{frame}.png"', '"regular/left/*.png"')
+
+
+def campaign(sandbox: Path, monkeypatch: pytest.MonkeyPatch, count: int, attack: Attack) -> int:
+    """Run commands with hostile names: nothing outside their outputs is written; how many runs were accepted."""
+    treasure(sandbox / "home")
+    work, accepted = sandbox / "work", 0
+    for number, name in enumerate(hostile_names(count, sandbox)):
+        work.mkdir()
+        monkeypatch.chdir(work)
+        commands, outputs = attack(work, number, name)
+        allowed, before = tuple(f"work/{output}" for output in outputs), contents(sandbox)
+        for words in commands:
+            try:
+                main(words)
+                accepted += 1
+            except SystemExit as stop:
+                assert stop.code == BAD_INPUT, (words, name)
+            after = contents(sandbox)
+            changed = [path for path in after.keys() | before.keys() if after.get(path) != before.get(path)]
+            above = [path for path in changed if any(output.startswith(f"{path}/") for output in allowed)]
+            assert all(path.startswith(allowed) or path in above for path in changed), (words, name, changed)
+        monkeypatch.chdir(sandbox)
+        shutil.rmtree(work)
+    print(f"{count} names, {accepted} runs accepted; 0 writes outside")
+    assert os.listdir(sandbox) == ["home"]
+    return accepted

@@ -29,8 +29,7 @@ def corrected(sequence: Sequence, index: int, threads: int, iterations: int) -> 
         settings=SurfaceSolver(iterations=iterations),
         live=False,
     )
-    for _ in optimizer:
-        pass
+    list(optimizer)
     assert optimizer.best is not None
     positions, deviations = optimizer.best.joint_positions(), optimizer.best.joint_std()
     return {**positions, **{f"{arm}.std": values for arm, values in deviations.items()}}

@@ -280,8 +280,7 @@ def test_a_refinement_keeps_to_what_the_points_left_open_and_to_known_cameras(
 
 
 @pytest.mark.parametrize(
-    ("turn_deg", "noise", "agrees"),
-    [(0.0, 2.0, True), (0.0, 5.0, True), (4.0, 2.0, False), (0.02, 0.1, True)],
+    ("turn_deg", "noise", "agrees"), [(0.0, 2.0, True), (0.0, 5.0, True), (4.0, 2.0, False), (0.02, 0.1, True)]
 )
 def test_points_reject_another_calibration(scene: Scene, turn_deg: float, noise: float, agrees: bool) -> None:
     scene = scene.with_arms(["PSM1"])

@@ -15,12 +15,7 @@ from carts_core.evaluation import dice
 from carts_core.imaging.working_image import Window
 from carts_core.model.parts import COVERAGE
 from carts_core.model.perturbation import perturb
-from carts_core.optimization import (
-    CalibrationOptimizer,
-    FrameOptimizer,
-    MaskPredictor,
-    SequenceOptimizer,
-)
+from carts_core.optimization import CalibrationOptimizer, FrameOptimizer, MaskPredictor, SequenceOptimizer
 from carts_core.recording import Frame, Sequence
 from carts_core.rendering import Renderer
 from carts_core.settings import FreeParameters

@@ -73,8 +73,7 @@ def test_a_frame_of_a_moving_camera_is_corrected_as_one_of_a_fixed_one(moving: S
     truths = Truths(moving)
     frame = truths.load(1)
     optimizer = FrameOptimizer(moving.scene, frame, {}, truths)
-    for _ in optimizer:
-        pass
+    list(optimizer)
     assert optimizer.best is not None
     assert overlap(moving, frame, optimizer.best.state) > 0.985
     assert np.allclose(optimizer.best.state.T_mount_world[0].numpy(), frame.mounts["left"], atol=1e-6)
@@ -83,8 +82,7 @@ def test_a_frame_of_a_moving_camera_is_corrected_as_one_of_a_fixed_one(moving: S
 def test_frames_of_a_moving_camera_are_corrected_together(moving: Sequence) -> None:
     truths = Truths(moving)
     optimizer = SequenceOptimizer(moving.scene, truths.load, {index: index / 10 for index in range(FRAMES)}, truths)
-    for _ in optimizer:
-        pass
+    list(optimizer)
     for index, estimate in optimizer.estimates.items():
         assert overlap(moving, moving.frame(index), estimate.state) > 0.985
 
@@ -100,8 +98,7 @@ def test_a_camera_that_moves_is_calibrated_on_its_mount(moving: Sequence) -> Non
     optimizer = CalibrationOptimizer(
         wrong, frames, predictor, free=FreeParameters(joints=False, extrinsics=True), settings=BY_COLOUR
     )
-    for _ in optimizer:
-        pass
+    list(optimizer)
     found = optimizer.result().scene.cameras[0].T_camera_world
     assert np.linalg.norm(found[:3, 3] - camera.T_camera_world[:3, 3]) < 0.0005
     both = FreeParameters(joints=False, base_frames=True, extrinsics=True)

@@ -35,8 +35,7 @@ def made_truths(shared_sequence: Callable[..., Path]) -> Off:
 
 def finished(truths: Truths, **arguments) -> SequenceOptimizer:
     sequence = optimizer(truths, model=HELD, **arguments)
-    for _ in sequence:
-        pass
+    list(sequence)
     return sequence
 
 

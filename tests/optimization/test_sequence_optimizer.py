@@ -105,8 +105,7 @@ def test_a_keyframe_stays_as_given_and_draws_the_others(truths: Truths) -> None:
     # Nothing else is seen, so what the others get can only come from the keyframe.
     truths.blind = set(range(FRAMES))
     sequence = optimizer(truths, keyframes={2: given})
-    for _ in sequence:
-        pass
+    list(sequence)
     estimates = sequence.estimates
     assert np.array_equal(estimates[2].joint_positions[ARM], given[ARM])
     assert np.allclose(estimates[2].state.joint_positions[0].numpy(), given[ARM], atol=1e-6)

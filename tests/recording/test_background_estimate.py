@@ -5,12 +5,7 @@ import pytest
 
 from carts_core.errors import SequenceError
 from carts_core.recording import Sequence
-from carts_core.recording.background import (
-    background_of_recording,
-    fill,
-    filled_in,
-    uncovered_median,
-)
+from carts_core.recording.background import background_of_recording, fill, filled_in, uncovered_median
 from carts_core.resources import sample_sequence
 
 RNG = np.random.default_rng(5)

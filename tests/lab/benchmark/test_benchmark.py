@@ -10,13 +10,7 @@ from rich.console import Console
 
 from carts_core.cli.command_line import BAD_INPUT, main
 from carts_core.files import output_path
-from carts_core.lab.benchmark import (
-    Benchmark,
-    Facts,
-    Measurement,
-    Run,
-    write_report,
-)
+from carts_core.lab.benchmark import Benchmark, Facts, Measurement, Run, write_report
 from carts_core.lab.benchmark.conditions import NO_ARM, OTHER_INSTRUMENT, WRONG
 from carts_core.lab.benchmark.frame import SourceBench
 

@@ -12,9 +12,7 @@ from carts_core.files import output_path
 from carts_core.lab.benchmark import Facts, Measurement, Run, Score, write_report
 from carts_core.lab.benchmark.hand_eye import HandEyeRun
 from carts_core.lab.benchmark.statistics import Measurements
-from carts_core.lab.benchmark.tables import (
-    main_tables,
-)
+from carts_core.lab.benchmark.tables import main_tables
 from carts_core.lab.synthesis import DOMAINS
 
 HAND_EYE = [HandEyeRun("masks, 15 degrees and 10 cm", 0, 0.05, 0.001, "good")]

@@ -7,12 +7,7 @@ import numpy as np
 from handmade import make_measurement, target_of
 
 from carts_core.lab.benchmark import Measurement
-from carts_core.lab.benchmark.conditions import (
-    NO_ARM,
-    misled,
-    with_other_instruments,
-    wrong_inputs,
-)
+from carts_core.lab.benchmark.conditions import NO_ARM, misled, with_other_instruments, wrong_inputs
 from carts_core.recording import Sequence
 
 

@@ -12,14 +12,7 @@ import torch
 from carts_core.cli.command_line import BAD_INPUT, main
 from carts_core.errors import SettingsError
 from carts_core.lab.randomization.arms import RecordedPlacements, RobotGeometry
-from carts_core.lab.training.adaptation import (
-    BACKGROUNDS,
-    STEPS,
-    Fits,
-    Judgement,
-    adapted_to,
-    made_images,
-)
+from carts_core.lab.training.adaptation import BACKGROUNDS, STEPS, Fits, Judgement, adapted_to, made_images
 from carts_core.lab.training.loop import load_checkpoint
 from carts_core.lab.training.tasks import SurfaceTask, dice, pooled_dice, tip_error
 from carts_core.lab.training.training import train

@@ -8,19 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from recordings import (
-    SIZE,
-    START,
-    BagKind,
-    assert_refused,
-    copied,
-    image,
-    joints_at,
-    pose_of,
-    remove,
-    write,
-    write_bag,
-)
+from recordings import SIZE, START, BagKind, assert_refused, copied, image, joints_at, pose_of, remove, write, write_bag
 from videos import write_video
 
 from carts_core.cli import main

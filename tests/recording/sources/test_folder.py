@@ -203,11 +203,7 @@ MUTATIONS: dict[str, tuple[Callable[[Path], object], dict, str]] = {
     "wrong column": (lambda folder: None, {"columns": {"yaw": "q9"}}, "has no column 'q9'. It has: image"),
     "broken YAML": (rewrite("left.yaml", "{rows", "{{{{rows"), {}, "cannot be used"),
     "no matrix": (rewrite("left.yaml", "data:", "values:"), {}, "cannot be used"),
-    "missing folder": (
-        lambda folder: None,
-        {"images": {"left": "nothing"}},
-        "nothing is neither a video nor",
-    ),
+    "missing folder": (lambda folder: None, {"images": {"left": "nothing"}}, "nothing is neither a video nor"),
     "cut image": (write("imgs_left/img_0000.png", b"\x89PNG\r\n\x1a\n123"), {}, "damaged"),
     "no common frames": (
         lambda f: [p.rename(p.with_name(f"img_9{p.name[4:]}")) for p in (f / "imgs_left").iterdir()],

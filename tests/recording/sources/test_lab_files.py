@@ -563,10 +563,7 @@ def test_rows_of_images_get_times_for_a_time_offset(tmp_path: Path, make: Callab
     [
         ({"robot": {"PSM7": "/nonexistent.urdf"}}, "rec has no arm 'PSM7'. It has: PSM1. Correct --robot"),
         ({"base": {"PSM9": Path("x.json")}}, "rec has no arm 'PSM9'. It has: PSM1. Correct --base"),
-        (
-            {"calibration": {"middle": Path("y.yaml")}},
-            "no camera 'middle'. It has: camera. Correct --calibration",
-        ),
+        ({"calibration": {"middle": Path("y.yaml")}}, "no camera 'middle'. It has: camera. Correct --calibration"),
         ({"arms": {"PSM1": "nose", "PSM2": "ear"}}, "rec has no arm 'PSM2'.*Correct --arms"),
         ({"columns": {"yawn": "yaw"}}, "yawn is not a meaning of a column. Allowed are: yaw"),
         ({"flip": ("knee",)}, "knee is not a joint.*--flip"),
