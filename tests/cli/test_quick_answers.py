@@ -20,6 +20,7 @@ COMMANDS = (
 )
 
 WRONG: list[tuple[list[str], str]] = [
+    (["optimise"], "there is no command 'optimise'. Did you mean 'optimize'?"),
     (["optimize"], "PATH"),
     (["optimize", "sequence.toml", "--seed", "many"], "--seed"),
     (["evaluate", "sequence.toml", "--solver", "newton"], "--solver"),
@@ -43,70 +44,43 @@ WRONG: list[tuple[list[str], str]] = [
 ]
 
 
-def _answer(*arguments: str) -> tuple[int, str, set[str]]:
-    """Exit status, what was printed, and all modules that were imported."""
-    command = [sys.executable, "-X", "importtime", "-m", "carts_core.cli", *arguments]
-    finished = subprocess.run(command, capture_output=True, text=True, check=False)
-    lines = finished.stderr.splitlines()
-    modules = {line.rpartition("|")[2].strip() for line in lines if line.startswith("import time:")}
-    errors = [line for line in lines if not line.startswith("import time:")]
-    assert "carts_core.cli" in modules or "carts_core.cli.optimize" in modules
-    return finished.returncode, " ".join((finished.stdout + "\n".join(errors)).split()), modules
-
-
 _ANSWER_EACH = """
 import contextlib, io, json, sys
 from carts_core.cli.command_line import main
 
 for arguments in json.load(sys.stdin):
-    said, status = io.StringIO(), None
+    said, status = io.StringIO(), 0
     with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
         try:
             main(arguments)
         except SystemExit as end:
-            status = end.code
+            status = end.code or 0
     print(json.dumps([status, " ".join(said.getvalue().split()), list(sys.modules)]))
 """
 
 
 def _answers(every: list[list[str]]) -> list[tuple[int, str, set[str]]]:
-    """The same of one process that is asked for one after another: starting one takes longer than the answer."""
+    """Status, output in one line, and imported modules after each of these commands, in one new process."""
     finished = subprocess.run(
-        [sys.executable, "-c", _ANSWER_EACH],
-        input=json.dumps(every),
-        capture_output=True,
-        text=True,
-        check=True,
+        [sys.executable, "-c", _ANSWER_EACH], input=json.dumps(every), capture_output=True, text=True, check=True
     )
     found = [json.loads(line) for line in finished.stdout.splitlines()]
     assert len(found) == len(every)
-    return [(status, text, set(modules)) for status, text, modules in found]
+    return [(status, " ".join(text.replace("│", " ").split()), set(modules)) for status, text, modules in found]
 
 
-def test_help_is_given_without_heavy_imports() -> None:
-    status, text, modules = _answer("--help")
-    assert status == 0 and "usage: carts" in text and not HEAVY & modules and all(name in text for name in COMMANDS)
-    for name, (status, text, modules) in zip(COMMANDS, _answers([[name, "--help"] for name in COMMANDS]), strict=True):
-        assert (status, HEAVY & modules) == (0, set()), name
-        assert f"usage: carts {name}" in text
-        if name in ("optimize", "evaluate", "render"):
-            said = " ".join(text.replace("│", " ").split())
-            assert "from the true joint positions, if known" in said, name
-
-
-def test_a_wrong_argument_is_reported_without_heavy_imports() -> None:
-    status, text, modules = _answer("optimise")
-    assert status == BAD_INPUT and "there is no command 'optimise'. Did you mean 'optimize'?" in text
-    assert not HEAVY & modules
-    for (arguments, message), found in zip(WRONG, _answers([arguments for arguments, _ in WRONG]), strict=True):
+def test_help_version_and_wrong_arguments_are_answered_without_heavy_imports() -> None:
+    asked = [(["--help"], 0, "usage: carts"), (["--version"], 0, f"carts {version('carts')}")]
+    asked += [([name, "--help"], 0, f"usage: carts {name}") for name in COMMANDS]
+    asked += [(arguments, BAD_INPUT, message) for arguments, message in WRONG]
+    for (arguments, expected, message), found in zip(asked, _answers([each for each, _, _ in asked]), strict=True):
         status, text, modules = found
-        assert (status, HEAVY & modules) == (BAD_INPUT, set()), arguments
-        assert message in " ".join(text.replace("│", " ").split())
-
-
-def test_the_version_is_told_without_heavy_imports() -> None:
-    status, text, modules = _answer("--version")
-    assert (status, text) == (0, f"carts {version('carts')}") and not HEAVY & modules
+        assert (status, HEAVY & modules) == (expected, set()), arguments
+        assert message in text, arguments
+        if arguments == ["--help"]:
+            assert all(name in text for name in COMMANDS)
+        if arguments in (["optimize", "--help"], ["evaluate", "--help"], ["render", "--help"]):
+            assert "from the true joint positions, if known" in text
 
 
 @pytest.mark.parametrize("arguments", [["optimize", "--help"], ["optimise"]])

@@ -17,6 +17,7 @@ from viewer_tab import OpenViewer, widget
 from waiting import eventually
 
 from carts_core.errors import CartsError
+from carts_core.networks.weights import read_weights, save_weights
 from carts_core.project import ReviewState, Source
 from carts_core.project.identity import data_dir
 from carts_core.resources import shipped_weights
@@ -313,9 +314,34 @@ def test_a_damaged_choice_is_kept_and_the_first_network_runs(planted: Path, cont
     assert file.with_name("work_network.json.damaged-1").read_text() == content and not file.exists()
 
 
+TRAINING = """#!{python} -S
+import json, pathlib, shutil, sys, time
+folder = pathlib.Path(sys.argv[4])
+checkpoint = folder / "checkpoint.safetensors"
+print("step 0", flush=True)
+if checkpoint.exists():
+    shutil.copy(pathlib.Path(__file__).with_name("adapted.safetensors"), folder / "surface.safetensors")
+    (folder / "report").mkdir()
+    (folder / "report" / "fits.json").write_text(json.dumps({{"worse": [], "gain": "Dice 0.9, remaining error 1"}}))
+else:
+    folder.mkdir(exist_ok=True)
+    checkpoint.touch()
+    time.sleep(1000)
+"""
+"""Stands for `carts train`: leaves a checkpoint at first, and a network when it is run again."""
+
+
+@pytest.mark.parametrize("real", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_training_that_is_cancelled_goes_on_in_its_folder_and_its_network_is_used_and_remembered(
-    at_desk: Desk, monkeypatch: pytest.MonkeyPatch
+    at_desk: Desk, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, real: bool
 ) -> None:
+    if not real:
+        stand_in, weights = tmp_path / "training", read_weights(shipped_weights()[1])
+        next(weights.network.parameters()).data.mul_(1.001)
+        save_weights(weights.network, tmp_path / "adapted.safetensors", {}, weights.working_size)
+        stand_in.write_text(TRAINING.format(python=sys.executable))
+        stand_in.chmod(0o700)
+        monkeypatch.setattr(sys, "executable", str(stand_in))
     monkeypatch.setattr(work, "OPTIONS", ("--steps", "100000", "--checkpoint-every", "1", *SMALL[2:]))
     trainings: list[subprocess.Popen] = []
     popen = subprocess.Popen
@@ -380,6 +406,7 @@ def test_an_adapted_network_is_offered_and_used_by_a_button(open_viewer: OpenVie
         assert app.wait_until_shown().network == "Adapted 1" and not offered.visible
 
 
+@pytest.mark.slow
 def test_a_program_that_ends_while_it_trains_does_not_hang(tiny_sequence: Callable[..., Path], tmp_path: Path) -> None:
     program = (
         "import pathlib, sys; from carts_viewer.jobs.work import adapt\n"

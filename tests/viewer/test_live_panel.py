@@ -3,7 +3,6 @@
 import shutil
 import socket
 from collections.abc import Iterator
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -22,9 +21,9 @@ SECONDS = 120.0
 """For the networks to be there, on a busy machine."""
 
 
-@pytest.fixture
-def app(tmp_path: Path) -> Iterator[ViewerApp]:
-    folder = tmp_path / "recording"
+@pytest.fixture(scope="module")
+def app(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ViewerApp]:
+    folder = tmp_path_factory.mktemp("live") / "recording"
     shutil.copytree(sample_sequence().parent, folder)
     # Without times of its images, a replay has a field for their rate.
     lines = (folder / "sequence.toml").read_text().splitlines()

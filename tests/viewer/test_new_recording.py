@@ -2,7 +2,6 @@
 
 import csv
 import shutil
-import threading
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing
 from pathlib import Path
@@ -19,12 +18,10 @@ from carts_core.evaluation.evaluate import dice
 from carts_core.model.camera import HALF_PIXEL
 from carts_core.model.psm_kinematics import JOINT_NAMES
 from carts_core.model.scene import Scene
-from carts_core.optimization import CalibrationOptimizer
 from carts_core.project.identity import data_dir
 from carts_core.recording import Sequence
 from carts_core.rendering import Renderer
 from carts_viewer.start.site import Site
-from carts_viewer.wizard.calibration import CalibrationJob
 from carts_viewer.wizard.wizard import RecordingWizard
 
 pytestmark = pytest.mark.browser
@@ -71,10 +68,7 @@ def click_what_is_asked_for(visitor: Visitor, scene: Scene, measured: dict[str, 
 
 
 def test_two_folders_a_table_and_calibrations_become_a_sequence_with_its_arm_in_place(
-    tiny_sequence: Callable[..., Path],
-    tmp_path: Path,
-    visit: Callable[[Path], Visitor],
-    monkeypatch: pytest.MonkeyPatch,
+    tiny_sequence: Callable[..., Path], tmp_path: Path, visit: Callable[[Path], Visitor]
 ) -> None:
     made = Sequence.open(tiny_sequence(frames=8, cameras=("left", "right"), width=320, height=240))
     assert made.truth is not None
@@ -103,18 +97,6 @@ def test_two_folders_a_table_and_calibrations_become_a_sequence_with_its_arm_in_
     visitor.press("Continue day 3")
     visitor.reads("Click the shaft edge")
     click_what_is_asked_for(visitor, made.scene, true, 0.5)
-    # After its first step it waits to be stopped, however slow the browser is.
-    stopped, cancel, step = threading.Event(), CalibrationJob.cancel, CalibrationOptimizer.step
-    monkeypatch.setattr(CalibrationJob, "cancel", lambda job: (cancel(job), stopped.set()))
-    monkeypatch.setattr(
-        CalibrationOptimizer,
-        "step",
-        lambda optimizer: (bool(optimizer.history) and stopped.wait(120), step(optimizer))[1],
-    )
-    visitor.press("Calibrate")
-    visitor.reads("Stage 1 of", 120)
-    visitor.press("Stop")
-    visitor.reads("Stopped; the calibration from your points is unchanged.", 120)
     visitor.press("Save and open")
     app = eventually(lambda: visitor.site.app, lambda now: now is not None, 120)
     assert app is not None
@@ -131,10 +113,10 @@ def test_two_folders_a_table_and_calibrations_become_a_sequence_with_its_arm_in_
 
 
 def agreement(found: Scene, truth: Sequence, camera: str) -> float:
-    """Mean Dice of rendered masks of two calibrations over all frames."""
+    """Mean Dice of rendered masks of two calibrations over every third frame."""
     renderers = [Renderer(scene, cameras=[camera]) for scene in (found, truth.scene)]
     scores = []
-    for index in range(len(truth)):
+    for index in range(0, len(truth), 3):
         joints = {arm: rows[index] for arm, rows in (truth.truth or {}).items()}
         masks = [
             renderer.segment(scene.state(joints))[0] >= 0

@@ -54,12 +54,41 @@ def check_note(tab: Tab) -> None:
     note.locator("button").dispatch_event("click")
 
 
+def check_tour(tab: Tab) -> None:
+    """The tour is offered until it is answered, and can be left at any time."""
+    page, stored = tab.page, "localStorage.getItem('carts-tour')"
+    offer, card = page.locator(".carts-offer"), page.get_by_role("dialog", name="Tour")
+    expect(offer).to_be_visible()
+    assert page.evaluate(stored) is None
+    page.get_by_role("button", name="No tour").click()
+    page.evaluate("carts.offerTour()")
+    expect(offer).to_have_count(0)
+    assert page.evaluate(stored) == "declined"
+    page.evaluate("localStorage.removeItem('carts-tour'); carts.offerTour()")
+    tab.open("Paint")
+    expect(page.get_by_role("button", name="Polygon", exact=True)).to_be_visible()
+    scrolled = "[...document.querySelectorAll('.mantine-ScrollArea-viewport')].map((one) => one.scrollTop)"
+    before = page.evaluate(scrolled)
+    page.get_by_role("button", name="Take the tour").click()
+    titles = go_through_the_tour(page, (1280, 800))
+    assert len(set(titles)) == 9 and titles[0] == "The picture" and page.evaluate(stored) == "begun"
+    assert page.evaluate(scrolled) == before
+    tab.press("?")
+    page.get_by_role("button", name="Take the tour").click()
+    tab.press("ArrowRight")
+    expect(card).to_contain_text("The verdict")
+    tab.press("Escape")
+    expect(card).to_have_count(0)
+    expect(page.locator(".carts-tour-frame")).to_have_count(0)
+
+
 def test_every_text_of_a_desktop_page_is_whole_legible_and_explained(open_tab: OpenTab) -> None:
-    tab = open_tab(window=(1280, 800), cameras=("left", "right"), domains=("regular", "smoke"), width=160, height=120)
+    cameras, domains = ("left", "right"), ("regular", "smoke")
+    tab = open_tab(window=(1280, 800), new=True, cameras=cameras, domains=domains, width=160, height=120)
     page = tab.page
+    check_tour(tab)
     check_note(tab)
     tab.put(intents.Perturb(2.0, 0), intents.SetRange((0, 1)), intents.Export("csv", "All"))
-    tab.open("Paint")
     for scheme in ("dark", "light"):
         expect(page.locator(f"html[data-mantine-color-scheme={scheme}]")).to_have_count(1)
         look_into_tabs(tab, folders=scheme == "dark")
@@ -73,15 +102,12 @@ def test_every_text_of_a_desktop_page_is_whole_legible_and_explained(open_tab: O
     assert len(tab.view.page.widgets()) > 120 and explain(tab.view.page) == []
     joint = tab.slider("PSM1", 0)
     assert joint.hint is not None and "[°], limits" in joint.hint
-    for name in ("Run", "Pause"):
-        page.mouse.move(640, 5)
-        page.get_by_role("button", name=name, exact=True).hover(force=True)
-        expect(page.get_by_role("button", name=name, exact=True)).to_have_attribute("title", HINTS[name])
-    for handle in (joint, tab.find("Seed")):
-        expect(page.locator(f"label[for='{tab.app.page.element_id(handle)}']")).to_have_attribute("title", handle.hint)
-        page.locator(tab.element(handle)).first.hover(force=True)
-        expect(page.get_by_role("tooltip").filter(has_text=handle.hint)).to_be_visible()
-        page.mouse.move(640, 5)
+    page.get_by_role("button", name="Pause", exact=True).hover(force=True)
+    expect(page.get_by_role("button", name="Pause", exact=True)).to_have_attribute("title", HINTS["Pause"])
+    expect(page.locator(f"label[for='{tab.app.page.element_id(joint)}']")).to_have_attribute("title", joint.hint)
+    page.locator(tab.element(joint)).first.hover(force=True)
+    expect(page.get_by_role("tooltip").filter(has_text=joint.hint)).to_be_visible()
+    page.mouse.move(640, 5)
     bare = "button:not([title]):not([aria-label]), select:not([title])"
     for bar in (".carts-bar", ".carts-strip"):
         assert page.locator(bar).locator(bare).count() == 0
@@ -95,18 +121,6 @@ def test_every_text_of_a_desktop_page_is_whole_legible_and_explained(open_tab: O
         return box is not None and box["x"] >= canvas["x"] and box["y"] >= tools["y"] + tools["height"] - 1
 
     eventually(in_view)
-    # The palette names the keys that the page listens to itself.
-    tab.press("Control+k")
-    page.keyboard.type("range at this")
-    found = page.locator("[class*=Spotlight-action]").filter(has_text="Begin the range at this frame")
-    expect(found.first).to_contain_text("(")
-    tab.press("Escape")
-    # What is cut off is found.
-    page.add_style_tag(content=".mantine-Slider-root + .mantine-NumberInput-root { width: 1.2rem !important }")
-    page.add_style_tag(content=".carts-caption { white-space: nowrap !important }")
-    lines = cut_off(page)
-    assert any("INPUT" in line and "too narrow" in line for line in lines)
-    assert any("outside of" in line for line in lines)
 
 
 _SHOW_CLOSE_POINTS = """() => {
@@ -167,39 +181,8 @@ def test_a_phone_shows_what_reading_and_reviewing_needs_and_the_rest_in_a_sheet(
     eventually(lambda: cut_off(page), lambda cut: not cut)
 
 
-def test_the_tour_is_offered_until_it_is_answered_and_can_be_left_at_any_time(open_tab: OpenTab) -> None:
-    tab = open_tab(window=(1280, 800), new=True, width=160, height=120)
-    page, stored = tab.page, "localStorage.getItem('carts-tour')"
-    offer, card = page.locator(".carts-offer"), page.get_by_role("dialog", name="Tour")
-    expect(offer).to_be_visible()
-    assert page.evaluate(stored) is None
-    page.get_by_role("button", name="No tour").click()
-    page.evaluate("carts.offerTour()")
-    expect(offer).to_have_count(0)
-    assert page.evaluate(stored) == "declined"
-    page.evaluate("localStorage.removeItem('carts-tour')")
-    page.evaluate("carts.offerTour()")
-    tab.open("Paint")
-    expect(page.get_by_role("button", name="Polygon", exact=True)).to_be_visible()
-    scrolled = "[...document.querySelectorAll('.mantine-ScrollArea-viewport')].map((one) => one.scrollTop)"
-    before = page.evaluate(scrolled)
-    page.get_by_role("button", name="Take the tour").click()
-    titles = go_through_the_tour(page, (1280, 800))
-    assert len(set(titles)) == 9 and titles[0] == "The picture" and page.evaluate(stored) == "begun"
-    assert page.evaluate(scrolled) == before
-    page.evaluate("carts.offerTour()")
-    expect(offer).to_have_count(0)
-    tab.press("?")
-    page.get_by_role("button", name="Take the tour").click()
-    tab.press("ArrowRight")
-    expect(card).to_contain_text("The verdict")
-    tab.press("Escape")
-    expect(card).to_have_count(0)
-    expect(page.locator(".carts-tour-frame")).to_have_count(0)
-
-
-def test_keys_do_what_their_sheet_says(open_tab: OpenTab) -> None:
-    tab = open_tab(masks=False)
+def check_keys(tab: Tab) -> None:
+    """Keys do what their sheet says."""
     app, page = tab.app, tab.page
     tab.press("?")
     expect(page.get_by_role("dialog", name="Keys")).to_contain_text("Accept, and go to the next")
@@ -230,10 +213,12 @@ def test_keys_do_what_their_sheet_says(open_tab: OpenTab) -> None:
         eventually(check)
 
 
-def test_fields_lists_and_errors_leave_the_page_usable_and_no_other_host_is_asked(open_tab: OpenTab) -> None:
+def test_keys_fields_lists_and_errors_leave_the_page_usable_and_no_other_host_is_asked(open_tab: OpenTab) -> None:
     asked: list[str] = []
-    tab = open_tab(asked=asked, frames=12, domains=("regular", "smoke"), width=160, height=120)
+    tab = open_tab(asked=asked, frames=12, domains=("regular", "smoke"), width=160, height=120, masks=False)
+    check_keys(tab)
     app, page, slider = tab.app, tab.page, tab.slider("PSM1", 0)
+    tab.put(intents.DismissError(), intents.GoToStep(0), intents.ShowFrame(0))
     # A slider's ends are near the joint of the shown frame; they reach as far as the joint goes, and come back.
     assert slider.max - slider.min <= 12
     tab.put(intents.ShowFrame(11))

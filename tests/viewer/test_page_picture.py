@@ -97,39 +97,8 @@ def check_slider(tab: Tab) -> None:
     eventually(lambda: (app.state.undoable, app.state.unsaved), lambda now: now == (2, False))
 
 
-def test_the_overlay_stays_on_the_frame_in_any_window_zoom_and_view(open_tab: OpenTab) -> None:
-    tab = open_tab(window=(1700, 620), marked=True)
-    canvas, mouse = tab.canvas, tab.page.mouse
-    canvas.wait_until_registered()
-    check_loupe(tab)
-    tab.page.set_viewport_size({"width": 1280, "height": 800})
-    wait_in(tab.page, "Math.abs(__viserMutable.canvas.getBoundingClientRect().bottom - innerHeight) < 2")
-    canvas.wait_until_registered()
-    # The wheel zooms about the pointer.
-    before, box = canvas.where(), box_of(tab.page.locator("canvas"))
-    mouse.move(640, 400)
-    mouse.wheel(0, -400)
-    after = canvas.where(lambda map_: map_[0, 0] > 1.7 * before[0, 0])
-    pointer = np.array([640 - box["x"], 400 - box["y"]])
-    image = np.linalg.solve(before[:, :2], pointer - before[:, 2])
-    assert after @ [*image, 1.0] == pytest.approx(pointer, abs=2.0)
-    tab.drag((640, 400), (670, 415))
-    dragged = canvas.where(lambda map_: abs(map_[0, 2] - after[0, 2]) > 25)
-    assert dragged[:, 2] - after[:, 2] == pytest.approx([30, 15], abs=2.0)
-    canvas.wait_until_registered()
-    straight = canvas.screenshot()
-    tab.button("3D view")
-    eventually(canvas.screenshot, lambda image: np.abs(image.astype(int) - straight).mean() > 5)
-    tab.drag((640, 400), (740, 440), steps=5)
-    tab.button("Endoscope view")
-    canvas.wait_until_registered()
-    # In the endoscope view, a drag does not turn the camera.
-    tab.drag((640, 400), (740, 440), steps=5)
-    canvas.wait_until_registered()
-
-
-def test_the_3d_view_shows_the_whole_arms_with_grid_axes_and_the_measured_arms(open_tab: OpenTab) -> None:
-    tab = open_tab(window=(1280, 800), width=160, height=120)
+def check_3d_view(tab: Tab) -> None:
+    """The 3D view shows the whole arms with grid, axes and the measured arms."""
     tab.put(intents.Perturb(6.0, 0))
     tab.press("v")
     wait_in(tab.page, "!carts.view.endoscope")
@@ -152,20 +121,16 @@ def test_the_3d_view_shows_the_whole_arms_with_grid_axes_and_the_measured_arms(o
     eventually(moved_away)
     tab.page.get_by_role("button", name="Fit", exact=True).click()
     eventually(seen_whole)
+    # Grid and measured arms are seen: the picture changes once the camera has stopped moving.
+    pictures = [tab.canvas.screenshot().astype(int)]
 
-    def at_rest() -> np.ndarray:
-        """The picture once the camera has stopped moving."""
-        pictures = [tab.canvas.screenshot().astype(int)]
-
-        def still() -> bool:
-            pictures.append(tab.canvas.screenshot().astype(int))
-            return np.array_equal(pictures[-2], pictures[-1])
-
-        eventually(still)
-        return pictures[-1]
+    def at_rest() -> bool:
+        pictures.append(tab.canvas.screenshot().astype(int))
+        return np.array_equal(pictures[-2], pictures[-1])
 
     for name in ("Grid", "Measured"):
-        before = at_rest()
+        eventually(at_rest)
+        before = pictures[-1]
         tab.page.get_by_role("button", name=name, exact=True).click()
         eventually(
             lambda before=before: (np.abs(before - tab.canvas.screenshot()).max(axis=-1) > 12).sum(),
@@ -175,6 +140,34 @@ def test_the_3d_view_shows_the_whole_arms_with_grid_axes_and_the_measured_arms(o
     assert tab.page.evaluate(axes) == 2
     tab.press("v")
     wait_in(tab.page, "carts.imageOnScreen() !== null")
+    tab.put(intents.Undo())
+
+
+def test_the_overlay_stays_on_the_frame_in_any_window_zoom_and_view(open_tab: OpenTab) -> None:
+    tab = open_tab(window=(1700, 620), marked=True)
+    canvas, mouse = tab.canvas, tab.page.mouse
+    canvas.wait_until_registered()
+    check_loupe(tab)
+    tab.page.set_viewport_size({"width": 1280, "height": 800})
+    wait_in(tab.page, "Math.abs(__viserMutable.canvas.getBoundingClientRect().bottom - innerHeight) < 2")
+    canvas.wait_until_registered()
+    # The wheel zooms about the pointer.
+    before, box = canvas.where(), box_of(tab.page.locator("canvas"))
+    mouse.move(640, 400)
+    mouse.wheel(0, -400)
+    after = canvas.where(lambda map_: map_[0, 0] > 1.7 * before[0, 0])
+    pointer = np.array([640 - box["x"], 400 - box["y"]])
+    image = np.linalg.solve(before[:, :2], pointer - before[:, 2])
+    assert after @ [*image, 1.0] == pytest.approx(pointer, abs=2.0)
+    tab.drag((640, 400), (670, 415))
+    dragged = canvas.where(lambda map_: abs(map_[0, 2] - after[0, 2]) > 25)
+    assert dragged[:, 2] - after[:, 2] == pytest.approx([30, 15], abs=2.0)
+    canvas.wait_until_registered()
+    # In the endoscope view, a drag does not rotate the camera.
+    tab.drag((640, 400), (740, 440), steps=5)
+    canvas.wait_until_registered()
+    check_3d_view(tab)
+    canvas.wait_until_registered()
 
 
 def test_sliders_keypoints_and_links_are_dragged_and_each_drag_is_one_step(open_tab: OpenTab) -> None:

@@ -5,15 +5,13 @@ import json
 import re
 import threading
 import zipfile
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from playwright.sync_api import expect
-from test_exchange import write_theirs
-from viewer_tab import OpenTab, Tab, box_of, decoded, run_without_end
+from viewer_tab import OpenTab, box_of, decoded, run_without_end
 from waiting import eventually, wait_in
 
 from carts_core.export.formats import FORMATS
@@ -23,7 +21,6 @@ from carts_viewer.actions import intents
 from carts_viewer.actions.sequence import PropagatingHandler
 from carts_viewer.app import ViewerApp
 from carts_viewer.jobs.job_list import JobState
-from carts_viewer.picture.layers import Layer
 from carts_viewer.picture.overlay import OverlayRenderer
 from carts_viewer.state import Phase
 
@@ -137,55 +134,28 @@ def test_exports_are_downloaded_written_beside_the_project_and_cancelled(
     assert {entry.name for entry in path.parent.iterdir()} == {"masks", "coco"}
 
 
-@pytest.fixture
-def prepared(monkeypatch: pytest.MonkeyPatch) -> Iterator[list]:
-    """Has the preparation of solving wait for an event and then fail, for each of these pairs in turn."""
-    pairs, make = [], PropagatingHandler._make
-
-    def slowly(*arguments):
-        if pairs:
-            go_on, error = pairs.pop(0)
-            assert go_on.wait(60)
-            if error is not None:
-                raise error
-        return make(*arguments)
-
-    monkeypatch.setattr(PropagatingHandler, "_make", slowly)
-    yield pairs
-    for go_on, _ in pairs:
-        go_on.set()
-
-
-def check_that_a_failing_start_is_shown(tab: Tab, prepared: list) -> None:
-    """What solving needs is not there yet, and will not be."""
-    stop, solve = (tab.page.get_by_role("button", name=name, exact=True) for name in ("Stop and keep", "Solve all"))
-    go_on = threading.Event()
-    prepared.append((go_on, OSError("The disk is gone.")))
-    tab.button("Solve all")
-    expect(tab.page.get_by_text("Preparing", exact=True)).to_be_visible()
-    expect(solve).to_be_disabled()
-    expect(stop).to_be_visible()
-    go_on.set()
-    expect(tab.page.get_by_text("The disk is gone").first).to_be_visible()
-    expect(solve).to_be_enabled()
-    tab.put(intents.DismissError())
-
-
 def test_frames_are_solved_while_the_page_stays_live_and_a_suspected_calibration_is_corrected(
-    open_tab: OpenTab, monkeypatch: pytest.MonkeyPatch, prepared: list
+    open_tab: OpenTab, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     tab = open_tab(frames=4, width=160, height=120)
     app = tab.app
-    stop = tab.page.get_by_role("button", name="Stop and keep", exact=True)
+    stop, solve = (tab.page.get_by_role("button", name=name, exact=True) for name in ("Stop and keep", "Solve all"))
+    go_on, make = threading.Event(), PropagatingHandler._make
+
+    def slowly(*arguments):
+        assert go_on.wait(60)
+        return make(*arguments)
+
+    monkeypatch.setattr(PropagatingHandler, "_make", slowly)
     tab.open("Review")
-    check_that_a_failing_start_is_shown(tab, prepared)
     tab.press("k")
     expect(tab.page.get_by_text("001 to 004")).to_be_visible()
     tab.put(intents.MoveFrame(1))
     expect(tab.page.get_by_text("3 frames would be fitted, 1 kept")).to_be_visible()
-    go_on = threading.Event()
-    prepared.append((go_on, None))
     tab.button("Solve between")
+    expect(tab.page.get_by_text("Preparing", exact=True)).to_be_visible()
+    expect(solve).to_be_disabled()
+    expect(stop).to_be_visible()
     tab.press("n")
     go_on.set()
     wait_in(tab.page, "carts.timeline().solving?.[1] === 4")
@@ -195,16 +165,8 @@ def test_frames_are_solved_while_the_page_stays_live_and_a_suspected_calibration
     sources = "[...Array(4).keys()].map((frame) => (carts.timeline().code(frame) >> 5) & 3)"
     eventually(lambda: tab.page.evaluate(sources), lambda codes: codes[1:] == [3] * 3)
     assert not app.state.project.joints(0) and all(app.state.project.joints(frame) for frame in range(1, 4))
-    steps = app.state.undoable
-    tab.press("Control+z")
-    eventually(lambda: app.state.project.joints(3), lambda joints: not joints)
-    monkeypatch.setattr(SequenceOptimizer, "base_frame_gain", lambda self: 0.4)
-    tab.button("Solve all")
-    eventually(lambda: app.state.solve, lambda solve: solve is not None and solve.running and solve.done >= 1)
-    tab.button("Stop and keep")
-    expect(tab.page.get_by_text("Stopped: ")).to_be_visible()
-    assert app.state.undoable == steps and app.state.project.joints(1)
     expect(tab.page.get_by_text("The calibration may be wrong")).to_have_count(0)
+    monkeypatch.setattr(SequenceOptimizer, "base_frame_gain", lambda self: 0.4)
     tab.button("Solve all")
     expect(tab.page.get_by_text("The calibration may be wrong")).to_be_visible(timeout=120_000)
     tab.button("Calibrate on 4 frames")
@@ -212,12 +174,6 @@ def test_frames_are_solved_while_the_page_stays_live_and_a_suspected_calibration
     expect(said.locator("visible=true")).to_have_count(1, timeout=120_000)
     expect(said.locator("visible=true")).to_contain_text("Moved: T_world_base of PSM1 by ")
     expect(tab.page.get_by_text("The calibration may be wrong")).to_have_count(0)
-    # Where jobs are, frames are solved again, too.
-    tab.open("Jobs")
-    tab.button("Solve all")
-    jobs = eventually(lambda: app.state.jobs, lambda jobs: jobs[-1].kind == "solve" and jobs[-1].over, timeout=120)
-    assert [job.kind for job in jobs][-2:] == ["calibrate", "solve"]
-    expect(tab.page.get_by_role("button", name="Solve all", exact=True)).to_have_count(0)
 
 
 def test_a_range_is_what_is_solved_exported_and_queued(open_tab: OpenTab) -> None:
@@ -336,24 +292,3 @@ def test_a_review_is_saved_as_the_page_says_under_the_name_that_was_typed(open_t
         project = again.state
     assert (project.review(0).state, project.review(0).note) == ("needs work", "smoke on the left")
     assert project.review(1).state == "accepted" and len(project.steps) == 3
-
-
-def test_masks_of_others_are_imported_shown_and_fitted(open_tab: OpenTab) -> None:
-    tab = open_tab(prepare=write_theirs, frames=3, masks=False)
-    app = tab.app
-    expect(tab.page.get_by_text("Mask source", exact=True)).to_have_count(0)
-    tab.choose("Fit to", "Masks")
-    tab.choose("Mask source", "Imported")
-    eventually(lambda: (app.state.observed.what, app.state.observed.masks), lambda now: now == ("masks", "imported"))
-    tab.open("Review", "Import")
-    label = tab.page.locator(f"label[for='{app.page.element_id(tab.find('From'))}']")
-    field = label.locator("xpath=ancestor::div[1]/following-sibling::div//input")
-    field.fill("theirs.json")
-    field.press("Tab")
-    eventually(lambda: tab.find("From").value, lambda value: value == "theirs.json")
-    tab.button("Import masks")
-    tab.page.get_by_text("Imported 2 masks and keypoints of 2 images from COCO (grasper).").wait_for()
-    tab.page.locator(".carts-legend").get_by_text("grasper").wait_for()
-    assert app.state.layer is Layer.IMPORTED
-    tab.button("Undo")
-    tab.page.get_by_text("Nothing was imported yet.").wait_for()

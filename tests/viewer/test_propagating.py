@@ -24,6 +24,7 @@ from carts_core.project import (
     Source,
 )
 from carts_viewer.actions import intents
+from carts_viewer.actions.sequence import PropagatingHandler
 from carts_viewer.panels.sequence import calibration_line
 
 FRAMES = 5
@@ -105,49 +106,36 @@ def test_between_keyframes_is_inside_the_range_where_the_frame_lies_in_one(desk:
     assert sources(desk) == [None, None, Source.PROPAGATED, Source.PROPAGATED, None]
 
 
-def test_solving_backwards_begins_at_the_last_frame(desk: Desk) -> None:
+def test_solving_backwards_begins_at_the_last_frame_and_stopping_keeps_what_is_solved_as_one_step(desk: Desk) -> None:
     hand_made(desk, 0)
     desk.do(intents.SetDirection("backward"), intents.ShowFrame(2), intents.Solve())
-    solve_some(desk, 1)
-    desk.do(intents.StopSolving())
-    assert sources(desk) == [Source.HAND, None, None, None, Source.PROPAGATED]
-
-
-def test_stopping_keeps_what_is_solved_as_one_step(desk: Desk) -> None:
-    desk.do(intents.Solve(whole=True))
     solve_some(desk, 2)
     state = desk.do(intents.StopSolving())
     assert not state.solving and state.solve is not None and state.solve.text.startswith("Stopped: 2 frames solved")
-    assert sources(desk) == [Source.PROPAGATED, Source.PROPAGATED, None, None, None] and state.undoable == 1
+    assert sources(desk) == [Source.HAND, None, None, Source.PROPAGATED, Source.PROPAGATED] and state.undoable == 2
     assert desk.wait_time() is None
 
 
-def test_a_frame_that_is_made_by_hand_meanwhile_is_not_overwritten(desk: Desk) -> None:
-    desk.do(intents.Solve(whole=True))
-    solve_some(desk, 1)
-    kept = hand_made(desk, 1)
-    desk.finish()
-    assert sources(desk) == [Source.PROPAGATED, Source.HAND, *[Source.PROPAGATED] * 3]
-    assert desk.saved.joints(1)["PSM1"].joint_positions[0] == kept[1]
-
-
-def test_a_frame_that_a_person_freed_is_solved_although_it_was_made_by_hand(desk: Desk) -> None:
+def test_a_freed_frame_is_solved_and_one_that_is_made_by_hand_meanwhile_is_not_overwritten(desk: Desk) -> None:
     hand_made(desk, 0, 1)
     desk.do(intents.HoldKeyframe(False))
     assert desk.saved.get(Key.keyframe(1)) == Keyframe(False)
     desk.do(intents.HoldKeyframe(), intents.HoldKeyframe(), intents.Solve())
+    solve_some(desk, 1)
+    kept = hand_made(desk, 2)
     desk.finish()
-    assert sources(desk) == [Source.HAND, *[Source.PROPAGATED] * 4]
+    assert sources(desk) == [Source.HAND, Source.PROPAGATED, Source.HAND, *[Source.PROPAGATED] * 2]
+    assert desk.saved.joints(2)["PSM1"].joint_positions[0] == kept[2]
 
 
 def test_ignored_pixels_are_not_looked_at(desk: Desk) -> None:
     project = desk.session.editor.project
     everything = np.ones((96, 128), bool)
-    project.apply("Ignore", {Key.ignore_region(frame, "left"): IgnoreRegion.of(everything) for frame in range(FRAMES)})
-    desk.do(intents.Solve(whole=True))
+    project.apply("Ignore", {Key.ignore_region(frame, "left"): IgnoreRegion.of(everything) for frame in range(2)})
+    desk.do(intents.SetRange((0, 1)), intents.Solve(whole=True))
     desk.finish()
-    measured = desk.session.sequence.measured["PSM1"]
-    solved = [desk.saved.joints(frame)["PSM1"].joint_positions for frame in range(FRAMES)]
+    measured = desk.session.sequence.measured["PSM1"][:2]
+    solved = [desk.saved.joints(frame)["PSM1"].joint_positions for frame in range(2)]
     assert np.abs(np.array(solved) - measured).max() < 1e-6
 
 
@@ -160,6 +148,16 @@ def test_an_image_that_is_missing_does_not_cost_the_frames_before_it(recording: 
     assert sources(desk) == [*[Source.PROPAGATED] * 4, None] and not desk.state.solving
 
 
+def test_an_error_before_the_first_frame_leaves_nothing_solved(desk: Desk, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_: object) -> None:
+        raise OSError("The disk is gone.")
+
+    monkeypatch.setattr(PropagatingHandler, "_make", fail)
+    with pytest.raises(OSError, match="The disk is gone"):
+        desk.do(intents.Solve(whole=True))
+    assert not desk.state.solving and desk.wait_time() is None and sources(desk) == [None] * FRAMES
+
+
 def test_an_error_of_something_else_does_not_cost_what_is_solved(desk: Desk) -> None:
     desk.do(intents.Solve(whole=True))
     solve_some(desk, 1)
@@ -168,22 +166,11 @@ def test_an_error_of_something_else_does_not_cost_what_is_solved(desk: Desk) -> 
     assert desk.state.error == "the export failed"
 
 
-@pytest.mark.parametrize(
-    ("before", "message"),
-    [
-        ((), "no keyframe yet"),
-        ((intents.SetSetting("solver", "acs"), intents.HoldKeyframe(True)), "requires the solver"),
-    ],
-)
-def test_what_cannot_be_solved_is_refused_with_the_reason(
-    desk: Desk, before: tuple[intents.Intent, ...], message: str
-) -> None:
-    desk.do(*before)
-    with pytest.raises(CartsError, match=message):
+def test_what_cannot_be_solved_is_refused_with_the_reason(desk: Desk) -> None:
+    with pytest.raises(CartsError, match="no keyframe yet"):
         desk.do(intents.Solve())
-
-
-def test_a_project_that_takes_no_edits_is_not_solved(desk: Desk) -> None:
+    with pytest.raises(CartsError, match="requires the solver"):
+        desk.do(intents.SetSetting("solver", "acs"), intents.HoldKeyframe(True), intents.Solve())
     with pytest.raises(ProjectError, match="could not be saved"):
         desk.reopened(read_only=True).do(intents.Solve(whole=True))
 
@@ -204,10 +191,10 @@ def test_dice_of_a_solved_frame_is_that_of_its_corrected_mask(desk: Desk) -> Non
     project = desk.session.editor.project
     everything, nothing = np.ones((96, 128), bool), np.zeros((96, 128), bool)
     project.apply("Add to the mask", {Key.mask_correction(1, "left"): MaskCorrection.of(everything, nothing)})
-    desk.do(intents.Solve(whole=True))
+    desk.do(intents.SetRange((0, 2)), intents.Solve(whole=True))
     desk.finish()
     masks = desk.session.sequence.frame(1, "regular", ["left"]).masks
-    figures = [desk.saved.figures(frame) for frame in range(FRAMES)]
+    figures = [desk.saved.figures(frame) for frame in range(3)]
     assert masks is not None and all(figure is not None for figure in figures)
     found = [figure.dice for figure in figures if figure is not None]
     assert found[1] == pytest.approx(dice(everything, masks["left"]))
@@ -221,7 +208,7 @@ def test_a_suspicion_against_base_frames_is_said_when_frames_were_solved_until_t
         assert desk.state.solve is not None
         return calibration_line(desk.state.solve.suspicion(desk.state.project))
 
-    desk.do(intents.Solve(whole=True))
+    desk.do(intents.SetRange((0, 1)), intents.Solve(whole=True))
     desk.finish()
     assert desk.state.solve is not None and desk.state.solve.suspicion(desk.state.project) is not None
     assert said() == "", "the base frame is right"

@@ -26,7 +26,7 @@ from carts_core.settings.interchange import ImportOptions
 from carts_viewer.actions import intents
 from carts_viewer.start.roots import Roots
 from carts_viewer.start.site import Site
-from carts_viewer.start.start_page import StartPage, forget, recent_projects, thumbnail
+from carts_viewer.start.start_page import StartPage, recent_projects, thumbnail
 from carts_viewer.transport.document import escaped, render
 from carts_viewer.transport.events import Chosen
 from carts_viewer.wizard.draft import Draft, DraftFile, Step, delete_draft, drafts
@@ -177,16 +177,6 @@ def test_only_a_listed_recent_sequence_is_opened_by_its_card(site: Site, tiny_se
         site.post(lambda: place.choose("nonsense", "x" * 100))
         site.wait()
         assert site.app is None and site.shown is place
-
-
-def test_a_damaged_list_of_recent_sequences_is_an_empty_one(tmp_path: Path) -> None:
-    folder = data_dir() / "recent"
-    folder.mkdir(parents=True)
-    for text in ("", "[1, 2]", '{"a": 1}', '[{"sequence": 3}]', "[" * 100_000, '[{"sequence": "a", "name": 1}]'):
-        (folder / "recent.json").write_text(text)
-        assert recent_projects() == []
-    forget("x")
-    assert recent_projects() == []
 
 
 def test_a_draft_is_the_same_after_it_was_written_and_read() -> None:

@@ -7,10 +7,9 @@ from pathlib import Path
 
 import pytest
 from playwright.sync_api import Browser, expect
-from viewer_tab import OpenTab, Tab, box_of, new_context, place_of, widget
+from viewer_tab import OpenTab, Tab, new_context, place_of, widget
 from waiting import eventually, wait_in
 
-from carts_viewer import editing
 from carts_viewer.actions import intents
 from carts_viewer.app import ViewerApp
 from tools.raw_tab import RawTab
@@ -43,9 +42,7 @@ def joint_of(tab: Tab) -> float:
     return math.degrees(float(tab.state.pose.scene.joint_positions[0][0]))
 
 
-def test_tabs_have_frames_of_their_own_and_one_project_also_after_a_reload_and_a_close_in_mid_drag(
-    open_tab: OpenTab, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_tabs_have_frames_of_their_own_and_one_project_also_after_a_reload(open_tab: OpenTab) -> None:
     first = open_tab(window=WINDOW, marked=True)
     app = first.app
     second = open_tab(app, WINDOW)
@@ -63,21 +60,6 @@ def test_tabs_have_frames_of_their_own_and_one_project_also_after_a_reload_and_a
     first.wait_until_ready()
     assert first.state.index == 1 and "frame=2" in first.page.url
     shows_its_own(first)
-    # One is closed in the middle of a drag, whose edit is saved when its time is over.
-    monkeypatch.setattr(editing, "LONGEST_DRAFT", 1e6)
-    place, start = first.place_in_viewer, joint_of(first)
-    thumb = box_of(first.page.locator(f"{first.element(first.slider('PSM1', 0))} [role=slider]"))
-    x, y = thumb["x"] + thumb["width"] / 2, thumb["y"] + thumb["height"] / 2
-    first.page.mouse.move(x, y)
-    first.page.mouse.down()
-    first.page.mouse.move(x + 15, y, steps=15)
-    eventually(lambda: abs(joint_of(first) - start), lambda moved: moved > 1.0)
-    assert place.controller.state.unsaved
-    monkeypatch.setattr(editing, "LONGEST_DRAFT", 0.1)
-    first.page.close()
-    eventually(lambda: place.controller.state.unsaved, lambda unsaved: not unsaved)
-    eventually(lambda: second.state.undoable, lambda steps: steps == 2)
-    shows_its_own(second)
 
 
 def test_undo_and_redo_can_be_pressed_as_soon_as_the_other_tab_has_left(shared_viewer: ViewerApp) -> None:
