@@ -163,10 +163,10 @@ def test_the_overlay_stays_on_the_frame_in_any_window_zoom_and_view(open_tab: Op
     dragged = canvas.where(lambda map_: abs(map_[0, 2] - after[0, 2]) > 25)
     assert dragged[:, 2] - after[:, 2] == pytest.approx([30, 15], abs=2.0)
     canvas.wait_until_registered()
+    check_3d_view(tab)
+    canvas.wait_until_registered()
     # In the endoscope view, a drag does not rotate the camera.
     tab.drag((640, 400), (740, 440), steps=5)
-    canvas.wait_until_registered()
-    check_3d_view(tab)
     canvas.wait_until_registered()
 
 

@@ -1,4 +1,4 @@
-"""Nothing that a recording, a project, a batch or another site brings runs as a script in the page."""
+"""The page and its document: nothing foreign runs as a script, and user input survives updates by the server."""
 
 import http.server
 import threading
@@ -13,6 +13,7 @@ from viewer_tab import new_context
 from waiting import eventually, get, wait_in
 
 from carts_viewer.transport.document import Document
+from carts_viewer.transport.events import Chosen
 from carts_viewer.transport.page import Page
 
 pytestmark = pytest.mark.browser
@@ -146,6 +147,41 @@ def test_of_a_document_only_what_documents_are_made_of_is_shown(tab: Tab, page: 
         '<h1 class="kept">Title</h1><img><img src="/media/0a.jpg"><svg><polyline points="0,0 1,1"></polyline></svg>'
     )
     assert tab.evaluate("ran") == [] and other_site.asked == []
+    document.show("")
+
+
+def show(document: Document, step: int) -> None:
+    document.show(
+        f"<p>step {step}</p><input type='text' data-do='name' value='old'>"
+        "<button type='button' data-do='stop'>Stop</button>"
+    )
+
+
+def test_a_pressed_button_and_text_being_typed_survive_what_the_server_writes(tab: Tab, page: Page) -> None:
+    document = Document(page)
+    show(document, 1)
+    tab.get_by_text("step 1").wait_for()
+    chosen: list[tuple[str, str]] = []
+    document.page.listen(Chosen, lambda _, event: chosen.append((event.name, event.value)))
+    tab.locator("main button").hover()
+    tab.mouse.down()
+    tab.evaluate("""() => {
+        const show = carts.showDocument;
+        carts.showDocument = (...what) => { window.shown = true; show(...what); };
+    }""")
+    show(document, 2)
+    wait_in(tab, "window.shown")
+    tab.mouse.up()
+    eventually(lambda: chosen, lambda said: said == [("stop", "")])
+    tab.get_by_text("step 2").wait_for()
+    field = tab.locator("main input[data-do=name]")
+    field.focus()
+    field.press("End")
+    tab.keyboard.type(" na")
+    show(document, 4)
+    tab.get_by_text("step 4").wait_for()
+    tab.keyboard.type("me")
+    assert field.input_value() == "old name"
     document.show("")
 
 
