@@ -1,4 +1,4 @@
-"""Text of others is printed in full and cannot steer a terminal or a page."""
+"""Printing of untrusted text, and words of messages."""
 
 import io
 import logging
@@ -7,6 +7,7 @@ import pytest
 from rich.table import Table
 
 from carts_core.console import Bar, Terminal, VisibleFormatter, in_markdown, track, visible
+from carts_core.wording import closest, counted
 
 HOSTILE = "[[cameras]] 'left' [red]x[/red] :smile: [/] \x1b[2J\x9b31m\u202eabc\u2066 \r\a"
 SHOWN = "[[cameras]] 'left' [red]x[/red] :smile: [/] \\x1b[2J\\x9b31m\\u202eabc\\u2066 \\r\\x07"
@@ -63,3 +64,15 @@ def test_markdown_leaves_names_with_underscores_as_they_are():
 
 def test_markdown_has_no_markup_of_others():
     assert in_markdown("<script>| *a* [b](c) `d` \n # e") == "&lt;script>\\| \\*a\\* \\[b\\](c) \\`d\\` \\# e"
+
+
+def test_one_thing_is_not_called_by_its_plural() -> None:
+    assert [counted(number, "frame") for number in (0, 1, 2)] == ["0 frames", "1 frame", "2 frames"]
+
+
+@pytest.mark.parametrize(
+    ("name", "meant"),
+    [("psm1", "PSM1"), ("lef", "left"), ("7", "007"), ("0007", "007"), ("0", None), ("zebra", None), ("", None)],
+)
+def test_the_name_that_is_meant_is_suggested(name: str, meant: str | None) -> None:
+    assert closest(name, ["PSM1", "left", "007", "070"]) == ("" if meant is None else f" Did you mean {meant!r}?")

@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from processes import eventually
 
 from carts_core.decoders import tables
 from carts_core.files.decoding import Decoder, Limits, decoded
@@ -70,15 +69,6 @@ def test_imports_do_not_count_as_decoding(decoder: Decoder, tmp_path: Path, monk
     monkeypatch.syspath_prepend(tmp_path)
     assert decoder.call(abs, -1, limits=SMALL) == 1
     assert decoder.call(importlib.import_module("slow_to_import").answer, limits=SMALL) == 42
-
-
-def test_a_child_that_has_ended_for_lack_of_work_is_replaced():
-    decoder = Decoder(idle=0.01)
-    first = decoder.call(os.getpid, limits=SMALL)
-    # It may not have been waited for by its parent.
-    eventually(lambda: not os.path.exists(f"/proc/{first}/exe"))
-    assert decoder.call(os.getpid, limits=SMALL) != first
-    decoder.close()
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""Closed-form kinematics of the PSM against its own chain, and against the shipped robot's."""
+"""Closed-form kinematics of the PSM and the ECM."""
 
 from dataclasses import replace
 
@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from carts_core.errors import SettingsError
+from carts_core.model.ecm_kinematics import forward as ecm_forward
 from carts_core.model.psm_kinematics import CLASSIC, JOINT_NAMES, SI, forward, inverse
 
 GEOMETRIES = {"classic": CLASSIC, "Si": SI, "classic ProGrasp": replace(CLASSIC, wrist_length=0.0107)}
@@ -91,3 +92,19 @@ def test_impossible_geometries_and_shapes_are_refused_in_words():
         replace(CLASSIC, limits=((-1.6, 1.6), (-0.9, 0.9), (0, 0.24), (-4.5, 4.5), (-1.7, 1.7), (-1.5, 1.5)))
     with pytest.raises(SettingsError, match=r"Give \[rows, 4, 4\]"):
         inverse(np.eye(4))
+
+
+def test_the_tip_moves_along_a_line_through_the_remote_centre() -> None:
+    joints = np.tile([0.3, -0.2, 0.0, 0.5], (3, 1))
+    joints[:, 2] = 0.05, 0.1, 0.2
+    Ts = ecm_forward(joints)
+    assert np.allclose(np.linalg.norm(Ts[:, :3, 3], axis=1), joints[:, 2] - 0.3822 + 0.3829, atol=1e-12)
+    assert np.allclose(np.cross(Ts[:, :3, 3], Ts[:, :3, 2]), 0.0, atol=1e-12)
+
+
+def test_it_turns_as_the_first_four_joints_of_a_psm_do() -> None:
+    """Both arms have the same chain up to the roll; the PSM's wrist adds turns that do not depend on them."""
+    psm = np.array([[0.3, -0.2, 0.1, 0.5, 0.0, 0.0], [-0.1, 0.4, 0.2, -0.7, 0.0, 0.0]])
+    R = [forward(psm)[:, :3, :3], ecm_forward(psm[:, :4])[:, :3, :3]]
+    wrists = R[1].transpose(0, 2, 1) @ R[0]
+    assert np.allclose(wrists[0], wrists[1], atol=1e-12)

@@ -62,18 +62,6 @@ def test_a_gpu_predicts_what_a_cpu_predicts_and_gives_it_back_where_the_images_a
     torch.testing.assert_close(there, here, atol=TOLERANCE, rtol=0)
 
 
-def test_the_number_of_threads_changes_no_bit(weights: Path) -> None:
-    images, given = torch.rand(1, 3, 112, 208), torch.rand(1, 6, 112, 208)
-    before, found = torch.get_num_threads(), []
-    for threads in (1, 2):
-        torch.set_num_threads(threads)
-        try:
-            found.append(FeatureExtractor.load(inference="onnx").surface(images, given))
-        finally:
-            torch.set_num_threads(before)
-    assert torch.equal(*found)
-
-
 def test_a_damaged_graph_is_exported_again(weights: Path, cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     FeatureExtractor.load(weights, inference="onnx")
     (graph,) = cache.glob("surface-*.onnx")

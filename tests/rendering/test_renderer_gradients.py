@@ -119,14 +119,6 @@ def test_a_batch_of_hypotheses_renders_as_each_alone(scene_and_state: tuple[Scen
         )
 
 
-def test_the_segmentation_is_the_silhouette_of_the_rendering(scene_and_state: tuple[Scene, SceneState]) -> None:
-    scene, state = scene_and_state
-    renderer = Renderer(scene)
-    rendering = renderer(state)
-    assert np.array_equal(renderer.segment(state) >= 0, rendering.silhouette.numpy() > 0.5)
-    assert torch.equal(rendering.arm_ids == 0, rendering.silhouette > 0.5)
-
-
 def test_a_nearer_arm_hides_the_other(shipped_psm: Robot) -> None:
 
     tiny = tiny_scene(shipped_psm, 1, ("left",), 160, 120)
