@@ -1,6 +1,6 @@
 """Reading of untrusted files (`reading`), and paths and writing of all outputs.
 
-No other module opens a file for writing, as checked by `tests/files/test_one_writer.py`.
+No other module opens a file for writing, as checked by `tests/files/test_one_reader_and_writer.py`.
 """
 
 from .paths import OutputPath as OutputPath

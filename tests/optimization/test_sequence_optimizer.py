@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 
 import cv2
 import numpy as np
@@ -101,40 +102,51 @@ def test_a_joint_that_is_hidden_now_and_then_is_carried_by_the_other_frames(trut
         assert 0.99 * seen < estimates[index].joint_std[ARM][WRIST_PITCH] < expected
 
 
-def test_a_keyframe_stays_as_given_and_draws_the_others(truths: Truths) -> None:
-    given = {ARM: truths.sequence.frame(2).measured[ARM] + 0.02}
-    # Nothing else is seen, so what the others get can only come from the keyframe.
+@pytest.fixture(scope="module")
+def drawn(made_truths: Truths) -> Callable[..., SequenceOptimizer]:
+    """Solves the sequence from a keyframe at frame 2, 0.02 off; no other frame shows anything."""
+    truths = made_truths.fresh()
     truths.blind = set(range(FRAMES))
-    sequence = optimizer(truths, keyframes={2: given})
-    list(sequence)
-    estimates = sequence.estimates
-    assert np.array_equal(estimates[2].joint_positions[ARM], given[ARM])
-    assert np.allclose(estimates[2].state.joint_positions[0].numpy(), given[ARM], atol=1e-6)
+
+    @cache
+    def solve(*std: float) -> SequenceOptimizer:
+        given = {ARM: truths.sequence.frame(2).measured[ARM] + 0.02}
+        known = {2: {ARM: np.array(std)}} if std else None
+        sequence = optimizer(truths, keyframes={2: given}, keyframe_std=known)
+        list(sequence)
+        return sequence
+
+    return solve
+
+
+def correction(sequence: SequenceOptimizer, truths: Truths, index: int) -> np.ndarray:
+    return sequence.estimates[index].joint_positions[ARM] - truths.sequence.frame(index).measured[ARM]
+
+
+def test_a_keyframe_stays_as_given_and_draws_the_others(
+    truths: Truths, drawn: Callable[..., SequenceOptimizer]
+) -> None:
+    sequence, estimates = drawn(), drawn().estimates
+    given = truths.sequence.frame(2).measured[ARM] + 0.02
+    assert np.array_equal(estimates[2].joint_positions[ARM], given)
+    assert np.allclose(estimates[2].state.joint_positions[0].numpy(), given, atol=1e-6)
     assert estimates[2].start == "keyframe" and not estimates[2].joint_std[ARM].any()
-    estimates[2].joint_positions[ARM][:] = 0
-    assert np.array_equal(sequence.estimates[2].joint_positions[ARM], estimates[2].joint_positions[ARM])
     for index in (0, 1, 3, 5):
-        correction = estimates[index].joint_positions[ARM] - truths.sequence.frame(index).measured[ARM]
-        assert 0.012 < correction[0] < 0.0205
+        assert 0.012 < correction(sequence, truths, index)[0] < 0.0205
         assert (estimates[index].joint_std[ARM] > 0).all()
 
 
-def test_what_an_accepted_frame_leaves_open_its_neighbours_do_not_take_for_known(truths: Truths) -> None:
-    given = {ARM: truths.sequence.frame(2).measured[ARM] + 0.02}
-    std = {ARM: np.array([1e-3, 1e-3, np.nan, 0.03, 1e-3, 1e-3, 1e-3])}
-    truths.blind = set(range(FRAMES))
-    found = []
-    for known in (None, {2: std}):
-        sequence = optimizer(truths, keyframes={2: given}, keyframe_std=known)
-        list(sequence)
-        found.append(sequence.estimates)
-    exact, open_ones = found
-    assert np.array_equal(open_ones[2].joint_std[ARM], np.nan_to_num(std[ARM]))
-    assert np.array_equal(open_ones[2].joint_positions[ARM], given[ARM]), "it stays as given"
-    roll = 3
-    assert open_ones[1].joint_std[ARM][roll] > 1.5 * exact[1].joint_std[ARM][roll]
-    assert open_ones[1].joint_std[ARM][0] == pytest.approx(np.hypot(1e-3, exact[1].joint_std[ARM][0]), rel=0.05)
-    moved = [of[1].joint_positions[ARM][roll] - truths.sequence.frame(1).measured[ARM][roll] for of in found]
+def test_deviations_of_a_keyframe_widen_those_of_its_neighbours(
+    truths: Truths, drawn: Callable[..., SequenceOptimizer]
+) -> None:
+    std, roll = (1e-3, 1e-3, np.nan, 0.03, 1e-3, 1e-3, 1e-3), 3
+    exact, uncertain = drawn(), drawn(*std)
+    assert np.array_equal(uncertain.estimates[2].joint_std[ARM], np.nan_to_num(std))
+    assert np.array_equal(correction(uncertain, truths, 2), correction(exact, truths, 2)), "it stays as given"
+    one, other = (sequence.estimates[1].joint_std[ARM] for sequence in (exact, uncertain))
+    assert other[roll] > 1.5 * one[roll]
+    assert other[0] == pytest.approx(np.hypot(1e-3, one[0]), rel=0.05)
+    moved = [correction(sequence, truths, 1)[roll] for sequence in (exact, uncertain)]
     assert 0.0 < moved[1] < 0.8 * moved[0], "less of the guess is carried over"
 
 
@@ -283,10 +295,11 @@ def test_deviations_count_on_no_more_than_images_that_differ(truths: Truths) -> 
     assert (ends[1][3].joint_std[ARM] > 1.1 * ends[0][3].joint_std[ARM]).any()
 
 
-def test_a_doubtful_frame_is_less_certain_unless_its_values_come_from_elsewhere(truths: Truths) -> None:
-    sequence = optimizer(truths)
-    list(sequence)
-    scene = truths.sequence.scene
+def test_a_doubtful_frame_is_less_certain(
+    truths: Truths, forward: tuple[SequenceOptimizer, list[FrameEstimate]]
+) -> None:
+    """Unless its values come from elsewhere."""
+    (sequence, _), scene = forward, truths.sequence.scene
     for start in Origin:
         estimate = replace(sequence.estimates[2], start=start)
         assert estimate.assessment is not None

@@ -248,14 +248,6 @@ def robot_folder(tmp_path: Path) -> Path:
 
 
 @pytest.mark.usefixtures("cold_cache")
-def test_a_robot_loads_by_a_relative_path_with_an_empty_cache(robot_folder: Path, monkeypatch: MonkeyPatch):
-    monkeypatch.chdir(robot_folder.parent.parent)
-    robot = Robot.load("robots/mine/psm_lnd.urdf")
-    assert len(robot.meshes) == len(Robot.load(shipped_robot()).meshes)
-    assert robot.urdf == robot_folder / "psm_lnd.urdf"
-
-
-@pytest.mark.usefixtures("cold_cache")
 def test_a_sequence_by_a_relative_path_has_its_images_after_the_working_directory_changed(
     tiny_sequence: Callable[..., Path], robot_folder: Path, tmp_path: Path, monkeypatch: MonkeyPatch
 ):

@@ -257,13 +257,6 @@ def test_what_is_no_video_is_refused(tmp_path, content, message):
         Video(tmp_path / "left.mp4", (0,))
 
 
-def test_a_truncated_video_is_an_error_where_it_ends(tmp_path):
-    path = write_opencv(tmp_path / "left.avi", "MJPG")
-    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
-    with pytest.raises(SequenceError, match=r"left.avi"):
-        Video(path, tuple(range(FRAMES))).read(FRAMES - 1)
-
-
 @pytest.mark.parametrize("value", ["1.5", "-1"])
 def test_a_video_frame_number_must_be_one(tiny_sequence, value):
     path = tiny_sequence(edit=lambda text: text.replace("[kinematics]", '[kinematics]\nvideo_frame = "time"'))
