@@ -188,10 +188,14 @@ def frames_within(project: ProjectState, frames: str, part: tuple[int, int] | No
 
 
 def shown_mask(context: Context) -> tuple[str, bytes]:
-    """The corrected mask of the shown frame and camera: name and content of a PNG file."""
+    """Mask of the shown frame and camera as a PNG file: name and content. It is refined if that layer is shown and the
+    mask was not painted."""
     state, sequence = context.state, context.session.sequence
     name = file_name(f"{sequence.name}_{state.frame.frame_id}_{state.camera}") + ".png"
     mask = context.renderer.mask(state.pose.scene, state.camera, state.mask_correction)
+    refined = state.refined_mask(state.pose.scene, state.camera)
+    if state.layer is Layer.REFINED and refined is not None and state.mask_correction is None:
+        mask = refined
     painted = state.part_labels_of(state.camera)
     if painted is not None:
         mask = mask | (painted.labels() > 0)

@@ -55,7 +55,9 @@ class ExportPanel:
             self._result = gui.add_html("", visible=False)
             self._download = page.button("Download it", intents.Download, icon=viser.Icon.DOWNLOAD, visible=False)
         with gui.add_folder("This frame"):
-            gui.add_html('<p class="carts-caption">Mask of the shown camera: 255 is arm, 0 background.</p>')
+            gui.add_html(
+                '<p class="carts-caption">Mask of the shown camera: 255 is arm, 0 background. Refined if that layer is shown.</p>'
+            )
             page.button("Export mask", intents.ExportMask, icon=viser.Icon.PHOTO_DOWN)
         for widget in (self._format, self._frames, self._within, self._cameras):
             page.on_input(widget, lambda _: intents.Refresh())

@@ -186,6 +186,8 @@ def test_a_refined_mask_follows_the_pose_and_shows_the_rendered_outline(desk: De
     white = (picture == 255).all(-1)
     assert white.any() and not (white & ~rendered).any()
     np.testing.assert_array_equal(picture[..., 3] > 0, before | white)
+    desk.do(intents.ExportMask(7))
+    np.testing.assert_array_equal(decoded(desk.delivered[0][2]) > 0, before)
     desk.do(intents.Perturb(4.0, 3))
     assert desk.state.refined_mask(desk.state.pose.scene, "left") is None
     desk.controller.map()
