@@ -20,6 +20,7 @@ _WRITTEN = (
     "Masks, keypoints and poses are those of the arms at the current joint positions; masks include "
     "painted corrections, and may be refined. The recording's own masks are not exported."
 )
+_THIS_FRAME = "Mask of the shown camera: 255 is arm, 0 background. It is refined while that layer is shown."
 _NOT_KEPT = "This project is temporary: download its exports before the viewer is closed."
 
 
@@ -55,9 +56,7 @@ class ExportPanel:
             self._result = gui.add_html("", visible=False)
             self._download = page.button("Download it", intents.Download, icon=viser.Icon.DOWNLOAD, visible=False)
         with gui.add_folder("This frame"):
-            gui.add_html(
-                '<p class="carts-caption">Mask of the shown camera: 255 is arm, 0 background. Refined if that layer is shown.</p>'
-            )
+            gui.add_html(f'<p class="carts-caption">{_THIS_FRAME}</p>')
             page.button("Export mask", intents.ExportMask, icon=viser.Icon.PHOTO_DOWN)
         for widget in (self._format, self._frames, self._within, self._cameras):
             page.on_input(widget, lambda _: intents.Refresh())
