@@ -44,11 +44,11 @@ _EVENTS = (
     | intents.ShowCamera
     | intents.ShowFrame
 )
-"""Events of the page's scripts; handlers check the values of intents."""
+"""Events that the page's scripts send; handlers check the values of intents."""
 
 
-class Listening:
-    """Dispatches events of the page to tabs; invalid ones are ignored."""
+class EventDispatcher:
+    """Dispatches browser events to tabs; invalid events are ignored."""
 
     def __init__(self, page: Page, tabs: Tabs, worker: Worker, sequence: Sequence) -> None:
         self._page, self._tabs, self._worker, self._sequence = page, tabs, worker, sequence
@@ -84,13 +84,13 @@ class Listening:
                 tab.put(event)
 
     def _attach(self, client_id: int, hello: events.Hello) -> None:
-        # A page repeats its greeting until it is answered, and may have closed by now.
+        # A page repeats `Hello` until it is answered, and may have been closed since.
         client = self._page.server.get_clients().get(client_id)
         if client is not None and self._tabs.of_client(client_id) is None:
             self._tabs.attach(client, hello)
 
     def _camera(self, index: int) -> Camera | None:
-        """The camera with this index; None where a tab names none."""
+        """The camera with this index; None if the index is invalid."""
         cameras = self._sequence.scene.cameras
         return cameras[index] if 0 <= index < len(cameras) else None
 
@@ -100,7 +100,7 @@ class Listening:
             stroke = read_stroke(painted, len(self._sequence), cameras, self._classes)
         except CartsError as error:
             # The viewer's own page never sends such strokes.
-            _log.info("Refused: %s", error)
+            _log.info("Stroke rejected: %s", error)
         else:
             tab.put(intents.Paint(client_id, stroke))
 
@@ -113,13 +113,13 @@ class ServerOptions(NetworkOptions, total=False):
     """Options of the networks and of the server."""
 
     host: str
-    """Address to listen on, 127.0.0.1 by default; one that other computers can reach adds a token to the url."""
+    """Address to listen on, 127.0.0.1 by default. The URL contains a token if other computers can reach the address."""
     port: int
-    """Port to listen on, 8080 by default; 0 picks a free port; instead of a busy one the next free one is used."""
+    """Port to listen on, 8080 by default; 0 for any free port. If the port is busy, the next free port is used."""
 
 
 class ViewerApp:
-    """The viewer of one sequence, serving until it is closed.
+    """Serves the viewer of one sequence until it is closed.
 
     Attributes:
         url: Address of the page.
@@ -127,7 +127,7 @@ class ViewerApp:
         tabs: All tabs.
         sequence: The recording.
         scene: The recording's arms and cameras.
-        project: The sequence's corrections.
+        project: The project with the sequence's corrections.
     """
 
     def __init__(
@@ -155,7 +155,7 @@ class ViewerApp:
         self._optimizers = OptimizerFactory(report=self._say, **networks)
         self.tabs = Tabs(sequence, storage, renderer, self._optimizers, self._deliver, queue, folders)
         # The first rendering compiles the visibility kernel, which takes seconds the very first time.
-        report("Preparing the renderer (the first time takes a few seconds)")
+        report("Preparing the renderer (takes a few seconds the first time)")
         renderer.arm_ids(self.state.pose.scene, self.state.camera)
         self.page = page or Page(host=host, port=port, title=f"{sequence.name} · CaRTS")
         self.url = self.page.url
@@ -164,7 +164,7 @@ class ViewerApp:
         self._thumbnails = Thumbnails(sequence)
         self.page.thumbnail = self._thumbnails.answer
         self._worker = Worker(queue, self.tabs)
-        Listening(self.page, self.tabs, self._worker, sequence)
+        EventDispatcher(self.page, self.tabs, self._worker, sequence)
         self._worker.start(self._prepare)
 
     @classmethod
@@ -184,7 +184,7 @@ class ViewerApp:
             path: The sequence file.
             project: The project file, created if missing; None for the default path.
             report: Called with a line for the user about long operations.
-            page: An empty page that is served already, and remains after the viewer is closed; None to serve a new one.
+            page: An empty page that is already served and remains after the viewer is closed; None to serve a new page.
             folders: Folders that masks may be imported from, besides the sequence's own folder.
             options: See `ServerOptions`.
 
@@ -213,12 +213,12 @@ class ViewerApp:
 
     @property
     def queue(self) -> Tab:
-        """The first tab, which takes intents whether or not a page shows it."""
+        """The first tab, which accepts intents even without a page."""
         return self.tabs.first
 
     @property
     def state(self) -> ViewState:
-        """The newest state of the first tab; a snapshot that does not change."""
+        """Immutable snapshot of the first tab's newest state."""
         return self.tabs.first.controller.state
 
     @property
@@ -234,19 +234,19 @@ class ViewerApp:
 
     @property
     def notice(self) -> str | None:
-        """Message on the storage of corrections, see `Storage.notice`; None if there is none."""
+        """Message about the storage of corrections (`Storage.notice`); None if there is none."""
         return self._storage.notice
 
     @property
     def incident(self) -> str | None:
-        """Why corrections are not in the project's file, and which file contains them; None if they are in it."""
+        """Message if corrections are not in the project file, naming the file that contains them; None otherwise."""
         return self.project.incident
 
     def close(self) -> None:
-        """Save unfinished edits, stop the worker and the server; closing again does nothing.
+        """Save unfinished edits, and stop the worker and the server; closing again does nothing.
 
         Raises:
-            ProjectError: it could not be saved.
+            ProjectError: the edits could not be saved.
         """
         if self._closed:
             return
@@ -256,15 +256,15 @@ class ViewerApp:
             self.page.close()
         self._thumbnails.close()
         with ExitStack() as stack:
-            # In reverse order, even if one of them fails.
+            # The callbacks run in reverse order, even if one of them fails.
             stack.callback(self._storage.close)
             stack.callback(self.tabs.close)
 
     def wait_until_shown(self, timeout: float = 120.0) -> ViewState:
-        """Wait at most `timeout` [s] until all intents so far are carried out and sent to the page.
+        """Wait until all intents so far are carried out and their results are sent to the page.
 
         Raises:
-            TimeoutError: they are not, in that time.
+            TimeoutError: the viewer is still busy after `timeout` [s].
         """
         if not self._worker.settled(timeout):
             raise TimeoutError(f"The viewer was still busy after {timeout} s.")

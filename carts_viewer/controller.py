@@ -1,6 +1,6 @@
 """Dispatches intents to handlers and advances long work: a controller per tab, one background for all tabs.
 
-Runs on the worker's thread alone; independent of threads and widgets.
+Used on the worker's thread only; does not depend on widgets.
 """
 
 import time
@@ -16,8 +16,8 @@ from carts_viewer.actions.live import LiveHandler
 from carts_viewer.actions.optimizing import OptimizingHandler
 from carts_viewer.actions.painting import PaintingHandler
 from carts_viewer.actions.posing import DraggingHandler, PosingHandler
-from carts_viewer.actions.reviewing import AnnotatingHandler, FindingHandler
-from carts_viewer.actions.sequence import MarkingHandler, PropagatingHandler
+from carts_viewer.actions.reviewing import AnnotatingHandler, FilterHandler
+from carts_viewer.actions.sequence import KeyframeHandler, PropagatingHandler
 from carts_viewer.editing import LONGEST_NAME, Person
 from carts_viewer.jobs.optimizers import OptimizerFactory
 from carts_viewer.picture.overlay import OverlayRenderer
@@ -43,11 +43,11 @@ class Background:
 
     @property
     def state(self) -> ViewState:
-        """Own state; tabs share its `jobs`, `solve` and `export`."""
+        """State of the background; tabs share the fields in `_COMMON`."""
         return self._context.state
 
     def takes(self, intent: intents.Intent) -> bool:
-        """Whether an intent is one for the background."""
+        """Whether the background handles an intent."""
         return any(handler.takes(intent) for handler in (self._jobs, self._propagating, self._exporting))
 
     def handle(self, intent: intents.Intent, person: Person, state: ViewState) -> None:
@@ -73,7 +73,7 @@ class Background:
         """Do one step of the running work: a frame to solve or export, a step of a job.
 
         Raises:
-            CartsError: it failed, and so did its job.
+            CartsError: the step failed; its job is marked as failed.
         """
         try:
             self._propagating.advance()
@@ -95,7 +95,7 @@ class Background:
         """Finish and save the running work; exports are cancelled.
 
         Raises:
-            CartsError: it could not be saved.
+            CartsError: the work could not be saved.
         """
         self._exporting.cancel()
         self._propagating.finish()
@@ -103,7 +103,7 @@ class Background:
         self._context.save()
 
 
-_BEGINNING = (
+_ENDS_RUN = (
     intents.Solve,
     intents.TakeSolved,
     intents.Export,
@@ -111,11 +111,11 @@ _BEGINNING = (
     intents.Calibrate,
     intents.RepeatJob,
 )
-"""Intents that end a run of the tab before they begin."""
+"""Intents that first end the run of their tab."""
 _COMMON = ("jobs", "solve", "export", "networks", "network", "asked_network", "problems")
 """Fields of the background's state that all tabs share."""
-WATCH_EVERY = 1.0
-"""Interval between checks of the project's file while nothing is edited [s]."""
+WATCH_INTERVAL = 1.0
+"""Interval between checks of the project file when nothing is edited [s]."""
 
 
 class Controller(Handler):
@@ -147,10 +147,10 @@ class Controller(Handler):
             self._live,
             DraggingHandler(context),
             PosingHandler(context),
-            MarkingHandler(context),
+            KeyframeHandler(context),
             PaintingHandler(context, optimizers.segmenter),
             ImportingHandler(context),
-            FindingHandler(context, self._browsing.show),
+            FilterHandler(context, self._browsing.show),
         )
         self._deliver = deliver
         self._share()
@@ -175,7 +175,7 @@ class Controller(Handler):
 
     def _forward(self, intent: intents.Intent) -> None:
         """Pass an intent to the background, after saving the edits of this tab."""
-        if isinstance(intent, _BEGINNING):
+        if isinstance(intent, _ENDS_RUN):
             self._optimizing.end("Stopped: a job was started")
             self._context.save()
             self._context.change(playing=False, error=None)
@@ -226,10 +226,7 @@ class Controller(Handler):
         return min((wait for handler in handlers if (wait := handler.wait_time()) is not None), default=None)
 
     def overdue_in(self) -> float | None:
-        """Time until `advance` has to save an unfinished gesture, or check the file [s].
-
-        None: it is not due.
-        """
+        """Time until `advance` has to save an unfinished gesture or check the project file [s]; None if read-only."""
         if not self._editor.project.writable:
             return None
         watch = max(0.0, self._watch_at - time.monotonic())
@@ -246,10 +243,10 @@ class Controller(Handler):
         self._watch()
 
     def _watch(self) -> None:
-        """Check regularly that the project's file still exists: it may be deleted between edits."""
+        """Check regularly that the project file still exists, since it may be deleted between edits."""
         project = self._editor.project
         if project.writable and time.monotonic() >= self._watch_at:
-            self._watch_at = time.monotonic() + WATCH_EVERY
+            self._watch_at = time.monotonic() + WATCH_INTERVAL
             with suppress(CartsError):
                 project.check()
         if project.incident != self._incident:
@@ -273,18 +270,18 @@ class Controller(Handler):
         """End the stream and save the unfinished gesture.
 
         Raises:
-            CartsError: it could not be saved.
+            CartsError: the stream or the gesture could not be saved.
         """
         self._live.stop("Stopped.")
         self._context.save()
 
     def say(self, text: str | None) -> None:
-        """Show a text on the present preparation; None removes it."""
+        """Show a text about the current preparation; None removes it."""
         self._share()
         self._context.change(busy=text)
 
     def score(self) -> None:
-        """Compare the pose with ground truth, if not done yet; errors as `handle`."""
+        """Compare the pose with ground truth, unless already done; errors as `handle`."""
         self._context.score()
 
     def map(self) -> None:

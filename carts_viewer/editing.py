@@ -1,8 +1,7 @@
-"""Edits by several users: drafts, steps of undo, and ownership of steps.
+"""Edits by several users: drafts, undo steps, and the owners of steps.
 
-A single tab moves freely in the history. With several tabs, undo reverts the tab's own last step, or
-one from before the viewer started that belongs to no other user, by a new step that leaves the steps of others in
-place.
+A single tab moves freely in the history. With several tabs, undo adds a step that reverts the user's own last step, or
+a step without an owner from before the viewer started; steps of other users stay in effect.
 """
 
 import time
@@ -13,7 +12,7 @@ from carts_core.errors import CartsError, ProjectError
 from carts_core.project import Change, Edits, Figures, Project, ProjectState, Step
 
 LONGEST_NAME = 30
-"""Longest name of a user [characters]."""
+"""Maximum length of a user's name [characters]."""
 
 
 @dataclass(eq=False)
@@ -29,7 +28,7 @@ class Person:
     index: int = 0
     """Index of the shown frame."""
     undone: list[int] = field(default_factory=list)
-    """Steps that reverted other steps, and that redo reverts in turn; the newest last."""
+    """Numbers of the user's *Undo* steps, which redo reverts; the newest last."""
 
     @property
     def name(self) -> str:
@@ -60,7 +59,7 @@ class People:
         return person
 
     def leave(self, person: Person) -> None:
-        """Remove a user; their steps have no owner then."""
+        """Remove a user; their steps then have no owner."""
         self.persons.remove(person)
         self._makers = {number: maker for number, maker in self._makers.items() if maker is not person}
 
@@ -72,7 +71,7 @@ class People:
     def apply(
         self, person: Person, name: str, edits: Edits, figures: Mapping[int, Figures] | None = None
     ) -> Change | None:
-        """Save a step of a user, with their name if chosen or if there are several users; errors as `Project.apply`."""
+        """Save a step of a user; its name starts with theirs, if set or needed. Errors as `Project.apply`."""
         person.undone.clear()
         return self._apply(person, name, edits, figures)
 
@@ -81,19 +80,19 @@ class People:
         self._makers[self.project.state.position] = person
 
     def can_undo(self, person: Person) -> bool:
-        """Whether this user may have a step to undo."""
+        """Whether there may be a step that this user can undo."""
         return self.project.state.position > 0 and (not self.several or self._last(person, free=True) is not None)
 
     def can_redo(self, person: Person) -> bool:
-        """Whether this user has a step to redo."""
+        """Whether there is a step that this user can redo."""
         return bool(person.undone) or self._next_is_free(person)
 
     def undo(self, person: Person) -> Change | None:
-        """Undo a user's last step, or one without an owner; None without either.
+        """Undo the last step that is the user's own or has no owner; None if there is no such step.
 
         Raises:
-            CartsError: a later step has changed the same.
-            ProjectError: it could not be saved.
+            CartsError: a later step has changed the same values.
+            ProjectError: the change could not be saved.
         """
         position, own = self.project.state.position, self._last(person, free=self.several)
         if not self.several and own in (None, position):
@@ -110,7 +109,7 @@ class People:
         return change
 
     def redo(self, person: Person) -> Change | None:
-        """Redo the last step that this user has undone; None without one. Errors as `undo`."""
+        """Redo the last step that this user has undone; None if there is no such step. Errors as `undo`."""
         if person.undone:
             number = person.undone[-1]
             person.undone.pop()
@@ -124,8 +123,8 @@ class People:
         """Go to a position in the history.
 
         Raises:
-            CartsError: steps of another present user would be undone.
-            ProjectError: it could not be saved.
+            CartsError: steps of another present user would be undone or redone.
+            ProjectError: the change could not be saved.
         """
         project = self.project
         between = range(min(position, project.state.position) + 1, max(position, project.state.position) + 1)
@@ -187,7 +186,7 @@ class People:
 
 
 LONGEST_DRAFT = 5.0
-"""Time without a change after which an edit counts as finished [s]."""
+"""Time without a change after which a draft is saved [s]."""
 
 
 class Editor:
@@ -212,11 +211,11 @@ class Editor:
 
     @property
     def view(self) -> ProjectState:
-        """The project as this person's page shows it, the draft included as its last step."""
+        """The project with the draft as its last step."""
         if self._view is None:
             return self.project.state
         if self._view[0] is not self.project.state:
-            # Another user has saved meanwhile.
+            # Another user has saved edits since.
             self._lay_draft()
         return self._view[1]
 
@@ -244,7 +243,7 @@ class Editor:
         """Change the draft.
 
         Args:
-            name: of the step that it will be.
+            name: name of the step that the draft becomes.
             edits: the changes; merged with earlier ones of the same gesture.
             gesture: identifies the draft; an earlier draft that could not be saved is merged into this one.
         """
@@ -258,20 +257,20 @@ class Editor:
         self._gesture, self._edits, self._view = None, {}, None
 
     def save(self, figures: dict[int, Figures] | None = None) -> None:
-        """Save the draft as one step of undo. In a read-only project it remains a draft.
+        """Save the draft as one undo step. In a read-only project it remains a draft.
 
         Raises:
-            ProjectError: it could not be saved; it is still there.
+            ProjectError: the draft could not be saved, and remains.
         """
         if self._view is None or not self.project.writable:
             return
-        # Not tried again at once when the disk is full.
+        # If the disk is full, the next attempt is made only after a pause.
         self._changed_at = time.monotonic()
         self.apply(self._name, self._edits, figures)
         self.drop()
 
     def apply(self, name: str, edits: Edits, figures: Mapping[int, Figures] | None = None) -> Change | None:
-        """Save edits as one step of undo of this user, without a draft; errors as `Project.apply`."""
+        """Save edits as one undo step of this user, without a draft; errors as `Project.apply`."""
         return self.people.apply(self.person, name, edits, figures)
 
     def claim(self) -> None:
@@ -279,7 +278,7 @@ class Editor:
         self.people.claim(self.person)
 
     def overdue_in(self) -> float | None:
-        """Time until the draft is saved even if its gesture does not end [s]; None without one."""
+        """Time until the draft is saved even if its gesture does not end [s]; None if there is no draft to save."""
         if self._view is None or not self.project.writable:
             return None
         return max(0.0, self._changed_at + LONGEST_DRAFT - time.monotonic())
@@ -288,7 +287,8 @@ class Editor:
         """Undo this user's last step, or drop a draft that cannot be saved.
 
         Raises:
-            ProjectError: it could not be saved, the project is read-only, or another user has changed the same since.
+            CartsError: a later step has changed the same values.
+            ProjectError: the change could not be saved, or the project is read-only.
         """
         return None if self._dropped() else self.people.undo(self.person)
 
@@ -301,7 +301,7 @@ class Editor:
 
         Raises:
             CartsError: steps of another present user are in between.
-            ProjectError: it could not be saved, or the project is read-only.
+            ProjectError: the change could not be saved, or the project is read-only.
         """
         if self._dropped():
             return None

@@ -41,8 +41,8 @@ def serve(
         options: See `ServerOptions`.
 
     Raises:
-        SystemExit: after a message on stderr, with code 2 when the sequence or an option is not usable, and with code 1
-            when corrections could not be saved, or not in the project that was opened.
+        SystemExit: after a message on stderr, with code 2 if the sequence or an option is not usable, and with code 1
+            if corrections could not be saved in the opened project.
     """
     began = time.monotonic()
     _serve(
@@ -75,9 +75,9 @@ def serve_site(
 
 
 def _serve(opened: "Callable[[], ViewerApp | Site]", ready: Callable[[], str], *, open_browser: bool) -> None:
-    """Open, serve, save and close; `ready` returns the message after opening. Errors as `serve`."""
+    """Open, serve, save and close; `ready` returns the message to print after opening. Errors as `serve`."""
     log_to_stderr()
-    with EndRequest() as end:
+    with GracefulShutdown() as end:
         try:
             served = opened()
         except CartsError as error:
@@ -86,7 +86,7 @@ def _serve(opened: "Callable[[], ViewerApp | Site]", ready: Callable[[], str], *
         end.ready()
         browser = opened_in_browser(served.url) if open_browser else nullcontext()
         try:
-            _say(f"{ready()} Open {served.url} in a browser; Ctrl-C ends.")
+            _say(f"{ready()} Open {served.url} in a browser; Press Ctrl-C to stop.")
             with browser:
                 end.wait()
             _say("\nClosing.")
@@ -124,10 +124,11 @@ def _say(text: str, to: TextIO | None = None) -> None:
 _SIGNALS = [signal.SIGINT, signal.SIGTERM, *([signal.SIGHUP] if hasattr(signal, "SIGHUP") else [])]
 
 
-class EndRequest:
-    """Graceful shutdown: these signals end `wait`; until `ready` they act as before, or raise `KeyboardInterrupt`.
+class GracefulShutdown:
+    """Context in which SIGINT, SIGTERM and SIGHUP end `wait`.
 
-    After `ready` they do nothing else, so that saving is not interrupted. Ignored signals (`nohup`) stay ignored.
+    Until `ready`, a signal calls its previous handler or raises `KeyboardInterrupt`; afterwards it only ends `wait`, so
+    that saving is not interrupted. Ignored signals (`nohup`) remain ignored.
     """
 
     def __init__(self) -> None:
@@ -137,7 +138,7 @@ class EndRequest:
         self._asked, self._ask = os.pipe()
         os.set_blocking(self._ask, False)
 
-    def __enter__(self) -> "EndRequest":
+    def __enter__(self) -> "GracefulShutdown":
         if threading.current_thread() is threading.main_thread():
             for number in _SIGNALS:
                 if number == signal.SIGTERM or signal.getsignal(number) is not signal.SIG_IGN:
@@ -151,11 +152,11 @@ class EndRequest:
         os.close(self._ask)
 
     def ready(self) -> None:
-        """From now on signals raise no exception."""
+        """Stop raising exceptions for signals; they end `wait` instead."""
         self._ready = True
 
     def wait(self) -> None:
-        """Wait until one of the signals arrives, or has arrived since `ready`."""
+        """Wait for a signal; return at once if a signal has arrived since `ready`."""
         os.read(self._asked, 1)
 
     def _on_signal(self, number: int, frame: FrameType | None) -> None:
@@ -176,10 +177,10 @@ _PAGE = '<!DOCTYPE html><meta charset="utf-8"><meta http-equiv="refresh" content
 
 @contextmanager
 def opened_in_browser(url: str) -> Iterator[None]:
-    """Open a page in the default browser; a file that redirects to it is kept until the block ends.
+    """Open a page in the default browser.
 
-    Every user of this computer can read the command line of a browser. A url with a token is therefore passed in a
-    file in a private folder.
+    Every user of this computer can read the command line of a browser. A URL with a token is therefore passed in a
+    redirecting file in a private folder, which is removed at the end of the block.
     """
     if "token=" not in url:
         webbrowser.open(url)

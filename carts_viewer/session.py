@@ -1,4 +1,4 @@
-"""An open recording: its frames, their poses in the project, and the project's file."""
+"""The frames of a recording with their poses in the project, and the storage of the project."""
 
 import tempfile
 from collections.abc import Iterable, Mapping
@@ -35,21 +35,21 @@ from carts_viewer.state import NETWORK, Observed, Pose, Target, joint_range
 
 
 class Session:
-    """Frames of one sequence and its project's corrections of them.
+    """Frames of a sequence with their corrections from the project.
 
     A frame's pose is the measured one until it is corrected; corrections do not depend on camera or domain.
 
     Attributes:
-        scene: its arms and cameras.
-        editor: its project with the unsaved draft.
+        scene: arms and cameras of the sequence.
+        editor: edits the project and holds the unsaved draft.
         ranges: allowed range of each joint, by arm.
-        roots: allowed folders of imports: that of the sequence, and others.
+        roots: folders from which files may be imported, the sequence's own included.
     """
 
     def __init__(
         self, sequence: Sequence, people: People, person: Person | None = None, folders: Iterable[Path] = ()
     ) -> None:
-        """`folders` are allowed folders of imports, besides the sequence's own."""
+        """`folders`: further folders from which files may be imported."""
         self._sequence = sequence
         self._own_offset = None if sequence.matching is None else sequence.matching.time_offset
         self.scene: Scene = sequence.scene
@@ -63,7 +63,7 @@ class Session:
 
     @property
     def time_offset(self) -> float | None:
-        """Time in the kinematics table minus time of the image [s]; None where rows are not matched by time."""
+        """Time in the kinematics table minus time of the image [s]; None if rows are not matched by time."""
         chosen = self.editor.view.get(Key.time_offset())
         return self._own_offset if chosen is None or self._own_offset is None else chosen.seconds
 
@@ -78,14 +78,14 @@ class Session:
         return self._sequence
 
     def matched(self, frame: Frame) -> bool:
-        """Whether the frame has the joint positions of the present time offset."""
+        """Whether the frame has the joint positions of the current time offset."""
         measured = self.sequence.measured
         return all(np.array_equal(values, measured[arm][frame.index]) for arm, values in frame.measured.items())
 
     def frame(self, index: int, domain: str, camera: str) -> Frame:
-        """The frame with the images of all cameras, or only that of `camera` if another one is not usable.
+        """The frame with the images of all cameras, or only that of `camera` if another image is not usable.
 
-        The following frames are read in advance.
+        The following frames are prefetched.
 
         Raises:
             SequenceError: the image of that camera is not usable.
@@ -97,16 +97,16 @@ class Session:
             return self._reader.frame(index, domain, camera)
 
     def close(self) -> None:
-        """Stop reading frames in advance, and save unfinished edits.
+        """Stop prefetching frames, and save unfinished edits.
 
         Raises:
-            ProjectError: it could not be saved.
+            ProjectError: the edits could not be saved.
         """
         self._reader.close()
         self.editor.save()
 
     def pose(self, frame: Frame, project: ProjectState | None = None) -> Pose:
-        """The frame's pose in a state of the project, by default the present one with its draft."""
+        """The frame's pose in a state of the project, by default the current state with the draft."""
         project = self.editor.view if project is None else project
         state = corrected_state(self.scene, frame, project)
         return Pose(state, source_of(project, frame.index))
@@ -114,7 +114,7 @@ class Session:
     def ignored(
         self, index: int, cameras: Iterable[str], target: Target = NETWORK
     ) -> dict[str, Bool[np.ndarray, "height width"]]:
-        """Camera -> pixels of the frame that a fit leaves out, for cameras with such pixels."""
+        """Camera -> pixels of the frame that a fit ignores, for cameras with such pixels."""
         cameras = list(cameras)
         regions = {camera: self.editor.view.get(Key.ignore_region(index, camera)) for camera in cameras}
         ignored = {camera: region.region() for camera, region in regions.items() if region is not None}
@@ -125,11 +125,11 @@ class Session:
         }
 
     def target(self, observed: Observed, project: ProjectState | None = None) -> Target:
-        """Target of a choice, with the masks of a state of the project, by default the present one."""
+        """The chosen target of a run, with the masks of a state of the project, by default the current state."""
         return Target.of(observed, self.editor.view if project is None else project, self.sequence)
 
     def measured(self, frame: Frame) -> SceneState:
-        """The state of the kinematics table, with the project's calibration."""
+        """The frame's measured state, with the project's calibration."""
         return calibrated_scene(self.scene, self.editor.view).state(frame.measured, mounts=frame.mounts)
 
     def edits(
@@ -139,15 +139,15 @@ class Session:
         provenance: Provenance,
         joint_std: Mapping[str, Float[np.ndarray, " dofs"]] | None = None,
     ) -> dict[Key[Any], Any]:
-        """Edits that give the frame this pose.
+        """Edits that set the frame's pose.
 
-        Unchanged values keep their provenance, and measured values need no correction.
+        Unchanged values keep their provenance; joints with their measured values get no correction.
 
         Args:
             frame: the frame.
-            state: its pose.
-            provenance: of the change.
-            joint_std: arm -> standard deviations [rad, m], NaN where not known.
+            state: its new pose.
+            provenance: provenance of the changed values.
+            joint_std: arm -> standard deviations [rad, m], NaN if unknown.
         """
         saved = self.editor.project.state
         before, measured = self.pose(frame, saved).scene, self.scene.state(frame.measured, mounts=frame.mounts)
@@ -214,9 +214,9 @@ class Session:
         )
 
     def perturbed(self, state: SceneState, index: int, degrees: float, seed: int) -> SceneState:
-        """The state with every measured joint moved by `degrees` [deg] or as many millimetres.
+        """The state with every measured joint offset by `degrees` [deg] or by as many millimetres, with random signs.
 
-        The same seed gives a frame the same signs here and in `carts evaluate`.
+        For the same seed, the signs are those of `carts evaluate`.
         """
         joints = perturb(self.scene, self.joints(state), degrees, (seed, index), self.sequence.measured_joints)
         return self.with_joints(state, joints)
@@ -229,7 +229,7 @@ class Session:
         }
 
     def _follow(self) -> None:
-        """Match joint positions with frames as `time_offset` says, if they are not."""
+        """Match joint positions to frames again if `time_offset` has changed."""
         matching, offset = self._sequence.matching, self.time_offset
         if matching is not None and offset is not None and offset != matching.time_offset:
             self._sequence = self._sequence.with_time_offset(offset)
@@ -242,7 +242,7 @@ def joint_correction(
     provenance: Provenance,
     joint_std: Float[np.ndarray, " dofs"] | None = None,
 ) -> JointCorrection:
-    """A correction [rad, m] with its standard deviations, as far as any is known."""
+    """A correction [rad, m] with its standard deviations, if any of them is known."""
     std = None if joint_std is None or not np.isfinite(joint_std).any() else tuple(joint_std.tolist())
     return JointCorrection(tuple(joint_positions.tolist()), provenance, std)
 
@@ -253,15 +253,15 @@ def _transform(matrix: Float[Tensor, "4 4"], provenance: Provenance) -> Correcte
 
 @dataclass(frozen=True)
 class Storage:
-    """An open project."""
+    """An open project, and whether its edits are kept."""
 
     project: Project
     reason: str | None
-    """Why edits are not kept; None if they are."""
+    """Reason why edits are not kept; None if they are kept."""
     scratch: tempfile.TemporaryDirectory | None = None
     """The folder of a temporary project."""
     hint: str | None = None
-    """Hint at rescued copies of the project."""
+    """Message about rescued copies of the project."""
 
     @property
     def kept(self) -> bool:
@@ -270,12 +270,12 @@ class Storage:
 
     @property
     def notice(self) -> str | None:
-        """Message for the user: edits are not kept, are kept in another file, or another file has further edits; None
-        if there is no message."""
+        """Message for the user if edits are not kept, are kept in another file, or may be in a rescued copy; else
+        None."""
         return self.project.incident or self.reason or self.hint
 
     def close(self) -> None:
-        """Close the project for other writers.
+        """Close the project, so that other programs can write to it.
 
         Raises:
             ProjectError: saved edits are no longer on disk.
@@ -288,16 +288,17 @@ class Storage:
 
 
 def open_storage(sequence: Sequence, path: Path | None = None) -> Storage:
-    """Open, or begin, a sequence's project for the viewer.
+    """Open a sequence's project for the viewer, or create it.
 
     A project that cannot be written opens read-only. If none can be created, a temporary one is used.
 
     Args:
         sequence: the recording.
-        path: of the project; None for the default path.
+        path: the project file; None for the default path.
 
     Raises:
-        ProjectError: the file is of another sequence, of a newer version or no project, or `path` cannot be made.
+        ProjectError: the file belongs to another sequence, has a newer version or is not a project, or `path` cannot be
+            created.
     """
     try:
         project = Project.open(sequence, path)

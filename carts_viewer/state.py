@@ -1,4 +1,4 @@
-"""The immutable state of a tab and the choices of its user; replaced by the worker, read by panels."""
+"""Immutable state of a tab, with the choices of its user; replaced by the worker and read by panels."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -41,11 +41,11 @@ class Compare:
     """The compared pose, and the share of the picture that shows it."""
 
     against: Against | None = None
-    """None: no comparison, except while the key is held."""
+    """None for no comparison, except while the key is pressed."""
     swipe: float = 0.5
-    """Share of the picture's width, from its left side, that shows the other pose, 0..1."""
+    """Share of the picture's width, from the left, that shows the other pose, 0..1."""
     peek: bool = False
-    """Whether the other pose fills the image, while the key is held."""
+    """Whether the key is pressed, so that the whole picture shows the other pose."""
 
     @property
     def share(self) -> float:
@@ -59,7 +59,7 @@ def other_pose(compare: Compare, measured: SceneState, before_run: SceneState | 
 
 
 def composed(own: Rgba, other: Rgba, share: float) -> Rgba:
-    """The other overlay up to a share of the width, the present one beyond it, and a line between them."""
+    """Overlay of the other pose up to a share of the width, of the current pose beyond, and a line between them."""
     column = round(share * own.shape[1])
     both = np.concatenate([other[:, :column], own[:, column:]], axis=1)
     if 0 < column < own.shape[1]:
@@ -88,7 +88,7 @@ class JointRange:
     joint: str
     revolute: bool
     lower: float
-    """[rad] or [m]; without limits, one revolution to either side."""
+    """[rad] or [m]; joints without limits get half a revolution or one metre to either side."""
     upper: float
 
     @property
@@ -109,7 +109,7 @@ def joint_range(arm: Arm, joint: int) -> JointRange:
     """Range of the joint with this index."""
     lower, upper = (float(value) for value in arm.robot.joint_limits[joint])
     revolute = arm.robot.joint_types[joint] == "revolute"
-    # A slider needs limits; the default is one revolution or one metre to either side.
+    # A slider needs limits; the default is half a revolution or one metre to either side.
     room = math.pi if revolute else 1.0
     return JointRange(
         arm.name,
@@ -126,16 +126,16 @@ Masks = Literal["recording", "imported", "painted"]
 
 @dataclass(frozen=True)
 class Observed:
-    """Choice of the target of a run.
+    """The user's choice of the target of a run.
 
     Raises:
         SettingsError: a value is not one of the choices.
     """
 
     what: Observe = "network"
-    """As `--observe`."""
+    """The target, as in `--observe`."""
     masks: Masks = "recording"
-    """Source of the masks, if masks are fitted; as `--masks`."""
+    """Source of the masks, if masks are fitted; as in `--masks`."""
 
     def __post_init__(self) -> None:
         for value, allowed in ((self.what, get_args(Observe)), (self.masks, get_args(Masks))):
@@ -145,7 +145,7 @@ class Observed:
 
 @dataclass(frozen=True, eq=False)
 class Target:
-    """Target of a run: network predictions or masks, with the project's masks at its start."""
+    """Target of a run: network predictions or masks. Masks of the project are those at the start of the run."""
 
     observed: Observed = Observed()
     given: GivenMasks | None = None
@@ -153,13 +153,13 @@ class Target:
 
     @staticmethod
     def of(observed: Observed, project: ProjectState, recording: Recording) -> "Target":
-        """The target of a choice, with the present masks of a project."""
+        """The chosen target, with the current masks of a project."""
         if observed.what == "network" or observed.masks == "recording":
             return Target(observed)
         return Target(observed, project_masks(observed.masks, project, recording))
 
     def seen(self, recording: Recording, index: int, domain: str, cameras: Sequence[str]) -> list[str]:
-        """Cameras whose images of a frame can be compared; with masks alone, those with a mask."""
+        """Cameras that can be compared in a frame; if only masks are fitted, those with a mask."""
         if self.observed.what != "masks":
             return list(cameras)
         if self.given is not None:
@@ -170,7 +170,7 @@ class Target:
 
 
 NETWORK = Target()
-"""Predictions of the network."""
+"""The network's predictions as target."""
 
 
 @dataclass(frozen=True)
@@ -178,7 +178,7 @@ class Preset:
     """A named set of solver settings."""
 
     meaning: str
-    """When to use it, as text for the user."""
+    """When to use the preset, as text for the user."""
     changes: Callable[[SurfaceSolver], dict[str, Any]]
     """Changes to the default settings of a solver of surface maps; other solvers have only the default."""
 
@@ -211,21 +211,21 @@ class SolveState:
     frames: range
     """All frames of the solve, including kept ones."""
     done: int = 0
-    """Frames that were visited."""
+    """Number of visited frames."""
     compared: int = 0
-    """Frames that were compared with their previous poses, after all visits."""
+    """Number of frames that were compared with their previous poses, after all visits."""
     running: bool = True
     text: str = ""
     """Progress, as text for the user."""
     listed: tuple[ListedFrame, ...] = ()
-    """Frames whose fit became worse, or is doubtful."""
+    """Frames whose fit became worse or is doubtful."""
     base_frame_gain: float | None = None
     """At the end, the share of the residual that free base frames would explain [1]; None if unknown."""
     calibration: Any = None
     """Calibration of the project during the solve."""
 
     def suspicion(self, project: ProjectState) -> float | None:
-        """`base_frame_gain`, as long as nothing runs and the project's calibration is the same."""
+        """`base_frame_gain`; None during a solve and after a change of the project's calibration."""
         same = project.records.get(WHOLE_PROJECT) is self.calibration
         return self.base_frame_gain if same and not self.running else None
 
@@ -236,7 +236,7 @@ class SolveState:
 
 
 Frames = range
-"""Neighbouring frames, by index; `ViewState` has a field called `range`."""
+"""Indices of consecutive frames. An alias, since `ViewState` has a field `range`."""
 
 
 class Phase(StrEnum):
@@ -267,14 +267,14 @@ def _tensors(scene: SceneState) -> tuple[torch.Tensor, ...]:
 
 @dataclass(frozen=True)
 class Scores:
-    """Scores of a pose against the truth; None without one."""
+    """Scores of a pose against ground truth; None if there is none."""
 
     dice: float | None = None
-    """Overlap of the rendered and the true mask in the shown camera, 0..1."""
+    """Dice overlap of the rendered mask and the ground truth in the shown camera, 0..1."""
     joint_degrees: float | None = None
     """Mean absolute error of the revolute joints [deg]."""
     cameras: Mapping[str, float] = field(default_factory=dict)
-    """Overlap in every camera whose image and true mask are at hand, 0..1."""
+    """Camera -> Dice overlap, for cameras with a loaded image and a ground-truth mask, 0..1."""
 
 
 @dataclass(frozen=True)
@@ -290,8 +290,8 @@ class Curves:
     seconds: tuple[float, ...] = ()
     """Duration of each iteration [s]."""
     best: int = 0
-    """Index of the iterate that is kept so far. Losses of different observations of the image are not comparable,
-    so it need not be the one of the lowest loss."""
+    """Index of the best iterate so far. It may not have the lowest loss, since losses of different observations are
+    not comparable."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -300,9 +300,9 @@ class Maps:
 
     iterate: Iterate
     cameras: tuple[str, ...]
-    """The cameras that the iterate's maps belong to, in their order."""
+    """Cameras of the iterate's maps, in the same order."""
     of_run: bool = True
-    """Whether a run produced the pose; otherwise it was only compared."""
+    """Whether a run produced the pose; otherwise the pose was only compared with the image."""
 
 
 @dataclass(frozen=True)
@@ -328,22 +328,22 @@ class RunState:
     start: SceneState | None = None
     """Pose at the start of the run."""
     base_frame_gain: float | None = None
-    """The share of the remaining residual that free base frames would explain [1]; None where it is not known."""
+    """The share of the remaining residual that free base frames would explain [1]; None if unknown."""
 
 
 @dataclass(frozen=True)
 class ExportState:
-    """The present or the last export."""
+    """The running or last export."""
 
     format: str
-    """Text for the user."""
+    """Name of the format, as text for the user."""
     frames: int
     """Number of exported frames."""
     done: int = 0
     total: int = 0
-    """Steps of the export; 0 until the first is done."""
+    """Number of steps; 0 until the first is done."""
     path: Path | None = None
-    """Path of the finished export; None before."""
+    """Path of the finished export; None until then."""
 
 
 @dataclass(frozen=True)
@@ -351,7 +351,7 @@ class LiveState:
     """A live stream, shown in place of the recording, or the result of the last one."""
 
     source: str
-    """Text for the user."""
+    """Name of the source, as text for the user."""
     text: str = ""
     """Progress, as text for the user."""
     on: bool = True
@@ -368,9 +368,9 @@ class KeypointState:
     """Keypoints, and their clicked positions in the shown frame."""
 
     shown: bool = False
-    """Whether they are marked in the picture."""
+    """Whether keypoints are drawn in the picture."""
     chosen: str | None = None
-    """Label of the one that is moved; None: the nearest."""
+    """Label of the keypoint that a click places; None for the nearest."""
     pins: tuple[Pin, ...] = ()
     residuals: tuple[float, ...] = ()
     """Distance of each pin from its keypoint in the shown pose [px]."""
@@ -409,22 +409,22 @@ class ViewState:
     compare: Compare = field(default_factory=Compare)
     """The other pose that the picture shows, if any."""
     filter: FrameFilter = field(default_factory=FrameFilter)
-    """The frame filter."""
+    """Filter of the *Browse* panel."""
     reach: Reach = Reach.NEAR
     """Range of the joints' sliders."""
     range: tuple[int, int] | None = None
-    """First and last frame of the part that is played, solved and optimized; None: the whole sequence."""
+    """First and last frame of the part that is played, solved and optimized; None for the whole sequence."""
     beside: bool = True
     """Whether the images of the other cameras are shown beside that of the active one."""
     playing: bool = False
     fps: float = 10.0
     run: RunState = field(default_factory=RunState)
     solve: SolveState | None = None
-    """The present or the last solving of many frames."""
+    """The running or last solve of many frames."""
     direction: Direction = "forward"
-    """Direction of solving many frames."""
+    """Direction in which many frames are solved."""
     joint: tuple[str, int] | None = None
-    """The joint that keys nudge: arm, index of the joint; None: the first."""
+    """The joint that keys move, as arm and index of the joint; None for the first."""
     keypoints: KeypointState = field(default_factory=KeypointState)
     brush: Brush = field(default_factory=Brush)
     maps: Maps | None = None
@@ -446,15 +446,15 @@ class ViewState:
     jobs: tuple[Job, ...] = ()
     """Jobs, oldest first."""
     can_undo: bool = False
-    """Whether this user may have a step to undo."""
+    """Whether there may be a step that this user can undo."""
     can_redo: bool = False
-    """Whether this user has a step to redo."""
+    """Whether there is a step that this user can redo."""
     name: str = ""
     """Name of this user."""
     others: tuple[tuple[str, int], ...] = ()
     """Names and frames of the other present users."""
     busy: str | None = None
-    """Present preparation of the worker, as text for the user."""
+    """Current preparation of the worker, as text for the user."""
     export: ExportState | None = None
     live: LiveState | None = None
     error: str | None = None
@@ -476,7 +476,7 @@ class ViewState:
 
     @property
     def verdict(self) -> FitVerdict | None:
-        """Verdict on the shown pose; None where it was not assessed."""
+        """Verdict on the shown pose; None if it was not assessed."""
         return None if self.streaming else self.project.verdict(self.index)
 
     @property
@@ -513,7 +513,7 @@ class ViewState:
 
     @property
     def ignore_region(self) -> IgnoreRegion | None:
-        """The pixels of the shown frame and camera that the optimizer leaves out."""
+        """The pixels of the shown frame and camera that the optimizer ignores."""
         return self.ignore_region_of(self.camera)
 
     def mask_correction_of(self, camera: str) -> MaskCorrection | None:
@@ -525,5 +525,5 @@ class ViewState:
         return None if self.streaming else self.project.get(Key.part_labels(self.index, camera))
 
     def ignore_region_of(self, camera: str) -> IgnoreRegion | None:
-        """The pixels of the shown frame that the optimizer leaves out in a camera."""
+        """The pixels of the shown frame that the optimizer ignores in a camera."""
         return None if self.streaming else self.project.get(Key.ignore_region(self.index, camera))

@@ -20,7 +20,7 @@ from carts_viewer.editing import People, Person
 from carts_viewer.jobs.optimizers import OptimizerFactory
 from carts_viewer.panels.inputs import PanelPage
 from carts_viewer.panels.layout import Layout, choose_theme
-from carts_viewer.panels.page_state import chosen
+from carts_viewer.panels.page_state import restored_choices
 from carts_viewer.picture.display import PageDisplay
 from carts_viewer.picture.layers import Layer
 from carts_viewer.picture.overlay import OverlayRenderer
@@ -33,18 +33,18 @@ T = TypeVar("T", bound=Hashable)
 
 
 @dataclass(frozen=True)
-class Asked(Generic[T]):
-    """An intent, and the tab that it came from."""
+class QueuedIntent(Generic[T]):
+    """An intent and the tab that it came from."""
 
     tab: T
     intent: Intent
 
 
 class IntentQueue(Generic[T]):
-    """Queue of intents in the order of their newest version. Any thread may put, the worker takes."""
+    """Queue of intents, ordered by their newest version. Any thread may put; only the worker takes."""
 
     def __init__(self) -> None:
-        self._waiting: dict[Hashable, Asked[T]] = {}
+        self._waiting: dict[Hashable, QueuedIntent[T]] = {}
         self._changed = threading.Condition()
         self._woken = False
 
@@ -54,15 +54,11 @@ class IntentQueue(Generic[T]):
             key = object() if intent.key is None else (tab, intent.key)
             # Removed first, so that the newest version is queued behind earlier requests.
             self._waiting.pop(key, None)
-            self._waiting[key] = Asked(tab, intent)
+            self._waiting[key] = QueuedIntent(tab, intent)
             self._changed.notify()
 
-    def take(self, timeout: float | None = None) -> list[Asked[T]]:
-        """Take all waiting intents.
-
-        Args:
-            timeout: How long to wait for a first intent [s]; None waits without limit, 0 not at all.
-        """
+    def take(self, timeout: float | None = None) -> list[QueuedIntent[T]]:
+        """Take all pending intents; if there are none, wait up to `timeout` [s] for one (None: without limit)."""
         with self._changed:
             self._changed.wait_for(lambda: self._waiting or self._woken, timeout)
             self._woken = False
@@ -77,17 +73,17 @@ class IntentQueue(Generic[T]):
             self._changed.notify()
 
     def empty(self) -> bool:
-        """Whether nothing waits."""
+        """Whether no intent is pending."""
         with self._changed:
             return not self._waiting
 
     def waits(self, tab: T, key: Hashable) -> bool:
-        """Whether an intent of this tab and key has arrived and was not yet taken."""
+        """Whether an intent with this tab and key is pending."""
         with self._changed:
             return (tab, key) in self._waiting
 
 
-AWAY = 20.0
+RECONNECT_TIME = 20.0
 """Time for a page to reconnect, as after a reload, before the run of its tab is ended [s]."""
 
 
@@ -148,7 +144,7 @@ class Tab:
         self._queue.put(self, intent)
 
     def waits(self, key: Hashable) -> bool:
-        """Whether an intent of this key waits for the worker."""
+        """Whether an intent with this key is pending."""
         return self._queue.waits(self, key)
 
     @property
@@ -157,7 +153,7 @@ class Tab:
         return None if self.view is None else self.view.page.client.client_id
 
     def attach(self, client: viser.ClientHandle, renderer: OverlayRenderer, storage: Storage, *, light: bool) -> None:
-        """Show this tab in a page, and no longer in an earlier one."""
+        """Show this tab in a page, which replaces its earlier page."""
         choose_theme(client.gui, light=light)
         self.person.present = True
         self.view = View(client, self.session, renderer, storage, self.controller.state, self.put, self.waits)
@@ -165,20 +161,20 @@ class Tab:
         self._gone = False
 
     def detach(self) -> None:
-        """Detach the closed page; its run continues for `AWAY` seconds."""
+        """Detach the closed page; the run continues for `RECONNECT_TIME`."""
         self.view = None
         self.person.present = False
         self._left_at = time.monotonic()
 
     def away_in(self) -> float | None:
-        """Time until `leave` is due [s]; None if it is not."""
-        return None if self._left_at is None else max(0.0, self._left_at + AWAY - time.monotonic())
+        """Time until `leave` ends the run [s]; None if the page is open or the run was ended."""
+        return None if self._left_at is None else max(0.0, self._left_at + RECONNECT_TIME - time.monotonic())
 
     def leave(self) -> None:
-        """End the run once the page has been closed for `AWAY` seconds.
+        """End the run once the page has been closed for `RECONNECT_TIME`.
 
         Raises:
-            CartsError: it could not be saved.
+            CartsError: the pose could not be saved.
         """
         if self.away_in() == 0.0:
             self._left_at, self._gone = None, True
@@ -186,11 +182,11 @@ class Tab:
 
     @property
     def pictured(self) -> bool:
-        """Whether a page shows a picture here."""
+        """Whether a page shows a picture of this tab."""
         return self.view is not None and self._pictured is not None
 
     def picture_wait(self) -> float | None:
-        """Time until the next picture should be sent [s]; None without one."""
+        """Time until the next picture is due [s]; None if none is due."""
         if self.view is None or self._pictured is self.controller.state:
             return None
         return self.view.display.ready_in()
@@ -217,10 +213,10 @@ class Tab:
                 self.view.display.show_panels(self._shown)
 
     def close(self) -> None:
-        """Save unfinished edits, and stop reading frames in advance.
+        """Save unfinished edits, and stop prefetching frames.
 
         Raises:
-            CartsError: it could not be saved.
+            CartsError: the edits could not be saved.
         """
         try:
             self.controller.close()
@@ -228,17 +224,17 @@ class Tab:
             self.session.close()
 
 
-_KEPT = 8
-"""Tabs that are kept after their pages closed."""
+_MAX_CLOSED_TABS = 8
+"""Maximum number of tabs that are kept after their pages were closed."""
 
 
 class Tabs:
-    """All tabs, and their shared state. Used on the worker's thread, except for `of_client` and `first`.
+    """All tabs and their shared state; used on the worker's thread only, except for `of_client` and `first`.
 
     Attributes:
         background: long-running work.
         people: users of the project.
-        first: the initial tab, which the first page takes.
+        first: the initial tab, which is assigned to the first page.
     """
 
     def __init__(
@@ -257,7 +253,7 @@ class Tabs:
         self.people = People(storage.project)
         session = Session(sequence, self.people, Person(0, present=False))
         self._session = session
-        self.background = Background(self._begin(session), session, renderer, optimizers, deliver)
+        self.background = Background(self._initial_state(session), session, renderer, optimizers, deliver)
         self._tabs: tuple[Tab, ...] = ()
         self.first = self._add()
 
@@ -265,7 +261,7 @@ class Tabs:
         return iter(self._tabs)
 
     def of_client(self, client_id: int) -> Tab | None:
-        """The tab of a connection. Thread-safe."""
+        """The tab whose page has this client id, if any. Thread-safe."""
         return next((tab for tab in self._tabs if tab.client_id == client_id), None)
 
     def attach(self, client: viser.ClientHandle, hello: Hello) -> None:
@@ -280,8 +276,8 @@ class Tabs:
         if hello.name:
             tab.controller.handle(intents.SetName(hello.name))
         if known is None:
-            self._do(tab, chosen(hello.settings, tab.controller.state))
-        self._go(tab, hello)
+            self._handle_all(tab, restored_choices(hello.settings, tab.controller.state))
+        self._show_address(tab, hello)
         tab.attach(client, self._renderer, self._storage, light=hello.light)
         self._forget_oldest()
 
@@ -304,7 +300,7 @@ class Tabs:
         """Save all unfinished work.
 
         Raises:
-            CartsError: something could not be saved; the rest is.
+            CartsError: some work could not be saved; all other work is saved.
         """
         problems = []
         for close in (self.background.close, self._session.close, *(tab.close for tab in self._tabs)):
@@ -315,7 +311,7 @@ class Tabs:
         if problems:
             raise problems[0]
 
-    def _go(self, tab: Tab, hello: Hello) -> None:
+    def _show_address(self, tab: Tab, hello: Hello) -> None:
         """Show the frame, camera and domain of the page's address, if they exist."""
         if tab.controller.state.streaming:
             return
@@ -327,10 +323,10 @@ class Tabs:
             found.append(intents.ShowCamera(hello.camera))
         if hello.frame is not None and hello.frame != tab.controller.state.index:
             found.append(intents.ShowFrame(hello.frame))
-        self._do(tab, found)
+        self._handle_all(tab, found)
 
     @staticmethod
-    def _do(tab: Tab, requests: Iterable[intents.Intent]) -> None:
+    def _handle_all(tab: Tab, requests: Iterable[intents.Intent]) -> None:
         for intent in requests:
             try:
                 tab.controller.handle(intent)
@@ -342,7 +338,7 @@ class Tabs:
         person.present = False
         session = Session(self._sequence, self.people, person, self._folders)
         controller = Controller(
-            self._begin(session), session, self._renderer, self._optimizers, self.background, self._deliver
+            self._initial_state(session), session, self._renderer, self._optimizers, self.background, self._deliver
         )
         tab = Tab(self._queue, session, person, controller)
         self._tabs = (*self._tabs, tab)
@@ -350,12 +346,12 @@ class Tabs:
 
     def _forget_oldest(self) -> None:
         gone = [tab for tab in self._tabs if tab.view is None and tab.key is not None]
-        for tab in gone[: max(len(gone) - _KEPT, 0)]:
+        for tab in gone[: max(len(gone) - _MAX_CLOSED_TABS, 0)]:
             self._tabs = tuple(other for other in self._tabs if other is not tab)
             self.people.leave(tab.person)
             tab.close()
 
-    def _begin(self, session: Session) -> ViewState:
+    def _initial_state(self, session: Session) -> ViewState:
         """Initial state of a tab."""
         sequence = session.sequence
         domain, camera = sequence.domains[0], sequence.scene.cameras[0].name

@@ -10,20 +10,20 @@ from queue import SimpleQueue
 from carts_core.errors import CartsError
 from carts_core.process import return_memory
 from carts_viewer.actions import intents
-from carts_viewer.tabs import Asked, IntentQueue, Tab, Tabs
+from carts_viewer.tabs import IntentQueue, QueuedIntent, Tab, Tabs
 
 _log = logging.getLogger(__name__)
 
 MEMORY_KEPT = 10.0
-"""Idle time after which freed memory is returned to the system [s]."""
+"""Idle time after which freed memory is returned to the operating system [s]."""
 MEMORY_KEPT_AT_WORK = 30.0
-"""The same during work beside an open page, where the return may delay a picture by some milliseconds [s]."""
-_BEGINNING = (intents.Optimizing, intents.Propagating, intents.Exporting, intents.Jobs)
-"""Intents that may begin long work."""
+"""Interval of the same during work with an open page, where it may delay a picture by some milliseconds [s]."""
+_STARTS_LONG_WORK = (intents.Optimizing, intents.Propagating, intents.Exporting, intents.Jobs)
+"""Classes of intents that may start long work."""
 
 
 class Worker:
-    """Drains the queue; pictures are sent as fast as each page draws them, and the last one always.
+    """Carries out queued intents; sends pictures as fast as each page draws them, and always the last one.
 
     Tabs take turns: work of one tab delays the others by a single step.
     """
@@ -43,7 +43,7 @@ class Worker:
         self._thread = threading.Thread(target=self._work, name="carts-worker", daemon=True)
 
     def start(self, startup: Callable[[], None] | None = None) -> None:
-        """Begin; `startup` runs on the worker's thread once a page has its first picture."""
+        """Start the thread; it calls `startup` once a page has its first picture."""
         self._startup = startup
         self._thread.start()
 
@@ -54,7 +54,7 @@ class Worker:
         self._thread.join(timeout=30.0)
 
     def call(self, work: Callable[[], None]) -> None:
-        """Call a function on the worker's thread, before waiting intents. Thread-safe."""
+        """Call a function on the worker's thread, before pending intents. Thread-safe."""
         self._calls.put(work)
         self._queue.wake()
 
@@ -68,7 +68,7 @@ class Worker:
         return True
 
     def report(self, text: str | None) -> None:
-        """Show at once in all tabs a text on the present preparation; called on the worker's thread."""
+        """Show a text about the current preparation at once in all tabs; called on the worker's thread."""
         for tab in self._tabs:
             tab.controller.say(text)
             tab.show_panels()
@@ -80,10 +80,10 @@ class Worker:
             if self._startup is not None and any(tab.pictured for tab in self._tabs):
                 self._attempt(self._startup, *self._tabs)
                 self._startup = None
-        # Edits that came just before the end are saved, too; no long work is begun.
-        for asked in self._queue.take(0.0):
-            if not isinstance(asked.intent, _BEGINNING):
-                self._handle(asked)
+        # Edits that arrived just before the end are saved too, but no long work is started.
+        for queued in self._queue.take(0.0):
+            if not isinstance(queued.intent, _STARTS_LONG_WORK):
+                self._handle(queued)
 
     def _round(self) -> None:
         wait_time = self._wait_time()
@@ -99,8 +99,8 @@ class Worker:
             self._worked_at = time.monotonic()
         while not self._calls.empty():
             self._attempt(self._calls.get_nowait(), *self._tabs)
-        for asked in waiting:
-            self._handle(asked)
+        for queued in waiting:
+            self._handle(queued)
         for tab in self._tabs:
             self._attempt(tab.leave, tab)
             self._attempt(tab.controller.advance, tab, stop=True)
@@ -114,7 +114,7 @@ class Worker:
     def _memory_wait(self, at_rest: bool) -> float | None:
         """Return freed memory when idle, and regularly during work, less often while a page is open.
 
-        Returns the time until then [s]; None once it is done.
+        Returns the time until memory is returned next [s]; None if it has been returned.
         """
         now, alone = time.monotonic(), not any(tab.view for tab in self._tabs)
         if not (at_rest or alone) and now - self._returned_at > MEMORY_KEPT_AT_WORK:
@@ -137,10 +137,10 @@ class Worker:
         return_memory()
         self._returned_at = time.monotonic()
 
-    def _handle(self, asked: Asked[Tab]) -> None:
+    def _handle(self, queued: QueuedIntent[Tab]) -> None:
         # Intents of removed tabs are dropped.
-        if asked.tab in self._tabs:
-            self._attempt(lambda: asked.tab.controller.handle(asked.intent), asked.tab)
+        if queued.tab in self._tabs:
+            self._attempt(lambda: queued.tab.controller.handle(queued.intent), queued.tab)
 
     def _advance_background(self) -> None:
         try:
@@ -155,7 +155,7 @@ class Worker:
             self._rest.notify_all()
 
     def _wait_time(self) -> float | None:
-        """Time to wait for an intent [s]: none while there is work, at most until a page takes its next picture."""
+        """Time to wait for an intent [s]: 0 while there is work, at most until a page can take its next picture."""
         waits = [self._tabs.background.wait_time()]
         for tab in self._tabs:
             waits += [tab.controller.wait_time(), tab.picture_wait()]

@@ -120,7 +120,7 @@ def take(work: Photographer) -> None:
         intents.ShowFrame(8),
     )
     work.run()
-    work.do(intents.HoldKeyframe(True), intents.ShowFrame(5), intents.Solve())
+    work.do(intents.SetKeyframe(True), intents.ShowFrame(5), intents.Solve())
     work.wait(lambda: not app.state.solving)
     work.picture("solve")
     work.do(

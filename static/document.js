@@ -19,11 +19,11 @@
         if (!field) return;
         say(field.dataset.do, field.type === "checkbox" ? (field.checked ? "1" : "0") : field.value);
       });
-      // Keys typed here are not shortcuts of the page behind.
+      // Keys typed in the document are not shortcuts of the page below.
       for (const kind of ["keydown", "keyup", "pointerdown", "wheel", "dblclick"]) {
         box.addEventListener(kind, (event) => event.stopPropagation());
       }
-      // A button that is replaced between press and release gets no click: new content waits for the release.
+      // New content is shown after the release of the pointer, since a button that is replaced before gets no click.
       box.addEventListener("pointerdown", () => { held = true; });
       for (const kind of ["pointerup", "pointercancel"]) {
         window.addEventListener(kind, () => setTimeout(release), { capture: true });

@@ -1,4 +1,4 @@
-// Dragging a link of an arm with Ctrl (or Cmd). Every message holds the start and the present position of the pointer, so
+// Dragging a link of an arm with Ctrl (or Cmd). Every message contains the start and the current position of the pointer, so
 // that lost messages do not matter. Needs page.js.
 (() => {
   "use strict";

@@ -1,4 +1,4 @@
-// The timeline's thumbnails and curve. Only the visible part is requested: thumbnails one after the other, the curve as
+// The timeline's thumbnails and curve. Only the visible part is requested: thumbnails two at a time, and the curve as
 // minimum and maximum of every column. timeline.js sets their positions. Needs page.js.
 (() => {
   "use strict";
@@ -6,11 +6,11 @@
   const KEPT = 800; // pictures
   const AT_ONCE = 2;
   const WAIT = 90; // delay before a curve is requested again during a zoom [ms]
-  const COLOURS = ["#8b98a5", "#2dd4a7"]; // of a curve: as measured, and corrected
+  const COLOURS = ["#8b98a5", "#2dd4a7"]; // of measured and corrected values
 
   // ---- Thumbnails -----------------------------------------------------------------------------------------------------
 
-  const pictures = new Map(); // address -> image, or null where there is none
+  const pictures = new Map(); // address -> image, or null if there is none
   const loading = new Set();
   let waiting = [];
   let drawAgain = () => {};
@@ -58,11 +58,11 @@
   // ---- The curve ---------------------------------------------------------------------------------------------------------
 
   let chosen = localStorage.getItem("carts-curve") ?? "";
-  let curve = null; // the newest answer
+  let curve = null; // the newest curve from the server
   let asked = "";
   let timer = null;
 
-  /** Request the visible part of the curve, unless requested already; the old one is drawn meanwhile. */
+  /** Request the visible part of the curve, unless already requested. */
   function ask(view, columns) {
     const [first, last] = [Math.floor(view[0]), Math.ceil(view[1])];
     const key = `${chosen} ${first} ${last} ${columns}`;
@@ -101,7 +101,7 @@
         const x = (xOf(curve.edges[column]) + xOf(curve.edges[column + 1])) / 2;
         if (pen) context.lineTo(x, yOf(highs[column]));
         else context.moveTo(x, yOf(highs[column]));
-        context.lineTo(x, yOf(low) + 0.01); // a single value is seen as a dot
+        context.lineTo(x, yOf(low) + 0.01); // draws a single value as a dot
         pen = true;
       });
       context.stroke();

@@ -21,7 +21,7 @@
     return texture?.image?.width ? texture : null;
   }
 
-  /** A drawing context that holds the pixels of a node's picture; null where there is none. */
+  /** A drawing context that contains the pixels of a node's picture; null if there is none. */
   function pixelsOf(name) {
     const texture = textureOf(name);
     if (!texture) return null;
@@ -89,7 +89,7 @@
   }
 
   window.addEventListener("pointermove", (event) => {
-    // Over a panel or a bar the pointer is not in an image.
+    // A pointer over a panel or a bar is not in an image.
     const over = event.target instanceof Element && event.target.matches("canvas");
     pointer = over ? { clientX: event.clientX, clientY: event.clientY } : null;
   }, { capture: true });

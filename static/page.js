@@ -9,7 +9,7 @@
 
   const FRAME = "/frame";
   const OVERLAY = "/overlay";
-  const OTHERS = "/others"; // the other cameras' frames and overlays, beside the shown one's
+  const OTHERS = "/others"; // frames and overlays of the other cameras, beside those of the shown camera
   const SCENE_ONLY = ["/world", "/lens", "/grid"]; // covered by the frame, or clutter in front of it
   const GHOST = "/world/measured "; // semi-transparent arms as measured, in the 3D view
   const SCENE_LAYER = 7;
@@ -17,12 +17,12 @@
   const SWITCHED = { grid: 9, ghost: 10 }; // layers of the 3D view that can be switched off
   const switchedOn = { grid: true, ghost: true };
   const MARGIN = 1.02;
-  const view = { endoscope: true, zoom: 1, x: 0.5, y: 0.5 }; // x, y: the view's centre, as shares of the image
+  const view = { endoscope: true, zoom: 1, x: 0.5, y: 0.5 }; // x, y: the view's centre, relative to the image
   const viser = () => window.__viserMutable;
 
   let shown = { cameras: [], active: 0 }; // state of the cameras from the server, see setPage
 
-  /** The cameras' images on the plane at distance 1 from the lens; `index` is that of the camera. */
+  /** Rectangles of the cameras' images on the plane at distance 1 from the lens, with the cameras' indices. */
   function cells() {
     const active = rectangleOf(FRAME);
     if (!active) return [];
@@ -69,7 +69,7 @@
     }
   }
 
-  /** The rectangle around all images on the plane at distance 1, or null before the first frame arrived. */
+  /** The rectangle around all images on the plane at distance 1; null before the first frame has arrived. */
   function imageRectangle() {
     const all = cells();
     if (!all.length) return null;
@@ -105,7 +105,7 @@
     return strip ? strip.offsetHeight + (parseFloat(getComputedStyle(strip).bottom) || 0) : 0;
   }
 
-  /** Shares of the canvas that our own bars cover, above and below. */
+  /** Shares of the canvas that this page's bars cover at its upper and lower end. */
   function covered() {
     const height = viser()?.canvas?.clientHeight || 1;
     return [46 / height, bottomBars() / height];
@@ -124,7 +124,7 @@
     };
   }
 
-  /** The rectangle of a camera's image, by default the shown one's, on the canvas in the endoscope view [CSS px]. */
+  /** The rectangle of a camera's image on the canvas in the endoscope view [CSS px]; by default of the shown camera. */
   function imageOnScreen(index = shown.active) {
     const image = view.endoscope ? imageRectangle() : null;
     const { camera, canvas } = viser() ?? {};
@@ -138,7 +138,7 @@
     };
   }
 
-  /** The camera under the pointer and the position in its image, as shares: [index, u, v]; null outside of all images. */
+  /** The camera under the pointer and the relative position in its image: [index, u, v]; null outside of all images. */
   function imageAt(event, index = null) {
     const box = viser().canvas.getBoundingClientRect();
     for (const cell of cells()) {
@@ -270,7 +270,7 @@
       in: () => zoomAt(1.25, 0.5, 0.5), out: () => zoomAt(0.8, 0.5, 0.5),
     };
     for (const button of bar.querySelectorAll("button")) {
-      // Unfocused, or the space bar would press it again.
+      // The button loses the focus; otherwise, the space bar would press it again.
       button.addEventListener("click", () => { actions[button.dataset.do](); button.blur(); });
     }
     for (const kind of ["pointerdown", "pointermove", "pointerup", "wheel", "dblclick"]) {
@@ -278,7 +278,7 @@
     }
     hint = document.createElement("div");
     hint.className = "carts-hint";
-    hint.textContent = "Drag to orbit · right-drag to move · wheel to come closer · grid of 1 cm";
+    hint.textContent = "Drag to orbit · right-drag to move · wheel to zoom · grid of 1 cm";
     const parent = canvas.parentElement;
     if (getComputedStyle(parent).position === "static") parent.style.position = "relative";
     parent.append(bar, hint);
@@ -305,7 +305,7 @@
 
   // ---- Zoom and pan with the mouse ---------------------------------------------------------------------------------
 
-  /** Zoom by a factor about the point (u, v) of the canvas, as shares. */
+  /** Zoom by a factor about the point (u, v), relative to the size of the canvas. */
   function zoomAt(factor, u, v) {
     const image = imageRectangle();
     const camera = viser()?.camera;
@@ -320,7 +320,7 @@
   }
 
   function listen() {
-    // paint.js lays its canvas over viser's; wheel and other buttons keep their function there.
+    // paint.js lays its canvas over viser's canvas; there, the wheel and the other buttons keep their functions.
     const painting = (event) => event.target instanceof Element && event.target.classList.contains("carts-paint");
     const inPicture = (event) =>
       view.endoscope && viser()?.canvas && (event.target === viser().canvas || painting(event));
@@ -333,9 +333,9 @@
     let place = null; // position to report
     let pressed = null; // position of a press that started no other gesture
     let latest = null; // newest event of the drag
-    // Report a resting pointer with its button down, too, or its edit would be saved.
+    // A resting pointer whose button is down is reported, too; otherwise, the unfinished edit would be saved.
     setInterval(() => { if (pointing !== null && latest) point(latest); }, 2000);
-    /** Report the pointer's position in the image, at most 30 times a second, the last one always. */
+    /** Report the pointer's position in the image, at most 30 times a second, and always the last position. */
     const point = (event) => {
       const found = imageAt(event, pointing);
       if (!found) return;
@@ -408,7 +408,7 @@
   const isControl = (event) => event.target instanceof Element && event.target.closest("[role=slider], input");
   let grabbed = false;
   let pressing = false; // whether a button of the mouse is down
-  // A drag takes the focus from a field; its release is reported with the drag's, or it would end the drag early.
+  // A drag takes the focus from a field. The field's release is reported with the end of the drag, not before.
   let pending = null; // timer of a release that is not reported yet
   const letGo = () => {
     if (!grabbed) return;
@@ -438,7 +438,7 @@
   window.addEventListener("focusout", (event) => { if (isControl(event)) { grabbed = true; letGo(); } });
   let drawnTexture = null;
 
-  /** Acknowledge a drawn overlay; WebGL drops a texture that a newer one replaces during decoding, so the server waits. */
+  /** Acknowledge a drawn overlay. The server waits for this, since WebGL drops a texture that is replaced while decoded. */
   function reportDrawn() {
     let texture = null;
     viser()?.nodeRefFromName[OVERLAY]?.traverse((child) => { texture ??= child.material?.map ?? null; });
@@ -476,7 +476,7 @@
 
   // ---- Show a lost connection -------------------------------------------------------------------------------------
 
-  /** While there is no connection, viser's client replaces what sends by a function that only writes to the log. */
+  /** Whether the tab is connected; if it is not, viser's client replaces `sendMessage` by a function that only logs. */
   const connected = () => !/not connected/i.test(String(viser()?.sendMessage));
   setInterval(() => document.body.classList.toggle("carts-offline", Boolean(viser()?.canvas) && !connected()), 300);
 
@@ -495,7 +495,7 @@
     }
     if (!bar?.isConnected) buildBar(mutable.canvas);
     if (view.endoscope && mutable.cameraControl.enabled) mutable.cameraControl.enabled = false;
-    // viser sets `visible` itself in every frame, so nodes of the 3D view have a layer of their own.
+    // viser sets `visible` in every frame, so nodes of the 3D view have a separate layer.
     for (const name of SCENE_ONLY) mutable.nodeRefFromName[name]?.traverse((child) => child.layers.set(SCENE_LAYER));
     mutable.nodeRefFromName["/grid"]?.traverse((child) => child.layers.set(SWITCHED.grid));
     for (const [name, node] of Object.entries(mutable.nodeRefFromName)) {
@@ -522,7 +522,7 @@
   window.carts = {
     view, imageAt, activate, connected,
     shown: () => shown,
-    /** Take the state of cameras, frame and marks from the server; other scripts listen to it, too. */
+    /** Receive the state of cameras, frame and marks from the server, and pass it to the other scripts. */
     setPage(message) {
       shown = message;
       document.dispatchEvent(new CustomEvent("carts-page", { detail: message }));

@@ -3,9 +3,9 @@
 (() => {
   "use strict";
 
-  const SPACING = 0.7; // least distance of stored points [px of the image]
-  const LONGEST = 15000; // points; then another stroke begins, since the server accepts 20,000
-  const BOX = 6; // motion of the pointer from which it draws a box [px of the screen]
+  const SPACING = 0.7; // minimum distance between stored points [px of the image]
+  const MAX_POINTS = 15000; // then another stroke begins, since the server accepts at most 20,000 points
+  const BOX = 6; // minimum motion of the pointer that draws a box [px of the screen]
   const NEAR = 9; // distance to the first corner within which a click closes the polygon [px of the screen]
   const SHOWN_BY_NOW = 250; // [ms] after the server's acknowledgement, if no new overlay is detected
   const FORGOTTEN = 60000; // [ms] after which an unacknowledged stroke is dropped
@@ -15,7 +15,7 @@
   let drawing = null; // the current stroke, or the open polygon
   let pending = []; // sent strokes that no overlay shows yet
   let count = 0;
-  let pointer = null; // in the image [px]
+  let pointer = null; // its position in the image [px]
   let shift = false;
   let drawn = "";
   let dirty = true;
@@ -33,7 +33,7 @@
     ];
   }
 
-  /** Distance of two points of the image on the screen [px]. */
+  /** Distance on the screen between two points of the image [px]. */
   function apart(a, b) {
     const image = place();
     return Math.hypot(((a[0] - b[0]) * image.width) / brush.width, ((a[1] - b[1]) * image.height) / brush.height);
@@ -50,7 +50,7 @@
 
   function add(point) {
     if (drawing.prompt) {
-      // A click, or a box from there to the pointer.
+      // A click, or a box from the first point to the pointer.
       drawing.points = apart(drawing.points[0], point) > BOX ? [drawing.points[0], point] : [drawing.points[0]];
       dirty = true;
       return;
@@ -58,7 +58,7 @@
     const last = drawing.points[drawing.points.length - 1];
     if (Math.hypot(point[0] - last[0], point[1] - last[1]) < SPACING) return;
     drawing.points.push(point);
-    if (drawing.points.length >= LONGEST && !drawing.polygon) {
+    if (drawing.points.length >= MAX_POINTS && !drawing.polygon) {
       finish();
       begin(point);
     }
@@ -122,7 +122,7 @@
     const moves = event.getCoalescedEvents?.() ?? [];
     for (const one of moves.length ? moves : [event]) {
       const point = inImage(one);
-      if (point) add(point); // there is none while the picture is replaced
+      if (point) add(point); // null while the picture is replaced
     }
   }
 
@@ -171,7 +171,7 @@
   function path(context, stroke, image, closed) {
     const [x, y] = [image.width / brush.width, image.height / brush.height];
     context.beginPath();
-    // A single point twice: it is drawn by the round ends of the line.
+    // A single point is repeated, so that the round ends of the line draw it.
     const points = stroke.points.length === 1 ? [...stroke.points, ...stroke.points] : stroke.points;
     for (const [u, v] of points) context.lineTo(u * x, v * y);
     if (closed) context.closePath();
@@ -261,7 +261,7 @@
     }
   }
 
-  /** With a tool selected, the canvas takes the pointer; without one, it pans the image. */
+  /** The canvas receives pointer events if a tool is selected; otherwise the pointer pans the image. */
   function takePointer(on) {
     canvas.style.pointerEvents = on ? "auto" : "none";
     canvas.style.cursor = ["polygon", "prompt"].includes(brush.tool) ? "crosshair" : "none";
@@ -295,7 +295,7 @@
     setBrush(message) {
       const other = message.frame !== brush.frame || message.camera !== brush.camera;
       if (drawing && (other || message.tool !== brush.tool)) {
-        // A stroke belongs to the frame on which it was begun; an unfinished polygon is dropped.
+        // A stroke belongs to the frame on which it was started; an unfinished polygon is dropped.
         if (drawing.polygon) drop();
         else finish();
       }

@@ -32,12 +32,12 @@
   window.addEventListener("pagehide", () => sessionStorage.setItem("carts-key", key));
   window.addEventListener("pageshow", () => sessionStorage.removeItem("carts-key"));
 
-  /** Project, frame (from 1), camera and domain in the address, as far as given. */
+  /** Frame, camera and domain in the address, if given; `problem` if the address belongs to another project. */
   function linked() {
     const said = new URL(location.href).searchParams;
     const project = window.cartsConfiguration.project;
     if (said.has("project") && said.get("project") !== project) {
-      return { problem: `This link is for ${said.get("project")}; open here is ${project || "no recording"}.` };
+      return { problem: `This link is for ${said.get("project")}, but ${project || "no recording"} is open.` };
     }
     const frame = Number.parseInt(said.get("frame"), 10);
     return {
@@ -45,7 +45,7 @@
     };
   }
 
-  /** The address of what this tab shows. */
+  /** Address of the frame, camera and domain that this tab shows. */
   function link(detail) {
     const address = new URL(location.href);
     const place = {
@@ -85,7 +85,7 @@
     const address = link(latest);
     try {
       await navigator.clipboard.writeText(address);
-      tell("The link is in the clipboard.");
+      tell("The link was copied.");
     } catch {
       window.prompt("The link to this frame:", address); // no clipboard without https
     }
@@ -135,7 +135,7 @@
     away = !on;
   }, 300);
 
-  // ---- The key sheet ---- ----------------------------------------------------------------------------------------------
+  // ---- The key sheet ---------------------------------------------------------------------------------------------------
 
   let sheet = null;
 
@@ -171,9 +171,9 @@
   // ---- Hints of buttons and labels; viser shows those of fields ------------------------------------------------------------
 
   let hints = {};
-  let explained = 0;
+  let hintsSetAt = 0;
 
-  function explain() {
+  function showHints() {
     for (const [id, hint] of Object.entries(hints)) {
       const control = document.getElementById(id);
       const named = control?.closest("button") ?? document.querySelector(`label[for="${id}"]`);
@@ -182,9 +182,9 @@
   }
 
   document.addEventListener("pointerover", () => {
-    if (performance.now() - explained < 300) return;
-    explained = performance.now();
-    explain();
+    if (performance.now() - hintsSetAt < 300) return;
+    hintsSetAt = performance.now();
+    showHints();
   });
 
   // ---- Show the compared pose while a key is held --------------------------------------------------------------------------
@@ -239,9 +239,9 @@
 
   Object.assign(window.carts, {
     copyLink, key,
-    setHints(message) { hints = message; explain(); },
-    /** Reload if the server was restarted after this page was loaded: it has none of its widgets. */
-    meet(name) { if (name !== window.cartsConfiguration.server) location.reload(); },
+    setHints(message) { hints = message; showHints(); },
+    /** Reload if the server was restarted after this page was loaded, since the new server has other widgets. */
+    reloadIfServerChanged(name) { if (name !== window.cartsConfiguration.server) location.reload(); },
     /** Reload the page without project, frame, camera and domain in its address. */
     reload() {
       const address = new URL(location.href);

@@ -11,9 +11,9 @@
   const SOURCE = [null, "#facc15", "#60a5fa", "#e879f9"];
   const [TICKS, BARS, FITS, SOURCES, WHOLE] = [13, 24, 5, 4, 8]; // heights [px]
   const [PICTURES, CURVE] = [38, 36]; // heights of the parts omitted in low windows [px]
-  const TALL = 560; // least height of a window that shows them [px]
-  const LEAST = 8; // visible frames at the largest zoom
-  const CONFIRMED_WITHIN = 1000; // time after which the server's range is taken even if it is not the reported one [ms]
+  const TALL = 560; // minimum height of a window that shows them [px]
+  const LEAST = 8; // minimum number of visible frames
+  const CONFIRMED_WITHIN = 1000; // time after which the server's range applies even if it differs from the reported range [ms]
   const GRIP = 7; // distance within which an end of the range can be grabbed [px]
 
   let strip = null;
@@ -33,9 +33,9 @@
   let range = null; // first and last frame that are played, solved and optimized
   let view = [0, 1]; // first and last visible frame
   let dragging = null; // "scrub", "whole" or "range"
-  let anchor = 0; // frame at which a range was begun
-  let hover = null;
-  let pointer = 0; // its column on the canvas [px]
+  let anchor = 0; // frame at which the marking of a range started
+  let hover = null; // frame under the pointer
+  let pointer = 0; // column of the pointer on the canvas [px]
   let dirty = true;
   let wanted = null;
   let open = localStorage.getItem("carts-lanes") !== "closed";
@@ -46,7 +46,7 @@
     strip = document.createElement("div");
     strip.className = "carts-strip";
     strip.innerHTML = `<div class="carts-strip-head">
-        <button data-do="first" title="Begin the range at this frame; it limits playing, solving, optimizing and exporting. Key: (">(&nbsp;Start</button>
+        <button data-do="first" title="Start the range at this frame; it limits playback, solving, optimizing and exporting. Key: (">(&nbsp;Start</button>
         <button data-do="last" title="End the range at this frame. Key: )">End&nbsp;)</button>
         <button data-do="whole" title="Remove the range">×</button>
         <span class="carts-range"></span>
@@ -101,11 +101,11 @@
     const keys = (colours, names) => [...names.keys()].filter((number) => colours[number])
       .flatMap((number) => [" ", key(colours[number], names[number])]);
     const rows = [
-      ["White tick", "kept: an accepted frame, a keyframe, or one that was moved by hand; solving does not change it"],
+      ["White tick", "kept: an accepted frame, a keyframe, or a frame moved by hand; solving does not change it"],
       ["Bar", "misfit: higher is worse; low and faint if the fit of the current pose is unknown, none if nothing is known. Its colour is the review state, or the source of the joints:", ...keys(REVIEW, NAMES)],
       ["Stripe below", "the verdict on the fit:", ...keys(FIT, VERDICTS)],
       ["Stripe below that", "the source of the joints:", ...keys(SOURCE, ["", NAMES[5], NAMES[1], NAMES[6]])],
-      ["Line at the bottom", "the whole sequence, in the colours of the verdict or, without one, of the review; its box marks the part shown above"],
+      ["Line at the bottom", "the whole sequence, in the colours of the verdicts or, if there is none, of the reviews; the box marks the part shown above"],
       ["Bands", "teal: the shown frame; pink: being solved; amber: ends of the range, dimmed outside of it"],
     ];
     card.append(...rows.flatMap(([name, ...about]) => [make("dt", {}, name), make("dd", {}, ...about)]));
@@ -168,7 +168,7 @@
     rangeTimer ??= setTimeout(tellRange, 40);
   }
 
-  /** Take over the server's range, except during a drag and until the server has answered the latest report. */
+  /** Apply the server's range, except during a drag and until the server has confirmed the reported range. */
   function takeRange() {
     if (dragging === "range" || unconfirmed !== null) return;
     range = shown.range;
@@ -208,7 +208,7 @@
     show(frameAt(event.offsetX) - at * next + (event.deltaX / width()) * count, next);
   }
 
-  /** For every column of pixels the worst frame, and whether any frame is kept. */
+  /** For every column of pixels: code of the worst frame, and whether any frame is kept. */
   function columns(first, last, count) {
     const found = [];
     for (let column = 0; column < count; column += 1) {
@@ -230,7 +230,7 @@
     if (!code) return;
     const bad = ((code >> 8) & 255) / 255;
     const tallness = Math.max(3, bad * height);
-    context.globalAlpha = bad ? 1 : 0.4; // unknown fits differ from good ones
+    context.globalAlpha = bad ? 1 : 0.4; // distinguishes unknown fits from good fits
     context.fillStyle = REVIEW[code & 7];
     context.fillRect(x, top + height - tallness, wide, tallness);
     context.globalAlpha = 1;
@@ -304,7 +304,7 @@
     context.globalAlpha = 1;
   }
 
-  /** Description of a frame; with its undetermined joints if `whole`. */
+  /** Description of a frame, with the number of its undetermined joints if `whole`. */
   function described(frame, whole = true) {
     const code = codes[frame] ?? 0;
     const said = NAMES[code & 7];
@@ -391,7 +391,7 @@
     if (dragging === null && (here < view[0] || here >= view[1])) show(here - count / 2, count);
   });
   Object.assign(window.carts, {
-    /** Set all codes, or only changed ones without `whole`: a flat list of pairs of frame and code. */
+    /** Set all codes, or only changed codes if not `whole`: a flat list of alternating frames and codes. */
     setTimeline(message) {
       if (message.whole) {
         const other = frames !== message.frames;

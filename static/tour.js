@@ -1,5 +1,5 @@
-// A guided tour of the page: each step frames and explains an element. It is offered once, can be left at any time, and
-// started again from the key sheet. Needs page.js and shell.js.
+// A guided tour of the page: each step frames and explains an element. It is offered until it is started or declined, can
+// be left at any time, and can be started again from the key sheet. Needs page.js and shell.js.
 (() => {
   "use strict";
 
@@ -9,16 +9,16 @@
       "a click chooses a camera."],
     [".carts-verdict", "The verdict", "The reliability of the fit: good, doubtful or failed, with a reason and a remedy. " +
       "It is derived from the images, not from the solver, and refers to the mask. The tab Values marks joints that the " +
-      "images hardly show."],
+      "images hardly determine."],
     ["Run", "Run", "The optimizer moves the joints until the rendered arm and the images agree (key R). Curves below show its progress."],
     ["Joints", "Joints", "Move joints by hand. Shift+click on the image places a keypoint of the arm."],
-    [".carts-strip", "The timeline", "All frames: high bars fit badly, and frames without a bar have no fit yet. Drag to scrub, wheel to zoom, Shift+drag for a range. " +
+    [".carts-strip", "The timeline", "All frames: high bars indicate bad fits, and frames without a bar have no fit yet. Drag to scrub, wheel to zoom, Shift+drag for a range. " +
       "Legend explains colours and marks."],
-    ["Review", "Review", "Accept (G) goes on to the next unreviewed frame. The tab also has keyframes, Solve between, " +
+    ["Review", "Review", "Accept + next (G) shows the next unreviewed frame. The tab also has keyframes, Solve between, " +
       "search and history."],
     ["Jobs", "Jobs", "Long tasks run here while you continue: many frames, calibrations, exports."],
     ["Export", "Export", "Masks, keypoints and kinematics for other tools. Every edit is saved at once and can be undone."],
-    [".carts-review-bar", "Review", "The verdict, and your review of the frame; accepting goes on to the next one."],
+    [".carts-review-bar", "Review", "The verdict, and your review of the frame; accepting shows the next unreviewed frame."],
     [".carts-review-bar [data-do=controls]", "All controls", "Everything else is behind this button, in tabs: fit, review, values, jobs, export, help."],
     [".carts-bar [data-do=help]", "More", "This button, or the key ?, opens the key sheet. Every control has a hint, shown when the pointer " +
       "rests on it."],
@@ -36,7 +36,7 @@
     if (direct) return visible(direct) ? direct : null;
     const named = [...document.querySelectorAll("button, [role=tab], .mantine-Paper-root *")];
     const found = named.find((one) => one.textContent.trim() === name && visible(one)) ?? null;
-    // The name of a folder stands for the folder.
+    // The name of a folder means the whole folder.
     return found?.closest("button, [role=tab]") ? found : found?.parentElement.closest(".mantine-Paper-root") ?? null;
   }
 
@@ -58,7 +58,7 @@
     document.body.append(frame, card);
   }
 
-  /** Frame the element of this step, and put the card beside it, inside the window. */
+  /** Frame the element of this step, and put the card beside the element, inside the window. */
   function draw() {
     if (place < 0) return;
     const [name, title, text] = steps[place];
@@ -116,7 +116,7 @@
     document.body.classList.remove("carts-touring");
   }
 
-  /** Offer the tour at every visit until it is answered, if there is something to show. */
+  /** Offer the tour at every visit until it is started or declined, if a recording is open. */
   function offer() {
     const answered = !["offered", null].includes(localStorage.getItem(SEEN)); // older versions stored "offered"
     if (answered || !document.querySelector(".carts-strip") || document.querySelector(".carts-offer")) return;

@@ -63,7 +63,7 @@ KINDS = {
         "Keyframe",
         "Dice below",
     ),
-    "jobs": ("Solve between", "Solve all", "Take all", "Stop and keep", "Optimize each alone", "Calibrate", "Cancel"),
+    "jobs": ("Solve between", "Solve all", "Take all", "Stop and keep", "Optimize individually", "Calibrate", "Cancel"),
     "export": ("Format", "Frames", "Category per", "With images", "Export", "Cancel export", "Export mask"),
     "live": ("Start", "Stop"),
     "paint": (),

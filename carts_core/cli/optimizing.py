@@ -368,11 +368,11 @@ class Optimizing:
         observer, offset = self._observer, asked.start
         what = observer.predictor, self._solver, self._free, model, offset.perturb_deg, offset.seed, observer.ignore
         setup = Setup(sequence, domain, cameras, *what)
-        return _Part(setup, FrameFolder(sequence, cameras, folder, self._settings(), asked.overwrite))
+        return _Part(setup, FrameFolder(sequence, cameras, folder, self._result_settings(), asked.overwrite))
 
     def _run(self, part: _Part) -> None:
         frames, output, setup, together = self._frames, part.output, part.setup, part.setup.model is not None
-        origins = FrameInputs(setup, self._observer, json.dumps(self._settings()))
+        origins = FrameInputs(setup, self._observer, json.dumps(self._result_settings()))
         common = origins.common
         if together:
             of_all = origins.of_all(frames)
@@ -458,7 +458,7 @@ class Optimizing:
         )
 
     def _solve_sequence(self, part: _Part, origins: Mapping[int, InputHashes], common: InputHashes) -> None:
-        made_with = fingerprint(json.dumps(self._settings()), json.dumps(dict(common)))
+        made_with = fingerprint(json.dumps(self._result_settings()), json.dumps(dict(common)))
         checkpoint = sequence_checkpoint(part.output.checkpoint, made_with)
         optimizer = part.setup.sequence_optimizer(self._frames, keyframes=self._keyframes, checkpoint=checkpoint)
         self._running = optimizer
@@ -507,7 +507,7 @@ class Optimizing:
         }
         return {index: rows[ids[index]] for index in self._frames if ids[index] in rows}
 
-    def _settings(self) -> dict[str, Any]:
+    def _result_settings(self) -> dict[str, Any]:
         """Settings stored with the results. Inputs are stored as fingerprints (`FrameInputs`)."""
         asked = self._asked
         settings = {

@@ -13,7 +13,7 @@ from carts_viewer.state import Against, Reach, RunState
 
 _log = logging.getLogger(__name__)
 SPEEDS = (0.5, 60.0)
-"""Slowest and fastest playing [frames/s]."""
+"""Minimum and maximum playback speed [frames/s]."""
 
 
 class BrowsingHandler(Handler):
@@ -38,7 +38,7 @@ class BrowsingHandler(Handler):
     def show(
         self, *, index: int | None = None, domain: str | None = None, camera: str | None = None, again: bool = False
     ) -> None:
-        """Go to another frame, domain or camera, or show the same again; out of range is clamped.
+        """Show another frame, domain or camera, or reload the same frame with `again`; indices are clamped.
 
         Raises:
             CartsError: a name is unknown, the image is not usable, or an unfinished edit could not be saved.
@@ -88,7 +88,7 @@ class BrowsingHandler(Handler):
             # Half-typed numbers are often far off, so no error is shown before the field is left.
             now = f"{sequence.matching.time_offset:g} s"
             text = (
-                f"With {seconds:g} s, some frames have no joint positions near their times; the offset remains {now}."
+                f"With {seconds:g} s, some frames have no joint positions near their times. The offset remains {now}."
             )
             _log.info("%s %s", text, error)
             self._context.change(time_error=text)
@@ -118,7 +118,7 @@ class BrowsingHandler(Handler):
     def _on_MarkRange(self, intent: intents.MarkRange) -> None:
         index, end = self._context.state.index, len(self._session.sequence) - 1
         first, last = self._context.state.range or (0, end)
-        # A new end before the present beginning, or the reverse, resets the opposite end.
+        # A new end before the current start resets the start; a new start after the current end resets the end.
         if intent.end:
             self.handle(intents.SetRange((first if first <= index else 0, index)))
         else:

@@ -59,7 +59,7 @@ class Context:
         """End the run on the shown frame, if there is one, and save its pose; `reason` is text for the user.
 
         Raises:
-            ProjectError: it could not be saved.
+            ProjectError: the pose could not be saved.
         """
         if self.run is not None:
             self.run.end(reason)
@@ -67,20 +67,20 @@ class Context:
     def set_pose(
         self, name: str, scene: SceneState, *, gesture: object = None, source: Source = Source.HAND, pins: bool = False
     ) -> None:
-        """Set the pose of the shown frame; no run may be open.
+        """Set the pose of the shown frame; no run may be active.
 
         Args:
-            name: of the step in the history.
+            name: name of the step in the history.
             scene: the pose.
-            gesture: edits of the same gesture are one step, saved when it ends; None: this is the whole gesture.
+            gesture: edits of the same gesture are one step, saved when it ends; None for a complete gesture.
             source: origin of the pose.
             pins: whether the pose was fitted to pins; otherwise they are removed.
 
         Raises:
-            ProjectError: it could not be saved.
+            ProjectError: the edit could not be saved.
         """
         if not pins:
-            self.forget_pins()
+            self.remove_pins()
         self.edit(name, self.session.edits(self.state.frame, scene, Provenance(source)), gesture=gesture)
 
     def edit(
@@ -92,7 +92,7 @@ class Context:
         loss: float | None = None,
         maps: Maps | None = None,
     ) -> None:
-        """Change the project; arguments and errors as `set_pose`. `loss` and `maps` are the optimizer's at its pose."""
+        """Change the project; arguments and errors as `set_pose`. `loss` and `maps` belong to the new pose."""
         if self._editor.gesture != gesture:
             self.save()
         self._loss = loss
@@ -107,7 +107,7 @@ class Context:
         """Save the unfinished gesture, if any, as one step.
 
         Raises:
-            ProjectError: it could not be saved.
+            ProjectError: the gesture could not be saved.
         """
         if not self._editor.unsaved:
             return
@@ -127,7 +127,7 @@ class Context:
     def leave_frame(self) -> None:
         """Save the shown frame before another one is shown. Errors as `save`."""
         self.save()
-        # A project that takes no edits cannot save it.
+        # In a read-only project the draft could not be saved.
         self._editor.drop()
         self._loss = None
 
@@ -143,13 +143,13 @@ class Context:
             self._measure_pins()
         self.change(maps=maps or self.state.maps)
         self._follow()
-        if self._truths(self.state) != self._truths(before):
+        if self._ground_truth_masks(self.state) != self._ground_truth_masks(before):
             self.change(scores=None)
         if self.state.ignore_region != before.ignore_region:
             self.change(maps=None)
 
     @staticmethod
-    def _truths(state: ViewState) -> tuple[object, ...]:
+    def _ground_truth_masks(state: ViewState) -> tuple[object, ...]:
         """Masks that scores depend on: the corrected mask and imported masks."""
         record = state.project.records.get(state.index)
         entries = {} if record is None else record.entries
@@ -157,7 +157,7 @@ class Context:
         return state.mask_correction, *others
 
     def score(self) -> None:
-        """Compare the pose with ground truth, unless already done; the project keeps the first figures."""
+        """Compare the pose with ground truth, unless already done; the project stores the first figures of a frame."""
         state = self.state
         if state.scores is not None:
             return
@@ -183,7 +183,7 @@ class Context:
                 distances.append(math.dist(at.tolist(), pin.pixel))
             self.change(keypoints=replace(keypoints, residuals=tuple(distances)))
 
-    def forget_pins(self) -> None:
+    def remove_pins(self) -> None:
         """Remove the placed keypoints."""
         if self.state.keypoints.pins:
             self.change(keypoints=replace(self.state.keypoints, pins=(), residuals=()))
@@ -196,7 +196,7 @@ def finite(value: float) -> float:
         CartsError: it is not finite.
     """
     if not math.isfinite(value):
-        raise CartsError(f"{value} is not a valid value of a control.")
+        raise CartsError(f"{value} is not a finite number.")
     return float(value)
 
 
@@ -210,7 +210,7 @@ def clamped(value: float, low: float, high: float) -> float:
 
 
 def one_of(asked: str | None, now: str, known: Collection[str], what: str) -> str:
-    """The requested name, by default the present one.
+    """The requested name, by default the current one.
 
     Raises:
         CartsError: the name is unknown.
@@ -218,12 +218,12 @@ def one_of(asked: str | None, now: str, known: Collection[str], what: str) -> st
     if asked is None:
         return now
     if asked not in known:
-        raise CartsError(f"There is no {what} {asked!r}; this sequence has: {', '.join(known)}.")
+        raise CartsError(f"Unknown {what} {asked!r}. This sequence has: {', '.join(known)}.")
     return asked
 
 
 class Handler:
-    """Carries out intents, each by the method `_on_NAME` of its class, as `ast.NodeVisitor` does."""
+    """Carries out intents by calling the method `_on_NAME` for the class NAME, similar to `ast.NodeVisitor`."""
 
     def __init__(self, context: Context) -> None:
         self._context, self._session = context, context.session
@@ -232,12 +232,12 @@ class Handler:
         """Carry out an intent.
 
         Raises:
-            CartsError: it cannot be carried out; the state stays valid.
+            CartsError: the intent cannot be carried out; the state stays valid.
         """
         if not self.takes(intent):
             raise CartsError(f"The viewer has no handler for {type(intent).__name__}; this is a bug.")
         getattr(self, f"_on_{type(intent).__name__}")(intent)
 
     def takes(self, intent: Intent) -> bool:
-        """Whether there is a method for an intent."""
+        """Whether this handler has a method for an intent."""
         return hasattr(self, f"_on_{type(intent).__name__}")

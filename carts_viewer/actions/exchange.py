@@ -47,7 +47,7 @@ _STEMS = {
     "dvrk-2.3": "base_frames",
     "dvrk-suj": "suj",
 }
-"""File names of formats whose own name is not descriptive."""
+"""File names for formats whose name is not descriptive."""
 _TIME_SLICE = 0.05
 """Time slice of an export [s]; longer steps are completed."""
 
@@ -73,7 +73,7 @@ class ExportingHandler(Handler):
         """Continue the export for `_TIME_SLICE` seconds.
 
         Raises:
-            CartsError: it cannot be written; its files are removed.
+            CartsError: the export cannot be written; its files are removed.
         """
         if self._job is None or self._intent is None:
             return
@@ -182,7 +182,7 @@ def _is_good(project: ProjectState, index: int) -> bool:
 
 
 def frames_within(project: ProjectState, frames: str, part: tuple[int, int] | None) -> list[int]:
-    """Indices of the frames of one of `FRAME_CHOICES`, of an inclusive range or of the whole sequence."""
+    """Indices of the frames of a choice (`FRAME_CHOICES`) in an inclusive range; None for the whole sequence."""
     first, last = part or (0, len(project.identity.frame_ids) - 1)
     return [index for index in frames_in(project, FRAME_CHOICES[frames]) if first <= index <= last]
 
@@ -212,8 +212,8 @@ def free_path(project: Path, stem: str, intent: intents.Export) -> OutputPath:
     return path
 
 
-LARGEST = 512 * 2**20
-"""Largest download [bytes]."""
+MAX_DOWNLOAD = 512 * 2**20
+"""Maximum size of a download [bytes]."""
 _COMPRESSED = {".png", ".jpg", ".mp4", ".npz"}
 
 
@@ -221,15 +221,15 @@ def zipped(path: Path) -> tuple[str, bytes]:
     """Name and content of a download: a file unchanged, a folder as a zip archive.
 
     Raises:
-        CartsError: it no longer exists, or is too large for a browser.
+        CartsError: the export no longer exists, or is too large for a browser.
     """
     files = [path] if path.is_file() else sorted(file for file in path.rglob("*") if file.is_file())
     if not files:
         raise CartsError(f"{path} no longer exists. Export again.")
     size = sum(file.stat().st_size for file in files)
-    if size > LARGEST:
+    if size > MAX_DOWNLOAD:
         raise CartsError(
-            f"{path} has {size / 2**20:.0f} MiB; the limit for downloads is {LARGEST // 2**20} MiB. "
+            f"{path} has {size / 2**20:.0f} MiB; the limit for downloads is {MAX_DOWNLOAD // 2**20} MiB. "
             "Copy it from that path."
         )
     if path.is_file():
@@ -242,14 +242,14 @@ def zipped(path: Path) -> tuple[str, bytes]:
     return f"{path.name}.zip", content.getvalue()
 
 
-_NAMED = 6
-"""Number of frames named in a warning."""
+_MAX_NAMED = 6
+"""Maximum number of frames named in a warning."""
 
 
 def export_warnings(project: ProjectState, frames: Sequence[int], cameras: Collection[str]) -> list[str]:
     """Warnings about an export, for frame indices and exported cameras."""
     found: list[str] = []
-    # An hour has 100,000 frames, of which few have a record.
+    # One hour has 100,000 frames, but few of them have a record.
     recorded = [index for index in frames if index in project.records]
     accepted = sum(project.review(index).state is ReviewState.ACCEPTED for index in recorded)
     open_ones = len(frames) - accepted
@@ -263,7 +263,7 @@ def export_warnings(project: ProjectState, frames: Sequence[int], cameras: Colle
 
 
 def _seen_by_all(project: ProjectState, frame: int, cameras: Collection[str]) -> bool:
-    """Whether all exported cameras were used to fit a frame; True where unknown."""
+    """Whether all exported cameras were used to fit a frame; True if unknown."""
     used = [_cameras(correction.provenance.settings) for correction in project.joints(frame).values()]
     return all(names is None or set(cameras) <= names for names in used)
 
@@ -278,8 +278,8 @@ def _cameras(settings: str | None) -> frozenset[str] | None:
 def _line(project: ProjectState, frames: Sequence[int], text: str) -> list[str]:
     if not frames:
         return []
-    named = ", ".join(project.identity.frame_ids[index] for index in frames[:_NAMED])
-    more = " …" if len(frames) > _NAMED else ""
+    named = ", ".join(project.identity.frame_ids[index] for index in frames[:_MAX_NAMED])
+    more = " …" if len(frames) > _MAX_NAMED else ""
     return [f"{len(frames)} {text}: {named}{more}"]
 
 
@@ -292,8 +292,8 @@ class CooperativeThread(Generic[T]):
     The function has a thread of its own, but runs only while `advance` waits for it, so shared data need no lock.
 
     Attributes:
-        done: steps that are done.
-        total: all steps; 0 until the first is done.
+        done: number of completed steps.
+        total: number of all steps; 0 until the first is done.
     """
 
     def __init__(self, function: Callable[[ExportProgress], T]) -> None:
@@ -310,7 +310,7 @@ class CooperativeThread(Generic[T]):
         """Continue for about `seconds`; returns the function's result once it has ended.
 
         Raises:
-            Exception: the exception of the function.
+            Exception: the exception raised by the function.
         """
         if self._thread.ident is None:
             self._thread.start()
@@ -347,7 +347,7 @@ class CooperativeThread(Generic[T]):
         return self._cancelled
 
 
-_LONGEST = 4096
+_MAX_PATH_LENGTH = 4096
 
 
 class ImportingHandler(Handler):
@@ -355,11 +355,11 @@ class ImportingHandler(Handler):
 
     def _on_ImportMasks(self, intent: intents.ImportMasks) -> None:
         session = self._session
-        place = intent.place.strip()[:_LONGEST]
-        if not place:
-            raise CartsError("Give the path of the masks: a COCO or CVAT file, or a folder of PNG masks.")
-        # Resolved, so that links to the folder do not matter.
-        path = session.roots.checked(session.sequence.path.parent.resolve() / Path(place))
+        given = intent.path.strip()[:_MAX_PATH_LENGTH]
+        if not given:
+            raise CartsError("Enter the path of the masks: a COCO or CVAT file, or a folder of PNG masks.")
+        # The folder is resolved, since it may be reached through a link.
+        path = session.roots.checked(session.sequence.path.parent.resolve() / Path(given))
         found = read_annotations(path, session.sequence, intent.camera, confined=True)
         self._context.end_run("Stopped: masks were imported")
         self._context.save()

@@ -7,8 +7,8 @@ from carts_core.project.values import UNREVIEWED
 
 ANY = "Any"
 NOT_CHECKED = "not checked"
-UNJUDGED = "unreviewed"
-"""Frames without a review, whatever the source of their joint positions."""
+NO_REVIEW = "unreviewed"
+"""Label of frames without a review, regardless of the source of their joint positions."""
 BY_HAND = "moved by hand"
 SOLVED = "solved together"
 
@@ -18,15 +18,15 @@ class FrameFilter:
     """Conditions on frames; a frame must meet all of them."""
 
     review: str = ANY
-    """A result of `review_name`, or `UNJUDGED`."""
+    """A result of `review_name`, or `NO_REVIEW`."""
     fit: str = ANY
     """A verdict, or `NOT_CHECKED`."""
     dice: float = 1.0
-    """Upper bound of the Dice [1]; 1 disables the condition."""
+    """Upper bound of the Dice score [1]; 1 disables the condition."""
     note: str = ""
     """Text contained in the note, ignoring case."""
     arm: str = ANY
-    """An arm that was corrected."""
+    """Name of an arm with corrected joints."""
 
     @property
     def empty(self) -> bool:
@@ -44,13 +44,13 @@ def review_name(project: ProjectState, index: int) -> str:
     return SOLVED if solved else str(state)
 
 
-def copied(project: ProjectState, index: int) -> bool:
-    """Whether joint positions of a frame were copied from another frame (solved ones have settings)."""
+def is_copied(project: ProjectState, index: int) -> bool:
+    """Whether joint positions of a frame were copied from another frame (solved joint positions have settings)."""
     made = [correction.provenance for correction in project.joints(index).values()]
     return any(one.source is Source.PROPAGATED and one.settings is None for one in made)
 
 
-def found(project: ProjectState, wanted: FrameFilter) -> list[int]:
+def matching_frames(project: ProjectState, wanted: FrameFilter) -> list[int]:
     """Indices of the frames that meet all conditions, in order."""
     return [index for index in range(len(project.identity.frame_ids)) if matches(project, index, wanted)]
 
@@ -58,7 +58,7 @@ def found(project: ProjectState, wanted: FrameFilter) -> list[int]:
 def matches(project: ProjectState, index: int, wanted: FrameFilter) -> bool:
     """Whether a frame meets all conditions."""
     review = project.review(index)
-    names = (ANY, review_name(project, index), *((UNJUDGED,) if review.state in UNREVIEWED else ()))
+    names = (ANY, review_name(project, index), *((NO_REVIEW,) if review.state in UNREVIEWED else ()))
     if wanted.review not in names or wanted.note.casefold() not in review.note.casefold():
         return False
     if wanted.fit != ANY:

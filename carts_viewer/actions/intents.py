@@ -1,7 +1,7 @@
 """Intents: requests of a user or of the page.
 
-A control that streams values, such as a slider that is being dragged, gives its intents a key: a newer intent
-replaces a waiting one of the same key, so that the queue stays short and the last value is used.
+Intents of a control that streams values, such as a slider that is being dragged, have a key. A newer intent replaces a
+pending one with the same key, so that the queue stays short and the last value is used.
 """
 
 from collections.abc import Hashable
@@ -20,18 +20,18 @@ class Intent(Event):
     """A request of a user or of the page."""
 
     keyed_by: ClassVar[tuple[str, ...] | None] = None
-    """Fields by which intents of a class replace one another while they wait; None: never."""
+    """Fields that form the key together with the class; None for no key."""
 
     @property
     def key(self) -> Hashable | None:
-        """Intents of the same key replace one another while they wait; None is never replaced."""
+        """A newer intent replaces a pending one with the same key; None for intents that are never replaced."""
         if not self.keyed_by:
             return None if self.keyed_by is None else type(self)
         return (type(self), *(getattr(self, name) for name in self.keyed_by))
 
 
 class Latest(Intent):
-    """An intent of which only the newest matters."""
+    """An intent that replaces all pending intents of its class."""
 
     keyed_by = ()
 
@@ -45,7 +45,7 @@ class Drawn(Latest):
 
 
 class Released(Latest):
-    """A slider or field was released; the next edit is another step of undo."""
+    """A slider or field was released; the next edit starts a new undo step."""
 
 
 class SetName(Latest):
@@ -77,7 +77,7 @@ class Play(Intent):
 
 
 class SetSpeed(Latest):
-    """Frames per second while playing."""
+    """Set the playback speed [frames/s]."""
 
     fps: float
 
@@ -113,7 +113,7 @@ class SetReach(Latest):
 
 
 class SetRange(Latest):
-    """Set the range to these first and last frames (0-based); None: the whole sequence."""
+    """Set the first and last frame of the range (0-based); None for the whole sequence."""
 
     frames: tuple[int, int] | None
 
@@ -143,13 +143,13 @@ class Peek(Intent):
 
 
 class ShowLayer(Latest):
-    """Draw this layer over the frame."""
+    """Choose the layer that is drawn over the frame."""
 
     layer: Layer
 
 
 class SetOpacity(Latest):
-    """Opacity of the layer, 0..1."""
+    """Set the opacity of the layer, 0..1."""
 
     opacity: float
 
@@ -180,7 +180,7 @@ class Nudge(Intent):
     """Move the chosen joint by a small step."""
 
     by: float
-    """[deg or mm]"""
+    """Step [deg or mm]."""
 
 
 class DragLink(Intent):
@@ -193,14 +193,14 @@ class DragLink(Intent):
     start: tuple[float, float]
     """Start of the drag [px]."""
     end: tuple[float, float]
-    """Present position of the pointer [px]."""
+    """Current position of the pointer [px]."""
 
 
 class ChooseJoint(Intent):
     """Choose the joint that `Nudge` moves; None for the next one."""
 
     joint: tuple[str, int] | None = None
-    """Arm, and index of its joint."""
+    """Arm and index of the joint."""
 
 
 class Optimizing(Intent):
@@ -243,7 +243,7 @@ class ResetSettings(Optimizing):
     """Set all settings of the chosen solver to those of a preset."""
 
     preset: str
-    """One of `choices.PRESETS`."""
+    """One of `state.PRESETS`."""
 
 
 class SetFreeJoint(Optimizing):
@@ -264,7 +264,7 @@ class SetFreeGroup(Optimizing):
 
 
 class SetCameras(Optimizing, Latest):
-    """Fit all cameras, or only the shown one."""
+    """Set whether runs use all cameras or only the shown one."""
 
     every: bool
 
@@ -273,9 +273,9 @@ class SetObserved(Optimizing, Latest):
     """Set the target of runs: predictions of the network, masks or both."""
 
     what: str
-    """One of `choices.Observe`."""
+    """One of `state.Observe`."""
     masks: str
-    """One of `choices.Masks`."""
+    """One of `state.Masks`."""
 
 
 class SetTool(Latest):
@@ -297,7 +297,7 @@ class SetTarget(Latest):
 
 
 class SetPaintClass(Latest):
-    """Paint this class on the mask (`carts_core.model.parts.PartClass`); 0: any arm."""
+    """Choose the class that is painted on the mask (`carts_core.model.parts.PartClass`); 0 for any arm."""
 
     number: int
 
@@ -309,7 +309,7 @@ class SetDiameter(Latest):
 
 
 class ScaleBrush(Intent):
-    """Scale the diameter of the brush by a factor, by at least one pixel."""
+    """Scale the diameter of the brush by a factor; it changes by at least one pixel."""
 
     factor: float
 
@@ -322,11 +322,11 @@ class Paint(Intent):
 
 
 class NextObject(Intent):
-    """Begin a new object with the prompt."""
+    """Let the next prompt start a new object."""
 
 
 class ClearLayer(Intent):
-    """Clear a painted layer of the shown frame and camera; None for the chosen one."""
+    """Clear a painted layer of the shown frame and camera; None for the chosen layer."""
 
     target: Target | None = None
 
@@ -352,7 +352,7 @@ class SetReview(Intent):
 
 
 class SetNote(Latest):
-    """Write a note about the shown frame."""
+    """Set the note of the shown frame."""
 
     note: str
 
@@ -368,11 +368,11 @@ class ShowUnreviewed(Intent):
     """1 forwards, -1 backwards."""
 
 
-class ShowWorse(Intent):
-    """Show the next worst frame that is neither accepted nor rejected."""
+class ShowWorst(Intent):
+    """Show the next frame in order of fit quality, among those neither accepted nor rejected."""
 
     step: int = 1
-    """1: the next better one; -1: the next worse one."""
+    """1 for the next better frame, -1 for the next worse."""
 
 
 class CopyCorrection(Intent):
@@ -405,7 +405,7 @@ class PointAt(Latest):
     """Camera of the image; None for the shown one."""
 
 
-class ForgetPins(Intent):
+class RemovePins(Intent):
     """Remove the placed keypoints; joints stay."""
 
 
@@ -413,7 +413,7 @@ class Propagating(Intent):
     """An intent about sequence mode."""
 
 
-class HoldKeyframe(Intent):
+class SetKeyframe(Intent):
     """Mark or unmark the shown frame as a keyframe; None toggles it."""
 
     on: bool | None = None
@@ -423,11 +423,11 @@ class Solve(Propagating):
     """Solve many frames together; kept frames (keyframes, accepted frames) do not change."""
 
     whole: bool = False
-    """All frames, instead of those between the kept frames around the shown one."""
+    """Whether to solve all frames instead of those between the kept frames around the shown one."""
 
 
 class StopSolving(Propagating):
-    """Stop, and keep the frames that are solved."""
+    """Stop solving, and save the solved frames."""
 
 
 class SetDirection(Intent):
@@ -437,12 +437,12 @@ class SetDirection(Intent):
 
 
 class TakeSolved(Propagating):
-    """Apply the solved pose of a frame although it fits worse; None for all listed frames."""
+    """Apply the solved pose of a frame that fits worse than before; None for all listed frames."""
 
     index: int | None = None
 
 
-class DropSolved(Propagating):
+class DiscardSolved(Propagating):
     """Discard the solved poses of all listed frames."""
 
 
@@ -454,14 +454,14 @@ class Jobs(Intent):
 
 
 class OptimizeFrames(Jobs):
-    """Run the optimizer on many frames, each alone, from its present pose."""
+    """Run the optimizer on many frames individually, each from its current pose."""
 
     frames: Frames = "unreviewed"
     """Frames that match the filter, frames without a review, frames in the range, or all frames."""
 
 
 class Calibrate(Jobs):
-    """Fit base frames, and cameras where they are free, to some frames of the sequence together."""
+    """Fit base frames, and cameras if they are free, jointly to several frames of the sequence."""
 
     frames: int = 20
     """Number of frames, spread evenly."""
@@ -500,13 +500,13 @@ class CancelJob(Jobs):
 
 
 class RepeatJob(Jobs):
-    """Queue a job again; one on many frames resumes where it stopped."""
+    """Queue a job again; a job on many frames resumes where it stopped."""
 
     number: int
 
 
-class ForgetJobs(Jobs):
-    """Remove ended jobs from the list."""
+class RemoveEndedJobs(Jobs):
+    """Remove completed jobs from the list."""
 
 
 class Exporting(Intent):
@@ -514,13 +514,13 @@ class Exporting(Intent):
 
 
 class ExportMask(Intent):
-    """Send this frame's mask, as a PNG, to the requesting tab."""
+    """Send the mask of the shown frame as a PNG file to the requesting tab."""
 
     client_id: int
 
 
 class Export(Exporting):
-    """Write frames in a format into a new folder or file beside the project."""
+    """Export frames to a new folder or file beside the project."""
 
     format: FormatName
     frames: str
@@ -528,13 +528,13 @@ class Export(Exporting):
     parts: Parts = "arms"
     """Granularity of the categories."""
     images: bool = False
-    """Copy the images beside their labels; else labels refer to the recording's images, if the format allows it."""
+    """Whether to copy images; otherwise labels refer to the recording's images, if the format allows it."""
     shown_camera: bool = False
-    """Only the shown camera."""
+    """Whether to export only the shown camera."""
     range: tuple[int, int] | None = None
-    """First and last frame, both exported; None for the whole sequence."""
+    """First and last exported frame; None for the whole sequence."""
     masks: Masks = "auto"
-    """Which masks are refined, where the format allows it."""
+    """Which masks are refined, if the format allows it."""
 
 
 class CancelExport(Exporting):
@@ -548,14 +548,14 @@ class Download(Exporting):
 
 
 class ImportMasks(Intent):
-    """Import masks and keypoints of a file or folder into the project, as one undo step."""
+    """Import masks and keypoints from a file or folder into the project, as one undo step."""
 
-    place: str
-    """Path of the file or folder; relative to the sequence's folder, or absolute in an allowed one."""
+    path: str
+    """Path of the file or folder, relative to the sequence's folder, or absolute in an allowed folder."""
     camera: str | None = None
     """Camera of the masks; None to infer it from the file names."""
     replace: bool = False
-    """Whether layers that were imported before may be replaced."""
+    """Whether previously imported layers may be replaced."""
 
 
 class SetFilter(Intent):
@@ -566,14 +566,15 @@ class SetFilter(Intent):
     value: Any
 
 
-class ShowFound(Intent):
-    """Show the next frame found, or with -1 the previous one."""
+class ShowMatching(Intent):
+    """Show the next frame that matches the filter."""
 
     step: int = 1
+    """1 forwards, -1 backwards."""
 
 
-class ReviewFound(Intent):
-    """Set the review state of all frames found, as one undo step; notes stay."""
+class ReviewMatching(Intent):
+    """Set the review state of all frames that match the filter, as one undo step; notes stay."""
 
     state: ReviewState
 
@@ -590,9 +591,9 @@ class StartLive(Intent):
     joints_port: int | None = None
     """With a camera: port of 127.0.0.1 that receives joint positions."""
     repeat: bool = False
-    """Whether a replay begins again when it ends."""
+    """Whether a replay is repeated endlessly."""
     rate: float | None = None
-    """Frames per second of a replay; those of the recording's times if None."""
+    """Frame rate of a replay [frames/s]; None for that of the recording."""
     record: bool = False
     """Whether frames and corrections are recorded."""
 

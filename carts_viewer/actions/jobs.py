@@ -1,4 +1,4 @@
-"""The queue of jobs, which run one after the other: start, progress, stop and record."""
+"""Handler of the job queue: jobs run one at a time; starts, progress, stops and logs."""
 
 import time
 from collections.abc import Generator
@@ -13,7 +13,7 @@ from carts_core.project.state import UNREVIEWED
 from carts_viewer.actions import intents
 from carts_viewer.actions.context import Context, Handler
 from carts_viewer.actions.exchange import ExportingHandler
-from carts_viewer.actions.frame_filter import found
+from carts_viewer.actions.frame_filter import matching_frames
 from carts_viewer.actions.sequence import PropagatingHandler
 from carts_viewer.editing import Person
 from carts_viewer.jobs.companions import Decisions
@@ -34,7 +34,7 @@ from carts_viewer.jobs.optimizers import OptimizerFactory
 from carts_viewer.jobs.work import Progress, adapt, calibrate, optimize_frames
 from carts_viewer.state import ViewState
 
-_SAVE_EVERY = 5.0
+_SAVE_INTERVAL = 5.0
 """Interval between saves of a job's progress [s]."""
 _CHOICES = "index frame domain camera pose settings free solver observed every_camera direction filter".split()
 """Fields of a tab's state that a job depends on."""
@@ -48,13 +48,13 @@ class JobRequester:
     state: ViewState
 
     def choose(self, context: Context) -> None:
-        """Set the context of a job to these choices and this user."""
+        """Set the user and the inputs of a job in its context."""
         context.session.editor.person = self.person
         context.change(**{name: getattr(self.state, name) for name in _CHOICES})
 
 
 class JobsHandler(Handler):
-    """Queues, starts, follows and stops jobs."""
+    """Queues, starts, monitors and stops jobs."""
 
     def __init__(
         self,
@@ -77,9 +77,9 @@ class JobsHandler(Handler):
             decisions=decisions,
         )
         self._requester: JobRequester | None = None
-        """The user of the request that is carried out."""
+        """User whose request is being carried out."""
         self._asked: dict[int, JobRequester] = {}
-        """Requesters by job number; jobs of an earlier viewer have none."""
+        """Requesters by job number; jobs from before the viewer started have none."""
         self._work: Generator[Progress] | None = None
         self._wait = 0.0
         self._saved_at = 0.0
@@ -87,12 +87,12 @@ class JobsHandler(Handler):
         self._publish()
 
     def ask(self, intent: intents.Intent, requester: JobRequester) -> None:
-        """Carry out an intent with the choices of its user; errors as `handle`."""
+        """Carry out an intent with the state of the requester's tab; errors as `handle`."""
         self._requester = requester
         self.handle(intent)
 
     def wait_time(self) -> float | None:
-        """Time until the next step is due [s]; None without jobs."""
+        """Time until the next step is due [s]; None if no job is active."""
         active = any(job.state in (JobState.WAITING, JobState.RUNNING) for job in self._list.jobs)
         return self._wait if active else None
 
@@ -150,17 +150,17 @@ class JobsHandler(Handler):
             options = replace(options, first=job.done if job.state is not JobState.DONE else 0)
         self._queue(job.kind, asdict(options))
 
-    def _on_ForgetJobs(self, intent: intents.ForgetJobs) -> None:
+    def _on_ForgetJobs(self, intent: intents.RemoveEndedJobs) -> None:
         self._list.forget()
         self._publish()
 
     # ---- The queue -------------------------------------------------------------------------------------------------
 
     def advance(self) -> None:
-        """Begin the next job, or continue the running one.
+        """Start the next job or continue the running one.
 
         Raises:
-            CartsError: the job failed and is marked as failed; the next one begins later.
+            CartsError: the job failed and is marked as failed; the next job is started by a later call.
         """
         job = self._running()
         if job is None:
@@ -194,12 +194,12 @@ class JobsHandler(Handler):
         if self._requester is not None:
             self._asked[job.number] = self._requester
         if self._running() is None and not any(j.state is JobState.WAITING and j is not job for j in self._list.jobs):
-            # At once, so that errors of the request are shown immediately.
+            # The job is started at once, so that errors of the request are shown immediately.
             self._begin(job)
         self._publish()
 
     def _safe_options(self, job: Job) -> Options:
-        """Options to repeat a job; a training is resumed only in an unfinished folder of this user."""
+        """Options to repeat a job; training is resumed only in an unfinished folder of this user."""
         own = self._list.is_own(job) and job.state is not JobState.DONE
         if isinstance(job.options, AdaptOptions) and not own:
             return replace(job.options, folder=self._networks.next_number())
@@ -271,7 +271,7 @@ class JobsHandler(Handler):
         if (now.done, now.total, now.text) == (progress.done, progress.total, progress.text) and progress.line is None:
             return
         self._list.change(job.number, progress.line, done=progress.done, total=progress.total, text=progress.text)
-        if time.monotonic() - self._saved_at > _SAVE_EVERY:
+        if time.monotonic() - self._saved_at > _SAVE_INTERVAL:
             self._saved_at = time.monotonic()
             self._list.save()
         self._publish()
@@ -288,7 +288,7 @@ class JobsHandler(Handler):
     def _end(self, job: Job, state: JobState, text: str) -> None:
         self._wait = 0.0
         self._asked.pop(job.number, None)
-        self._networks.look()
+        self._networks.update_names()
         if isinstance(job.options, AdaptOptions) and job.state is JobState.RUNNING:
             self._networks.trained(job.options.folder)
         done = {"done": job.total} if state is JobState.DONE and job.total else {}
@@ -302,7 +302,7 @@ class JobsHandler(Handler):
     def _frames(self, which: str) -> list[int]:
         view = self._context.session.editor.view
         if which == "found":
-            frames = found(view, self._choices.filter)
+            frames = matching_frames(view, self._choices.filter)
         elif which == "range":
             first, last = self._choices.range or (0, len(self._context.session.sequence) - 1)
             frames = list(range(first, last + 1))
@@ -311,7 +311,7 @@ class JobsHandler(Handler):
         else:
             frames = frames_in(view, UNREVIEWED)
         if not frames:
-            raise CartsError("No frames were selected. Choose other frames.")
+            raise CartsError("There are no such frames. Choose other frames.")
         return frames
 
     @property

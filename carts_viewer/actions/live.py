@@ -1,4 +1,4 @@
-"""Live streams: starting and stopping one, and showing its newest result."""
+"""Live streams: start, stop, and display of the newest result."""
 
 import threading
 import time
@@ -23,13 +23,13 @@ class LiveRun:
 
     Args:
         stream: source of frames, which also receives the results.
-        tracker: of the arms.
+        tracker: tracks the arms.
         results: makes messages for the stream's clients.
         recorder: records frames and corrections; None for no recording.
 
     Attributes:
         statistics: throughput and latency.
-        error: the error that ended it; None while it runs, and after a normal end.
+        error: the error that ended the stream; None while it runs, and after a normal end.
     """
 
     def __init__(self, stream: OpenStream, tracker: LiveTracker, results: Results, recorder: Recorder | None) -> None:
@@ -44,7 +44,7 @@ class LiveRun:
 
     @property
     def over(self) -> bool:
-        """Whether no more results come."""
+        """Whether the stream has ended."""
         return not self._thread.is_alive()
 
     @property
@@ -53,7 +53,7 @@ class LiveRun:
         return None if self._stream.server is None else self._stream.server.port
 
     def take(self) -> Tracked | None:
-        """The newest result that was not taken yet."""
+        """The newest result; None if it was already taken."""
         with self._changing:
             newest, self._newest = self._newest, None
         return newest
@@ -67,7 +67,7 @@ class LiveRun:
         sinks = [self._show, *([self.recorder] if self.recorder is not None else [])]
         try:
             follow(self._stream.source, self._tracker, sinks, self.statistics)
-        except Exception as error:  # The worker shows it.
+        except Exception as error:  # `LiveHandler.advance` raises it on the worker's thread.
             self.error = error
         finally:
             self._stream.close()
@@ -82,12 +82,12 @@ class LiveRun:
                 send(message)
 
 
-_LOOK_EVERY = 0.01
+_POLL_INTERVAL = 0.01
 """Interval between checks for a new result [s]."""
-_TELL_EVERY = 0.5
+_STATISTICS_INTERVAL = 0.5
 """Interval between updates of the statistics [s]."""
-_FOR_EVER = 1_000_000
-ALLOWED = (
+_ENDLESS_LOOPS = 1_000_000
+ALLOWED_WHILE_LIVE = (
     intents.StartLive,
     intents.StopLive,
     intents.ShowLayer,
@@ -103,11 +103,11 @@ ALLOWED = (
     intents.DismissError,
     intents.CancelJob,
 )
-"""Intents that are allowed while a stream is shown."""
+"""Classes of intents that are allowed while a stream is shown."""
 
 
-class Show(Protocol):
-    """Shows the recording again."""
+class ShowRecording(Protocol):
+    """Function that shows the recording again."""
 
     def __call__(self, *, again: bool) -> None:
         """As `BrowsingHandler.show`."""
@@ -116,7 +116,7 @@ class Show(Protocol):
 class LiveHandler(Handler):
     """Handler of live streams, which are shown in place of the recording."""
 
-    def __init__(self, context: Context, optimizers: OptimizerFactory, show: Show) -> None:
+    def __init__(self, context: Context, optimizers: OptimizerFactory, show: ShowRecording) -> None:
         super().__init__(context)
         self._optimizers, self._show = optimizers, show
         self._live: LiveRun | None = None
@@ -131,12 +131,12 @@ class LiveHandler(Handler):
         self.stop("Stopped.")
 
     def replaces(self, intent: intents.Intent) -> bool:
-        """Whether an intent is handled here because a stream is shown.
+        """Carry out an intent that has another meaning during a stream; returns whether it was carried out.
 
         Raises:
             CartsError: the intent is not allowed during a stream.
         """
-        if not self.active or isinstance(intent, ALLOWED):
+        if not self.active or isinstance(intent, ALLOWED_WHILE_LIVE):
             return False
         state = self._context.state
         if isinstance(intent, intents.ShowCamera) and intent.camera in state.frame.images:
@@ -147,8 +147,8 @@ class LiveHandler(Handler):
         raise CartsError("A live stream cannot be edited. Press Stop (Live) first.")
 
     def wait_time(self) -> float | None:
-        """Time until the next check for a result [s]; None without a stream."""
-        return _LOOK_EVERY if self.active else None
+        """Time until the next check for a result [s]; None if no stream is shown."""
+        return _POLL_INTERVAL if self.active else None
 
     def advance(self) -> None:
         """Show the newest result, or stop after the end of the stream.
@@ -173,7 +173,7 @@ class LiveHandler(Handler):
         """Stop the stream, show the recording again, and close the recorder.
 
         Raises:
-            CartsError: it could not be written.
+            CartsError: the recording of the stream could not be written.
         """
         run, self._live = self._live, None
         if run is None:
@@ -185,7 +185,7 @@ class LiveHandler(Handler):
         try:
             self._show(again=True)
         finally:
-            # After the frame, so that no frame of the stream is shown as one of the recording.
+            # Changed only after the frame, so that a streamed frame is never shown as a frame of the recording.
             self._context.change(live=replace(state, on=False, text=text), scores=None, maps=None)
         if run.recorder is not None:
             path = run.recorder.close()
@@ -206,7 +206,7 @@ class LiveHandler(Handler):
         extractor = self._optimizers.prepare()
         state, sequence, cameras = context.state, session.sequence, context.cameras
         folder = self._folder() if intent.record else None
-        loops = _FOR_EVER if intent.repeat else 1
+        loops = _ENDLESS_LOOPS if intent.repeat else 1
         stream = open_stream(address, sequence, cameras, state.domain, rate=intent.rate, loops=loops)
         try:
             replayed = address.kind is StreamKind.REPLAY
@@ -229,7 +229,7 @@ class LiveHandler(Handler):
         """A new folder beside the project.
 
         Raises:
-            CartsError: the project is temporary, and files beside it would be lost.
+            CartsError: the project is read-only.
         """
         project = self._session.editor.project
         if not project.writable:
@@ -246,7 +246,7 @@ class LiveHandler(Handler):
         camera = context.state.camera if context.state.camera in frame.images else next(iter(frame.images))
         text = live.text
         if time.monotonic() >= self._tell_at:
-            self._tell_at = time.monotonic() + _TELL_EVERY
+            self._tell_at = time.monotonic() + _STATISTICS_INTERVAL
             text = str(run.statistics)
         context.change(
             frame=frame,

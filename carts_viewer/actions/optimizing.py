@@ -21,13 +21,13 @@ _REASONS = {
     "not optimized": "Evaluated only: this solver does not optimize",
     "converged": "Ended: no step reduces the loss further",
     "failed": "Ended: the image contradicts the result",
-    "start kept": "Initial pose kept: the result hardly fits better",
+    "start kept": "Initial pose kept: the optimized pose hardly fits better",
     "cancelled": "Cancelled",
 }
 
 
 class OptimizingHandler(Handler):
-    """The handler that drives the optimizer, an iteration at a time."""
+    """Handler that runs the optimizer, one iteration at a time."""
 
     def __init__(self, context: Context, optimizers: OptimizerFactory) -> None:
         super().__init__(context)
@@ -42,7 +42,7 @@ class OptimizingHandler(Handler):
 
     @property
     def active(self) -> bool:
-        """Whether there is a run, paused or not."""
+        """Whether there is a run, which may be paused."""
         return self._run is not None
 
     def wait_time(self) -> float | None:
@@ -58,7 +58,7 @@ class OptimizingHandler(Handler):
         """End the run and save its pose; its curves are kept until the next run.
 
         Raises:
-            ProjectError: it could not be saved.
+            ProjectError: the pose could not be saved.
         """
         if self._context.state.run.base_frame_gain is not None:
             self._set(base_frame_gain=None)
@@ -76,7 +76,7 @@ class OptimizingHandler(Handler):
         """Compute the maps or refined masks of the chosen layer, if they are missing.
 
         Raises:
-            CartsError: it cannot be computed.
+            CartsError: the maps cannot be computed.
         """
         state = self._context.state
         if state.layer is Layer.REFINED:
@@ -89,7 +89,7 @@ class OptimizingHandler(Handler):
             run = self._make((state.camera,))
             iterate = run.optimizer.step()
         except CartsError:
-            # Without weights, for example, there is no map; it is not retried with every picture.
+            # For example, the weights are missing. The layer is changed, so that not every picture repeats the attempt.
             self._context.change(layer=Layer.MASK)
             raise
         self._context.change(maps=None if iterate is None else Maps(iterate, run.cameras, of_run=False), busy=None)
@@ -138,7 +138,7 @@ class OptimizingHandler(Handler):
 
     def _on_Reset(self, intent: intents.Reset) -> None:
         if self._run is not None:
-            # Nothing of the run was saved yet, so there is nothing to undo.
+            # The poses of the run are an unsaved draft.
             self._session.editor.drop()
         self.end(None)
         self._context.change(run=RunState())
@@ -154,7 +154,7 @@ class OptimizingHandler(Handler):
             else:
                 settings = changed(settings, {intent.name: intent.value}, "the solver")
         except SettingsError as error:
-            # Half-typed numbers are often out of range, so no error is shown yet; Run refuses them.
+            # Half-typed numbers are often out of range, so the error is not shown before Run.
             self._context.change(settings_error=str(error), settings_field=intent.name)
             return
         self.end("Settings changed; Run starts again from here")
@@ -163,7 +163,7 @@ class OptimizingHandler(Handler):
     def _on_ResetSettings(self, intent: intents.ResetSettings) -> None:
         preset = PRESETS.get(intent.preset)
         if preset is None:
-            raise SettingsError(f"There is no preset {intent.preset!r}; there are: {', '.join(PRESETS)}.")
+            raise SettingsError(f"Unknown preset {intent.preset!r}. Choose one of: {', '.join(PRESETS)}.")
         state = self._context.state
         settings = named_solver(state.solver)
         if isinstance(settings, SurfaceSolver):
@@ -178,7 +178,7 @@ class OptimizingHandler(Handler):
 
     def _on_SetFreeGroup(self, intent: intents.SetFreeGroup) -> None:
         if intent.group not in ("base_frames", "extrinsics", "intrinsics"):
-            raise SettingsError(f"There is no group of parameters {intent.group!r}.")
+            raise SettingsError(f"Unknown group of parameters {intent.group!r}.")
         self._set_free(**{intent.group: intent.on})
 
     def _on_SetCameras(self, intent: intents.SetCameras) -> None:
@@ -187,7 +187,7 @@ class OptimizingHandler(Handler):
 
     def _on_SetObserved(self, intent: intents.SetObserved) -> None:
         observed = Observed(intent.what, intent.masks)  # type: ignore[arg-type]
-        self.end("The target was changed; Run starts again from here")
+        self.end("Target changed; Run starts again from here")
         self._context.change(observed=observed, maps=None)
 
     # ---- The run ---------------------------------------------------------------------------------------------------
@@ -226,7 +226,7 @@ class OptimizingHandler(Handler):
         if self._target.observed.what != "network" or not isinstance(state.settings, SurfaceSolver):
             return ()
         scene = scene_at(self._session.scene, state.pose.scene)
-        return self._optimizers.unfamiliar(
+        return self._optimizers.domain_warnings(
             self._session.sequence, scene, state.index, state.domain, self._context.cameras
         )
 
@@ -259,7 +259,7 @@ class OptimizingHandler(Handler):
         )
 
     def _verdict(self, run: ActiveRun, end: Iterate) -> FitVerdict | None:
-        """Verdict at the end of a run; with several cameras, from each camera alone."""
+        """Verdict at the end of a run; with several cameras, each camera is assessed individually."""
         own = run.verdict()
         if own is not None and (len(self._session.scene.cameras) == 1 or own.verdict == "failed"):
             return own
@@ -267,18 +267,18 @@ class OptimizingHandler(Handler):
         try:
             found = self._check.fit(state.index, state.domain, run.pose(end), state.settings, self._target).verdict
         except CartsError:
-            # A solver that needs no surface network has run without one.
+            # There is no surface network, and the solver does not need one.
             return own
         return found
 
     def _on_Assess(self, intent: intents.Assess) -> None:
-        self.end("Stopped: the fit is checked")
+        self.end("Stopped: the fit was checked")
         self._optimizers.report("comparing with the images")
         state = self._context.state
         target = self._session.target(state.observed)
         found = self._check.fit(state.index, state.domain, state.pose, state.settings, target)
         if self._session.editor.project.writable:
-            # A verdict changes no value, so it is not a step of undo.
+            # A verdict changes no value, so it is not an undo step.
             self._context.save()
             self._session.editor.project.record_verdict(state.index, found.verdict)
             self._context.refresh()
@@ -287,10 +287,10 @@ class OptimizingHandler(Handler):
         self._context.change(busy=None)
 
     def _accept(self, run: ActiveRun, iterate: Iterate, verdict: FitVerdict | None = None) -> None:
-        """Show an iterate as the frame's pose; all iterates of a run are one step of undo."""
+        """Set the frame's pose to an iterate; all iterates of a run are one undo step."""
         state = self._context.state
         edits = self._session.edits(state.frame, run.pose(iterate).scene, run.provenance, iterate.joint_std())
-        # An earlier verdict was on another pose.
+        # An earlier verdict refers to another pose.
         edits[Key.verdict(state.index)] = verdict
         maps = Maps(iterate, run.cameras)
         self._context.edit("Optimize", edits, gesture=run, loss=float(iterate.loss), maps=maps)

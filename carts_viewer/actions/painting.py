@@ -37,26 +37,26 @@ class PaintingHandler(Handler):
 
     def _on_SetTool(self, intent: intents.SetTool) -> None:
         self._prompting.finish()
-        self._hold(tool=intent.tool)
+        self._set_brush(tool=intent.tool)
 
     def _on_ToggleTool(self, intent: intents.ToggleTool) -> None:
-        self._hold(tool=Tool.OFF if self._context.state.brush.tool is intent.tool else intent.tool)
+        self._set_brush(tool=Tool.OFF if self._context.state.brush.tool is intent.tool else intent.tool)
 
     def _on_SetTarget(self, intent: intents.SetTarget) -> None:
         other = Target.IGNORE if self._context.state.brush.target is Target.MASK else Target.MASK
-        self._hold(target=intent.target or other)
+        self._set_brush(target=intent.target or other)
 
     def _on_SetPaintClass(self, intent: intents.SetPaintClass) -> None:
         known = {0, *(one.number for one in part_classes(self._session.scene.arms))}
         if intent.number not in known:
-            raise CartsError(f"There is no class {intent.number!r} to paint; there are: {sorted(known)}.")
-        self._hold(label=intent.number, target=Target.MASK)
+            raise CartsError(f"Unknown class {intent.number!r}. Choose one of: {', '.join(map(str, sorted(known)))}.")
+        self._set_brush(label=intent.number, target=Target.MASK)
         if intent.number:
             # The layer of parts shows the painted classes.
             self._context.change(layer=Layer.PARTS)
 
     def _on_SetDiameter(self, intent: intents.SetDiameter) -> None:
-        self._hold(diameter=round(clamped(intent.diameter, *DIAMETERS)))
+        self._set_brush(diameter=round(clamped(intent.diameter, *DIAMETERS)))
 
     def _on_ScaleBrush(self, intent: intents.ScaleBrush) -> None:
         now = self._context.state.brush.diameter
@@ -69,7 +69,7 @@ class PaintingHandler(Handler):
         try:
             self._change(self._step(stroke), self._edits(stroke))
         finally:
-            self._hold(painted=painted)
+            self._set_brush(painted=painted)
 
     def _on_ClearLayer(self, intent: intents.ClearLayer) -> None:
         state = self._context.state
@@ -78,7 +78,7 @@ class PaintingHandler(Handler):
         self._change(_CLEARED[target], {make(state.index, state.camera): None for make in painted})
 
     def _edits(self, stroke: Stroke) -> Edits:
-        """Edits of a stroke or a prompt: ignore region, or mask and part labels."""
+        """Edits of a stroke or a prompt to the ignore region, or to the mask and the part labels."""
         project, place = self._session.editor.view, (stroke.frame, stroke.camera)
         mask, labels, region = Key.mask_correction(*place), Key.part_labels(*place), Key.ignore_region(*place)
 
@@ -97,7 +97,7 @@ class PaintingHandler(Handler):
         return changed({key: project.get(key) for key in keys}, covered, stroke.erase)
 
     def _image(self, stroke: Stroke) -> UInt8[np.ndarray, "height width 3"]:
-        """The image that a stroke was drawn over."""
+        """The image on which a stroke was drawn."""
         state = self._context.state
         if stroke.frame == state.index and stroke.camera in state.frame.images:
             return state.frame.images[stroke.camera]
@@ -114,7 +114,7 @@ class PaintingHandler(Handler):
         return _STEPS[stroke.target, stroke.erase]
 
     def _change(self, name: str, edits: Edits) -> None:
-        """Save the layers that have changed as one step of undo."""
+        """Save the layers that have changed as one undo step."""
         view = self._session.editor.view
         changed = {key: layer for key, layer in edits.items() if view.get(key) != layer}
         if changed:
@@ -122,13 +122,13 @@ class PaintingHandler(Handler):
             self._context.edit(name, changed, loss=self._loss(next(iter(changed))))
 
     def _loss(self, key: Key[Any]) -> float | None:
-        """Loss that stays valid after a change of this layer: corrected masks do not affect it."""
+        """Loss of the shown frame; None if a change of this layer affects it, as for ignore regions."""
         figures = self._session.editor.view.figures(key.frame)
         shown = key.frame == self._context.state.index
         return figures.loss if figures and shown and key.kind is not Kind.IGNORE_REGION else None
 
     def _rendered(self, stroke: Stroke) -> Mask:
-        """The mask that the stroke corrects, as it is rendered in the stroke's frame."""
+        """The rendered mask that the stroke corrects."""
         state = self._context.state
         if stroke.frame == state.index:
             pose = state.pose
@@ -136,7 +136,7 @@ class PaintingHandler(Handler):
             pose = self._session.pose(self._session.sequence.frame(stroke.frame, cameras=[]))
         return self._context.renderer.mask(pose.scene, stroke.camera)
 
-    def _hold(self, **changes: Any) -> None:
+    def _set_brush(self, **changes: Any) -> None:
         self._context.change(brush=replace(self._context.state.brush, **changes))
 
 
@@ -159,9 +159,9 @@ class _PromptedObject:
 class Prompting:
     """Turns clicks and boxes into edits of painted layers.
 
-    A click adds the object under it. As long as nothing else changes these layers, further clicks refine this object by
-    a point on it or, with `erase`, off it. Otherwise a click with `erase` removes the object under it. A box replaces
-    the layer inside it by the segmentation.
+    A click adds the object under the pointer. Further clicks refine this object by a point on it or, with `erase`, off
+    it, until the layers are changed otherwise. Any other click with `erase` removes the object under the pointer. A box
+    replaces the content of the layer inside the box by the segmentation.
     """
 
     def __init__(self, segmenter: Callable[[], Segmenter]) -> None:
@@ -169,7 +169,7 @@ class Prompting:
         self._begun: _PromptedObject | None = None
 
     def finish(self) -> None:
-        """Begin a new object with the next click."""
+        """Let the next click start a new object."""
         self._begun = None
 
     def edits(
@@ -184,17 +184,17 @@ class Prompting:
 
         Args:
             stroke: one point, or two corners of a box.
-            image: of its frame and camera, RGB.
-            project: its present state.
-            keys: the layers that it may change.
-            changed: maps layers, pixels and whether they are erased to the changed layers.
+            image: RGB image of the stroke's frame and camera.
+            project: current state of the project.
+            keys: the layers that the stroke may change.
+            changed: function of layers, pixels, and whether these are erased, that returns the changed layers.
 
         Raises:
             CartsError: segmentation failed or found nothing.
         """
         now = {key: project.get(key) for key in keys}
         place = (stroke.frame, stroke.camera, stroke.target, stroke.label)
-        begun, prompt = self._begun, asked(stroke)
+        begun, prompt = self._begun, prompt_of(stroke)
         self._begun = None
         goes_on = begun is not None and (begun.place, begun.after) == (place, now) and prompt.box is None
         if begun is not None and goes_on:
@@ -220,7 +220,7 @@ def _boxed(box: tuple[float, float, float, float], found: Mask) -> Mask:
     return (columns + 0.5 > left) & (columns + 0.5 < right) & (rows + 0.5 > top) & (rows + 0.5 < low)
 
 
-def asked(stroke: Stroke) -> Prompt:
+def prompt_of(stroke: Stroke) -> Prompt:
     """The prompt of a stroke: one point, or two corners of a box in any order."""
     low, high = stroke.points.min(0).tolist(), stroke.points.max(0).tolist()
     if len(stroke.points) == 1:

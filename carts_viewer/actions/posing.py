@@ -10,8 +10,8 @@ from carts_core.project import Key
 from carts_viewer.actions import intents
 from carts_viewer.actions.context import Context, Handler, clamped, finite
 
-LARGEST_PERTURBATION = 30.0
-"""Largest perturbation [deg and mm]."""
+MAX_PERTURBATION = 30.0
+"""Maximum perturbation [deg and mm]."""
 
 
 class PosingHandler(Handler):
@@ -21,7 +21,7 @@ class PosingHandler(Handler):
         value = finite(intent.value)
         scene = self._session.with_joint(self._context.state.pose.scene, intent.arm, intent.joint, value)
         self._context.change(joint=(intent.arm, intent.joint))
-        # All events of one joint until its release are one step of undo.
+        # All changes of one joint until the slider is released are one undo step.
         gesture = (intents.SetJoint, intent.arm, intent.joint)
         self._set_pose(f"Move {self._joint_name()}", scene, gesture=gesture)
 
@@ -30,13 +30,13 @@ class PosingHandler(Handler):
         following = joints[(joints.index(self._joint()) + 1) % len(joints)]
         chosen = intent.joint or following
         if chosen not in joints:
-            raise CartsError(f"There is no joint {chosen!r}.")
+            raise CartsError(f"Unknown joint {chosen!r}.")
         self._context.change(joint=chosen)
 
     def _on_Nudge(self, intent: intents.Nudge) -> None:
         arm, joint = self._joint()
         pose = self._context.state.pose.scene
-        by = clamped(intent.by, -LARGEST_PERTURBATION, LARGEST_PERTURBATION)
+        by = clamped(intent.by, -MAX_PERTURBATION, MAX_PERTURBATION)
         step = math.radians(by) if self._session.ranges[arm][joint].revolute else by / 1e3
         now = self._session.joints(pose)[arm][joint]
         self._set_pose(f"Nudge {self._joint_name()}", self._session.with_joint(pose, arm, joint, now + step))
@@ -48,7 +48,7 @@ class PosingHandler(Handler):
         self._context.edit("Back to measured", {Key.joints(index, name): None for name in names})
 
     def _on_Perturb(self, intent: intents.Perturb) -> None:
-        degrees = clamped(intent.degrees, 0.0, LARGEST_PERTURBATION)
+        degrees = clamped(intent.degrees, 0.0, MAX_PERTURBATION)
         state = self._context.state
         scene = self._session.perturbed(state.pose.scene, state.index, degrees, intent.seed)
         self._set_pose(f"Perturb by {degrees:g}°", scene)
@@ -66,17 +66,17 @@ class PosingHandler(Handler):
         return f"{arm} {name.removesuffix('_joint').replace('_', ' ')}"
 
 
-_REACH = 15.0
-"""Largest distance from the arm at which a link can be grabbed [px]."""
-_LEAST = 0.5
-"""Least motion of the pointer that counts as a drag [px]."""
+_GRAB_DISTANCE = 15.0
+"""Maximum distance from the arm at which a link can be grabbed [px]."""
+_MIN_DRAG = 0.5
+"""Minimum motion of the pointer that counts as a drag [px]."""
 
 
 class DraggingHandler(Handler):
     """Handler of links that are dragged in the picture.
 
-    Each position of a gesture is solved from the pose at its beginning, so that the path does not matter and dragging
-    back restores the pose.
+    Every pose of a gesture is solved from the pose at its start, so that the path does not matter and dragging back
+    restores the pose.
     """
 
     def __init__(self, context: Context) -> None:
@@ -85,7 +85,7 @@ class DraggingHandler(Handler):
         self._frame = 0
         self._start: SceneState | None = None
         self._point: Keypoint | None = None
-        """The dragged point; None where no arm was under the pointer."""
+        """The dragged point; None if no arm was under the pointer."""
 
     def _on_DragLink(self, intent: intents.DragLink) -> None:
         if not all(map(math.isfinite, (*intent.start, *intent.end))):
@@ -98,11 +98,11 @@ class DraggingHandler(Handler):
         under_way = context.session.editor.gesture == gesture
         if point is None or start is None or context.state.index != self._frame:
             return
-        if math.hypot(*moved) < _LEAST and not under_way:
+        if math.hypot(*moved) < _MIN_DRAG and not under_way:
             return
         scene, camera = context.session.scene, context.session.scene.camera(intent.camera)
         u, v = project_keypoints(scene, start, [point], camera.name)[0].tolist()
-        # The pointer's displacement, not its position, or a link grabbed beside its outline would jump.
+        # The displacement of the pointer is used: with its position, a link grabbed beside its outline would jump.
         pixel = _within(u + moved[0], camera.width), _within(v + moved[1], camera.height)
         fit = fit_keypoints(scene, start, [Pin(point, camera.name, pixel)])
         self._context.end_run("Stopped: the pose was changed by hand")
@@ -113,7 +113,7 @@ class DraggingHandler(Handler):
         """Pick the link under the pointer."""
         state = self._context.state
         self._gesture, self._frame, self._start, self._point = intent.gesture, state.index, state.pose.scene, None
-        self._point = self._context.renderer.pick(state.pose.scene, intent.camera, intent.start, _REACH)
+        self._point = self._context.renderer.pick(state.pose.scene, intent.camera, intent.start, _GRAB_DISTANCE)
         if self._point is None:
             raise CartsError(
                 "There is no arm under the pointer. Hold Ctrl, press on a link in the overlay, and drag it."
@@ -121,5 +121,5 @@ class DraggingHandler(Handler):
 
 
 def _within(value: float, size: int) -> float:
-    """The point clamped to at most one image size beyond the image."""
+    """The coordinate clamped to at most one image size beyond the image."""
     return min(max(value, -float(size)), 2.0 * size)

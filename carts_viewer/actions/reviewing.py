@@ -15,7 +15,7 @@ from carts_core.project import Change, Key, Review, ReviewState, Source, next_un
 from carts_core.project.values import LONGEST_NOTE
 from carts_viewer.actions import intents
 from carts_viewer.actions.context import Context, Handler, clamped
-from carts_viewer.actions.frame_filter import FrameFilter, found
+from carts_viewer.actions.frame_filter import FrameFilter, matching_frames
 from carts_viewer.picture.overlay import labelled_keypoints
 
 _SETTLED = frozenset({ReviewState.ACCEPTED, ReviewState.REJECTED})
@@ -36,13 +36,13 @@ class AnnotatingHandler(Handler):
         self._show = show
         self._keypoints = labelled_keypoints(context.session.scene)
         self._held: str | None = None
-        """The keypoint that is dragged."""
+        """Label of the dragged keypoint."""
         self._pinned_from: SceneState | None = None
-        """The pose before the first of the present pins."""
+        """The pose before the first of the current pins."""
         self._fitted: SceneState | None = None
-        """The pose fitted to the present pins."""
+        """The pose fitted to the current pins."""
         self._worst: int | None = None
-        """Frame last shown by `ShowWorse`; None after other navigation."""
+        """Frame last shown by `ShowWorst`; None after other navigation."""
 
     def released(self) -> None:
         """Handle the release of the pointer."""
@@ -67,10 +67,10 @@ class AnnotatingHandler(Handler):
         self._context.save()
 
     def _changed(self, change: Change | None) -> None:
-        self._context.forget_pins()
+        self._context.remove_pins()
         frames = () if change is None else change.frames
         index = self._context.state.index
-        # Show the frame that changes.
+        # Show a frame that has changed.
         self._show(index=index if index in frames or not frames else frames[0], again=True)
 
     # ---- Review ----------------------------------------------------------------------------------------------------
@@ -92,7 +92,7 @@ class AnnotatingHandler(Handler):
         if index is not None:
             self._go(index)
             return
-        # After the last frame there is no next one, which is no error.
+        # It is not an error if there is no next frame.
         where = " of the range" if within is not None and state.range is not None else ""
         count = len(within or range(len(self._session.sequence)))
         self._context.change(notice=f"All {count} frames{where} are reviewed.")
@@ -101,18 +101,18 @@ class AnnotatingHandler(Handler):
         state = self._context.state
         index = next_unreviewed(state.project, state.index, 1 if intent.step > 0 else -1)
         if index is None:
-            raise CartsError("Every frame has been reviewed.")
+            raise CartsError("All frames are reviewed.")
         self._go(index)
 
-    def _on_ShowWorse(self, intent: intents.ShowWorse) -> None:
+    def _on_ShowWorse(self, intent: intents.ShowWorst) -> None:
         state = self._context.state
         project = state.project
         frames = range(len(project.identity.frame_ids))
         open_ones = [i for i in frames if i == state.index or project.review(i).state not in _SETTLED]
         order = worst_first(project, open_ones)
         if len(order) == 1:
-            raise CartsError("Every other frame is accepted or rejected.")
-        # After other navigation begin with the worst frame, otherwise with the one after the shown frame.
+            raise CartsError("All other frames are accepted or rejected.")
+        # After other navigation, start with the worst frame; otherwise continue from the shown frame.
         begins = self._worst != state.index and order[0] != state.index
         place = 0 if begins else (order.index(state.index) + (1 if intent.step > 0 else -1)) % len(order)
         self._go(order[place])
@@ -125,7 +125,7 @@ class AnnotatingHandler(Handler):
     def _mark(self, name: str, review: Review, *, gesture: object = None) -> None:
         """Set the review of the shown frame, which ends a run."""
         self._context.end_run("Stopped: the frame was reviewed")
-        # An empty review is None, so that clearing it again is not a step.
+        # An empty review is stored as None, so that clearing it again adds no step.
         edits = {Key.review(self._context.state.index): None if review == Review() else review}
         self._context.edit(name, edits, gesture=gesture)
 
@@ -152,11 +152,11 @@ class AnnotatingHandler(Handler):
 
     def _on_ChooseKeypoint(self, intent: intents.ChooseKeypoint) -> None:
         if intent.label is not None and intent.label not in self._keypoints:
-            raise CartsError(f"There is no keypoint {intent.label!r}; there are: {', '.join(self._keypoints)}.")
+            raise CartsError(f"Unknown keypoint {intent.label!r}. Choose one of: {', '.join(self._keypoints)}.")
         self._context.change(keypoints=replace(self._context.state.keypoints, chosen=intent.label))
 
-    def _on_ForgetPins(self, intent: intents.ForgetPins) -> None:
-        self._context.forget_pins()
+    def _on_ForgetPins(self, intent: intents.RemovePins) -> None:
+        self._context.remove_pins()
 
     def _on_PointAt(self, intent: intents.PointAt) -> None:
         self._context.end_run("Stopped: the pose was changed by hand")
@@ -179,7 +179,7 @@ class AnnotatingHandler(Handler):
         self._context.set_pose(f"Place {self._held}", fit.state, gesture=gesture, pins=True)
 
     def _moved_since(self, scene: SceneState) -> bool:
-        """Whether the arms were moved, such as by a run, since they were fitted to pins."""
+        """Whether the arms were moved, for example by a run, since they were fitted to pins."""
         if self._fitted is None:
             return True
         pairs = zip(self._fitted.joint_positions, scene.joint_positions, strict=True)
@@ -193,11 +193,11 @@ class AnnotatingHandler(Handler):
         return list(self._keypoints)[int(distances.argmin())]
 
 
-_LONGEST = 200
-"""Longest text of a condition [characters]."""
+_MAX_TEXT = 200
+"""Maximum length of a condition's text [characters]."""
 
 
-class FindingHandler(Handler):
+class FilterHandler(Handler):
     """Handler of the frame filter."""
 
     def __init__(self, context: Context, show: Callable[..., None]) -> None:
@@ -207,13 +207,13 @@ class FindingHandler(Handler):
     def _on_SetFilter(self, intent: intents.SetFilter) -> None:
         if intent.name not in [field.name for field in fields(FrameFilter)]:
             raise CartsError(f"Frames cannot be filtered by {intent.name!r}.")
-        value: Any = clamped(intent.value, 0.0, 1.0) if intent.name == "dice" else str(intent.value)[:_LONGEST]
+        value: Any = clamped(intent.value, 0.0, 1.0) if intent.name == "dice" else str(intent.value)[:_MAX_TEXT]
         self._context.change(filter=replace(self._context.state.filter, **{intent.name: value}))
 
     def _on_ClearFilter(self, intent: intents.ClearFilter) -> None:
         self._context.change(filter=FrameFilter())
 
-    def _on_ShowFound(self, intent: intents.ShowFound) -> None:
+    def _on_ShowFound(self, intent: intents.ShowMatching) -> None:
         state = self._context.state
         frames = self._found()
         if intent.step > 0:
@@ -223,21 +223,21 @@ class FindingHandler(Handler):
         self._context.change(playing=False)
         self._show(index=index)
 
-    def _on_ReviewFound(self, intent: intents.ReviewFound) -> None:
+    def _on_ReviewFound(self, intent: intents.ReviewMatching) -> None:
         frames, project = self._found(), self._context.session.editor.view
         self._context.end_run("Stopped: many frames were reviewed")
         edits: dict[Key[Any], Any] = {}
         for index in frames:
             review = Review(intent.state, project.review(index).note)
             edits[Key.review(index)] = None if review == Review() else review
-        # A name with all frames would be too long.
+        # Applied without the context, which would name every frame in the step.
         self._context.save()
         of = " of" if intent.state is ReviewState.UNTOUCHED else ""
         self._context.session.editor.apply(f"{_REVIEW_STEPS[intent.state]}{of} {len(frames)} frames", edits)
         self._context.refresh()
 
     def _found(self) -> list[int]:
-        frames = found(self._context.session.editor.view, self._context.state.filter)
+        frames = matching_frames(self._context.session.editor.view, self._context.state.filter)
         if not frames:
-            raise CartsError("No frame meets the conditions. Relax or clear them.")
+            raise CartsError("No frame matches the filter. Relax or clear its conditions.")
         return frames

@@ -27,7 +27,7 @@ class PropagatingHandler(Handler):
         self._optimizers = optimizers
         self._comparison = Comparison(context.session, context.renderer, optimizers)
         self._held: dict[int, Outcome] = {}
-        """Results that fit worse than before and are not applied."""
+        """Results by frame that fit worse than the previous pose and are not applied."""
         self._run: SequenceRun | None = None
         self._work: Iterator[None] = iter(())
         self._before: ProjectState = context.session.editor.view
@@ -62,10 +62,10 @@ class PropagatingHandler(Handler):
     # ---- Intents ---------------------------------------------------------------------------------------------------
 
     def solve(self, whole: bool, at: int, part: range | None = None) -> None:
-        """Begin to solve all frames, or those between the kept frames around the frame `at`, within `part` if given.
+        """Start to solve all frames, or those between the kept frames around the frame `at`, within `part` if given.
 
         Raises:
-            CartsError: there is nothing to solve, or it could not be saved.
+            CartsError: there is nothing to solve, or edits could not be saved.
         """
         if self._run is not None:
             raise CartsError("Frames are already being solved. Wait, or stop solving first.")
@@ -86,9 +86,7 @@ class PropagatingHandler(Handler):
         frames = (part or everything) if whole else between_kept(view, at, part)
         kept = [frame for frame in view.kept_frames if frame in frames]
         if not (whole or kept):
-            raise CartsError(
-                "There is no keyframe yet. Correct a frame by hand, accept one, or solve all frames without any."
-            )
+            raise CartsError("There is no keyframe yet. Correct a frame by hand, accept a frame, or solve all frames.")
         if len(kept) == len(frames):
             raise CartsError("All of these frames are keyframes or accepted, so there is nothing to solve.")
         self._before = view
@@ -109,7 +107,7 @@ class PropagatingHandler(Handler):
     # ---- The run ---------------------------------------------------------------------------------------------------
 
     def _make(self, frames: range, kept: list[int]) -> SequenceRun:
-        """A run on frames together; joints are free as in a run on one frame, calibration is not."""
+        """A run on these frames. The free joints are those of a run on one frame; the calibration is fixed."""
         state, session, cameras = self._context.state, self._session, list(self._context.cameras)
         sequence, target = session.sequence, session.target(state.observed, self._before)
         poses = {index: session.pose(sequence.frame(index, cameras=[]), self._before) for index in kept}
@@ -156,14 +154,14 @@ class PropagatingHandler(Handler):
                 gain = run.optimizer.base_frame_gain()
                 self._report(base_frame_gain=gain, calibration=self._before.records.get(WHOLE_PROJECT))
         finally:
-            # Frames solved before a missing image are kept.
+            # Frames that were solved before an error, such as a missing image, are saved.
             if self._run is run:
                 self._run = None
                 self._report(running=False, text="")
                 self._report(text=self._save(run, outcomes))
 
     def _solved(self, estimate: FrameEstimate) -> bool:
-        """Whether an estimate may be saved: edits made to its frame meanwhile take precedence."""
+        """Whether an estimate may be saved; edits of the frame since the start of the run take precedence."""
         now, index = self._session.editor.view, estimate.index
         kept = estimate.start == "keyframe" or index in now.kept_frames
         return not kept and now.joints(index) == self._before.joints(index)
@@ -177,7 +175,7 @@ class PropagatingHandler(Handler):
             )
 
     def _save(self, run: SequenceRun, outcomes: Mapping[int, Outcome]) -> str:
-        """Save the frames that fit no worse than before as one step; returns a summary that counts the others."""
+        """Save the frames that fit no worse than before as one step; returns a summary for the user."""
         self._context.save()
         edits: dict[Key[Any], Any] = {}
         figures: dict[int, Figures] = {}
@@ -187,13 +185,13 @@ class PropagatingHandler(Handler):
             if not self._solved(estimate):
                 continue
             outcome = outcomes.get(index) or unchecked(estimate, run)
-            if outcome.held:
+            if outcome.worse:
                 self._held[index] = outcome
             else:
                 edits.update(outcome.edits)
                 figures[index] = outcome.figures
             if outcome.remark is not None:
-                listed.append(ListedFrame(index, outcome.remark, not outcome.held))
+                listed.append(ListedFrame(index, outcome.remark, not outcome.worse))
         self._report(listed=tuple(sorted(listed, key=lambda frame: frame.index)))
         count = len(figures) + len(self._held)
         if not count:
@@ -202,7 +200,7 @@ class PropagatingHandler(Handler):
             first, last = (self._session.sequence.frame_ids[index] for index in (min(figures), max(figures)))
             self._session.editor.apply(f"Solve {len(figures)} frames, {first} to {last}", edits, figures)
             self._context.refresh()
-        solved = f"{counted(len(figures), 'frame')} solved, one step of undo"
+        solved = f"{counted(len(figures), 'frame')} solved, one undo step"
         text = f"{'Stopped: ' if run.cancelled else ''}{solved}"
         return f"{text}; {len(self._held)} unchanged, because they would fit worse" if self._held else text
 
@@ -226,7 +224,7 @@ class PropagatingHandler(Handler):
         self._report(listed=tuple(replace(f, taken=f.taken or f.index in taken) for f in listed))
         self._context.refresh()
 
-    def _on_DropSolved(self, intent: intents.DropSolved) -> None:
+    def _on_DropSolved(self, intent: intents.DiscardSolved) -> None:
         self._held = {}
         self._report(listed=())
 
@@ -236,15 +234,15 @@ class PropagatingHandler(Handler):
 
 
 def _deviations(project: ProjectState, index: int) -> dict[str, np.ndarray]:
-    """Standard deviations of a kept frame's joint positions [rad, m], by arm; none for positions set by hand."""
+    """Arm -> standard deviations of a kept frame's joint positions [rad, m], if not set by hand."""
     known = {arm: value.standard_deviations for arm, value in project.joints(index).items()}
     return {arm: np.array(values, np.float64) for arm, values in known.items() if values is not None}
 
 
-class MarkingHandler(Handler):
+class KeyframeHandler(Handler):
     """Handler of keyframes and of the direction of solving."""
 
-    def _on_HoldKeyframe(self, intent: intents.HoldKeyframe) -> None:
+    def _on_HoldKeyframe(self, intent: intents.SetKeyframe) -> None:
         state = self._context.state
         on = not state.project.is_keyframe(state.index) if intent.on is None else bool(intent.on)
         self._context.end_run("Stopped: the frame was marked")
@@ -253,5 +251,5 @@ class MarkingHandler(Handler):
 
     def _on_SetDirection(self, intent: intents.SetDirection) -> None:
         if intent.direction not in ("forward", "backward"):
-            raise CartsError(f"There is no direction {intent.direction!r}.")
+            raise CartsError(f"Unknown direction {intent.direction!r}.")
         self._context.change(direction=intent.direction)

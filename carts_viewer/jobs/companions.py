@@ -1,4 +1,4 @@
-"""Files beside a recording that the viewer reads: which content this user has accepted, and damaged files.
+"""Files that the viewer reads beside a recording: the user's decisions on their content, and damaged files.
 
 Recordings are shared and copied, so their files may be from another user. Each decision is a file in `decisions/`
 of the user's data folder, named by the SHA-256 digest of the content that was accepted or refused.
@@ -14,19 +14,19 @@ from carts_core.files.reading import Kind, read_text
 from carts_core.project.identity import data_dir
 
 _FILE = Kind("decision", 64)
-_LONGEST_CAUSE = 300
-"""Longest quoted cause [characters]."""
+_MAX_CAUSE = 300
+"""Maximum length of a quoted cause [characters]."""
 _ACCEPTED, _REFUSED = "accepted", "refused"
 
 
 class Decisions:
-    """Decisions of this user on file contents; only in memory where the data folder cannot be written."""
+    """Decisions of this user on file contents; kept only in memory if the data folder is not writable."""
 
     def __init__(self) -> None:
         self._made: dict[str, bool] = {}
 
     def find(self, content: bytes) -> bool | None:
-        """Whether content was accepted; None where nothing was decided."""
+        """Whether content was accepted; None if undecided."""
         digest = _digest(content)
         if digest in self._made:
             return self._made[digest]
@@ -58,14 +58,14 @@ def _path(digest: str) -> OutputPath:
     return output_path(data_dir(), "decisions", digest)
 
 
-def damage(path: Path, what: str, error: Exception, effect: str, *, writable: bool = True) -> str:
+def set_aside_damaged(path: Path, what: str, error: Exception, effect: str, *, writable: bool = True) -> str:
     """Set a damaged file aside, and describe the damage.
 
     Args:
-        path: of the file.
+        path: the damaged file.
         what: kind of file, such as "list of jobs".
-        error: why it cannot be read.
-        effect: what happens instead, a sentence without its full stop.
+        error: reason why the file cannot be read.
+        effect: consequence for the user, as a sentence without full stop.
         writable: whether the file may be renamed.
 
     Returns:
@@ -77,4 +77,4 @@ def damage(path: Path, what: str, error: Exception, effect: str, *, writable: bo
             kept = f"The damaged file is kept as {set_aside(path).name}"
         except CartsError as failed:
             kept = f"The damaged file could not be renamed: {failed}"
-    return f"The {what} {path.name} cannot be read: {str(error)[:_LONGEST_CAUSE]}. {effect}. {kept}."
+    return f"The {what} {path.name} cannot be read: {str(error)[:_MAX_CAUSE]}. {effect}. {kept}."

@@ -1,4 +1,4 @@
-"""Comparison of a solved pose with the earlier pose of its frame: verdict, loss, Dice, and which result is kept."""
+"""Comparison of a solved pose with the earlier pose of its frame by verdict, loss and Dice."""
 
 import json
 from collections.abc import Iterator
@@ -17,9 +17,9 @@ from carts_viewer.session import Session, joint_correction
 from carts_viewer.state import Pose, Target, ViewState
 
 _OUT_OF_VIEW = 5e-4
-"""Share of an image below which no arm is in view of a camera [1]."""
+"""Share of an image that arms must cover to count as in view of the camera [1]."""
 _WORSE_LOSS, _WORSE_FAILURE, _WORSE_DICE = 1.1, 0.02, 0.005
-"""Thresholds of a worse fit: factor of the loss, difference of probability and of Dice [1]."""
+"""Thresholds of a worse fit: ratio of losses, difference between probabilities of failure and between Dice [1]."""
 
 
 @dataclass(frozen=True)
@@ -30,12 +30,12 @@ class Fit:
     loss: float
     """Mean loss of the cameras with an arm in view [1]."""
     dice: float | None = None
-    """Overlap with the true mask; None where there is none."""
+    """Dice overlap with the ground-truth mask; None if there is none."""
 
     def worse_than(self, other: "Fit") -> str | None:
-        """Text on why this fit is worse than another one of the same frame; None otherwise."""
+        """Reason why this fit is worse than another fit of the same frame; None if it is not worse."""
         if other.dice is not None and self.dice is not None:
-            # If the truth is known, only Dice counts.
+            # If ground truth is known, only Dice counts.
             return f"Dice {self.dice:.3f}, before {other.dice:.3f}" if self.dice < other.dice - _WORSE_DICE else None
         if VERDICTS.index(self.verdict.verdict) > VERDICTS.index(other.verdict.verdict):
             return f"{self.verdict.verdict}, before {other.verdict.verdict}"
@@ -47,7 +47,7 @@ class Fit:
 
 
 class FitCheck:
-    """Assesses poses against images, without moving anything."""
+    """Assesses poses against images without changing them."""
 
     def __init__(self, session: Session, optimizers: OptimizerFactory) -> None:
         self._session = session
@@ -65,14 +65,14 @@ class FitCheck:
             ignore = self._session.ignored(index, [name], target)
             task = FrameTask(sequence, index, domain, (name,), pose, settings, FreeParameters(), target, ignore)
             found[name] = self._optimizers.assess(task)
-        # Cameras without an arm in view are left out, unless all are.
+        # Cameras without an arm in view are ignored, unless no camera has an arm in view.
         seeing = {name: one for name, one in found.items() if one[0].evidence.area >= _OUT_OF_VIEW} or found
         loss = sum(loss for _, loss in seeing.values()) / len(seeing)
-        return Fit(of_cameras({name: assessment for name, (assessment, _) in seeing.items()}), loss)
+        return Fit(frame_verdict({name: assessment for name, (assessment, _) in seeing.items()}), loss)
 
 
-def of_cameras(assessed: dict[str, Assessment]) -> FitVerdict:
-    """Verdict on a frame: the worst one of its cameras."""
+def frame_verdict(assessed: dict[str, Assessment]) -> FitVerdict:
+    """Verdict on a frame: the worst verdict of its cameras."""
     worst = max(assessed, key=lambda name: (VERDICTS.index(assessed[name].verdict.value), assessed[name].probability))
     found = assessed[worst]
     verdict = FitVerdict(found.verdict.value, found.reason, found.remedy, found.probability)
@@ -91,8 +91,8 @@ class Outcome:
     figures: Figures
     remark: str | None = None
     """Reason to inspect the frame, as text for the user."""
-    held: bool = False
-    """Whether it fits worse than before, so that the earlier pose is kept."""
+    worse: bool = False
+    """Whether the result fits worse than the earlier pose, which is kept."""
 
 
 class Comparison:
@@ -105,9 +105,9 @@ class Comparison:
         self._check = FitCheck(session, optimizers)
 
     def outcome(self, estimate: FrameEstimate, run: SequenceRun, before: ProjectState, state: ViewState) -> Outcome:
-        """The best of the solved pose, a run on the frame alone, and the earlier pose.
+        """The best of the solved pose, the result of an individual run on the frame, and the earlier pose.
 
-        The run alone is made only if the solved pose is worse than the earlier one, or not good.
+        The individual run is made only if the solved pose is worse than the earlier pose, or its verdict is not good.
 
         Raises:
             CartsError: an image or the weights are not usable.
@@ -126,7 +126,7 @@ class Comparison:
         if remark is None and solved.verdict.verdict != "good":
             remark = f"{solved.verdict.verdict}: {solved.verdict.reason}"
         verdict = {Key.verdict(estimate.index): solved.verdict}
-        return replace(found, edits={**found.edits, **verdict}, remark=remark, held=worse is not None)
+        return replace(found, edits={**found.edits, **verdict}, remark=remark, worse=worse is not None)
 
     def _frame(self, index: int, state: ViewState) -> Frame:
         sequence, domain = self._session.sequence, state.domain
@@ -143,7 +143,7 @@ class Comparison:
         return replace(fit, dice=min(known, default=None))
 
     def own_run(self, index: int, state: ViewState) -> Iterator[tuple[Fit, Edits, str | None] | None]:
-        """Run on one frame alone; yields None after each step, then the fit, its edits, and why it is worse.
+        """Run on one frame individually; yields None after each step, then the fit, its edits and `Fit.worse_than`.
 
         Raises:
             CartsError: an image, the weights or a setting is not usable.
@@ -159,7 +159,7 @@ class Comparison:
     def _alone(
         self, frame: Frame, start: Pose, state: ViewState, target: Target, of_many: Provenance
     ) -> tuple[Fit, Edits]:
-        """The fit of a run on this frame alone, and the edits that apply it."""
+        """The fit of an individual run on this frame, and the edits that apply it."""
         settings = json.dumps({**json.loads(of_many.settings or "{}"), "alone": True})
         steps = self._steps(frame, start, state, target, replace(of_many, settings=settings))
         return next(outcome for outcome in steps if outcome is not None)
@@ -199,6 +199,6 @@ def solved_edits(estimate: FrameEstimate, run: SequenceRun) -> Edits:
 
 
 def unchecked(estimate: FrameEstimate, run: SequenceRun) -> Outcome:
-    """The result of a frame that was not compared, because solving was stopped."""
+    """The outcome of a frame that was not compared, because solving was stopped."""
     edits = {**solved_edits(estimate, run), Key.verdict(estimate.index): None}
     return Outcome(edits, Figures(estimate.loss), "not compared with the previous pose, because solving was stopped")

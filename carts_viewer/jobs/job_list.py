@@ -1,4 +1,4 @@
-"""Jobs of the viewer, their options, and the list of them in `PROJECT_jobs.json` beside the project."""
+"""Jobs of the viewer, their options, and the list of jobs in `PROJECT_jobs.json` beside the project."""
 
 import json
 import secrets
@@ -16,23 +16,23 @@ from carts_core.export import FORMATS, FormatName, Parts
 from carts_core.files import output_path, write_text
 from carts_core.files.reading import Kind, parse_json, read_text, typed
 from carts_core.settings import Masks
-from carts_viewer.jobs.companions import Decisions, damage
+from carts_viewer.jobs.companions import Decisions, set_aside_damaged
 
-_KEPT = 50
-"""Number of ended jobs that are kept."""
-_LONGEST_LIST = 1000
-"""Most jobs in the file."""
-_LONGEST_LOG = 200
-"""Most lines of a log."""
-_LONGEST_TEXT = 2000
-"""Longest title, text or line [characters]."""
+_MAX_ENDED = 50
+"""Maximum number of ended jobs in the list."""
+_MAX_JOBS = 1000
+"""Maximum number of jobs in the file."""
+_MAX_LOG = 200
+"""Maximum number of lines of a log."""
+_MAX_TEXT = 2000
+"""Maximum length of a title, text or line [characters]."""
 _FILE = Kind("list of jobs", 8 * 2**20)
-LARGEST_CALIBRATION = 500
-"""Most frames of a calibration."""
-LONGEST_TRAINING = 240
-"""Most time for a training [min]."""
-_LARGEST_FOLDER = 999_999
-"""Number of an adapted network."""
+MAX_CALIBRATION_FRAMES = 500
+"""Maximum number of frames of a calibration."""
+MAX_TRAINING_TIME = 240
+"""Maximum time of training [min]."""
+_MAX_NETWORK_NUMBER = 999_999
+"""Maximum number of an adapted network."""
 
 
 # ---- Options ---------------------------------------------------------------------------------------------------------
@@ -44,19 +44,19 @@ class SolveOptions:
 
     whole: bool = False
     at: int = 0
-    """Index of a frame; the frames between the keyframes around it are solved."""
+    """Index of a frame; the frames between the nearest kept frames are solved."""
     range: tuple[int, int] | None = None
     """First and last frame; None for the whole sequence."""
 
 
 @dataclass(frozen=True)
 class OptimizeOptions:
-    """Options of optimizing frames, each alone."""
+    """Options of optimizing frames individually."""
 
     frames: tuple[int, ...]
     """Frame indices."""
     first: int = 0
-    """Position in `frames` to begin at."""
+    """Index in `frames` of the first frame to optimize."""
 
 
 @dataclass(frozen=True)
@@ -69,10 +69,10 @@ class CalibrateOptions:
 
 @dataclass(frozen=True)
 class AdaptOptions:
-    """Options of a training."""
+    """Options of the adaptation of the network."""
 
     minutes: int
-    """Most time [min]."""
+    """Time limit [min]."""
     folder: int
     """Number of the folder of the network."""
 
@@ -104,7 +104,7 @@ def read_options(kind: str, values: Mapping[str, Any], frames: int) -> Options:
     """Options of a job with checked types, clamped to the ranges of the page.
 
     Raises:
-        ValueError: there is no such kind of job, or a value is missing or of another type.
+        ValueError: the kind of job is unknown, or a value is missing or of the wrong type.
     """
     if kind not in _KINDS:
         raise ValueError(f"unknown kind of job: {kind!r}")
@@ -116,10 +116,10 @@ def read_options(kind: str, values: Mapping[str, Any], frames: int) -> Options:
             indices = tuple(dict.fromkeys(index for index in options.frames if 0 <= index <= last))
             return OptimizeOptions(indices, _within(options.first, 0, len(indices)))
         case CalibrateOptions():
-            return CalibrateOptions(_within(options.frames, 1, LARGEST_CALIBRATION))
+            return CalibrateOptions(_within(options.frames, 1, MAX_CALIBRATION_FRAMES))
         case AdaptOptions():
-            minutes = _within(options.minutes, 1, LONGEST_TRAINING)
-            return AdaptOptions(minutes, _within(options.folder, 1, _LARGEST_FOLDER))
+            minutes = _within(options.minutes, 1, MAX_TRAINING_TIME)
+            return AdaptOptions(minutes, _within(options.folder, 1, _MAX_NETWORK_NUMBER))
         case ExportOptions():
             return replace(options, range=_range(options.range, last))
 
@@ -162,7 +162,7 @@ class JobState(StrEnum):
     """State of a job."""
 
     ASKED = "asked"
-    """It was not queued by this user on this machine, and waits for their decision."""
+    """Queued by another user or on another computer, and needs confirmation."""
     WAITING = "waiting"
     RUNNING = "running"
     DONE = "done"
@@ -179,13 +179,13 @@ class Job:
     title: str
     """Title, as text for the user."""
     options: Options
-    """With the kind, all data to repeat the job."""
+    """All data to repeat the job, together with its kind."""
     state: JobState = JobState.WAITING
     done: Annotated[int, msgspec.Meta(ge=0)] = 0
     total: Annotated[int, msgspec.Meta(ge=0)] = 0
-    """Number of steps; 0 while unknown."""
+    """Number of steps; 0 if unknown."""
     began: float = 0.0
-    """Time of the start [s since 1970]; 0 before."""
+    """Time of the start [s since 1970]; 0 until then."""
     ended: float = 0.0
     text: str = ""
     """Progress or result, as text for the user."""
@@ -195,7 +195,7 @@ class Job:
 
     @property
     def over(self) -> bool:
-        """Whether it has ended."""
+        """Whether the job has ended."""
         return self.state in (JobState.DONE, JobState.FAILED, JobState.CANCELLED)
 
     @property
@@ -205,7 +205,7 @@ class Job:
         return None if ends is None else range(ends[0], ends[1] + 1)
 
     def seconds_left(self, now: float) -> float | None:
-        """Estimated remaining time [s]; None where unknown."""
+        """Estimated remaining time [s]; None if unknown."""
         if self.state is not JobState.RUNNING or not self.done or not self.total:
             return None
         return max(0.0, (now - self.began) / self.done * (self.total - self.done))
@@ -223,13 +223,13 @@ class JobList:
 
     Attributes:
         jobs: the list.
-        problem: that the file was damaged, and where it is kept; empty if it was not.
+        problem: message about a damaged file; empty if the file was not damaged.
     """
 
     def __init__(
         self, project: Path, *, kept: bool, frame_ids: Sequence[str], recording: str = "", decisions: Decisions
     ) -> None:
-        """`recording` is a digest; jobs in the list of another recording do not count as this user's."""
+        """`recording`: digest of the recording; jobs in a list of another recording do not count as this user's."""
         self._path = output_path(project.parent, f"{project.stem}_jobs.json") if kept else None
         self._frame_ids, self._recording, self._decisions = frame_ids, recording, decisions
         self.problem = ""
@@ -239,7 +239,7 @@ class JobList:
         """Queue a job.
 
         Raises:
-            CartsError: there is no such job, or the list cannot be written.
+            CartsError: the kind or an option is invalid, or the list cannot be written.
         """
         try:
             options = read_options(kind, values, len(self._frame_ids))
@@ -248,20 +248,20 @@ class JobList:
         number = max((job.number for job in self.jobs), default=0) + 1
         job = self._own(Job(number, kind, job_title(options, self._frame_ids), options))
         ended = [job for job in self.jobs if job.over]
-        self._drop(ended[: max(len(ended) - _KEPT, 0)])
+        self._drop(ended[: max(len(ended) - _MAX_ENDED, 0)])
         self.jobs = (*self.jobs, job)
         self._write()
         return job
 
     def change(self, number: int, line: str | None = None, **changes: Any) -> None:
-        """Change a job; a line is added to its log."""
+        """Change fields of a job, and append a line to its log."""
         before = self.jobs
         self.jobs = tuple(_changed(job, line, changes) if job.number == number else job for job in self.jobs)
         if [job.state for job in before] != [job.state for job in self.jobs]:
             self._write()
 
     def accept(self, number: int, options: Options) -> None:
-        """Queue a job of another user, with these options, as this user's."""
+        """Queue a job of another user, with these options, as a job of this user."""
         job = replace(self.find(number), state=JobState.WAITING, options=options)
         job = self._own(job)
         self.jobs = tuple(job if each.number == number else each for each in self.jobs)
@@ -284,7 +284,7 @@ class JobList:
         """A job by its number.
 
         Raises:
-            CartsError: there is none.
+            CartsError: there is no job with this number.
         """
         job = next((job for job in self.jobs if job.number == number), None)
         if job is None:
@@ -317,35 +317,37 @@ class JobList:
         try:
             rows = typed(parse_json(read_text(self._path.path, _FILE)), list[_Row])
             numbers = [row.number for row in rows]
-            if len(set(numbers)) < len(numbers) or len(numbers) > _LONGEST_LIST:
-                raise ValueError(f"it has more than {_LONGEST_LIST} jobs, or duplicate numbers")
+            if len(set(numbers)) < len(numbers) or len(numbers) > _MAX_JOBS:
+                raise ValueError(f"it has more than {_MAX_JOBS} jobs, or duplicate numbers")
             return [self._job(row) for row in rows]
         except FileNotFoundError:
             return []
         except (OSError, ValueError) as error:
-            self.problem = damage(self._path.path, "list of jobs", error, "A new list was started; no job is running")
+            self.problem = set_aside_damaged(
+                self._path.path, "list of jobs", error, "A new list was started; no job is running"
+            )
             return []
 
     def _job(self, row: _Row) -> Job:
         options = read_options(row.kind, row.options, len(self._frame_ids))
         texts = {
-            "text": row.text[:_LONGEST_TEXT],
-            "log": tuple(line[:_LONGEST_TEXT] for line in row.log[-_LONGEST_LOG:]),
+            "text": row.text[:_MAX_TEXT],
+            "log": tuple(line[:_MAX_TEXT] for line in row.log[-_MAX_LOG:]),
         }
         title = job_title(options, self._frame_ids)
         return Job(**{**vars(row), **texts, "options": options, "title": title})
 
     def _resumed(self, job: Job) -> Job:
-        """A job of an earlier viewer: a waiting one waits or needs confirmation, a running one has failed."""
+        """A job after a restart: a waiting job of another user needs confirmation, and a running job has failed."""
         if job.state in (JobState.WAITING, JobState.ASKED):
             return replace(job, state=JobState.WAITING if self.is_own(job) else JobState.ASKED)
         if job.state is not JobState.RUNNING:
             return job
-        text = "The viewer ended while the job ran. Saved results are kept; start it again to continue."
+        text = "The viewer was closed during the job. Saved results are kept; start the job again to continue."
         return _changed(job, text, {"state": JobState.FAILED, "text": text, "ended": time.time()})
 
 
 def _changed(job: Job, line: str | None, changes: Mapping[str, Any]) -> Job:
     if line is not None:
-        changes = {**changes, "log": (*job.log, f"{time.strftime('%H:%M:%S')} {line}")[-_LONGEST_LOG:]}
+        changes = {**changes, "log": (*job.log, f"{time.strftime('%H:%M:%S')} {line}")[-_MAX_LOG:]}
     return replace(job, **changes)

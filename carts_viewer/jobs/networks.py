@@ -1,4 +1,4 @@
-"""Networks of a recording: those that the viewer was started with, and adapted ones."""
+"""Networks of a recording: the initial network of the viewer, and adapted networks."""
 
 import json
 import re
@@ -9,7 +9,7 @@ from pathlib import Path
 from carts_core.errors import CartsError
 from carts_core.files import output_path, write_text
 from carts_core.files.reading import WEIGHTS, Kind, is_regular, parse_json, read_bytes, read_text, typed
-from carts_viewer.jobs.companions import Decisions, damage
+from carts_viewer.jobs.companions import Decisions, set_aside_damaged
 from carts_viewer.jobs.optimizers import OptimizerFactory
 
 STARTED = "As started"
@@ -17,8 +17,8 @@ STARTED = "As started"
 _WEIGHTS_FILE = "surface.safetensors"
 _ADAPTED = "Adapted {}"
 _FILE = Kind("choice of a network", 2**12)
-_LONGEST_NAME = 40
-"""Longest name of a network [characters]."""
+_MAX_NAME = 40
+"""Maximum length of a network's name [characters]."""
 
 
 @dataclass(frozen=True)
@@ -31,13 +31,13 @@ class _Choice:
 class Networks:
     """The surface network that all tabs use; the choice is kept in `PROJECT_network.json` beside the project.
 
-    Weights that this user has neither trained here nor accepted are not used before they are accepted, once per file.
+    Weights that this user has not trained on this computer are used only after the user has accepted them.
 
     Attributes:
         names: labels of the networks to choose from.
         used: label of the network in use.
-        asked: label of a chosen network whose weights are not accepted yet; empty without one.
-        problem: why the saved choice is not used; empty if it is.
+        asked: label of a chosen network whose weights are not accepted yet; empty if there is none.
+        problem: reason why the saved choice is not used; empty if it is used.
     """
 
     def __init__(self, project: Path, *, kept: bool, optimizers: OptimizerFactory, decisions: Decisions) -> None:
@@ -47,7 +47,7 @@ class Networks:
         self.names: tuple[str, ...] = ()
         self.used = STARTED
         self.asked = self.problem = ""
-        self.look()
+        self.update_names()
         remembered = self._read()
         try:
             if remembered != STARTED and not optimizers.given_surface():
@@ -55,7 +55,7 @@ class Networks:
         except (OSError, CartsError) as error:
             self.problem = f"The last chosen network {remembered!r} cannot be used: {error}."
 
-    def look(self) -> None:
+    def update_names(self) -> None:
         """Update `names`."""
         numbers = [number for number in self._numbers() if is_regular(self.folder(number) / _WEIGHTS_FILE)]
         self.names = (STARTED, *(_ADAPTED.format(number) for number in numbers))
@@ -72,11 +72,11 @@ class Networks:
         """Use a network from now on and save the choice; weights of another user have to be accepted first.
 
         Raises:
-            CartsError: there is none of this name, or its weights cannot be used.
+            CartsError: the name is unknown, or the weights cannot be used.
         """
-        self.look()
+        self.update_names()
         if name not in self.names:
-            raise CartsError(f"There is no network {name!r}. Available: {', '.join(self.names)}.")
+            raise CartsError(f"Unknown network {name!r}. Choose one of: {', '.join(self.names)}.")
         self.asked = "" if name == STARTED or self._decisions.find(self._weights(name)) else name
         if not self.asked:
             self._run(name)
@@ -87,7 +87,7 @@ class Networks:
         """Accept or refuse the weights that need confirmation.
 
         Raises:
-            CartsError: there is no question, or they cannot be used.
+            CartsError: no weights need confirmation, or they cannot be used.
         """
         name, self.asked = self.asked, ""
         if not name:
@@ -97,7 +97,7 @@ class Networks:
             self.use(name)
 
     def trained(self, number: int) -> None:
-        """Accept the weights of a training that this viewer has run, if any."""
+        """Accept the weights of the adapted network with this number, which this viewer has trained."""
         with suppress(OSError, CartsError):
             self._decisions.make(self._weights(_ADAPTED.format(number)), True)
 
@@ -122,7 +122,7 @@ class Networks:
         """Content of the weights of an adapted network.
 
         Raises:
-            CartsError: they cannot be read.
+            CartsError: the weights cannot be read.
         """
         path = self._weights_file(name)
         try:
@@ -139,10 +139,10 @@ class Networks:
     def _read(self) -> str:
         """Name of the network that was chosen last."""
         try:
-            return typed(parse_json(read_text(self._file.path, _FILE)), _Choice).network[:_LONGEST_NAME]
+            return typed(parse_json(read_text(self._file.path, _FILE)), _Choice).network[:_MAX_NAME]
         except FileNotFoundError:
             return STARTED
         except (OSError, ValueError) as error:
             effect = "The viewer's initial network is used"
-            self.problem = damage(self._file.path, "choice of a network", error, effect, writable=self._kept)
+            self.problem = set_aside_damaged(self._file.path, "choice of a network", error, effect, writable=self._kept)
             return STARTED

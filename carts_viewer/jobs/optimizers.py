@@ -44,21 +44,21 @@ class Optimizer(Protocol):
 
     @property
     def best(self) -> Iterate | None:
-        """The best iterate so far: of the present observation, the one of the lowest loss; at the end, the last."""
+        """During a run, the iterate with the lowest loss for the current observation; at the end, the last iterate."""
 
     @property
     def stop_reason(self) -> str | None:
-        """Reason for the end of the run; None before."""
+        """Reason for the end of the run; None until then."""
 
     @property
     def assessment(self) -> Assessment | None:
-        """At the end, the assessment of the result; None before, and if it is not assessed."""
+        """Assessment of the result; None during the run, and if the solver does not assess it."""
 
     def step(self) -> Iterate | None:
-        """The next iterate, the start itself at first; None when there are no more."""
+        """The next iterate, first the initial state; None after the last iterate."""
 
     def base_frame_gain(self) -> float | None:
-        """At the end, the share of the residual that free base frames would explain [1]; None if not known."""
+        """At the end, the share of the residual that free base frames would explain [1]; None if unknown."""
 
     @property
     def history(self) -> list[Progress]:
@@ -72,7 +72,7 @@ class Optimizer(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class FrameTask:
-    """A frame that is optimized, or assessed."""
+    """A frame to optimize or assess."""
 
     sequence: Recording
     index: int
@@ -97,7 +97,7 @@ class ActiveRun:
         self._rows = [names.index(name) for name in task.cameras]
 
     def verdict(self) -> FitVerdict | None:
-        """At the end, the verdict on the result; None if the solver does not assess it."""
+        """Verdict on the result of an ended run; None if the solver does not assess it."""
         found = self.optimizer.assessment
         if found is None:
             return None
@@ -145,7 +145,7 @@ class SequenceRun:
         if done == total:
             return f"All {total} frames estimated; revising inconsistent ones and assessing the fit"
         if done < 2 < total:
-            return f"Frame {done} of {total}"  # The first takes longer than others.
+            return f"Frame {done} of {total}"  # The first frame takes longer, so it does not predict the time left.
         return f"Frame {done} of {total}, about {spoken_time(self.optimizer.seconds_left)} left"
 
 
@@ -157,13 +157,13 @@ class NetworkOptions(TypedDict, total=False):
     """Options of the networks."""
 
     weights: tuple[Path, ...]
-    """Weights files; a network without one is the shipped network."""
+    """Weights files; networks without a file have the shipped weights."""
     device: str
     """Device of the networks, such as `cpu`, the default, or `cuda`."""
     inference: Inference
     """Runtime of the surface network; `auto` by default."""
     segmenter: Segmenter | None
-    """Segmenter of the tool *Prompt*; the shipped one by default."""
+    """Segmenter of the *Prompt* tool; the shipped network by default."""
 
 
 class OptimizerFactory:
@@ -178,10 +178,10 @@ class OptimizerFactory:
         self.report = report
         self._surface: Path | None = None
         self._extractor: FeatureExtractor | None = None
-        self._unfamiliar: dict[tuple[object, ...], tuple[str, ...]] = {}
+        self._warnings: dict[tuple[object, ...], tuple[str, ...]] = {}
 
     def given_surface(self) -> bool:
-        """Whether a surface network is among the weights that were given.
+        """Whether the weights options include a surface network.
 
         Raises:
             WeightsError: weights cannot be read.
@@ -189,20 +189,20 @@ class OptimizerFactory:
         return any(read_weights(path).network.kind == SurfaceNetwork.kind for path in self._weights)
 
     def use(self, surface: Path | None) -> None:
-        """Use another surface network from now on; None: the one that the viewer was started with.
+        """Use another surface network from now on; None for the initial network.
 
         Raises:
             WeightsError: the weights cannot be read, or are not those of a surface network.
         """
         if surface is not None and read_weights(surface).network.kind != SurfaceNetwork.kind:
-            raise WeightsError(f"{surface} holds no surface network. Adapt the network again.")
+            raise WeightsError(f"{surface} contains no surface network. Adapt the network again.")
         self._surface, self._extractor = surface, None
 
     def prepare(self) -> FeatureExtractor:
         """Load the networks, if they are not loaded yet.
 
         Raises:
-            WeightsError: they cannot be loaded.
+            WeightsError: the networks cannot be loaded.
         """
         if self._extractor is None:
             self.report("Loading the networks")
@@ -214,7 +214,7 @@ class OptimizerFactory:
         return self._extractor
 
     def segmenter(self) -> Segmenter:
-        """The segmenter of the tool *Prompt*.
+        """The segmenter of the *Prompt* tool.
 
         Raises:
             WeightsError: the networks cannot be loaded.
@@ -226,25 +226,25 @@ class OptimizerFactory:
             self._own_segmenter = extractor, NetworkSegmenter.of(extractor)
         return self._own_segmenter[1]
 
-    def unfamiliar(
+    def domain_warnings(
         self, sequence: Recording, scene: Scene, index: int, domain: str, cameras: Sequence[str]
     ) -> tuple[str, ...]:
-        """Warnings that these arms and images are outside the domain of the network, from one frame; cached.
+        """Warnings if these arms or images are outside the domain of the network, from one frame; cached.
 
         Raises:
             CartsError: weights or an image is not usable.
         """
         extractor = self.prepare()
         known = extractor.sha256, domain, *cameras
-        if known not in self._unfamiliar:
+        if known not in self._warnings:
             scene = scene.with_cameras(cameras)
             found = check_domain(scene, sequence.frame(index, domain, list(cameras)), extractor)
             background = Backgrounds.of(sequence, cameras, domain).covers(scene)
-            self._unfamiliar[known] = tuple(found.warnings(", ".join(cameras), REMEDY, background=background))
-        return self._unfamiliar[known]
+            self._warnings[known] = tuple(found.warnings(", ".join(cameras), REMEDY, background=background))
+        return self._warnings[known]
 
     def predictor(self, target: Target) -> FeatureExtractor | MaskPredictor:
-        """Predictor of a target; with masks alone no network is loaded.
+        """Predictor of a target; if only masks are fitted, no network is loaded.
 
         Raises:
             WeightsError: the networks cannot be loaded.
@@ -264,7 +264,7 @@ class OptimizerFactory:
         source: Source = Source.OPTIMIZER,
         **more: Any,
     ) -> Provenance:
-        """Provenance of a run with these settings, and further ones in `more`.
+        """Provenance of a run with these settings, and with `more` settings.
 
         Raises:
             WeightsError: the networks cannot be loaded.
@@ -277,7 +277,7 @@ class OptimizerFactory:
         return Provenance.made_by_optimizer(used, weights, source)
 
     def make(self, task: FrameTask) -> Optimizer:
-        """An optimizer of a frame.
+        """Make an optimizer of a frame.
 
         Raises:
             CartsError: weights, an image, a mask or a setting is not usable.
@@ -292,10 +292,10 @@ class OptimizerFactory:
         return self._frame_optimizer(task, predictor)
 
     def assess(self, task: FrameTask) -> tuple[Assessment, float]:
-        """Assessment and loss of a pose, without moving it; errors as in `make`."""
+        """Assessment and loss of a pose, which is not changed; errors as in `make`."""
         surface = task.settings if isinstance(task.settings, SurfaceSolver) else SurfaceSolver()
-        held = replace(task, settings=replace(surface, stages=NONE), free=FreeParameters())
-        optimizer = self._frame_optimizer(held, self.predictor(task.target))
+        fixed = replace(task, settings=replace(surface, stages=NONE), free=FreeParameters())
+        optimizer = self._frame_optimizer(fixed, self.predictor(task.target))
         for _ in optimizer:
             pass
         assert optimizer.assessment is not None and optimizer.best is not None
@@ -319,7 +319,7 @@ class OptimizerFactory:
 
 
 def scene_at(scene: Scene, state: SceneState) -> Scene:
-    """The scene with base frames, extrinsics and intrinsics of a state in place of the calibrated ones."""
+    """The scene with base frames, extrinsics and intrinsics of a state."""
 
     def array(value: torch.Tensor):
         return value.numpy().astype("float64")

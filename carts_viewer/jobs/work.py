@@ -53,9 +53,9 @@ class Progress:
 
 
 def optimize_frames(context: Context, comparison: Comparison, frames: Sequence[int], first: int) -> Generator[Progress]:
-    """Run on each of these frames alone, beginning at position `first`; worse results are discarded.
+    """Run the optimizer on frames individually, starting at index `first` of `frames`; worse results are discarded.
 
-    Every frame is a separate step of undo, and is saved before the next one begins.
+    Every frame is a separate undo step, and is saved before the next frame is started.
     """
     taken = worse = 0
     cameras = [camera.name for camera in context.session.scene.cameras]
@@ -91,7 +91,7 @@ def optimize_frames(context: Context, comparison: Comparison, frames: Sequence[i
 
 
 def calibrate(context: Context, optimizers: OptimizerFactory, count: int) -> Generator[Progress]:
-    """Fit base frames, and cameras where they are free, to frames spread over the sequence; one step of undo."""
+    """Fit base frames, and cameras if they are free, to frames spread over the sequence; one undo step."""
     session, state = context.session, context.state
     sequence = session.sequence
     cameras = [camera.name for camera in session.scene.cameras]
@@ -130,30 +130,30 @@ def calibrate(context: Context, optimizers: OptimizerFactory, count: int) -> Gen
         yield Progress(most, most, f"Nothing was changed. {verdict}")
         return
     if session.editor.view.records.get(WHOLE_PROJECT) is not before.records.get(WHOLE_PROJECT):
-        raise CartsError("The calibration was changed meanwhile, so this result is outdated. Start it again.")
+        raise CartsError("The calibration was changed meanwhile, so this result is outdated. Calibrate again.")
     context.save()
     accepted, solved = (_count(session.editor.view, states) for states in ({_ACCEPTED}, {_ACCEPTED, _OPTIMIZED}))
     session.editor.apply(f"Calibrate on {len(indices)} frames", edits)
     context.refresh()
     again = " All masks have changed: run or solve fitted frames again." if solved else ""
     again += f" Unreviewed now, though accepted before: {accepted}." if accepted else ""
-    done = f"Calibrated on {len(indices)} frames, one step of undo.{_moved(scene, result.scene)}"
+    done = f"Calibrated on {len(indices)} frames, one undo step.{_moved(scene, result.scene)}"
     yield Progress(most, most, f"{done} {verdict}{again}")
 
 
 def _moved(before: Scene, after: Scene) -> str:
-    """Text on the poses that a calibration has moved, with angle and distance; empty if none."""
+    """Text with angles and distances of the poses that a calibration has moved; empty if there are none."""
     found = [f"{name} by {angle:.1f}° and {way:.1f} mm" for name, angle, way in moved_frames(before, after)]
     return f" Moved: {', '.join(found)}." if found else ""
 
 
 def _count(project: ProjectState, states: Container[ReviewState]) -> int:
-    """Frames in one of these review states."""
+    """Number of frames in one of these review states."""
     return sum(project.review(index).state in states for index in project.records if index >= 0)
 
 
 def _calibration_edits(before: Scene, after: Scene, provenance: Provenance) -> dict[Key[Any], Any]:
-    """Edits that give a project this calibration."""
+    """Edits that set the calibration of a project."""
     edits: dict[Key[Any], Any] = {}
     for old, new in zip(before.arms, after.arms, strict=True):
         if (old.T_world_base != new.T_world_base).any():
@@ -169,23 +169,23 @@ def _calibration_edits(before: Scene, after: Scene, provenance: Provenance) -> d
     return edits
 
 
-OPTIONS: tuple[str, ...] = ()
-"""Options of `carts train` besides the recording and the time."""
-_POLL = 0.25
-"""Interval between checks of the training [s]."""
-_LONGEST_END = 30.0
-"""Time for a stopped training to save its checkpoint [s]."""
+TRAINING_OPTIONS: tuple[str, ...] = ()
+"""Options of `carts train` in addition to the recording and the time."""
+_POLL_INTERVAL = 0.25
+"""Interval between checks of the training process [s]."""
+_CHECKPOINT_TIME = 30.0
+"""Time for a stopped training process to save its checkpoint [s]."""
 
 
 def adapt(sequence: Path, folder: Path, minutes: float) -> Generator[Progress]:
-    """Train in a child process and report progress; closing the iterator stops the training.
+    """Adapt the network in a child process and report progress; closing the generator stops the process.
 
-    A stopped training continues in its folder for the given minutes.
+    Stopped training is resumed in its folder for the given minutes.
 
     Raises:
         CartsError: training failed.
     """
-    training = _Training([str(folder), "--for", str(sequence), "--minutes", f"{minutes:g}", *OPTIONS])
+    training = _Training([str(folder), "--for", str(sequence), "--minutes", f"{minutes:g}", *TRAINING_OPTIONS])
     total, text, lines = max(1, round(minutes)), "Making validation images", []
     try:
         yield Progress(0, total, text, f"in {folder}")
@@ -194,7 +194,7 @@ def adapt(sequence: Path, folder: Path, minutes: float) -> Generator[Progress]:
             if line is not None:
                 lines.append(line)
                 text = line
-            yield Progress(min(training.minutes, total), total, text, line, _POLL)
+            yield Progress(min(training.minutes, total), total, text, line, _POLL_INTERVAL)
     finally:
         training.end()
     if training.failed:
@@ -203,7 +203,7 @@ def adapt(sequence: Path, folder: Path, minutes: float) -> Generator[Progress]:
 
 
 def _outcome(folder: Path) -> str:
-    """Gain of an adaptation, or the metrics that became worse; empty without a report."""
+    """Gain of an adaptation, or the metrics that became worse; empty if there is no report."""
     try:
         report = parse_json(read_text(folder / "report" / "fits.json", VALUES))
         worse, gain = "; ".join(report["worse"]), str(report["gain"])
@@ -213,11 +213,11 @@ def _outcome(folder: Path) -> str:
 
 
 class _Training:
-    """Child process of a training."""
+    """Child process that trains a network."""
 
     def __init__(self, arguments: list[str]) -> None:
         self._began = time.monotonic()
-        # Spinning threads would slow down the page.
+        # Threads that wait actively would slow down the page.
         output = {"PYTHONUNBUFFERED": "1", "NO_COLOR": "1", "OMP_WAIT_POLICY": "PASSIVE"}
         environment = {**os.environ, **output, PARENT: str(os.getpid())}
         self._process = subprocess.Popen(
@@ -235,7 +235,7 @@ class _Training:
 
     @property
     def running(self) -> bool:
-        """Whether more output may come."""
+        """Whether more output may follow."""
         return self._reader.is_alive() or self._process.poll() is None
 
     @property
@@ -245,7 +245,7 @@ class _Training:
 
     @property
     def failed(self) -> bool:
-        """Whether it ended with an error."""
+        """Whether the process ended with an error."""
         return self._process.wait() != 0
 
     @property
@@ -254,22 +254,22 @@ class _Training:
         return int((time.monotonic() - self._began) / 60)
 
     def next_line(self) -> str | None:
-        """The next unread line; None without one."""
+        """The next unread line; None if there is none."""
         with suppress(Empty):
             return self._lines.get_nowait()
         return None
 
     def end(self) -> None:
-        """Ask the process to save and end, without waiting for it."""
+        """Ask the process to save and end, without waiting for the end."""
         if self._process.poll() is None:
             self._process.terminate()
-            # A thread never starts while the interpreter ends; training then ends with its parent.
+            # No thread can be started while the interpreter ends; the process then ends with its parent.
             if not sys.is_finalizing():
                 threading.Thread(target=self._reap, daemon=True).start()
 
     def _reap(self) -> None:
         try:
-            self._process.wait(_LONGEST_END)
+            self._process.wait(_CHECKPOINT_TIME)
         except subprocess.TimeoutExpired:
             self._process.kill()
 

@@ -1,1 +1,1 @@
-"""The panels: each builds its widgets, turns input into intents, and shows a state."""
+"""Panels: each builds widgets, converts input into intents, and shows a state."""

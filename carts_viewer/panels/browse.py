@@ -10,7 +10,7 @@ from carts_core.project import Key, Source
 from carts_core.wording import counted
 from carts_viewer.actions import intents
 from carts_viewer.actions.browsing import SPEEDS
-from carts_viewer.actions.frame_filter import SOLVED, copied
+from carts_viewer.actions.frame_filter import SOLVED, is_copied
 from carts_viewer.panels.inputs import PanelPage, humanized, swatch, write
 from carts_viewer.picture.layers import ARM_COLORS, RENDERED_COLOR, TRUTH_COLORS, Layer, label_color
 from carts_viewer.picture.overlay import with_imported
@@ -37,10 +37,10 @@ class BrowsePanel:
         self._count = len(sequence)
         stamps = sequence.timestamps
         self._began = 0.0 if stamps is None else float(stamps[0])
-        # Kept while those of a newer pose are computed, so that the line does not jump.
+        # The last scores are shown until those of a newer pose are computed, so that the line does not jump.
         self._scores = Scores()
         with gui.add_folder("Sequence"):
-            # A slider needs two ends even for a sequence of a single frame.
+            # A slider needs two different ends even for a sequence of a single frame.
             self._frame = gui.add_slider("Frame", 1, max(self._count, 2), 1, 1, disabled=self._count == 1)
             back = page.button("", intents.MoveFrame(-1), icon=viser.Icon.CHEVRON_LEFT, hint="Previous frame (B)")
             self._play = page.button("Play", intents.Play(), icon=viser.Icon.PLAYER_PLAY)
@@ -63,7 +63,7 @@ class BrowsePanel:
                 lines = "".join(f"<li>{escaped(remark)}</li>" for remark in sequence.remarks)
                 count = counted(len(sequence.remarks), "remark")
                 gui.add_html(
-                    f"<details class='carts-remarks'><summary>⚠ {count} on the files</summary>{lines}</details>"
+                    f"<details class='carts-remarks'><summary>⚠ {count} about the files</summary>{lines}</details>"
                 )
             self._error = gui.add_html("", visible=False)
             self._caption = gui.add_html("")
@@ -82,7 +82,7 @@ class BrowsePanel:
         self._error.visible = state.time_error is not None
         self._error.content = f'<p class="carts-error">{escaped(state.time_error or "")}</p>'
         offset = self._session.time_offset
-        # An invalid value stays in the field while it is typed.
+        # A half-typed invalid value stays in the field.
         if offset is not None and state.time_error is None and not self._waits(intents.SetTimeOffset):
             write(self._offset, offset)
         write(self._domain, next(label for label, name in self._domains.items() if name == state.domain))
@@ -93,12 +93,12 @@ class BrowsePanel:
 
     @staticmethod
     def _source(state: ViewState) -> str:
-        if state.pose.source is Source.PROPAGATED and copied(state.project, state.index):
+        if state.pose.source is Source.PROPAGATED and is_copied(state.project, state.index):
             return "joints copied from another frame"
         return _SOURCES[state.pose.source]
 
     def _describe(self, state: ViewState) -> str:
-        """Text on the frame: name, source of its joint positions, and scores."""
+        """Name of the frame, source of its joint positions, and scores, as HTML."""
         shown = f"Frame <b>{escaped(state.frame.frame_id)}</b> ({state.index + 1} of {self._count})"
         parts = [
             f"Live frame <b>{escaped(state.frame.frame_id)}</b>" if state.streaming else shown,
@@ -115,11 +115,11 @@ class BrowsePanel:
 
 
 _CALENDAR = 1e8
-"""Times from this value on count from 1970, as in ROS, and are shown as dates [s]."""
+"""Timestamps from this value on are times since 1970, as in ROS, and are shown as dates [s]."""
 
 
 def _time(stamp: float, began: float) -> str:
-    """Time of a frame as text: since the first frame, and the date if known."""
+    """Time of a frame since the first frame, and its date if known, as HTML."""
     since = f"{stamp - began:.3f} s after the first"
     if stamp < _CALENDAR:
         return f"at {stamp:.3f} s"
@@ -135,7 +135,7 @@ _RAMPS = {
 
 
 class OverlayPanel:
-    """Layer and opacity, with a legend and the fit to the truth."""
+    """Layer and opacity of the overlay with a legend, and comparison with another pose."""
 
     def __init__(self, page: PanelPage, session: Session, state: ViewState) -> None:
         gui = page.gui
@@ -164,9 +164,9 @@ class OverlayPanel:
         self._swipe.visible = state.compare.against is not None
         if not self._waits(intents.SetSwipe):
             write(self._swipe, round(100 * state.compare.swipe))
-        self._legend.content = f'<div class="carts-legend">{self._explain(state)}</div>'
+        self._legend.content = f'<div class="carts-legend">{self._describe(state)}</div>'
 
-    def _explain(self, state: ViewState) -> str:
+    def _describe(self, state: ViewState) -> str:
         if state.layer in (Layer.MASK, Layer.CONTOUR, Layer.REFINED):
             swatches = [swatch(ARM_COLORS[number % len(ARM_COLORS)], name) for number, name in enumerate(self._arms)]
             if state.layer is Layer.REFINED:
@@ -179,10 +179,10 @@ class OverlayPanel:
                 return "This frame has no mask to compare with."
             return " ".join(swatch(color, name.capitalize()) for name, color in TRUTH_COLORS.items())
         if state.layer is Layer.IMPORTED:
-            return self._explain_imported(state)
+            return self._describe_imported(state)
         return _RAMPS.get(state.layer, "")
 
-    def _explain_imported(self, state: ViewState) -> str:
+    def _describe_imported(self, state: ViewState) -> str:
         """Legend of the imported labels in the shown frame."""
         layer = state.project.get(Key.imported_mask(state.index, state.camera))
         points = state.project.get(Key.imported_keypoints(state.index, state.camera))

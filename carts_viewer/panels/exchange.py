@@ -15,7 +15,7 @@ _PARTS = {"Arm": "arms", "Part": "parts", "Link": "links"}
 _MASKS = {"Refined if good": "auto", "Refined": "refined", "As rendered": "rendered"}
 _DVRK = ("dvrk", "dvrk-2.3", "dvrk-suj")
 _WITHOUT_PARTS = ("masks", "coco-keypoints", "bop", "csv", "npz", "json", *_DVRK, "video")
-"""Formats that have no categories, or always both kinds."""
+"""Formats without categories, or with a fixed choice of categories."""
 _WRITTEN = (
     "Masks, keypoints and poses are those of the arms at the current joint positions; masks include "
     "painted corrections, and may be refined. The recording's own masks are not exported."
@@ -41,7 +41,7 @@ class ExportPanel:
             self._format = gui.add_dropdown("Format", list(self._formats))
             self._frames = gui.add_dropdown("Frames", list(FRAME_CHOICES))
             self._within = gui.add_checkbox("Only the range", True, visible=False)
-            self._cameras = gui.add_dropdown("Cameras", ["All", "Shown one"], visible=cameras > 1)
+            self._cameras = gui.add_dropdown("Cameras", ["All", "Shown camera"], visible=cameras > 1)
             self._parts = gui.add_dropdown("Category per", list(_PARTS))
             self._masks = gui.add_dropdown(
                 "Masks",
@@ -54,7 +54,7 @@ class ExportPanel:
             self._progress = gui.add_progress_bar(0.0, visible=False)
             self._cancel = page.button("Cancel export", intents.CancelExport(), icon=viser.Icon.X, visible=False)
             self._result = gui.add_html("", visible=False)
-            self._download = page.button("Download it", intents.Download, icon=viser.Icon.DOWNLOAD, visible=False)
+            self._download = page.button("Download", intents.Download, icon=viser.Icon.DOWNLOAD, visible=False)
         with gui.add_folder("This frame"):
             gui.add_html(f'<p class="carts-caption">{_THIS_FRAME}</p>')
             page.button("Export mask", intents.ExportMask, icon=viser.Icon.PHOTO_DOWN)
@@ -88,13 +88,13 @@ class ExportPanel:
         self._result.content = f'<p class="carts-caption" role="status">{text}</p>'
 
     def _intent(self) -> intents.Export:
-        """The export that the widgets describe; the controller checks it."""
+        """The export with the options of the widgets, which the controller checks."""
         return intents.Export(
             self._formats.get(self._format.value, self._format.value),  # type: ignore[arg-type]
             self._frames.value,
             _PARTS.get(self._parts.value, self._parts.value),  # type: ignore[arg-type]
             bool(self._images.value),
-            self._cameras.value == "Shown one",
+            self._cameras.value == "Shown camera",
             self._range,
             _MASKS.get(self._masks.value, self._masks.value),  # type: ignore[arg-type]
         )
@@ -106,13 +106,13 @@ class ExportPanel:
         self._counted, self._chosen = state.project, chosen
         known = self._frames.value in FRAME_CHOICES
         frames = frames_within(state.project, self._frames.value, self._range) if known else []
-        cameras = [state.camera] if self._cameras.value == "Shown one" else self._camera_names
+        cameras = [state.camera] if self._cameras.value == "Shown camera" else self._camera_names
         warnings = export_warnings(state.project, frames, cameras)
         outside = set(frames_within(state.project, self._frames.value, None)) - set(frames) if known else ()
         accepted = sum(state.project.review(index).state is ReviewState.ACCEPTED for index in outside)
         if accepted:
             names = "frame outside of the range is" if accepted == 1 else "frames outside of the range are"
-            warnings.append(f"{accepted} accepted {names} left out")
+            warnings.append(f"{accepted} accepted {names} not exported")
         notes = "".join(f"<br>⚠ {escaped(line)}" for line in warnings)
         total = len(state.project.identity.frame_ids)
         self._count.content = f'<p class="carts-caption"><b>{len(frames)}</b> of {total} frames{notes}</p>'
@@ -129,7 +129,7 @@ class ImportPanel:
         gui = page.gui
         cameras = [camera.name for camera in session.scene.cameras]
         with gui.add_folder("Import", expand_by_default=False):
-            self._place = gui.add_text("From", "", hint=_HINT)
+            self._path = gui.add_text("From", "", hint=_HINT)
             self._camera = gui.add_dropdown(
                 "Camera", [_BY_NAME, *cameras], visible=len(cameras) > 1, hint="Camera whose images were annotated"
             )
@@ -139,12 +139,12 @@ class ImportPanel:
 
     def _intent(self) -> intents.ImportMasks:
         camera = None if self._camera.value == _BY_NAME else self._camera.value
-        return intents.ImportMasks(str(self._place.value), camera, bool(self._replace.value))
+        return intents.ImportMasks(str(self._path.value), camera, bool(self._replace.value))
 
     def show(self, state: ViewState) -> None:
         """Update the text."""
         there = state.project.get(Key.imported_labels()) is not None
-        content = "Nothing was imported yet."
+        content = "Nothing has been imported yet."
         if there:
             content = escaped(state.imported) or "The layer <i>Imported masks</i> shows the imports."
         if self._text.content != (wanted := f'<p class="carts-caption">{content}</p>'):

@@ -36,10 +36,10 @@ class LivePanel:
                 _RATE,
                 min=0.1,
                 max=1000,
-                hint=("Frame rate of this recording, whose images have no times"),
+                hint="Frame rate of this recording, whose images have no timestamps",
             )
             self._record = gui.add_checkbox(
-                "Record", False, hint="Keep images, joints and corrections in a new folder beside the project"
+                "Record", False, hint="Save images, joints and corrections in a new folder beside the project"
             )
             self._start = page.button("Start", lambda _: self._intent(), icon=viser.Icon.PLAYER_RECORD, color="teal")
             self._stop = page.button("Stop", intents.StopLive(), icon=viser.Icon.PLAYER_STOP)
@@ -73,7 +73,7 @@ class LivePanel:
 
 
 def live_text(live: LiveState) -> str:
-    """The tracker's verdict on the frame that is shown, as HTML."""
+    """The tracker's verdict on the shown frame, as HTML."""
     if live.busy:
         return f'<div class="carts-verdict unknown" role="status"><b>Live</b> {escaped(live.text)}</div>'
     reason = {
@@ -93,7 +93,7 @@ _MEANING = (
 
 
 class FitPanel:
-    """The verdict, always visible, and a button that computes it."""
+    """The verdict on the shown pose, and a button that computes the verdict."""
 
     def __init__(self, page: PanelPage, session: Session) -> None:
         gui = page.gui
@@ -114,7 +114,7 @@ class FitPanel:
             self._text.content = live_text(state.live)
             return
         running = state.run.phase is Phase.RUNNING or state.solving
-        # It keeps its place, so that elements below it do not move under the pointer.
+        # The button stays visible, so that the elements below do not move under the pointer.
         self._check.visible = True
         self._check.disabled = running or state.verdict is not None
         self._check.label = "Check the fit" if state.verdict is None else "The fit is checked"
@@ -139,11 +139,11 @@ def fit_text(
     """A verdict with its reason, remedy and cameras, as HTML.
 
     Args:
-        verdict: of the shown pose; None where it was not assessed.
-        running: whether the pose is still moving.
-        scores: Dice of the cameras with a true mask.
-        undetermined: joints that the images do not determine; None where no deviation is known.
-        busy: text on the present preparation.
+        verdict: verdict on the shown pose; None if it was not assessed.
+        running: whether the pose is still changing.
+        scores: Dice of the cameras with a ground-truth mask.
+        undetermined: joints that the images do not determine; None if no standard deviation is known.
+        busy: text about the current preparation.
     """
     cameras = dict(verdict.cameras) if verdict is not None else {}
     chips = []

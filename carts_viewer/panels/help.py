@@ -1,7 +1,6 @@
 """Keyboard shortcuts, hints of controls, and the help panel.
 
-`python -m carts_viewer.panels.help docs/reference/keys.md` updates the table of keys in a Markdown file, between two
-marks.
+`python -m carts_viewer.panels.help docs/reference/keys.md` updates the table of keys between two marks in this file.
 """
 
 import sys
@@ -23,12 +22,12 @@ from carts_viewer.transport.page import OWN_KEYS
 from carts_viewer.transport.viser_private import element_id
 
 FINE, COARSE = 0.1, 1.0
-"""Steps of nudging [deg or mm]."""
+"""Step sizes of `intents.Nudge` [deg or mm]."""
 _GROWTH = 1.25
 _BEGIN, _END = "<!-- keys: written by python -m carts_viewer.panels.help -->", "<!-- end of keys -->"
 
 Special = Literal["perturb", "view"]
-"""Shortcuts without an intent: `perturb` depends on fields of the page, `view` is handled by the tab."""
+"""Shortcuts without an intent: `perturb` depends on fields of the page, and the page's script handles `view`."""
 
 
 @dataclass(frozen=True)
@@ -50,28 +49,28 @@ class Shortcut:
 def shortcuts() -> list[Shortcut]:
     """All shortcuts; they are the same in every recording.
 
-    Letters that viser uses to fly the camera (W A S D Q E) are left alone, and so are the arrow keys, which move a
-    slider that has the focus.
+    They use neither the letters with which viser moves the camera (W A S D Q E) nor the arrow keys, which move a
+    focused slider.
     """
     return [
         Shortcut("space", "Play or stop", intents.Play()),
         Shortcut("N", "Next frame", intents.MoveFrame(1)),
         Shortcut("B", "Previous frame (back)", intents.MoveFrame(-1)),
-        Shortcut("(", "Begin the range at this frame", intents.MarkRange()),
+        Shortcut("(", "Start the range at this frame", intents.MarkRange()),
         Shortcut(")", "End the range at this frame", intents.MarkRange(end=True)),
         Shortcut("R", "Run or pause the optimizer", intents.RunOrPause()),
         Shortcut("T", "One step of the optimizer", intents.Step()),
         Shortcut("X", "Reset to the start of the run", intents.Reset()),
-        Shortcut("K", "Mark or unmark the frame as a keyframe", intents.HoldKeyframe()),
+        Shortcut("K", "Mark or unmark the frame as a keyframe", intents.SetKeyframe()),
         Shortcut("K", "Solve between the keyframes", intents.Solve(), "shift"),
-        Shortcut("G", "Accept, and go to the next unreviewed frame", intents.AcceptAndNext()),
+        Shortcut("G", "Accept, and show the next unreviewed frame", intents.AcceptAndNext()),
         Shortcut("F", "Mark as needing work", intents.SetReview(ReviewState.NEEDS_WORK)),
         Shortcut("J", "Reject", intents.SetReview(ReviewState.REJECTED)),
         Shortcut("G", "Clear the review", intents.SetReview(ReviewState.UNTOUCHED), "shift"),
         Shortcut("Y", "Next unreviewed frame", intents.ShowUnreviewed()),
         Shortcut("Y", "Previous unreviewed frame", intents.ShowUnreviewed(-1), "shift"),
-        Shortcut("L", "Next worst frame that is neither accepted nor rejected", intents.ShowWorse()),
-        Shortcut("L", "Previous worst frame", intents.ShowWorse(-1), "shift"),
+        Shortcut("L", "Next worst frame that is neither accepted nor rejected", intents.ShowWorst()),
+        Shortcut("L", "Previous worst frame", intents.ShowWorst(-1), "shift"),
         Shortcut("O", f"Nudge the joint by {FINE:g}° or mm", intents.Nudge(FINE)),
         Shortcut("I", f"Nudge the joint by -{FINE:g}° or mm", intents.Nudge(-FINE)),
         Shortcut("O", f"Nudge the joint by {COARSE:g}° or mm", intents.Nudge(COARSE), "shift"),
@@ -89,7 +88,7 @@ def shortcuts() -> list[Shortcut]:
         Shortcut("X", "Eraser on or off", intents.ToggleTool(Tool.ERASER), "shift"),
         Shortcut("P", "Polygon on or off", intents.ToggleTool(Tool.POLYGON), "shift"),
         Shortcut("T", "Prompt (click or box) on or off", intents.ToggleTool(Tool.PROMPT), "shift"),
-        Shortcut("enter", "Prompt: begin the next object", intents.NextObject()),
+        Shortcut("enter", "Prompt: start the next object", intents.NextObject()),
         Shortcut("M", "Paint on the mask or on the ignore region", intents.SetTarget(), "shift"),
         Shortcut("[", "Smaller brush", intents.ScaleBrush(1 / _GROWTH)),
         Shortcut("]", "Larger brush", intents.ScaleBrush(_GROWTH)),
@@ -114,11 +113,11 @@ _POINTER = (
     ("Ctrl+drag", "Drag a link of an arm; its joints follow"),
     ("Shift+click", "Place a keypoint of the arm; Shift+drag moves it"),
 )
-"""Actions of the pointer on the picture with a modifier key."""
+"""Actions of the pointer on the picture with a modifier key, and their descriptions."""
 
 
 def key_groups() -> list[tuple[str, list[tuple[str, str]]]]:
-    """Shortcuts for the key sheet: name of each group, with pairs of key and meaning."""
+    """Shortcuts of the key sheet: name of each group, with pairs of key and description."""
     groups: dict[str, list[tuple[str, str]]] = {name: [] for name in _GROUPS}
     groups["On the picture"] = list(_POINTER)
     order = ["Review", "Optimize", "Paint", "Frames", "View"]
@@ -126,8 +125,8 @@ def key_groups() -> list[tuple[str, list[tuple[str, str]]]]:
         name = next(name for name in order if any(word in shortcut.label for word in _GROUPS[name]))
         groups[name].append((shortcut.key, shortcut.label))
     groups["View"].append((",", "Loupe: pixels, coordinates, colour; hold, or press to toggle"))
-    groups["View"].append((".", "Hold: the measured pose, or the compared one"))
-    groups["View"].append(("?", "This sheet"))
+    groups["View"].append((".", "Hold: show the measured pose, or the pose to compare with"))
+    groups["View"].append(("?", "Show this sheet"))
     groups["View"].append(("Ctrl+K", "Find any action by name"))
     return list(groups.items())
 
@@ -138,10 +137,10 @@ def key_table() -> str:
     rows += [
         *(f"| **{key}** | {text} |" for key, text in _POINTER),
         "| **,** | Loupe: pixels, coordinates, colour; hold, or press to toggle |",
-        "| **.** (held) | The measured pose, or the compared one |",
-        "| **?** | All keys on one sheet |",
+        "| **.** | Hold: show the measured pose, or the pose to compare with |",
+        "| **?** | Show all keys on one sheet |",
     ]
-    return "\n".join(["| Key | What it does |", "|---|---|", *rows])
+    return "\n".join(["| Key | Action |", "|---|---|", *rows])
 
 
 def with_keys(text: str) -> str:
@@ -168,7 +167,7 @@ HINTS = {
     "Undo": "Undo your last step, in any frame (Ctrl+Z)",
     "Redo": "Redo the last undone step (Ctrl+Shift+Z)",
     # Sequence
-    "Frame": "Number of the shown frame, from 1; N and B go to the next and the previous one",
+    "Frame": "Number of the shown frame, from 1; N and B show the next and the previous frame",
     "Play": "Play the sequence, or the range in the timeline, in a loop (space)",
     "Frames/s": "Playback rate [frames/s]",
     "Domain": "Variant of the images to show and optimize; all have the same joint positions",
@@ -191,40 +190,40 @@ HINTS = {
     "Clear": "Remove all paint of this layer in this frame and camera",
     # Joints
     "Perturb all joints": "Offset every measured joint by the amount below, with random signs (P)",
-    "By [°, mm]": "Size of the offset: degrees for revolute joints, millimetres for prismatic ones",
+    "By [°, mm]": "Size of the offset: degrees for revolute joints, millimetres for prismatic joints",
     "Seed": "Seed of the random signs; the same number gives the same signs",
     "Back to measured": "Reset this frame's joints to the measured values (M)",
     "All back to measured": "Reset this frame's joints to the measured values (M)",
     # Optimize
-    "Run": "Fit the arms to this frame's images from their present pose; clicked keypoints do not constrain it (R)",
+    "Run": "Fit the arms to this frame's images from the current pose; clicked keypoints do not constrain the fit (R)",
     "Pause": "Pause the run; Continue resumes it (R)",
-    "Step": "A single iteration (T)",
+    "Step": "Perform one iteration (T)",
     "Reset": "Reset to the start of the run (X)",
     "Solver": "Objective and solver; the default is the most accurate",
     "Cameras": "Cameras whose images are fitted",
-    "Advanced settings": "All settings of the chosen solver, with unit and meaning",
+    "Advanced settings": "Show all settings of the chosen solver, with units and descriptions",
     "Reset to preset": "Reset all settings to those of the chosen preset",
     "Close": "Close this window; settings are kept",
     "Base frames": "Allow runs and calibrations to move the bases of the arms",
     "Camera pose": "Allow runs and calibrations to move the cameras",
     "Camera intrinsics": "Allow runs and calibrations to change focal length and principal point [px]",
     # Review
-    "Accept + next": "Accept this frame, and go to the next unreviewed one (G)",
+    "Accept + next": "Accept this frame, and show the next unreviewed frame (G)",
     "Accept": "Accept this frame; solving does not change it",
     "Needs work": "Mark this frame for later (F)",
     "Reject": "Mark this frame as unusable; exports can exclude it (J)",
     "Note": "Note on this frame; saved when you leave the field",
-    "Previous worst": "Go to the previous frame in the order from worst to best (Shift+L)",
-    "Next worst": "Go to the next frame, from worst to best, that is neither accepted nor rejected; frames "
-    "without a verdict come last, in order (L)",
-    "Next unreviewed": "Go to the next frame without a review (Y)",
-    "Solve between": "Jointly fit the frames between the kept ones around this frame (Shift+K)",
-    "Solve all": "Jointly fit all frames, or those in the timeline's range; kept frames do not change",
+    "Previous worst": "Show the previous frame in the order from worst to best (Shift+L)",
+    "Next worst": "Show the next frame, from worst to best, that is neither accepted nor rejected; frames "
+    "without a verdict are last, in order (L)",
+    "Next unreviewed": "Show the next frame without a review (Y)",
+    "Solve between": "Fit all frames between the nearest kept frames together (Shift+K)",
+    "Solve all": "Fit all frames, or those in the timeline's range, together; kept frames do not change",
     "Begin at": "End of the sequence where solving starts",
     "Take solved pose": "Use the solved pose of this frame, although it fits worse",
     "Take all": "Use the solved poses of all listed frames, although they fit worse",
     "Discard all": "Keep the previous poses of the listed frames, and close the list",
-    "Stop and keep": "Stop solving, and keep the frames that are done",
+    "Stop and keep": "Stop solving, and save the solved frames",
     "Keypoint": "Point of the arm that the next Shift+click places",
     "Show keypoints": "Mark the keypoints of the arms in the images, with their names (H)",
     "Clear clicks": "Remove the placed keypoints; the arm keeps its pose",
@@ -233,19 +232,19 @@ HINTS = {
     "Review": "Frames in this review state",
     "Corrected": "Frames in which this arm's joints were corrected",
     "Note text": "Frames whose note contains this text",
-    "Previous": "Previous frame found",
-    "Next": "Next frame found",
-    "Accept all": "Accept all frames found, as one undo step",
-    "Reject all": "Reject all frames found, as one undo step",
-    "Reset all": "Clear the review of all frames found, as one undo step",
+    "Previous": "Previous matching frame",
+    "Next": "Next matching frame",
+    "Accept all": "Accept all matching frames, as one undo step",
+    "Reject all": "Reject all matching frames, as one undo step",
+    "Reset all": "Clear the review of all matching frames, as one undo step",
     # Jobs
     "Run jobs": "Run the jobs queued by another user or on another computer",
     "Discard jobs": "Cancel these jobs without running them",
     "Accept network": "Use these weights now and in the future",
     "Refuse network": "Do not use these weights",
     "Which frames": "Frames of the job",
-    "Optimize each alone": "Run on each of these frames from its current pose; worse results are discarded",
-    "Calibrate": "Jointly fit base frames, or the parameters ticked under Free parameters, to these frames. All masks "
+    "Optimize individually": "Run on each of these frames from its current pose; worse results are discarded",
+    "Calibrate": "Fit base frames, or the parameters ticked under Free parameters, jointly to these frames. All masks "
     "change, so accepted frames become unreviewed; one undo step",
     "Job": "Job for the buttons and the log below",
     "Cancel": "Stop this job, or remove it from the queue; saved results are kept",
@@ -257,21 +256,21 @@ HINTS = {
     # Export
     "Format": "File format",
     "Frames": "Frames to write, by review state",
-    "Only the range": "Restrict them to the timeline's range",
-    "Category per": "Objects with separate categories",
+    "Only the range": "Export only frames in the timeline's range",
+    "Category per": "Kind of object with a category of its own",
     "Copy images": "Copy the images beside their labels; otherwise labels refer to the recording's images",
-    "Export": "Write into a new folder beside the project, as a job",
+    "Export": "Write the frames to a new folder beside the project, as a job",
     "Cancel export": "Cancel the export and remove its files",
-    "Download it": "Send the last export to this browser",
+    "Download": "Send the last export to this browser",
     "Export mask": "Download this frame's mask of the shown camera as PNG",
 }
 """Hints of controls by label."""
 
 
-def explain(page: PanelPage) -> list[str]:
-    """Set the hints of all controls of a tab; returns the labels of those without one.
+def set_hints(page: PanelPage) -> list[str]:
+    """Set the hints of all controls of a tab; returns the labels of controls without a hint.
 
-    viser shows hints over fields only, so the page's script shows those of buttons and labels.
+    viser shows only hints of fields, so the page's script shows those of buttons and labels.
     """
     missing, shown = [], {}
     for handle in page.widgets():
@@ -295,7 +294,7 @@ class HelpPanel:
         own = {}
         for shortcut in shortcuts():
             hotkey = None if shortcut.hotkey in OWN_KEYS else shortcut.hotkey
-            # viser lists the keys that it handles itself.
+            # viser adds the keys that it handles itself to its list of commands.
             described = shortcut.key if hotkey is None else None
             command = gui.add_command(shortcut.label, description=described, hotkey=hotkey, modifier=shortcut.modifier)  # type: ignore[arg-type]
             _listen(page, command, shortcut, perturb)

@@ -1,4 +1,4 @@
-"""Widgets that emit intents; values from a browser are checked, own writes emit nothing."""
+"""Widgets that emit intents; values from a browser are checked, and programmatic writes emit nothing."""
 
 import math
 from collections.abc import Callable, Hashable
@@ -10,7 +10,7 @@ from carts_viewer.actions.intents import Intent, Refresh
 from carts_viewer.state import ViewState
 from carts_viewer.transport.document import escaped
 from carts_viewer.transport.page import TabPage
-from carts_viewer.transport.viser_private import on_sent
+from carts_viewer.transport.viser_private import on_tab_value
 
 
 class Panel(Protocol):
@@ -24,8 +24,8 @@ class PanelPage(TabPage):
     """A tab's page, whose widgets emit intents.
 
     Attributes:
-        emit: hands an intent to the worker; never blocks.
-        waits: whether an intent of this key waits for the worker; its widget is ahead of the state then.
+        emit: queues an intent for the worker; never blocks.
+        waits: whether an intent with this key is pending, so that its widget is ahead of the state.
     """
 
     def __init__(
@@ -56,8 +56,8 @@ class PanelPage(TabPage):
 
         Programmatic writes, non-finite numbers and unknown choices are not input.
         """
-        # Invalid values are ignored, but the tabs show them and must be corrected.
-        on_sent(handle, lambda value: self.emit(intent(value) if valid(handle, value) else Refresh()))
+        # After an invalid value, the widgets of the tab are reset to the state.
+        on_tab_value(handle, lambda value: self.emit(intent(value) if valid(handle, value) else Refresh()))
 
 
 def valid(handle: Any, value: Any) -> bool:
@@ -75,7 +75,7 @@ def write(handle: Any, value: Any) -> None:
 
 
 def swatch(color: tuple[int, int, int], name: str) -> str:
-    """An entry of a legend, as HTML."""
+    """Entry of a legend, as HTML."""
     square = f'<span class="carts-swatch" style="background: rgb{color}"></span>'
     return f'<span class="carts-key">{square}{escaped(name)}</span>'
 

@@ -6,7 +6,7 @@ import viser
 
 from carts_core.wording import spoken_time
 from carts_viewer.actions import intents
-from carts_viewer.jobs.job_list import LARGEST_CALIBRATION, LONGEST_TRAINING, Job, JobState
+from carts_viewer.jobs.job_list import MAX_CALIBRATION_FRAMES, MAX_TRAINING_TIME, Job, JobState
 from carts_viewer.jobs.networks import STARTED
 from carts_viewer.panels.inputs import PanelPage, write
 from carts_viewer.panels.sequence import newest_calibration, whole_label
@@ -14,8 +14,8 @@ from carts_viewer.state import ViewState
 from carts_viewer.transport.document import escaped
 
 _NONE = "None"
-_LISTED = 5
-"""Number of jobs that a question lists."""
+_MAX_LISTED = 5
+"""Maximum number of jobs listed in a question."""
 _UNREVIEWED, _RANGE = "Unreviewed", "Range in the timeline"
 _FRAMES: dict[str, intents.Frames] = {
     _UNREVIEWED: "unreviewed",
@@ -47,7 +47,7 @@ class JobsPanel:
         with gui.add_folder("New job"):
             self._frames = gui.add_dropdown("Which frames", list(_FRAMES))
             page.button(
-                "Optimize each alone",
+                "Optimize individually",
                 lambda _: intents.OptimizeFrames(_FRAMES.get(self._frames.value, "unreviewed")),
                 icon=viser.Icon.PLAYER_PLAY,
                 color="teal",
@@ -56,7 +56,7 @@ class JobsPanel:
                 "Calibrate on [frames]",
                 intents.Calibrate().frames,
                 min=1,
-                max=LARGEST_CALIBRATION,
+                max=MAX_CALIBRATION_FRAMES,
                 step=1,
                 hint="Spread evenly over the whole sequence, independent of the range",
             )
@@ -65,24 +65,26 @@ class JobsPanel:
                 "Adapt for [min]",
                 intents.Adapt().minutes,
                 min=1,
-                max=LONGEST_TRAINING,
+                max=MAX_TRAINING_TIME,
                 step=1,
-                hint="Limit of processor time; training stops earlier without improvement",
+                hint="Limit of processor time; training stops earlier if it no longer improves",
             )
             page.button(
                 "Adapt the network",
                 lambda _: intents.Adapt(int(self._minutes.value)),
                 icon=viser.Icon.SCHOOL,
-                hint="Train it for this recording's robots, cameras, distances and backgrounds",
+                hint="Train the network for this recording's robots, cameras, distances and backgrounds",
             )
             gui.add_html(
-                '<p class="carts-caption"><b>Optimize each alone</b> runs on every frame individually; to fit '
+                '<p class="carts-caption"><b>Optimize individually</b> fits every frame separately; to fit '
                 "neighbouring frames jointly, see Review, <b>Solve</b>. <b>Calibrate</b> fits the poses of the arms' "
                 "bases (base frames), or the parameters ticked under Free parameters, to frames of the whole "
                 "sequence. All masks change: solve again afterwards, and accept frames again. Solving and exports "
                 "are also queued here.</p>"
             )
-        self._network = gui.add_dropdown("Network", [STARTED], visible=False, hint="Used in all tabs; saved")
+        self._network = gui.add_dropdown(
+            "Network", [STARTED], visible=False, hint="Network of all tabs; the choice is saved"
+        )
         self._newest = page.button(
             "Use newest network",
             lambda _: intents.UseNetwork(self._network.options[-1]),
@@ -100,14 +102,14 @@ class JobsPanel:
             self._again = page.button(
                 "Start again", lambda _: intents.RepeatJob(self._number()), icon=viser.Icon.REFRESH
             )
-            self._forget = page.button("Clear ended", intents.ForgetJobs())
+            self._forget = page.button("Clear ended", intents.RemoveEndedJobs())
             page.row(self._cancel, self._again)
             self._log = gui.add_html("")
         page.on_input(self._network, intents.UseNetwork)
         page.on_input(self._chosen, lambda _: intents.Refresh())
 
     def show(self, state: ViewState) -> None:
-        """Update the list; a new job is selected."""
+        """Update the widgets, and select a new job."""
         self._show_networks(state)
         self._show_question(self._asked, jobs_question(state), self._run, self._discard)
         self._show_question(self._asked_network, network_question(state), self._accept, self._refuse)
@@ -161,11 +163,12 @@ class JobsPanel:
 
 
 def jobs_question(state: ViewState) -> str:
-    """Question about jobs of another user, as text; empty without any."""
+    """Question about jobs of another user, as text; empty if there are none."""
     titles = [job.title for job in state.jobs if job.state is JobState.ASKED]
     if not titles:
         return ""
-    shown = "; ".join(titles[:_LISTED]) + (f"; and {len(titles) - _LISTED} more" if len(titles) > _LISTED else "")
+    more = len(titles) - _MAX_LISTED
+    shown = "; ".join(titles[:_MAX_LISTED]) + (f"; and {more} more" if more > 0 else "")
     return (
         f"Jobs in the list beside this project were not queued by you on this computer and are not run: {shown}. "
         "Run or discard them."
@@ -173,7 +176,7 @@ def jobs_question(state: ViewState) -> str:
 
 
 def network_question(state: ViewState) -> str:
-    """Question about a network of another user, as text; empty without one."""
+    """Question about a network of another user, as text; empty if there is none."""
     if not state.asked_network:
         return ""
     return (
@@ -183,12 +186,12 @@ def network_question(state: ViewState) -> str:
 
 
 def job_line(job: Job, now: float) -> str:
-    """One job with its progress and remaining time, as HTML."""
+    """A job with its progress and remaining time, as HTML."""
     left = job.seconds_left(now)
-    about = "at most" if job.kind == "calibrate" else "about"  # Training stops early without further gain.
+    about = "at most" if job.kind == "calibrate" else "about"  # A calibration may converge earlier.
     eta = "" if left is None else f", {about} {spoken_time(left)} left"
     running = job.state is JobState.RUNNING
-    # The text of solving has frames and time already.
+    # The text of a solve already contains frames and time.
     steps = f" {job.done} of {job.total}{eta}" if running and job.total and job.kind != "solve" else ""
     share = 100.0 * job.done / job.total if job.total else 0.0
     bar = f'<progress max="100" value="{share:.0f}"></progress>' if running else ""

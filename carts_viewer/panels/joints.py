@@ -6,7 +6,7 @@ import viser
 
 from carts_core.settings import SurfaceSolver
 from carts_viewer.actions import intents
-from carts_viewer.actions.posing import LARGEST_PERTURBATION
+from carts_viewer.actions.posing import MAX_PERTURBATION
 from carts_viewer.panels.inputs import PanelPage, humanized, valid, write
 from carts_viewer.picture.overlay import labelled_keypoints
 from carts_viewer.session import Session
@@ -37,7 +37,7 @@ class JointsPanel:
             hint="Range of the sliders around the measured values [° or mm]",
         )
         page.button("Perturb all joints", lambda _: self.perturb())
-        self._degrees = gui.add_number("By [°, mm]", 2.0, min=0.0, max=LARGEST_PERTURBATION, step=0.5)
+        self._degrees = gui.add_number("By [°, mm]", 2.0, min=0.0, max=MAX_PERTURBATION, step=0.5)
         self._seed = gui.add_number("Seed", 0, min=0, max=2**31 - 1, step=1)
         page.columns([self._degrees, self._seed], narrow_labels=True)
         back = "All back to measured" if len(session.scene.arms) > 1 else "Back to measured"
@@ -52,12 +52,12 @@ class JointsPanel:
             for arm in session.scene.arms
             for number, limits in enumerate(session.ranges[arm.name])
         }
-        self._nudged = gui.add_dropdown("Nudge (I, O)", list(self._names), hint="The joint that the keys I and O move")
+        self._nudged = gui.add_dropdown("Nudge (I, O)", list(self._names), hint="Joint that the keys I and O move")
         page.on_input(self._reach, lambda name: intents.SetReach(Reach(name)))
         page.on_input(self._nudged, lambda name: intents.ChooseJoint(self._names[name]))
 
     def perturb(self) -> intents.Perturb:
-        """The perturbation that the fields describe."""
+        """Perturbation with the amount and seed in the fields."""
         seed = int(self._seed.value) if valid(self._seed, self._seed.value) else 0
         return intents.Perturb(float(self._degrees.value), max(0, seed))
 
@@ -70,10 +70,10 @@ class JointsPanel:
         joints = self._session.joints(state.pose.scene)
         with self._page.atomic():
             for (arm, joint), (limits, slider) in self._sliders.items():
-                # A slider being moved is ahead of the state; writing would pull it back.
+                # A slider that is being dragged is ahead of the state; writing would pull it back.
                 if not self._waits((intents.SetJoint, arm, joint)):
                     measured, shown = (limits.to_shown(float(of[arm][joint])) for of in (state.frame.measured, joints))
-                    self._place(slider, limits, state, measured, shown)
+                    self._set_slider(slider, limits, state, measured, shown)
         write(self._reach, str(state.reach))
         if state.joint is not None:
             write(self._nudged, next(name for name, joint in self._names.items() if joint == state.joint))
@@ -101,12 +101,12 @@ class JointsPanel:
             page.button(f"{arm} back to measured", intents.BackToMeasured(arm), icon=viser.Icon.HISTORY, hint=hint)
 
     @staticmethod
-    def _place(
+    def _set_slider(
         slider: viser.GuiSliderHandle[float], limits: JointRange, state: ViewState, measured: float, shown: float
     ) -> None:
         """Set a slider's ends around the measured value, within the joint's limits, and its value.
 
-        The range extends to the shown value and shrinks with it, but not during a drag, which would change the value
+        The range extends to the shown value and shrinks again later, but not during a drag: this would change the value
         under the pointer.
         """
         low, high = limits.to_shown(limits.lower), limits.to_shown(limits.upper)
@@ -129,13 +129,13 @@ def _tidy(value: float) -> float:
 
 
 _UNSURE = 1.0
-"""Standard deviation from which a joint's value is a guess [deg] and [mm]: under half the usual error of arms."""
+"""Standard deviation above which a joint counts as undetermined [deg], [mm]; less than half the usual error of arms."""
 _EXPECTED = SurfaceSolver()
 _UNUSUAL = (
     2.0 * _EXPECTED.prior_deg,
     2e3 * math.radians(_EXPECTED.prior_deg) * _EXPECTED.length_scale,
 )
-"""Corrections that count as rare: twice the deviation that the solver expects of measured joints [deg] and [mm]."""
+"""Threshold of unusually large corrections: two standard deviations of the solver's prior [deg], [mm]."""
 _EXPLAINED = (
     f"± is one standard deviation. <span class='carts-unsure'>Amber ±</span> (above {_UNSURE:g}° or mm): the images "
     "hardly determine this joint. Its value is a guess, but hardly affects the mask.<br>"
@@ -152,7 +152,7 @@ class ValuesPanel:
         self._table = gui.add_html("")
 
     def show(self, state: ViewState) -> None:
-        """Bring the table up to date."""
+        """Update the table."""
         shown = self._session.joints(state.pose.scene)
         truth = state.frame.truth or {}
         known = {arm: value.standard_deviations for arm, value in state.project.joints(state.index).items()}
@@ -167,7 +167,7 @@ class ValuesPanel:
                     f"{measured:.2f}",
                     f"{now:.2f}",
                     _marked(_signed(now - measured), abs(now - measured) > _UNUSUAL[0 if limits.revolute else 1]),
-                    _deviation(limits, known.get(arm.name), joint),
+                    _standard_deviation(limits, known.get(arm.name), joint),
                 ]
                 if arm.name in truth:
                     cells.append(_signed(now - limits.to_shown(float(truth[arm.name][joint]))))
@@ -179,12 +179,12 @@ class ValuesPanel:
 
 
 def _signed(difference: float) -> str:
-    """Difference as signed text; without a sign where it rounds to zero."""
+    """Difference as text with its sign, unless it rounds to zero."""
     return f"{difference:+.2f}" if abs(difference) >= 0.005 else "0.00"
 
 
-def _deviation(limits: JointRange, known: tuple[float | None, ...] | None, joint: int) -> str:
-    """Standard deviation of a joint as text; empty where it is not known."""
+def _standard_deviation(limits: JointRange, known: tuple[float | None, ...] | None, joint: int) -> str:
+    """Standard deviation of a joint as text; empty if unknown."""
     value = known[joint] if known else None
     if value is None:
         return ""
@@ -200,7 +200,7 @@ _NEAREST = "Nearest to the pointer"
 
 
 class KeypointsPanel:
-    """Choice of the keypoint to place, and residuals of the placed ones."""
+    """Choice of the keypoint to place, and residuals of placed keypoints."""
 
     def __init__(self, page: PanelPage, session: Session) -> None:
         gui = page.gui
@@ -215,7 +215,7 @@ class KeypointsPanel:
             self._chosen = gui.add_dropdown("Keypoint", options)
             self._shown = gui.add_checkbox("Show keypoints", False)
             self._residuals = gui.add_html("")
-            self._forget = page.button("Clear clicks", intents.ForgetPins(), icon=viser.Icon.X, visible=False)
+            self._forget = page.button("Clear clicks", intents.RemovePins(), icon=viser.Icon.X, visible=False)
         page.on_input(self._chosen, lambda label: intents.ChooseKeypoint(None if label == _NEAREST else label))
         page.on_input(self._shown, lambda on: intents.ShowKeypoints(bool(on)))
 

@@ -5,7 +5,7 @@ import viser
 from carts_viewer.panels.browse import BrowsePanel, OverlayPanel
 from carts_viewer.panels.exchange import ExportPanel, ImportPanel
 from carts_viewer.panels.fit import FitPanel, LivePanel
-from carts_viewer.panels.help import HelpPanel, explain
+from carts_viewer.panels.help import HelpPanel, set_hints
 from carts_viewer.panels.inputs import Panel, PanelPage
 from carts_viewer.panels.jobs import JobsPanel
 from carts_viewer.panels.joints import JointsPanel, KeypointsPanel, ValuesPanel
@@ -20,11 +20,11 @@ from carts_viewer.session import Session, Storage
 from carts_viewer.state import ViewState
 
 _WIDTH = 312.0
-"""Width of either side [px]."""
+"""Width of the panels on either side [px]."""
 
 
 def choose_theme(gui: viser.GuiApi, *, light: bool) -> None:
-    """Set the theme of all tabs, or of the tab of this interface."""
+    """Set the theme of one tab, or of all tabs if `gui` is that of the server."""
     gui.configure_theme(dark_mode=not light, show_share_button=False, show_logo=False)
 
 
@@ -32,9 +32,9 @@ class Layout:
     """All panels of a page.
 
     Attributes:
-        panels: in the order in which they are brought up to date.
-        joints: the one with the joints' sliders.
-        timeline: data of the strip below the image.
+        panels: panels in the order in which they are updated.
+        joints: panel of the joint sliders.
+        timeline: data of the timeline below the image.
     """
 
     def __init__(self, page: PanelPage, session: Session, storage: Storage, state: ViewState) -> None:
@@ -72,7 +72,7 @@ class Layout:
             panels.append(ExportPanel(page, session, storage))
         with right.add_tab("Help"):
             HelpPanel(page, self.joints.perturb)
-        explain(page)
+        set_hints(page)
         right.dock_right()
         right.set_width(_WIDTH)
         self.timeline = TimelineData(page, session)

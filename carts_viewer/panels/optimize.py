@@ -36,7 +36,7 @@ OBSERVED = {"Network predictions": "network", "Masks": "masks", "Masks and netwo
 MASKS = {"Recording": "recording", "Imported": "imported", "Painted": "painted"}
 """Labels of the masks that a run fits."""
 UNDETERMINED = "Not determined by this image"
-"""Label of unknowns that the image does not determine."""
+"""Label of unknowns that the images do not determine."""
 _CONSEQUENCE = "The mask hardly depends on these, so it can be correct although their values are guesses."
 _RUN = "Press Run to fit the arm to this frame."
 _BEFORE_RUN = {
@@ -44,7 +44,7 @@ _BEFORE_RUN = {
     ReviewState.REJECTED: "This frame is rejected. Run still fits it.",
     ReviewState.OPTIMIZED: "This frame has been fitted. Run continues from its pose.",
 }
-"""Status before a run, by review state."""
+"""Status text before a run, by review state."""
 
 
 class OptimizePanel:
@@ -137,7 +137,7 @@ def undetermined_lines(state: ViewState, session: Session) -> str:
 
 
 def _moved(unknown: str, state: ViewState, session: Session) -> str:
-    """Change of a joint by a run, in brackets; empty for other unknowns."""
+    """Change of a joint by a run, as text in brackets; empty for other unknowns."""
     arm, _, joint = unknown.partition("/")
     found = session.ranges.get(arm, ())
     places = [number for number, limits in enumerate(found) if limits.joint == joint]
@@ -158,9 +158,9 @@ _GROUPS = {"base_frames": "Base frames", "extrinsics": "Camera pose", "intrinsic
 
 
 class SettingsPanel:
-    """A preset, and a window with one widget per number of the chosen solver's settings, explained by its docstring.
+    """Preset, and a window with one widget per field of the solver's settings; docstrings of fields are the hints.
 
-    Stages are not edited here: a settings file holds them (`carts evaluate --settings`).
+    Stages can be edited only in a settings file (`carts evaluate --settings`).
     """
 
     def __init__(self, page: PanelPage, state: ViewState) -> None:
@@ -228,7 +228,7 @@ class SettingsPanel:
 
 
 class FreePanel:
-    """Which joints and which calibration the optimizer may move."""
+    """Choice of the joints and the calibration parameters that the optimizer may change."""
 
     def __init__(self, page: PanelPage, session: Session, state: ViewState) -> None:
         gui = page.gui
@@ -268,9 +268,9 @@ def is_free(state: ViewState, arm: str, joint: str) -> bool:
 def _widget(gui: Any, kind: type, name: str, value: Any) -> Any:
     hint = field_docstrings(kind).get(name)
     unit = re.search(r"\[([^\]]*)\]", hint or "")
-    # "[px of the working image]" is for the hint; the label has room for "px". [1] is no unit to show.
+    # The label has room for the first word of a unit, such as "px" of "[px of the working image]"; [1] is not shown.
     short = unit.group(1).split()[0] if unit else "1"
-    # `prior_deg` has its unit already.
+    # The name `prior_deg` already contains its unit.
     words = humanized(name.removesuffix(f"_{short}"))
     label = words if short == "1" else f"{words} [{short.replace('^2', '²')}]"
     if isinstance(value, str):
@@ -346,7 +346,7 @@ class _Chart:
         )
 
     def show(self, values: Sequence[float | None], curves: Curves, outdated: bool) -> None:
-        """Draw one value per iterate, None where there is none."""
+        """Draw one value per iterate; None if unknown."""
         known = [value for value in values if value is not None]
         self._title.visible = self._plot.visible = bool(known)
         if not known:

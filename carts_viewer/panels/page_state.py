@@ -71,11 +71,11 @@ class PageState:
             "range": state.range,
             "playing": state.playing,
             "notice": state.notice,
-            "settings": remembered(state),
+            "settings": stored_choices(state),
         }
 
 
-def remembered(state: ViewState) -> dict[str, Any]:
+def stored_choices(state: ViewState) -> dict[str, Any]:
     """Choices that a browser stores."""
     return {
         "layer": str(state.layer),
@@ -86,11 +86,11 @@ def remembered(state: ViewState) -> dict[str, Any]:
     }
 
 
-def chosen(settings: Mapping[str, Any], state: ViewState) -> list[intents.Intent]:
-    """Intents that restore the valid choices of `remembered`."""
+def restored_choices(settings: Mapping[str, Any], state: ViewState) -> list[intents.Intent]:
+    """Intents that restore the valid choices among those stored by `stored_choices`."""
     found: list[intents.Intent] = []
     layer, reach, beside = (settings.get(name) for name in ("layer", "reach", "beside"))
-    # Layers of imported masks or of the truth do not exist in every recording.
+    # Layers of imported masks or of ground truth do not exist in every recording.
     if isinstance(layer, str) and layer in {Layer.SHADED, Layer.MASK, Layer.CONTOUR, Layer.NONE} - {state.layer}:
         found.append(intents.ShowLayer(Layer(layer)))
     if isinstance(reach, str) and reach in set(Reach) - {state.reach}:

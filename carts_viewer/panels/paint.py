@@ -25,15 +25,15 @@ _HINTS = {
     Tool.POLYGON: "<b>Click</b> corners; <b>double click</b> or <b>Enter</b> closes, with <b>Shift</b> to cut out. "
     "<b>Backspace</b> removes the last corner.",
     Tool.PROMPT: "<b>Click</b> an object to add it, or drag a <b>box</b> to replace the layer inside it. Further "
-    "clicks refine the object: on it, or with <b>Shift</b> (or Alt) off it; <b>Enter</b> begins the next. "
-    "<b>Shift</b> on a new object removes it.",
+    "clicks refine the object: on it, or with <b>Shift</b> (or Alt) off it; <b>Enter</b> starts the next object. "
+    "<b>Shift</b>+click on another object removes it.",
 }
 _ANY = "Any arm"
 _MOVING = "<b>Right-drag</b> pans, <b>wheel</b> zooms."
 
 
 class PaintPanel:
-    """Tools and layers; it also sends the chosen tool to the tab."""
+    """Painting tools and layers; also sends the selected tool to the page's script."""
 
     def __init__(self, page: PanelPage, session: Session, state: ViewState) -> None:
         gui = page.gui
@@ -54,8 +54,8 @@ class PaintPanel:
             self._class = gui.add_dropdown(
                 "Class",
                 list(self._classes),
-                hint="Painted class: a part of an arm (layer Parts), or any arm. Pixels of Any arm belong to the arm "
-                "nearest to them in the overlay, also in an export with a category per arm",
+                hint="Painted class: a part of an arm (layer Parts), or any arm. Pixels of Any arm belong to the "
+                "nearest arm in the overlay, also in an export with a category per arm",
             )
             self._size = gui.add_slider("Size [px]", *DIAMETERS, 1, state.brush.diameter)
             self._text = gui.add_html("")
@@ -68,9 +68,9 @@ class PaintPanel:
         """Update the widgets and the page's scripts."""
         brush = state.brush
         for tool, button in self._tools.items():
-            _press(button, tool is brush.tool)
+            _highlight(button, tool is brush.tool)
         for target, button in self._targets.items():
-            _press(button, target is brush.target)
+            _highlight(button, target is brush.target)
         if not self._waits(intents.SetDiameter):
             write(self._size, brush.diameter)
         write(self._class, next(name for name, number in self._classes.items() if number == brush.label))
@@ -83,7 +83,7 @@ class PaintPanel:
         )
         hint = f"{_HINTS[brush.tool]} {_MOVING}" if brush.tool is not Tool.OFF else _HINTS[brush.tool]
         if brush.target is Target.IGNORE and isinstance(state.settings, DescentSolver):
-            hint += " This solver does not use the ignore region; <b>Surface maps</b> does."
+            hint += " The chosen solver does not use the ignore region; the solver <b>Surface maps</b> does."
         self._text.content = f'<p class="carts-caption">{hint}<br>{_counts(state)}</p>'
         message = self._message(state)
         if message != self._sent:
@@ -91,7 +91,7 @@ class PaintPanel:
             self._page.call("setBrush", message)
 
     def _message(self, state: ViewState) -> dict[str, object]:
-        """State for the page's script that draws strokes."""
+        """State for the script that draws strokes in the page."""
         camera, brush = self._scene.camera(state.camera), state.brush
         add, erase = (ADDED_COLOR, REMOVED_COLOR) if brush.target is Target.MASK else (IGNORED_COLOR, (255, 255, 255))
         label = brush.label if brush.target is Target.MASK else 0
@@ -110,7 +110,7 @@ class PaintPanel:
         }
 
 
-def _press(button: viser.GuiButtonHandle, on: bool) -> None:
+def _highlight(button: viser.GuiButtonHandle, on: bool) -> None:
     color = "teal" if on else "gray"
     if button.color != color:
         button.color = color

@@ -10,8 +10,8 @@ from carts_viewer.session import Storage
 from carts_viewer.state import ViewState
 from carts_viewer.transport.document import escaped
 
-_LISTED = 60
-"""Number of listed steps, around the present one."""
+_MAX_LISTED = 60
+"""Maximum number of listed steps, centred on the current step."""
 
 
 class SavedPanel:
@@ -28,7 +28,7 @@ class SavedPanel:
         page.row(self._undo, self._redo)
 
     def show(self, state: ViewState) -> None:
-        """Update the line and the buttons."""
+        """Update the widgets."""
         path = self._storage.project.path
         asked = jobs_question(state) or network_question(state)
         decide = "Jobs or a network of another user need your confirmation: see Jobs." if asked else None
@@ -52,7 +52,7 @@ class SavedPanel:
 
 
 class HistoryPanel:
-    """The list of steps."""
+    """List of the steps in the history."""
 
     def __init__(self, page: PanelPage) -> None:
         gui = page.gui
@@ -65,13 +65,13 @@ class HistoryPanel:
     def show(self, state: ViewState) -> None:
         """Update the list."""
         project = state.project
-        first = max(project.position - _LISTED // 2, 0)
+        first = max(project.position - _MAX_LISTED // 2, 0)
         positions = {"Start": 0} | {
             f"{step.number}. {step.name}{' (undone)' if step.number > project.position else ''}": step.number
-            for step in project.steps[first : first + _LISTED]
+            for step in project.steps[first : first + _MAX_LISTED]
         }
         if positions != self._positions:
-            # Before the widget offers them, so that every option has an entry.
+            # Set before the options of the widget, so that every option has an entry.
             self._positions = positions
             self._steps.options = tuple(positions)
         write(self._steps, next(label for label, number in positions.items() if number == project.position))
@@ -92,7 +92,7 @@ class PeoplePanel:
             page.columns([self._name], 1, narrow_labels=True)
             self._others = gui.add_html("")
             link = gui.add_button(
-                "Copy link", icon=viser.Icon.LINK, color="gray", hint="Copies a link to this frame, camera and domain"
+                "Copy link", icon=viser.Icon.LINK, color="gray", hint="Copy a link to this frame, camera and domain"
             )
         page.on_input(self._name, lambda name: intents.SetName(str(name)))
 
@@ -107,7 +107,7 @@ class PeoplePanel:
         ids = state.project.identity.frame_ids
         rows = [
             f'<a href="#" data-frame="{index}">{escaped(name)}</a> on frame {escaped(ids[index])}'
-            + (" <b>(this one)</b>" if index == state.index else "")
+            + (" <b>(this frame)</b>" if index == state.index else "")
             for name, index in state.others
         ]
         text = "<br>".join(rows) if rows else "No other user."

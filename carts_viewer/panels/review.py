@@ -1,4 +1,4 @@
-"""Panels of reviews, and of frames found by a filter."""
+"""Panels of reviews, and of the frame filter."""
 
 from collections import Counter
 
@@ -10,11 +10,11 @@ from carts_viewer.actions import intents
 from carts_viewer.actions.frame_filter import (
     ANY,
     BY_HAND,
+    NO_REVIEW,
     NOT_CHECKED,
     SOLVED,
-    UNJUDGED,
     FrameFilter,
-    found,
+    matching_frames,
     review_name,
 )
 from carts_viewer.panels.inputs import PanelPage, write
@@ -52,8 +52,8 @@ class ReviewPanel:
             clear = page.button("Clear", intents.SetReview(ReviewState.UNTOUCHED), hint=hint)
             page.row(work, reject, clear, weights=(11, 7.65, 7.35))
             self._note = gui.add_text("Note", "")
-            previous = page.button("Previous worst", intents.ShowWorse(-1))
-            following = page.button("Next worst", intents.ShowWorse(1))
+            previous = page.button("Previous worst", intents.ShowWorst(-1))
+            following = page.button("Next worst", intents.ShowWorst(1))
             page.row(previous, following, weights=(5, 4))
             page.button("Next unreviewed", intents.ShowUnreviewed(1), icon=viser.Icon.CHEVRON_RIGHT)
             self._counts = gui.add_html("")
@@ -77,7 +77,7 @@ class ReviewPanel:
             self._count(state.project)
 
     def _count(self, project: ProjectState) -> None:
-        # An hour has 100,000 frames, of which few have a record.
+        # One hour has 100,000 frames, but few of them have a record.
         recorded = project.records.keys() - {WHOLE_PROJECT}
         counts = Counter(review_name(project, index) for index in recorded)
         counts[str(ReviewState.UNTOUCHED)] += len(project.identity.frame_ids) - len(recorded)
@@ -94,12 +94,12 @@ def _dot(name: str) -> str:
     return f'<span class="carts-swatch" style="background: {_COLORS[name]}"></span>'
 
 
-_LISTED = 150
+_MAX_LISTED = 150
 _BULK = {"Accept all": ReviewState.ACCEPTED, "Reject all": ReviewState.REJECTED, "Reset all": ReviewState.UNTOUCHED}
 
 
 class FindPanel:
-    """Conditions, links to the frames that meet them, and reviews of all of these."""
+    """Conditions of the frame filter, links to matching frames, and buttons that review all of them."""
 
     def __init__(self, page: PanelPage, session: Session) -> None:
         gui = page.gui
@@ -108,7 +108,7 @@ class FindPanel:
         self._known: tuple[ProjectState | None, FrameFilter] = (None, FrameFilter())
         with gui.add_folder("Find", expand_by_default=False):
             self._widgets = {
-                "review": gui.add_dropdown("Review", [ANY, UNJUDGED, *map(str, ReviewState), BY_HAND, SOLVED]),
+                "review": gui.add_dropdown("Review", [ANY, NO_REVIEW, *map(str, ReviewState), BY_HAND, SOLVED]),
                 "fit": gui.add_dropdown(
                     "Fit",
                     [ANY, *VERDICTS, NOT_CHECKED],
@@ -126,10 +126,10 @@ class FindPanel:
                 "note": gui.add_text("Note text", ""),
             }
             self._list = gui.add_html("")
-            before = page.button("Previous", intents.ShowFound(-1), icon=viser.Icon.CHEVRON_LEFT)
-            after = page.button("Next", intents.ShowFound(1), icon=viser.Icon.CHEVRON_RIGHT)
+            before = page.button("Previous", intents.ShowMatching(-1), icon=viser.Icon.CHEVRON_LEFT)
+            after = page.button("Next", intents.ShowMatching(1), icon=viser.Icon.CHEVRON_RIGHT)
             page.row(before, after)
-            self._bulk = [page.button(name, intents.ReviewFound(state)) for name, state in _BULK.items()]
+            self._bulk = [page.button(name, intents.ReviewMatching(state)) for name, state in _BULK.items()]
             clear = page.button("Clear", intents.ClearFilter(), hint="Clear these conditions")
             page.row(*self._bulk[:2])
             page.row(self._bulk[2], clear)
@@ -137,21 +137,21 @@ class FindPanel:
             page.on_input(widget, lambda value, name=name: intents.SetFilter(name, value))
 
     def show(self, state: ViewState) -> None:
-        """Update conditions and frames; unchanged during an unfinished gesture."""
+        """Update the widgets; the list of frames does not change during an unfinished gesture."""
         for name, widget in self._widgets.items():
             if not self._waits((intents.SetFilter, name)):
                 write(widget, getattr(state.filter, name))
         if state.unsaved or (state.project, state.filter) == self._known:
             return
         self._known = state.project, state.filter
-        frames = [] if state.filter.empty else found(state.project, state.filter)
+        frames = [] if state.filter.empty else matching_frames(state.project, state.filter)
         for button in self._bulk:
             button.disabled = not frames
         if state.filter.empty:
             self._list.content = '<p class="carts-caption">Set conditions to find frames.</p>'
             return
-        links = " ".join(f'<a href="#" data-frame="{i}">{escaped(self._ids[i])}</a>' for i in frames[:_LISTED])
-        more = " …" if len(frames) > _LISTED else ""
+        links = " ".join(f'<a href="#" data-frame="{i}">{escaped(self._ids[i])}</a>' for i in frames[:_MAX_LISTED])
+        more = " …" if len(frames) > _MAX_LISTED else ""
         self._list.content = (
             f'<div class="carts-list carts-found" aria-label="Frames found"><b>{len(frames)}</b> of {len(self._ids)} '
             f"frames: {links}{more}</div>"

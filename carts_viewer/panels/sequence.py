@@ -1,4 +1,4 @@
-"""Panel of sequence mode, and the warning of a wrong calibration with its button."""
+"""Panel of sequence mode, and warning about a wrong calibration."""
 
 import viser
 
@@ -15,7 +15,7 @@ from carts_viewer.transport.document import escaped
 
 
 class CalibrationHint:
-    """Warning of a wrong calibration with a *Calibrate* button and progress."""
+    """Warning about a wrong calibration, with a *Calibrate* button and progress."""
 
     def __init__(self, page: PanelPage, session: Session) -> None:
         frames = min(intents.Calibrate().frames, len(session.sequence))
@@ -40,7 +40,7 @@ class CalibrationHint:
         self._text.visible = bool(self._text.content)
 
     def _progress_line(self, job: Job | None) -> str:
-        """Progress of a calibration, or result of one that this tab has followed, as HTML."""
+        """Progress of a calibration, or its result if this tab has shown the progress, as HTML."""
         if job is None:
             return ""
         text, title = escaped(job.text), f"<b>{escaped(job.title)}</b>"
@@ -57,14 +57,14 @@ class CalibrationHint:
 
 
 def newest_calibration(jobs: tuple[Job, ...]) -> Job | None:
-    """The calibration that waits or runs, or that has ended and no other job has followed."""
+    """The newest calibration if it is waiting or running, or is the newest of all jobs."""
     shown = [job for job in jobs if job.state is not JobState.ASKED]
     found = (job for job in reversed(shown) if job.kind == "calibrate" and (not job.over or job is shown[-1]))
     return next(found, None)
 
 
 def calibration_line(gain: float | None) -> str:
-    """Warning of wrong base frames with its remedy, as HTML; empty for a small or unknown gain."""
+    """Warning about wrong base frames with a remedy, as HTML; empty for a small or unknown gain."""
     if gain is None or gain < BASE_FRAME_GAIN:
         return ""
     return (
@@ -75,7 +75,7 @@ def calibration_line(gain: float | None) -> str:
     )
 
 
-_LONGEST_LIST = 200
+_MAX_LISTED = 200
 _MEANING = (
     "Solving fits neighbouring frames jointly; <b>Run</b> fits a single frame. Frames that you accepted, moved by "
     "hand or marked as keyframes do not change."
@@ -93,10 +93,10 @@ class KeyframesPanel:
         self._solvable, self._open, self._plan = False, True, ""
         self._index = 0
         with gui.add_folder("Keyframes"):
-            self._held = gui.add_checkbox(
+            self._keyframe = gui.add_checkbox(
                 "Keyframe",
                 False,
-                hint=("Solving does not change this frame. Frames that you moved or accepted are also kept."),
+                hint="Solving does not change this frame. Frames that you moved or accepted are also kept.",
             )
             self._text = gui.add_html("")
             self._between = page.button(
@@ -111,14 +111,14 @@ class KeyframesPanel:
             self._take = page.button("Take solved pose", lambda _: intents.TakeSolved(self._index), visible=False)
             self._take_all = page.button("Take all", intents.TakeSolved(), visible=False)
             page.row(self._take, self._take_all, weights=(3, 2))
-            self._drop = page.button("Discard all", intents.DropSolved(), icon=viser.Icon.X, visible=False)
+            self._drop = page.button("Discard all", intents.DiscardSolved(), icon=viser.Icon.X, visible=False)
             self._stop = page.button("Stop and keep", intents.StopSolving(), icon=viser.Icon.PLAYER_STOP, visible=False)
-        page.on_input(self._held, lambda on: intents.HoldKeyframe(bool(on)))
+        page.on_input(self._keyframe, lambda on: intents.SetKeyframe(bool(on)))
         page.on_input(self._direction, lambda label: intents.SetDirection(_DIRECTIONS[label]))
 
     def show(self, state: ViewState) -> None:
         """Update the widgets."""
-        write(self._held, state.project.is_keyframe(state.index))
+        write(self._keyframe, state.project.is_keyframe(state.index))
         write(self._direction, next(label for label, name in _DIRECTIONS.items() if name == state.direction))
         self._all.label = whole_label(state)
         self._direction.disabled = state.solving
@@ -126,7 +126,7 @@ class KeyframesPanel:
         self._plan_ahead(state)
         self._between.disabled = state.solving or not self._solvable
         self._all.disabled = state.solving or not self._open
-        # A range is usually chosen to solve all of it.
+        # A range is usually selected in order to solve all its frames.
         bright = self._between if self._solvable and state.range is None else self._all
         for button in (self._between, self._all):
             button.color = "teal" if button is bright else "gray"
@@ -135,36 +135,36 @@ class KeyframesPanel:
             done, total = state.solve.progress
             self._progress.value = 100.0 * done / total
             text = escaped(state.solve.text)
-            lines.append(f"<b>{text}</b>" if state.solving else f"Last time: {text}")
+            lines.append(f"<b>{text}</b>" if state.solving else f"Last solve: {text}")
         self._show_listed(state)
         self._text.content = "".join(f'<p class="carts-caption">{line}</p>' for line in lines)
         self._calibration.show(None if state.solve is None else state.solve.suspicion(state.project), state)
 
     def _show_listed(self, state: ViewState) -> None:
-        """The frames that became worse or are doubtful, each a link to it."""
+        """Update the list of frames that became worse or are doubtful, with links to them."""
         self._index = state.index
         listed = () if state.solve is None or state.solving else state.solve.listed
-        held = [frame.index for frame in listed if not frame.taken]
+        unchanged = [frame.index for frame in listed if not frame.taken]
         self._listed.visible = self._drop.visible = bool(listed)
-        self._take.visible = self._take_all.visible = bool(held)
-        self._take.disabled = state.index not in held
+        self._take.visible = self._take_all.visible = bool(unchanged)
+        self._take.disabled = state.index not in unchanged
         rows = "".join(
             f'<li><a href="#" data-frame="{frame.index}">{escaped(self._ids[frame.index])}</a> '
             f"{escaped(frame.reason)}{'' if frame.taken else ' <b>not changed</b>'}</li>"
-            for frame in listed[:_LONGEST_LIST]
+            for frame in listed[:_MAX_LISTED]
         )
-        more = f"<li>and {len(listed) - _LONGEST_LIST} more</li>" if len(listed) > _LONGEST_LIST else ""
-        self._listed.content = f'<ul class="carts-list" aria-label="Frames to look at">{rows}{more}</ul>'
+        more = f"<li>and {len(listed) - _MAX_LISTED} more</li>" if len(listed) > _MAX_LISTED else ""
+        self._listed.content = f'<ul class="carts-list" aria-label="Frames to inspect">{rows}{more}</ul>'
 
     def _plan_ahead(self, state: ViewState) -> None:
-        """Update the text on what would be solved; not during an unfinished gesture."""
+        """Update the text about the frames to be solved, except during an unfinished gesture."""
         seen = (state.project, state.index, state.range)
         if self._seen == seen or (state.unsaved and self._seen[1:] == seen[1:]):
             return
         self._seen = seen
-        self._plan = f"{self._between_here(state)}<br>{self._all_here(state)}"
+        self._plan = f"{self._between_plan(state)}<br>{self._all_plan(state)}"
 
-    def _between_here(self, state: ViewState) -> str:
+    def _between_plan(self, state: ViewState) -> str:
         name = "<b>Solve between</b>"
         frames = between_kept(state.project, state.index, state.part)
         kept = set(state.project.kept_frames) & set(state.part)
@@ -179,7 +179,7 @@ class KeyframesPanel:
             f"{counted(count, 'frame')} would be fitted, {len(frames) - count} kept" if count else "every frame is kept"
         )
 
-    def _all_here(self, state: ViewState) -> str:
+    def _all_plan(self, state: ViewState) -> str:
         count = len(state.part) - len(set(state.project.kept_frames) & set(state.part))
         self._open = count > 0
         return f"<b>{whole_label(state)}</b>: " + (
@@ -188,5 +188,5 @@ class KeyframesPanel:
 
 
 def whole_label(state: ViewState) -> str:
-    """Label of solving all frames, or those of the range."""
+    """Label of the button that solves all frames, or those in the range."""
     return "Solve all" if state.range is None else "Solve range"

@@ -32,11 +32,11 @@ from carts_viewer.transport.guard import response
 from carts_viewer.transport.page import TabPage
 
 _FIGURES = ("Loss [1]", "Dice [1]", "Probability of failure [1]")
-_MOST_COLUMNS = 4000
+_MAX_COLUMNS = 4000
 
 
 class Traces:
-    """Values of every frame, updated as the project changes."""
+    """Curves over all frames, updated when the project changes."""
 
     def __init__(self, session: Session) -> None:
         frames = len(session.sequence)
@@ -58,7 +58,7 @@ class Traces:
         return [*_FIGURES, *self._joints]
 
     def measure(self, sequence: Sequence) -> bool:
-        """Take the measured joints of this recording; returns whether they have changed."""
+        """Use the measured joints of this sequence; returns whether they have changed."""
         other = sequence is not self._sequence
         self._sequence = sequence
         return other
@@ -79,17 +79,17 @@ class Traces:
                 rows[frame] = np.nan if known is None else known.joint_positions
 
     def between(self, name: str, first: int, last: int, columns: int) -> dict[str, Any] | None:
-        """A curve from frame `first` up to but excluding `last`; None without values.
+        """A curve from frame `first` up to but excluding `last`; None if there is no such curve.
 
         Returns:
-            `edges`: first frame of each column, and the end of the last one; `curves`: for measured (or estimated)
-            values and, for joints, corrected ones, the minimum and maximum of each column, null where there is none.
+            `edges`: first frame of each column, and the end of the last column; `curves`: minimum and maximum of each
+            column, null if there is no value, for measured (or estimated) and, for joints, corrected values.
         """
         first, last = max(first, 0), min(last, self._figures.shape[1])
         values = self._values(name)
         if values is None or last <= first or columns < 1:
             return None
-        count = min(columns, _MOST_COLUMNS, last - first)
+        count = min(columns, _MAX_COLUMNS, last - first)
         edges = np.unique(np.linspace(first, last, count + 1).astype(int))
         return {"edges": edges.tolist(), "curves": [_extremes(row[first:last], edges - first) for row in values]}
 
@@ -104,15 +104,15 @@ class Traces:
 
 
 def _extremes(values: np.ndarray, edges: np.ndarray) -> list[list[float | None]]:
-    """Lowest and highest finite value between neighbouring edges."""
+    """Minima and maxima of the finite values between adjacent edges."""
     ends = (np.fmin.reduceat(values, edges[:-1]), np.fmax.reduceat(values, edges[:-1]))
     return [[None if np.isnan(value) else float(f"{value:.5g}") for value in end] for end in ends]
 
 
-HEIGHT = 64
+THUMBNAIL_HEIGHT = 64
 """Height of thumbnails [px]; displayed smaller, for screens with several pixels per CSS pixel."""
-_MOST = 4000
-"""Number of cached thumbnails of some 3 kB; the least recently used go first."""
+_MAX_THUMBNAILS = 4000
+"""Maximum number of cached thumbnails of about 3 kB; the least recently used are removed first."""
 _QUALITY = 70
 _PATH = re.compile(r"(\d{1,4})/(\d{1,4})/(\d{1,9})\.jpg")
 
@@ -126,11 +126,11 @@ class Thumbnails:
         self._sources: dict[tuple[int, int], ImageSource] = {}
         self._kept: OrderedDict[str, bytes] = OrderedDict()
         self._lock = threading.Lock()
-        # One at a time, since scrubbing needs the processor more.
+        # A single thread, since scrubbing needs the processor more.
         self._thread = ThreadPoolExecutor(1, "carts-thumbnails")
 
     async def answer(self, path: str) -> Response:
-        """The picture at `CAMERA/DOMAIN/FRAME.jpg`, all numbers from 0, or status 404."""
+        """The picture at `CAMERA/DOMAIN/FRAME.jpg`, given by indices; status 404 if there is none."""
         content = self._find(path)
         if content is None:
             try:
@@ -146,7 +146,7 @@ class Thumbnails:
         self._thread.shutdown(wait=True, cancel_futures=True)
 
     def _source(self, camera: int, domain: int) -> ImageSource:
-        """Images as recorded; a video gets a separate reader."""
+        """Recorded images of a camera and domain; videos get a separate reader."""
         if (camera, domain) not in self._sources:
             source = self._sequence.image_source(self._cameras[camera], self._sequence.domains[domain])
             self._sources[camera, domain] = source.another() if isinstance(source, Video) else source
@@ -170,10 +170,10 @@ class Thumbnails:
             image = self._source(camera, domain).read(frame)
         except CartsError:
             return None
-        content = small_jpeg(image, height=HEIGHT, quality=_QUALITY)
+        content = small_jpeg(image, height=THUMBNAIL_HEIGHT, quality=_QUALITY)
         with self._lock:
             self._kept[path] = content
-            while len(self._kept) > _MOST:
+            while len(self._kept) > _MAX_THUMBNAILS:
                 self._kept.popitem(last=False)
         return content
 
@@ -188,15 +188,15 @@ _REVIEWS = (
     SOLVED,
 )
 _SOURCES = (Source.HAND, Source.OPTIMIZER, Source.PROPAGATED)
-_FULL = 0.2
-"""1 - Dice, and probability of failure, that fill the height of a bar [1]."""
-_MOST_OPEN = 255
-_MOST_IDS = 5000
-"""Longest sequence with names of frames; frames of longer ones are named by number."""
+_FULL_BAR = 0.2
+"""Value of 1 - Dice, or probability of failure, at which a bar has its full height [1]."""
+_MAX_UNDETERMINED = 255
+_MAX_IDS = 5000
+"""Maximum length of a sequence whose frame names are sent; otherwise frames are named by number."""
 
 
 class TimelineData:
-    """Sends the codes of all frames to a tab, then changes."""
+    """Sends the codes of all frames to a tab, and then changed codes."""
 
     def __init__(self, page: TabPage, session: Session) -> None:
         self._page = page
@@ -208,13 +208,13 @@ class TimelineData:
         self._records: Mapping[int, Record] = {}
         self._codes: dict[int, int] = {}
         self._draft: int | None = None
-        """Frame of which unsaved values were sent."""
+        """Frame whose unsaved code was sent."""
         self._solving: list[int] | None = None
         self._traces = Traces(session)
         page.call("setTimeline", self._whole())
 
     def show(self, state: ViewState) -> None:
-        """Send changes; an unfinished gesture changes its own frame only."""
+        """Send changes; an unfinished gesture changes only its own frame."""
         solving = None
         if state.solve is not None and state.solving:
             solving = [state.solve.frames[0], len(state.solve.frames), state.solve.done]
@@ -227,14 +227,14 @@ class TimelineData:
             self._page.call("setTimeline", message)
 
     def answer(self, trace: Trace) -> None:
-        """Send a curve that the tab asks for, if there is one."""
+        """Send a requested curve, if it exists."""
         found = self._traces.between(trace.name, trace.first, trace.last, trace.columns)
         if found is not None:
             self._page.call("setTrace", {"name": trace.name, **found})
 
     def _whole(self) -> dict[str, Any]:
         codes = [number for pair in list(self._codes.items()) for number in pair]
-        ids = list(self._ids) if len(self._ids) <= _MOST_IDS else None
+        ids = list(self._ids) if len(self._ids) <= _MAX_IDS else None
         sequence = self._session.sequence
         return {
             "whole": True,
@@ -250,8 +250,8 @@ class TimelineData:
         }
 
     def _drafted(self, state: ViewState) -> list[int]:
-        """As `_changed`, of the shown frame alone, during an unfinished gesture or a run."""
-        self._draft, number = state.index, code(state.project, state.index, self._session.scene)
+        """Like `_changed`, for the shown frame only, during an unfinished gesture or a run."""
+        self._draft, number = state.index, frame_code(state.project, state.index, self._session.scene)
         if self._codes.get(state.index, 0) == number:
             return []
         self._codes[state.index] = number
@@ -272,14 +272,14 @@ class TimelineData:
         self._traces.follow(project, indices)
         changed: list[int] = []
         for index in sorted(indices):
-            number = code(project, index, self._session.scene)
+            number = frame_code(project, index, self._session.scene)
             if self._codes.get(index, 0) != number:
                 self._codes[index] = number
                 changed += [index, number]
         return changed
 
 
-def code(project: ProjectState, frame: int, scene: Scene) -> int:
+def frame_code(project: ProjectState, frame: int, scene: Scene) -> int:
     """Bit field of review, verdict, source, kept, misfit (1 to 255, 0 unknown), and number of undetermined joints plus
     one (0 unknown)."""
     record = project.records.get(frame)
@@ -295,12 +295,12 @@ def code(project: ProjectState, frame: int, scene: Scene) -> int:
         + 8 * (0 if verdict is None else 1 + VERDICTS.index(verdict.verdict))
         + 32 * source
         + 128 * int(record.is_kept)
-        + 256 * (0 if badness is None else min(max(round(255 * badness / _FULL), 1), 255))
-        + 65536 * _open(project, frame, scene)
+        + 256 * (0 if badness is None else min(max(round(255 * badness / _FULL_BAR), 1), 255))
+        + 65536 * _undetermined(project, frame, scene)
     )
 
 
-def _open(project: ProjectState, frame: int, scene: Scene) -> int:
+def _undetermined(project: ProjectState, frame: int, scene: Scene) -> int:
     known = {name: found.standard_deviations or () for name, found in project.joints(frame).items()}
     joints = undetermined_joints(scene, known)
-    return 0 if joints is None else min(1 + len(joints), _MOST_OPEN)
+    return 0 if joints is None else min(1 + len(joints), _MAX_UNDETERMINED)

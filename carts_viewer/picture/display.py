@@ -1,4 +1,4 @@
-"""Sends states to a tab: pictures and values that changed, as fast as the tab draws."""
+"""Sends changed pictures and widgets to a tab, as fast as the tab draws."""
 
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -54,7 +54,7 @@ class PageDisplay:
         new_frame = old is None or state.frame is not old.frame
         new_pose = old is None or state.pose is not old.pose or state.camera != old.camera
         if new_frame or new_pose or old is None or _picture(state) != _picture(old):
-            overlays = self._overlays(state, self._seen(state))
+            overlays = self._overlays(state, self._shown_cameras(state))
             # Sent together, so that a new frame never appears under the old frame's overlay.
             with self._page.atomic():
                 if new_frame:
@@ -75,13 +75,13 @@ class PageDisplay:
                 self._scene_view.show_measured(self._session.measured(state.frame))
         self._shown = state
 
-    def _seen(self, state: ViewState) -> list[str]:
-        """The cameras whose images are shown: those that the frame has, the active one first."""
+    def _shown_cameras(self, state: ViewState) -> list[str]:
+        """The cameras whose images are shown, the active camera first."""
         others = [camera.name for camera in self._scene.cameras if camera.name != state.camera]
         return [state.camera, *(name for name in others if state.beside and name in state.frame.images)]
 
     def _overlays(self, state: ViewState, cameras: list[str]) -> dict[str, Rgba]:
-        """Overlays by camera; several are rendered in parallel."""
+        """Overlays by camera, rendered in parallel."""
         if len(cameras) == 1:
             return {cameras[0]: self._overlay(state, cameras[0])}
         return dict(zip(cameras, _threads().map(lambda camera: self._overlay(state, camera), cameras), strict=True))
@@ -155,17 +155,17 @@ def _draw_paint(
     """Draw painted layers, unless only the frame is shown."""
     at_work = state.brush.tool is not Tool.OFF
     if at_work or state.layer is not Layer.NONE:
-        # The comparison with the truth, and the parts, show the corrected mask itself.
+        # The layers of ground truth and parts show the corrected mask itself.
         correction = None if state.layer in (Layer.TRUTH, Layer.PARTS) else corrected
         paint_over(overlay, correction, ignored, max(state.opacity, 0.4) if at_work else state.opacity)
 
 
-LONGEST_WAIT = 0.08
+MAX_WAIT = 0.08
 """Time after which the next picture is sent without an acknowledgement [s]."""
 
 
 class RateLimit:
-    """Decides when the next picture may be sent: once the tab has drawn the last one, or after `LONGEST_WAIT`."""
+    """Decides when the next picture may be sent: once the tab has drawn the last one, or after `MAX_WAIT`."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
@@ -181,4 +181,4 @@ class RateLimit:
 
     def ready_in(self) -> float:
         """Time until the next picture may be sent [s]."""
-        return max(0.0, self._sent_at + LONGEST_WAIT - self._clock()) if self._drawn_at < self._sent_at else 0.0
+        return max(0.0, self._sent_at + MAX_WAIT - self._clock()) if self._drawn_at < self._sent_at else 0.0

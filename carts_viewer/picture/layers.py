@@ -13,13 +13,13 @@ from carts_core.project import IgnoreRegion, MaskCorrection
 
 
 class Layer(StrEnum):
-    """A way to show the arm over the frame; the value is the label in the page."""
+    """Layer drawn over the frame; the value is the label in the page."""
 
     SHADED = "Shaded arm"
     MASK = "Mask"
     REFINED = "Refined mask"
     CONTOUR = "Contour"
-    TRUTH = "Against truth"
+    TRUTH = "Ground truth"
     ATTENTION = "Attention map"
     SIMILARITY = "Feature similarity"
     NONE = "None"
@@ -36,7 +36,7 @@ TRUTH_COLORS = {
     "false negative": (220, 20, 30),
     "true negative": (0, 0, 0),
 }
-"""The paper's colours for the comparison with a true mask."""
+"""The paper's colours for the comparison with a ground-truth mask."""
 
 ADDED_COLOR, REMOVED_COLOR, IGNORED_COLOR = (190, 242, 60), (239, 68, 68), (168, 85, 247)
 """Colours of pixels added to the mask, removed from it, or excluded from the optimizer."""
@@ -50,7 +50,7 @@ ArmIds = Int[np.ndarray, "height width"]
 def small_jpeg(
     image: UInt8[np.ndarray, "height width 3"], *, height: int = 0, width: int = 0, quality: int = 80
 ) -> bytes:
-    """An RGB image as a JPEG file of this height or width [px], in the image's proportions."""
+    """JPEG file of an RGB image that is scaled to this height or width [px]."""
     if width:
         height = max(1, round(image.shape[0] * width / image.shape[1]))
     else:
@@ -61,14 +61,14 @@ def small_jpeg(
     ].tobytes()
 
 
-def nothing(height: int, width: int) -> Rgba:
+def transparent(height: int, width: int) -> Rgba:
     """A fully transparent picture."""
     return np.zeros((height, width, 4), np.uint8)
 
 
 def shaded(image: Float[np.ndarray, "3 height width"], arm_ids: ArmIds, opacity: float) -> Rgba:
-    """The rendered arm itself; `image` is RGB in [0, 1]."""
-    picture = nothing(*arm_ids.shape)
+    """The rendered arms; `image` is RGB in [0, 1]."""
+    picture = transparent(*arm_ids.shape)
     # Most of a frame is background, so only the arm's own pixels are converted.
     rows, columns = np.nonzero(arm_ids >= 0)
     picture[rows, columns, :3] = np.clip(image[:, rows, columns].T * 255.0 + 0.5, 0, 255)
@@ -100,7 +100,7 @@ def parts(classes: Int[np.ndarray, "height width"], opacity: float) -> Rgba:
 
 
 def contour(arm_ids: ArmIds, opacity: float) -> Rgba:
-    """The rim of each arm's visible part in its colour, wide enough to be visible in reduced images."""
+    """Outline of each arm's visible part in the arm's colour, wide enough to be visible in reduced images."""
     colors, count = _palette(arm_ids)
     colors[1:, 3] = _byte(opacity)
     width = max(2, round(max(arm_ids.shape) / 320))
@@ -129,8 +129,8 @@ def imported(
     size: tuple[int, int],
     opacity: float,
 ) -> Rgba:
-    """Imported labels in the arms' colours, in turn, and their keypoints as crosses; `size` is height and width."""
-    picture = nothing(*size)
+    """Imported labels in the colours of `label_color`, and keypoints as crosses; `size` is height and width [px]."""
+    picture = transparent(*size)
     if labels is not None:
         colors = np.array([(*label_color(max(number, 1)), _byte(opacity)) for number in range(256)], np.uint8)
         colors[0, 3] = 0
@@ -145,7 +145,7 @@ def imported(
 
 
 def label_color(number: int) -> tuple[int, int, int]:
-    """Colour of a label, from 1; after the arms' colours, others spread over the hues."""
+    """Colour of a label, counted from 1: first the arms' colours, then colours spread over the hues."""
     if number <= len(ARM_COLORS):
         return ARM_COLORS[number - 1]
     red, green, blue = colorsys.hsv_to_rgb(0.618 * number % 1.0, 0.65, 0.95)
@@ -158,7 +158,7 @@ def heat(values: Float[np.ndarray, "h w"], low: float, high: float, size: tuple[
     share = np.clip((np.nan_to_num(values.astype(np.float32)) - low) / (high - low), 0, 1)
     share = cv2.resize(share, (width, height), interpolation=cv2.INTER_LINEAR)
     colored = cv2.applyColorMap((share * 255).astype(np.uint8), cv2.COLORMAP_VIRIDIS)
-    picture = nothing(height, width)
+    picture = transparent(height, width)
     picture[..., :3] = colored[..., ::-1]
     picture[..., 3] = _byte(opacity)
     return picture

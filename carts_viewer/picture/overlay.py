@@ -1,4 +1,4 @@
-"""The overlay of a pose over its frame, keypoints in the image, and scores against true masks."""
+"""The overlay of a pose over its frame, keypoints in the image, and scores against ground-truth masks."""
 
 import math
 from collections.abc import Mapping
@@ -33,7 +33,7 @@ class OverlayRenderer:
 
     def arm_ids(self, state: SceneState, camera: str) -> layers.ArmIds:
         """Index of the visible arm per pixel of the camera's own image, -1 for background."""
-        # Overlay and scores of one pose are requested one after the other.
+        # The result is cached, since overlay and scores of a pose are requested one after the other.
         if camera not in self._last or self._last[camera][0] is not state:
             self._last[camera] = (state, self._renderer(camera).segment(state.to("cpu"))[0])
         return self._last[camera][1]
@@ -77,12 +77,12 @@ class OverlayRenderer:
 
         Args:
             state: The pose of the whole scene.
-            frame: The frame, with true masks for the comparison.
+            frame: The frame, with ground-truth masks for the comparison.
             camera: The camera's name.
             layer: What to draw.
             opacity: Opacity, 0..1.
-            maps: Source of attention and similarity; without them these layers are empty.
-            correction: Correction of the mask that is compared with the truth.
+            maps: Attention and similarity; without maps, these layers are empty.
+            correction: Correction of the mask that is compared with ground truth.
         """
         size = self._scene.camera(camera).height, self._scene.camera(camera).width
         if layer is Layer.SHADED:
@@ -94,12 +94,12 @@ class OverlayRenderer:
         if layer is Layer.TRUTH:
             truth = None if frame.masks is None else frame.masks.get(camera)
             predicted = self.mask(state, camera, correction)
-            return layers.nothing(*size) if truth is None else layers.against_truth(predicted, truth, opacity)
+            return layers.transparent(*size) if truth is None else layers.against_truth(predicted, truth, opacity)
         if layer in (Layer.ATTENTION, Layer.SIMILARITY) and maps is not None and camera in maps.cameras:
-            # Features are not negative, so their similarity is not either.
+            # Similarity is not negative, because features are not negative.
             values = maps.iterate.attention if layer is Layer.ATTENTION else maps.iterate.similarity
             return layers.heat(values[maps.cameras.index(camera)], 0.0, 1.0, size, opacity)
-        return layers.nothing(*size)
+        return layers.transparent(*size)
 
     def refined(
         self, state: SceneState, camera: str, mask: Bool[np.ndarray, "height width"] | None, opacity: float
@@ -111,11 +111,11 @@ class OverlayRenderer:
         return layers.refined(labelled(mask, rendered, camera), rendered, opacity)
 
     def pick(self, state: SceneState, camera: str, pixel: tuple[float, float], radius: float) -> Keypoint | None:
-        """The visible point of an arm at a pixel, or the nearest within `radius` [px]; None without one."""
+        """The visible point of an arm at a pixel, or the nearest within `radius` [px]; None if there is none."""
         return pick_point(self._scene, self._renderer(camera), state.to("cpu"), pixel, radius)
 
     def scores(self, state: SceneState, frame: Frame, camera: str, correction: MaskCorrection | None = None) -> Scores:
-        """Scores of the pose and its corrected mask against the frame's truth."""
+        """Scores of the pose and its corrected mask against the frame's ground truth."""
         mask = None if frame.masks is None else frame.masks.get(camera)
         overlap = None if mask is None else dice(self.mask(state, camera, correction), mask)
         others = {
@@ -152,7 +152,7 @@ def with_imported(frame: Frame, scene: Scene, project: ProjectState) -> Frame:
 
 
 def labelled_keypoints(scene: Scene) -> dict[str, Keypoint]:
-    """All keypoints of a scene by label, which names the arm where there are several."""
+    """All keypoints of a scene by label, which contains the arm's name if there are several arms."""
     points = [point for arm in scene.arms for point in keypoints(arm)]
     several = len(scene.arms) > 1
     return {f"{point.arm} {point.name}" if several else point.name: point for point in points}

@@ -1,7 +1,7 @@
 """The 3D scene of the page: the frame and its overlay in front of the lens, and behind them arms and cameras.
 
-viser's world is the shown camera's frame (OpenCV axes), so looking through the endoscope is looking from the origin
-along z, whatever camera is shown; the recording's own world is a node that moves when the camera is changed.
+viser's world frame is that of the shown camera (OpenCV axes), so the endoscope view looks from the origin along z. The
+recording's world frame is a node that is moved when another camera is shown.
 """
 
 from collections.abc import Callable
@@ -24,9 +24,9 @@ OVERLAY = "/overlay"
 GRID = "/grid"
 """Grid of centimetres in the 3D view."""
 OTHERS = "/others"
-"""Frames and overlays of the other cameras, beside the shown one's; the page's script hides them in the 3D view."""
+"""Frames and overlays of the other cameras, beside those of the shown camera; hidden in the 3D view by a script."""
 WORLD = "/world"
-"""Arms and other cameras; the page's script hides it in the endoscope view, where the frame covers it anyway."""
+"""Arms and other cameras; hidden by a script in the endoscope view, where the frame covers them."""
 _LENS_COLOR = (45, 212, 167)
 _OTHER_COLOR = (150, 160, 165)
 _GHOST, _GHOST_OPACITY = (200, 205, 210), 0.28
@@ -34,15 +34,15 @@ _GHOST, _GHOST_OPACITY = (200, 205, 210), 0.28
 _AXES = 0.012
 """Length of the axes of base and tip [m]."""
 _GRID_CELL = 0.01
-"""Distance of grid lines [m]."""
+"""Distance between grid lines [m]."""
 Colour = Callable[[Any], tuple[int, int, int]]
-"""Maps a link's own colour to the displayed one."""
+"""Maps a link's own colour to the displayed colour."""
 _JPEG_QUALITY = 88
 _DEPTH_SHARE = 0.25
-_LEAST_DEPTH = 0.005
+_MIN_DEPTH = 0.005
 _OVERLAY_SHARE = 0.99
 _SPACING = 1.01
-"""Distance of adjacent images, as a share of an image's size."""
+"""Distance between the centres of adjacent images, relative to the size of an image."""
 
 
 class SceneView:
@@ -52,13 +52,13 @@ class SceneView:
         """`state` determines the distance of the frame from the lens."""
         self._shown = shown
         self._scene = scene
-        self._depth = max(_DEPTH_SHARE * _distance_of_arms(scene, state, camera), _LEAST_DEPTH)
+        self._depth = max(_DEPTH_SHARE * _distance_of_arms(scene, state, camera), _MIN_DEPTH)
         self._links: list[list[viser.FrameHandle]] = []
         self._outlines: dict[str, viser.LineSegmentsHandle] = {}
         self._planes: dict[str, tuple[tuple[Camera, ...], viser.ImageHandle]] = {}
         self._world = shown.add_frame(WORLD, show_axes=False)
         self._measured: list[list[viser.FrameHandle]] = []
-        self._places: dict[str, bytes] = {}
+        self._poses: dict[str, bytes] = {}
         self._add_arms()
         self._add_cameras()
         self._add_grid()
@@ -72,9 +72,10 @@ class SceneView:
         self._put(OVERLAY, picture, camera, _OVERLAY_SHARE * self._depth, "png")
 
     def show_beside(self, camera: Camera, active: Camera, image: np.ndarray | None, overlay: Rgba | None) -> None:
-        """Put another camera's image, or its overlay, beside that of the active camera; None: unchanged.
+        """Show another camera's image and overlay beside those of the active camera; None: unchanged.
 
-        Images lie in a grid in the cameras' order, each as high as the active camera's, whose place is the true one.
+        Images form a grid in the order of the cameras. Each is scaled to the size of the active camera's image, which
+        remains in front of the lens.
         """
         names = [own.name for own in self._scene.cameras]
         place, width, height = self._beside(names.index(camera.name), names.index(active.name), camera, active)
@@ -124,7 +125,7 @@ class SceneView:
         self._place_arms(self._links, state)
 
     def show_measured(self, state: SceneState) -> None:
-        """Move the ghosts of the arms to their measured poses."""
+        """Move the translucent copies of the arms to their measured poses."""
         self._place_arms(self._measured, state)
 
     def _place_arms(self, arms: list[list[viser.FrameHandle]], state: SceneState) -> None:
@@ -136,13 +137,13 @@ class SceneView:
             for node, T_base_link in zip(nodes, Ts_base_link, strict=True):
                 _place(node, T_world_base @ T_base_link)
 
-    def _unmoved(self, name: str, place: bytes) -> bool:
-        """Whether the node of this name has not moved since the last call."""
-        before, self._places[name] = self._places.get(name), place
-        return before == place
+    def _unmoved(self, name: str, pose: bytes) -> bool:
+        """Whether the pose of the node with this name is the same as in the last call."""
+        before, self._poses[name] = self._poses.get(name), pose
+        return before == pose
 
     def _put(self, name: str, image: np.ndarray, camera: Camera, z: float, kind: str) -> None:
-        """Show an image as a plane at depth z that K projects exactly onto the image's own pixels."""
+        """Show an image as a plane at depth z whose projection by the intrinsics is the image itself."""
         fx, fy, cx, cy = camera.intrinsics
         size = (camera.width / fx * z, camera.height / fy * z)
         position = ((camera.width / 2 - cx) / fx * z, (camera.height / 2 - cy) / fy * z, z)
@@ -158,7 +159,7 @@ class SceneView:
         position: tuple[float, float, float],
         kind: str,
     ) -> bool:
-        """Show an image as a plane [m]; returns whether it is new, as after a change of cameras."""
+        """Show an image as a plane [m]; returns whether the plane is new, as after a change of cameras."""
         if name in self._planes and self._planes[name][0] == cameras:
             self._planes[name][1].image = image
             return False
@@ -242,7 +243,7 @@ def _place(node: viser.SceneNodeHandle, T_parent_node: Float[np.ndarray, "4 4"])
 
 
 def _distance_of_arms(scene: Scene, state: SceneState, camera: str) -> float:
-    """Depth of the nearest link in front of the camera [m], or a plausible one."""
+    """Depth of the nearest link in front of the camera [m], or a default depth."""
     row = [own.name for own in scene.cameras].index(camera)
     depths = []
     for arm, T_world_base, joints in zip(scene.arms, state.T_world_base, state.joint_positions, strict=True):
@@ -252,6 +253,6 @@ def _distance_of_arms(scene: Scene, state: SceneState, camera: str) -> float:
 
 
 def _mixed(color, accent: tuple[int, int, int]) -> tuple[int, int, int]:
-    """A link's own colour mixed with the arm's, so that arms can be distinguished."""
+    """A link's own colour mixed with the arm's colour, so that arms can be distinguished."""
     own = np.asarray(color, float)[:3] * 255
     return tuple(int(value) for value in np.clip(0.75 * own + 0.25 * np.array(accent), 0, 255))  # type: ignore[return-value]

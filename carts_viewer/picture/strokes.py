@@ -16,11 +16,11 @@ from carts_core.project import IgnoreRegion, MaskCorrection, PartLabels
 from carts_viewer.transport.events import Event
 
 DIAMETERS = (1, 300)
-"""Thinnest and thickest brush [px]."""
-LONGEST_STROKE = 20_000
-"""Most points of a stroke; the page begins another stroke earlier."""
+"""Minimum and maximum diameter of the brush [px]."""
+MAX_STROKE_POINTS = 20_000
+"""Maximum number of points of a stroke; the page splits longer strokes."""
 _FRACTION_BITS = 4
-"""OpenCV draws to 1/16 of a pixel."""
+"""Fractional bits of pixel coordinates passed to OpenCV."""
 
 Mask = Bool[np.ndarray, "height width"]
 _Count = Annotated[int, msgspec.Meta(ge=0, lt=2**53)]
@@ -45,12 +45,12 @@ class Target(StrEnum):
 
 @dataclass(frozen=True)
 class Brush:
-    """Tool of a tab."""
+    """Painting tool of a tab."""
 
     tool: Tool = Tool.OFF
     target: Target = Target.MASK
     label: int = 0
-    """Number of the class that is painted on the mask (`carts_core.model.parts.PartClass`); 0: any arm."""
+    """Number of the class that is painted on the mask (`carts_core.model.parts.PartClass`); 0 for any arm."""
     diameter: int = 20
     """Diameter of the brush [px]."""
     painted: Mapping[int, int] = field(default_factory=dict)
@@ -62,9 +62,9 @@ class Stroke:
     """One stroke or polygon, checked and clamped."""
 
     number: int
-    """The tab's own count of its strokes."""
+    """Number of the stroke, counted by its tab."""
     frame: int
-    """Index of the frame that it was drawn over, which may differ from the shown one."""
+    """Index of the frame on which the stroke was drawn; another frame may be shown by now."""
     camera: str
     target: Target
     erase: bool
@@ -74,14 +74,14 @@ class Stroke:
     points: Float[np.ndarray, "points 2"]
     """(u, v) [px], at most one image size beyond the image."""
     label: int = 0
-    """Number of the class that it paints; 0: any arm."""
+    """Number of the painted class; 0 for any arm."""
     prompt: bool = False
-    """Whether its point, or the box between its two points, is a prompt to the segmenter."""
+    """Whether the point, or the box between the two points, is a prompt to the segmenter."""
 
     def covers(self, camera: Camera) -> Mask:
-        """The pixels of the camera's image that it covers."""
+        """The pixels of the camera's image that the stroke covers."""
         canvas = np.zeros((camera.height, camera.width), np.uint8)
-        # OpenCV counts from the centre of a pixel, we from its corner.
+        # OpenCV places integer coordinates at pixel centres, this package at pixel corners.
         line = np.rint((self.points - 0.5) * 2**_FRACTION_BITS).astype(np.int32)
         if self.polygon:
             cv2.fillPoly(canvas, [line], 1, cv2.LINE_8, _FRACTION_BITS)
@@ -103,17 +103,16 @@ class Painted(Event):
     erase: bool
     polygon: bool
     diameter: Annotated[float, msgspec.Meta(gt=0)]
-    points: Annotated[list[tuple[float, float]], msgspec.Meta(min_length=1, max_length=LONGEST_STROKE)]
+    points: Annotated[list[tuple[float, float]], msgspec.Meta(min_length=1, max_length=MAX_STROKE_POINTS)]
     label: _Count = 0
     prompt: bool = False
 
 
 def read_stroke(painted: Painted, frames: int, cameras: Mapping[str, Camera], classes: int = 0) -> Stroke:
-    """A stroke over a frame of a recording, which has these cameras, by name, and classes.
+    """Check a stroke, given the numbers of frames and classes and the cameras by name; clamp its points and diameter.
 
     Raises:
-        SettingsError: it is not a stroke over one of these frames and cameras. Points beyond the image and a brush that
-            is too thick are clamped instead.
+        SettingsError: the frame, camera or class does not exist, or the number of points is invalid.
     """
     camera, count = cameras.get(painted.camera), len(painted.points)
     shaped = count <= 2 if painted.prompt else count >= 3 or not painted.polygon
@@ -138,9 +137,9 @@ def read_stroke(painted: Painted, frames: int, cameras: Mapping[str, Camera], cl
 
 
 def corrected(old: MaskCorrection | None, stroke: Mask, rendered: Mask, *, erase: bool) -> MaskCorrection | None:
-    """The correction after a stroke that adds pixels to the mask or removes them; None if none is left.
+    """The correction after a stroke that adds pixels to the mask or removes them; None if it is empty.
 
-    Only pixels that are not rendered are added, and only rendered ones are removed.
+    Only pixels that are not rendered are added, and only rendered pixels are removed.
     """
     nothing = np.zeros_like(stroke)
     added, removed = (nothing, nothing) if old is None else (old.added(), old.removed())
@@ -152,7 +151,7 @@ def corrected(old: MaskCorrection | None, stroke: Mask, rendered: Mask, *, erase
 
 
 def relabelled(old: PartLabels | None, stroke: Mask, label: int, *, erase: bool) -> PartLabels | None:
-    """The painted classes after a stroke on the mask; None if none is left.
+    """The painted classes after a stroke on the mask; None if there are none.
 
     Removed pixels lose their class; pixels added without a class keep theirs.
     """
@@ -164,7 +163,7 @@ def relabelled(old: PartLabels | None, stroke: Mask, label: int, *, erase: bool)
 
 
 def ignored(old: IgnoreRegion | None, stroke: Mask, *, erase: bool) -> IgnoreRegion | None:
-    """The ignore region after a stroke; None if none is left."""
+    """The ignore region after a stroke; None if it is empty."""
     region = np.zeros_like(stroke) if old is None else old.region()
     region = region & ~stroke if erase else region | stroke
     return IgnoreRegion.of(region) if region.any() else None

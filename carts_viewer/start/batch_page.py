@@ -1,4 +1,4 @@
-"""Page of a batch: its jobs, failures first, and its worst frames, with buttons that open them."""
+"""Page of a batch: table of jobs, failures first, and the worst frames."""
 
 import threading
 from collections import Counter
@@ -24,17 +24,18 @@ from carts_core.recording import Sequence
 from carts_viewer.start.host import Host
 from carts_viewer.transport.document import render
 
-_SECONDS = 5.0
+_UPDATE_INTERVAL = 5.0
 """Interval between updates while jobs run [s]."""
-_WORST = 12
-_SHOWN = 500
-"""Most listed jobs."""
+_MAX_WORST = 12
+"""Maximum number of shown frames."""
+_MAX_LISTED = 500
+"""Maximum number of listed jobs."""
 _SEPARATOR = "\n"
-"""Separates job and frame in the value of a button; no name contains it."""
+"""Separator of job and frame in the value of a button; names do not contain it."""
 
 
 class BatchPage:
-    """A table of jobs and pictures of the worst frames; each opens for review."""
+    """Table of jobs and pictures of the worst frames, which can be opened for review."""
 
     def __init__(self, site: Host, folder: Path) -> None:
         """
@@ -48,7 +49,7 @@ class BatchPage:
         self._closed = threading.Event()
 
     def show(self) -> None:
-        """Update the document, now and as long as jobs run."""
+        """Update the document, and repeat the update while jobs run."""
         known = most_urgent_first(known_jobs(self._batch, self._jobs))
         counts = Counter(entry.status for entry in known)
         content = render(
@@ -57,7 +58,7 @@ class BatchPage:
             summary=", ".join(f"{counts[status]} {status}" for status in ORDER if counts[status]),
             problem=self._problem,
             known=known,
-            most=_SHOWN,
+            most=_MAX_LISTED,
             worst=self._worst(known),
             separator=_SEPARATOR,
         )
@@ -66,7 +67,7 @@ class BatchPage:
             self._update()
 
     def choose(self, name: str, value: str) -> None:
-        """Carry out a choice."""
+        """Carry out a choice of the user."""
         self._problem = ""
         match name:
             case "back":
@@ -92,7 +93,7 @@ class BatchPage:
         """Open a job's recording with its results.
 
         Raises:
-            CartsError: there is no such job, or it lies outside of the allowed folders, or has no results.
+            CartsError: the job is unknown, lies outside of the allowed folders, or has no results.
         """
         job = next((job for job in self._jobs if job.name == name), None)
         if job is None:
@@ -106,18 +107,18 @@ class BatchPage:
         self._site.open_sequence(path, project=project, frame=frames.index(frame_id) if frame_id in frames else None)
 
     def _worst(self, known: list[KnownJob]) -> list[tuple[float, KnownJob, FrameFinding, str]]:
-        """Frames with the highest probability of failure: probability, job, frame, and address of the picture."""
+        """Probability, job, frame and URL of the picture of the frames with the highest probability of failure."""
         found = [
             (frame.probability, entry, frame)
             for entry in known
             for frame in (entry.findings.frames if entry.findings else ())
             if frame.picture
         ]
-        worst = sorted(found, key=lambda each: -each[0])[:_WORST]
+        worst = sorted(found, key=lambda each: -each[0])[:_MAX_WORST]
         return [(each, entry, frame, self._published(entry, frame.picture)) for each, entry, frame in worst]
 
     def _published(self, entry: KnownJob, name: str) -> str:
-        """The address of a picture of a job; empty where it cannot be read."""
+        """URL of a job's picture; empty if the picture cannot be read."""
         try:
             path = (self._batch / "jobs" / entry.job.name / name).path
             image = cv2.imdecode(np.frombuffer(read_bytes(path, IMAGE), np.uint8), cv2.IMREAD_COLOR)
@@ -127,7 +128,7 @@ class BatchPage:
 
     def _update(self) -> None:
         def wait() -> None:
-            if not self._closed.wait(_SECONDS):
+            if not self._closed.wait(_UPDATE_INTERVAL):
                 self._site.post(lambda: None if self._closed.is_set() else self.show())
 
         threading.Thread(target=wait, name="carts-batch-page", daemon=True).start()

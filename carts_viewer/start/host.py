@@ -6,19 +6,19 @@ from typing import Protocol
 
 from carts_core.errors import SettingsError
 from carts_core.networks import FeatureExtractor
-from carts_viewer.start.roots import MOST_ENTRIES, Entry, Roots
+from carts_viewer.start.roots import MAX_ENTRIES, Entry, Roots
 from carts_viewer.transport.document import Document
 from carts_viewer.transport.page import Page
 
 
 class SitePage(Protocol):
-    """A page of the site, such as the start page. Everything but the constructor is called on the site's thread."""
+    """A page of the site, such as the start page; its methods are called on the site's thread."""
 
     def show(self) -> None:
         """Update the document."""
 
     def choose(self, name: str, value: str) -> None:
-        """Carry out a choice in the document; a tab can send any two texts."""
+        """Carry out a choice in the document; a tab can send arbitrary strings."""
 
     def click(self, u: float, v: float) -> None:
         """Handle a click in the image, at shares of its width and height."""
@@ -31,41 +31,41 @@ class SitePage(Protocol):
 
 
 class Host(Protocol):
-    """The site as its pages see it."""
+    """Interface of the site for its pages."""
 
     page: Page
     document: Document
     roots: Roots
 
     def post(self, job: Callable[[], None]) -> None:
-        """Queue a function for the site's thread. Any thread may call this."""
+        """Queue a function for the site's thread. Thread-safe."""
 
     def load_networks(self) -> FeatureExtractor:
-        """Load the networks. Any thread may ask.
+        """Load the networks. Thread-safe.
 
         Raises:
-            WeightsError: they cannot be loaded.
+            WeightsError: the networks cannot be loaded.
         """
         ...
 
     def show_start(self, problem: str = "") -> None:
-        """Go to the start page."""
+        """Show the start page."""
 
     def show_recording(self, draft: str | None = None) -> None:
-        """Go to New recording: a new one, or an existing draft."""
+        """Show the page *New recording* with a new or an existing draft."""
 
     def show_batch(self, folder: Path) -> None:
-        """Go to a batch; if it cannot be read, to the start page with the reason."""
+        """Show a batch, or the start page with an error if the batch cannot be read."""
 
     def open_sequence(self, path: Path, *, project: Path | None = None, frame: int | None = None) -> None:
-        """Go to the viewer of a sequence and one of its frames; if it cannot be opened, to the start page."""
+        """Show the viewer of a sequence, or the start page with an error if the sequence cannot be opened."""
 
     def open_sample(self) -> None:
         """Open the shipped sequence."""
 
 
 Wanted = Callable[[Entry], bool]
-"""Whether a file may be picked."""
+"""Returns whether a file may be picked."""
 
 
 class FileBrowser:
@@ -73,14 +73,14 @@ class FileBrowser:
 
     Attributes:
         roots: the allowed folders.
-        wanted: which files may be picked; others are shown greyed out.
+        wanted: returns whether a file may be picked; other files are disabled.
         folders: whether a folder may be picked.
         purpose: instruction for the user.
-        folder: what is listed; None for the list of the allowed folders.
-        problem: why the last choice was not possible; empty if it was.
+        folder: the listed folder; None for the list of the allowed folders.
+        problem: error of the last choice; empty if there was none.
     """
 
-    most = MOST_ENTRIES
+    most = MAX_ENTRIES
 
     def __init__(self, roots: Roots, *, wanted: Wanted, folders: bool, purpose: str) -> None:
         self.roots, self.wanted, self.folders, self.purpose = roots, wanted, folders, purpose
@@ -94,7 +94,7 @@ class FileBrowser:
             self.folder, self.problem = self.roots.folders[0], ""
 
     def browse(self, text: str) -> None:
-        """Go to a folder; "" is the list of the allowed ones."""
+        """List a folder, or, for an empty string, the allowed folders."""
         self.problem = ""
         try:
             folder = self.roots.checked(text) if text else None

@@ -9,8 +9,8 @@ from pathlib import Path
 
 from carts_core.errors import SettingsError
 
-MOST_ENTRIES = 2000
-"""Largest number of listed entries of a folder."""
+MAX_ENTRIES = 2000
+"""Maximum number of listed entries of a folder."""
 
 
 @dataclass(frozen=True)
@@ -21,13 +21,13 @@ class Entry:
     path: Path
     is_folder: bool
     size: int
-    """[bytes]"""
+    """Size [bytes]."""
     changed: float
-    """[s since 1970]"""
+    """Modification time [s since 1970]."""
 
     @property
     def about(self) -> str:
-        """Size and day of a file."""
+        """Size and modification date, as text."""
         size, unit = float(self.size), "B"
         for unit in ("B", "KB", "MB", "GB"):
             if size < 1000 or unit == "GB":
@@ -51,14 +51,14 @@ class Roots:
         for folder in folders:
             if not folder.is_dir():
                 raise SettingsError(f"--root {folder} is not a folder. Give folders that contain recordings.")
-        # A named root may be a link; links below it are not followed.
+        # An allowed folder may itself be a link; links below it are not followed.
         self.folders = tuple(dict.fromkeys(folder.resolve() for folder in folders))
 
     def checked(self, text: str | Path) -> Path:
-        """An absolute path below one of the folders, without links and hidden folders in it.
+        """Check an absolute path below one of the folders.
 
         Raises:
-            SettingsError: it is outside, does not exist, or has a link or a hidden folder in its path.
+            SettingsError: the path is outside of the folders, does not exist, or contains a link or a hidden folder.
         """
         path = Path(text)
         root = next((root for root in self.folders if path == root or path.is_relative_to(root)), None)
@@ -84,7 +84,7 @@ class Roots:
         return path
 
     def entries(self, folder: Path) -> list[Entry]:
-        """Folders, then files, each by name; without hidden ones and links.
+        """Folders and then files, sorted by name, without hidden entries and links.
 
         Raises:
             SettingsError: the folder is not allowed, or not readable.
@@ -93,7 +93,7 @@ class Roots:
         try:
             with os.scandir(self.checked(folder)) as listing:
                 for each in listing:
-                    if each.name.startswith(".") or each.is_symlink() or len(found) >= MOST_ENTRIES:
+                    if each.name.startswith(".") or each.is_symlink() or len(found) >= MAX_ENTRIES:
                         continue
                     is_folder = each.is_dir(follow_symlinks=False)
                     if is_folder or each.is_file(follow_symlinks=False):

@@ -40,7 +40,7 @@ class Site:
         shown: the shown page; None while a sequence is open.
         app: the viewer of the open sequence, if there is one.
         url: address of the page.
-        incident: message on the file with the corrections of a closed sequence, if they are not in its project.
+        incident: message that names the file with the corrections of a closed sequence, if it is not its project.
     """
 
     def __init__(
@@ -83,14 +83,14 @@ class Site:
         self.close()
 
     def post(self, job: Callable[[], None]) -> None:
-        """Queue a function for the site's thread. Any thread may call this."""
+        """Queue a function for the site's thread. Thread-safe."""
         self._jobs.put(job)
 
     def wait(self, timeout: float = 120.0) -> None:
-        """Wait at most `timeout` [s] until all requests so far are done.
+        """Wait until all requests so far are done.
 
         Raises:
-            TimeoutError: they are not, in that time.
+            TimeoutError: the site is still busy after `timeout` [s].
         """
         done = threading.Event()
         self.post(done.set)
@@ -116,21 +116,21 @@ class Site:
         return OptimizerFactory(report=self._report, **networks).prepare()  # pyright: ignore[reportArgumentType]
 
     def show_start(self, problem: str = "") -> None:
-        """Go to the start page."""
-        self._go(lambda: StartPage(self, problem))
+        """Show the start page."""
+        self._show(lambda: StartPage(self, problem))
 
     def show_recording(self, draft: str | None = None) -> None:
-        """Go to New recording: a new one, or an existing draft."""
-        self._go(lambda: RecordingWizard(self, draft))
+        """Show the page *New recording* with a new or an existing draft."""
+        self._show(lambda: RecordingWizard(self, draft))
 
     def open_sample(self) -> None:
         """Open the shipped sequence."""
         self.open_sequence(sample_sequence())
 
     def show_batch(self, folder: Path) -> None:
-        """Go to a batch; if it cannot be read, to the start page with the reason."""
+        """Show a batch, or the start page with an error if the batch cannot be read."""
         try:
-            self._go(lambda: BatchPage(self, folder))
+            self._show(lambda: BatchPage(self, folder))
         except CartsError as error:
             self.show_start(str(error))
 
@@ -163,8 +163,8 @@ class Site:
         self.document.show("")
         self.page.reload()
 
-    def _go(self, make: Callable[[], SitePage]) -> None:
-        """Close the shown page and show another one."""
+    def _show(self, make: Callable[[], SitePage]) -> None:
+        """Close the shown page, and show another page."""
         self._leave()
         again = not self._listening
         if again:

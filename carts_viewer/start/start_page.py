@@ -20,13 +20,13 @@ from carts_core.project.identity import data_dir
 from carts_core.recording import Sequence
 from carts_core.resources import sample_sequence
 from carts_viewer.app import ViewerApp
-from carts_viewer.jobs.companions import damage
+from carts_viewer.jobs.companions import set_aside_damaged
 from carts_viewer.picture.layers import small_jpeg
 from carts_viewer.start.host import FileBrowser, Host, Wanted
 from carts_viewer.transport.document import render
 from carts_viewer.wizard.draft import delete_draft, drafts
 
-_KEPT = 24
+_MAX_RECENT = 24
 _WIDTH = 320
 """Width of a thumbnail [px]."""
 _DONE = frozenset({ReviewState.ACCEPTED, ReviewState.REJECTED})
@@ -38,10 +38,10 @@ class RecentProject:
     """Recently opened sequence."""
 
     sequence: str
-    """Path of its file."""
+    """Path of the sequence file."""
     name: str
     project: str
-    """Path of its project."""
+    """Path of the project file."""
     frames: _Count
     reviewed: _Count
     """Number of accepted or rejected frames."""
@@ -52,7 +52,7 @@ class RecentProject:
 
     @property
     def thumbnail(self) -> Path:
-        """Path of its thumbnail, which may be missing."""
+        """Path of the thumbnail, which may not exist."""
         return _folder() / f"{sha256(self.sequence.encode()).hexdigest()[:16]}.jpg"
 
 
@@ -65,19 +65,19 @@ def recent_projects() -> list[RecentProject]:
 
 
 def set_damaged_aside() -> str:
-    """Set a damaged list aside; gives a text for the user, empty where it is not damaged."""
+    """Set a damaged list aside; returns a message for the user, empty if the list is not damaged."""
     try:
         _read()
     except (OSError, ValueError) as error:
-        return damage(_list(), "list of recent recordings", error, "A new list was started")
+        return set_aside_damaged(_list(), "list of recent recordings", error, "A new list was started")
     return ""
 
 
 def _read() -> list[RecentProject]:
-    """The list.
+    """Read the list.
 
     Raises:
-        OSError, ValueError: it is damaged.
+        OSError, ValueError: the list is damaged.
     """
     try:
         return typed(parse_json(read_text(_list(), TABLE)), list[RecentProject])
@@ -86,7 +86,7 @@ def _read() -> list[RecentProject]:
 
 
 def up_to_date(project: RecentProject) -> RecentProject:
-    """The entry with the current numbers of its project file, which another program may have changed.
+    """The entry with its counts of reviewed and corrected frames, read again if the project file has changed.
 
     Raises:
         ProjectError: the project cannot be read.
@@ -98,17 +98,17 @@ def up_to_date(project: RecentProject) -> RecentProject:
     # An unchanged project is not read again.
     if max(stamp) <= project.changed:
         return project
-    reviewed, corrected = _read_numbers(path, stamp)
+    reviewed, corrected = _read_counts(path, stamp)
     return replace(project, reviewed=reviewed, corrected=corrected, changed=max(stamp))
 
 
-@lru_cache(maxsize=_KEPT)
-def _read_numbers(path: Path, stamp: tuple[float, float]) -> tuple[int, int]:
-    return _numbers(read_state(path))
+@lru_cache(maxsize=_MAX_RECENT)
+def _read_counts(path: Path, stamp: tuple[float, float]) -> tuple[int, int]:
+    return _counts(read_state(path))
 
 
-def _numbers(state: ProjectState) -> tuple[int, int]:
-    """Numbers of reviewed and of corrected frames."""
+def _counts(state: ProjectState) -> tuple[int, int]:
+    """Numbers of reviewed and corrected frames."""
     frames = range(len(state.identity.frame_ids))
     reviewed = sum(state.review(index).state in _DONE for index in frames)
     return reviewed, sum(bool(state.joints(index)) for index in frames)
@@ -123,7 +123,7 @@ def _changed(path: Path) -> float:
 
 
 def thumbnail(project: RecentProject) -> bytes | None:
-    """A JPEG file, None without one."""
+    """Thumbnail of a project as a JPEG file; None if there is none."""
     try:
         return read_bytes(project.thumbnail, TABLE)
     except (CartsError, OSError):
@@ -132,7 +132,7 @@ def thumbnail(project: RecentProject) -> bytes | None:
 
 def remember(app: ViewerApp) -> None:
     """Move the sequence of a viewer, open or closed, to the head of the list."""
-    reviewed, corrected = _numbers(app.project.state)
+    reviewed, corrected = _counts(app.project.state)
     entry = RecentProject(
         sequence=str(app.sequence.path),
         name=app.sequence.name,
@@ -153,7 +153,7 @@ def forget(sequence: str) -> None:
 
 def _write(projects: Iterable[RecentProject]) -> None:
     set_damaged_aside()
-    write_text(_list(), json.dumps([asdict(each) for each in projects][:_KEPT], indent=1))
+    write_text(_list(), json.dumps([asdict(each) for each in projects][:_MAX_RECENT], indent=1))
 
 
 def _folder() -> Path:
@@ -189,7 +189,7 @@ class StartPage:
         self._site.document.show(content)
 
     def choose(self, name: str, value: str) -> None:
-        """Carry out a choice."""
+        """Carry out a choice of the user."""
         self._problem = ""
         browser = self._browser
         match name:
@@ -232,7 +232,7 @@ class StartPage:
         """Does nothing."""
 
     def _card(self, project: RecentProject) -> tuple[RecentProject, str, str]:
-        """The current entry of a project, the error that prevents it, and the address of its picture."""
+        """Current entry of a project, the error if the project cannot be read, and the URL of the thumbnail."""
         picture = self._published(thumbnail(project))
         try:
             return up_to_date(project), "", picture
@@ -240,7 +240,7 @@ class StartPage:
             return project, str(error), picture
 
     def _published(self, jpeg: bytes | None) -> str:
-        """The address of a picture; empty without one."""
+        """URL of a picture; empty if there is none."""
         return "" if jpeg is None else self._site.page.media.publish(jpeg)
 
 

@@ -1,7 +1,7 @@
 """A document over the page: HTML from the server, and the choices made in it.
 
-An element with `data-do="NAME"` reports a click (a button) or a change of its value (a list, a field). The handler of
-the name checks the value: a tab can send anything (`events.Chosen`).
+An element with `data-do="NAME"` reports a click (a button) or a change of its value (a list, a field) as
+`events.Chosen`. The handler checks name and value, since a tab can send arbitrary strings.
 """
 
 import functools
@@ -24,15 +24,15 @@ class Document:
     def __init__(self, page: Page) -> None:
         self.page = page
         self._shown = ("", "")
-        # A tab that joins later.
+        # Tabs that connect later get the document, too.
         page.server.on_client_connect(lambda client: self._send(client) if self._shown[0] else None)
 
     def show(self, content: str, place: str = "page") -> None:
-        """Show HTML in all tabs and in those that join later.
+        """Show HTML in all tabs, including tabs that connect later.
 
         Args:
             content: HTML with escaped values; "" removes the document.
-            place: "page" covers the whole page, "side" its left side, beside the visible image.
+            place: "page" covers the whole page; "side" covers its left side, so that the image remains visible.
         """
         self._shown = (content, place)
         for client in self.page.server.get_clients().values():
@@ -40,7 +40,7 @@ class Document:
 
     @property
     def content(self) -> str:
-        """The HTML that is shown; empty if none is."""
+        """The shown HTML; empty if there is none."""
         return self._shown[0]
 
     def _send(self, client: viser.ClientHandle) -> None:
@@ -48,12 +48,12 @@ class Document:
 
 
 def escaped(value: Any) -> str:
-    """Text for use inside HTML and its attributes."""
+    """The text escaped for use in HTML and its attributes."""
     return html.escape(visible(str(value)), quote=True)
 
 
 def render(template: str, **values: Any) -> str:
-    """HTML of a template of `carts_viewer/templates/`; values are escaped as `escaped` does."""
+    """HTML of a template in `carts_viewer/templates/`; values are escaped as by `escaped`."""
     return _templates().get_template(template).render(values)
 
 

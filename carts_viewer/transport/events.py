@@ -1,4 +1,4 @@
-"""Events that a tab reports, besides intents: decoded by type, and otherwise not trusted."""
+"""Events that a tab reports in addition to intents; their types are checked, but their values are not trusted."""
 
 from typing import Annotated, Any, dataclass_transform
 
@@ -22,15 +22,15 @@ class Hello(Event):
     name: _Text = ""
     light: bool = False
     frame: int | None = None
-    """From 0."""
+    """Index of the frame."""
     camera: _Text | None = None
     domain: _Text | None = None
     settings: dict[str, Any] = {}
-    """Choices that the browser has stored, see `page_state.remembered`."""
+    """Choices that the browser has stored, see `page_state.stored_choices`."""
 
 
 class Theme(Event):
-    """Light or dark was chosen."""
+    """The light or the dark theme was chosen."""
 
     light: bool
 
@@ -52,7 +52,7 @@ class Pressed(Event):
 
 
 class Pointed(Event):
-    """A keypoint was placed in the image of a camera, by its index."""
+    """A keypoint was placed in the image of the camera with this index."""
 
     camera: int
     at: _Point
@@ -75,7 +75,7 @@ class Clicked(Event):
 
 
 class Chosen(Event):
-    """Something was chosen in a document over the page."""
+    """A value was chosen in the document over the page."""
 
     name: _Text
     value: _Text

@@ -23,12 +23,12 @@ from carts_core.errors import SettingsError
 
 PAGES = ("/", "/index.html")
 """Paths of the page."""
-_ELSEWHERE = "192.0.2.1"
-"""An address reserved for documentation, to find the outgoing network interface."""
+_REMOTE = "192.0.2.1"
+"""Address reserved for documentation (RFC 5737), used to find the outgoing network interface."""
 
 
 def check_address(host: str, port: int) -> None:
-    """Raise `SettingsError` unless `host` is an address of this computer and `port` a port."""
+    """Raise `SettingsError` unless `host` is an address of this computer and `port` is valid."""
     if not 0 <= port <= 65535:
         raise SettingsError(f"Port {port} is invalid. Give 1 to 65535, or 0 for a free port.")
     try:
@@ -44,7 +44,7 @@ def check_address(host: str, port: int) -> None:
 
 
 class Guard:
-    """Decides which requests one server answers.
+    """Decides which requests a server answers.
 
     Attributes:
         token: Token required in a first request; None if only this computer can reach the server.
@@ -53,7 +53,7 @@ class Guard:
     def __init__(self, host: str) -> None:
         self._host = host
         self.token = None if _is_loopback(host) else secrets.token_urlsafe(32)
-        # Not the token itself, which may stay behind in a browser's history or a terminal.
+        # Differs from the token, which may remain in a browser's history or a terminal.
         self._session = secrets.token_urlsafe(32)
 
     def url(self, port: int) -> str:
@@ -68,7 +68,7 @@ class Guard:
 
         Args:
             target: Requested path and query.
-            headers: Of the request.
+            headers: Headers of the request.
         """
         hosts = headers.get_all("Host")
         if len(hosts) != 1 or not self._is_ours(_hostname(hosts[0])):
@@ -83,9 +83,9 @@ class Guard:
         return None
 
     def cookie(self, target: str, headers: Headers) -> str | None:
-        """The `Set-Cookie` that answers a request for the page with a token; None without one.
+        """`Set-Cookie` header of the response to a request with a token; None if the request has no token.
 
-        Scripts cannot read it, and no other site can make a browser send it.
+        Scripts cannot read the cookie, and no other site can make a browser send it.
         """
         if self.token is None or not self._has_token(target):
             return None
@@ -146,7 +146,7 @@ def _is_loopback(host: str) -> bool:
 
 
 def _is_wildcard(host: str) -> bool:
-    """Whether a server there listens on every address of this computer."""
+    """Whether a server with this address listens on every address of this computer."""
     address = _address(host)
     return address is not None and address.is_unspecified
 
@@ -155,8 +155,8 @@ def _own_address() -> str:
     """The address by which other computers most likely reach this one."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         try:
-            # Sends nothing: it only makes the system choose a network interface.
-            probe.connect((_ELSEWHERE, 9))
+            # Sends nothing; the system only chooses a network interface.
+            probe.connect((_REMOTE, 9))
         except OSError:
             return socket.gethostname()
         return str(probe.getsockname()[0])
@@ -167,19 +167,19 @@ def _bracketed(host: str) -> str:
 
 
 def _hostname(host: str) -> str | None:
-    """Host name in a `Host` header; None where it is not a name with an optional port."""
+    """Host name in a `Host` header; None if it is not a name with an optional port."""
     try:
         parts = urlsplit(f"//{host}")
-        _ = parts.port  # Raises when it is none.
+        _ = parts.port  # Raises if the port is invalid.
     except ValueError:
         return None
     return parts.hostname if parts.netloc == host and parts.username is None else None
 
 
-LARGEST_MESSAGE = 1 << 20
-"""[bytes]; a larger one ends the connection."""
-_LARGEST_NUMBER = float(1 << 53)
-"""Up to here a float holds every integer."""
+MAX_MESSAGE_SIZE = 1 << 20
+"""Maximum size of a message [bytes]; a larger message ends the connection."""
+_MAX_NUMBER = float(1 << 53)
+"""Maximum absolute value of a number; floats represent all integers up to this value."""
 _Point = tuple[float, float, float]
 
 
@@ -201,7 +201,7 @@ class CommandTriggerMessage(msgspec.Struct, tag_field="type", tag=True, forbid_u
 
 
 class ViewerCameraMessage(msgspec.Struct, tag_field="type", tag=True, forbid_unknown_fields=True):
-    """The tab's camera; the first one says that the tab is ready."""
+    """Camera of the tab; the first message shows that the tab is ready."""
 
     wxyz: tuple[float, float, float, float]
     position: _Point
@@ -222,13 +222,13 @@ def refusal(data: object, value_of: Callable[[str], Any]) -> str | None:
 
     Args:
         data: The message.
-        value_of: The present value of the widget with this id; None when there is no such widget.
+        value_of: Returns the current value of the widget with an id; None if there is no such widget.
     """
     if not isinstance(data, bytes):
-        return "it is text"
+        return "text instead of bytes"
     try:
         message = _DECODER.decode(data)
-    # The latter two are raised for invalid UTF-8 and for excessive nesting.
+    # Invalid UTF-8 raises UnicodeDecodeError, and excessive nesting raises RecursionError.
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         return str(error)
     if isinstance(message, GuiUpdateMessage):
@@ -240,7 +240,7 @@ def _value_refusal(value: bool | int | float | str, present: Any) -> str | None:
     if isinstance(present, int | float) and not isinstance(present, bool):
         if isinstance(value, bool | str):
             return f"{type(value).__name__} for a number"
-        if not (math.isfinite(value) and abs(value) <= _LARGEST_NUMBER):
+        if not (math.isfinite(value) and abs(value) <= _MAX_NUMBER):
             return "a number out of range"
     elif type(present) is not type(value) or not isinstance(present, bool | str):
         return f"{type(value).__name__} for {'no widget' if present is None else type(present).__name__}"
@@ -255,10 +255,10 @@ _SERVER_CONSTRUCTION = threading.Lock()
 def gated(
     respond: Callable[[Request], Response | Awaitable[Response] | None], refuse: Callable[[object], str | None]
 ) -> Iterator[None]:
-    """While active, websocket servers that are started filter requests and messages.
+    """Context in which started websocket servers filter requests and messages.
 
     Args:
-        respond: Answers a request; None leaves that to the server.
+        respond: Returns the response to a request; None to let the server respond.
         refuse: Returns the reason to drop a message; None to accept it.
     """
     original = websockets.asyncio.server.serve
@@ -284,7 +284,7 @@ def gated(
                 return answer
             return process_request(connection, request)
 
-        options = {**options, "max_size": LARGEST_MESSAGE, "create_connection": Connection}
+        options = {**options, "max_size": MAX_MESSAGE_SIZE, "create_connection": Connection}
         return original(*arguments, process_request=guarded, **options)
 
     with _SERVER_CONSTRUCTION:
@@ -296,7 +296,7 @@ def gated(
 
 
 def response(status: http.HTTPStatus, kind: str, body: bytes, **more: str) -> Response:
-    """A response with headers against MIME sniffing, caching and framing; `more` are headers, `_` for `-`."""
+    """A response with headers against MIME sniffing, caching and framing; `more`: headers with `_` instead of `-`."""
     headers = Headers()
     headers["Content-Type"] = kind
     headers["Content-Length"] = str(len(body))

@@ -37,8 +37,8 @@ class TabPage:
 
     Attributes:
         client: the tab's connection.
-        gui: where widgets are added.
-        scene: where nodes are added.
+        gui: the tab's widgets.
+        scene: the tab's 3D scene.
     """
 
     def __init__(self, client: viser.ClientHandle) -> None:
@@ -52,11 +52,11 @@ class TabPage:
         call(self.client, name, *arguments)
 
     def on_pressed(self, callback: Callable[[str], None]) -> None:
-        """Call `callback(key)` when a key of `OWN_KEYS` is pressed in this tab; a tab can send any text."""
+        """Call `callback(key)` when a key of `OWN_KEYS` is pressed in this tab; the key may be an arbitrary string."""
         self._pressed.append(callback)
 
     def press(self, key: str) -> None:
-        """A key of `OWN_KEYS` was pressed in this tab."""
+        """Call the callbacks for a key that was pressed in this tab."""
         for callback in self._pressed:
             callback(key)
 
@@ -86,12 +86,12 @@ class TabPage:
 
         Args:
             handles: The widgets, in order.
-            count: How many to a line.
+            count: Number of columns.
             narrow_labels: Make labels as narrow as their text, and fields as wide as possible.
         """
         for first in range(0, len(handles), count):
             group = [element_id(handle) for handle in handles[first : first + count]]
-            # A short last line keeps the width of the others.
+            # Widgets in an incomplete last row are as wide as the others.
             box = "div:has(> .mantine-Flex-root > div [id='{}'])"
             self._side_by_side(group, [1.0] * len(group), box, total=float(count))
             if narrow_labels:
@@ -99,7 +99,7 @@ class TabPage:
                 self.gui.add_html(f"<style>{labels} {{ width: auto !important; white-space: nowrap }}</style>")
 
     def _side_by_side(self, ids: Sequence[str], shares: Sequence[float], box: str, total: float | None = None) -> None:
-        """Lay out the boxes of these elements in a line, by a style sheet for their ids."""
+        """Lay out the boxes of these elements in a row, by a style sheet for their ids."""
         total = sum(shares) if total is None else total
         boxes = [box.format(name) for name in ids]
         rules = [
@@ -107,7 +107,7 @@ class TabPage:
             "margin-inline: 0 !important; padding-inline: 4px !important }"
         ]
         for one, share in zip(boxes, shares, strict=True):
-            # The line is as wide as single elements, which keep 10 px from either side of the panel.
+            # The row is as wide as a single element, which keeps 10 px from either side of the panel.
             rules.append(f"{one} {{ width: calc((100% - 12px) * {share / total:.4f}) }}")
         rules.append(f"{boxes[0]} {{ margin-left: 6px !important }}")
         self.gui.add_html(f"<style>{' '.join(rules)}</style>")
@@ -120,10 +120,10 @@ def call(client: viser.ClientHandle, name: str, *arguments: Any) -> None:
 
 _log = logging.getLogger(__name__)
 _TITLE, _LOADER, _CLIENT = "<title>Viser</title>", "<script data-p=", 'e.type="module";'
-"""Replaced parts of viser's page: its title, the script that unpacks the client, and the client's own element."""
+"""Replaced parts of viser's page: its title, the script that unpacks the client, and the client's script element."""
 
 
-def index_of_viser(head: str, nonce: str) -> str:
+def viser_index(head: str, nonce: str) -> str:
     """HTML of viser's page with `head` in place of its title, and a nonce for its inline scripts.
 
     Raises:
@@ -142,36 +142,36 @@ def _parts() -> tuple[str, str]:
         raise CartsError(
             f"{index} is not the page of viser 1.1. Install the supported version: pip install 'viser~=1.1.1'"
         )
-    # The client's own script element gets the nonce of the one that unpacks it.
+    # The client's script element gets the nonce of the script that unpacks the client.
     text = text.replace(_CLIENT, f'{_CLIENT}e.nonce=document.querySelector("script[data-p]").nonce;')
     before, _, after = text.partition(_TITLE)
     return before, after
 
 
 MEDIA = "/media/"
-_MOST = 256
-"""Number of pictures kept; the oldest go first."""
+_MAX_PICTURES = 256
+"""Maximum number of kept pictures; the oldest are removed first."""
 
 
 class Media:
-    """Pictures by names that follow from their content."""
+    """Pictures that are served under hashes of their content."""
 
     def __init__(self) -> None:
         self._contents: OrderedDict[str, bytes] = OrderedDict()
         self._lock = threading.Lock()
 
     def publish(self, jpeg: bytes) -> str:
-        """Serve a JPEG file from now on; gives its address."""
+        """Serve a JPEG file, and return its address."""
         name = f"{hashlib.sha256(jpeg).hexdigest()[:24]}.jpg"
         with self._lock:
             self._contents[name] = jpeg
             self._contents.move_to_end(name)
-            while len(self._contents) > _MOST:
+            while len(self._contents) > _MAX_PICTURES:
                 self._contents.popitem(last=False)
         return MEDIA + name
 
     def answer(self, name: str) -> Response:
-        """The picture of a name, or status 404."""
+        """The picture with this name; status 404 if there is none."""
         with self._lock:
             content = self._contents.get(name)
         if content is None:
@@ -196,14 +196,14 @@ WebAssembly, writes style sheets, and makes its workers and textures from blobs.
 
 
 class Page:
-    """A viser server that answers its own page only, plus the script that runs in that page."""
+    """A viser server that answers only requests from its own page, and the scripts of this page."""
 
     def __init__(self, *, host: str = "127.0.0.1", port: int = 8080, title: str = "CaRTS") -> None:
         """Start serving.
 
         Args:
-            host: The address to listen on; one that other computers can reach adds a token to the url.
-            port: The port to listen on; 0 picks a free one; instead of a busy one the next free one is used.
+            host: The address to listen on. The URL contains a token if other computers can reach the address.
+            port: The port to listen on; 0 for any free port. If the port is busy, the next free port is used.
             title: The browser tab's title.
 
         Raises:
@@ -213,12 +213,12 @@ class Page:
         self._guard = Guard(host)
         self._title = title
         self.key_groups: list[Any] = []
-        """Content of the key sheet: groups with pairs of key and meaning."""
+        """Content of the key sheet: groups with pairs of key and description."""
         self.project = ""
-        """Name of the recording that is shown; empty while none is."""
+        """Name of the shown recording; empty if there is none."""
         self.media = Media()
         self.thumbnail: Callable[[str], Awaitable[Response]] | None = None
-        """Answers requests below `/thumbnail/`; None while no recording is shown."""
+        """Answers requests below `/thumbnail/`; None if no recording is shown."""
         self._files = {path.name: path for path in static_dir().iterdir() if path.is_file()}
         queue_safely()
         list_icons_once()
@@ -229,37 +229,37 @@ class Page:
             self.server = viser.ViserServer(host=host, port=port, verbose=False)
         self.url = self._guard.url(self.server.get_port())
         self._add_channel()
-        self._orient()
+        self._set_initial_view()
         self._name = secrets.token_hex(8)
-        self.server.on_client_connect(lambda client: call(client, "meet", self._name))
-        self._farewells: list[Callable[[int], None]] = []
-        self.server.on_client_disconnect(self._part)
+        self.server.on_client_connect(lambda client: call(client, "reloadIfServerChanged", self._name))
+        self._disconnect_callbacks: list[Callable[[int], None]] = []
+        self.server.on_client_disconnect(self._disconnected)
 
     def on_disconnect(self, callback: Callable[[int], None]) -> None:
         """Call `callback(client_id)` whenever a tab disconnects, until the page is cleared."""
-        self._farewells.append(callback)
+        self._disconnect_callbacks.append(callback)
 
-    def _part(self, client: viser.ClientHandle) -> None:
-        for callback in list(self._farewells):
+    def _disconnected(self, client: viser.ClientHandle) -> None:
+        for callback in list(self._disconnect_callbacks):
             callback(client.client_id)
 
     def _add_channel(self) -> None:
-        """Invisible field whose value is the newest event of a tab, with the tab's key and its count of events."""
+        """Add the invisible field whose value is a tab's newest event, with the tab's key and its count of events."""
         self._channel = self.server.gui.add_text("channel", "", visible=False)
 
     def clear(self, title: str) -> None:
         """Remove all widgets, commands, nodes and callbacks; tabs must be reloaded once new ones exist."""
         self._title = title
-        self._farewells.clear()
+        self._disconnect_callbacks.clear()
         self.key_groups = []
         self.project = ""
         self.thumbnail = None
         self.server.gui.reset()
         self.server.scene.reset()
         self._add_channel()
-        self._orient()
+        self._set_initial_view()
 
-    def _orient(self) -> None:
+    def _set_initial_view(self) -> None:
         """Set OpenCV's axes and the initial view along the lens."""
         self.server.scene.set_up_direction("-y")
         initial = self.server.initial_camera
@@ -268,7 +268,7 @@ class Page:
     def reload(self) -> None:
         """Reload the page in every tab, without the frame in its address.
 
-        A tab that has loaded the page and is not connected yet does so when it is.
+        A tab that has loaded the page but is not connected yet reloads it after connecting.
         """
         self._name = secrets.token_hex(8)
         for client in self.server.get_clients().values():
@@ -283,8 +283,8 @@ class Page:
         """Call `callback(client_id, event)` on the event loop for events of a tab, until the page is cleared.
 
         Args:
-            kinds: Union of the structs that are decoded; anything else is refused.
-            callback: Takes an event, of which the types of its values alone are checked.
+            kinds: Union of the structs that are decoded; other events are refused.
+            callback: Receives an event; only the types of its values have been checked.
         """
         decoder, channel = msgspec.json.Decoder(tuple[str, int, kinds]), self._channel
 
@@ -300,11 +300,11 @@ class Page:
             callback(update.client_id, event)
 
     def element_id(self, handle: Any) -> str:
-        """The `id` that a GUI element's input carries in the page (for tests and scripts)."""
+        """The `id` of a widget's input element in the page (for tests and scripts)."""
         return element_id(handle)
 
     def _respond(self, request: Request) -> Response | Awaitable[Response] | None:
-        """The viewer's response to a request, or None for viser's."""
+        """The viewer's response to a request; None to let viser respond."""
         reason = self._guard.refusal(request.path, request.headers)
         if reason is not None:
             return response(http.HTTPStatus.FORBIDDEN, "text/plain; charset=utf-8", reason.encode())
@@ -322,7 +322,7 @@ class Page:
 
     def _page(self, request: Request) -> Response:
         nonce = secrets.token_urlsafe(16)
-        # viser's client connects to any server that `?websocket=` names, and executes its messages.
+        # Without a policy, viser's client would connect to any server in `?websocket=` and execute its messages.
         policy = _POLICY.format(nonce=nonce, host=request.headers["Host"])
         cookie = self._guard.cookie(request.path, request.headers)
         more = {"Content_Security_Policy": policy} | ({} if cookie is None else {"Set_Cookie": cookie})
@@ -357,4 +357,4 @@ class Page:
             f'<script src="/static/boot.js" data-configuration="{configuration}"></script>'
         )
         scripts = "".join(f'<script src="/static/{name}.js" defer></script>' for name in _SCRIPTS)
-        return index_of_viser(head + scripts, nonce).encode()
+        return viser_index(head + scripts, nonce).encode()

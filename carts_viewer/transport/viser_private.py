@@ -1,7 +1,7 @@
 """Private viser APIs used by the viewer.
 
 No other module uses them. viser is pinned to one minor version, tests/viewer/test_transport.py names every
-attribute that is used, and the browser tests drive them all.
+attribute that is used, and the browser tests use all of them.
 """
 
 import asyncio
@@ -37,17 +37,17 @@ def _icons() -> ZipFile:
 
 
 def element_id(handle: Any) -> str:
-    """The `id` that the input of a widget carries in the page."""
+    """The `id` of a widget's input element in the page."""
     return handle._impl.uuid
 
 
 def widgets(gui: viser.GuiApi) -> Iterable[Any]:
-    """All widgets of all tabs, or of one, that hold a value."""
+    """All widgets with a value, of the server or of a client."""
     return gui._gui_input_handle_from_uuid.values()
 
 
 def value_of(server: viser.ViserServer, element: str) -> Any:
-    """The present value of the widget with this id, of all tabs or of one; None when there is no such widget."""
+    """The current value of the widget with this id, of the server or of a client; None if there is no such widget."""
     for owner in (server, *server.get_clients().values()):
         handle = owner.gui._gui_input_handle_from_uuid.get(element)
         if handle is not None:
@@ -61,18 +61,18 @@ def image_file(handle: viser.ImageHandle) -> bytes:
 
 
 def run_script(client: viser.ClientHandle, source: str) -> None:
-    """Send a script to one tab, where `static/boot.js` takes JSON only and runs no code.
+    """Send a script to one tab, where `static/boot.js` accepts only JSON and runs no code.
 
     Never broadcast: viser replays a broadcast script to every tab that joins later.
     """
     client._websock_connection.queue_message(RunJavascriptMessage(source=source))
 
 
-def on_sent(handle: Any, callback: Callable[[Any], None]) -> None:
+def on_tab_value(handle: Any, callback: Callable[[Any], None]) -> None:
     """Call `callback(value)` on the event loop whenever a tab sends a new value for a widget.
 
-    By the time that viser's own `on_update` reads the widget, the worker may have written an older value into it, and
-    the value from the tab would be lost.
+    viser's own `on_update` reads the value from the widget later, when the worker may have overwritten it with an older
+    value.
     """
     impl = handle._impl
     update_other_tabs = impl.sync_cb
@@ -85,7 +85,7 @@ def on_sent(handle: Any, callback: Callable[[Any], None]) -> None:
 
 
 class LoopEvent(asyncio.Event):
-    """An event that is set on its event loop only; calls from other threads are left to the next one on the loop."""
+    """An event that can be set on its event loop only; calls of `set` from other threads have no effect."""
 
     def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
         super().__init__()

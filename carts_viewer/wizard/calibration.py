@@ -1,4 +1,4 @@
-"""Calibration over a recording in New recording: the job, its report, and the sequence file with its result."""
+"""Calibration in *New recording*: the job, its report, and the recording with its result."""
 
 import threading
 from collections.abc import Callable, Mapping
@@ -32,8 +32,8 @@ from carts_core.wording import counted
 from carts_viewer.start.roots import Roots
 from carts_viewer.wizard.points import Clicking
 
-FRAMES = 20
-"""Number of evenly spaced frames."""
+CALIBRATION_FRAMES = 20
+"""Number of evenly spaced frames of a calibration."""
 
 
 @dataclass(frozen=True)
@@ -43,22 +43,22 @@ class CalibrationProgress:
     text: str
     """Text for the user."""
     share: float
-    """Share of its stages, in [0, 1]."""
+    """Completed share of the stages, in [0, 1]."""
     scene: Scene | None = None
     """The scene with the calibration so far."""
     result: CalibrationResult | None = None
     """Result of a finished calibration."""
     error: str = ""
-    """Cause of a failure."""
+    """Cause of a failure; empty if there is none."""
     ended: bool = False
 
 
 STOPPED = CalibrationProgress("Stopped; the calibration from your points is unchanged.", 0.0, ended=True)
-"""End of a stopped calibration."""
+"""Progress at the end of a stopped calibration."""
 
 
 class CalibrationJob:
-    """One calibration on a separate thread."""
+    """A calibration on a separate thread."""
 
     def __init__(
         self,
@@ -69,7 +69,7 @@ class CalibrationJob:
         load_networks: Callable[[], FeatureExtractor],
         report: Callable[[CalibrationProgress], None],
     ) -> None:
-        """Start; `report` is called on the job's thread with each progress, the last one `ended`."""
+        """Start the calibration; `report` is called on its thread with every progress, of which the last is `ended`."""
         self._sequence, self._scene, self._known = sequence, scene, known
         self._load_networks = load_networks
         self._report = report
@@ -103,12 +103,12 @@ class CalibrationJob:
         extractor = self._load_networks()
         self._report(CalibrationProgress("Reading images", 0.0))
         frames = []
-        for index in spread(len(self._sequence), FRAMES):
+        for index in spread(len(self._sequence), CALIBRATION_FRAMES):
             if self.cancelled:
                 return STOPPED
             frames.append(self._sequence.frame(index))
-        held = [camera.name for camera in self._scene.cameras if camera.name not in self._known.free_cameras]
-        free = replace(CALIBRATION, locked_cameras=tuple(held))
+        fixed = [camera.name for camera in self._scene.cameras if camera.name not in self._known.free_cameras]
+        free = replace(CALIBRATION, locked_cameras=tuple(fixed))
         optimizer = CalibrationOptimizer(
             self._scene, frames, extractor, free=free, known_base_frames=self._known.base_covariances
         )
@@ -142,7 +142,7 @@ class PoseReport:
     camera: str
     turn_deg: float
     shift_mm: float
-    """At the mean of the tips in the clicked frames [mm]."""
+    """Displacement of the mean tip position in the clicked frames [mm]."""
     deviation: PoseDeviation
     """Uncertainty of the new pose."""
 
@@ -152,21 +152,21 @@ class CalibrationReport:
     """Report of a finished calibration, as stored in a draft."""
 
     loss_before: float
-    """Mean over the frames [1]."""
+    """Mean loss of the frames [1]."""
     loss_after: float
     verdict: str
-    """good, doubtful or failed; empty without a verdict."""
+    """good, doubtful or failed; empty if there is no verdict."""
     reason: str
     """Reason of the verdict, with a remedy."""
     poses: tuple[PoseReport, ...]
     before: tuple[float | None, ...]
     """Initial residuals of the points [px]; None for unused points."""
     after: tuple[float | None, ...]
-    """Final residuals."""
+    """Final residuals of the points [px]."""
     disagreeing: tuple[int, ...]
-    """Points whose residual has grown beyond the noise of clicks."""
+    """Indices of points whose residual has grown beyond the noise of clicks."""
     objection: str
-    """Why the points contradict the calibration; empty where they agree."""
+    """Reason why the points contradict the calibration; empty if they agree."""
 
 
 def report_of(result: CalibrationResult, clicking: Clicking, points: Rows[ImagePoint]) -> CalibrationReport:
@@ -195,7 +195,7 @@ def report_of(result: CalibrationResult, clicking: Clicking, points: Rows[ImageP
 def _objection(
     result: CalibrationResult, compared: PointAgreement, clicking: Clicking, points: Rows[ImagePoint]
 ) -> str:
-    """Why the points contradict the calibration; empty where they agree."""
+    """Reason why the points contradict the calibration; empty if they agree."""
     before, after, limits = compared.before, compared.after, compared.limits
     if compared.disagreeing and not compared.agrees:
         worst = max(compared.disagreeing, key=lambda row: after[row] / limits[row])
@@ -217,7 +217,7 @@ def _objection(
 
 
 def _poses(result: CalibrationResult, clicking: Clicking, points: Rows[ImagePoint]) -> tuple[PoseReport, ...]:
-    """Motion of each arm in each camera."""
+    """Change of the pose of each arm in each camera."""
     frames = sorted({point.frame for point in points})
     poses = []
     for (name, camera), deviation in result.deviations.items():
@@ -234,7 +234,7 @@ def _poses(result: CalibrationResult, clicking: Clicking, points: Rows[ImagePoin
 
 
 def calibrated_scene(scene: Scene, calibration: Mapping[str, Any]) -> Scene:
-    """The scene with a calibration (`as_plain`); `SettingsError` if that has other arms or cameras, or is malformed."""
+    """The scene with a calibration (`as_plain`); `SettingsError` if it is malformed or of other arms or cameras."""
     try:
         arms = tuple(
             replace(arm, T_world_base=rigid_transform(calibration["arms"][arm.name], f"T_world_base of {arm.name}"))
@@ -276,9 +276,9 @@ def calibrated_recording(
 
 
 def target_folder(roots: Roots, source: Path, name: str) -> Path:
-    """Folder for the sequence of a recording: beside it, or inside if the recording is a root folder."""
+    """Folder for the sequence of a recording: beside the recording, or inside it if it is an allowed folder."""
     if (fault := name_fault(name)) is not None:
-        raise SettingsError(f"the name {name!r} cannot be used, {fault}. Choose another.")
+        raise SettingsError(f"the name {name!r} cannot be used, {fault}. Choose another name.")
     parent = source.parent if source not in roots.folders else source
     folder = roots.checked(parent) / f"{name}_sequence"
     number = 2

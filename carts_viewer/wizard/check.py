@@ -27,7 +27,7 @@ from carts_viewer.wizard.draft import Draft
 
 _COLORS = ("#2dd4a7", "#60a5fa", "#facc15", "#e879f9", "#fb923c", "#f87171", "#a3a3a3")
 _WIDTH, _HEIGHT = 600, 150
-_MOST_POINTS = 400
+_MAX_POINTS = 400
 _PREVIEW_WIDTH = 360
 _JPEG_QUALITY = 75
 
@@ -47,7 +47,7 @@ def curves(arm: FoundArm) -> list[Curve]:
     """Curves of all joints of an arm."""
     if arm.values is None or not len(arm.values):
         return []
-    rows = np.unique(np.linspace(0, len(arm.values) - 1, min(len(arm.values), _MOST_POINTS)).astype(int))
+    rows = np.unique(np.linspace(0, len(arm.values) - 1, min(len(arm.values), _MAX_POINTS)).astype(int))
     x = rows.astype(float) if arm.times is None else arm.times[rows]
     x = (x - x[0]) / max(float(x[-1] - x[0]), 1e-9) * (_WIDTH - 8) + 4
     found = []
@@ -62,7 +62,7 @@ def curves(arm: FoundArm) -> list[Curve]:
     return found
 
 
-def opened(recording: FoundRecording) -> tuple[Sequence, TemporaryDirectory[str]]:
+def open_recording(recording: FoundRecording) -> tuple[Sequence, TemporaryDirectory[str]]:
     """The recording as a sequence, with the temporary folder of its tables; `CartsError` if it is invalid."""
     folder = TemporaryDirectory(prefix="carts-import-")
     try:
@@ -91,24 +91,24 @@ class Guess:
     """Content of the files of a draft, and the problems of each part."""
 
     kind: str
-    """Name of the source."""
+    """Name of the source format."""
     recording: FoundRecording | None
-    """None while it cannot be read."""
+    """The recording; None if it cannot be read."""
     problems: Mapping[tuple[Part, str], str] = field(default_factory=dict)
     """Part and its camera (empty for all) -> problem."""
     table: ForeignTable | None = None
-    """Table of the kinematics, where its columns have names."""
+    """Kinematics table, if its columns have names."""
     meanings: ColumnMeanings | None = None
     trials: tuple[Path, ...] = ()
     """Recordings in the folder, if one of several has to be chosen."""
 
     @property
     def columns(self) -> dict[str, str]:
-        """Joint -> column, as guessed."""
+        """Joint -> guessed column."""
         return {} if self.meanings is None else next(iter(self.meanings.arms.values()), {})
 
     def unset_column(self, role: str, chosen: bool) -> str:
-        """Label of the choice to have a column guessed."""
+        """Label of the choice that restores the guessed column."""
         if chosen or self.meanings is None:
             return "none"
         column = getattr(self.meanings, role) if role in ("time", "frame") else self.columns.get(role)
@@ -145,7 +145,7 @@ def guess(draft: Draft) -> Guess:
             place = (error.part, error.about) if isinstance(error, PartError) else _WHOLE
             problems[place] = problem_of(error)
         about_table = not any(part in ("calibration", "images") for part, _ in problems)
-        recording = _images_alone(source, options) if kind == FOLDER and about_table else None
+        recording = _images_only(source, options) if kind == FOLDER and about_table else None
     if kind == FOLDER:
         try:
             table = kinematics_table(source, options)
@@ -158,12 +158,12 @@ def guess(draft: Draft) -> Guess:
         )
     trials = jigsaws_trials(source) if kind == JIGSAWS.name and recording is None else ()
     if len(trials) > 1:
-        problems = {_WHOLE: f"The folder has {len(trials)} trials of JIGSAWS. Choose one."}
+        problems = {_WHOLE: f"The folder has {len(trials)} trials of JIGSAWS. Choose a trial."}
     return Guess(kind, recording, problems, table, meanings, trials)
 
 
-def _images_alone(source: Path, options: ImportOptions) -> FoundRecording | None:
-    """The cameras, shown while the kinematics have errors."""
+def _images_only(source: Path, options: ImportOptions) -> FoundRecording | None:
+    """The recording without its kinematics table, if the images can be read."""
     plain = ImportOptions(source=options.source, images=options.images, kinematics=NO_TABLE)
     with suppress(CartsError):
         return find(source, plain)
@@ -183,7 +183,7 @@ def _problems_of_images(source: Path, options: ImportOptions) -> dict[tuple[Part
 
 def estimated_delay(recording: FoundRecording) -> TimeOffsetEstimate:
     """Time offset estimated from the motion in images and table; `CartsError` if rows have no times."""
-    sequence, folder = opened(recording)
+    sequence, folder = open_recording(recording)
     with folder:
         return estimate_time_offset(sequence)
 

@@ -21,8 +21,8 @@ from carts_core.settings.interchange import NO_TABLE, AngleUnit, ImportOptions, 
 from carts_viewer.wizard.calibration import CalibrationReport
 
 _FORMAT = "carts-draft/1"
-_LONGEST_NAME = 200
-"""Longest name of a sequence [characters]."""
+_MAX_NAME = 200
+"""Maximum length of a sequence's name [characters]."""
 
 
 class Step(StrEnum):
@@ -40,7 +40,7 @@ class Draft:
 
     step: Step = Step.FILES
     source: str = ""
-    """Folder or file of the recording; empty before it is chosen."""
+    """Folder or file of the recording; empty until it is chosen."""
     name: str = ""
     """Name of the sequence; by default that of the source."""
     options: ImportOptions = field(default_factory=ImportOptions)
@@ -49,14 +49,14 @@ class Draft:
     focal_length: bool = False
     """Whether the focal length is also estimated."""
     calibration: Mapping[str, Any] | None = None
-    """Refined calibration (`as_plain`); None before."""
+    """Refined calibration (`as_plain`); None if there is none."""
     offered: Mapping[str, Any] | None = None
     """A calibration that contradicts the clicked points, until it is kept or discarded."""
     report: CalibrationReport | None = None
     """Report of the kept or offered calibration."""
 
     def to_json(self) -> str:
-        """The draft as text."""
+        """The draft in JSON format."""
         plain = asdict(self)
         plain["options"] = {
             name: _plain(value) for name, value in plain["options"].items() if value not in (None, {}, ())
@@ -65,7 +65,7 @@ class Draft:
 
     @staticmethod
     def from_json(text: str) -> "Draft":
-        """The draft of a text; `SettingsError` if the text is not a draft."""
+        """Parse a draft in JSON format; `SettingsError` if the text is not a draft."""
         try:
             plain = parse_json(text)
             if plain.pop("format") != _FORMAT:
@@ -75,7 +75,9 @@ class Draft:
                 check_path(named)
             return draft
         except (ValueError, TypeError, KeyError, AttributeError) as error:
-            raise SettingsError(f"this import cannot be continued ({error}). Delete it and start a new one.") from error
+            raise SettingsError(
+                f"this import cannot be continued ({error}). Delete it and start a new import."
+            ) from error
 
     def uncalibrated(self, **changes: Any) -> "Draft":
         """The draft with other fields and without its calibration, which becomes invalid."""
@@ -102,7 +104,7 @@ class DraftFile:
     def __init__(self, key: str | None = None) -> None:
         """File of an existing draft, or of a new one if `key` is None; `SettingsError` if the draft does not exist."""
         if key is not None and key not in {draft.key for draft in drafts()}:
-            raise SettingsError("this import no longer exists. Start a new one.")
+            raise SettingsError("this import no longer exists. Start a new import.")
         self.key = key or secrets.token_hex(8)
 
     def read(self) -> Draft:
@@ -113,7 +115,7 @@ class DraftFile:
         try:
             text = read_text(path, VALUES)
         except (OSError, ValueError) as error:
-            raise SettingsError(f"{path} cannot be read ({error}). Delete this import and start a new one.") from error
+            raise SettingsError(f"{path} cannot be read ({error}). Delete this import and start another.") from error
         return Draft.from_json(text)
 
     def write(self, draft: Draft) -> None:
@@ -132,7 +134,7 @@ def drafts() -> list[DraftSummary]:
     for path in _folder().glob("*.json"):
         try:
             plain = parse_json(read_text(path, SETTINGS))
-            name = str(plain.get("name") or Path(str(plain.get("source", ""))).name)[:_LONGEST_NAME]
+            name = str(plain.get("name") or Path(str(plain.get("source", ""))).name)[:_MAX_NAME]
             found.append(DraftSummary(path.stem, name, path.stat().st_mtime))
         except (CartsError, OSError, ValueError, AttributeError):
             found.append(DraftSummary(path.stem, "damaged import", time.time()))
@@ -177,7 +179,7 @@ _MEANINGS = (*JOINT_NAMES, "jaw", "time", "frame")
 
 
 def changed(draft: Draft, name: str, value: str, guessed: Mapping[str, str]) -> Draft | None:
-    """The draft after a choice in the form; None for an unknown one, `SettingsError` for an invalid value.
+    """The draft after a choice in the form; None for an unknown choice, `SettingsError` for an invalid value.
 
     Args:
         value: the chosen value; empty to restore the guess.
@@ -187,7 +189,7 @@ def changed(draft: Draft, name: str, value: str, guessed: Mapping[str, str]) -> 
     options: dict[str, Any] = {}
     if name in _CHOICES:
         if value and value not in _CHOICES[name]:
-            raise SettingsError(f"{name} is {value!r}; allowed is {', '.join(_CHOICES[name])}.")
+            raise SettingsError(f"{name} is {value!r}; allowed: {', '.join(_CHOICES[name])}.")
         options[name] = value or None
     elif name in _NUMBERS:
         options[name] = _number(value)
@@ -232,7 +234,7 @@ def picked(draft: Draft, part: str, path: Path, found: Mapping[str, Path]) -> Dr
 
 
 def _columns(draft: Draft, which: str, value: str, guessed: Mapping[str, str]) -> dict[str, str]:
-    """Chosen columns; the first choice of a joint fixes the guesses of the others."""
+    """Chosen columns; the first choice of a joint also stores the guessed columns of the other joints."""
     chosen = dict(draft.options.columns)
     joints = which in (*JOINT_NAMES, "jaw")
     if joints and not any(name in chosen for name in JOINT_NAMES):
@@ -241,7 +243,7 @@ def _columns(draft: Draft, which: str, value: str, guessed: Mapping[str, str]) -
 
 
 def _with(entries: Mapping[str, str], key: str, value: str) -> dict[str, str]:
-    """Entries with one of them replaced, or removed if the value is empty."""
+    """Entries with one value replaced, or removed if the new value is empty."""
     others = {name: entry for name, entry in entries.items() if name != key}
     return {**others, key: value} if value else others
 
@@ -254,12 +256,12 @@ def _number(value: str) -> float | None:
     except ValueError:
         number = math.nan
     if not math.isfinite(number):
-        raise SettingsError(f"{value!r} is not a number. Type one, such as 0.12, or leave the field empty.")
+        raise SettingsError(f"{value!r} is not a number. Enter a number, such as 0.12, or leave the field empty.")
     return number
 
 
 def _new_name(images: Mapping[str, Any], path: Path) -> str:
-    """Name of a new camera: that of its folder, with a number if needed."""
+    """Name of a new camera: the name of its folder, with a number if needed."""
     name, number = path.stem, 2
     while name in images:
         name, number = f"{path.stem} {number}", number + 1

@@ -25,7 +25,7 @@ from carts_viewer.start.host import Host
 from carts_viewer.transport.document import render
 from carts_viewer.transport.page import Page
 from carts_viewer.wizard.calibration import (
-    FRAMES,
+    CALIBRATION_FRAMES,
     STOPPED,
     CalibrationJob,
     CalibrationProgress,
@@ -35,7 +35,7 @@ from carts_viewer.wizard.calibration import (
     report_of,
     target_folder,
 )
-from carts_viewer.wizard.check import opened
+from carts_viewer.wizard.check import open_recording
 from carts_viewer.wizard.draft import Draft
 from carts_viewer.wizard.points import Clicking, ClickPrompt, unknown_cameras
 
@@ -68,7 +68,7 @@ class FramePicture:
         frame = self._sequence.frame(index, cameras=[camera])
         own = self._sequence.scene.camera(camera)
         if scene is None:
-            picture = layers.nothing(own.height, own.width)
+            picture = layers.transparent(own.height, own.width)
         else:
             ids = self._renderer.arm_ids(scene.state(frame.measured, mounts=frame.mounts), camera)
             picture = layers.contour(ids, _OPACITY)
@@ -99,7 +99,7 @@ def hand_eye_panel(
     folder: str,
     undoable: bool,
 ) -> str:
-    """HTML of the panel."""
+    """HTML of the panel of the Hand-eye step."""
     report, result = draft.report, clicking.result
     deviations = {} if result is None else result.deviations
     if report is not None:
@@ -114,7 +114,7 @@ def hand_eye_panel(
         problem=problem,
         folder=folder,
         undoable=undoable,
-        calibration_frames=FRAMES,
+        calibration_frames=CALIBRATION_FRAMES,
         done=len({(p.camera, p.frame, p.arm, p.landmark) for p in draft.points}),
         frames={str(index): name for index, name in enumerate(clicking.sequence.frame_ids[:2000])},
         deviations=deviations,
@@ -136,21 +136,21 @@ _WIDTH = 340.0
 """Width of the document at the side [px], as in `static/document.css`."""
 
 Calibrated = Callable[[Callable[[Draft], Draft]], None]
-"""Receiver, on the site's thread, of the change of the draft by a calibration."""
+"""Receives, on the site's thread, a function that changes the draft after a calibration."""
 
 
 class HandEyeStep:
     """Clicked points in the images of a recording, and calibration from them.
 
     Attributes:
-        problem: the last error; empty without one.
+        problem: the last error; empty if there is none.
     """
 
     def __init__(self, host: Host, recording: FoundRecording, draft: Draft, report: Calibrated) -> None:
         """Open the recording; `CartsError` if it is not a valid sequence. `report` receives calibration results."""
         self._host, self._recording, self._report = host, recording, report
         self.problem = ""
-        self._sequence, self._folder = opened(recording)
+        self._sequence, self._folder = open_recording(recording)
         self._clicking = Clicking(self._sequence, focal_length=draft.focal_length)
         self._solved: tuple[object, ...] | None = None
         self._skipped: frozenset[ClickPrompt] = frozenset()
@@ -197,7 +197,7 @@ class HandEyeStep:
         return draft.uncalibrated(points=(*kept, point))
 
     def chosen(self, draft: Draft, name: str, value: str) -> Draft:
-        """The draft after a choice in the panel; `SettingsError` if that is not possible now."""
+        """The draft after a choice in the panel; `SettingsError` if the choice is not possible now."""
         self.problem = ""
         kind, _, which = name.partition(" ")
         prompt = self.prompt(draft)
@@ -221,7 +221,7 @@ class HandEyeStep:
         return draft
 
     def _changed(self, draft: Draft, name: str, value: str) -> Draft:
-        """The draft after one of the choices that change it."""
+        """The draft after a choice that may change it."""
         if name == "focal_length":
             draft = draft.uncalibrated(focal_length=value == "1")
         elif name == "name":
@@ -237,13 +237,13 @@ class HandEyeStep:
         return draft
 
     def write(self, draft: Draft) -> Path:
-        """Write the sequence and return its file; `CartsError` if that fails."""
+        """Write the sequence and return its file; `CartsError` if this fails."""
         if self._running():
             raise SettingsError("the calibration is still running. Stop it, or wait for its end.")
         folder = target_folder(self._host.roots, Path(draft.source), draft.name)
         count = len(draft.points)
         if draft.calibration is not None:
-            text = f"{count} points clicked in carts view, and a calibration over {FRAMES} frames"
+            text = f"{count} points clicked in carts view, and a calibration over {CALIBRATION_FRAMES} frames"
             calibration = draft.calibration
         elif self._clicking.result is not None:
             text, calibration = f"{count} points clicked in carts view", as_plain(self._clicking.result.scene)
@@ -260,7 +260,7 @@ class HandEyeStep:
             self._solved = wanted
 
     def prompt(self, draft: Draft) -> ClickPrompt | None:
-        """The next prompt; None without one."""
+        """The next prompt; None if there is none."""
         return self._wanted or self._clicking.next_prompt(draft.points, self._skipped)
 
     def _skip_frame(self, draft: Draft, prompt: ClickPrompt) -> None:
@@ -292,7 +292,7 @@ class HandEyeStep:
         return self._progress is not None and not self._progress.ended
 
     def shown_scene(self, draft: Draft) -> Scene | None:
-        """Arms and cameras as the overlay shows them; None without an overlay."""
+        """The scene shown by the overlay; None if there is no overlay."""
         if self._running() and self._progress is not None and self._progress.scene is not None:
             return self._progress.scene
         if (calibration := draft.calibration or draft.offered) is not None:

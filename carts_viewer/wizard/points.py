@@ -28,12 +28,12 @@ class ClickPrompt:
 
 
 class Clicking:
-    """The planned points, the next one to click, and the calibration computed from the clicked ones.
+    """The planned points, the next point to click, and the calibration computed from clicked points.
 
     Attributes:
         sequence: the recording, with placeholder base frames.
         plan: all prompts, in order.
-        result: calibration from the points; None while there are too few.
+        result: calibration from the points; None if there are too few points.
         problem: cause of a missing result.
     """
 
@@ -50,11 +50,11 @@ class Clicking:
         return self.sequence.scene if self.result is None else self.result.scene
 
     def free_focal_length(self, free: bool) -> None:
-        """Whether the next `solve` also estimates focal lengths."""
+        """Set whether `solve` also estimates focal lengths."""
         self._settings = replace(self._settings, focal_length=free)
 
     def next_prompt(self, points: Rows[ImagePoint], skipped: frozenset[ClickPrompt]) -> ClickPrompt | None:
-        """The first prompt that is neither clicked nor skipped; None without one."""
+        """The first prompt that is neither clicked nor skipped; None if there is none."""
         done = {ClickPrompt(point.camera, point.frame, point.arm, point.landmark) for point in points} | skipped
         return next((prompt for prompt in self.plan if prompt not in done), None)
 
@@ -83,7 +83,7 @@ class Clicking:
 
 
 def unknown_cameras(scene: Scene) -> tuple[str, ...]:
-    """Cameras with unknown pose, which is that of the first camera in the recording."""
+    """Cameras with unknown pose; in the recording they have the pose of the first camera."""
     first = scene.cameras[0]
     return tuple(
         camera.name for camera in scene.cameras[1:] if np.array_equal(camera.T_camera_world, first.T_camera_world)
@@ -111,15 +111,15 @@ def _plan(sequence: Sequence) -> tuple[ClickPrompt, ...]:
 
 
 def _prompted(scene: Scene, arm: str) -> list[str]:
-    """The prompted landmarks: tip, end of the shaft, and an edge of it."""
+    """The prompted landmarks: tip, end of the shaft, and edge of the shaft."""
     known = landmarks(scene.arm(arm))
     joints = [name for name, mark in known.items() if mark.kind is LandmarkKind.POINT and name != TIP]
     return [name for name in (TIP, *joints[-1:], SHAFT_EDGE) if name in known]
 
 
-def spread_out(places: Rows[np.ndarray] | np.ndarray, count: int) -> list[int]:
-    """Sorted rows with positions far from each other: the most typical one, then repeatedly the furthest one."""
-    points = np.asarray(places, float)
+def spread_out(positions: Rows[np.ndarray] | np.ndarray, count: int) -> list[int]:
+    """Sorted rows of positions far from each other, by farthest-point sampling from the most central position."""
+    points = np.asarray(positions, float)
     chosen = [int(np.linalg.norm(points - np.median(points, axis=0), axis=1).argmin())]
     while len(chosen) < min(count, len(points)):
         distances = np.min([np.linalg.norm(points - points[row], axis=1) for row in chosen], axis=0)

@@ -12,26 +12,26 @@ from carts_core.recording.video import SUFFIXES
 from carts_viewer.start.host import FileBrowser, Host
 from carts_viewer.start.roots import Entry
 from carts_viewer.transport.document import render
-from carts_viewer.wizard.check import Guess, check_form, estimated_delay, guess, opened, previews, problem_of
+from carts_viewer.wizard.check import Guess, check_form, estimated_delay, guess, open_recording, previews, problem_of
 from carts_viewer.wizard.draft import Draft, DraftFile, Step, changed, picked
 from carts_viewer.wizard.hand_eye import HandEyeStep
 from carts_viewer.wizard.points import ClickPrompt
 
 _SOURCES = (*SUFFIXES, ".bag", ".mcap", ".parquet")
 _TABLES = (".csv", ".txt", ".tsv", ".parquet", ".npy", ".npz")
-_LENSES = (".yaml", ".yml", ".mat", ".json", ".ini", ".txt")
+_CALIBRATIONS = (".yaml", ".yml", ".mat", ".json", ".ini", ".txt")
 _PURPOSES = {
     "source": ("Choose the folder of the recording: images or videos, and a table of joints.", _SOURCES, True),
     "images": ("Choose a folder of images, or a video.", SUFFIXES, True),
-    "calibration": ("Choose the camera's calibration (ROS, OpenCV, Kalibr, MATLAB).", _LENSES, False),
+    "calibration": ("Choose the camera's calibration (ROS, OpenCV, Kalibr, MATLAB).", _CALIBRATIONS, False),
     "kinematics": ("Choose the table of joint positions or tip poses.", _TABLES, False),
     "robot": ("Choose the URDF of the instrument; carts robot generates one.", (".urdf",), False),
 }
-_MOST_UNDO = 200
+_MAX_UNDO = 200
 
 
 class RecordingWizard:
-    """A draft, and the page that shows it."""
+    """The page *New recording* with its draft."""
 
     def __init__(self, host: Host, key: str | None = None) -> None:
         self._host = host
@@ -58,12 +58,12 @@ class RecordingWizard:
 
     @property
     def prompt(self) -> ClickPrompt | None:
-        """The next prompt; None without one."""
+        """The next prompt; None if there is none."""
         return None if self._step is None else self._step.prompt(self._draft)
 
     @property
     def shown_scene(self) -> Scene | None:
-        """Arms and cameras as the overlay shows them; None without an overlay."""
+        """The scene shown by the overlay; None if there is no overlay."""
         return None if self._step is None else self._step.shown_scene(self._draft)
 
     def show(self) -> None:
@@ -143,14 +143,14 @@ class RecordingWizard:
         self.show()
 
     def close(self) -> None:
-        """Stop running work; the draft is saved already."""
+        """Stop running work; the draft is already saved."""
         self._leave_hand_eye()
 
     def _set(self, draft: Draft) -> None:
         """Replace the draft as an undo step."""
         if draft == self._draft:
             return
-        self._undo = [*self._undo, self._draft][-_MOST_UNDO:]
+        self._undo = [*self._undo, self._draft][-_MAX_UNDO:]
         self._change(draft)
 
     def _change(self, draft: Draft) -> None:
@@ -231,7 +231,7 @@ class RecordingWizard:
 
     def _add_pictures(self, found: Guess) -> None:
         assert found.recording is not None
-        sequence, folder = opened(found.recording)
+        sequence, folder = open_recording(found.recording)
         with folder:
             for camera in sequence.scene.cameras:
                 images = previews(sequence, camera.name)
@@ -239,7 +239,7 @@ class RecordingWizard:
                 self._pictures[camera.name] = [(frame, publish(jpeg)) for frame, jpeg in images]
 
     def _enter_hand_eye(self) -> bool:
-        """Open the recording for the last step; returns whether that succeeded."""
+        """Open the recording for the step Hand-eye; returns whether this succeeded."""
         if self._step is None:
             found = self._guessed()
             try:

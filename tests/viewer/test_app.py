@@ -63,7 +63,7 @@ def test_neither_page_nor_images_are_left_some_time_after_the_last_tab_has_left(
 def test_a_run_is_ended_and_its_pose_saved_once_its_tab_does_not_come_back(
     open_viewer: OpenViewer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(tabs, "AWAY", 1e6)
+    monkeypatch.setattr(tabs, "RECONNECT_TIME", 1e6)
     app = open_viewer()
     run_without_end(app)
     with RawTab(app.url, key="one") as raw:
@@ -72,7 +72,7 @@ def test_a_run_is_ended_and_its_pose_saved_once_its_tab_does_not_come_back(
         eventually(lambda: len(place.controller.state.run.curves.loss) > 1)
     with RawTab(app.url, key="one"):
         # It came back in time, so its run goes on for as long as it stays.
-        monkeypatch.setattr(tabs, "AWAY", 0.0)
+        monkeypatch.setattr(tabs, "RECONNECT_TIME", 0.0)
         done = len(place.controller.state.run.curves.loss)
         eventually(lambda: len(place.controller.state.run.curves.loss) > done + 10)
         assert place.controller.state.run.phase is Phase.RUNNING
@@ -164,7 +164,7 @@ def test_captions_have_times_remarks_and_the_offset_between_clocks(open_viewer: 
         app.wait_until_shown()
         assert offset.value == -0.02
         shown = " ".join(str(widget.get("content", widget.get("label"))) for widget in tab.widgets.values())
-        assert "1 remark on the files" in shown and "left: its calibration has focal lengths of 20 and" in shown
+        assert "1 remark about the files" in shown and "left: its calibration has focal lengths of 20 and" in shown
     app.close()
     app.project.path.unlink()
     other = open_viewer(prepare=as_ros)

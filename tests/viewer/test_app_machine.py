@@ -170,7 +170,7 @@ def _machine(path: Path, factory: OptimizerFactory) -> type[RuleBasedStateMachin
 
         @rule(on=st.booleans())
         def keyframe(self, on: bool) -> None:
-            self.desk.do(intents.HoldKeyframe(on))
+            self.desk.do(intents.SetKeyframe(on))
             self.model.do(marked=on)
 
         @rule(index=st.integers(0, FRAMES - 1))

@@ -25,10 +25,19 @@ from carts_viewer.picture.layers import (
     IGNORED_COLOR,
     REMOVED_COLOR,
     Layer,
-    nothing,
     paint_over,
+    transparent,
 )
-from carts_viewer.picture.strokes import LONGEST_STROKE, Painted, Stroke, Target, Tool, corrected, ignored, read_stroke
+from carts_viewer.picture.strokes import (
+    MAX_STROKE_POINTS,
+    Painted,
+    Stroke,
+    Target,
+    Tool,
+    corrected,
+    ignored,
+    read_stroke,
+)
 
 CAMERA = Camera("left", 64, 48, (60.0, 60.0, 32.0, 24.0), np.eye(4))
 
@@ -70,7 +79,10 @@ def test_points_far_outside_and_brushes_too_thick_are_clamped() -> None:
 @pytest.mark.parametrize(
     ("name", "values"),
     [
-        ("points", ([[float("nan"), 1.0]], [[1.0, float("inf")]], [], [[1, 2]] * (LONGEST_STROKE + 1), [[10**400, 1]])),
+        (
+            "points",
+            ([[float("nan"), 1.0]], [[1.0, float("inf")]], [], [[1, 2]] * (MAX_STROKE_POINTS + 1), [[10**400, 1]]),
+        ),
         ("points", ([[1, 2, 3]], [[1, 2], [3]], [None], {"0": [1, 2]})),
         ("diameter", (-3, float("nan"), "5")),
         ("frame", (3, -1, 1.5, True)),
@@ -108,7 +120,7 @@ def test_a_later_stroke_wins_and_what_is_rendered_needs_no_adding() -> None:
 def test_painted_pixels_are_seen_in_their_colours() -> None:
     added, removed, region = np.zeros((3, 40, 60), bool)
     added[:20, :20], removed[:20, 20:40], region[25:38, 10:50] = True, True, True
-    picture = nothing(40, 60)
+    picture = transparent(40, 60)
     paint_over(picture, MaskCorrection.of(added, removed), IgnoreRegion.of(region), 0.5)
     assert (picture[added] == (*ADDED_COLOR, 128)).all() and (picture[removed] == (*REMOVED_COLOR, 128)).all()
     hatched = picture[region][:, 3] > 0

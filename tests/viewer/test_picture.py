@@ -12,9 +12,9 @@ from carts_core.project import Figures, Key, Review, ReviewState
 from carts_viewer.actions import intents
 from carts_viewer.app import ViewerApp
 from carts_viewer.panels.help import key_table, shortcuts, with_keys
-from carts_viewer.panels.timeline import HEIGHT, Traces, code
+from carts_viewer.panels.timeline import THUMBNAIL_HEIGHT, Traces, frame_code
 from carts_viewer.picture import layers
-from carts_viewer.picture.display import LONGEST_WAIT, RateLimit
+from carts_viewer.picture.display import MAX_WAIT, RateLimit
 
 
 @pytest.fixture
@@ -83,8 +83,8 @@ def test_the_next_picture_may_go_once_the_last_one_is_drawn_or_after_a_while() -
     limit = RateLimit(lambda: now[0])
     assert limit.ready_in() == 0.0
     limit.sent()
-    assert limit.ready_in() == pytest.approx(LONGEST_WAIT)
-    now[0] += LONGEST_WAIT
+    assert limit.ready_in() == pytest.approx(MAX_WAIT)
+    now[0] += MAX_WAIT
     assert limit.ready_in() == 0.0
     limit.sent()
     now[0] += 0.02
@@ -125,7 +125,7 @@ def test_a_frame_of_which_the_fit_is_not_known_has_no_height_and_one_that_fits_w
     editor.apply("Accept", {Key.review(1): Review(ReviewState.ACCEPTED), Key.review(2): Review(ReviewState.ACCEPTED)})
 
     def high() -> list[int]:
-        return [code(editor.project.state, frame, desk.session.scene) >> 8 for frame in (0, 1, 2)]
+        return [frame_code(editor.project.state, frame, desk.session.scene) >> 8 for frame in (0, 1, 2)]
 
     assert high() == [0, 0, 0]
     editor.project.record_figures({1: Figures(dice=1.0), 2: Figures(dice=0.5)}, editor.project.state)
@@ -134,7 +134,7 @@ def test_a_frame_of_which_the_fit_is_not_known_has_no_height_and_one_that_fits_w
 
 def test_thumbnails_are_served_of_frames_that_there_are(shared_viewer: ViewerApp) -> None:
     answer = get(shared_viewer.url, "/thumbnail/0/0/2.jpg")
-    assert answer.status == 200 and decoded(answer.read()).shape == (HEIGHT, HEIGHT * 96 // 72, 3)
+    assert answer.status == 200 and decoded(answer.read()).shape == (THUMBNAIL_HEIGHT, THUMBNAIL_HEIGHT * 96 // 72, 3)
     for path in (
         "0/0/3.jpg",
         "1/0/0.jpg",

@@ -50,7 +50,7 @@ class Labeller:
         """Queue a run on every frame, and wait for it."""
         self._tab.open("Jobs")
         self._tab.choose("Which frames", "All")
-        self._tab.button("Optimize each alone")
+        self._tab.button("Optimize individually")
         self.shared += 4
         eventually(lambda: self.app.state.jobs, lambda jobs: bool(jobs) and jobs[-1].state is JobState.DONE, 1500)
         expect(self._tab.page.locator(".carts-jobs li.done")).to_be_visible()
