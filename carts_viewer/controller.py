@@ -84,8 +84,8 @@ class Background:
         self._jobs.advance()
 
     def fail(self, text: str) -> None:
-        """Stop the running work after its error."""
-        # An error of other work must not lose solved frames; the solver's own errors have saved them.
+        """Stop the running work after an error."""
+        # Solved frames are saved after an error of other work; after its own errors, the solver has saved them.
         with suppress(CartsError):
             self._propagating.finish()
         self._exporting.cancel()
@@ -264,7 +264,7 @@ class Controller(Handler):
     def leave(self) -> None:
         """End the run of a closed tab and save its pose. Errors as `close`."""
         if self._optimizing.active:
-            self._optimizing.end("Stopped: its tab was closed; Run starts again from here")
+            self._optimizing.end("Stopped: its tab was closed; Run starts from the current pose")
 
     def close(self) -> None:
         """End the stream and save the unfinished gesture.

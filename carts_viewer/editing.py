@@ -20,7 +20,7 @@ class Person:
     """The user of one tab."""
 
     number: int
-    """From 1, in order of arrival."""
+    """Number of the user, from 1 in order of arrival."""
     chosen: str = ""
     """Chosen name, or empty."""
     present: bool = True
@@ -41,14 +41,14 @@ class People:
 
     Attributes:
         project: the project.
-        persons: in order of arrival.
+        persons: users in order of arrival.
     """
 
     def __init__(self, project: Project) -> None:
         self.project = project
         self.persons: list[Person] = []
         self._makers: dict[int, Person] = {}
-        """Owner by number of step, since the viewer started."""
+        """Owner by step number, for steps since the viewer started."""
         self._reverted: set[int] = set()
         """Steps reverted by a later step, and these later steps."""
 
@@ -71,7 +71,10 @@ class People:
     def apply(
         self, person: Person, name: str, edits: Edits, figures: Mapping[int, Figures] | None = None
     ) -> Change | None:
-        """Save a step of a user; its name starts with theirs, if set or needed. Errors as `Project.apply`."""
+        """Save a step of a user, with the user's name if it is chosen or several users are present.
+
+        Errors as `Project.apply`.
+        """
         person.undone.clear()
         return self._apply(person, name, edits, figures)
 
@@ -148,7 +151,7 @@ class People:
         return next((n for n in done if n not in self._reverted and self._maker(n) in owners), None)
 
     def _maker(self, number: int) -> Person | None:
-        """Owner of a step; for steps from before the viewer started, the user whose name it begins with."""
+        """Owner of a step; for steps from before the viewer started, the user whose name precedes that of the step."""
         if number in self._makers:
             return self._makers[number]
         name = self.project.state.steps[number - 1].name
@@ -244,7 +247,7 @@ class Editor:
 
         Args:
             name: name of the step that the draft becomes.
-            edits: the changes; merged with earlier ones of the same gesture.
+            edits: the changes; merged with earlier changes of the same gesture.
             gesture: identifies the draft; an earlier draft that could not be saved is merged into this one.
         """
         self._name, self._gesture = name, gesture

@@ -86,7 +86,7 @@ def _serve(opened: "Callable[[], ViewerApp | Site]", ready: Callable[[], str], *
         end.ready()
         browser = opened_in_browser(served.url) if open_browser else nullcontext()
         try:
-            _say(f"{ready()} Open {served.url} in a browser; Press Ctrl-C to stop.")
+            _say(f"{ready()} Open {served.url} in a browser. Press Ctrl-C to stop.")
             with browser:
                 end.wait()
             _say("\nClosing.")

@@ -290,7 +290,7 @@ class Storage:
 def open_storage(sequence: Sequence, path: Path | None = None) -> Storage:
     """Open a sequence's project for the viewer, or create it.
 
-    A project that cannot be written opens read-only. If none can be created, a temporary one is used.
+    A project that cannot be written opens read-only. If no project can be created, a temporary project is used.
 
     Args:
         sequence: the recording.

@@ -54,7 +54,7 @@ class Compare:
 
 
 def other_pose(compare: Compare, measured: SceneState, before_run: SceneState | None) -> SceneState:
-    """The reference pose; the measured one if there was no run."""
+    """The reference pose; the measured pose if there was no run."""
     return before_run if compare.against is Against.BEFORE_RUN and before_run is not None else measured
 
 
@@ -140,7 +140,7 @@ class Observed:
     def __post_init__(self) -> None:
         for value, allowed in ((self.what, get_args(Observe)), (self.masks, get_args(Masks))):
             if value not in allowed:
-                raise SettingsError(f"{value!r} cannot be observed. Choose one of: {', '.join(allowed)}.")
+                raise SettingsError(f"{value!r} is not a target of runs. Choose one of: {', '.join(allowed)}.")
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,7 +180,7 @@ class Preset:
     meaning: str
     """When to use the preset, as text for the user."""
     changes: Callable[[SurfaceSolver], dict[str, Any]]
-    """Changes to the default settings of a solver of surface maps; other solvers have only the default."""
+    """Changes to the default settings of a solver of surface maps; other solvers have only the default preset."""
 
 
 PRESETS = {
@@ -209,7 +209,7 @@ class SolveState:
     """Progress or result of sequence mode."""
 
     frames: range
-    """All frames of the solve, including kept ones."""
+    """All frames of the solve, including kept frames."""
     done: int = 0
     """Number of visited frames."""
     compared: int = 0
@@ -348,7 +348,7 @@ class ExportState:
 
 @dataclass(frozen=True)
 class LiveState:
-    """A live stream, shown in place of the recording, or the result of the last one."""
+    """A live stream, shown in place of the recording, or the result of the last stream."""
 
     source: str
     """Name of the source, as text for the user."""
@@ -405,17 +405,17 @@ class ViewState:
     observed: Observed = field(default_factory=Observed)
     """Target of runs."""
     every_camera: bool = True
-    """Whether a run uses all cameras or only the shown one."""
+    """Whether a run uses all cameras or only the shown camera."""
     compare: Compare = field(default_factory=Compare)
     """The other pose that the picture shows, if any."""
     filter: FrameFilter = field(default_factory=FrameFilter)
-    """Filter of the *Browse* panel."""
+    """Filter of *Find*."""
     reach: Reach = Reach.NEAR
-    """Range of the joints' sliders."""
+    """Range of the joint sliders."""
     range: tuple[int, int] | None = None
     """First and last frame of the part that is played, solved and optimized; None for the whole sequence."""
     beside: bool = True
-    """Whether the images of the other cameras are shown beside that of the active one."""
+    """Whether the images of the other cameras are shown beside that of the active camera."""
     playing: bool = False
     fps: float = 10.0
     run: RunState = field(default_factory=RunState)
@@ -434,7 +434,7 @@ class ViewState:
     scores: Scores | None = None
     """Scores of the shown pose; None until computed, after its picture was sent."""
     networks: tuple[str, ...] = ()
-    """Networks to choose from: the initial one, and those adapted to the recording."""
+    """Networks to choose from: the initial network, and networks adapted to the recording."""
     network: str = ""
     """The network in use."""
     asked_network: str = ""

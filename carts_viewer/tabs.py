@@ -118,7 +118,7 @@ class Tab:
     """State of one browser tab: frame, camera, tools and run, and the page that shows it.
 
     Attributes:
-        key: identifier sent by the browser tab; None before one is attached.
+        key: identifier sent by the browser tab; None before a page is attached.
         person: the user.
         session: the recording and its project, with the state of this tab.
         controller: holds the state and changes it.
@@ -201,7 +201,7 @@ class Tab:
                 attempt(lambda: display.show_picture(controller.state))
             # Scores come after the picture, which matters more during a drag.
             attempt(controller.score)
-            # Also after an error, which would otherwise recur endlessly.
+            # Set also after an error, which would otherwise recur endlessly.
             self._pictured = controller.state
         self.show_panels()
 
@@ -265,7 +265,7 @@ class Tabs:
         return next((tab for tab in self._tabs if tab.client_id == client_id), None)
 
     def attach(self, client: viser.ClientHandle, hello: Hello) -> None:
-        """Assign a tab to a page: its earlier one, an unused one, or a new one.
+        """Assign a tab to a page: its earlier tab, an unused tab, or a new tab.
 
         Raises:
             CartsError: a discarded tab could not be saved.

@@ -190,10 +190,10 @@ class Context:
 
 
 def finite(value: float) -> float:
-    """The number, if it is finite.
+    """Return the number if it is finite.
 
     Raises:
-        CartsError: it is not finite.
+        CartsError: the number is not finite.
     """
     if not math.isfinite(value):
         raise CartsError(f"{value} is not a finite number.")
@@ -204,7 +204,7 @@ def clamped(value: float, low: float, high: float) -> float:
     """The number clamped to a range.
 
     Raises:
-        CartsError: it is not finite.
+        CartsError: the number is not finite.
     """
     return min(max(finite(value), low), high)
 

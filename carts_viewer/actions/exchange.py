@@ -129,7 +129,7 @@ class ExportingHandler(Handler):
     # ---- The export ------------------------------------------------------------------------------------------------
 
     def _dataset(self, intent: intents.Export) -> tuple[Callable[[ExportProgress], Dataset], int]:
-        """A function that builds the dataset from the present project, and its number of frames."""
+        """A function that builds the dataset from the current project, and the number of its frames."""
         state, session = self._context.state, self._session
         view = session.editor.view
         chosen = frames_within(view, intent.frames, intent.range)
@@ -287,7 +287,7 @@ T = TypeVar("T")
 
 
 class CooperativeThread(Generic[T]):
-    """Runs a function that checks a `ExportProgress` between its steps.
+    """Runs a function that checks an `ExportProgress` between its steps.
 
     The function has a thread of its own, but runs only while `advance` waits for it, so shared data need no lock.
 

@@ -18,7 +18,7 @@ class FrameFilter:
     """Conditions on frames; a frame must meet all of them."""
 
     review: str = ANY
-    """A result of `review_name`, or `NO_REVIEW`."""
+    """A label from `review_name`, or `NO_REVIEW`."""
     fit: str = ANY
     """A verdict, or `NOT_CHECKED`."""
     dice: float = 1.0

@@ -65,7 +65,7 @@ class ShowFrame(Latest):
 
 
 class MoveFrame(Intent):
-    """Move the shown frame by `by` frames."""
+    """Show the frame that is `by` frames after the shown frame."""
 
     by: int
 
@@ -107,7 +107,7 @@ class ShowBeside(Intent):
 
 
 class SetReach(Latest):
-    """Set the range of the joints' sliders around the measured values."""
+    """Set the range of the joint sliders around the measured values."""
 
     reach: Reach
 
@@ -137,7 +137,7 @@ class SetSwipe(Latest):
 
 
 class Peek(Intent):
-    """Show the compared pose in the whole image, or stop."""
+    """Start or stop showing the compared pose in the whole image."""
 
     on: bool
 
@@ -197,7 +197,7 @@ class DragLink(Intent):
 
 
 class ChooseJoint(Intent):
-    """Choose the joint that `Nudge` moves; None for the next one."""
+    """Choose the joint that `Nudge` moves; None for the next joint."""
 
     joint: tuple[str, int] | None = None
     """Arm and index of the joint."""
@@ -264,7 +264,7 @@ class SetFreeGroup(Optimizing):
 
 
 class SetCameras(Optimizing, Latest):
-    """Set whether runs use all cameras or only the shown one."""
+    """Set whether runs use all cameras or only the shown camera."""
 
     every: bool
 
@@ -358,7 +358,7 @@ class SetNote(Latest):
 
 
 class AcceptAndNext(Intent):
-    """Accept the shown frame, then show the next unreviewed one (within the range, if the frame lies there)."""
+    """Accept the shown frame, then show the next unreviewed frame, within the range if the shown frame lies in it."""
 
 
 class ShowUnreviewed(Intent):
@@ -376,7 +376,7 @@ class ShowWorst(Intent):
 
 
 class CopyCorrection(Intent):
-    """Copy the correction of the previous (-1) or next (1) frame to the shown one."""
+    """Copy the correction of the previous (-1) or next (1) frame to the shown frame."""
 
     step: int
 
@@ -388,7 +388,7 @@ class ShowKeypoints(Intent):
 
 
 class ChooseKeypoint(Intent):
-    """Choose the keypoint that `PointAt` moves."""
+    """Choose the keypoint that `PointAt` places."""
 
     label: str | None
     """None: the keypoint nearest to the pointer."""
@@ -506,7 +506,7 @@ class RepeatJob(Jobs):
 
 
 class RemoveEndedJobs(Jobs):
-    """Remove completed jobs from the list."""
+    """Remove ended jobs from the list."""
 
 
 class Exporting(Intent):
@@ -587,7 +587,7 @@ class StartLive(Intent):
     """Show a live stream with tracked arms."""
 
     source: str
-    """As `carts live --source`: `replay`, `socket:PORT` or `camera:NUMBER`."""
+    """As in `carts live --source`: `replay`, `socket:PORT` or `camera:NUMBER`."""
     joints_port: int | None = None
     """With a camera: port of 127.0.0.1 that receives joint positions."""
     repeat: bool = False

@@ -1,4 +1,4 @@
-"""Handler of the job queue: jobs run one at a time; starts, progress, stops and logs."""
+"""Handler of the job queue; jobs run one at a time."""
 
 import time
 from collections.abc import Generator
@@ -131,7 +131,7 @@ class JobsHandler(Handler):
             if job.state is JobState.ASKED and intent.accepted:
                 self._list.accept(job.number, self._safe_options(job))
             elif job.state is JobState.ASKED:
-                self._end(job, JobState.CANCELLED, "Discarded before it ran.")
+                self._end(job, JobState.CANCELLED, "Discarded before the start.")
         self._publish()
 
     def _on_CancelJob(self, intent: intents.CancelJob) -> None:
@@ -150,7 +150,7 @@ class JobsHandler(Handler):
             options = replace(options, first=job.done if job.state is not JobState.DONE else 0)
         self._queue(job.kind, asdict(options))
 
-    def _on_ForgetJobs(self, intent: intents.RemoveEndedJobs) -> None:
+    def _on_RemoveEndedJobs(self, intent: intents.RemoveEndedJobs) -> None:
         self._list.forget()
         self._publish()
 
@@ -311,7 +311,7 @@ class JobsHandler(Handler):
         else:
             frames = frames_in(view, UNREVIEWED)
         if not frames:
-            raise CartsError("There are no such frames. Choose other frames.")
+            raise CartsError("No frame matches this choice. Choose other frames.")
         return frames
 
     @property

@@ -157,7 +157,7 @@ class OptimizingHandler(Handler):
             # Half-typed numbers are often out of range, so the error is not shown before Run.
             self._context.change(settings_error=str(error), settings_field=intent.name)
             return
-        self.end("Settings changed; Run starts again from here")
+        self.end("Settings changed; Run starts from the current pose")
         self._context.change(settings=settings, solver=solver, settings_error=None, settings_field=None, maps=None)
 
     def _on_ResetSettings(self, intent: intents.ResetSettings) -> None:
@@ -168,7 +168,7 @@ class OptimizingHandler(Handler):
         settings = named_solver(state.solver)
         if isinstance(settings, SurfaceSolver):
             settings = replace(settings, **preset.changes(settings))
-        self.end("Settings changed; Run starts again from here")
+        self.end("Settings changed; Run starts from the current pose")
         self._context.change(settings=settings, settings_error=None, settings_field=None, maps=None)
 
     def _on_SetFreeJoint(self, intent: intents.SetFreeJoint) -> None:
@@ -182,12 +182,12 @@ class OptimizingHandler(Handler):
         self._set_free(**{intent.group: intent.on})
 
     def _on_SetCameras(self, intent: intents.SetCameras) -> None:
-        self.end("Cameras changed; Run starts again from here")
+        self.end("Cameras changed; Run starts from the current pose")
         self._context.change(every_camera=intent.every)
 
     def _on_SetObserved(self, intent: intents.SetObserved) -> None:
         observed = Observed(intent.what, intent.masks)  # type: ignore[arg-type]
-        self.end("Target changed; Run starts again from here")
+        self.end("Target changed; Run starts from the current pose")
         self._context.change(observed=observed, maps=None)
 
     # ---- The run ---------------------------------------------------------------------------------------------------
@@ -273,7 +273,7 @@ class OptimizingHandler(Handler):
 
     def _on_Assess(self, intent: intents.Assess) -> None:
         self.end("Stopped: the fit was checked")
-        self._optimizers.report("comparing with the images")
+        self._optimizers.report("Comparing with the images")
         state = self._context.state
         target = self._session.target(state.observed)
         found = self._check.fit(state.index, state.domain, state.pose, state.settings, target)
@@ -296,7 +296,7 @@ class OptimizingHandler(Handler):
         self._context.edit("Optimize", edits, gesture=run, loss=float(iterate.loss), maps=maps)
 
     def _set_free(self, **changes: Any) -> None:
-        self.end("Free parameters changed; Run starts again from here")
+        self.end("Free parameters changed; Run starts from the current pose")
         self._context.change(free=replace(self._context.state.free, **changes), maps=None)
 
     def _set(self, **changes: Any) -> None:

@@ -118,7 +118,7 @@ class PaintingHandler(Handler):
         view = self._session.editor.view
         changed = {key: layer for key, layer in edits.items() if view.get(key) != layer}
         if changed:
-            self._context.end_run("Stopped: a layer was painted; Run starts again from here")
+            self._context.end_run("Stopped: a layer was painted; Run starts from the current pose")
             self._context.edit(name, changed, loss=self._loss(next(iter(changed))))
 
     def _loss(self, key: Key[Any]) -> float | None:

@@ -104,7 +104,7 @@ class AnnotatingHandler(Handler):
             raise CartsError("All frames are reviewed.")
         self._go(index)
 
-    def _on_ShowWorse(self, intent: intents.ShowWorst) -> None:
+    def _on_ShowWorst(self, intent: intents.ShowWorst) -> None:
         state = self._context.state
         project = state.project
         frames = range(len(project.identity.frame_ids))
@@ -155,7 +155,7 @@ class AnnotatingHandler(Handler):
             raise CartsError(f"Unknown keypoint {intent.label!r}. Choose one of: {', '.join(self._keypoints)}.")
         self._context.change(keypoints=replace(self._context.state.keypoints, chosen=intent.label))
 
-    def _on_ForgetPins(self, intent: intents.RemovePins) -> None:
+    def _on_RemovePins(self, intent: intents.RemovePins) -> None:
         self._context.remove_pins()
 
     def _on_PointAt(self, intent: intents.PointAt) -> None:
@@ -213,7 +213,7 @@ class FilterHandler(Handler):
     def _on_ClearFilter(self, intent: intents.ClearFilter) -> None:
         self._context.change(filter=FrameFilter())
 
-    def _on_ShowFound(self, intent: intents.ShowMatching) -> None:
+    def _on_ShowMatching(self, intent: intents.ShowMatching) -> None:
         state = self._context.state
         frames = self._found()
         if intent.step > 0:
@@ -223,7 +223,7 @@ class FilterHandler(Handler):
         self._context.change(playing=False)
         self._show(index=index)
 
-    def _on_ReviewFound(self, intent: intents.ReviewMatching) -> None:
+    def _on_ReviewMatching(self, intent: intents.ReviewMatching) -> None:
         frames, project = self._found(), self._context.session.editor.view
         self._context.end_run("Stopped: many frames were reviewed")
         edits: dict[Key[Any], Any] = {}

@@ -122,7 +122,7 @@ class PropagatingHandler(Handler):
             model=model,
             free=free,
             keyframes={index: session.joints(pose.scene) for index, pose in poses.items()},
-            keyframe_std={index: _deviations(self._before, index) for index in kept},
+            keyframe_std={index: _standard_deviations(self._before, index) for index in kept},
             ignore=lambda index: session.ignored(index, cameras, target),
             backgrounds=Backgrounds.of(sequence, cameras, state.domain),
             cameras=cameras,
@@ -224,7 +224,7 @@ class PropagatingHandler(Handler):
         self._report(listed=tuple(replace(f, taken=f.taken or f.index in taken) for f in listed))
         self._context.refresh()
 
-    def _on_DropSolved(self, intent: intents.DiscardSolved) -> None:
+    def _on_DiscardSolved(self, intent: intents.DiscardSolved) -> None:
         self._held = {}
         self._report(listed=())
 
@@ -233,8 +233,8 @@ class PropagatingHandler(Handler):
             self._context.change(solve=replace(self._context.state.solve, **changes))
 
 
-def _deviations(project: ProjectState, index: int) -> dict[str, np.ndarray]:
-    """Arm -> standard deviations of a kept frame's joint positions [rad, m], if not set by hand."""
+def _standard_deviations(project: ProjectState, index: int) -> dict[str, np.ndarray]:
+    """Arm -> standard deviations of a kept frame's joint positions [rad, m], for arms not posed by hand."""
     known = {arm: value.standard_deviations for arm, value in project.joints(index).items()}
     return {arm: np.array(values, np.float64) for arm, values in known.items() if values is not None}
 
@@ -242,7 +242,7 @@ def _deviations(project: ProjectState, index: int) -> dict[str, np.ndarray]:
 class KeyframeHandler(Handler):
     """Handler of keyframes and of the direction of solving."""
 
-    def _on_HoldKeyframe(self, intent: intents.SetKeyframe) -> None:
+    def _on_SetKeyframe(self, intent: intents.SetKeyframe) -> None:
         state = self._context.state
         on = not state.project.is_keyframe(state.index) if intent.on is None else bool(intent.on)
         self._context.end_run("Stopped: the frame was marked")

@@ -13,7 +13,7 @@ from carts_viewer.jobs.companions import Decisions, set_aside_damaged
 from carts_viewer.jobs.optimizers import OptimizerFactory
 
 STARTED = "As started"
-"""Label of the network that the viewer was started with: the shipped one, or that of `--weights`."""
+"""Label of the initial network: the shipped network, or that of `--weights`."""
 _WEIGHTS_FILE = "surface.safetensors"
 _ADAPTED = "Adapted {}"
 _FILE = Kind("choice of a network", 2**12)
@@ -56,7 +56,7 @@ class Networks:
             self.problem = f"The last chosen network {remembered!r} cannot be used: {error}."
 
     def update_names(self) -> None:
-        """Update `names`."""
+        """Update `names` from the folders beside the project."""
         numbers = [number for number in self._numbers() if is_regular(self.folder(number) / _WEIGHTS_FILE)]
         self.names = (STARTED, *(_ADAPTED.format(number) for number in numbers))
 
@@ -87,7 +87,7 @@ class Networks:
         """Accept or refuse the weights that need confirmation.
 
         Raises:
-            CartsError: no weights need confirmation, or they cannot be used.
+            CartsError: no weights need confirmation, or the weights cannot be used.
         """
         name, self.asked = self.asked, ""
         if not name:

@@ -159,7 +159,7 @@ class NetworkOptions(TypedDict, total=False):
     weights: tuple[Path, ...]
     """Weights files; networks without a file have the shipped weights."""
     device: str
-    """Device of the networks, such as `cpu`, the default, or `cuda`."""
+    """PyTorch device of the networks, such as `cuda`; `cpu` by default."""
     inference: Inference
     """Runtime of the surface network; `auto` by default."""
     segmenter: Segmenter | None

@@ -136,7 +136,7 @@ def calibrate(context: Context, optimizers: OptimizerFactory, count: int) -> Gen
     session.editor.apply(f"Calibrate on {len(indices)} frames", edits)
     context.refresh()
     again = " All masks have changed: run or solve fitted frames again." if solved else ""
-    again += f" Unreviewed now, though accepted before: {accepted}." if accepted else ""
+    again += f" Accepted frames that became unreviewed: {accepted}." if accepted else ""
     done = f"Calibrated on {len(indices)} frames, one undo step.{_moved(scene, result.scene)}"
     yield Progress(most, most, f"{done} {verdict}{again}")
 
@@ -217,7 +217,7 @@ class _Training:
 
     def __init__(self, arguments: list[str]) -> None:
         self._began = time.monotonic()
-        # Threads that wait actively would slow down the page.
+        # Busy-waiting threads would slow down the page.
         output = {"PYTHONUNBUFFERED": "1", "NO_COLOR": "1", "OMP_WAIT_POLICY": "PASSIVE"}
         environment = {**os.environ, **output, PARENT: str(os.getpid())}
         self._process = subprocess.Popen(

@@ -1,6 +1,6 @@
 """Keyboard shortcuts, hints of controls, and the help panel.
 
-`python -m carts_viewer.panels.help docs/reference/keys.md` updates the table of keys between two marks in this file.
+`python -m carts_viewer.panels.help docs/reference/keys.md` updates the table of keys between two marks in `keys.md`.
 """
 
 import sys
@@ -180,7 +180,7 @@ HINTS = {
     "Off": "No tool: dragging pans the image (Esc)",
     "Brush": "Paint with a round brush; Shift erases (Shift+B)",
     "Eraser": "Erase with a round brush; Shift paints (Shift+X)",
-    "Adapt the network to this recording": "Train the network on synthetic images for this recording; a job",
+    "Adapt the network to this recording": "Queue a job that trains the network on synthetic images for this recording",
     "Use newest network": "Use the network that was adapted last",
     "Prompt": "Segment the object at a click or in a box; Shift or Alt removes (Shift+T)",
     "Polygon": "Fill a polygon: click its corners; Enter or a double click closes it (Shift+P)",
@@ -227,7 +227,7 @@ HINTS = {
     "Keypoint": "Point of the arm that the next Shift+click places",
     "Show keypoints": "Mark the keypoints of the arms in the images, with their names (H)",
     "Clear clicks": "Remove the placed keypoints; the arm keeps its pose",
-    "Import masks": "Import masks or keypoints into a layer of this project; one undo step",
+    "Import masks": "Import masks or keypoints into a layer of this project, as one undo step",
     # Find
     "Review": "Frames in this review state",
     "Corrected": "Frames in which this arm's joints were corrected",
@@ -251,7 +251,7 @@ HINTS = {
     "Start again": "Queue this job again; a job on many frames continues where it stopped",
     "Clear ended": "Remove ended jobs from the list",
     # Live
-    "Start": "Track the arms in the source, shown in place of the recording",
+    "Start": "Show the source in place of the recording, and track the arms in it",
     "Stop": "Return to the recording",
     # Export
     "Format": "File format",

@@ -143,7 +143,7 @@ class JobsPanel:
             handle.visible = bool(question)
 
     def _follow_range(self, state: ViewState) -> None:
-        """Select the range when one is marked, and deselect it when it is removed."""
+        """Select the frames in the range when a range is marked, and unreviewed frames when it is removed."""
         ranged = state.range is not None
         before, now = (_UNREVIEWED, _RANGE) if ranged else (_RANGE, _UNREVIEWED)
         if ranged != self._ranged and self._frames.value == before:

@@ -316,7 +316,7 @@ class CurvesPanel:
 
 
 def note(curves: Curves, outdated: bool) -> str:
-    """Note on the curves."""
+    """Note about the curves."""
     if outdated:
         return "Outdated: the pose, the image or a setting has changed since the run."
     if curves.comparable:

@@ -87,7 +87,7 @@ def stored_choices(state: ViewState) -> dict[str, Any]:
 
 
 def restored_choices(settings: Mapping[str, Any], state: ViewState) -> list[intents.Intent]:
-    """Intents that restore the valid choices among those stored by `stored_choices`."""
+    """Intents that restore stored choices, if they are valid."""
     found: list[intents.Intent] = []
     layer, reach, beside = (settings.get(name) for name in ("layer", "reach", "beside"))
     # Layers of imported masks or of ground truth do not exist in every recording.

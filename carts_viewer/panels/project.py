@@ -58,7 +58,7 @@ class HistoryPanel:
         gui = page.gui
         self._positions: dict[str, int] = {}
         with gui.add_folder("History"):
-            self._steps = gui.add_dropdown("Go to", ["As measured"], hint="All steps; select one to undo or redo to it")
+            self._steps = gui.add_dropdown("Go to", ["As measured"], hint="Undo or redo up to the selected step")
             page.columns([self._steps], 1, narrow_labels=True)
         page.on_input(self._steps, lambda label: intents.GoToStep(self._positions[label]))
 

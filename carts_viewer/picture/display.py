@@ -165,7 +165,7 @@ MAX_WAIT = 0.08
 
 
 class RateLimit:
-    """Decides when the next picture may be sent: once the tab has drawn the last one, or after `MAX_WAIT`."""
+    """Decides when the next picture may be sent: once the tab has drawn the last picture, or after `MAX_WAIT`."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock

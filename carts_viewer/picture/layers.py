@@ -77,7 +77,7 @@ def shaded(image: Float[np.ndarray, "3 height width"], arm_ids: ArmIds, opacity:
 
 
 def mask(arm_ids: ArmIds, opacity: float) -> Rgba:
-    """Each arm's pixels in its colour."""
+    """Each arm's pixels in the arm's colour."""
     colors, _ = _palette(arm_ids)
     colors[1:, 3] = _byte(opacity)
     return np.take(colors, arm_ids + 1, axis=0)

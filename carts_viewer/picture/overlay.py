@@ -161,7 +161,7 @@ def labelled_keypoints(scene: Scene) -> dict[str, Keypoint]:
 def keypoints_in_image(
     scene: Scene, state: SceneState, camera: str, points: Mapping[str, Keypoint]
 ) -> list[tuple[str, float, float]]:
-    """Label, column and row of every keypoint that is in or near a camera's image, as shares of its size."""
+    """Label, column and row of every keypoint that is in or near a camera's image, relative to its size."""
     own = scene.camera(camera)
     found = []
     for label, (u, v) in zip(

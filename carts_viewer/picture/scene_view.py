@@ -72,7 +72,7 @@ class SceneView:
         self._put(OVERLAY, picture, camera, _OVERLAY_SHARE * self._depth, "png")
 
     def show_beside(self, camera: Camera, active: Camera, image: np.ndarray | None, overlay: Rgba | None) -> None:
-        """Show another camera's image and overlay beside those of the active camera; None: unchanged.
+        """Show another camera's image and overlay beside those of the active camera; None leaves them unchanged.
 
         Images form a grid in the order of the cameras. Each is scaled to the size of the active camera's image, which
         remains in front of the lens.

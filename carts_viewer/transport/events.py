@@ -41,7 +41,7 @@ class Trace(Event):
     name: _Text
     first: int
     last: int
-    """One after the last frame."""
+    """Index after the last frame."""
     columns: int
 
 

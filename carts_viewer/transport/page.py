@@ -248,7 +248,7 @@ class Page:
         self._channel = self.server.gui.add_text("channel", "", visible=False)
 
     def clear(self, title: str) -> None:
-        """Remove all widgets, commands, nodes and callbacks; tabs must be reloaded once new ones exist."""
+        """Remove all widgets, commands, nodes and callbacks; tabs must be reloaded once new widgets exist."""
         self._title = title
         self._disconnect_callbacks.clear()
         self.key_groups = []

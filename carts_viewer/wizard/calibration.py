@@ -152,7 +152,7 @@ class CalibrationReport:
     """Report of a finished calibration, as stored in a draft."""
 
     loss_before: float
-    """Mean loss of the frames [1]."""
+    """Initial mean loss of the frames [1]."""
     loss_after: float
     verdict: str
     """good, doubtful or failed; empty if there is no verdict."""

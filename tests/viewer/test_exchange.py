@@ -345,7 +345,7 @@ def test_what_cannot_be_fitted_is_said(at_desk: Desk) -> None:
     at_desk.do(intents.SetSetting("solver", "acs"))
     with pytest.raises(CartsError, match=r"cannot fit masks\. Choose the solver Surface maps"):
         at_desk.do(intents.Run())
-    with pytest.raises(CartsError, match=r"'eyes' cannot be observed\. Choose one of: network, masks, both"):
+    with pytest.raises(CartsError, match=r"'eyes' is not a target of runs\. Choose one of: network, masks, both"):
         at_desk.do(intents.SetObserved("eyes", "imported"))
     at_desk.do(intents.SetSetting("solver", "surface"), intents.SetObserved("both", "imported"))
     with pytest.raises(CartsError, match=r"missing\.safetensors"):

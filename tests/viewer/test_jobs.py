@@ -91,7 +91,7 @@ def test_a_calibration_is_a_job_and_one_step_of_undo_and_says_what_it_does_to_ac
     (job,) = desk.state.jobs
     assert job.state is JobState.DONE
     assert desk.saved.review(0).state is ReviewState.UNTOUCHED
-    assert "accepted before: 1." in job.text and "solve fitted frames again" in job.text
+    assert "Accepted frames that became unreviewed: 1." in job.text and "solve fitted frames again" in job.text
     steps = [step.name for step in desk.saved.steps]
     assert steps[1:] == ["Calibrate on 2 frames"]
 
@@ -387,7 +387,7 @@ def test_training_that_is_cancelled_goes_on_in_its_folder_and_its_network_is_use
         at_desk.do(intents.AnswerNetwork(True))
     assert at_desk.do(intents.UseNetwork(STARTED)).network == STARTED
     assert at_desk.factory.prepare().sha256 == before
-    with pytest.raises(CartsError, match=r"no network '\.\./\.\./else'"):
+    with pytest.raises(CartsError, match=r"Unknown network '\.\./\.\./else'"):
         at_desk.do(intents.UseNetwork("../../else"))
 
 

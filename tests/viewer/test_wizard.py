@@ -111,7 +111,7 @@ def test_the_trials_of_a_folder_of_jigsaws_are_offered(tmp_path: Path) -> None:
     draft = Draft(source=str(tmp_path / "JIGSAWS"), name="JIGSAWS")
     found = guess(draft)
     form = check_form(draft, found, {})
-    assert "Choose one" in form and f'<option value="{folder / "Suturing_B002.txt"}">Suturing_B002</option>' in form
+    assert "Choose a trial" in form and f'<option value="{folder / "Suturing_B002.txt"}">Suturing_B002</option>' in form
 
 
 def test_a_delay_between_video_and_log_is_proposed_taken_and_undone(tmp_path: Path, shipped_psm: Robot) -> None:
