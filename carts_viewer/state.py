@@ -312,9 +312,9 @@ class RefinedMasks:
     frame: Frame
     pose: SceneState
     ignored: Mapping[str, IgnoreRegion | None]
-    """Camera name -> ignored pixels, which stay as rendered."""
+    """Camera -> ignored pixels, where the masks are as rendered."""
     masks: Mapping[str, Bool[np.ndarray, "height width"]]
-    """Camera name -> mask."""
+    """Camera -> refined mask."""
 
 
 @dataclass(frozen=True)
@@ -505,7 +505,7 @@ class ViewState:
         return self.mask_correction_of(self.camera)
 
     def refined_mask(self, pose: SceneState, camera: str) -> Bool[np.ndarray, "height width"] | None:
-        """Refined mask of the shown frame at a pose; None where it is not computed."""
+        """Refined mask of the shown frame at a pose; None if it is not computed."""
         known = self.refined
         if known is None or known.frame is not self.frame or known.pose is not pose:
             return None

@@ -36,7 +36,7 @@ FRAME_CHOICES = {
 }
 """Choices of the frames to export, as review states."""
 MASKS_CHOICES: tuple[Masks, ...] = ("auto", "refined", "rendered")
-"""Choices of the masks to refine."""
+"""Choices of masks: refined if the verdict is good, refined, or as rendered."""
 PARTS_CHOICES: tuple[Parts, ...] = ("arms", "parts", "links")
 """Choices of the granularity of categories."""
 _STEMS = {

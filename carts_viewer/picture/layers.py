@@ -41,7 +41,7 @@ TRUTH_COLORS = {
 ADDED_COLOR, REMOVED_COLOR, IGNORED_COLOR = (190, 242, 60), (239, 68, 68), (168, 85, 247)
 """Colours of pixels added to the mask, removed from it, or excluded from the optimizer."""
 RENDERED_COLOR = (255, 255, 255)
-"""Colour of the outline of the rendered mask under a refined one."""
+"""Colour of the outline of the rendered mask in the layer *Refined mask*."""
 
 Rgba = UInt8[np.ndarray, "height width 4"]
 ArmIds = Int[np.ndarray, "height width"]
@@ -84,7 +84,7 @@ def mask(arm_ids: ArmIds, opacity: float) -> Rgba:
 
 
 def refined(arm_ids: ArmIds, rendered: ArmIds, opacity: float) -> Rgba:
-    """Each arm's pixels of a refined mask in its colour, and the outline of the rendered mask."""
+    """Each arm's pixels of a refined mask in the arm's colour, and the outline of the rendered mask."""
     picture = mask(arm_ids, opacity)
     inside = (rendered >= 0).view(np.uint8)
     _fill(picture, (inside - cv2.erode(inside, np.ones((3, 3), np.uint8))).view(bool), (*RENDERED_COLOR, 255))
