@@ -95,7 +95,7 @@ def shortcuts() -> list[Shortcut]:
         Shortcut("escape", "Discard the polygon, or deselect the tool", intents.SetTool(Tool.OFF)),
         Shortcut("V", "Endoscope view or 3D view", "view"),
         *(
-            Shortcut(str(number), f"Overlay: {layer.lower()}", intents.ShowLayer(layer))
+            Shortcut(str(number % 10), f"Overlay: {layer.lower()}", intents.ShowLayer(layer))
             for number, layer in enumerate(Layer, start=1)
         ),
     ]

@@ -17,7 +17,6 @@ class Layer(StrEnum):
 
     SHADED = "Shaded arm"
     MASK = "Mask"
-    REFINED = "Refined mask"
     CONTOUR = "Contour"
     TRUTH = "Ground truth"
     ATTENTION = "Attention map"
@@ -25,6 +24,7 @@ class Layer(StrEnum):
     NONE = "None"
     IMPORTED = "Imported masks"
     PARTS = "Parts"
+    REFINED = "Refined mask"
 
 
 ARM_COLORS = ((45, 212, 167), (96, 165, 250), (250, 204, 21), (232, 121, 249))
