@@ -81,12 +81,12 @@ def test_the_worst_frame_that_is_not_settled_comes_first(desk: Desk) -> None:
     desk.do(intents.Refresh(), intents.ShowFrame(1))
     visited = [
         desk.state.index,
-        *(desk.do(intents.ShowWorse()).index for _ in range(2)),
-        desk.do(intents.ShowWorse(-1)).index,
+        *(desk.do(intents.ShowWorst()).index for _ in range(2)),
+        desk.do(intents.ShowWorst(-1)).index,
     ]
     assert visited == [1, 2, 0, 2]
     desk.do(intents.ShowFrame(1), intents.SetReview(ReviewState.ACCEPTED), intents.ShowFrame(2))
-    assert [desk.do(intents.ShowWorse()).index for _ in range(2)] == [0, 2]
+    assert [desk.do(intents.ShowWorst()).index for _ in range(2)] == [0, 2]
 
 
 def test_keys_nudge_the_joint_that_was_moved_last_or_chosen(desk: Desk) -> None:
@@ -137,7 +137,7 @@ def test_a_dragged_keypoint_is_the_one_that_was_nearest_and_one_step(desk: Desk)
 
 
 @pytest.mark.parametrize(
-    "intent", [intents.SetJoint("PSM1", 0, 0.1), intents.MoveFrame(1), intents.Undo(), intents.ForgetPins()]
+    "intent", [intents.SetJoint("PSM1", 0, 0.1), intents.MoveFrame(1), intents.Undo(), intents.RemovePins()]
 )
 def test_pins_are_forgotten_when_the_pose_is_changed_otherwise(desk: Desk, intent: intents.Intent) -> None:
     desk.do(intents.PointAt(40.0, 30.0), intents.Released())
@@ -148,7 +148,7 @@ def test_pins_are_forgotten_when_the_pose_is_changed_otherwise(desk: Desk, inten
 def test_a_place_that_is_none_is_refused_and_one_outside_the_image_is_at_its_edge(desk: Desk) -> None:
     with pytest.raises(CartsError, match="not a position in the image"):
         desk.do(intents.PointAt(float("nan"), 3.0))
-    with pytest.raises(CartsError, match="There is no keypoint"):
+    with pytest.raises(CartsError, match="Unknown keypoint"):
         desk.do(intents.ChooseKeypoint("elbow"))
     desk.do(intents.PointAt(1e9, -1e9))
     assert desk.state.keypoints.pins[0].pixel == (96.0, 0.0)

@@ -174,7 +174,7 @@ def test_a_download_is_the_last_export_whole(desk: Desk, monkeypatch: pytest.Mon
     table = exported(desk, intents.Export("csv", "All"))
     desk.do(intents.Download(4))
     assert desk.delivered[-1] == (4, "kinematics.csv", table.read_bytes())
-    monkeypatch.setattr(exporting, "LARGEST", 10)
+    monkeypatch.setattr(exporting, "MAX_DOWNLOAD", 10)
     with pytest.raises(CartsError, match="Copy it from that path"):
         desk.do(intents.Download(4))
     table.unlink()
@@ -261,7 +261,7 @@ def test_masks_of_the_recording_itself_stay_the_truth(desk: Desk) -> None:
 def test_nothing_outside_of_the_allowed_folders_is_read(plain: Desk) -> None:
     (plain.session.sequence.path.parent / "linked").symlink_to("/etc")
     for place in ("", "/etc", "../elsewhere", "nothing.json", "linked"):
-        with pytest.raises(CartsError, match=r"Give the path|outside of the allowed|cannot be opened|is a link"):
+        with pytest.raises(CartsError, match=r"Enter the path|outside of the allowed|cannot be opened|is a link"):
             plain.do(intents.ImportMasks(place))
     assert not plain.saved.steps
 

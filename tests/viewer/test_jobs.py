@@ -72,7 +72,7 @@ def test_a_job_that_waits_or_runs_can_be_cancelled_and_started_again(desk: Desk)
     assert states(desk)[-1] == ("optimize", "running")
     with pytest.raises(CartsError, match="not ended"):
         desk.do(intents.RepeatJob(3))
-    desk.do(intents.CancelJob(3), intents.ForgetJobs())
+    desk.do(intents.CancelJob(3), intents.RemoveEndedJobs())
     assert desk.state.jobs == ()
     with pytest.raises(CartsError, match="Job 7 no longer exists"):
         desk.do(intents.CancelJob(7))
@@ -121,7 +121,7 @@ def test_after_the_viewer_was_killed_waiting_jobs_wait_and_the_one_that_ran_is_s
     jobs.change(first.number, "begun", state=JobState.RUNNING, done=1, total=2)
     again = job_list(tmp_path)
     assert [job.state for job in again.jobs] == [JobState.FAILED, JobState.WAITING]
-    assert "start it again" in again.jobs[0].text and again.jobs[1] == second
+    assert "start the job again" in again.jobs[0].text and again.jobs[1] == second
     assert again.jobs[0].options == OptimizeOptions((0, 1)) and again.jobs[0].done == 1
 
 
@@ -342,7 +342,7 @@ def test_training_that_is_cancelled_goes_on_in_its_folder_and_its_network_is_use
         stand_in.write_text(TRAINING.format(python=sys.executable))
         stand_in.chmod(0o700)
         monkeypatch.setattr(sys, "executable", str(stand_in))
-    monkeypatch.setattr(work, "OPTIONS", ("--steps", "100000", "--checkpoint-every", "1", *SMALL[2:]))
+    monkeypatch.setattr(work, "TRAINING_OPTIONS", ("--steps", "100000", "--checkpoint-every", "1", *SMALL[2:]))
     trainings: list[subprocess.Popen] = []
     popen = subprocess.Popen
 
@@ -366,7 +366,7 @@ def test_training_that_is_cancelled_goes_on_in_its_folder_and_its_network_is_use
     assert at_desk.state.jobs[0].state is JobState.CANCELLED and at_desk.wait_time() is None
     assert trainings[0].wait(OVER) != 0
     assert any("step 0" in line for line in at_desk.state.jobs[0].log)
-    monkeypatch.setattr(work, "OPTIONS", tuple(SMALL))
+    monkeypatch.setattr(work, "TRAINING_OPTIONS", tuple(SMALL))
     at_desk.do(intents.RepeatJob(1))
     job = ended(at_desk)
     assert job.state is JobState.DONE and job.options == AdaptOptions(1, 1)
@@ -416,7 +416,7 @@ def test_a_program_that_ends_while_it_trains_does_not_hang(tiny_sequence: Callab
 
 
 def test_training_that_fails_says_why(at_desk: Desk, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(work, "OPTIONS", ("--steps", "0"))
+    monkeypatch.setattr(work, "TRAINING_OPTIONS", ("--steps", "0"))
     at_desk.do(intents.Adapt(1))
     with pytest.raises(CartsError, match="steps is 0; allowed: 1 or more"):
         ended(at_desk)
@@ -431,7 +431,7 @@ def test_a_run_says_what_the_network_does_not_know_once_and_what_helps(
     assert all("Fit masks (Fit to), or adapt the network" in line for line in state.unfamiliar)
     monkeypatch.setattr(sys.modules["carts_core.optimization.verdict"], "RECOGNIZED", 1.01)
     at_desk.factory.use(None)
-    at_desk.factory._unfamiliar.clear()
+    at_desk.factory._warnings.clear()
     state = at_desk.do(intents.Reset(), intents.Step())
     assert "this robot or distance" in state.unfamiliar[0]
     assert at_desk.do(intents.Reset(), intents.SetObserved("masks", "recording"), intents.Step()).unfamiliar == ()

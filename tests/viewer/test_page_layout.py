@@ -8,7 +8,7 @@ from waiting import eventually, wait_in
 
 from carts_core.project import ReviewState
 from carts_viewer.actions import intents
-from carts_viewer.panels.help import HINTS, explain
+from carts_viewer.panels.help import HINTS, set_hints
 
 pytestmark = pytest.mark.browser
 
@@ -99,7 +99,7 @@ def test_every_text_of_a_desktop_page_is_whole_legible_and_explained(open_tab: O
     redo = box_of(page.get_by_role("button", name="Redo", exact=True))
     assert bar["x"] > redo["x"] + redo["width"]
     # Every control has an explanation: over buttons, also greyed out, labels and fields; of a joint with unit, limits.
-    assert len(tab.view.page.widgets()) > 120 and explain(tab.view.page) == []
+    assert len(tab.view.page.widgets()) > 120 and set_hints(tab.view.page) == []
     joint = tab.slider("PSM1", 0)
     assert joint.hint is not None and "[°], limits" in joint.hint
     page.get_by_role("button", name="Pause", exact=True).hover(force=True)
@@ -185,10 +185,10 @@ def check_keys(tab: Tab) -> None:
     """Keys do what their sheet says."""
     app, page = tab.app, tab.page
     tab.press("?")
-    expect(page.get_by_role("dialog", name="Keys")).to_contain_text("Accept, and go to the next")
+    expect(page.get_by_role("dialog", name="Keys")).to_contain_text("Accept, and show the next")
     rows = page.locator(".carts-sheet tr").filter(has_text="Overlay: ").all_inner_texts()
     tab.press("Escape")
-    assert [row.split()[0] for row in rows] == list("123456789")
+    assert [row.split()[0] for row in rows] == list("1234567890")
     for key, _, *name in (row.split() for row in rows):
         tab.press(key)
         eventually(lambda: str(tab.state.layer).lower(), lambda layer, name=name: layer == " ".join(name))

@@ -104,7 +104,7 @@ def test_exports_are_downloaded_written_beside_the_project_and_cancelled(
     path = eventually(lambda: app.state.export and app.state.export.path)
     expect(tab.page.get_by_role("status").filter(has_text=str(path))).to_be_visible()
     with tab.page.expect_download() as started:
-        tab.button("Download it")
+        tab.button("Download")
     assert started.value.suggested_filename == "masks.zip"
     with zipfile.ZipFile(io.BytesIO(Path(started.value.path()).read_bytes())) as archive:
         assert np.array_equal(decoded(archive.read("masks/binary/left_001.png")), mask)
@@ -196,7 +196,7 @@ def test_a_range_is_what_is_solved_exported_and_queued(open_tab: OpenTab) -> Non
     # The bright button is what the range was most likely chosen for.
     assert (tab.find("Solve range").color, tab.find("Solve between").color) == ("teal", "gray")
     tab.open("Export")
-    expect(tab.page.get_by_text("1 accepted frame outside of the range is left out")).to_be_visible()
+    expect(tab.page.get_by_text("1 accepted frame outside of the range is not exported")).to_be_visible()
     tab.page.get_by_label("Only the range").uncheck()
     expect(tab.page.get_by_text("outside of the range")).to_be_hidden()
     tab.open("Jobs")
@@ -237,7 +237,7 @@ def test_jobs_of_another_user_are_asked_for_and_jobs_and_choices_survive_the_ser
     expect(tab.page.get_by_text("need your confirmation")).to_have_count(0)
     expect(tab.page.get_by_role("button", name="Run jobs")).to_have_count(0)
     run_without_end(app)
-    tab.button("Optimize each alone")
+    tab.button("Optimize individually")
     running = tab.page.locator(".carts-jobs li.running")
     expect(running).to_contain_text("Optimize 6 frames individually")
     tab.press("n")

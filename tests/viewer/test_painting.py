@@ -270,7 +270,7 @@ def _labels(desk: Desk) -> np.ndarray:
 def test_a_painted_class_is_part_of_the_mask_and_one_step_of_undo(desk: Desk) -> None:
     jaws = next(one for one in part_classes(desk.session.scene.arms) if one.part == "jaws")
     covered = _pixels(desk)
-    with pytest.raises(CartsError, match="no class 99"):
+    with pytest.raises(CartsError, match="Unknown class 99"):
         desk.do(intents.SetPaintClass(99))
     desk.do(intents.SetPaintClass(jaws.number))
     assert desk.state.layer is Layer.PARTS and desk.state.brush.label == jaws.number

@@ -118,9 +118,9 @@ def test_solving_backwards_begins_at_the_last_frame_and_stopping_keeps_what_is_s
 
 def test_a_freed_frame_is_solved_and_one_that_is_made_by_hand_meanwhile_is_not_overwritten(desk: Desk) -> None:
     hand_made(desk, 0, 1)
-    desk.do(intents.HoldKeyframe(False))
+    desk.do(intents.SetKeyframe(False))
     assert desk.saved.get(Key.keyframe(1)) == Keyframe(False)
-    desk.do(intents.HoldKeyframe(), intents.HoldKeyframe(), intents.Solve())
+    desk.do(intents.SetKeyframe(), intents.SetKeyframe(), intents.Solve())
     solve_some(desk, 1)
     kept = hand_made(desk, 2)
     desk.finish()
@@ -170,7 +170,7 @@ def test_what_cannot_be_solved_is_refused_with_the_reason(desk: Desk) -> None:
     with pytest.raises(CartsError, match="no keyframe yet"):
         desk.do(intents.Solve())
     with pytest.raises(CartsError, match="requires the solver"):
-        desk.do(intents.SetSetting("solver", "acs"), intents.HoldKeyframe(True), intents.Solve())
+        desk.do(intents.SetSetting("solver", "acs"), intents.SetKeyframe(True), intents.Solve())
     with pytest.raises(ProjectError, match="could not be saved"):
         desk.reopened(read_only=True).do(intents.Solve(whole=True))
 
@@ -284,7 +284,7 @@ class KeyframeSets:
                 desk.do(intents.SetReview(ReviewState.ACCEPTED))
             if dice.random() < 0.4:
                 # Some of what was made by hand is solved all the same.
-                desk.do(intents.HoldKeyframe(dice.random() < 0.5))
+                desk.do(intents.SetKeyframe(dice.random() < 0.5))
 
     @staticmethod
     def _overlap(desk: Desk, index: int) -> float:

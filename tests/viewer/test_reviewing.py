@@ -15,12 +15,12 @@ from carts_viewer.actions import intents
 from carts_viewer.actions.exchange import FRAME_CHOICES, export_warnings
 from carts_viewer.actions.frame_filter import (
     BY_HAND,
+    NO_REVIEW,
     NOT_CHECKED,
     SOLVED,
-    UNJUDGED,
     FrameFilter,
-    copied,
-    found,
+    is_copied,
+    matching_frames,
     review_name,
 )
 from carts_viewer.jobs.comparison import Fit
@@ -54,7 +54,7 @@ def test_a_frame_that_changes_after_it_was_accepted_must_be_accepted_again(desk:
     for moves in MOVES:
         desk.do(ACCEPT, *moves)
         assert desk.state.review.state is not ReviewState.ACCEPTED and desk.saved.review(0).note == "smoke", moves
-        assert found(desk.saved, FrameFilter(review="accepted")) == []
+        assert matching_frames(desk.saved, FrameFilter(review="accepted")) == []
         steps = len(desk.saved.steps)
         assert desk.do(intents.Undo()).review.state is ReviewState.ACCEPTED and len(desk.saved.steps) == steps
         assert desk.do(intents.Redo()).review.state is not ReviewState.ACCEPTED
@@ -82,9 +82,9 @@ def test_the_calibration_is_part_of_what_was_accepted_in_every_frame(desk: Desk)
 def test_what_is_said_of_a_frame_that_nobody_judged_follows_who_made_its_joints(desk: Desk) -> None:
     desk.do(intents.Perturb(2.0, 0), intents.Run())
     desk.finish()
-    assert _name(desk) == "optimized" and found(desk.saved, FrameFilter(review="optimized")) == [0]
+    assert _name(desk) == "optimized" and matching_frames(desk.saved, FrameFilter(review="optimized")) == [0]
     desk.do(intents.Nudge(1.0))
-    assert _name(desk) == BY_HAND and found(desk.saved, FrameFilter(review="optimized")) == []
+    assert _name(desk) == BY_HAND and matching_frames(desk.saved, FrameFilter(review="optimized")) == []
     desk.do(intents.BackToMeasured())
     assert _name(desk) == "untouched" and desk.state.review.state is ReviewState.UNTOUCHED
     desk.do(intents.Undo(), intents.Undo())
@@ -94,14 +94,14 @@ def test_what_is_said_of_a_frame_that_nobody_judged_follows_who_made_its_joints(
 def test_frames_that_were_solved_together_say_so_and_a_copy_says_what_it_is(desk: Desk) -> None:
     desk.do(intents.SetSetting("solver", "surface"), intents.Solve(whole=True))
     desk.finish()
-    assert [_name(desk, index) for index in range(3)] == [SOLVED] * 3 and not copied(desk.saved, 0)
+    assert [_name(desk, index) for index in range(3)] == [SOLVED] * 3 and not is_copied(desk.saved, 0)
     desk.do(intents.Nudge(1.0), intents.MoveFrame(1), intents.CopyCorrection(-1))
-    assert copied(desk.saved, 1) and _name(desk, 1) == "untouched"
+    assert is_copied(desk.saved, 1) and _name(desk, 1) == "untouched"
 
 
 def test_unreviewed_means_the_same_in_find_in_exports_and_in_next_unreviewed(desk: Desk) -> None:
     desk.do(ACCEPT, intents.ShowFrame(1), intents.Nudge(1.0))
-    assert found(desk.saved, FrameFilter(review=UNJUDGED)) == [1, 2]
+    assert matching_frames(desk.saved, FrameFilter(review=NO_REVIEW)) == [1, 2]
     states = FRAME_CHOICES["Unreviewed"]
     assert [index for index in range(3) if desk.saved.review(index).state in states] == [1, 2]
     assert [desk.do(intents.ShowUnreviewed()).index for _ in range(2)] == [2, 1]
@@ -115,7 +115,7 @@ def test_accept_and_next_stays_in_the_range_and_says_when_it_is_done(desk: Desk)
     assert desk.do(intents.ShowFrame(0)).notice is None
     # Outside of the range, and without one, it is about the whole sequence.
     assert desk.do(intents.AcceptAndNext()).notice == "All 3 frames are reviewed."
-    with pytest.raises(CartsError, match="Every frame has been reviewed"):
+    with pytest.raises(CartsError, match="All frames are reviewed"):
         desk.do(intents.ShowUnreviewed())
 
 
@@ -150,21 +150,23 @@ def test_frames_are_found_by_what_is_known_of_them(known: Desk) -> None:
         (FrameFilter(arm="PSM1"), [0]),
         (FrameFilter(fit="failed", review="accepted"), []),
     ):
-        assert found(known.saved, wanted) == frames, wanted
+        assert matching_frames(known.saved, wanted) == frames, wanted
     known.do(intents.SetFilter("fit", NOT_CHECKED), intents.ShowFrame(0))
-    assert [known.do(intents.ShowFound(step)).index for step in (1, 1, -1)] == [2, 0, 2]
+    assert [known.do(intents.ShowMatching(step)).index for step in (1, 1, -1)] == [2, 0, 2]
 
 
 def test_all_found_frames_are_reviewed_in_one_step_and_notes_stay(known: Desk) -> None:
     steps = len(known.saved.steps)
-    known.do(intents.SetFilter("fit", "failed"), intents.ReviewFound(ReviewState.REJECTED))
+    known.do(intents.SetFilter("fit", "failed"), intents.ReviewMatching(ReviewState.REJECTED))
     assert known.saved.review(1) == Review(ReviewState.REJECTED, "Smoke on the left")
-    known.do(intents.ClearFilter(), intents.SetFilter("review", "accepted"), intents.ReviewFound(ReviewState.UNTOUCHED))
+    known.do(
+        intents.ClearFilter(), intents.SetFilter("review", "accepted"), intents.ReviewMatching(ReviewState.UNTOUCHED)
+    )
     assert known.saved.review(2) == Review() and len(known.saved.steps) == steps + 2
     known.do(intents.Undo())
     assert known.saved.review(2).state is ReviewState.ACCEPTED
-    with pytest.raises(CartsError, match="No frame meets the conditions"):
-        known.do(intents.SetFilter("note", "xyz"), intents.ShowFound())
+    with pytest.raises(CartsError, match="No frame matches the filter"):
+        known.do(intents.SetFilter("note", "xyz"), intents.ShowMatching())
     with pytest.raises(CartsError, match="cannot be filtered by 'colour'"):
         known.do(intents.SetFilter("colour", "red"))
 
