@@ -300,9 +300,7 @@ def datumaro_python(pytestconfig: pytest.Config) -> Path:
 @pytest.mark.slow
 @pytest.mark.timeout(900)
 @pytest.mark.parametrize("name", ["cvat", "datumaro", "coco", "voc"])
-def test_datumaro_itself_reads_the_very_masks(
-    dataset: Dataset, tmp_path: Path, datumaro_python: Path, name: FormatName
-) -> None:
+def test_datumaro_reads_the_masks(dataset: Dataset, tmp_path: Path, datumaro_python: Path, name: FormatName) -> None:
     dataset = replace(dataset, images="copied")
     folder, output = export(dataset, name, tmp_path / "out"), tmp_path / "read.npz"
     finished = subprocess.run(

@@ -54,7 +54,7 @@ def test_values_arrays_and_errors_come_back_as_the_decoder_gave_them(decoder: De
         (signal.raise_signal, [int(signal.SIGSEGV)], "ended with status -11"),
     ],
 )
-def test_too_much_memory_or_time_and_a_crash_are_errors_and_the_next_call_works(
+def test_limits_and_crashes_are_errors(
     decoder: Decoder, function: Callable[..., Any], arguments: list[int], message: str
 ):
     with pytest.raises(ValueError, match=message):

@@ -81,7 +81,7 @@ def test_nothing_planted_is_followed(name: str, recording: Path, tmp_path_factor
 
 
 @pytest.mark.parametrize("name", ["render", "import", "robot"])
-def test_special_files_among_the_inputs_are_refused(
+def test_special_files_as_inputs_are_refused(
     name: str, recording: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
     assert _attack(name, recording, tmp_path_factory.mktemp("attacks"), sample=2, inputs=True) == 2
@@ -90,16 +90,12 @@ def test_special_files_among_the_inputs_are_refused(
 @pytest.mark.slow
 @pytest.mark.timeout(3600)
 @pytest.mark.parametrize("name", COMMANDS)
-def test_nothing_planted_anywhere_is_followed(
-    name: str, recording: Path, tmp_path_factory: pytest.TempPathFactory
-) -> None:
+def test_no_planted_link_is_followed(name: str, recording: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
     assert _attack(name, recording, tmp_path_factory.mktemp("attacks"), sample=None) >= len(PLANTED)
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(3600)
 @pytest.mark.parametrize("name", [name for name in COMMANDS if name not in ("train", "synthesize", "bench")])
-def test_special_files_anywhere_among_the_inputs_are_refused(
-    name: str, recording: Path, tmp_path_factory: pytest.TempPathFactory
-) -> None:
+def test_no_special_file_is_read_anywhere(name: str, recording: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
     assert _attack(name, recording, tmp_path_factory.mktemp("attacks"), sample=None, inputs=True) >= len(SPECIAL)

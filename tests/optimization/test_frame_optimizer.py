@@ -114,9 +114,7 @@ def test_an_occluder_that_is_known_is_left_out(sequence: Sequence, extractor: Fe
 
 
 @pytest.mark.parametrize(("loss", "method"), [*((loss, "adam") for loss in Loss), (Loss.ACS, "gradient_descent")])
-def test_every_loss_and_method_lowers_its_loss(
-    sequence: Sequence, extractor: FeatureExtractor, loss: Loss, method: Method
-) -> None:
+def test_every_loss_decreases(sequence: Sequence, extractor: FeatureExtractor, loss: Loss, method: Method) -> None:
     settings = DescentSolver(loss=loss, method=method, iterations=4, learning_rate=2e-3)
     optimizer = optimizer_of(sequence, extractor, cameras=["left"], settings=settings)
     first, *_ = list(optimizer)

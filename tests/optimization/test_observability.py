@@ -156,9 +156,7 @@ def test_a_base_frame_that_no_joint_can_replace_is_suspected(sequence: Sequence,
     assert freed.best.loss < 0.5 * suspected.best.loss, "freeing them more than halves it indeed"
 
 
-def test_base_frames_are_not_suspected_where_joints_explain_all(
-    sequence: Sequence, predictor: PerfectPredictor
-) -> None:
+def test_base_frames_that_are_right_are_unsuspected(sequence: Sequence, predictor: PerfectPredictor) -> None:
     frame = sequence.frame(0)
     start = {"PSM1": (frame.truth or {})["PSM1"] + np.deg2rad([1.5, -1.5, 0.0, 1.5, 1.5, -1.5, 0.0])}
     optimizer = FrameOptimizer(sequence.scene, frame, {}, predictor, start=start)

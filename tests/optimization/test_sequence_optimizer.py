@@ -62,9 +62,7 @@ def forward(made_truths: Truths) -> tuple[SequenceOptimizer, list[FrameEstimate]
     return sequence, list(sequence)
 
 
-def test_a_constant_error_is_recovered_in_every_frame(
-    truths: Truths, forward: tuple[SequenceOptimizer, list[FrameEstimate]]
-) -> None:
+def test_constant_errors_are_recovered(truths: Truths, forward: tuple[SequenceOptimizer, list[FrameEstimate]]) -> None:
     sequence, steps = forward
     assert [step.index for step in steps[:FRAMES]] == list(range(FRAMES))
     assert [step.start for step in steps[:FRAMES]] == ["cold"] + ["warm"] * (FRAMES - 1)
@@ -123,9 +121,7 @@ def correction(sequence: SequenceOptimizer, truths: Truths, index: int) -> np.nd
     return sequence.estimates[index].joint_positions[ARM] - truths.sequence.frame(index).measured[ARM]
 
 
-def test_a_keyframe_stays_as_given_and_draws_the_others(
-    truths: Truths, drawn: Callable[..., SequenceOptimizer]
-) -> None:
+def test_keyframes_stay_and_inform_their_neighbours(truths: Truths, drawn: Callable[..., SequenceOptimizer]) -> None:
     sequence, estimates = drawn(), drawn().estimates
     given = truths.sequence.frame(2).measured[ARM] + 0.02
     assert np.array_equal(estimates[2].joint_positions[ARM], given)
@@ -136,9 +132,7 @@ def test_a_keyframe_stays_as_given_and_draws_the_others(
         assert (estimates[index].joint_std[ARM] > 0).all()
 
 
-def test_deviations_of_a_keyframe_widen_those_of_its_neighbours(
-    truths: Truths, drawn: Callable[..., SequenceOptimizer]
-) -> None:
+def test_uncertain_keyframes_inform_others_less(truths: Truths, drawn: Callable[..., SequenceOptimizer]) -> None:
     std, roll = (1e-3, 1e-3, np.nan, 0.03, 1e-3, 1e-3, 1e-3), 3
     exact, uncertain = drawn(), drawn(*std)
     assert np.array_equal(uncertain.estimates[2].joint_std[ARM], np.nan_to_num(std))
@@ -193,9 +187,7 @@ def test_where_it_starts_suits_all_frames_that_were_solved_alone(truths: Truths,
     assert np.array_equal(found, wrong if jumped else right)
 
 
-def test_backward_begins_at_the_last_frame_and_ends_alike(
-    truths: Truths, forward: tuple[SequenceOptimizer, list[FrameEstimate]]
-) -> None:
+def test_backward_ends_as_forward(truths: Truths, forward: tuple[SequenceOptimizer, list[FrameEstimate]]) -> None:
     backward = optimizer(truths, model=replace(ALONE, direction="backward"))
     steps = list(backward)
     assert [step.index for step in steps[:FRAMES]] == list(reversed(range(FRAMES)))
@@ -295,7 +287,7 @@ def test_deviations_count_on_no_more_than_images_that_differ(truths: Truths) -> 
     assert (ends[1][3].joint_std[ARM] > 1.1 * ends[0][3].joint_std[ARM]).any()
 
 
-def test_a_doubtful_frame_is_less_certain(
+def test_doubtful_frames_are_less_certain(
     truths: Truths, forward: tuple[SequenceOptimizer, list[FrameEstimate]]
 ) -> None:
     """Unless its values come from elsewhere."""

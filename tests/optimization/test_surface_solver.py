@@ -120,9 +120,7 @@ def test_a_missed_arm_is_searched_in_the_whole_image(sequence: Sequence, predict
     assert ends[64] < np.deg2rad(0.5)
 
 
-def test_many_states_are_compared_at_once_as_each_alone(
-    tiny_sequence: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_batched_costs_equal_single_ones(tiny_sequence: Callable[..., Path], monkeypatch: pytest.MonkeyPatch) -> None:
     sequence = Sequence.open(tiny_sequence(frames=1, cameras=("left", "right"), width=320, height=240))
     frame, scene = sequence.frame(0), sequence.scene
     settings = SurfaceSolver(dehaze=0.0)
@@ -150,9 +148,7 @@ def problem_of(sequence: Sequence, predictor: PerfectPredictor, settings: Surfac
     return FrameProblem(scene, frame.images, predictor, variables, settings, live=False)
 
 
-def test_what_is_seen_through_haze_counts_less_in_observations_that_say_so(
-    sequence: Sequence, predictor: PerfectPredictor, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_haze_lowers_weights(sequence: Sequence, predictor: PerfectPredictor, monkeypatch: pytest.MonkeyPatch) -> None:
     # This predictor sees the same through any haze, so all that changes is how much it counts.
     found = {}
     for through in (1.0, 0.5):

@@ -110,9 +110,7 @@ def test_importing_keypoints_leaves_figures_of_a_frame_as_they_are(sequence: Seq
         assert (report.masks, report.keypoints) == (0, 1) and project.state.revision(0) == revision
 
 
-def test_the_command_imports_into_the_project_and_says_what(
-    sequence: Sequence, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_command_imports_masks(sequence: Sequence, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     write_masks(tmp_path / "theirs", 10)
     main(["import-masks", str(sequence.path), str(tmp_path / "theirs")])
     assert "Imported 2 masks from a folder of masks (instrument)." in capsys.readouterr().out

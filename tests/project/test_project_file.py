@@ -122,9 +122,7 @@ def test_a_project_survives_moving_its_folder(tiny_sequence: Callable[..., Path]
         Project.open(Sequence.open(file))
 
 
-def test_the_project_of_the_shipped_sequence_is_in_the_user_data(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_shipped_sequence_has_its_project_in_the_user_data(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert default_path(sample_sequence()).parent == Path(os.environ["CARTS_DATA"])
     monkeypatch.delenv("CARTS_DATA")
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "xdg"))
@@ -182,9 +180,7 @@ UPDATE changes SET value = json_set(value, '$.note', 'migrated') WHERE kind = 'r
 """
 
 
-def test_older_projects_are_migrated_when_opened_for_writing(
-    project_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_projects_are_migrated_when_opened_for_writing(project_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with Project(IDENTITY, project_path) as project:
         project.apply("Accept", {Key.review(0): ACCEPTED})
     before = project_path.read_bytes()

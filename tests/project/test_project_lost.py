@@ -102,9 +102,7 @@ def test_a_loss_is_noticed_and_rescued_without_an_edit(project: Project, project
         assert again.state.review(0).note == "a"
 
 
-def test_without_any_place_for_a_rescue_it_says_so_and_tries_again(
-    project: Project, project_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_failed_rescue_is_retried(project: Project, project_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     project.apply("Note", {Key.review(0): Review(note="a")})
     project_path.unlink()
     monkeypatch.setattr(store, "write_new", lambda path, content: False)
@@ -116,9 +114,7 @@ def test_without_any_place_for_a_rescue_it_says_so_and_tries_again(
     assert project.safe and [step.name for step in project.history()] == ["Note", "Note"]
 
 
-def test_what_cannot_be_saved_at_the_end_is_an_error(
-    project: Project, project_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_failing_to_save_at_close_raises(project: Project, project_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     project.apply("Note", {Key.review(0): Review(note="a")})
     project_path.unlink()
     monkeypatch.setattr(store, "write_new", lambda path, content: False)

@@ -260,9 +260,7 @@ def test_masks_in_folders_called_left_and_right_find_their_cameras(sequence: Seq
         (np.full((HEIGHT, WIDTH, 3), (1, 2, 3), np.uint8), "have a labels.json that names them"),
     ],
 )
-def test_masks_that_do_not_fit_are_refused(
-    sequence: Sequence, tmp_path: Path, values: np.ndarray, message: str
-) -> None:
+def test_masks_of_other_sizes_are_refused(sequence: Sequence, tmp_path: Path, values: np.ndarray, message: str) -> None:
     write_png(tmp_path / "left" / "001.png", values)
     with pytest.raises(SequenceError, match=message):
         all_of(tmp_path / "left", sequence)

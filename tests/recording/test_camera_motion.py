@@ -127,7 +127,7 @@ def _set(row: int, column: int, text: str) -> Callable[[list[list[str]]], object
         (_set(0, 1, "X"), "no column 'x', which .*motion: position"),
     ],
 )
-def test_an_impossible_motion_is_refused_with_what_to_do(
+def test_impossible_motions_are_refused(
     moving: Path, change: Callable[[list[list[str]]], object], message: str
 ) -> None:
     rewrite(moving.parent / "ecm.csv", change)

@@ -232,7 +232,7 @@ def test_a_frame_with_more_bits_than_the_others_asks_for_them(tiny_sequence: Cal
         ({"mirrored": True}, lambda stored: stored[:, ::-1]),
     ],
 )
-def test_videos_are_turned_and_mirrored_by_their_display_matrix(
+def test_display_matrices_are_applied(
     tmp_path: Path, options: dict, upright: Callable[[np.ndarray], np.ndarray]
 ) -> None:
     path = write_video(tmp_path / "video.mp4", [PICTURE, PICTURE // 2, PICTURE // 3], options={"crf": "4"}, **options)

@@ -19,9 +19,7 @@ _BLUR = 1.5
 
 
 @pytest.mark.parametrize("free", ["joints", "base_frames", "extrinsics", "intrinsics"])
-def test_the_compiled_kernel_agrees_with_torch(
-    sample_sequence_path: Path, free: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_kernel_agrees_with_torch(sample_sequence_path: Path, free: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Two arms seen by two cameras, and by a third one that looks elsewhere."""
     sequence = Sequence.open(sample_sequence_path)
     (left,) = sequence.scene.cameras

@@ -102,7 +102,7 @@ def test_an_empty_view_has_no_outline(scene_and_state: tuple[Scene, SceneState])
     assert found.position.shape == (2, 0) and found.motion.shape == (len(parameters), 0)
 
 
-def test_compiled_kernels_find_what_torch_finds(
+def test_the_kernels_agree_with_torch(
     scene_and_state: tuple[Scene, SceneState], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     scene, state = scene_and_state

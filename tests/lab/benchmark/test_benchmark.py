@@ -89,9 +89,7 @@ def test_every_method_is_scored_in_every_domain_although_stopped_once_and_a_furt
     assert f"{RUNS} of {RUNS}" in page.read_text() and "TC-CaRTS" in page.read_text()
 
 
-def test_frames_of_a_sequence_are_measured_together_also_where_some_are_known(
-    tiny_benchmark: Callable[..., Benchmark], count_runs: list[Measurement]
-) -> None:
+def test_sequence_mode_is_resumed(tiny_benchmark: Callable[..., Benchmark], count_runs: list[Measurement]) -> None:
     runs = [Run("synthetic", "regular", frame, "sequence", 1.0) for frame in (0, 1)]
     benchmark = tiny_benchmark(runs=runs)
     benchmark.run(QUIET)
@@ -105,7 +103,7 @@ def test_frames_of_a_sequence_are_measured_together_also_where_some_are_known(
     assert [entry.final.dice for entry in again.measurements()] == [entry.final.dice for entry in first]
 
 
-def test_measurements_of_other_images_settings_weights_or_code_are_not_used(
+def test_stale_measurements_are_not_used(
     tiny_benchmark: Callable[..., Benchmark], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     reference = tiny_benchmark()

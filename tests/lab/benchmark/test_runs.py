@@ -116,9 +116,7 @@ def test_sequence_mode_starts_with_one_error_for_all_frames(tiny_sequence: Calla
     assert any(errors["ours", index] != errors["ours", 0] for index in range(4))
 
 
-def test_one_start_is_measured_kept_and_not_measured_again(
-    tmp_path: Path, extractor: FeatureExtractor, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_hand_eye_runs_are_kept(tmp_path: Path, extractor: FeatureExtractor, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(hand_eye, "CONDITIONS", CONDITIONS[:1])
     run = HandEyeRun(CONDITIONS[0].name, 0, 0.1, 1e-3, "good")
     monkeypatch.setattr(hand_eye, "_run", lambda condition, seed, extractor: run)

@@ -17,7 +17,7 @@ def attack(work: Path, number: int, name: str) -> tuple[list[list[str]], tuple[s
 
 @pytest.mark.slow
 @pytest.mark.timeout(7200)
-def test_500_hostile_names_lead_nowhere_when_synthesized(
+def test_500_hostile_names_to_synthesize(
     tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert campaign(tmp_path_factory.mktemp("sandbox"), monkeypatch, 500, attack) > 20

@@ -258,7 +258,7 @@ def test_the_default_output_has_the_whole_name_of_a_folder_with_a_dot(folder, tm
         (np.arange(FRAMES) / 10, {"name": "a\x1bb"}, "name"),
     ],
 )
-def test_errors_about_what_is_written_name_the_recording_and_not_a_temporary_file(
+def test_errors_name_the_recording(
     folder: Path, tmp_path: Path, times: list[float] | np.ndarray, change: dict, message: str
 ):
     found = find(folder)

@@ -623,7 +623,7 @@ def test_leftovers_links_rights_and_names_do_not_matter(tmp_path: Path, monkeypa
     ],
     ids=["right", "inverse", "millimetres"],
 )
-def test_a_base_frame_out_of_view_is_said_with_the_reading_that_fits(
+def test_base_frames_out_of_view_are_said(
     tmp_path: Path, change: Callable[[np.ndarray], np.ndarray], reading: str
 ) -> None:
     counted_from(1, 1)(tmp_path / "rec")
