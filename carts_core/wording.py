@@ -13,7 +13,7 @@ def counted(number: int, what: str) -> str:
     return f"{number} {what}{'' if number == 1 else 's'}"
 
 
-def spoken_time(seconds: float) -> str:
+def duration_text(seconds: float) -> str:
     """Rounded duration, such as "40 s" or "3 min"."""
     return f"{seconds:.0f} s" if seconds < 100 else f"{seconds / 60:.0f} min"
 

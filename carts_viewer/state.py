@@ -163,7 +163,7 @@ class Target:
         if self.observed.what != "masks":
             return list(cameras)
         if self.given is not None:
-            return [name for name in cameras if self.given.there(index, name)]
+            return [name for name in cameras if self.given.available(index, name)]
         own = [name for name in cameras if recording.has_masks(name, domain)]
         there = recording.frame(index, domain, own).masks or {}
         return [name for name in own if name in there]

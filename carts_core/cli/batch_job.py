@@ -32,7 +32,7 @@ from .calibrate import Calibrate
 from .export import Export
 from .importing import Import
 from .optimize import Evaluate, Optimize
-from .options import NO_PROJECT, FromProject
+from .options import NO_PROJECT, ProjectOption
 
 _COMMANDS: dict[Step, type] = {
     "import": Import,
@@ -89,7 +89,7 @@ class BatchWork:
 def with_project(job: Job) -> Path | None:
     """Project beside the recording, for a job that only evaluates or exports; None for other jobs."""
     used = {"evaluate", "export"} & set(job.steps) and not set(_CORRECTING) & set(job.steps)
-    return FromProject().path(job.recording) if used else None
+    return ProjectOption().path(job.recording) if used else None
 
 
 def check_options(jobs: Sequence[Job]) -> None:

@@ -13,7 +13,7 @@ from ..errors import SettingsError
 from ..settings import CALIBRATION, FreeParameters
 from ..settings.serialization import to_plain
 from ..stopping import message_if_stopped
-from .options import CalibrationOptions, Observing, Selection, SequencePath, output_folder
+from .options import CalibrationOptions, ObservationOptions, Selection, SequencePath, output_folder
 
 if TYPE_CHECKING:
     from collections.abc import Sequence as Points
@@ -179,7 +179,7 @@ class Calibrate:
     beyond_hand_eye: bool = False
     """Write the calibration even if a base frame moves by more than the uncertainty estimated by `carts hand-eye`."""
     free: Annotated[FreeParameters, tyro.conf.arg(name="")] = CALIBRATION
-    network: Annotated[Observing, tyro.conf.arg(name="")] = field(default_factory=Observing)
+    network: Annotated[ObservationOptions, tyro.conf.arg(name="")] = field(default_factory=ObservationOptions)
     solving: Annotated[CalibrationOptions, tyro.conf.arg(name="")] = field(default_factory=CalibrationOptions)
 
     def run(self) -> None:

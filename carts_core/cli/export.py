@@ -11,7 +11,7 @@ from ..errors import SettingsError
 from ..settings import FormatName, Images, Masks, Parts
 from ..stopping import message_if_stopped
 from ..wording import counted
-from .options import FromProject, Network, Perturbation, Selection, SequencePath, output_folder
+from .options import Network, Perturbation, ProjectOption, Selection, SequencePath, output_folder
 
 if TYPE_CHECKING:
     from ..export import ExportFrame
@@ -30,7 +30,7 @@ class Render:
     """Rendering blended over the image, rendering alone, or mask."""
     opacity: float = 0.6
     """Opacity of the rendering in an overlay, 0 to 1."""
-    source: Annotated[FromProject, tyro.conf.arg(name="")] = field(default_factory=FromProject)
+    source: Annotated[ProjectOption, tyro.conf.arg(name="")] = field(default_factory=ProjectOption)
     start: Annotated[Perturbation, tyro.conf.arg(name="")] = field(default_factory=Perturbation)
     select: Annotated[Selection, tyro.conf.arg(name="")] = field(default_factory=Selection)
 
@@ -84,7 +84,7 @@ class Export:
     """Export format."""
     kinematics: Path | None = None
     """Kinematics table of `carts optimize` to export instead of a project's corrections."""
-    source: Annotated[FromProject, tyro.conf.arg(name="")] = field(default_factory=FromProject)
+    source: Annotated[ProjectOption, tyro.conf.arg(name="")] = field(default_factory=ProjectOption)
     parts: Parts = "arms"
     """Categories: one per arm, per part (shaft, wrist, jaws), or per link."""
     images: Images = "named"
@@ -94,8 +94,8 @@ class Export:
     """Frame rate of a video [1/s]; by default the frame rate of the recording, or 25 without times."""
     masks: Masks = "auto"
     """Masks of the formats masks, coco, yolo, voc, cvat and datumaro: `rendered` at the corrected pose, or `refined`
-    near their outline by the network; `auto` refines where the verdict is *good*. Rendered masks of refined views are
-    in the folder `rendered`."""
+    near their outline by the network; `auto` refines the masks of frames with the verdict *good*. Rendered masks of
+    refined views are in the folder `rendered`."""
     network: Annotated[Network, tyro.conf.arg(name="")] = field(default_factory=Network)
     overwrite: bool = False
     """Replace an earlier export."""
@@ -140,7 +140,7 @@ class Export:
         if refines:
             sources = [dataset.mask_source(frame, camera) for _, frame, camera in dataset.steps]
             number = f"{sources.count('refined')} of {counted(len(sources), 'mask')}"
-            console.print(f"{number} refined near the outline; the folder rendered has them as rendered")
+            console.print(f"{number} refined near the outline; the rendered masks are in the folder `rendered`")
         console.print(f"wrote {path}")
 
     def _frames(

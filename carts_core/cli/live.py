@@ -11,7 +11,7 @@ import tyro
 from ..console import Terminal
 from ..settings.live import StreamAddress
 from ..settings.ranges import Count, Range
-from .options import FreeInFrames, Network, RangedOptions, Selection, SequencePath, check_writable
+from .options import FrameFreeParameters, Network, RangedOptions, Selection, SequencePath, check_writable
 
 if TYPE_CHECKING:
     from ..live import Tracked
@@ -46,7 +46,7 @@ class Live(RangedOptions):
     """Cameras, by name."""
     domain: str | None = None
     """Replay: domain, by name; by default the first domain of the sequence."""
-    free: Annotated[FreeInFrames, tyro.conf.arg(name="")] = field(default_factory=FreeInFrames)
+    free: Annotated[FrameFreeParameters, tyro.conf.arg(name="")] = field(default_factory=FrameFreeParameters)
     network: Annotated[Network, tyro.conf.arg(name="")] = field(default_factory=Network)
 
     def __post_init__(self) -> None:

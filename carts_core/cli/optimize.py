@@ -12,12 +12,12 @@ from ..errors import SettingsError
 from ..stopping import message_if_stopped
 from ..wording import counted
 from .options import (
-    FreeInFrames,
-    FromProject,
+    FrameFreeParameters,
     Mode,
-    Observing,
+    ObservationOptions,
     OptimizeOptions,
     Perturbation,
+    ProjectOption,
     Selection,
     SequencePath,
     SolverOptions,
@@ -31,9 +31,9 @@ class Optimize(OptimizeOptions):
 
     def run(self) -> None:
         """Optimize the frames without an up-to-date result."""
-        from .optimizing import Optimizing
+        from .optimizing import OptimizeRun
 
-        Optimizing(self).run()
+        OptimizeRun(self).run()
 
 
 STANDARD_OUTPUT = Path("-")
@@ -59,11 +59,11 @@ class Evaluate:
     """Optimize each frame individually, or all frames jointly (docs: sequences)."""
     together: bool = False
     """Optimize each frame jointly over all selected cameras (stereo); otherwise once per camera."""
-    source: Annotated[FromProject, tyro.conf.arg(name="")] = field(default_factory=FromProject)
+    source: Annotated[ProjectOption, tyro.conf.arg(name="")] = field(default_factory=ProjectOption)
     start: Annotated[Perturbation, tyro.conf.arg(name="")] = field(default_factory=Perturbation)
     select: Annotated[Selection, tyro.conf.arg(name="")] = field(default_factory=Selection)
-    free: Annotated[FreeInFrames, tyro.conf.arg(name="")] = field(default_factory=FreeInFrames)
-    network: Annotated[Observing, tyro.conf.arg(name="")] = field(default_factory=Observing)
+    free: Annotated[FrameFreeParameters, tyro.conf.arg(name="")] = field(default_factory=FrameFreeParameters)
+    network: Annotated[ObservationOptions, tyro.conf.arg(name="")] = field(default_factory=ObservationOptions)
     solving: Annotated[SolverOptions, tyro.conf.arg(name="")] = field(default_factory=SolverOptions)
 
     def __post_init__(self) -> None:

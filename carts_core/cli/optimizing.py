@@ -209,7 +209,7 @@ class FrameFolder:
         self._check_settings()
 
     @contextmanager
-    def held(self) -> Iterator[None]:
+    def locked(self) -> Iterator[None]:
         """Lock the folder against other processes and read existing results; errors as in the class."""
         with locked_folder(self.folder):
             self._check_settings()
@@ -221,7 +221,7 @@ class FrameFolder:
                 self._records = read_records(self._records_file)
             yield
 
-    def fault(self, frame_id: str, origin: InputHashes) -> str | None:
+    def outdated_reason(self, frame_id: str, origin: InputHashes) -> str | None:
         """Reason why a frame's result is outdated with respect to the given input fingerprints; None if it is up to
         date.
         """
@@ -239,7 +239,7 @@ class FrameFolder:
                 return "the masks are missing or damaged"
         return None
 
-    def others_dropped(self, chosen: Several[str]) -> int:
+    def count_dropped(self, chosen: Several[str]) -> int:
         """Number of unselected frames whose results are removed when the first result is written."""
         if not self._overwrite or not holds_file(self._table):
             return 0
@@ -330,7 +330,7 @@ class _Part:
         return f"{self.setup.domain}, {', '.join(self.setup.cameras)}"
 
 
-class Optimizing:
+class OptimizeRun:
     """Correction of the selected frames, and output of the results."""
 
     def __init__(self, asked: OptimizeOptions) -> None:
@@ -352,7 +352,7 @@ class Optimizing:
         parts = [self._part(domain, group) for domain in select.domain_names(self._sequence) for group in groups]
         with ExitStack() as held:
             for part in parts:
-                held.enter_context(part.output.held())
+                held.enter_context(part.output.locked())
             for part in parts:
                 with message_if_stopped(lambda part=part: self._kept(part)):
                     self._run(part)
@@ -403,7 +403,9 @@ class Optimizing:
         """Indices of the selected frames without an up-to-date result; prints the reasons."""
         output, ids = part.output, self._sequence.frame_ids
         there = {row.frame_id for row in output.rows}
-        faults = {index: output.fault(ids[index], origin) for index, origin in now.items() if ids[index] in there}
+        faults = {
+            index: output.outdated_reason(ids[index], origin) for index, origin in now.items() if ids[index] in there
+        }
         reasons = Counter(fault for fault in faults.values() if fault)
         total, kept = counted(len(now), "frame"), sum(fault is None for fault in faults.values())
         if kept:
@@ -415,11 +417,11 @@ class Optimizing:
     def _report_others(self, part: _Part, common: InputHashes) -> None:
         """Report outdated results of frames that were not selected."""
         output, chosen = part.output, [self._sequence.frame_ids[index] for index in self._frames]
-        if dropped := output.others_dropped(chosen):
+        if dropped := output.count_dropped(chosen):
             note = f"--overwrite removes the results of {counted(dropped, 'other frame')}"
             self._console.print(f"{output.folder}: {note}")
         others = [row.frame_id for row in output.rows if row.frame_id not in chosen]
-        reasons = Counter(fault for frame_id in others if (fault := output.fault(frame_id, common)))
+        reasons = Counter(fault for frame_id in others if (fault := output.outdated_reason(frame_id, common)))
         for reason, count in reasons.items():
             note = f"{counted(count, 'frame')} outside of this run are outdated: {reason}"
             self._console.print(f"{output.folder}: {note}")

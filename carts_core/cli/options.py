@@ -131,7 +131,7 @@ NO_PROJECT = "none"
 
 
 @dataclass(frozen=True)
-class FromProject:
+class ProjectOption:
     """Project whose corrections are applied."""
 
     project: str | None = None
@@ -286,7 +286,7 @@ SequencePath = Annotated[Path, tyro.conf.Positional]
 
 
 @dataclass(frozen=True)
-class FreeInFrames(FreeParameters):
+class FrameFreeParameters(FreeParameters):
     """Free parameters of frames; rarely used parameters are set with --settings."""
 
     locked_cameras: tyro.conf.Suppress[tuple[str, ...]] = ()
@@ -448,7 +448,7 @@ class Observer:
     def _has_mask(self, sequence: "Sequence", index: int, camera: str, domain: str | None) -> bool:
         if self.given is None:
             return sequence.has_masks(camera, domain, index)
-        return self.given.there(index, camera)
+        return self.given.available(index, camera)
 
     def warnings(
         self, sequence: "Sequence", index: int, domain: str | None, cameras: tuple[str, ...], *, background: bool
@@ -476,7 +476,7 @@ class Observer:
 
 
 @dataclass(frozen=True)
-class Observing(Network):
+class ObservationOptions(Network):
     """Options for the fitted observations: predictions of the network, masks, or both."""
 
     observe: Literal["network", "masks", "both"] = "network"
@@ -592,8 +592,8 @@ class OptimizeOptions:
     """In `sequence` mode: kinematics table whose rows with source `edited` are keyframes."""
     start: Annotated[Perturbation, tyro.conf.arg(name="")] = field(default_factory=Perturbation)
     select: Annotated[Selection, tyro.conf.arg(name="")] = field(default_factory=Selection)
-    free: Annotated[FreeInFrames, tyro.conf.arg(name="")] = field(default_factory=FreeInFrames)
-    network: Annotated[Observing, tyro.conf.arg(name="")] = field(default_factory=Observing)
+    free: Annotated[FrameFreeParameters, tyro.conf.arg(name="")] = field(default_factory=FrameFreeParameters)
+    network: Annotated[ObservationOptions, tyro.conf.arg(name="")] = field(default_factory=ObservationOptions)
     solving: Annotated[SolverOptions, tyro.conf.arg(name="")] = field(default_factory=SolverOptions)
 
     def __post_init__(self) -> None:

@@ -49,7 +49,7 @@ class ExportFrame(KinematicsRow):
     classes override rendered classes, and painted pixels belong to the mask.
     """
     ignored: Mapping[str, Bool[ndarray, "height width"]] = field(default_factory=dict, kw_only=True)
-    """Camera -> pixels that show an occluder, where masks are not refined."""
+    """Camera -> pixels that show an occluder, which are not refined."""
 
 
 def measured_frames(sequence: Sequence, indices: Iterable[int]) -> list[ExportFrame]:
@@ -208,8 +208,8 @@ class View:
 
 
 MaskSource = Literal["rendered", "refined", "painted"]
-"""How the mask of a view was made: rendered at the joint positions, rendered and refined by the network, or rendered
-and corrected by hand (or given)."""
+"""Source of a view's mask: rendered at the joint positions, rendered and refined by the network, or rendered and
+corrected by hand (or given)."""
 
 
 @dataclass(frozen=True)
@@ -230,9 +230,9 @@ class Dataset:
     frame_rate: float | None = None
     """Frame rate of a video [1/s]; None for the recorded rate."""
     masks: Masks = "rendered"
-    """Which masks are refined; masks that were painted or given stay as they are."""
+    """Masks that are refined; painted and given masks are not changed."""
     networks: FeatureExtractor | None = None
-    """Networks that refine masks; without them, masks are rendered."""
+    """Networks that refine masks; None for rendered masks."""
     rendered_folder: OutputPath | None = None
     """Folder for the rendered masks of refined views."""
 

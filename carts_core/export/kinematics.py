@@ -21,7 +21,7 @@ from ..optimization.observability import undetermined_joints
 from ..wording import shortened
 
 _TEXT_COLUMNS = ["verdict", "not_determined"]
-"""Text columns after the numeric ones."""
+"""Text columns, after the numeric columns."""
 JOINED = "; "
 """Separator of joint names in a text column."""
 

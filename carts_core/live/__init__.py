@@ -7,10 +7,10 @@ from .loop import follow as follow
 from .messages import Assembler as Assembler
 from .messages import FrameMessage as FrameMessage
 from .messages import ImageMessage as ImageMessage
-from .messages import Moment as Moment
 from .messages import ResultMessage as ResultMessage
 from .messages import Source as Source
 from .messages import StreamError as StreamError
+from .messages import StreamFrame as StreamFrame
 from .messages import packed as packed
 from .recorder import Recorder as Recorder
 from .sources import Camera as Camera

@@ -9,7 +9,7 @@ import numpy as np
 
 from ..model.scene import Scene
 from ..rendering import Renderer
-from .messages import LatestFrame, Moment, ResultMessage, Source, encoded_masks
+from .messages import LatestFrame, ResultMessage, Source, StreamFrame, encoded_masks
 from .tracker import LiveEstimate, LiveTracker, LiveVerdict
 
 _RECENT = 20
@@ -24,7 +24,7 @@ _FRESH = 0.01
 class Tracked:
     """Frame with its estimate and age."""
 
-    moment: Moment
+    moment: StreamFrame
     estimate: LiveEstimate
     age: float
     """Time since the arrival of the frame [s]."""

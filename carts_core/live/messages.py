@@ -1,4 +1,4 @@
-"""Messages of a stream, and frames (`Moment`) assembled from messages."""
+"""Messages of a stream, and frames (`StreamFrame`) assembled from messages."""
 
 import math
 import socket
@@ -151,7 +151,7 @@ def encoded_masks(masks: Mapping[str, np.ndarray]) -> dict[str, bytes]:
 
 
 @dataclass(frozen=True)
-class Moment:
+class StreamFrame:
     """Frame of a stream: images with joint positions."""
 
     frame: Frame
@@ -164,7 +164,7 @@ class Moment:
 class Source(Protocol):
     """Source of frames, iterated on its own thread."""
 
-    def __iter__(self) -> Iterator[Moment]:
+    def __iter__(self) -> Iterator[StreamFrame]:
         """Iterate over frames as they arrive, until the stream ends or `close` is called.
 
         Raises:
@@ -205,7 +205,7 @@ class Assembler:
         self._count = 0
         self._changing = threading.Lock()
 
-    def moment(self, message: FrameMessage) -> Moment | None:
+    def moment(self, message: FrameMessage) -> StreamFrame | None:
         """Frame completed by a message; None for a message without images, or before all joints are known.
 
         Raises:
@@ -230,7 +230,7 @@ class Assembler:
                 masks=None,
                 timestamp=message.time,
             )
-            return Moment(frame, dict(self._poses))
+            return StreamFrame(frame, dict(self._poses))
 
     def _take_joints(self, message: FrameMessage) -> None:
         for name, joints in message.joints.items():
@@ -292,14 +292,14 @@ class LatestFrame:
 
     def __init__(self, source: Source) -> None:
         self._source = source
-        self._moment: Moment | None = None
+        self._moment: StreamFrame | None = None
         self._ended, self._error = False, None
         self._changed = threading.Condition()
         self.arrived = self.dropped = 0
         self._thread = threading.Thread(target=self._read, name="carts-live-source", daemon=True)
         self._thread.start()
 
-    def take(self, patience: float) -> Moment | None:
+    def take(self, patience: float) -> StreamFrame | None:
         """Wait for the latest frame; None at the end of the stream.
 
         Args:

@@ -24,10 +24,10 @@ from .messages import (
     ErrorMessage,
     FrameMessage,
     ImageMessage,
-    Moment,
     ResultMessage,
     Source,
     StreamError,
+    StreamFrame,
     packed,
     receive,
 )
@@ -68,7 +68,7 @@ class StreamServer:
 
     def __init__(self, assembler: Assembler, port: int) -> None:
         self._assembler = assembler
-        self._moments: queue.Queue[Moment | None] = queue.Queue(2)
+        self._moments: queue.Queue[StreamFrame | None] = queue.Queue(2)
         self._clients: dict[socket.socket, _Client] = {}
         self._changing, self._closed = threading.Lock(), threading.Event()
         try:
@@ -80,7 +80,7 @@ class StreamServer:
         self.port: int = self._listener.getsockname()[1]
         threading.Thread(target=self._accept, name="carts-live-accept", daemon=True).start()
 
-    def __iter__(self) -> Iterator[Moment]:
+    def __iter__(self) -> Iterator[StreamFrame]:
         """See `Source`; only `close` ends the stream."""
         while (moment := self._moments.get()) is not None:
             yield moment
@@ -222,7 +222,7 @@ class Replay(_Closable):
         last_gap = self._times[-1] - self._times[-2] if count > 1 else 1.0
         self._length = float(self._times[-1] + last_gap)
 
-    def __iter__(self) -> Iterator[Moment]:
+    def __iter__(self) -> Iterator[StreamFrame]:
         """See `Source`."""
         began = time.monotonic()
         for loop in range(self._loops):
@@ -234,7 +234,7 @@ class Replay(_Closable):
                 frame = self._sequence.frame(index, self._domain, self._cameras)
                 if self._closed.wait(max(0.0, due - (time.monotonic() - began))):
                     return
-                yield Moment(replace(frame, timestamp=due))
+                yield StreamFrame(replace(frame, timestamp=due))
 
 
 class Camera(_Closable):
@@ -261,7 +261,7 @@ class Camera(_Closable):
         rate = self._capture.get(cv2.CAP_PROP_FPS) if isinstance(device, str) else 0.0
         self._gap = 1.0 / rate if rate > 0 else 0.0
 
-    def __iter__(self) -> Iterator[Moment]:
+    def __iter__(self) -> Iterator[StreamFrame]:
         """See `Source`."""
         began = due = time.monotonic()
         try:
@@ -301,7 +301,7 @@ class Folder(_Closable):
         self._assembler, self._cameras, self._folder = assembler, cameras, folder
         self._left_out = 0
 
-    def __iter__(self) -> Iterator[Moment]:
+    def __iter__(self) -> Iterator[StreamFrame]:
         """See `Source`."""
         seen = ""
         while not self._closed.wait(_POLL):

@@ -10,7 +10,7 @@ from jaxtyping import Float, Int
 from ..files.decoding import DecodingLimitError, Limits, called
 from ..files.reading import GIB
 
-LIBRARIES = {"fewest": ("fast_simplification", "scipy.spatial")}
+LIBRARIES = {"fewest_triangles": ("fast_simplification", "scipy.spatial")}
 """Modules that a child process imports before its memory is measured."""
 _SECONDS = 12.0
 """Constant part of the CPU time limit [s]."""
@@ -49,7 +49,7 @@ def decimated(
     """
     limits = Limits(_SECONDS + _SECONDS_PER_FACE * len(faces), _MEMORY)
     try:
-        return called(fewest, vertices, faces, tolerance, limits=limits)
+        return called(fewest_triangles, vertices, faces, tolerance, limits=limits)
     except DecodingLimitError as error:
         raise DecimationError(f"it was not simplified within {limits.seconds:.0f} s: {error}") from error
     except (OSError, ValueError) as error:
@@ -148,7 +148,7 @@ def _to_segments(points: np.ndarray, a: np.ndarray, b: np.ndarray) -> Float[np.n
     return np.linalg.norm(points - a - share[:, None] * along, axis=1)
 
 
-def fewest(vertices: np.ndarray, faces: np.ndarray, tolerance: float) -> tuple[np.ndarray, np.ndarray, float]:
+def fewest_triangles(vertices: np.ndarray, faces: np.ndarray, tolerance: float) -> tuple[np.ndarray, np.ndarray, float]:
     """Find the mesh with the fewest triangles within a tolerance [m]; returns vertices, triangles and deviation [m].
 
     The number of triangles is reduced step by step; the last mesh within the tolerance is returned.

@@ -19,7 +19,7 @@ from ..package_imports import require_package
 from ..wording import counted
 from .meshes import mesh_path
 from .psm_kinematics import CLASSIC, SI
-from .psm_urdf import carrier
+from .psm_urdf import remote_center_chain
 from .xacro_guard import expanded
 
 PACKAGE = "dvrk_model"
@@ -116,7 +116,7 @@ def dvrk_urdf(model: Path, number: str, folder: Path) -> str:
             if element.tag in ("link", "parent", "child") and key in element.attrib:
                 element.set(key, element.attrib[key].removeprefix(_PREFIX))
     _keep_what_is_seen(root)
-    for position, element in enumerate(carrier(CLASSIC if chosen.generation == "Classic" else SI)):
+    for position, element in enumerate(remote_center_chain(CLASSIC if chosen.generation == "Classic" else SI)):
         root.insert(position, element)
     _relocate_meshes(root, model, folder)
     ElementTree.indent(root)

@@ -35,11 +35,11 @@ def fingerprint(files: Iterable[Path], *settings: object) -> str:
     return digest.hexdigest()[:32]
 
 
-Made = tuple[tuple[LinkMesh, ...], Decimation]
+PreparedMeshes = tuple[tuple[LinkMesh, ...], Decimation]
 """Meshes of links, and a summary of their decimation."""
 
 
-def kept(key: str, make: Callable[[], Made]) -> Made:
+def cached_meshes(key: str, make: Callable[[], PreparedMeshes]) -> PreparedMeshes:
     """Return the entry of a key; a missing entry is computed and stored.
 
     Concurrent processes wait for the process that computes the entry, unless the cache cannot be locked.
@@ -56,7 +56,7 @@ def kept(key: str, make: Callable[[], Made]) -> Made:
         return made
 
 
-def read(key: str) -> Made | None:
+def read(key: str) -> PreparedMeshes | None:
     """Read the entry of a key; None for a missing or damaged entry."""
     try:
         with (

@@ -7,7 +7,7 @@ from xml.etree import ElementTree
 from .psm_kinematics import PsmGeometry
 
 
-def quarter_turns(roll: int, pitch: int, yaw: int) -> str:
+def right_angle_rpy(roll: int, pitch: int, yaw: int) -> str:
     """URDF attribute `rpy` of a rotation by multiples of 90 degrees, in full precision."""
     return " ".join("0" if turns == 0 else repr(turns * math.pi / 2) for turns in (roll, pitch, yaw))
 
@@ -34,12 +34,12 @@ def joint(
     return element
 
 
-def carrier(geometry: PsmGeometry) -> Iterator[ElementTree.Element]:
+def remote_center_chain(geometry: PsmGeometry) -> Iterator[ElementTree.Element]:
     """Links and joints from the remote centre to the instrument's base, as in the dVRK's controller."""
     places = (
-        ("yaw", "revolute", "0 0 0", quarter_turns(0, -1, 1)),
-        ("pitch", "revolute", "0 0 0", quarter_turns(0, -1, -1)),
-        ("insertion", "prismatic", f"0 {geometry.remote_center} 0", quarter_turns(1, 0, 0)),
+        ("yaw", "revolute", "0 0 0", right_angle_rpy(0, -1, 1)),
+        ("pitch", "revolute", "0 0 0", right_angle_rpy(0, -1, -1)),
+        ("insertion", "prismatic", f"0 {geometry.remote_center} 0", right_angle_rpy(1, 0, 0)),
     )
     parent = "base_link"
     yield ElementTree.Element("link", name=parent)

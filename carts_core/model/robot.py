@@ -446,7 +446,7 @@ class Robot:
             )
         link_names = tuple(link.name for link in model.robot.links if link.visuals)
         limits = max_faces, tolerance
-        meshes, decimation = mesh_cache.kept(
+        meshes, decimation = mesh_cache.cached_meshes(
             _cache_key(model, kinematics, urdf, limits),
             lambda: _prepared_meshes(model, kinematics, urdf, link_names, limits, report),
         )
@@ -526,7 +526,7 @@ def _prepared_meshes(
     link_names: tuple[str, ...],
     limits: tuple[int, float | None],
     report: Callable[[str], None],
-) -> mesh_cache.Made:
+) -> mesh_cache.PreparedMeshes:
     """Read and decimate the meshes of links."""
     report(f"{model.robot.name}: preparing meshes (once)")
     materials = {material.name: material for material in model.robot.materials}

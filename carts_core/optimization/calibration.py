@@ -28,7 +28,7 @@ from ..settings import (
 from ..settings.stages import Descend
 from .calibration_problem import CalibrationEvaluation, CalibrationProblem, Ignored, with_joint_errors
 from .frame import Progress
-from .hand_eye.files import RESTING
+from .hand_eye.files import STATIONARY_TOLERANCE
 from .hand_eye.result import PoseDeviation
 from .observation import Backgrounds
 from .predictor import SurfacePredictor, predictor_of
@@ -74,7 +74,7 @@ def _moved(given: np.ndarray, start: SceneState, state: SceneState, name: str, i
 _TRIED = 4
 """Maximum number of frames for the domain check."""
 
-_HELD_INTRINSICS = 0.01
+_INTRINSICS_ERROR = 0.01
 """Expected error of fixed focal lengths and principal points, as a share of the focal length [1]. It increases standard
 deviations and changes no estimate: they are consider parameters (Schmidt, Application of state-space methods to
 navigation problems, 1966).
@@ -150,8 +150,8 @@ class CalibrationResult:
 class CalibrationOptimizer:
     """Step-wise calibration over many frames; the counterpart of `FrameOptimizer`.
 
-    If cameras and the base frames of all arms are free and no camera moves, only their product is observable; the first
-    camera's extrinsics are then held fixed.
+    If cameras and the base frames of all arms are free and no camera moves, only their product is observable; the
+    extrinsics of the first camera are then fixed.
 
     Args:
         frames: observed images and measured joint positions.
@@ -196,7 +196,7 @@ class CalibrationOptimizer:
         # Moving cameras make both cameras and base frames observable.
         still = frames[0].mounts
         moves = any(
-            not np.allclose(T, still.get(camera, np.eye(4)), atol=RESTING)
+            not np.allclose(T, still.get(camera, np.eye(4)), atol=STATIONARY_TOLERANCE)
             for frame in frames
             for camera, T in frame.mounts.items()
         )
@@ -323,7 +323,7 @@ class CalibrationOptimizer:
         assert evaluation.outline is not None
         shifts = [alone @ evaluation.outline[:, None], alone @ evaluation.gradient.double().cpu()[:, None]]
         if not self.free.intrinsics:
-            shifts.append(_HELD_INTRINSICS * alone @ self._problem.curvature_with_intrinsics(offsets))
+            shifts.append(_INTRINSICS_ERROR * alone @ self._problem.curvature_with_intrinsics(offsets))
         together = torch.cat(shifts, 1)
         shared = together @ together.T
         if self._known:

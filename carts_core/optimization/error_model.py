@@ -222,7 +222,7 @@ class Smoother:
         own = {index: self._measured[index].scaled(1.0 - self._shares[index]) for index in self._order}
         return {index: combined(state, own[index]) for index, state in zip(self._order, states, strict=True)}
 
-    def cautious(self, correlation_seconds: float) -> "Smoother":
+    def with_correlation(self, correlation_seconds: float) -> "Smoother":
         """Smoother of the same measurements with a longer correlation time of image errors [s]."""
         other = Smoother(self._errors, self._gaps, correlation_seconds, self._exact)
         other._order, other._measured = self._order, self._measured

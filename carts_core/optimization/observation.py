@@ -52,10 +52,10 @@ _CONTRAST = 0.04, 0.10
 _FOREIGN = 0.06
 """Median difference above which a background does not belong to the image [1]."""
 
-_UNTELLING = 0.15
+_UNINFORMATIVE = 0.15
 """Difference above which arms are not distinguishable from other changes, such as moving smoke [1]."""
 
-DECEPTIVE = 0.08
+MAX_FALSE_POSITIVES = 0.08
 """Share of a background with false positives above which the background is removed from the network's input [1]."""
 
 _SMOOTH = 12.0
@@ -73,9 +73,9 @@ _KEPT = 4
 class Change:
     """Difference between images and the empty background."""
 
-    surely: Float[Tensor, "cameras 1 h w"]
+    differs: Float[Tensor, "cameras 1 h w"]
     """Confidence that a pixel differs, in [0, 1]; 1 where the background is unknown."""
-    telling: Float[Tensor, "cameras 1 h w"]
+    informative: Float[Tensor, "cameras 1 h w"]
     """Confidence that an unchanged pixel shows no arm, in [0, 1]: 0 where the background is unknown, in images of
     another scene, and where smoke differs from the background as much as an arm would.
     """
@@ -103,9 +103,9 @@ class Background:
         found = [
             self._compared(background, image, scale) for background, image in zip(self.images, images, strict=True)
         ]
-        surely = torch.stack([changed for changed, _ in found])
-        telling = torch.tensor([clear for _, clear in found], device=surely.device)[:, None, None, None]
-        return Change(1.0 - self.known * (1.0 - surely), self.known * telling)
+        differs = torch.stack([changed for changed, _ in found])
+        informative = torch.tensor([clear for _, clear in found], device=differs.device)[:, None, None, None]
+        return Change(1.0 - self.known * (1.0 - differs), self.known * informative)
 
     def _compared(self, background: Tensor, image: Tensor, scale: float) -> tuple[Float[Tensor, "1 h w"], bool]:
         """Confidence that each pixel differs from the background under the image's illumination, in [0, 1], and whether
@@ -119,7 +119,7 @@ class Background:
         deviation = 1.4826 * float((difference - usual).abs().median())
         low = max(usual + _NOISE[0] * deviation, _CONTRAST[0])
         width = max(_NOISE[1] * deviation, _CONTRAST[1] - _CONTRAST[0])
-        return ((difference - low) / width).clamp(0.0, 1.0), low + width < _UNTELLING
+        return ((difference - low) / width).clamp(0.0, 1.0), low + width < _UNINFORMATIVE
 
 
 def _lit_as(background: Float[Tensor, "3 h w"], image: Float[Tensor, "3 h w"]) -> Float[Tensor, "3 h w"]:
@@ -246,7 +246,7 @@ class Backgrounds:
 _MADE: WeakKeyDictionary[Recording, dict[tuple[tuple[str, ...], str, bool], Backgrounds]] = WeakKeyDictionary()
 
 
-HAS_LEFT = 0.3
+MIN_AREA_RATIO = 0.3
 """Share of its initial area below which an arm has left the image [1]."""
 
 
@@ -291,7 +291,7 @@ class FrameImages:
     ) -> float:
         """Ratio of an arm's area after and before [1], from labels and state of each; occluded parts count."""
         share = int((after[0] == arm).sum()) / max(int((before[0] == arm).sum()), 1)
-        if share >= HAS_LEFT or len(self.renderer.scene.arms) < 2:
+        if share >= MIN_AREA_RATIO or len(self.renderer.scene.arms) < 2:
             return share
         return self.area_alone(after[1], arm) / max(self.area_alone(before[1], arm), 1)
 
@@ -335,11 +335,11 @@ class FrameImages:
         if not predictor.masked and backgrounds is not None and backgrounds.covers(scene):
             background = backgrounds.at(scene, size, settings.dehaze, predictor)
             change = background.compared(stacked, size[0] / unit)
-            deceptive = total(background.seen) / background.seen.numel() > DECEPTIVE
+            deceptive = total(background.seen) / background.seen.numel() > MAX_FALSE_POSITIVES
             if deceptive if replaced is None else replaced:
-                stacked, through = without_background(stacked, change.surely, size[0] / unit), torch.ones_like(through)
+                stacked, through = without_background(stacked, change.differs, size[0] / unit), torch.ones_like(through)
             else:
-                explained = background.seen * (1.0 - change.surely)
+                explained = background.seen * (1.0 - change.differs)
         return FrameImages(
             scale=size[0] / unit,
             size=size,

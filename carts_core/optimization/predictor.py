@@ -128,7 +128,7 @@ class GivenMasks:
     """Name of such a mask in messages, such as "imported mask"."""
     masks: Callable[[int], Mapping[str, GivenMask]]
     """Frame index -> camera name -> mask at the camera's size, for the cameras with a mask."""
-    there: Callable[[int, str], bool]
+    available: Callable[[int, str], bool]
     """(frame index, camera name) -> whether a mask is available."""
     ignored: Callable[[int], Mapping[str, Bool[np.ndarray, "h w"]]] = lambda _: {}
     """Frame index -> camera name -> unlabelled pixels, which are not compared."""

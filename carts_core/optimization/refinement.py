@@ -1,7 +1,7 @@
 """Refined masks: rendered masks, corrected near their outline by the coverage that the network predicts.
 
-A rigid model cannot reproduce worn, bent or imprecisely modelled instruments exactly. The network, conditioned on the
-final pose, sees their outline in the image.
+A rigid model does not reproduce worn, bent or imprecisely modelled instruments exactly, but the network, conditioned on
+the final pose, predicts their outline from the image.
 """
 
 from collections.abc import Mapping
@@ -22,16 +22,16 @@ from .predictor import SurfacePredictor
 _SCALE = 2.0
 """Size of the observed images relative to the working size, at most that of the camera [1]."""
 _BAND = 5.0
-"""Distance from the rendered outline beyond which a mask stays as rendered [px of the working image]."""
+"""Distance from the rendered outline beyond which a mask is not refined [px of the working image]."""
 _SLOPE = 4.0
-"""Change of the log odds of the rendered mask with the distance from its outline [1/px of the working image]."""
+"""Slope of the log odds of the rendered mask over the distance from its outline [1/px of the working image]."""
 _SURE = 1e-4
-"""Lower bound of the probabilities of the network [1]."""
+"""Lower bound of probabilities predicted by the network [1]."""
 
 
 @dataclass(frozen=True)
 class MaskRefiner:
-    """Refines rendered masks of the frames of a recording."""
+    """Refiner of rendered masks of the frames of a recording."""
 
     predictor: SurfacePredictor
     backgrounds: Backgrounds = field(default_factory=lambda: Backgrounds({}))
@@ -50,9 +50,9 @@ class MaskRefiner:
     ) -> dict[str, Bool[np.ndarray, "height width"]]:
         """Refine the masks of a pose.
 
-        The log odds of a pixel are those of the network plus those of the rendered mask, which are proportional to the
-        signed distance from its outline. Pixels farther from the outline than 5 px of the working image, and ignored
-        ones, stay as rendered; so do empty masks.
+        The log odds of a pixel are the sum of those of the network and those of the rendered mask, which are
+        proportional to the signed distance from its outline. Pixels farther from the outline than 5 px of the working
+        image, ignored pixels and empty masks are not refined.
 
         Args:
             scene: scene of the frame; only cameras in `rendered` are used.
@@ -94,7 +94,7 @@ class MaskRefiner:
 def _fused(
     mask: Bool[np.ndarray, "height width"], coverage: Float[np.ndarray, "h w"], working_width: float
 ) -> Bool[np.ndarray, "height width"]:
-    """Mask by the sum of both log odds, near the outline of `mask`."""
+    """Fuse mask and coverage: sum of both log odds near the outline of `mask`."""
     height, width = mask.shape
     inside = mask.astype(np.uint8)
     distance = cv2.distanceTransform(inside, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)

@@ -27,14 +27,14 @@ from .verdict import SequenceAssessment, Verdict, assess, assess_sequence
 
 
 def visiting_gaps(times: Mapping[int, float | None], model: SequenceSettings) -> dict[int, float]:
-    """Frame index -> time from the previously visited frame [s], in visiting order; 0 for the first one.
+    """Frame index -> time from the previously visited frame [s], in visiting order; 0 for the first frame.
 
     Args:
         times: frame index -> time [s], or None if unknown.
         model: direction, and the time between frames with unknown times.
 
     Raises:
-        SettingsError: there are no frames, only some have times, or times do not increase.
+        SettingsError: there are no frames, only some frames have times, or times do not increase.
     """
     if not times:
         raise SettingsError("no frame was given. Choose at least one frame.")
@@ -63,8 +63,8 @@ def initial_correction(
     open_frame: Callable[[int], tuple[Frame, Variables]],
     allowance: float,
 ) -> Float[np.ndarray, " n"]:
-    """Of the corrections [rad] of individually solved frames (by frame index), the one with the lowest mean loss over
-    these frames.
+    """Select, from the corrections [rad] of individually solved frames (by frame index), the correction with the lowest
+    mean loss over these frames.
 
     Corrections whose loss in the first frame exceeds `allowance` times the minimum are excluded, since the error may
     jump between frames.
@@ -247,7 +247,7 @@ class SequenceOptimizer:
         """Frame index -> smoothed estimate of each visited frame, in visiting order."""
         if self._estimates is None:
             corrections = self._smoother.smoothed()
-            certain = self._smoother.cautious(self.model.shared_seconds).smoothed()
+            certain = self._smoother.with_correlation(self.model.shared_seconds).smoothed()
             known = {index: Gaussian(found.mean, certain[index].covariance) for index, found in corrections.items()}
             self._estimates = {index: self._estimate(index, self._visits[index], known[index]) for index in known}
         return dict(self._estimates)

@@ -34,7 +34,7 @@ from .factors import REJECTIONS, FirstOrderDescent, LevenbergMarquardt, Lineariz
 from .feature_problem import FeatureProblem
 from .frame_problem import FrameProblem
 from .observability import Evaluation
-from .observation import HAS_LEFT
+from .observation import MIN_AREA_RATIO
 from .variables import Variables
 from .verdict import Assessment, Verdict, assess
 
@@ -164,7 +164,7 @@ def arm_is_lost(problem: FrameProblem, offsets: Float[Tensor, " n"]) -> bool:
         here = found == arm
         if not (start == arm).any():
             continue
-        left = images.still_in_view(arm, (start, before), (end, after)) < HAS_LEFT
+        left = images.still_in_view(arm, (start, before), (end, after)) < MIN_AREA_RATIO
         if left or total(coverage[here]) < _SUPPORT * int(here.sum()):
             return True
     return False

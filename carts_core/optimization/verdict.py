@@ -20,7 +20,7 @@ from ..recording import Frame
 from ..settings import SurfaceSolver
 from ..threads import total
 from .observability import Uncertainty
-from .observation import HAS_LEFT, FrameImages
+from .observation import MIN_AREA_RATIO, FrameImages
 from .predictor import FramePredictor, SurfacePredictor, predictor_of
 
 
@@ -76,7 +76,7 @@ _MARGIN, _RIM = 16, 8
 """Margin of the network's input around the arms, and distance within which predictions count [px of the working
 image]."""
 
-_SHOWN, _TELLING = 2e-3, 0.3
+_SHOWN, _INFORMATIVE = 2e-3, 0.3
 """Minimum area of a separately assessed arm, as a share of the images, and minimum share of an arm with informative
 change [1].
 """
@@ -135,7 +135,7 @@ def evidence(
     before_labels, labels = images.renderer.segment(start), images.renderer.segment(end)
     change = None
     if images.change is not None:
-        change = window.of(images.change.telling), window.of(images.change.surely)
+        change = window.of(images.change.informative), window.of(images.change.differs)
     found = [
         _of_arm(here, rendered, conditioned, alone, change)
         for here in _places(images, labels, len(end.joint_positions), window, weight, whole=predictor.masked)
@@ -147,7 +147,7 @@ def evidence(
         shown = window.of(maps[:, COVERAGE])[:, [part]] * weight
         if total(shown) >= _PART_SHOWN:
             shares.append(_share(parts[:, [part]].clamp(0.0, 1.0), shown))
-    informative = change is not None and _share(change[0], rendered) > _TELLING
+    informative = change is not None and _share(change[0], rendered) > _INFORMATIVE
     areas = {arm: int((before_labels == arm).sum()) for arm in range(len(start.joint_positions))}
     visible = [arm for arm, pixels in areas.items() if pixels >= OUT_OF_VIEW * labels.size]
     in_view = [images.still_in_view(arm, (before_labels, start), (labels, end)) for arm in visible]
@@ -175,7 +175,7 @@ def _elsewhere(
     nothing = images.images.new_zeros(len(labels), SURFACE_CHANNELS, *labels.shape[-2:])
     seen = predictor.predict(images.images, nothing, Window(0, 0, *images.size))[:, COVERAGE].sum(1, keepdim=True)
     if images.change is not None:
-        seen = seen * images.change.surely
+        seen = seen * images.change.differs
     far = 1.0 - attention((labels >= 0).to(seen), round(_MARGIN * images.scale))
     return total(seen * far * images.weight) / seen.numel()
 
@@ -214,7 +214,7 @@ def _of_arm(
     """
     rendered, conditioned, alone = rendered * here, conditioned * here, alone * here
     overlap = None
-    if change is not None and _share(change[0], rendered) > _TELLING:
+    if change is not None and _share(change[0], rendered) > _INFORMATIVE:
         overlap = _overlap(rendered * change[0], change[1] * change[0] * here)
     return ArmEvidence(
         residual=2.0 * total((rendered - conditioned).square()) / max(total(rendered + conditioned), 1.0),
@@ -375,7 +375,7 @@ _NOTHING_THERE: tuple[tuple[Callable[[Evidence], bool], str, str], ...] = (
         "Check that the image shows the arms (not black or occluded) and matches these kinematics.",
     ),
     (
-        lambda found: found.still_in_view < HAS_LEFT,
+        lambda found: found.still_in_view < MIN_AREA_RATIO,
         "An arm that was in view initially has left the image.",
         "Check that the image, or the fitted mask, shows all arms; move the arm roughly by hand and run again, or "
         "check T_camera_world and T_world_base.",
@@ -442,7 +442,7 @@ class DomainCheck:
     """Overlap (soft Dice) of a rendering of the arms over a uniform background with the network's unconditioned
     prediction from it [1]; None if no arm is in view."""
     elsewhere: float
-    """Share of the image that is predicted as arms far from the measured ones [1]."""
+    """Share of the image that is predicted as arms, far from the measured arms [1]."""
 
     def warnings(self, where: str, remedy: str = UNKNOWN_ROBOT_REMEDY, *, background: bool = False) -> list[str]:
         """Warnings before an optimization; empty if the network suits the recording.
@@ -464,7 +464,7 @@ class DomainCheck:
         if self.elsewhere > _ELSEWHERE and not background:
             found.append(
                 f"{where}: the network predicts arms in {100 * self.elsewhere:.0f} % of the image, far from the "
-                f"measured ones, and no empty background is given. {remedy}"
+                f"measured arms, and no empty background is given. {remedy}"
             )
         return found
 

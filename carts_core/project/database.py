@@ -209,7 +209,7 @@ class DamagedProject(ProjectError):
     """The content of a project file differs from what CaRTS wrote."""
 
 
-def hardened(connection: sqlite3.Connection) -> sqlite3.Connection:
+def harden(connection: sqlite3.Connection) -> sqlite3.Connection:
     """Prevent a connection from running code of the file's schema and from opening other files."""
     for limit, value in _LIMITS.items():
         connection.setlimit(limit, value)
@@ -237,7 +237,7 @@ def time_limit(connection: sqlite3.Connection, seconds: float) -> Iterator[None]
 
 def empty(identity: SequenceIdentity) -> sqlite3.Connection:
     """Create a new project in memory."""
-    connection = hardened(sqlite3.connect(":memory:", isolation_level=None, check_same_thread=False))
+    connection = harden(sqlite3.connect(":memory:", isolation_level=None, check_same_thread=False))
     connection.execute(f"PRAGMA application_id = {APPLICATION_ID}")
     with transaction(connection):
         for statement in _statements("".join(MIGRATIONS)):

@@ -2,8 +2,8 @@
 
 The lock covers the bytes that SQLite locks and belongs to the open file description (F_OFD_SETLK), so it is released at
 the end of the process instead of when another descriptor is closed. While the file is open, edits are written to
-SQLite's write-ahead log, so other processes caused any other change of the file. SQLite replays a log up to the first
-damaged frame, which may only be followed by an incomplete, unacknowledged transaction. Format:
+SQLite's write-ahead log, so any other change of the file is due to another process. SQLite replays a log up to the
+first damaged frame, which may only be followed by an incomplete, unacknowledged transaction. Format:
 https://www.sqlite.org/fileformat2.html#the_write_ahead_log
 """
 
@@ -279,7 +279,7 @@ def open_copy(content: Content, path: Path) -> Copy:
         missing = min(promised, LARGEST) - len(patched)
         patched.extend(bytes(max(missing, 0)))
         memory.deserialize(patched)
-        database.hardened(memory)
+        database.harden(memory)
         database.check_version(memory, path)
     except BaseException:
         memory.close()
@@ -377,7 +377,7 @@ class ProjectFile:
             connection = sqlite3.connect(uri, uri=True, isolation_level=None, check_same_thread=False)
             self._connection = connection
             connection.execute("PRAGMA locking_mode = EXCLUSIVE")
-            database.hardened(connection)
+            database.harden(connection)
             if connection.execute("PRAGMA journal_mode = WAL").fetchone() != ("wal",):
                 raise ProjectError(f"project {self.path} cannot be opened for writing. Open it read-only.")
             connection.execute("PRAGMA synchronous = FULL")

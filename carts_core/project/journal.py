@@ -1,6 +1,6 @@
 """Journal of all steps with their changes. The state results from the steps up to a position, which undo changes.
 
-Changes are returned as a `Script`, which is run on the file and on its in-memory copy.
+Changes are returned as a `Transaction`, which is run on the file and on its in-memory copy.
 """
 
 import sqlite3
@@ -15,7 +15,7 @@ from .values import Edits, Figures, Key, Kind, check_edit, decode
 
 
 @dataclass
-class Script:
+class Transaction:
     """Statements of one transaction.
 
     Attributes:
@@ -39,7 +39,7 @@ class Script:
         self.statements.append((statement, sealed))
         self.digests += sum(as_number(row[-1]) for row in sealed)
 
-    def take_out(self, found: Iterable[tuple[bytes]]) -> None:
+    def subtract(self, found: Iterable[tuple[bytes]]) -> None:
         """Subtract the digests of removed or replaced rows from the sum."""
         self.digests -= sum(as_number(digest) for (digest,) in found)
 
@@ -86,13 +86,13 @@ def load(connection: sqlite3.Connection) -> tuple[ProjectState, Seal]:
     return state.with_entries(decoded).with_figures(figures), seal
 
 
-def append(memory: sqlite3.Connection, step: Step, edits: Edits, last: int) -> Script:
+def append(memory: sqlite3.Connection, step: Step, edits: Edits, last: int) -> Transaction:
     """Append a step at the current position, and remove the undone steps after it (through `last`)."""
-    script = Script(position=step.number)
+    script = Transaction(position=step.number)
     if last >= step.number:
         script.cut_at = step.number
         for table, column in (("steps", "step"), ("changes", "step"), ("figures", "revision")):
-            script.take_out(memory.execute(f"SELECT digest FROM {table} WHERE {column} >= ?", (step.number,)))
+            script.subtract(memory.execute(f"SELECT digest FROM {table} WHERE {column} >= ?", (step.number,)))
             script.statements.append((f"DELETE FROM {table} WHERE {column} >= ?", [(step.number,)]))
     script.insert("steps", [(step.number, step.name, float(step.time))])
     rows = [
@@ -103,7 +103,7 @@ def append(memory: sqlite3.Connection, step: Step, edits: Edits, last: int) -> S
     return script
 
 
-def move(memory: sqlite3.Connection, start: int, target: int) -> tuple[Script, dict[Key[Any], Entry | None]]:
+def move(memory: sqlite3.Connection, start: int, target: int) -> tuple[Transaction, dict[Key[Any], Entry | None]]:
     """Move to another position of the history; also returns the entries that may differ at the new position (None:
     absent)."""
     touched = memory.execute(
@@ -114,7 +114,7 @@ def move(memory: sqlite3.Connection, start: int, target: int) -> tuple[Script, d
         step, value = _newest(memory, about, target)
         key: Key[Any] = Key(Kind(about[0]), *about[1:])
         entries[key] = Entry(step, decode(key.kind, value)) if step >= 0 else None
-    return Script(position=target), entries
+    return Transaction(position=target), entries
 
 
 def _newest(memory: sqlite3.Connection, about: tuple[str, int, str], last: int) -> tuple[int, Any]:
@@ -140,30 +140,32 @@ def before(memory: sqlite3.Connection, step: int, position: int) -> tuple[dict[K
     return edits, min(later, default=None)
 
 
-def add_figures(memory: sqlite3.Connection, script: Script, figures: Mapping[tuple[int, int], Figures]) -> Script:
+def add_figures(
+    memory: sqlite3.Connection, script: Transaction, figures: Mapping[tuple[int, int], Figures]
+) -> Transaction:
     """Add quality figures by (frame, revision)."""
     for key in figures:
         if script.cut_at is not None and key[1] >= script.cut_at:
             continue
-        script.take_out(memory.execute("SELECT digest FROM figures WHERE frame = ? AND revision = ?", key))
+        script.subtract(memory.execute("SELECT digest FROM figures WHERE frame = ? AND revision = ?", key))
     script.insert(
         "figures", [(int(frame), revision, value.loss, value.dice) for (frame, revision), value in figures.items()]
     )
     return script
 
 
-def add_remark(memory: sqlite3.Connection, key: Key[Any], entry: Entry) -> Script:
+def add_remark(memory: sqlite3.Connection, key: Key[Any], entry: Entry) -> Transaction:
     """Set a value as part of an existing step, which replaces the step's previous value."""
-    script, row = Script(), (key.kind.value, int(key.frame), str(key.name), entry.step)
+    script, row = Transaction(), (key.kind.value, int(key.frame), str(key.name), entry.step)
     found = "SELECT digest FROM changes WHERE kind = ? AND frame = ? AND name = ? AND step = ?"
-    script.take_out(memory.execute(found, row))
+    script.subtract(memory.execute(found, row))
     script.insert("changes", [(*row, entry.value.encode())])
     return script
 
 
-def add_export(record: ExportRecord) -> Script:
+def add_export(record: ExportRecord) -> Transaction:
     """Add a row to the log of exports."""
-    script = Script()
+    script = Transaction()
     script.insert("exports", [(record.time, str(record.format), record.path, int(record.frames), record.settings)])
     return script
 

@@ -224,7 +224,7 @@ class Project:
             }
             if known:
                 store = self._writer()
-                store.commit(journal.add_figures(store.memory, journal.Script(), known))
+                store.commit(journal.add_figures(store.memory, journal.Transaction(), known))
                 self._saved(self.state.with_figures(known), "figures", frames=[frame for frame, _ in known])
 
     def record_verdict(self, frame: int, verdict: FitVerdict) -> None:

@@ -384,8 +384,8 @@ def source_of(project: ProjectState, frame: int) -> Source:
 
 
 def corrected_state(scene: Scene, frame: Frame, project: ProjectState) -> SceneState:
-    """State of a frame under the project's calibration, with corrected joint positions if available, else the measured
-    ones."""
+    """State of a frame under the project's calibration, with corrected joint positions if available, else measured
+    joint positions."""
     measured = {name: frame.measured[name] for name in project.identity.arms}
     corrected = {name: found.joint_positions for name, found in project.joints(frame.index).items()}
     return calibrated_scene(scene, project).state({**measured, **corrected}, mounts=frame.mounts)

@@ -21,7 +21,7 @@ from . import database, journal
 from .database import NONCE_BYTES, TABLES, Seal, row_digest, seal, verify
 from .file import Copy, LostFile, ProjectFile, SealRow, check_copy, check_files, holder, open_copy, read_files
 from .identity import SequenceIdentity, data_dir, rescue_paths
-from .journal import Script
+from .journal import Transaction
 from .state import ProjectState
 from .values import Figures, Key, Kind, check_edit, decode
 
@@ -175,7 +175,7 @@ class Store:
         """Whether all acknowledged edits are on disk, as of the last check."""
         return self._file is not None
 
-    def commit(self, script: Script) -> None:
+    def commit(self, script: Transaction) -> None:
         """Write a transaction to `path`; `ProjectError` if it could not be written."""
         position = self._position if script.position is None else script.position
         seal = self._seal.plus(script.digests)

@@ -21,7 +21,7 @@ _LARGEST_ERROR = 3
 """Maximum error of measured kinematics, in margins [1]."""
 
 _STAYS = 0.4
-"""Share of an arm's silhouette that is covered in all views, above which the arm counts as immobile [1]."""
+"""Share of an arm's silhouette that is covered in all views, above which the arm is considered immobile [1]."""
 
 _FEWEST = 3
 """Minimum number of views whose agreement makes a pixel known [1]."""
@@ -49,7 +49,9 @@ def spread(length: int, count: int = FRAMES) -> list[int]:
     return sorted({round(float(index)) for index in np.linspace(0, length - 1, min(count, length))})
 
 
-def widen(silhouette: Bool[np.ndarray, "height width"], margins: int = 1) -> Bool[np.ndarray, "height width"]:
+def dilate_silhouette(
+    silhouette: Bool[np.ndarray, "height width"], margins: int = 1
+) -> Bool[np.ndarray, "height width"]:
     """Dilate a silhouette by one or several uncertainty margins of measured kinematics."""
     radius = max(1, round(margins * MARGIN * silhouette.shape[1]))
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
@@ -76,8 +78,8 @@ def background_of_recording(
 
     renderer = Renderer(scene, cameras=[camera])
     arms = [renderer.segment(state)[0] >= 0 for state in states]
-    covers = [widen(silhouette) for silhouette in arms]
-    clear = len(arms) - np.sum([widen(silhouette, _LARGEST_ERROR) for silhouette in arms], axis=0)
+    covers = [dilate_silhouette(silhouette) for silhouette in arms]
+    clear = len(arms) - np.sum([dilate_silhouette(silhouette, _LARGEST_ERROR) for silhouette in arms], axis=0)
     used = len(arms) - np.sum(covers, axis=0)
     estimate, deviation = uncovered_median((image(place), cover) for place, cover in enumerate(covers))
     estimate = filled_in(estimate, used == 0)
@@ -132,7 +134,7 @@ def filled_in(
 ) -> UInt8[np.ndarray, "height width 3"]:
     """`image` with permanently covered pixels filled in from their surroundings."""
     # If the kinematic error exceeds the margin, the arm may be visible next to permanently covered pixels.
-    rim = widen(hole)
+    rim = dilate_silhouette(hole)
     return fill(image, hole if rim.all() else rim)
 
 

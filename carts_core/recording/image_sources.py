@@ -23,7 +23,7 @@ from ..package_imports import require_package
 from .images import ImageSource, decode_image
 
 BAG_SUFFIXES = (".bag", ".mcap", ".db3")
-"""Suffixes of ROS bags; a folder with `metadata.yaml` is a bag, too."""
+"""Suffixes of ROS bags; a folder with `metadata.yaml` is also a bag."""
 
 _ENCODINGS: dict[str, tuple[int, int | None]] = {
     "rgb8": (3, None),
@@ -105,7 +105,7 @@ class Bag:
         return record, stamps
 
     def message(self, topic: str, time: int | None = None) -> Any:
-        """The message recorded at a time [ns], or the first one; None if there is no such message."""
+        """Read the message recorded at a time [ns], or the first message; None without such a message."""
         fields = self._call(bags.message, topic, time)
         return None if fields is None else SimpleNamespace(**fields)
 

@@ -188,7 +188,7 @@ class _Delays:
         self._bases: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
 
     def estimate(self, present: float, largest: float) -> TimeOffsetEstimate:
-        """Estimate the offset within `largest` of the current one [s]."""
+        """Estimate the offset within `largest` of the current offset [s]."""
         steps = round(largest / _GRID)
         grid = [present + step * _GRID for step in range(-steps, steps + 1)]
         tried = {offset: parts for offset in grid if (parts := self._parts(offset)) is not None}

@@ -106,8 +106,8 @@ Parts = Literal["arms", "parts", "links"]
 """Categories: one per arm, per part (shaft, wrist, jaws), or per link."""
 
 Masks = Literal["auto", "refined", "rendered"]
-"""Masks of an export: rendered at the corrected pose, or refined near their outline by the network; `auto` refines
-where the verdict is *good*."""
+"""Masks of an export: rendered at the corrected pose, or refined near their outline by the network; `auto` refines the
+masks of frames with the verdict *good*."""
 
 Images = Literal["named", "copied", "none"]
 """Images of an export: `named` refers to the recording's files, `copied` writes byte-identical copies, `none` writes no

@@ -378,7 +378,7 @@ class BaselineNetwork:
         return self.encoder or _ENCODERS.get(self.name, "")
 
     @property
-    def looks_at_kinematics(self) -> bool:
+    def uses_kinematics(self) -> bool:
         """Whether a rendering of the measured kinematics is an input."""
         return self.name == "colleoni"
 

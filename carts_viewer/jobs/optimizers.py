@@ -35,7 +35,7 @@ from carts_core.segmentation import NetworkSegmenter, Segmenter
 from carts_core.settings.optimization import Inference
 from carts_core.settings.serialization import to_plain
 from carts_core.settings.stages import NONE
-from carts_core.wording import spoken_time
+from carts_core.wording import duration_text
 from carts_viewer.state import NETWORK, Pose, Target
 
 
@@ -146,7 +146,7 @@ class SequenceRun:
             return f"All {total} frames estimated; revising inconsistent ones and assessing the fit"
         if done < 2 < total:
             return f"Frame {done} of {total}"  # The first frame takes longer, so it does not predict the time left.
-        return f"Frame {done} of {total}, about {spoken_time(self.optimizer.seconds_left)} left"
+        return f"Frame {done} of {total}, about {duration_text(self.optimizer.seconds_left)} left"
 
 
 REMEDY = "Fit masks (Fit to), or adapt the network to this recording."

@@ -4,7 +4,7 @@ import time
 
 import viser
 
-from carts_core.wording import spoken_time
+from carts_core.wording import duration_text
 from carts_viewer.actions import intents
 from carts_viewer.jobs.job_list import MAX_CALIBRATION_FRAMES, MAX_TRAINING_TIME, Job, JobState
 from carts_viewer.jobs.networks import STARTED
@@ -189,7 +189,7 @@ def job_line(job: Job, now: float) -> str:
     """A job with its progress and remaining time, as HTML."""
     left = job.seconds_left(now)
     about = "at most" if job.kind == "calibrate" else "about"  # A calibration may converge earlier.
-    eta = "" if left is None else f", {about} {spoken_time(left)} left"
+    eta = "" if left is None else f", {about} {duration_text(left)} left"
     running = job.state is JobState.RUNNING
     # The text of a solve already contains frames and time.
     steps = f" {job.done} of {job.total}{eta}" if running and job.total and job.kind != "solve" else ""

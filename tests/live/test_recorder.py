@@ -9,7 +9,7 @@ from moving import swing
 
 from carts_core.export.kinematics import read_kinematics_csv
 from carts_core.live.loop import Tracked
-from carts_core.live.messages import Moment
+from carts_core.live.messages import StreamFrame
 from carts_core.live.recorder import Recorder
 from carts_core.live.tracker import Effort, LiveEstimate, LiveVerdict
 from carts_core.project import Project, Provenance, Source
@@ -40,7 +40,7 @@ def record(
             {arm: np.full_like(values, 1e-3) for arm, values in joints.items()},
             0.0,
         )
-        recorder(Tracked(Moment(frame, sent), estimate, 0.0))
+        recorder(Tracked(StreamFrame(frame, sent), estimate, 0.0))
     path = recorder.close()
     assert path is not None
     return Sequence.open(path)

@@ -28,11 +28,11 @@ from carts_core.live import (
     ImageMessage,
     LiveEstimate,
     LiveVerdict,
-    Moment,
     Replay,
     ResultMessage,
     Results,
     StreamError,
+    StreamFrame,
     StreamServer,
     follow,
     packed,
@@ -79,10 +79,10 @@ class Repeater:
 class Given:
     """A source of moments, each of which comes after a wait."""
 
-    def __init__(self, tracker: Repeater, *moments: tuple[Callable[[], object], Moment]) -> None:
+    def __init__(self, tracker: Repeater, *moments: tuple[Callable[[], object], StreamFrame]) -> None:
         self._tracker, self._moments = tracker, moments
 
-    def __iter__(self) -> Iterator[Moment]:
+    def __iter__(self) -> Iterator[StreamFrame]:
         for wait, moment in self._moments:
             wait()
             yield moment
@@ -125,7 +125,9 @@ def test_a_slow_tracker_gets_the_newest_frame_and_the_others_are_dropped(sequenc
     def begun() -> None:
         eventually(lambda: bool(tracker.frames))
 
-    source = Given(tracker, (lambda: None, Moment(frames[0])), *((begun, Moment(frame)) for frame in frames[1:]))
+    source = Given(
+        tracker, (lambda: None, StreamFrame(frames[0])), *((begun, StreamFrame(frame)) for frame in frames[1:])
+    )
     statistics = follow(source, tracker, [])  # pyright: ignore
     assert [frame.frame_id for frame in tracker.frames] == ["0", "4"]
     assert (statistics.arrived, statistics.tracked, statistics.dropped) == (5, 2, 3)
@@ -135,20 +137,20 @@ def test_a_slow_tracker_gets_the_newest_frame_and_the_others_are_dropped(sequenc
 def test_a_frame_that_would_be_too_old_is_not_tracked(sequence: Sequence, seconds: float, waited: float) -> None:
     """Because it has waited for longer than it may, or for longer than the tracker usually leaves."""
     tracker, frame = Repeater(sequence, seconds), sequence.frame(0)
-    late = Moment(replace(frame, frame_id="late"), arrived=time.monotonic() - waited)
+    late = StreamFrame(replace(frame, frame_id="late"), arrived=time.monotonic() - waited)
 
     def begun() -> None:
         eventually(lambda: bool(tracker.frames))
 
-    moments = ((lambda: None, Moment(frame)), (begun, late), (lambda: time.sleep(0.3), Moment(frame)))
+    moments = ((lambda: None, StreamFrame(frame)), (begun, late), (lambda: time.sleep(0.3), StreamFrame(frame)))
     statistics = follow(Given(tracker, *moments), tracker, [])  # pyright: ignore
     assert (statistics.dropped, statistics.tracked) == (1, 2) and "late" not in {one.frame_id for one in tracker.frames}
 
 
 def test_what_ends_a_source_is_raised_where_frames_are_taken(sequence: Sequence) -> None:
     class Broken:
-        def __iter__(self) -> Iterator[Moment]:
-            yield Moment(sequence.frame(0))
+        def __iter__(self) -> Iterator[StreamFrame]:
+            yield StreamFrame(sequence.frame(0))
             raise StreamError("the cable is out")
 
         def close(self) -> None:

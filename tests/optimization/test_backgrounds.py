@@ -10,7 +10,7 @@ import torch
 
 from carts_core.evaluation import dice
 from carts_core.imaging.working_image import Window
-from carts_core.lab.benchmark.rooms import AnotherRoom, made_rooms
+from carts_core.lab.benchmark.rooms import AnotherRoom, synthetic_rooms
 from carts_core.model.parts import COVERAGE
 from carts_core.model.scene import Scene
 from carts_core.networks import FeatureExtractor
@@ -112,7 +112,7 @@ def test_noise_does_not_count_as_a_change() -> None:
     background = Background(room, torch.ones_like(room[:, :1]), torch.ones_like(room[:, :1]))
     noisy = room + 0.03 * torch.randn(room.shape, generator=generator)
     noisy[..., 40:60, 40:80] = 1 - room[..., 40:60, 40:80]
-    changed = background.compared(noisy, 1.0).surely[0, 0]
+    changed = background.compared(noisy, 1.0).differs[0, 0]
     assert changed[43:57, 43:77].mean() > 0.7
     changed[36:64, 36:84] = 0
     assert changed.mean() < 0.01
@@ -131,7 +131,7 @@ def test_arms_that_never_leave_say_so_once_and_nothing_is_explained_away(tiny_se
 
 def test_a_real_instrument_is_found_in_a_room_that_deceives_the_network(shared_dir: Path) -> None:
     sequence = Sequence.open(DVRK)
-    room = next(room for room in made_rooms() if room.name == "rods 1")
+    room = next(room for room in synthetic_rooms() if room.name == "rods 1")
     recording = AnotherRoom(sequence, [room], seed=0)
     frame, extractor = recording.frame(22, room.domain, ["left"]), FeatureExtractor.load()
     assert frame.masks is not None

@@ -116,7 +116,7 @@ class Baseline(nn.Module):
         if self.settings.name == "unet":
             return self.body(images)
         images = (images - self.mean) / self.deviation
-        if self.settings.looks_at_kinematics:
+        if self.settings.uses_kinematics:
             return self.body(images, given)
         return self.body(images)
 
@@ -222,7 +222,7 @@ def read_baseline(path: Path) -> TrainedBaseline:
             network = Baseline(BaselineNetwork(**values, decoder=decoder, size=(int(width), int(height)), unet=unet))
             tensors = {name: file.get_tensor(name) for name in file.keys()}
             if not all(bool(torch.isfinite(value).all()) for value in tensors.values()):
-                raise ValueError("some of its values are not finite")
+                raise ValueError("it has values that are not finite")
             network.load_state_dict(tensors)
     except (FileNotFoundError, IsADirectoryError) as error:
         raise WeightsError(f"weights file {path} is missing. {_REMEDY}") from error

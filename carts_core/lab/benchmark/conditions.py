@@ -136,7 +136,7 @@ _BLUR, _NOISE = 0.65, 2.0
 """Standard deviations of lens blur [px] and noise [grey levels]."""
 
 
-def crossed(recording: Recording, index: int, camera: str, seed: int = 0) -> Frame:
+def crossing_frame(recording: Recording, index: int, camera: str, seed: int = 0) -> Frame:
     """Frame of the regular domain with its arms moved so that they cross.
 
     Measured joints keep the errors of the original frame. The arms may intersect.
@@ -210,7 +210,7 @@ def with_other_instruments(scene: Scene, index: int) -> Scene:
     return replace(scene, arms=tuple(replace(arm, robot=robot) for arm in scene.arms))
 
 
-def misled(recording: Recording, kind: str, index: int, camera: str) -> Frame:
+def contradicting_frame(recording: Recording, kind: str, index: int, camera: str) -> Frame:
     """Frame of the regular domain whose image contradicts its kinematics, in a way of `WRONG`.
 
     Masks match the image of the returned frame.

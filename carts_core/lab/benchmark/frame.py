@@ -36,7 +36,16 @@ from ...rendering import Renderer
 from ...settings import DescentSolver
 from ...wording import counted
 from ..baselines.networks import TrainedBaseline
-from .conditions import CROSSING, OCCLUSION, OTHER_INSTRUMENT, WRONG, crossed, misled, occlude, with_other_instruments
+from .conditions import (
+    CROSSING,
+    OCCLUSION,
+    OTHER_INSTRUMENT,
+    WRONG,
+    contradicting_frame,
+    crossing_frame,
+    occlude,
+    with_other_instruments,
+)
 from .measurement import BEST_OF, TOLERANCE, WIDE_TOLERANCE, Measurement, Score, machine
 from .scope import METHODS, RENDERING, Run, Scope
 from .sources import Recording, Source
@@ -46,7 +55,7 @@ _SEED = 0
 
 
 @dataclass(frozen=True)
-class Truth:
+class GroundTruth:
     """Ground truth of a frame in one camera."""
 
     camera: str
@@ -190,7 +199,7 @@ def start_of(scene: Scene, frame: Frame, run: Run, joints: Mapping[str, tuple[st
 
 
 def _followed(
-    optimizer: FrameOptimizer, truth: Truth, renderer: Renderer, seconds: float
+    optimizer: FrameOptimizer, truth: GroundTruth, renderer: Renderer, seconds: float
 ) -> tuple[list[Score], list[int], float]:
     """Step the optimizer to the end; returns the scores of all iterates, for each the index of the best iterate so far,
     and the total time [s]."""
@@ -276,9 +285,9 @@ class SourceBench:
         cameras = self._source.cameras if method.every_camera else (camera,)
         domain = "regular" if run.domain in (OCCLUSION, CROSSING, *WRONG) else run.domain
         if run.domain in WRONG:
-            frame = misled(recording, run.domain, run.frame, camera)
+            frame = contradicting_frame(recording, run.domain, run.frame, camera)
         elif run.domain == CROSSING:
-            frame = crossed(recording, run.frame, camera)
+            frame = crossing_frame(recording, run.frame, camera)
         else:
             frame = recording.frame(run.frame, None if run.domain == OCCLUSION else run.domain, cameras)
         truth = self._truth(frame)
@@ -327,7 +336,7 @@ class SourceBench:
             **_judged(optimizer.assessment),
         )
 
-    def _segment(self, run: Run, frame: Frame, truth: Truth) -> Measurement:
+    def _segment(self, run: Run, frame: Frame, truth: GroundTruth) -> Measurement:
         """Score the mask predicted by a network for one image, at the training resolution of the network.
 
         The input of networks with kinematics includes the rendering at the measured joint positions.
@@ -339,7 +348,7 @@ class SourceBench:
             network, size, kinematics = None, extractor.working_size, run.method == RENDERING
         else:
             network, settings = trained.network.to(device), trained.network.settings
-            size, kinematics = settings.size, settings.looks_at_kinematics
+            size, kinematics = settings.size, settings.uses_kinematics
         renderer = Renderer(scene, width=size[0], height=size[1]) if kinematics else None
         began = time.perf_counter()
         given = renderer and renderer.surface_maps(scene.state(frame.measured, mounts=frame.mounts)).to(device)
@@ -424,10 +433,10 @@ class SourceBench:
             found.append(Measurement(run, after, "warm" if found else "cold", self._machine, before=before))
         return found
 
-    def _truth(self, frame: Frame) -> Truth:
+    def _truth(self, frame: Frame) -> GroundTruth:
         assert frame.masks is not None
         camera = self._source.camera
-        return Truth(camera, frame.masks[camera], frame.truth or {}, self._recording.measured_joints)
+        return GroundTruth(camera, frame.masks[camera], frame.truth or {}, self._recording.measured_joints)
 
     @cached_property
     def _recording(self) -> Recording:

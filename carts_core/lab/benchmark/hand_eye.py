@@ -24,8 +24,8 @@ from ...optimization import CalibrationOptimizer, FreeParameters, MaskPredictor
 from ...recording import Frame
 from ...wording import counted
 from .measurement import code_fingerprint, stored
-from .rooms import made_rooms
-from .statistics import NOTHING, table_of
+from .rooms import synthetic_rooms
+from .statistics import NO_VALUE, table_of
 from .targets import Target, target_of
 
 ARM = Path(__file__).with_name("seven_joint_arm.urdf")
@@ -187,8 +187,8 @@ def hand_eye_table(runs: list[HandEyeRun]) -> Table | None:
                 {
                     "target and start": condition.name,
                     "near enough": f"{len(right)} of {len(found)}",
-                    "largest angle [deg]": f"{max(run.angle_deg for run in right):.2f}" if right else NOTHING,
-                    "largest distance [mm]": f"{1e3 * max(run.distance for run in right):.1f}" if right else NOTHING,
+                    "largest angle [deg]": f"{max(run.angle_deg for run in right):.2f}" if right else NO_VALUE,
+                    "largest distance [mm]": f"{1e3 * max(run.distance for run in right):.1f}" if right else NO_VALUE,
                     "verdicts on others": ", ".join(f"{count} {verdict}" for verdict, count in others.items()),
                 }
             )
@@ -220,7 +220,7 @@ def _near(run: HandEyeRun, condition: HandEyeCondition) -> bool:
 
 
 def _run(condition: HandEyeCondition, seed: int, extractor: FeatureExtractor) -> HandEyeRun:
-    rooms = [room for room in made_rooms() if room.half == "held-out"]
+    rooms = [room for room in synthetic_rooms() if room.half == "held-out"]
     room = rooms[seed % len(rooms)].draw(640, 480)
     rng = np.random.default_rng((seed, round(condition.angle_deg)))
     axis, direction = (vector / np.linalg.norm(vector) for vector in rng.normal(size=(2, 3)))

@@ -45,7 +45,7 @@ class Room:
         return f"{self.half}: {self.name}"
 
 
-def made_rooms() -> list[Room]:
+def synthetic_rooms() -> list[Room]:
     """Synthetic rooms."""
     halves: list[tuple[Half, dict[str, Callable[..., Picture]]]] = [("tuning", _TUNING), ("held-out", _HELD_OUT)]
     return [

@@ -186,7 +186,7 @@ _AUGMENTATIONS: dict[Augmentation, str] = {
 assert set(_NETWORKS) == set(get_args(BaselineName)) and set(_AUGMENTATIONS) == set(get_args(Augmentation))
 BASELINES = {
     f"{network}_{change}": Method(
-        f"{label}, {what}", None, baseline=True, image_alone=not BaselineNetwork(network).looks_at_kinematics
+        f"{label}, {what}", None, baseline=True, image_alone=not BaselineNetwork(network).uses_kinematics
     )
     for network, label in _NETWORKS.items()
     for change, what in _AUGMENTATIONS.items()

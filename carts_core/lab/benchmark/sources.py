@@ -19,7 +19,7 @@ from ..synthesis.scene import place_cameras
 from ..synthesis.synthesize import Progress, synthesize
 from .counterfactual import Counterfactual, backdrop
 from .measurement import code_fingerprint
-from .rooms import AlteredSequence, AnotherRoom, Room, made_rooms, photographs
+from .rooms import AlteredSequence, AnotherRoom, Room, photographs, synthetic_rooms
 from .scope import FAMILY, REAL, ROOMS, SYNTHETIC, Scope
 
 TEST_SEED = 730_511
@@ -193,7 +193,7 @@ def real_source(path: Path, scope: Scope, seed: int = TEST_SEED) -> Source:
 
 def _rooms(folder: Path | None, scope: Scope, *parts: object) -> "tuple[list[Room], hashlib._Hash]":
     """Rooms, and a hash of the rooms and `parts`."""
-    rooms = (made_rooms() + (photographs(folder) if folder else []))[:: scope.room_share]
+    rooms = (synthetic_rooms() + (photographs(folder) if folder else []))[:: scope.room_share]
     digest = _digest(*parts, code_fingerprint(_ROOMS_CODE))
     for photograph in sorted(folder.glob("*")) if folder else []:
         digest.update(photograph.name.encode() + read_bytes(photograph, IMAGE))

@@ -107,7 +107,7 @@ def scores(measurements: Iterable[Measurement], iterations: int | None = None) -
 DOMAIN_LABELS = {domain: domain.replace("_", " ") for domain in (*DOMAINS, OCCLUSION)}
 SHORT_LABELS = {"paper": "paper's setting", "ours": "ours"}
 """Short labels of methods, for tables by iterations and errors."""
-NOTHING = "–"
+NO_VALUE = "–"
 """Placeholder for a missing number."""
 
 
@@ -129,7 +129,7 @@ class Figure:
     def text(self, scores: Iterable[Score | None]) -> str:
         """Mean ± standard deviation; only the mean for a single value."""
         if not (values := self.values(scores)):
-            return NOTHING
+            return NO_VALUE
         mean = f"{self.scale * np.mean(values):.{self.digits}f}"
         return mean if len(values) == 1 else f"{mean} ± {self.scale * np.std(values):.{self.digits}f}"
 
@@ -147,12 +147,12 @@ VISIBLE_MAE = Figure("visible joints [deg]", "visible_joint_mae_deg")
 TIP_DEPTH = Figure("depth of the tips [mm]", "tip_depth_mm")
 
 
-def begun(error_deg: float | None) -> str:
+def start_label(error_deg: float | None) -> str:
     """Label of the start of a run in tables."""
     return "as measured" if error_deg is None else f"{error_deg:g}°"
 
 
-GAINED = 0.01
+MIN_GAIN = 0.01
 """Minimum gain in Dice of the paper's setting for a speed comparison."""
 
 
@@ -186,7 +186,7 @@ def pairs(data: Measurements) -> list[Pair]:
             continue
         papers = _seconds_to(theirs, best.dice)
         assert papers is not None
-        gained = best.dice >= theirs.start.dice + GAINED
+        gained = best.dice >= theirs.start.dice + MIN_GAIN
         found.append(Pair(run.source, run.error_deg, gained, papers, _seconds_to(other, best.dice)))
     return found
 

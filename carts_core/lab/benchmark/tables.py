@@ -16,9 +16,9 @@ from .scope import BASELINES, FAMILY, METHODS, PAPERS_STEPS, RENDERING, ROOMS, S
 from .statistics import (
     DICE,
     DOMAIN_LABELS,
-    GAINED,
     JOINT_MAE,
-    NOTHING,
+    MIN_GAIN,
+    NO_VALUE,
     NSD,
     PAPER,
     SHORT_LABELS,
@@ -27,13 +27,23 @@ from .statistics import (
     WIDE_NSD,
     Figure,
     Measurements,
-    begun,
     pairs,
     paper_column,
     scores,
+    start_label,
     table_of,
 )
-from .targets import NEAR_FINAL, RIGHT, area, called_good, image_alone, judged, steps_to_final, within, wrong
+from .targets import (
+    MIN_CORRECT_DICE,
+    NEAR_FINAL,
+    good_verdicts,
+    image_alone,
+    roc_area,
+    steps_to_final,
+    with_verdict,
+    within,
+    wrong_masks,
+)
 
 Row = dict[str, str | Cell]
 
@@ -134,10 +144,10 @@ def speed_table(data: Measurements) -> Table | None:
                 "frames": source,
                 "method": entry.label,
                 "runs": str(len(chosen)),
-                "iterations": f"{steps:.1f}" if steps else NOTHING,
+                "iterations": f"{steps:.1f}" if steps else NO_VALUE,
                 "s per frame": f"{seconds:.2f}",
-                "ms per iteration": f"{1e3 * seconds / steps:.0f}" if steps else NOTHING,
-                "made worse": f"{100 * mean(worse):.1f} %" if worse and method != "start" else NOTHING,
+                "ms per iteration": f"{1e3 * seconds / steps:.0f}" if steps else NO_VALUE,
+                "made worse": f"{100 * mean(worse):.1f} %" if worse and method != "start" else NO_VALUE,
             }
         )
     return table_of("speed", rows)
@@ -153,16 +163,16 @@ def pair_table(data: Measurements) -> Table | None:
         rows.append(
             {
                 "frames": source,
-                "error at the start": begun(error),
+                "error at the start": start_label(error),
                 "pairs": str(len(chosen)),
-                "s, paper's setting": f"{median(pair.papers for pair in chosen):.2f}" if chosen else NOTHING,
-                "s, ours": f"{median(reached):.2f}" if reached else NOTHING,
-                "times faster": f"{median(pair.ratio for pair in chosen):.1f}" if chosen else NOTHING,
+                "s, paper's setting": f"{median(pair.papers for pair in chosen):.2f}" if chosen else NO_VALUE,
+                "s, ours": f"{median(reached):.2f}" if reached else NO_VALUE,
+                "times faster": f"{median(pair.ratio for pair in chosen):.1f}" if chosen else NO_VALUE,
                 "never there": str(len(chosen) - len(reached)),
                 f"steps to within {NEAR_FINAL}": f"{median(steps):g}",
             }
         )
-    return table_of("pairs", rows, steps=PAPERS_STEPS, gained=GAINED)
+    return table_of("pairs", rows, steps=PAPERS_STEPS, gained=MIN_GAIN)
 
 
 def worse_table(data: Measurements) -> Table | None:
@@ -173,7 +183,7 @@ def worse_table(data: Measurements) -> Table | None:
             "domain": DOMAIN_LABELS[m.run.domain],
             "frame": str(m.run.frame),
             "method": METHODS[m.run.method].label,
-            "error at the start": begun(m.run.error_deg),
+            "error at the start": start_label(m.run.error_deg),
             "initial Dice": DICE.text([m.start]),
             "Dice": DICE.text([m.final]),
         }
@@ -225,7 +235,7 @@ def _table(
                 row: Row = {
                     "frames": source,
                     "number": str(len(frames)),
-                    "error at the start": begun(error),
+                    "error at the start": start_label(error),
                     "method": label,
                 }
                 rows.append(row | {figure.heading: figure.text(found) for figure in figures})
@@ -253,13 +263,13 @@ def sequence_table(data: Measurements) -> Table | None:
             {
                 "frames": source,
                 "domain": DOMAIN_LABELS[domain],
-                "error at the start": begun(error),
+                "error at the start": start_label(error),
                 "method": METHODS[method].label,
                 "number": str(len(together)),
                 "Dice": Cell(DICE.text(after), f"before: {DICE.text(before)}"),
                 "joint MAE [deg]": Cell(JOINT_MAE.text(after), f"before: {JOINT_MAE.text(before)}"),
                 "visible joints [deg]": VISIBLE_MAE.text(after),
-                "s per warm frame": Cell(f"{median(warm):.2f}" if warm else NOTHING, counted(len(warm), "frame")),
+                "s per warm frame": Cell(f"{median(warm):.2f}" if warm else NO_VALUE, counted(len(warm), "frame")),
                 "also alone": str(len(both)),
                 "Dice alone": DICE.text(alone[m.run.frame].final for m in both),
                 "Dice together": DICE.text(m.final for m in both),
@@ -338,21 +348,21 @@ def family_table(data: Measurements) -> Table | None:
 def verdict_table(data: Measurements) -> Table | None:
     """Verdicts compared with Dice, for each condition and in total."""
     rows = []
-    groups = judged(data)
+    groups = with_verdict(data)
     for name, runs in {**groups, "all": [run for found in groups.values() for run in found]}.items():
-        good, known = called_good(runs), area(runs)
+        good, known = good_verdicts(runs), roc_area(runs)
         rows.append(
             {
                 "condition": name,
                 "runs": str(len(runs)),
-                "wrong": str(len(wrong(runs))),
+                "wrong": str(len(wrong_masks(runs))),
                 "good": str(len(good)),
-                "good, but wrong": str(len(wrong(good))),
+                "good, but wrong": str(len(wrong_masks(good))),
                 "good, but worse than initially": str(sum(run.made_worse for run in good)),
-                "area under the ROC": NOTHING if known is None else f"{known:.3f}",
+                "area under the ROC": NO_VALUE if known is None else f"{known:.3f}",
             }
         )
-    return table_of("verdicts", rows if groups else [], right=RIGHT)
+    return table_of("verdicts", rows if groups else [], right=MIN_CORRECT_DICE)
 
 
 def deviation_table(data: Measurements) -> Table | None:
@@ -364,7 +374,7 @@ def deviation_table(data: Measurements) -> Table | None:
             "within one": f"{100 * known[1]:.0f} %",
             "within two": f"{100 * known[2]:.0f} %",
         }
-        for name, runs in judged(data).items()
+        for name, runs in with_verdict(data).items()
         if (known := within(runs)) is not None
     ]
     return table_of("deviations", rows)

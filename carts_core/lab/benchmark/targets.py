@@ -13,9 +13,9 @@ from ...wording import counted
 from .conditions import CROSSING, OCCLUSION, SHARE, WRONG
 from .measurement import Measurement, on_gpu
 from .scope import FAMILY, METHODS, PAPERS_STEPS, REAL, ROOMS, SYNTHETIC
-from .statistics import DOMAIN_LABELS, GAINED, JOINT_MAE, VISIBLE_MAE, Measurements, pairs, read_table
+from .statistics import DOMAIN_LABELS, JOINT_MAE, MIN_GAIN, VISIBLE_MAE, Measurements, pairs, read_table
 
-RIGHT = 0.9
+MIN_CORRECT_DICE = 0.9
 """Minimum Dice of a correct mask."""
 NEAR_FINAL = 0.005
 """Difference from the final Dice below which a run is considered converged."""
@@ -112,7 +112,7 @@ def _speed(data: Measurements) -> Iterator[Target]:
     yield target_of(
         "speedup",
         _median(pair.ratio for pair in found),
-        f"median over {counted(len(found), 'pair')} of runs in which the paper's setting gained at least {GAINED} "
+        f"median over {counted(len(found), 'pair')} of runs in which the paper's setting gained at least {MIN_GAIN} "
         f"Dice: time to its best Dice in {PAPERS_STEPS} iterations; {sum(pair.ours is None for pair in found)} never "
         "reach it and count as 0",
     )
@@ -272,7 +272,7 @@ def _ahead(data: Measurements, source: str) -> Target:
     )
 
 
-def judged(data: Measurements) -> dict[str, list[Measurement]]:
+def with_verdict(data: Measurements) -> dict[str, list[Measurement]]:
     """Runs with a verdict, by condition."""
     labels = {"ours": "", "sequence": ", sequence mode", "masks": ", masks as target"}
     found: dict[str, list[Measurement]] = {}
@@ -290,20 +290,20 @@ def judged(data: Measurements) -> dict[str, list[Measurement]]:
     return dict(sorted(found.items()))
 
 
-def wrong(runs: Iterable[Measurement]) -> list[Measurement]:
+def wrong_masks(runs: Iterable[Measurement]) -> list[Measurement]:
     """Runs with a wrong mask."""
-    return [run for run in runs if run.final.dice < RIGHT]
+    return [run for run in runs if run.final.dice < MIN_CORRECT_DICE]
 
 
-def called_good(runs: Iterable[Measurement]) -> list[Measurement]:
+def good_verdicts(runs: Iterable[Measurement]) -> list[Measurement]:
     """Runs with a good verdict."""
     return [run for run in runs if run.verdict == "good"]
 
 
-def area(runs: Sequence[Measurement]) -> float | None:
+def roc_area(runs: Sequence[Measurement]) -> float | None:
     """Area under the ROC curve of the probability of a wrong mask [1]; None unless there are correct and wrong
     masks."""
-    bad = np.array([run.final.dice < RIGHT for run in runs])
+    bad = np.array([run.final.dice < MIN_CORRECT_DICE for run in runs])
     if bad.all() or not bad.any():
         return None
     ranks, count = rankdata([run.probability or 0.0 for run in runs]), int(bad.sum())
@@ -321,11 +321,11 @@ def within(runs: Iterable[Measurement]) -> tuple[int, float, float] | None:
 
 
 def _verdicts(data: Measurements) -> Iterator[Target]:
-    runs = [run for runs in judged(data).values() for run in runs]
-    good, known, wrong_inputs = called_good(runs), within(runs), any(run.run.domain in WRONG for run in runs)
-    basis = f"{len(wrong(runs))} of {counted(len(runs), 'run')} wrong"
-    yield target_of("area", area(runs), basis, complete=wrong_inputs, right=RIGHT)
-    for name, found in (("wrong", len(wrong(good))), ("worse", sum(run.made_worse for run in good))):
+    runs = [run for runs in with_verdict(data).values() for run in runs]
+    good, known, wrong_inputs = good_verdicts(runs), within(runs), any(run.run.domain in WRONG for run in runs)
+    basis = f"{len(wrong_masks(runs))} of {counted(len(runs), 'run')} wrong"
+    yield target_of("area", roc_area(runs), basis, complete=wrong_inputs, right=MIN_CORRECT_DICE)
+    for name, found in (("wrong", len(wrong_masks(good))), ("worse", sum(run.made_worse for run in good))):
         basis = f"{found} of {counted(len(good), 'good run')}"
         yield target_of(f"good_though_{name}", found / len(good) if good else None, basis)
     for place, name, share in ((1, "one", 0.68), (2, "two", 0.95)):

@@ -19,10 +19,10 @@ _DEPTH = (0.05, 0.40)
 """Range of the distance from the camera [m]."""
 
 
-def add_things(rng: np.random.Generator, image: Image, intrinsics: Intrinsics) -> Image:
+def add_objects(rng: np.random.Generator, image: Image, intrinsics: Intrinsics) -> Image:
     """Draw one to four random objects and their shadows on a background."""
     height, width = image.shape[:2]
-    things = [random_thing(rng) for _ in range(rng.choice([1, 2, 3, 4], p=[0.4, 0.3, 0.2, 0.1]))]
+    things = [random_object(rng) for _ in range(rng.choice([1, 2, 3, 4], p=[0.4, 0.3, 0.2, 0.1]))]
     posed = [_placed(rng, thing, intrinsics, width, height) for thing in things]
     fx, fy, cx, cy = (value * _SUPERSAMPLING for value in intrinsics)
     view = render_gbuffer(things, posed, (fx, fy, cx, cy), width * _SUPERSAMPLING, height * _SUPERSAMPLING)
@@ -35,7 +35,7 @@ def add_things(rng: np.random.Generator, image: Image, intrinsics: Intrinsics) -
     return image * (1 - coverage[..., None]) + layers[..., :3]
 
 
-def random_thing(rng: np.random.Generator) -> Body:
+def random_object(rng: np.random.Generator) -> Body:
     """Random rod, plate, rail, cable, tool or ring with a size of several centimetres, centred at the origin."""
     kinds = [_rod, _plate, _rails, _cable, _tool, _ring]
     make = kinds[int(rng.choice(len(kinds), p=[0.3, 0.2, 0.12, 0.16, 0.14, 0.08]))]

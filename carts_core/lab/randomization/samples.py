@@ -27,7 +27,7 @@ from .arms import (
 from .backgrounds import Photographs, random_background
 from .blood import bleed
 from .chains import random_chain
-from .clutter import add_clutter, add_things, cast_shadow, contact_shadow, occlude
+from .clutter import add_clutter, add_objects, cast_shadow, contact_shadow, occlude
 from .shading import GBuffer, photograph, render_gbuffer, shade, tone
 
 SUPERSAMPLING = 2
@@ -92,8 +92,8 @@ class Observer:
         placements = claimed
         if rng.random() < settings.absent:
             placements = self._without_some(claimed)
-            view = look(variant.geometries, placements, intrinsics, size)
-        fine = look(variant.geometries, placements, intrinsics, size, SUPERSAMPLING)
+            view = render_view(variant.geometries, placements, intrinsics, size)
+        fine = render_view(variant.geometries, placements, intrinsics, size, SUPERSAMPLING)
         coverage = cv2.resize(fine.image(np.ones(len(fine.rows), np.float32)), size, interpolation=cv2.INTER_AREA)
         background = self._background(intrinsics, *size)
         camera_seed = int(rng.integers(2**63))
@@ -131,7 +131,7 @@ class Observer:
             else:
                 intrinsics = random_intrinsics(rng, *size, field)
                 placements = self._placed(variant, intrinsics, size)
-            view = look(variant.geometries, placements, intrinsics, size)
+            view = render_view(variant.geometries, placements, intrinsics, size)
             share = len(view.rows) / (settings.width * settings.height)
             tries += 1
             if settings.coverage[0] <= share <= settings.coverage[1] or tries == _TRIES:
@@ -144,7 +144,7 @@ class Observer:
         for geometry in geometries[1:]:
             near = None
             if rng.random() < self.settings.crossing:
-                view = look(geometries[:1], placements[:1], intrinsics, size)
+                view = render_view(geometries[:1], placements[:1], intrinsics, size)
                 if len(view.points):
                     near = view.points[rng.integers(len(view.points))].astype(float)
             placements.append(random_placement(rng, geometry, intrinsics, *size, near))
@@ -169,7 +169,7 @@ class Observer:
         else:
             image = add_clutter(rng, random_background(rng, width, height))
         if rng.random() < settings.things:
-            image = add_things(rng, image, intrinsics)
+            image = add_objects(rng, image, intrinsics)
         return image.astype(np.float32)
 
     def _observe(
@@ -191,7 +191,7 @@ class Observer:
         return photograph(np.random.default_rng(camera_seed), composed, self.settings.appearance)
 
 
-def look(
+def render_view(
     arms: Sequence[RobotGeometry],
     placements: Sequence[Placement],
     intrinsics: Intrinsics,
@@ -247,7 +247,7 @@ class PairGenerator:
             scale = float(rng.uniform(0.3, 2.0))
             pairs = zip(seen.variant.geometries, rendered, strict=True)
             rendered = [perturbed(rng, geometry, placement, scale) for geometry, placement in pairs]
-        hybrid_view = look(seen.variant.rendered, rendered, seen.intrinsics, (settings.width, settings.height))
+        hybrid_view = render_view(seen.variant.rendered, rendered, seen.intrinsics, (settings.width, settings.height))
         mean_background = self._mean_background(seen.background, seen.camera_seed)
         hybrid_image = self._render_hybrid(seen.variant, rendered, seen.intrinsics, mean_background)
         return TrainingPair(
@@ -350,7 +350,7 @@ class SurfaceGenerator:
             perturbed(rng, geometry, placement, scale)
             for geometry, placement in zip(seen.variant.rendered, seen.claimed, strict=True)
         ]
-        wrong = _surface(seen.variant.rendered, look(seen.variant.rendered, given, seen.intrinsics, size), size)
+        wrong = _surface(seen.variant.rendered, render_view(seen.variant.rendered, given, seen.intrinsics, size), size)
         return np.zeros_like(wrong) if rng.random() < _UNKNOWN else wrong
 
 

@@ -125,7 +125,7 @@ def judge(
     """
     assert config.images.recording is not None
     networks = [FeatureExtractor.load(path) for path in (before, after)]
-    images, recording = list(made_images(config, made)), Sequence.open(config.images.recording)
+    images, recording = list(synthetic_images(config, made)), Sequence.open(config.images.recording)
     chosen = spread(len(recording), min(own, len(recording)))
     total, done = 2 * (len(images) + len(chosen)), count()
 
@@ -146,7 +146,7 @@ def judge(
 
 
 @dataclass(frozen=True)
-class MadeImage:
+class SyntheticImage:
     """Synthetic image of arms at known joint positions."""
 
     scene: Scene
@@ -167,7 +167,7 @@ class MadeImage:
         return dice, right, float(known.mean()) if len(known) else 0.0
 
 
-def made_images(config: TrainingConfig, number_of_images: int) -> Iterator[MadeImage]:
+def synthetic_images(config: TrainingConfig, number_of_images: int) -> Iterator[SyntheticImage]:
     """Uncropped images without occluders from the training distribution, which are not used in training or
     validation."""
     width, height = _SIZE
@@ -189,7 +189,7 @@ def made_images(config: TrainingConfig, number_of_images: int) -> Iterator[MadeI
         joints = {arm.name: arm.robot.joint_names for arm in arms}
         start = perturb(scene, truth, _OFF_DEG, (config.seed, JUDGING_STREAM, number), joints)
         frame = Frame(number, f"{number}", "made", {"made": to_uint8(seen.image)}, start, truth, None, None)
-        yield MadeImage(scene, frame)
+        yield SyntheticImage(scene, frame)
 
 
 def _solved(scene: Scene, frame: Frame, network: FeatureExtractor) -> tuple[SceneState, Assessment | None]:

@@ -20,7 +20,7 @@ from ...resources import shipped_robot
 from ...wording import closest, shown
 from ..mesh_cache import cache_dir
 from ..psm_kinematics import CLASSIC, SI, PsmGeometry
-from ..psm_urdf import carrier, joint, quarter_turns
+from ..psm_urdf import joint, remote_center_chain, right_angle_rpy
 from .catalogue import BY_NAME, SI_SUFFIX, Instrument
 from .shapes import CHEEK_OUTSIDE, FIRST, SECOND, Electrode, Jaws, Solid, cylinder, wide_body, wide_cables
 
@@ -144,14 +144,14 @@ def _urdf(name: str, instrument: Instrument, geometry: PsmGeometry) -> str:
     for material, grey in _COLORS.items():
         color = ElementTree.SubElement(ElementTree.SubElement(root, "material", name=material), "color")
         color.set("rgba", f"{grey} {grey} {grey} 1")
-    root.extend(carrier(geometry))
+    root.extend(remote_center_chain(geometry))
     root.extend(_wrist_joints(geometry))
     tip_end = f"0 {instrument.length * 1e-3:.6g} 0"
     if instrument.has_jaws:
         root.extend(_jaw_joints(instrument))
     else:
         root.append(joint("jaw", "fixed", "wrist_yaw_link", "jaw_link"))
-    root.append(joint("tool_tip", "fixed", "wrist_yaw_link", "tool_tip_link", tip_end, quarter_turns(0, 1, 1)))
+    root.append(joint("tool_tip", "fixed", "wrist_yaw_link", "tool_tip_link", tip_end, right_angle_rpy(0, 1, 1)))
     visuals: dict[str, list[ElementTree.Element]] = {}
     for part, link, material, shape in _parts(instrument):
         visual = ElementTree.Element("visual")
@@ -172,7 +172,7 @@ def _urdf(name: str, instrument: Instrument, geometry: PsmGeometry) -> str:
 def _wrist_joints(geometry: PsmGeometry) -> Iterator[ElementTree.Element]:
     """Joints from the instrument's base to the link that carries the jaws."""
     roll, pitch, yaw = geometry.limits[3:]
-    turn = quarter_turns(0, -1, -1)
+    turn = right_angle_rpy(0, -1, -1)
     along = f"{geometry.wrist_length:.6g} 0 0"
     yield joint("roll", "revolute", "insertion_link", "roll_link", f"0 0 {geometry.shaft_length}", "0 0 0", roll)
     yield joint("wrist_pitch", "revolute", "roll_link", "wrist_pitch_link", "0 0 0", turn, pitch)

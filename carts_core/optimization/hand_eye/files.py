@@ -149,7 +149,7 @@ def result_json(
     }
 
 
-RESTING = 1e-3
+STATIONARY_TOLERANCE = 1e-3
 """Maximum difference between transforms of a mount that counts as stationary [rad, m]."""
 
 
@@ -165,7 +165,7 @@ def mounts_of_points(recording: Sequence, points: Rows[ImagePoint]) -> dict[str,
             raise SettingsError(f"there is no frame {point.frame}; frames are 0 to {len(recording) - 1}.")
         for camera, T in recording.mounts(point.frame).items():
             frame, first = found.setdefault(camera, (point.frame, T))
-            if not np.allclose(T, first, atol=RESTING):
+            if not np.allclose(T, first, atol=STATIONARY_TOLERANCE):
                 ids = recording.frame_ids
                 raise SettingsError(
                     f"camera {camera!r} moves between frames {ids[frame]!r} and {ids[point.frame]!r}, both of which "

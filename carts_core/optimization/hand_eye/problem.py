@@ -178,7 +178,7 @@ def poses_of(
 
 
 def _subsets(view: View) -> Iterator[Bool[np.ndarray, " points"]]:
-    """Subsets of points: all, all but a few, and random ones."""
+    """Subsets of points: all points, all except a few, and random subsets."""
     points = view.is_point
     yield points
     frames = np.array(view.frames)
@@ -320,7 +320,7 @@ class HandEyeProblem:
         cameras = dict(self._T_camera_world)
         for camera, step in zip(self._free, steps[len(self._arms) :], strict=True):
             arm = next(view.arm for view in self.views if view.camera == camera)
-            cameras[camera] = moved(cameras[camera], step, place_of(self._T_world_base[arm], self.middles[arm]))
+            cameras[camera] = moved(cameras[camera], step, transform_point(self._T_world_base[arm], self.middles[arm]))
         intrinsics = self._intrinsics.copy()
         for camera, change in zip(self.focal, values[6 * len(steps) :], strict=True):
             intrinsics[camera, :2] *= np.exp(change)
@@ -346,14 +346,14 @@ class HandEyeProblem:
 def moved(T: np.ndarray, step: np.ndarray, middle: np.ndarray) -> np.ndarray:
     """Rotate T about the transformed point `middle` by step[:3] [rad], and translate it by step[3:] [m]."""
     turn = Rotation.from_rotvec(step[:3]).as_matrix()
-    place = place_of(T, middle)
+    place = transform_point(T, middle)
     moved = np.eye(4)
     moved[:3, :3] = turn @ T[:3, :3]
     moved[:3, 3] = turn @ (T[:3, 3] - place) + place + step[3:]
     return moved
 
 
-def place_of(T: np.ndarray, point: np.ndarray) -> np.ndarray:
+def transform_point(T: np.ndarray, point: np.ndarray) -> np.ndarray:
     """Transform a point by T."""
     return T[:3, :3] @ point + T[:3, 3]
 

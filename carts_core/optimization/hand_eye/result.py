@@ -15,7 +15,7 @@ from ...errors import SettingsError
 from ...model.keypoints import LandmarkKind
 from ...model.scene import Scene
 from ...settings import SurfaceSolver
-from .problem import HandEyeProblem, HandEyeSettings, ImagePoint, View, place_of, views_of
+from .problem import HandEyeProblem, HandEyeSettings, ImagePoint, View, transform_point, views_of
 
 _OUTLIER = 4.0
 """Multiple of the expected error beyond which a point contradicts the others [1]."""
@@ -83,7 +83,7 @@ def result_of(problem: HandEyeProblem, fit: OptimizeResult, count: int) -> HandE
     for view, found in zip(problem.views, problem.distances(fit.x), strict=True):
         distances[list(view.rows)] = np.linalg.norm(found, axis=-1)
     # Ratio of estimated to expected variance of the points [1].
-    excess = max(2.0 * fit.cost / _spare(problem, fit), 1.0)
+    excess = max(2.0 * fit.cost / _degrees_of_freedom(problem, fit), 1.0)
     information = fit.jac.T @ fit.jac
     scale = np.sqrt(np.maximum(np.diag(information), 1e-300))
     values, vectors = np.linalg.eigh(information / np.outer(scale, scale))
@@ -110,7 +110,7 @@ def result_of(problem: HandEyeProblem, fit: OptimizeResult, count: int) -> HandE
     )
 
 
-def _spare(problem: HandEyeProblem, fit: OptimizeResult) -> int:
+def _degrees_of_freedom(problem: HandEyeProblem, fit: OptimizeResult) -> int:
     """Number of residuals minus number of unknowns, at least 1."""
     return max(sum(2 if point else 1 for view in problem.views for point in view.is_point) - len(fit.x), 1)
 
@@ -125,7 +125,7 @@ def _noise(problem: HandEyeProblem, fit: OptimizeResult, excess: float) -> float
         np.linalg.norm(found[view.is_point], axis=-1)
         for view, found in zip(problem.views, problem.distances(fit.x), strict=True)
     ]
-    spare = _spare(problem, fit)
+    spare = _degrees_of_freedom(problem, fit)
     typical = float(np.median(np.concatenate(points))) / np.sqrt(2.0 * np.log(2.0))
     return float(max(problem.settings.pixel_error * np.sqrt(excess), typical * np.sqrt(1.0 + len(fit.x) / spare)))
 
@@ -151,7 +151,7 @@ def _deviation(problem: HandEyeProblem, view: View, values: np.ndarray, covarian
         bases, cameras, _ = problem.poses(step)
         T = cameras[view.camera] @ bases[view.arm]
         turn = Rotation.from_matrix(T[:3, :3] @ T_now[:3, :3].T).as_rotvec()
-        return np.concatenate([turn, place_of(T, problem.middles[view.arm])])
+        return np.concatenate([turn, transform_point(T, problem.middles[view.arm])])
 
     bases, cameras, _ = problem.poses(values)
     T_now = cameras[view.camera] @ bases[view.arm]

@@ -43,7 +43,7 @@ class Calibration:
     size: tuple[int, int] | None = None
     """Width and height of the calibrated images [px]."""
     T_right_left: Float[np.ndarray, "4 4"] | None = None
-    """Pose of the left camera in the right one [m]; None if not given."""
+    """Pose of the left camera in the right camera [m]; None if not given."""
     R: Float[np.ndarray, "3 3"] | None = None
     """Rectification: rotation from the camera's frame to the common frame of the pair."""
     P: Float[np.ndarray, "3 4"] | None = None
@@ -194,7 +194,7 @@ def _calibration(K: np.ndarray, D: np.ndarray | None, size: tuple[int, int] | No
             raise ValueError(f"its matrix has a skew of {matrix[0, 1]:g}; calibrate without skew")
         numbers = matrix[[0, 1, 0, 1], [0, 1, 2, 2]]
     if numbers.size != 4 or not np.isfinite(numbers).all():
-        raise ValueError(f"its matrix has {numbers.size} numbers; 9 finite ones are needed")
+        raise ValueError(f"its matrix has {numbers.size} numbers; 9 finite numbers are required")
     if min(numbers[:2]) <= 0:
         raise ValueError(f"its focal lengths are {numbers[0]:g} and {numbers[1]:g} px, which must be positive")
     coefficients = () if D is None else tuple(float(value) for value in np.asarray(D).reshape(-1))

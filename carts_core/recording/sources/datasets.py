@@ -370,7 +370,9 @@ def _domain_images(path: Path, domains: list[str], folders: dict[str, str], job:
         place = "{domain}" if len(domains) > 1 else domains[0]
         images[camera] = Images(path, f"{place}/{folder}/{first.pattern}", ids, first.size)
     if not images:
-        raise SequenceError(f"{path}: no camera has images in all of {', '.join(domains)}. Remove the incomplete ones.")
+        raise SequenceError(
+            f"{path}: no camera has images in all of {', '.join(domains)}. Remove the incomplete domains."
+        )
     return images
 
 

@@ -118,7 +118,7 @@ def _checked(stream: _Stream, sidecar: Path, job: Import) -> _Stream:
     count = len(find_images(stream.video).ids)
     if stream.numbers.max() >= count or len(stream.numbers) < count:
         job.warning(
-            f"{stream.video.name} has {count} frames and its sidecar {len(stream.numbers)}; the common ones are used."
+            f"{stream.video.name} has {count} frames and its sidecar {len(stream.numbers)}; the common frames are used."
         )
     good = (stream.numbers >= 0) & (stream.numbers < count) & np.isfinite(stream.times)
     if not good.any():

@@ -7,9 +7,9 @@ import cv2
 import numpy as np
 import pytest
 
-from carts_core.lab.benchmark.conditions import SHARE, crossed, occlude
+from carts_core.lab.benchmark.conditions import SHARE, crossing_frame, occlude
 from carts_core.lab.benchmark.counterfactual import Counterfactual
-from carts_core.lab.benchmark.rooms import AnotherRoom, Room, made_rooms
+from carts_core.lab.benchmark.rooms import AnotherRoom, Room, synthetic_rooms
 from carts_core.lab.synthesis import DOMAINS
 from carts_core.recording import Sequence
 from carts_core.rendering import Renderer
@@ -35,7 +35,7 @@ def test_occluders_cover_the_wanted_share_of_the_instruments_and_look_unlike_the
 
 def test_one_arm_hides_a_part_of_the_other_which_stays_in_view() -> None:
     recording = Sequence.open(sample_sequence())
-    frame, original = crossed(recording, 3, "left"), recording.frame(3, "regular", ["left"])
+    frame, original = crossing_frame(recording, 3, "left"), recording.frame(3, "regular", ["left"])
     scene = recording.scene.with_cameras(["left"])
     assert frame.masks is not None and frame.truth is not None and original.truth is not None
     labels = Renderer(scene).segment(scene.state(frame.truth))[0]
@@ -48,7 +48,7 @@ def test_one_arm_hides_a_part_of_the_other_which_stays_in_view() -> None:
         error = frame.measured[arm.name] - frame.truth[arm.name]
         assert np.allclose(error, original.measured[arm.name] - original.truth[arm.name])
     assert 0.08 < min(shares) < 0.87
-    again = crossed(recording, 3, "left")
+    again = crossing_frame(recording, 3, "left")
     assert np.array_equal(frame.images["left"], again.images["left"])
     assert not np.array_equal(frame.images["left"], original.images["left"])
 
@@ -95,7 +95,8 @@ GREEN = Room("green", "tuning", lambda width, height: np.full((height, width, 3)
 
 def test_no_kind_of_room_serves_tuning_and_is_held_out() -> None:
     kinds = {
-        half: {room.name.split()[0] for room in made_rooms() if room.half == half} for half in ("tuning", "held-out")
+        half: {room.name.split()[0] for room in synthetic_rooms() if room.half == half}
+        for half in ("tuning", "held-out")
     }
     assert kinds["tuning"] and kinds["held-out"] and not kinds["tuning"] & kinds["held-out"]
 

@@ -12,7 +12,7 @@ from handmade import make_measurement, target_of
 
 from carts_core.files import output_path
 from carts_core.lab.benchmark import Facts, Measurement, Run, Score, targets, write_report
-from carts_core.lab.benchmark.conditions import NO_ARM, misled, with_other_instruments, wrong_inputs
+from carts_core.lab.benchmark.conditions import NO_ARM, contradicting_frame, with_other_instruments, wrong_inputs
 from carts_core.lab.benchmark.hand_eye import HandEyeRun
 from carts_core.lab.benchmark.statistics import Measurements
 from carts_core.lab.benchmark.tables import main_tables
@@ -163,7 +163,9 @@ def test_what_is_wrong_about_an_input_is_what_its_name_says(tiny_sequence) -> No
     sequence = Sequence.open(path)
     right = sequence.frame(1, "regular")
     assert right.masks is not None
-    empty, joints, image, instrument = (misled(sequence, kind, 1, "left") for kind in wrong_inputs(4, 2, built_in=True))
+    empty, joints, image, instrument = (
+        contradicting_frame(sequence, kind, 1, "left") for kind in wrong_inputs(4, 2, built_in=True)
+    )
     assert empty.masks is not None and not empty.masks["left"].any()
     np.testing.assert_array_equal(empty.images["left"], sequence.background("left", "regular"))
     np.testing.assert_array_equal(joints.measured["PSM1"], sequence.frame(3, "regular").measured["PSM1"])

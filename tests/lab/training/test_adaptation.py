@@ -12,7 +12,7 @@ import torch
 from carts_core.cli.command_line import BAD_INPUT, main
 from carts_core.errors import SettingsError
 from carts_core.lab.randomization.arms import RecordedPlacements, RobotGeometry
-from carts_core.lab.training.adaptation import BACKGROUNDS, STEPS, Fits, Judgement, adapted_to, made_images
+from carts_core.lab.training.adaptation import BACKGROUNDS, STEPS, Fits, Judgement, adapted_to, synthetic_images
 from carts_core.lab.training.loop import load_checkpoint
 from carts_core.lab.training.tasks import SurfaceTask, dice, pooled_dice, tip_error
 from carts_core.lab.training.training import train
@@ -214,7 +214,7 @@ def test_weights_are_offered_only_where_nothing_is_worse(
 
 def test_made_images_to_judge_by_are_whole_and_always_the_same(tmp_path: Path):
     config = adapted_to(sample_sequence(), tmp_path, TrainingConfig())
-    (first,), (again,) = (list(made_images(config, 1)) for _ in range(2))
+    (first,), (again,) = (list(synthetic_images(config, 1)) for _ in range(2))
     assert first.frame.images["made"].shape == (240, 320, 3)
     assert np.array_equal(first.frame.images["made"], again.frame.images["made"])
     for arm in first.scene.arms:
