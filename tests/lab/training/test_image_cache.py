@@ -50,7 +50,7 @@ def test_a_cache_holds_what_the_generator_makes_and_is_made_once(tmp_path: Path,
 
 def test_a_damaged_shard_is_named_with_the_remedy(tmp_path: Path):
     (tmp_path / "images-00000.safetensors").write_bytes(b"half a file")
-    with pytest.raises(WeightsError, match=r"images-00000.* cannot be read .*Delete it"):
+    with pytest.raises(WeightsError, match=r"images-00000.* cannot be read .*Delete the file"):
         ImageCache(tmp_path, 1)
 
 
