@@ -125,19 +125,16 @@ def test_after_the_viewer_was_killed_waiting_jobs_wait_and_the_one_that_ran_is_s
     assert again.jobs[0].options == OptimizeOptions((0, 1)) and again.jobs[0].done == 1
 
 
-@pytest.mark.parametrize(
-    ("options", "read"),
-    [
+def test_options_of_a_job_are_clamped_as_in_the_page() -> None:
+    for (kind, options), read in (
         (("optimize", {"frames": [2, -1, 7, 2, 10**12], "first": 10**12}), OptimizeOptions((2,), 1)),
         (("calibrate", {"frames": 10**12}), CalibrateOptions(500)),
         (("calibrate", {"frames": -3}), CalibrateOptions(1)),
         (("adapt", {"minutes": 10**9, "folder": 0}), AdaptOptions(240, 1)),
         (("solve", {"at": 99, "range": [5, -5]}), SolveOptions(False, 2, (0, 2))),
         (("export", {**EXPORT, "range": [9, 1]}), ExportOptions("csv", "All", range=(1, 2))),
-    ],
-)
-def test_options_of_a_job_are_clamped_as_in_the_page(options: tuple[str, dict], read: object) -> None:
-    assert read_options(*options, frames=3) == read
+    ):
+        assert read_options(kind, options, frames=3) == read
 
 
 @pytest.mark.parametrize(
@@ -305,13 +302,14 @@ def test_weights_that_were_replaced_are_asked_for_again(planted: Path) -> None:
     assert (again.used, again.asked) == (STARTED, "Adapted 1")
 
 
-@pytest.mark.parametrize("content", ["", "[]", '{"network": 1}', '{"network": null}', "{}", "[" * 100])
-def test_a_damaged_choice_is_kept_and_the_first_network_runs(planted: Path, content: str) -> None:
+def test_a_damaged_choice_is_kept_and_the_first_network_runs(planted: Path) -> None:
     file = planted.with_name("work_network.json")
-    file.write_text(content)
-    found = networks(planted)
-    assert (found.used, found.asked) == (STARTED, "") and "choice of a network work_network.json" in found.problem
-    assert file.with_name("work_network.json.damaged-1").read_text() == content and not file.exists()
+    for number, content in enumerate(("", "[]", '{"network": 1}', '{"network": null}', "{}", "[" * 100), 1):
+        file.write_text(content)
+        found = networks(planted)
+        assert (found.used, found.asked) == (STARTED, "")
+        assert "choice of a network work_network.json" in found.problem
+        assert file.with_name(f"work_network.json.damaged-{number}").read_text() == content and not file.exists()
 
 
 TRAINING = """#!{python} -S

@@ -31,6 +31,8 @@ def test_the_mask_covers_exactly_the_arms_in_their_colours(arm_ids: np.ndarray) 
     assert np.array_equal(picture[..., 3] > 0, arm_ids >= 0)
     assert tuple(picture[12, 12]) == (*layers.ARM_COLORS[0], 128)
     assert tuple(picture[25, 35]) == (*layers.ARM_COLORS[1], 128)
+    for layer in (layers.mask, layers.contour):
+        assert not layer(np.full((8, 8), -1), 1.0)[..., 3].any()
 
 
 def test_the_contour_runs_along_the_arms_and_leaves_their_inside_open(arm_ids: np.ndarray) -> None:
@@ -65,17 +67,7 @@ def test_a_map_of_a_lower_resolution_fills_the_picture_from_dark_to_bright() -> 
     brightness = picture[24, :, :3].astype(int).sum(-1)
     assert brightness[2] < brightness[32] < brightness[61]
     assert set(picture[..., 3].ravel()) == {128}
-
-
-def test_values_that_are_not_numbers_do_not_break_a_map() -> None:
-    values = np.full((4, 4), np.nan, np.float32)
-    assert layers.heat(values, 0.0, 1.0, (8, 8), 1.0).shape == (8, 8, 4)
-
-
-def test_no_arm_in_view_gives_an_empty_picture() -> None:
-    empty = np.full((8, 8), -1)
-    assert not layers.mask(empty, 1.0)[..., 3].any()
-    assert not layers.contour(empty, 1.0)[..., 3].any()
+    assert layers.heat(np.full((4, 4), np.nan, np.float32), 0.0, 1.0, (8, 8), 1.0).shape == (8, 8, 4)
 
 
 def test_the_next_picture_may_go_once_the_last_one_is_drawn_or_after_a_while() -> None:
@@ -97,6 +89,8 @@ def test_the_next_picture_may_go_once_the_last_one_is_drawn_or_after_a_while() -
 
 def test_a_curve_is_the_lowest_and_highest_value_of_each_column_and_follows_what_is_corrected(desk: Desk) -> None:
     traces, project = Traces(desk.session), desk.session.editor.project
+    for asked in (("Nothing", 0, 3, 9), ("Loss [1]", 2, 2, 9), ("Loss [1]", 0, 3, 0), ("", -5, -3, 1)):
+        assert traces.between(*asked) is None
     assert traces.names[:2] == ["Loss [1]", "Dice [1]"] and traces.names[3].endswith("[°]")
     yaw = traces.names[3]
     measured = np.degrees(desk.session.sequence.measured["PSM1"][:, 0])
@@ -113,11 +107,6 @@ def test_a_curve_is_the_lowest_and_highest_value_of_each_column_and_follows_what
     traces.follow(project.state, [2])
     loss = traces.between("Loss [1]", 0, 3, 100)
     assert loss is not None and loss["curves"] == [[[None, None, 0.25]] * 2]
-
-
-@pytest.mark.parametrize("asked", [("Nothing", 0, 3, 9), ("Loss [1]", 2, 2, 9), ("Loss [1]", 0, 3, 0), ("", -5, -3, 1)])
-def test_a_curve_that_there_is_not_is_none(desk: Desk, asked: tuple[str, int, int, int]) -> None:
-    assert Traces(desk.session).between(*asked) is None
 
 
 def test_a_frame_of_which_the_fit_is_not_known_has_no_height_and_one_that_fits_well_has_some(desk: Desk) -> None:

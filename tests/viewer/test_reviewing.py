@@ -189,21 +189,16 @@ def test_the_other_pose_is_seen_up_to_the_swipe_or_all_over_while_a_key_is_held(
 GOOD, DOUBTFUL = FitVerdict("good", "", "", 0.02), FitVerdict("doubtful", "In part.", "Look.", 0.2)
 
 
-@pytest.mark.parametrize(
-    ("after", "before", "worse"),
-    [
+def test_a_fit_is_worse_by_what_the_images_say_and_by_the_truth_where_it_is_known() -> None:
+    for after, before, worse in (
         (Fit(GOOD, 0.02), Fit(DOUBTFUL, 0.06), None),
         (Fit(DOUBTFUL, 0.02), Fit(GOOD, 0.06), "doubtful, before good"),
         (Fit(FitVerdict("good", "", "", 0.09), 0.02), Fit(GOOD, 0.02), "probability of failure 9%, before 2%"),
         (Fit(GOOD, 0.03), Fit(GOOD, 0.02), "loss 0.03, before 0.02"),
         (Fit(GOOD, 0.02, 0.564), Fit(DOUBTFUL, 0.06, 0.701), "Dice 0.564, before 0.701"),
         (Fit(DOUBTFUL, 0.09, 0.95), Fit(GOOD, 0.02, 0.90), None),
-    ],
-)
-def test_a_fit_is_worse_by_what_the_images_say_and_by_the_truth_where_it_is_known(
-    after: Fit, before: Fit, worse: str | None
-) -> None:
-    assert after.worse_than(before) == worse
+    ):
+        assert after.worse_than(before) == worse
 
 
 def test_a_verdict_is_read_with_reason_remedy_and_cameras() -> None:

@@ -55,30 +55,13 @@ def test_folders_and_files_below_a_root_are_listed_without_links_pipes_and_hidde
     assert roots.parent(root / "inner") == root and roots.parent(root) is None
 
 
-@pytest.mark.parametrize(
-    "path",
-    [
-        "{root}/../secret/s.toml",
-        "{root}/inner/../../secret",
-        "{root}/out/s.toml",
-        "{root}/out",
-        "{root}/inner/s.toml",
-        "{root}/pipe",
-        "{root}/nothing",
-        "{root}/.hidden",
-        "{root}/.hidden/b.toml",
-        "{root}/inner/.c.toml",
-        "{root}x",
-        "/etc/passwd",
-        "inner",
-        "",
-        "{root}/inner\x00",
-        "/",
-    ],
-)
-def test_nothing_outside_of_the_roots_can_be_reached(roots: Roots, path: str) -> None:
-    with pytest.raises(SettingsError):
-        roots.checked(path.replace("{root}", str(roots.folders[0])))
+def test_nothing_outside_of_the_roots_can_be_reached(roots: Roots) -> None:
+    root = str(roots.folders[0])
+    inside = ("/../secret/s.toml", "/inner/../../secret", "/out/s.toml", "/out", "/inner/s.toml", "/pipe", "/nothing")
+    hidden = ("/.hidden", "/.hidden/b.toml", "/inner/.c.toml", "x", "/inner\x00")
+    for path in (*(root + path for path in (*inside, *hidden)), "/etc/passwd", "inner", "", "/"):
+        with pytest.raises(SettingsError):
+            roots.checked(path)
 
 
 def test_a_root_that_is_not_there_is_refused(tmp_path: Path) -> None:
@@ -312,22 +295,13 @@ def test_new_results_get_a_project_of_their_own_and_what_was_reviewed_stays(batc
     assert second != first and first.exists()
 
 
-@pytest.mark.parametrize(
-    "content",
-    [
-        "",
-        "{}",
-        '{"format": "carts-batch-jobs/1", "jobs": [{}]}',
-        '{"format": "carts-batch-jobs/1", "jobs": [{"name": "../x", "recording": "/r", "camera": "", "domain": "", '
-        '"steps": []}]}',
-        '{"format": "carts-batch-jobs/1", "jobs": [{"name": "x", "recording": "r", "camera": "", "domain": "", '
-        '"steps": []}]}',
-    ],
-)
-def test_a_list_of_jobs_that_is_damaged_or_leads_elsewhere_is_refused(tmp_path: Path, content: str) -> None:
-    (tmp_path / "batch.json").write_text(content)
-    with pytest.raises(CartsError):
-        read_jobs(tmp_path)
+def test_a_list_of_jobs_that_leads_elsewhere_is_refused(tmp_path: Path) -> None:
+    row = {"name": "x", "recording": "/r", "camera": "", "domain": "", "steps": []}
+    for change in ({"name": "../x"}, {"recording": "r"}):
+        content = {"format": "carts-batch-jobs/1", "jobs": [row | change]}
+        (tmp_path / "batch.json").write_text(json.dumps(content))
+        with pytest.raises(CartsError):
+            read_jobs(tmp_path)
 
 
 def test_a_recording_outside_of_the_allowed_folders_is_not_opened(batch: Path, tmp_path: Path) -> None:
