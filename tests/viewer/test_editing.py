@@ -324,24 +324,6 @@ def _reviews(people: People) -> list[str]:
     return [str(people.project.state.review(frame).state) for frame in range(4)]
 
 
-def test_undo_takes_back_ones_own_last_step_and_leaves_what_others_did(people: People) -> None:
-    ann, bob = people.join(), people.join()
-    people.apply(ann, "Accept", {Key.review(0): ACCEPTED})
-    people.apply(ann, "Accept", {Key.review(1): ACCEPTED})
-    people.apply(bob, "Reject", {Key.review(2): REJECTED})
-    people.undo(ann)
-    people.undo(ann)
-    assert _reviews(people) == ["untouched", "untouched", "rejected", "untouched"] and not people.can_undo(ann)
-    people.redo(ann)
-    people.redo(ann)
-    assert _reviews(people) == ["accepted", "accepted", "rejected", "untouched"] and not people.can_redo(ann)
-    people.undo(ann)
-    people.undo(bob)
-    assert _reviews(people) == ["accepted", "untouched", "untouched", "untouched"]
-    assert people.project.state.steps[0].name == "Tab 1: Accept"
-    assert people.project.state.steps[-1].name == "Tab 2: Undo: Reject"
-
-
 def test_what_somebody_else_has_changed_since_is_not_taken_back(people: People) -> None:
     ann, bob = people.join(), people.join()
     people.apply(ann, "Accept", {Key.review(1): ACCEPTED})

@@ -70,14 +70,14 @@ def click_what_is_asked_for(visitor: Visitor, scene: Scene, measured: dict[str, 
 def test_two_folders_a_table_and_calibrations_become_a_sequence_with_its_arm_in_place(
     tiny_sequence: Callable[..., Path], tmp_path: Path, visit: Callable[[Path], Visitor]
 ) -> None:
-    made = Sequence.open(tiny_sequence(frames=8, cameras=("left", "right"), width=320, height=240))
+    made = Sequence.open(tiny_sequence(frames=4, cameras=("left", "right"), width=320, height=240))
     assert made.truth is not None
     true = {"PSM1": made.truth["PSM1"]}
     root = tmp_path / "labs"
     for camera in ("left", "right"):
         shutil.copytree(made.path.parent / "regular" / camera, root / "day 3" / f"{camera}_images")
     lenses = [(camera.name, (camera.width, camera.height), camera.K - SHIFT) for camera in made.scene.cameras]
-    write_lab_files(root / "day 3", range(1, 9), true["PSM1"], lenses)
+    write_lab_files(root / "day 3", range(1, 5), true["PSM1"], lenses)
     visitor = visit(root)
     visitor.press("New recording")
     visitor.press_folder("day 3")
@@ -108,7 +108,7 @@ def test_two_folders_a_table_and_calibrations_become_a_sequence_with_its_arm_in_
     text = saved.path.read_text()
     assert "points clicked in carts view" in text and "no base frame" not in text
     visitor.page.get_by_role("button", name="All recordings", exact=True).click()
-    visitor.reads("0 of 8 frames reviewed")
+    visitor.reads("0 of 4 frames reviewed")
     assert not (data_dir() / "drafts").exists() or not list((data_dir() / "drafts").glob("*.json"))
 
 

@@ -175,8 +175,7 @@ def test_a_phone_shows_what_reading_and_reviewing_needs_and_the_rest_in_a_sheet(
     look_into_tabs(tab, folders=True)
     # The curves of a run leave the panel as wide as it is.
     tab.open("Optimize")
-    tab.put(intents.Run())
-    eventually(lambda: tab.state.verdict, timeout=120)
+    tab.put(intents.Step())
     page.locator(".uplot").first.wait_for(state="visible")
     eventually(lambda: cut_off(page), lambda cut: not cut)
 
