@@ -88,6 +88,16 @@ def test_missing_and_broken_meshes_leave_nothing_behind(model):
         dvrk_urdf(model, "400093", model)
 
 
+def test_a_file_is_replaced_only_on_request(model, tmp_path):
+    output = tmp_path / "x.urdf"
+    output.write_text("mine")
+    with pytest.raises(SystemExit):
+        main(["robot", str(model), "--instrument", "400093", "-o", str(output)])
+    assert output.read_text() == "mine"
+    main(["robot", str(model), "--instrument", "400093", "-o", str(output), "--overwrite"])
+    assert output.read_text().startswith("<robot")
+
+
 @pytest.mark.parametrize("content", ["[1", "[" * 50_000, "instruments: 3", "instruments: {'400006': {}}", "\xff"])
 def test_a_tree_without_a_readable_table_is_refused(model, content):
     (model / "urdf/common/instruments/instruments.yaml").write_bytes(content.encode("latin-1"))

@@ -76,6 +76,18 @@ def test_meshes_are_closed_small_and_of_the_stated_length(instrument: Instrument
     assert ("jaw 1 tip" in named) == instrument.has_jaws
 
 
+def test_jaws_open_to_opposite_sides_and_do_not_overlap() -> None:
+    for name in ("debakey_forceps", "clip_applier"):
+        robot = loaded(name)
+        first, second = (
+            np.concatenate([mesh.vertices for mesh in robot.meshes if robot.link_names[mesh.link] == link])
+            for link in ("jaw_1_link", "jaw_2_link")
+        )
+        beyond_the_hub = 0.012
+        assert (first[first[:, 1] > beyond_the_hub, 0] <= 0).all()
+        assert (second[second[:, 1] > beyond_the_hub, 0] >= 0).all()
+
+
 def test_the_same_files_are_made_again_and_a_damaged_one_is_replaced() -> None:
     urdf = builtin_urdf("cautery_hook")
     mesh = urdf.parent / "meshes" / "tip_electrode.ply"
