@@ -175,7 +175,7 @@ class Worker:
     def _fail(self, error: Exception, *tabs: Tab, stop: bool = False) -> str:
         if not isinstance(error, CartsError):
             # The terminal gets the traceback; the page shows the error.
-            _log.error("Unexpected error of the viewer's worker at %s", time.strftime("%H:%M:%S"), exc_info=error)
+            _log.error("Unexpected error in the viewer's worker at %s", time.strftime("%H:%M:%S"), exc_info=error)
         for tab in tabs:
             tab.controller.fail(error, stop=stop)
         return str(error) if isinstance(error, CartsError) else f"{type(error).__name__}: {error}"

@@ -118,7 +118,7 @@ def _recordings(manifest: Path, output: Path | None, where: str, patterns: tuple
 
 
 def _name(recording: Path, domain: str, camera: str) -> str:
-    """Name of a job, from the recording (the folder of a `sequence.toml`), domain and camera."""
+    """Name of a job: recording (folder of a `sequence.toml`, else the stem), domain and camera, joined by hyphens."""
     stem = recording.parent.name if recording.name == "sequence.toml" else recording.stem
     return "-".join(part for part in (stem, domain, camera if camera != "all" else "") if part)
 

@@ -45,7 +45,7 @@ _COMMANDS: dict[Step, type] = {
 _GIVEN = ("--output", "-o", "--overwrite", "--json", "--kinematics", "--mode", "--camera", "--domain")
 """Options that a job sets itself."""
 _CORRECTING: tuple[Step, ...] = ("import", "calibrate", "optimize", "sequence")
-"""Steps after which a job evaluates and exports the results of these steps."""
+"""Steps after which a job evaluates and exports their results."""
 _CODE = ("**/*.py",)
 
 

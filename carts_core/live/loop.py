@@ -70,7 +70,7 @@ class LiveStatistics:
         if not self.ages:
             return text + verdicts
         middle, late = (1000.0 * float(np.percentile(self.ages, share)) for share in (50, 95))
-        return f"{text}{verdicts}. Age of results: median {middle:.0f} ms, 95 % within {late:.0f} ms"
+        return f"{text}{verdicts}. Latency: median {middle:.0f} ms, 95th percentile {late:.0f} ms"
 
 
 def follow(

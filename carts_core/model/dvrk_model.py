@@ -76,10 +76,10 @@ def list_instruments(model: Path) -> dict[str, Instrument]:
 
 
 def choose_instrument(model: Path, number: str) -> Instrument:
-    """Find an instrument by its number, with or without the dots of a `tool_type`.
+    """Find an instrument by its number.
 
     Raises:
-        RobotError: the tree does not list the instrument, or lacks the meshes of its tip.
+        RobotError: the checkout does not list the instrument, or lacks the meshes of its tip.
     """
     instruments = list_instruments(model)
     if number not in instruments:

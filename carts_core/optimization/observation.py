@@ -59,7 +59,7 @@ MAX_FALSE_POSITIVES = 0.08
 """Share of a background with false positives above which the background is removed from the network's input [1]."""
 
 _SMOOTH = 12.0
-"""Standard deviation of the blur that replaces such a background [px of the working image]."""
+"""Standard deviation of the blur of a background that is removed from the network's input [px of the working image]."""
 
 _FITS, _SAMPLES = 4, 4
 """Iterations of the robust illumination fit, and its pixel sampling step [px]."""
@@ -259,7 +259,7 @@ class FrameImages:
     size: tuple[int, int]
     """Width and height [px]."""
     images: Float[Tensor, "cameras 3 h w"]
-    """RGB in [0, 1], without smoke and haze."""
+    """RGB in [0, 1], dehazed."""
     weight: Float[Tensor, "cameras 1 h w"]
     """Pixel weight: 0 at known occluders, 1 elsewhere."""
     certainty: Float[Tensor, "cameras 1 h w"]

@@ -150,7 +150,7 @@ class ImportReport:
         if not self.changed:
             text = f"The project already has these {' and '.join(parts)}; nothing was changed."
         if self.unknown:
-            text += f" {counted(len(self.unknown), 'image')} without a frame skipped, such as {self.unknown[0]}."
+            text += f" {counted(len(self.unknown), 'image')} skipped that match no frame, such as {self.unknown[0]}."
         if self.remarks:
             more = f"; and {len(self.remarks) - _SHOWN} more" if len(self.remarks) > _SHOWN else ""
             text += f" Remarks: {'; '.join(self.remarks[:_SHOWN])}{more}."

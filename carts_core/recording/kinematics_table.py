@@ -117,7 +117,7 @@ def read_table(path: Path, delimiter: str = ",", what: str = "kinematics table")
     if set(map(len, rows)) != {len(header)}:
         line, row = next((line, row) for line, row in zip(lines, rows, strict=True) if len(row) != len(header))
         raise SequenceError(
-            f"{path}, line {line} has {len(row)} cells, but the header has {len(header)}. Complete the row."
+            f"{path}, line {line} has {len(row)} cells, but the header has {len(header)}. Correct the row."
         )
     return Table(path, header, tuple(rows[1:]), tuple(lines[1:]))
 
@@ -244,8 +244,9 @@ class JointColumn:
         if fitting:
             option = "angle_unit" if joint.revolute else "length_unit"
             raise table.error(
-                f", {where}: read as {joint.unit}, joint {joint.name!r} is from {values.min():.4g} to "
-                f"{values.max():.4g} {joint.unit}, and its limits are {joint.lower:.4g} to {joint.upper:.4g}. "
+                f", {where}: read in {joint.unit}, the positions of joint {joint.name!r} range from "
+                f"{values.min():.4g} to {values.max():.4g} {joint.unit}, but its limits are {joint.lower:.4g} to "
+                f"{joint.upper:.4g}. "
                 f'Set the unit in [[arms]]: {option} = "{fitting[0]}" or "{PERCENT}" (-100 to 100 of the range), or '
                 f'"{joint.unit}" if it is correct.'
             )

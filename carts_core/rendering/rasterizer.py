@@ -418,7 +418,7 @@ def gather_points(
 
 @dataclass(frozen=True)
 class VisiblePoints:
-    """Surface points of visible pixels, without gradients. `K` counts visible pixels in all views."""
+    """Surface points of visible pixels, without gradients. `K` is the number of visible pixels in all views."""
 
     pixel: Int[Tensor, " K"]
     """Index into the flattened `views x height x width`."""

@@ -165,7 +165,7 @@ class LiveHandler(Handler):
             self._show_result(run, tracked)
         elif over:
             error = run.error
-            self.stop("The stream has ended." if error is None else "The stream was ended by an error.")
+            self.stop("The stream has ended." if error is None else "The stream ended with an error.")
             if error is not None:
                 raise error
 

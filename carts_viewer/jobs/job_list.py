@@ -292,7 +292,7 @@ class JobList:
         return job
 
     def _own(self, job: Job) -> Job:
-        """A job with a new token, which is stored in this user's decisions."""
+        """Give a job a new token, and record that this user approved it."""
         job = replace(job, token=secrets.token_hex(16))
         self._decisions.make(self._identity(job), True)
         return job

@@ -141,7 +141,7 @@ class SequenceRun:
         """Progress, as text for the user."""
         done, total = self.optimizer.progress
         if done == 0:
-            return "Solving single frames to initialize the kinematic error"
+            return "Solving single frames for an initial estimate of the kinematic error"
         if done == total:
             return f"All {total} frames estimated; revising inconsistent ones and assessing the fit"
         if done < 2 < total:

@@ -133,7 +133,7 @@ WRONG: list[tuple[Callable[[Path], object], list[str]]] = [
     ),
     (
         edit_cell("kinematics.csv", 1, "pitch", "-31.5"),
-        ["line 2, column 'pitch': read as rad", 'pitch = { column = "pitch", unit = "deg" }'],
+        ["line 2, column 'pitch': read in rad", 'pitch = { column = "pitch", unit = "deg" }'],
     ),
     (edit_cell("kinematics.csv", 1, "insertion", "151"), ['insertion = { column = "insertion", unit = "mm" }']),
     (edit_cell("kinematics.csv", 3, "frame", "1"), ["line 4, column 'frame': frame '001' is already in line 2"]),

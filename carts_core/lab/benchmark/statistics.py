@@ -158,7 +158,9 @@ MIN_GAIN = 0.01
 
 @dataclass(frozen=True)
 class Pair:
-    """Times of both methods to the final Dice of the paper's setting."""
+    """Times that the paper's setting and the default solver need to reach the best Dice of the paper's setting, from
+    the same start.
+    """
 
     source: str
     error_deg: float | None

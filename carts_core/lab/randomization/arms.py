@@ -203,7 +203,7 @@ class Placement:
 
 
 def random_intrinsics(rng: np.random.Generator, width: int, height: int, field: int) -> Intrinsics:
-    """fx, fy, cx, cy [px] of a crop of `width` x `height` px from a camera image that is `field` px wide."""
+    """Random fx, fy, cx, cy [px] of a crop of `width` x `height` px from a camera image that is `field` px wide."""
     focal = float(np.exp(rng.uniform(*np.log(FOCAL_LENGTH)))) * field
     cx, cy = rng.uniform(0.3, 0.7) * width, rng.uniform(0.3, 0.7) * height
     return focal, focal * rng.uniform(0.98, 1.02), cx, cy

@@ -187,7 +187,9 @@ def _box(extents: np.ndarray, centre: np.ndarray) -> Part:
 
 
 def _normals(vertices: np.ndarray, faces: np.ndarray) -> Float[np.ndarray, "V 3"]:
-    """Vertex normals: area-weighted means over adjacent triangles, with irrelevant sign (see `render_gbuffer`)."""
+    """Vertex normals: area-weighted means over adjacent triangles. Their sign is arbitrary, since `render_gbuffer`
+    turns them towards the camera.
+    """
     a, b, c = (vertices[faces[:, corner]] for corner in range(3))
     cross, normals = np.cross(b - a, c - a), np.zeros_like(vertices)
     for corner in range(3):

@@ -335,8 +335,8 @@ def gain(before: dict[str, float], now: dict[str, float]) -> str:
     share = (1 - now["dice"]) / (1 - before["dice"]) if before["dice"] < 1 else np.nan
     dice = f"Dice {before['dice']:.3f} -> {now['dice']:.3f}, remaining error {share:.0%}"
     parts = ", ".join(f"{part} {before[f'dice_{part}']:.3f} -> {now[f'dice_{part}']:.3f}" for part in PARTS)
-    tips = f"tips {before['tip_error']:.1f} -> {now['tip_error']:.1f} px"
-    normals = f"normals {before['normal_error_deg']:.1f} -> {now['normal_error_deg']:.1f} deg"
+    tips = f"tip error {before['tip_error']:.1f} -> {now['tip_error']:.1f} px"
+    normals = f"normal error {before['normal_error_deg']:.1f} -> {now['normal_error_deg']:.1f} deg"
     return f"synthetic images of this recording: {dice}; {parts}; {tips}; {normals}"
 
 

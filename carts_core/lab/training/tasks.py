@@ -227,8 +227,8 @@ class SurfaceTask:
         "dice_given": "Dice of the given kinematics",
         "part_accuracy": "part accuracy of pixels",
         **{f"dice_{part}": f"Dice of the part {part}" for part in PARTS},
-        "tip_error": "error of tips [px]",
-        "normal_error_deg": "error of normals [deg]",
+        "tip_error": "tip error [px]",
+        "normal_error_deg": "normal error [deg]",
     }
     score: ClassVar[str] = "dice"
 

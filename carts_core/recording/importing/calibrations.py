@@ -49,7 +49,7 @@ class Calibration:
     P: Float[np.ndarray, "3 4"] | None = None
     """Projection of the rectified camera [px]; its last column is -focal length * baseline [px m]."""
     remarks: tuple[str, ...] = ()
-    """Decisions on the values, as sentences."""
+    """Remarks on how the file was interpreted, as sentences."""
 
 
 def read_calibration(path: Path, side: str) -> Calibration:

@@ -34,7 +34,7 @@ def detect(path: Path, name: str | None = None) -> Source:
             if source.name == name:
                 return source
         meant = closest(name, [source.name for source in SOURCES])
-        raise SequenceError(f"the format {name!r} is unknown.{meant} Supported are:\n{kinds}")
+        raise SequenceError(f"the format {name!r} is unknown.{meant} Supported formats:\n{kinds}")
     for suffix, remedy in _UNFINISHED.items():
         if path.name.lower().endswith(suffix):
             raise SequenceError(f"{path} ends with {suffix}: {remedy}")

@@ -141,7 +141,7 @@ def length_unit(highest: float, limit: float, arm: str, what: str, orders: Seque
     also = f" Or choose other columns: {' or '.join(orders)} would fit." if orders else ""
     raise PartError(
         "columns",
-        f"{arm}: the unit of {what} is ambiguous: it is up to {highest:.4g}, and at most {limit:.3g} m is possible. "
+        f"{arm}: the unit of {what} is ambiguous: its values reach {highest:.4g}, and its limit is {limit:.3g} m. "
         f"Give the unit: {listed}.{also}",
         "Options: --length-unit, --columns." if orders else "Option: --length-unit.",
     )

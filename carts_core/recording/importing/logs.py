@@ -344,7 +344,7 @@ def _geometry(log: ArmLog, job: Import) -> PsmGeometry:
     if chosen.wrist_length != CLASSIC.wrist_length and log.name not in job.options.robot:
         job.warning(
             "the shipped robot has a wrist of 9.1 mm and this instrument one of "
-            f"{1e3 * chosen.wrist_length:.1f} mm. Generate its robot with carts robot, and choose it.",
+            f"{1e3 * chosen.wrist_length:.1f} mm. Generate the URDF of this instrument with carts robot and select it.",
             log.name,
             remedy=f"Option: --robot {log.name} FILE.urdf.",
         )

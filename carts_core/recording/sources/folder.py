@@ -257,8 +257,8 @@ def _matched(
         names = ", ".join(table.path.name for table, _ in found)
         raise PartError(
             "columns",
-            f"rows of {names} match the images in different ways. Give the tables times of one clock, or choose one "
-            "table.",
+            f"the rows of {names} are matched with the images differently: by frame or by time, or with different time "
+            "offsets. Give all tables times of the same clock, or choose one table.",
             "Options: --time-offset, --kinematics FILE.",
         )
     return tuple(arms), first

@@ -671,7 +671,7 @@ def test_a_sequence_file_never_reads_shares_of_a_range_as_radians(tmp_path: Path
     path = tmp_path / "sequence.toml"
     path.write_text(text.replace("UNIT", ""))
     with pytest.raises(
-        CartsError, match=r'read as rad, .* -8 to 8 rad, .* -1.92 to 1.92.*angle_unit = "deg" or "percent"'
+        CartsError, match=r'read in rad, .* -8 to 8 rad, .* -1.92 to 1.92.*angle_unit = "deg" or "percent"'
     ):
         Sequence.open(path)
     path.write_text(text.replace("UNIT", 'angle_unit = "percent"\n'))
