@@ -14,6 +14,7 @@ from waiting import eventually
 
 from carts_core.evaluation import dice
 from carts_core.project import ReviewState
+from carts_core.recording.images import read_mask
 from carts_viewer.app import ViewerApp
 from carts_viewer.jobs.job_list import JobState
 from carts_viewer.picture.overlay import OverlayRenderer
@@ -111,10 +112,11 @@ def test_thirty_real_frames_take_at_most_two_actions_each_and_are_exported(
 
 
 def _read_back(folder: Path, app: ViewerApp, accepted: list[int]) -> list[float]:
-    """Dice with the true masks of the reviewed camera; masks of all cameras are to the pixel what the project holds."""
+    """Dice with the true masks of the reviewed camera; rendered masks of all cameras are those of the project's poses."""
     file = folder / "annotations" / "instances_default.json"
     coco, renderer = COCO(str(file)), OverlayRenderer(app.sequence)
-    images = json.loads(file.read_text(encoding="utf-8"))["images"]
+    content = json.loads(file.read_text(encoding="utf-8"))
+    images, recorded = content["images"], Path(content["info"]["image_folder"])
     by_view = {(image["frame"], image["camera"]): image for image in images}
     cameras = [camera.name for camera in app.scene.cameras]
     ids = app.sequence.frame_ids
@@ -128,10 +130,13 @@ def _read_back(folder: Path, app: ViewerApp, accepted: list[int]) -> list[float]
         kept = app.scene.state({**frame.measured, **joints})
         for camera in cameras:
             image = by_view[ids[index], camera]
-            assert image["source"] == "optimized" and (folder / "images" / image["file_name"]).is_file()
+            assert image["source"] == "optimized" and (recorded / image["file_name"]).is_file()
             (annotation,) = coco.loadAnns(coco.getAnnIds(imgIds=image["id"]))
             mask = coco.annToMask(annotation).astype(bool)
-            assert np.array_equal(mask, renderer.arm_ids(kept, camera) >= 0)
+            beside = folder / "rendered" / f"{camera}_{ids[index]}.png"
+            assert image.get("refined", False) == beside.exists()
+            rendered = read_mask(beside) if beside.exists() else mask
+            assert np.array_equal(rendered, renderer.arm_ids(kept, camera) >= 0)
             if camera == CAMERA:
                 assert frame.masks is not None
                 found.append(dice(mask, frame.masks[camera]))
