@@ -112,7 +112,7 @@ def test_thirty_real_frames_take_at_most_two_actions_each_and_are_exported(
 
 
 def _read_back(folder: Path, app: ViewerApp, accepted: list[int]) -> list[float]:
-    """Dice with the true masks of the reviewed camera; rendered masks of all cameras are those of the project's poses."""
+    """Dice with the true masks of the reviewed camera; rendered masks of all cameras are those of the project."""
     file = folder / "annotations" / "instances_default.json"
     coco, renderer = COCO(str(file)), OverlayRenderer(app.sequence)
     content = json.loads(file.read_text(encoding="utf-8"))
