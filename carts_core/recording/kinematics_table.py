@@ -232,7 +232,7 @@ class JointColumn:
         allowed, other = PLAUSIBLE[joint.kind], "deg" if joint.revolute else "mm"
         if not (worst := np.abs(values).max()) <= allowed:
             raise table.error(
-                f", {where}: read as {self.unit}, joint {joint.name!r} is at {worst:.4g} {joint.unit}, which no "
+                f", {where}: read in {self.unit}, joint {joint.name!r} is at {worst:.4g} {joint.unit}, which no "
                 f"instrument reaches ({allowed:.3g} {joint.unit} is allowed). If the column is in {other}, set "
                 f'{joint.name} = {{ column = "{self.column}", unit = "{other}" }}.',
                 np.abs(values).argmax(),

@@ -246,7 +246,7 @@ def test_a_stopped_batch_goes_on_and_comes_to_the_same_end(sequence: Path, tmp_p
     eventually(lambda: bool(list(tmp_path.glob("stopped/jobs/*/findings.json"))))
     process.send_signal(signal.SIGTERM)
     _, errors = process.communicate(timeout=120)
-    assert process.returncode in (0, 128 + signal.SIGTERM)
+    assert process.returncode in (0, 128 + signal.SIGTERM), errors
     assert process.returncode == 0 or "holds the finished jobs; rerun the command to resume" in errors
     finished = run(path, "--output", tmp_path / "stopped", "--workers", "1")
     assert finished.returncode == 0 and "already there" in finished.stdout
