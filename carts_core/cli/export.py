@@ -1,6 +1,6 @@
 """`carts render` writes images of the arms; `carts export` writes frames in the formats of other tools."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -122,12 +122,8 @@ class Export:
             images=self.images,
             frame_rate=self.frame_rate,
             masks=self.masks,
+            load_networks=self.network.load,
         )
-        refines = FORMATS[self.format].refines and (
-            self.masks == "refined" or (self.masks == "auto" and any(frame.verdict == "good" for frame in frames))
-        )
-        if refines:
-            dataset = replace(dataset, networks=self.network.load())
         with Bar(console=console) as bar:
             task = bar.add_task(f"{self.format}, {counted(len(frames), 'frame')}", total=None)
             progress = ExportProgress(lambda done, total: bar.update(task, completed=done, total=total))
@@ -137,9 +133,9 @@ class Export:
             cameras_named = ", ".join(dataset.remade_cameras)
             reason = "they are undistorted, cropped, rotated, or from a video or bag, so labels match no recorded file"
             console.print(f"images of {cameras_named} are written as PNG: {reason}", soft_wrap=True)
-        if refines:
-            sources = [dataset.mask_source(frame, camera) for _, frame, camera in dataset.steps]
-            number = f"{sources.count('refined')} of {counted(len(sources), 'mask')}"
+        sources = [dataset.mask_source(frame, camera) for _, frame, camera in dataset.steps]
+        if FORMATS[self.format].refines and (refined := sources.count("refined")):
+            number = f"{refined} of {counted(len(sources), 'mask')}"
             console.print(f"{number} refined near the outline; the rendered masks are in the folder `rendered`")
         console.print(f"wrote {path}")
 

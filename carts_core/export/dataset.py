@@ -231,8 +231,8 @@ class Dataset:
     """Frame rate of a video [1/s]; None for the recorded rate."""
     masks: Masks = "rendered"
     """Masks that are refined; painted and given masks are not changed."""
-    networks: FeatureExtractor | None = None
-    """Networks that refine masks; None for rendered masks."""
+    load_networks: Callable[[], FeatureExtractor] | None = None
+    """Loads the networks for the first mask to refine; without it, masks are rendered."""
     rendered_folder: OutputPath | None = None
     """Folder for the rendered masks of refined views."""
 
@@ -300,7 +300,7 @@ class Dataset:
         if camera.name in frame.masks or camera.name in frame.part_labels:
             return "painted"
         wanted = self.masks == "refined" or (self.masks == "auto" and frame.verdict == "good")
-        return "refined" if wanted and self.networks is not None else "rendered"
+        return "refined" if wanted and self.load_networks is not None else "rendered"
 
     def views(self, progress: ExportProgress) -> Iterator[View]:
         """Yield the labelled views of all frames and cameras, one `progress` step each.
@@ -323,13 +323,15 @@ class Dataset:
                     write_bytes(self.rendered_folder / f"{name}.png", mask_png(rendered >= 0))
             yield View(number, frame, camera, name, link_ids, source)
 
+    @cached_property
+    def _predictor(self) -> NetworkPredictor:
+        assert self.load_networks is not None
+        return NetworkPredictor(self.load_networks())
+
     def _refined(
         self, frame: ExportFrame, camera: Camera, rendered: Bool[ndarray, "height width"]
     ) -> Bool[ndarray, "height width"]:
-        assert self.networks is not None
-        refiner = MaskRefiner(
-            NetworkPredictor(self.networks), Backgrounds.of(self.sequence, (camera.name,), self.domain)
-        )
+        refiner = MaskRefiner(self._predictor, Backgrounds.of(self.sequence, (camera.name,), self.domain))
         recorded = self.sequence.frame(frame.index, self.domain, [camera.name])
         masks = refiner.refine(self.scene, recorded, self.state(frame), {camera.name: rendered}, frame.ignored)
         return masks[camera.name]

@@ -197,7 +197,7 @@ def export(
         return Path(output)
     with published(output, overwrite=overwrite) as path:
         dataset = replace(
-            dataset, networks=dataset.networks if chosen.refines else None, rendered_folder=path / "rendered"
+            dataset, load_networks=dataset.load_networks if chosen.refines else None, rendered_folder=path / "rendered"
         )
         chosen.write(dataset, path, progress or ExportProgress())
         write_text(path / MARKER, _summary(dataset, name))

@@ -141,9 +141,6 @@ class ExportingHandler(Handler):
         cameras = [state.camera] if intent.shown_camera else [camera.name for camera in session.scene.cameras]
         scene = calibrated_scene(session.scene, view).with_cameras(cameras)
         renderer, sequence, images = self._context.renderer, session.sequence, "copied" if intent.images else "named"
-        good = any(_is_good(view, index) for index in chosen)
-        refines = FORMATS[intent.format].refines and (intent.masks == "refined" or (intent.masks == "auto" and good))
-        networks = self._optimizers.prepare() if refines else None
 
         def make(progress: ExportProgress) -> Dataset:
             indices = ExportProgress(cancelled=progress.cancelled).track(chosen)
@@ -156,7 +153,7 @@ class ExportingHandler(Handler):
                 parts=intent.parts,
                 images=images,
                 masks=intent.masks,
-                networks=networks,
+                load_networks=self._optimizers.prepare,
             )
 
         return make, len(chosen)
@@ -173,12 +170,6 @@ class ExportingHandler(Handler):
     def _report(self, **changes: object) -> None:
         if self._context.state.export is not None:
             self._context.change(export=replace(self._context.state.export, **changes))
-
-
-def _is_good(project: ProjectState, index: int) -> bool:
-    """Whether a frame has the verdict *good*."""
-    verdict = project.verdict(index) if index in project.records else None
-    return verdict is not None and verdict.verdict == "good"
 
 
 def frames_within(project: ProjectState, frames: str, part: tuple[int, int] | None) -> list[int]:

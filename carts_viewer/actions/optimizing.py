@@ -95,8 +95,10 @@ class OptimizingHandler(Handler):
         self._context.change(maps=None if iterate is None else Maps(iterate, run.cameras, of_run=False), busy=None)
 
     def _refine(self) -> None:
-        """Refine the rendered masks of the shown cameras."""
+        """Refine the rendered masks of the shown cameras; during a gesture or a run, masks are shown as rendered."""
         state, context = self._context.state, self._context
+        if state.unsaved or state.run.phase is Phase.RUNNING:
+            return
         pose, frame = state.pose.scene, state.frame
         cameras = [state.camera] if not state.beside else [*frame.images]
         if all(state.refined_mask(pose, camera) is not None for camera in cameras):

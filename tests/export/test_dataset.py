@@ -156,7 +156,7 @@ def test_masks_of_good_frames_are_refined_with_the_rendered_ones_beside_them(
     frames = (replace(first, verdict="good"), replace(second, verdict="doubtful"), replace(third, verdict="good"))
     frames = (*frames[:2], replace(frames[2], masks=given))
     rendered = Dataset(sequence, frames, scene, "regular")
-    dataset = replace(rendered, masks="auto", networks=FeatureExtractor.load())
+    dataset = replace(rendered, masks="auto", load_networks=FeatureExtractor.load)
     folders = [export(each, "masks", tmp_path / str(number)) for number, each in enumerate((rendered, dataset))]
     sources = [view["mask"] for view in json.loads((folders[1] / "export.json").read_text())["views"]]
     assert sources == ["refined", "rendered", "painted"]
