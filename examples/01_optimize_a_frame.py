@@ -27,7 +27,7 @@ def main(sequence: Path | None = None, picture: Path = Path("overlay.png")) -> N
     start = perturb(recording.scene, frame.measured, degrees=2.0, seed=1)
 
     extractor = FeatureExtractor.load()
-    # Images of the scene without arms, to discount false detections; {} omits them.
+    # Images of the scene without arms, used to discount false detections; pass {} to omit them.
     backgrounds = Backgrounds.of(recording, [camera], frame.domain)
     optimizer = FrameOptimizer(recording.scene, frame, backgrounds, extractor, start=start, cameras=[camera])
     for iterate in optimizer:

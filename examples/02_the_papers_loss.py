@@ -1,9 +1,9 @@
-"""Compare the paper's setting with the default solver on one frame from the same start: loss, steps and time.
+"""Compare Dice and time of the paper's setting and of the default solver on one frame, from the same start.
 
 python examples/02_the_papers_loss.py [--iterations 20] [--picture paper.png]
 
 The loss of the paper compares features of the image with features of a rendered image (ACS) and is minimized by Adam.
-The default compares which part of the arm covers each pixel, and is solved by damped Gauss-Newton steps.
+The default solver compares the parts of the arm that cover each pixel, and takes damped Gauss-Newton steps.
 """
 
 from pathlib import Path
@@ -30,7 +30,7 @@ def main(iterations: int = 20, picture: Path = Path("paper.png")) -> None:
     camera = sequence.scene.cameras[0].name
     assert frame.truth is not None and frame.masks is not None
     start = perturb(sequence.scene, frame.truth, degrees=1.0, seed=3)
-    # The arms are drawn over the mean background before features are compared.
+    # The arms are rendered over the mean background before features are compared.
     background = {camera: sequence.background(camera)}
     extractor, renderer = FeatureExtractor.load(), Renderer(sequence.scene)
 

@@ -24,7 +24,7 @@ from carts_core.rendering import Renderer
 
 
 def synthesized(folder: Path) -> Path:
-    """The sequence file of one small stereo frame."""
+    """Synthesize one small stereo frame; returns its sequence file."""
     config = SynthesisConfig(
         seed=12,
         domains=("regular",),
@@ -37,7 +37,7 @@ def synthesized(folder: Path) -> Path:
 
 
 def main(sequence: Path | None = None, picture: Path = Path("stereo.png")) -> None:
-    """Optimize the first frame with one camera, then with all."""
+    """Optimize the first frame with the first camera, then with all cameras."""
     with tempfile.TemporaryDirectory() as folder:
         recording = Sequence.open(sequence or synthesized(Path(folder) / "stereo"))
         frame = recording.frame(0)

@@ -1,4 +1,4 @@
-"""Correct several frames jointly with a keyframe, which is held fixed and constrains the others.
+"""Correct several frames jointly with a keyframe, which is held fixed and constrains the other frames.
 
 python examples/04_a_sequence_with_keyframes.py [--frames 4] [--picture sequence.png]
 """
@@ -18,7 +18,7 @@ from carts_core.resources import sample_sequence
 
 
 def main(frames: int = 4, picture: Path = Path("sequence.png")) -> None:
-    """Correct the first frames of the shipped sequence; the keyframe has the sample's true joint positions."""
+    """Correct the first frames of the shipped sequence; the first one is a keyframe with true joint positions."""
     sequence = Sequence.open(sample_sequence())
     scene, truth = sequence.scene, sequence.truth
     assert truth is not None and sequence.timestamps is not None

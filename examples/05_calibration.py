@@ -1,8 +1,8 @@
-"""Calibrate a wrong base frame: move one arm's base by a centimetre, and estimate it from several frames.
+"""Calibrate a wrong base frame: move one arm's base by a centimetre, and estimate its pose from several frames.
 
 python examples/05_calibration.py [--frames 4] [--picture calibration.png]
 
-Joints are held: a rotated base frame and a constant error of the first joint are indistinguishable.
+Joints are held fixed, since a rotated base frame and a constant error of the first joint are indistinguishable.
 """
 
 from dataclasses import replace
@@ -23,7 +23,7 @@ from carts_core.resources import sample_sequence
 
 
 def moved(scene: Scene, arm: str, metres: tuple[float, float, float]) -> Scene:
-    """The scene with the base frame of one arm translated."""
+    """Translate the base frame of one arm of a scene."""
     T = scene.arm(arm).T_world_base.copy()
     T[:3, 3] += metres
     arms = tuple(replace(each, T_world_base=T) if each.name == arm else each for each in scene.arms)
@@ -31,14 +31,14 @@ def moved(scene: Scene, arm: str, metres: tuple[float, float, float]) -> Scene:
 
 
 def tip(scene: Scene, frame: Frame) -> np.ndarray:
-    """Position of the point between the jaws of the first arm in the first camera [m]."""
+    """Position of the point between the jaws of the first arm, in the frame of the first camera [m]."""
     state = scene.state(frame.measured)
     T_base_tip = scene.arms[0].robot.link_transform(state.joint_positions[0], "tool_tip_link")
     return (state.T_camera_world[0] @ state.T_world_base[0] @ T_base_tip)[:3, 3].numpy()
 
 
 def main(frames: int = 4, picture: Path = Path("calibration.png")) -> None:
-    """Calibrate the shipped sequence, with the true joints in place of the measured ones."""
+    """Calibrate the shipped sequence, with the true joint positions in place of the measured ones."""
     sequence = Sequence.open(sample_sequence())
     chosen = [sequence.frame(index) for index in spread(len(sequence), frames)]
     chosen = [replace(frame, measured=frame.truth or frame.measured) for frame in chosen]

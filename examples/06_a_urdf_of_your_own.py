@@ -1,4 +1,4 @@
-"""Use any URDF with meshes as an arm: write one, render it, and fit its joints to an image with plain PyTorch.
+"""Use any URDF with meshes as an arm: write a URDF, render it, and fit its joints to an image with plain PyTorch.
 
 python examples/06_a_urdf_of_your_own.py [--steps 80] [--picture own_arm.png]
 
@@ -25,7 +25,7 @@ LENGTHS = {"upper": 0.05, "lower": 0.04, "hand": 0.02}  # lengths of the rods, e
 
 
 def write_urdf(folder: Path) -> Path:
-    """A planar arm of three rods, which turn about y."""
+    """Write the URDF and meshes of a planar arm: three rods that rotate about y."""
     parts, parent, offset = ['<robot name="three_rods"><link name="base"/>'], "base", 0.0
     for name, length in LENGTHS.items():
         rod = trimesh.creation.cylinder(radius=0.006, segment=[[0, 0, 0], [0, 0, length]])
@@ -43,12 +43,12 @@ def write_urdf(folder: Path) -> Path:
 
 
 def blurred(silhouette: torch.Tensor) -> torch.Tensor:
-    """A silhouette [height, width] under a wide blur, for gradients over larger distances."""
+    """Blur a silhouette [height, width] widely, for gradients over larger distances."""
     return gaussian_blur2d(silhouette[None, None], (25, 25), (6.0, 6.0))
 
 
 def main(steps: int = 80, picture: Path = Path("own_arm.png")) -> None:
-    """Fit the arm to an image of itself."""
+    """Fit the joints to a rendered image of the arm."""
     with tempfile.TemporaryDirectory() as folder:
         robot = Robot.load(write_urdf(Path(folder)))
     # The camera looks along the world's y from 20 cm away, so the arm moves parallel to the image plane.

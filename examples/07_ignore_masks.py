@@ -21,7 +21,7 @@ from carts_core.resources import sample_sequence
 
 
 def covered(image: np.ndarray, mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The image with a sheet of gauze over the jaws of the left instrument, and the mask of the gauze."""
+    """Draw a sheet of gauze over the jaws of the left instrument; returns the image and the mask of the gauze."""
     count, labels, _, centres = cv2.connectedComponentsWithStats(mask.astype(np.uint8))
     left = min(range(1, count), key=lambda number: centres[number][0])
     rows, columns = np.nonzero(labels == left)
@@ -32,7 +32,7 @@ def covered(image: np.ndarray, mask: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
 
 def main(picture: Path = Path("ignore.png")) -> None:
-    """Optimize the first shipped frame with an occluder, without and with its mask."""
+    """Optimize the first shipped frame with an occluder, first without and then with its mask."""
     sequence = Sequence.open(sample_sequence())
     scene, frame = sequence.scene, sequence.frame(0)
     camera = scene.cameras[0].name

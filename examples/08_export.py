@@ -19,7 +19,7 @@ from carts_core.resources import sample_sequence
 
 
 def corrected(sequence: Sequence, index: int, extractor: FeatureExtractor) -> ExportFrame:
-    """One frame with the joint positions that the optimizer finds."""
+    """Optimize the joint positions of one frame for the export."""
     frame = sequence.frame(index)
     optimizer = FrameOptimizer(sequence.scene, frame, {}, extractor, live=False)
     list(optimizer)
@@ -29,7 +29,7 @@ def corrected(sequence: Sequence, index: int, extractor: FeatureExtractor) -> Ex
 
 
 def main(frames: int = 2, output: Path = Path("exported"), picture: Path = Path("export.png")) -> None:
-    """Export the first frames of the shipped sequence, and draw the annotations as COCO's own reader returns them."""
+    """Export the first frames of the shipped sequence, and draw the annotations as read by pycocotools."""
     sequence, extractor = Sequence.open(sample_sequence()), FeatureExtractor.load()
     rows = tuple(corrected(sequence, index, extractor) for index in range(frames))
     dataset = Dataset(sequence, rows, sequence.scene, sequence.domains[0])

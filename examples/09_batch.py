@@ -1,4 +1,4 @@
-"""Process many recordings: correct some frames of each sequence and condition, and write one table of scores.
+"""Process many recordings: correct some frames of each sequence and domain, and write one table of scores.
 
 python examples/09_batch.py [SEQUENCE.toml ...] [--frames 1] [--domains regular smoke] [--table scores.csv]
 """

@@ -1,9 +1,9 @@
-"""Synthesize a small path-traced recording with ground truth under several conditions, and draw it.
+"""Synthesize a small path-traced recording with ground truth in several domains, and draw the arms over it.
 
 python examples/10_synthesizing.py [OUTPUT] [--frames 1] [--seed 12] [--picture synthesized.png]
 
-Requires `pip install 'carts[synthesis]'`. The sizes are small, so that it takes seconds; the shipped
-sequence was generated with the defaults of `carts synthesize`.
+Requires `pip install 'carts[synthesis]'`. The sizes are small, so that it takes only seconds; the
+shipped sequence was generated with the defaults of `carts synthesize`.
 """
 
 import tempfile
@@ -27,7 +27,7 @@ def main(
     seed: int = 12,
     picture: Path = Path("synthesized.png"),
 ) -> None:
-    """Synthesize, and draw the arms as measured over every condition."""
+    """Synthesize a recording, and draw the arms at the measured joint positions in every domain."""
     config = SynthesisConfig(
         seed=seed,
         domains=DOMAINS,

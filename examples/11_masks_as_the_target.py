@@ -20,7 +20,7 @@ from carts_core.resources import sample_sequence
 
 
 def main(picture: Path = Path("masks.png")) -> None:
-    """Fit the first shipped frame to its mask with a fifth of its blocks removed."""
+    """Fit the first shipped frame to its mask, from which a fifth of the blocks is removed."""
     sequence = Sequence.open(sample_sequence())
     scene, frame = sequence.scene, sequence.frame(0)
     camera = scene.cameras[0].name

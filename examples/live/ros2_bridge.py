@@ -1,4 +1,4 @@
-"""A bridge between ROS 2 and `carts live --source socket:PORT`. Not run by the tests, since it needs ROS 2.
+"""Bridge between ROS 2 and `carts live --source socket:PORT`, not run by the tests, since it requires ROS 2.
 
     carts live sequence.toml --source socket:7000 --quiet
     python examples/live/ros2_bridge.py --port 7000 --image /stereo/left/image_raw/compressed --camera left --arm PSM1
@@ -21,7 +21,7 @@ from std_msgs.msg import String  # pyright: ignore[reportMissingImports]
 
 
 class Bridge(Node):
-    """Sends published images and joints to `carts live`, and publishes its results."""
+    """ROS 2 node that sends published images and joints to `carts live`, and publishes its results."""
 
     def __init__(self, arguments: argparse.Namespace) -> None:
         super().__init__("carts_live")
@@ -73,7 +73,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--port", type=int, required=True)
     parser.add_argument("--image", required=True, help="topic of compressed images")
-    parser.add_argument("--camera", required=True, help="its name in the sequence file")
+    parser.add_argument("--camera", required=True, help="name of the camera in the sequence file")
     parser.add_argument("--arm", action="append", required=True, help="name of an arm; may be given several times")
     arguments, others = parser.parse_known_args()
     rclpy.init(args=others)

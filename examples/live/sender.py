@@ -40,7 +40,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("port", type=int)
     parser.add_argument("sequence", type=Path, nargs="?", default=sample_sequence())
-    parser.add_argument("--rate", type=float, default=4.0, help="frames a second")
+    parser.add_argument("--rate", type=float, default=4.0, help="frames per second")
     arguments = parser.parse_args()
     sequence = Sequence.open(arguments.sequence)
     with socket.create_connection(("127.0.0.1", arguments.port)) as connection:
