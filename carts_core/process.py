@@ -5,7 +5,7 @@ import os
 from collections.abc import Callable
 from dataclasses import dataclass
 
-MOST_THREADS = 4
+MAX_THREADS = 4
 """Maximum useful number of threads for images of this size."""
 
 _MMAP_THRESHOLD = 1 << 30
@@ -52,7 +52,7 @@ def _leave_a_core_free() -> None:
     if "OMP_NUM_THREADS" not in os.environ:
         import torch  # noqa: PLC0415  child processes without torch import this module, too
 
-        torch.set_num_threads(max(1, min((os.cpu_count() or 2) - 1, MOST_THREADS)))
+        torch.set_num_threads(max(1, min((os.cpu_count() or 2) - 1, MAX_THREADS)))
         _TUNED.core_left_free = True
 
 
@@ -63,7 +63,7 @@ def inference_threads() -> int:
     0.73 and 0.53 of the time of one.
     """
     if _TUNED.core_left_free:
-        return min(os.cpu_count() or 1, MOST_THREADS)
+        return min(os.cpu_count() or 1, MAX_THREADS)
     import torch  # noqa: PLC0415
 
     return torch.get_num_threads()

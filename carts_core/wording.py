@@ -4,7 +4,7 @@ from collections.abc import Iterable
 from difflib import get_close_matches
 from itertools import islice
 
-_LONGEST_COMPARED, _MOST_COMPARED = 100, 200
+_MAX_COMPARED_LENGTH, _MAX_COMPARED = 100, 200
 """Maximum length and number of names searched for misspellings, since the cost grows with the product of lengths."""
 
 
@@ -41,6 +41,6 @@ def closest(name: str, known: Iterable[str]) -> str:
     known, number = list(known), name.lstrip("0")
     same = [one for one in known if one.casefold() == name.casefold()]
     same = same or [one for one in known if name.isdecimal() and one.lstrip("0") == number]
-    if len(name) <= _LONGEST_COMPARED and not name.isdecimal():
-        same = same or get_close_matches(name, known[:_MOST_COMPARED], n=1, cutoff=0.5)
+    if len(name) <= _MAX_COMPARED_LENGTH and not name.isdecimal():
+        same = same or get_close_matches(name, known[:_MAX_COMPARED], n=1, cutoff=0.5)
     return f" Did you mean {same[0]!r}?" if same else ""

@@ -238,9 +238,9 @@ class ViewerApp:
         return self._storage.notice
 
     @property
-    def incident(self) -> str | None:
+    def storage_failure(self) -> str | None:
         """Message if corrections are not in the project file, naming the file that contains them; None otherwise."""
-        return self.project.incident
+        return self.project.storage_failure
 
     def close(self) -> None:
         """Save unfinished edits, and stop the worker and the server; closing again does nothing.

@@ -18,7 +18,7 @@ from carts_viewer.actions.painting import PaintingHandler
 from carts_viewer.actions.posing import DraggingHandler, PosingHandler
 from carts_viewer.actions.reviewing import AnnotatingHandler, FilterHandler
 from carts_viewer.actions.sequence import KeyframeHandler, PropagatingHandler
-from carts_viewer.editing import LONGEST_NAME, Person
+from carts_viewer.editing import MAX_NAME_LENGTH, Person
 from carts_viewer.jobs.optimizers import OptimizerFactory
 from carts_viewer.picture.overlay import OverlayRenderer
 from carts_viewer.session import Session
@@ -136,7 +136,7 @@ class Controller(Handler):
         self._background = background
         self._editor = session.editor
         self._watch_at = 0.0
-        self._incident: str | None = None
+        self._storage_failure: str | None = None
         self._browsing = BrowsingHandler(context)
         self._live = LiveHandler(context, optimizers, self._browsing.show)
         self._annotating = AnnotatingHandler(context, self._browsing.show)
@@ -204,7 +204,7 @@ class Controller(Handler):
         self._context.change(**{name: getattr(self._background.state, name) for name in _COMMON})
 
     def _on_SetName(self, intent: intents.SetName) -> None:
-        chosen = " ".join(intent.name.split())[:LONGEST_NAME]
+        chosen = " ".join(intent.name.split())[:MAX_NAME_LENGTH]
         self._editor.person.chosen = chosen
         self._context.change(name=chosen)
 
@@ -249,9 +249,9 @@ class Controller(Handler):
             self._watch_at = time.monotonic() + WATCH_INTERVAL
             with suppress(CartsError):
                 project.check()
-        if project.incident != self._incident:
-            self._incident = project.incident
-            self._context.change(error=self._incident)
+        if project.storage_failure != self._storage_failure:
+            self._storage_failure = project.storage_failure
+            self._context.change(error=self._storage_failure)
 
     def fail(self, error: Exception, *, stop: bool) -> None:
         """Show an error to the user; with `stop`, also stop the work that caused it."""

@@ -98,7 +98,7 @@ def _close(served: "ViewerApp | Site") -> None:
     """Save and close. Errors as `serve`."""
     try:
         served.close()
-        problem = served.incident
+        problem = served.storage_failure
     except CartsError as error:
         problem = f"error: {error}"
     if problem is not None:

@@ -272,7 +272,7 @@ class Storage:
     def notice(self) -> str | None:
         """Message for the user if edits are not kept, are kept in another file, or may be in a rescued copy; else
         None."""
-        return self.project.incident or self.reason or self.hint
+        return self.project.storage_failure or self.reason or self.hint
 
     def close(self) -> None:
         """Close the project, so that other programs can write to it.

@@ -17,7 +17,7 @@ from carts_core.model.scene import Scene
 from carts_core.networks import FeatureExtractor
 from carts_core.optimization import CALIBRATION, CalibrationOptimizer
 from carts_core.process import tune_process
-from carts_core.recording import Frame, Sequence, spread
+from carts_core.recording import Frame, Sequence, evenly_spaced
 from carts_core.rendering import Renderer
 from carts_core.resources import sample_sequence
 
@@ -40,7 +40,7 @@ def tip(scene: Scene, frame: Frame) -> np.ndarray:
 def main(frames: int = 4, picture: Path = Path("calibration.png")) -> None:
     """Calibrate the shipped sequence, with the true joint positions in place of the measured ones."""
     sequence = Sequence.open(sample_sequence())
-    chosen = [sequence.frame(index) for index in spread(len(sequence), frames)]
+    chosen = [sequence.frame(index) for index in evenly_spaced(len(sequence), frames)]
     chosen = [replace(frame, measured=frame.truth or frame.measured) for frame in chosen]
     wrong = moved(sequence.scene, "psm1", (0.006, -0.006, 0.006))
 

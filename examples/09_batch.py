@@ -16,7 +16,7 @@ from carts_core.evaluation import FrameScore, evaluate
 from carts_core.networks import FeatureExtractor
 from carts_core.optimization import FreeParameters, SurfaceSolver
 from carts_core.process import tune_process
-from carts_core.recording import Sequence, spread
+from carts_core.recording import Sequence, evenly_spaced
 from carts_core.resources import sample_sequence
 
 
@@ -36,7 +36,7 @@ def main(
             found = evaluate(
                 sequence,
                 extractor,
-                frames=spread(len(sequence), frames),
+                frames=evenly_spaced(len(sequence), frames),
                 cameras=[camera.name for camera in sequence.scene.cameras],
                 domains=[domain for domain in sequence.domains if domain in domains] or [sequence.domains[0]],
                 settings=SurfaceSolver(),

@@ -27,7 +27,7 @@ from carts_viewer.tabs import Tab, View
 from tools.memory import resident_megabytes
 from tools.raw_tab import RawTab
 
-LARGEST_GROWTH = 0.05
+MAX_GROWTH = 0.05
 """Of memory after warm-up that is still flat, as a share."""
 _TABS = 3
 _STEP = 0.05
@@ -61,7 +61,7 @@ class Soak:
         return float(np.median(megabytes[-some:]) / np.median(megabytes[begin : begin + some])) - 1.0
 
     @property
-    def spread(self) -> float:
+    def standard_deviations(self) -> float:
         """Greatest difference of two memories after warm-up, as a share of the least."""
         settled = [megabytes for _, megabytes in self.megabytes[int(_WARM_UP * len(self.megabytes)) :]]
         return max(settled) / min(settled) - 1.0
@@ -204,7 +204,7 @@ def main() -> None:
     print(f"memory: {100 * seen.growth:+.1f} % after warm-up, spread {100 * seen.spread:.1f} %")
     print(f"stale overlays: {len(seen.stale)}", *seen.stale, sep="\n  ")
     print(f"exceptions: {len(seen.exceptions)}", *seen.exceptions, sep="\n  ")
-    if seen.stale or seen.exceptions or seen.growth > LARGEST_GROWTH:
+    if seen.stale or seen.exceptions or seen.growth > MAX_GROWTH:
         raise SystemExit(1)
 
 

@@ -22,7 +22,7 @@ from carts_core.lab.benchmark.scope import FULL, METHODS
 from carts_core.lab.benchmark.sources import Source
 from carts_core.networks.extractor import FeatureExtractor
 from carts_core.recording import Sequence
-from carts_core.recording.background import spread
+from carts_core.recording.background import evenly_spaced
 from carts_core.settings import DomainConfig
 
 SEVERITIES: dict[str, tuple[DomainConfig, ...]] = {
@@ -45,7 +45,7 @@ def run(results: Path, path: Path, baselines: list[Path]) -> None:
     sequence, extractor = Sequence.open(path), FeatureExtractor.load()
     camera = sequence.scene.cameras[0]
     masked = [index for index in range(len(sequence)) if camera.name in (sequence.frame(index).masks or {})]
-    frames = [masked[place] for place in spread(len(masked), _FRAMES)]
+    frames = [masked[place] for place in evenly_spaced(len(masked), _FRAMES)]
     done = {tuple(entry["of"]) for entry in _read(results)}
     nothing = np.zeros((camera.height, camera.width, 3), np.uint8)
     output = output_path(results.parent, results.name)

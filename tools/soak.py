@@ -27,13 +27,13 @@ from carts_core.resources import sample_sequence
 from tools.memory import resident_megabytes
 from tools.raw_tab import RawTab
 
-LARGEST_GROWTH, LARGEST_REST = 0.15, 0.2
+MAX_GROWTH, MAX_REST = 0.15, 0.2
 """Growth after the second minute, and what stays after the last tab left beyond the start, that pass [1]."""
 _SETTLED = 15.0
 """From the tabs' coming to the start of the measurement [s]."""
-_WATCHED, _IDLE, _LONGEST_WORK = 10.0, 0.05, 120
+_WATCHED, _IDLE, _MAX_WORK_TIME = 10.0, 0.05, 120
 """Interval [s] and share of a core [1] below which a server is idle, and the largest number of intervals."""
-_MOST_JOBS = 60
+_MAX_JOBS = 60
 """Seconds during which jobs are cancelled, one a second."""
 _PACE = 0.2
 """Longest time between two actions [s]."""
@@ -232,7 +232,7 @@ def soak(
 def _cancel_jobs(url: str) -> None:
     """Cancel the jobs, of which the chosen one is the next to end; they would go on for an hour without a tab."""
     with suppress(ConnectionClosed, TimeoutError), RawTab(url, draws=True, keep=1, key="cancel") as tab:
-        for _ in range(_MOST_JOBS):
+        for _ in range(_MAX_JOBS):
             for element, widget in list(tab.widgets.items()):
                 if widget.get("label") == "Cancel" and widget.get("visible", True):
                     tab.press(element)
@@ -242,7 +242,7 @@ def _cancel_jobs(url: str) -> None:
 def _wait_until_idle(process: int) -> None:
     """Wait until a process hardly computes: clicks wait for the server, and jobs go on without a tab."""
     before = _ticks(process)
-    for _ in range(_LONGEST_WORK):
+    for _ in range(_MAX_WORK_TIME):
         time.sleep(_WATCHED)
         now = _ticks(process)
         if now - before < _IDLE * _WATCHED * os.sysconf("SC_CLK_TCK"):
@@ -271,7 +271,7 @@ def main() -> None:
     print(f"start {seen.start:.0f} MB; growth after the second minute {seen.growth:+.0%}")
     print(f"the server worked for {seen.worked:.0f} s after the last tab had left")
     print(f"{given.rest:g} min later: {seen.rest:.0f} MB, {seen.kept:+.0%} of the start")
-    if seen.growth > LARGEST_GROWTH or seen.kept > LARGEST_REST:
+    if seen.growth > MAX_GROWTH or seen.kept > MAX_REST:
         raise SystemExit(1)
 
 

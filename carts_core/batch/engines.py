@@ -33,7 +33,7 @@ Work = Callable[[Job], Outcome]
 """Function that runs a job; failures are described in the outcome."""
 
 
-def lost(job: Job) -> Outcome:
+def worker_died(job: Job) -> Outcome:
     """Outcome of a job whose worker died in every attempt."""
     return Outcome(
         job.name, "failed", f"its worker process died {ATTEMPTS} times, perhaps for lack of memory; see its log"
@@ -83,7 +83,7 @@ class Pool:
                         if attempts[job.name] < ATTEMPTS:
                             waiting.append(job)
                         else:
-                            yield lost(job)
+                            yield worker_died(job)
         finally:
             for worker in workers:
                 worker.connection.close()
@@ -195,7 +195,7 @@ class Cluster:
                 job = futures[future]
                 error = future.exception()
                 if isinstance(error, KilledWorker):
-                    yield lost(job)
+                    yield worker_died(job)
                 elif error is not None:
                     yield Outcome(job.name, "failed", f"{type(error).__name__}: {error}")
                 else:

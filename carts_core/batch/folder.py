@@ -257,7 +257,7 @@ def _pictured(folder: OutputPath, sequence: Sequence, part: Path, frames: list[F
 
 
 BATCH_FILE = "batch.json"
-_LONGEST_ERROR = 1000
+_MAX_ERROR_LENGTH = 1000
 """Maximum length of a stored error [characters]."""
 ORDER = ("failed", "lost", "stopped", "running", "waiting", "done")
 """Statuses, most urgent first."""
@@ -279,7 +279,7 @@ class KnownJob:
     def error(self) -> str:
         """Last line of the job's error, or reason why its results cannot be read; empty without either."""
         lines = self.state.error.strip().splitlines()
-        return lines[-1][:_LONGEST_ERROR] if lines else self.damage
+        return lines[-1][:_MAX_ERROR_LENGTH] if lines else self.damage
 
 
 def known_jobs(batch: OutputPath, jobs: Rows[Job]) -> list[KnownJob]:
@@ -294,7 +294,9 @@ def _known(folder: OutputPath, job: Job) -> KnownJob:
     try:
         return KnownJob(job, status, state, read_findings(folder))
     except (OSError, ValueError) as error:
-        damage = f"{FINDINGS_FILE} cannot be read: {str(error)[:_LONGEST_ERROR]}. Run the batch again to recreate it."
+        damage = (
+            f"{FINDINGS_FILE} cannot be read: {str(error)[:_MAX_ERROR_LENGTH]}. Run the batch again to recreate it."
+        )
         return KnownJob(job, status, state, None, damage)
 
 

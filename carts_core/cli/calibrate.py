@@ -184,7 +184,7 @@ class Calibrate:
 
     def run(self) -> None:
         """Calibrate; no files are left after Ctrl-C or an error."""
-        from ..evaluation import frame_residuals, mean_dice, remark, write_calibration
+        from ..evaluation import calibration_warning, frame_residuals, mean_dice, write_calibration
         from ..evaluation.calibration import beyond_prior
         from ..files import MARKER, published, write_text
         from ..optimization import Backgrounds, CalibrationOptimizer
@@ -241,7 +241,11 @@ class Calibrate:
                 console.print(f"{camera}: mean Dice {means[0]:.4f} before, {means[1]:.4f} after")
         print_hints(console, self.network.caution)
         console.print(f"wrote {output}: sequence.toml, calibration.json and the report README.md")
-        print_hints(console, calibration_hint(result.assessment, result.stop_reason), remark(sequence.scene, result))
+        print_hints(
+            console,
+            calibration_hint(result.assessment, result.stop_reason),
+            calibration_warning(sequence.scene, result),
+        )
 
     def _summary(self, weights: str, frames: list[str], cameras: list[str]) -> dict:
         """Description of the run, for the marker file of the folder."""
@@ -270,9 +274,9 @@ def frame_indices(frames: str | None, positions: str | None, sequence: "Sequence
         raise SettingsError(f"--frames {frames!r} selects no frame. Give a number of at least 1, such as `spread:20`.")
     if positions is not None:
         raise SettingsError("--frames and --positions are mutually exclusive. Give only one of them.")
-    from ..recording import spread
+    from ..recording import evenly_spaced
 
-    return spread(len(sequence), int(count))
+    return evenly_spaced(len(sequence), int(count))
 
 
 def _optimized(optimizer: "CalibrationOptimizer", console: Console) -> "CalibrationResult":

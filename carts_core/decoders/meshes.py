@@ -12,9 +12,9 @@ from trimesh.resolvers import FilePathResolver
 from ..errors import RobotError
 from ..files.reading import IMAGE, MESH, is_regular, read_bytes, size_problem
 
-MOST_FACES = 1_000_000
+MAX_FACES = 1_000_000
 """Maximum number of triangles in a mesh file, before simplification."""
-MOST_PARTS = 1_000
+MAX_PARTS = 1_000
 """Maximum number of mesh instances in a file."""
 _IMAGES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 
@@ -55,16 +55,16 @@ def mesh_parts(
     """
     content = read_bytes(path, MESH)
     # A binary STL has a header of 84 bytes and 50 bytes per triangle.
-    if kind == "stl" and len(content) > 84 + 50 * MOST_FACES and not content.startswith(b"solid"):
-        raise RobotError(f"mesh {path} has more than {MOST_FACES:,} triangles. Export a simpler mesh.")
+    if kind == "stl" and len(content) > 84 + 50 * MAX_FACES and not content.startswith(b"solid"):
+        raise RobotError(f"mesh {path} has more than {MAX_FACES:,} triangles. Export a simpler mesh.")
     loaded = trimesh.load_scene(io.BytesIO(content), file_type=kind, resolver=_BesideTheMesh(str(path)))
-    if sum(len(getattr(part, "faces", ())) for part in loaded.geometry.values()) > MOST_FACES:
-        raise RobotError(f"mesh {path} has more than {MOST_FACES:,} triangles. Export a simpler mesh.")
-    if len(loaded.graph.nodes_geometry) > MOST_PARTS:
-        raise RobotError(f"mesh {path} has more than {MOST_PARTS:,} parts. Export it as one mesh.")
+    if sum(len(getattr(part, "faces", ())) for part in loaded.geometry.values()) > MAX_FACES:
+        raise RobotError(f"mesh {path} has more than {MAX_FACES:,} triangles. Export a simpler mesh.")
+    if len(loaded.graph.nodes_geometry) > MAX_PARTS:
+        raise RobotError(f"mesh {path} has more than {MAX_PARTS:,} parts. Export it as one mesh.")
     meshes = [part for part in loaded.dump() if isinstance(part, trimesh.Trimesh) and len(part.faces)]
-    if sum(len(mesh.faces) for mesh in meshes) > MOST_FACES:
-        raise RobotError(f"mesh {path} has more than {MOST_FACES:,} triangles. Export a simpler mesh.")
+    if sum(len(mesh.faces) for mesh in meshes) > MAX_FACES:
+        raise RobotError(f"mesh {path} has more than {MAX_FACES:,} triangles. Export a simpler mesh.")
     return [(np.asarray(mesh.vertices), np.asarray(mesh.faces), mesh_color(mesh)) for mesh in meshes]
 
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from ..files.reading import CALIBRATION, TABLE, read_bytes
 
-MOST_CELLS, MOST_ROWS, MOST_COLUMNS = 10_000_000, 1_500_000, 10_000
+MAX_CELLS, MAX_ROWS, MAX_COLUMNS = 10_000_000, 1_500_000, 10_000
 """Maximum number of values, rows and columns of a table."""
 LIBRARIES = {"read_parquet": ("pyarrow.parquet",), "read_matlab": ("scipy.io",)}
 """Modules per function that are imported before the memory limit applies."""
@@ -113,7 +113,7 @@ def check_size(rows: int, columns: int = 1) -> None:
     Raises:
         ValueError: there are too many rows, columns or values.
     """
-    limits = (rows * columns, MOST_CELLS, "values"), (rows, MOST_ROWS, "rows"), (columns, MOST_COLUMNS, "columns")
+    limits = (rows * columns, MAX_CELLS, "values"), (rows, MAX_ROWS, "rows"), (columns, MAX_COLUMNS, "columns")
     for count, most, what in limits:
         if count > most:
             raise ValueError(f"it has {count:,} {what}; the limit is {most:,}")

@@ -2,9 +2,9 @@
 
 from .calibration import FrameResidual as FrameResidual
 from .calibration import calibration_json as calibration_json
+from .calibration import calibration_warning as calibration_warning
 from .calibration import frame_residuals as frame_residuals
 from .calibration import mean_dice as mean_dice
-from .calibration import remark as remark
 from .calibration import write_calibration as write_calibration
 from .evaluate import FrameScore as FrameScore
 from .evaluate import Setup as Setup

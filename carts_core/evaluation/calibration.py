@@ -124,7 +124,7 @@ def beyond_prior(before: Scene, result: CalibrationResult, known: Mapping[str, F
     return f"{'; '.join(said)}." if said else None
 
 
-def remark(before: Scene, result: CalibrationResult) -> str | None:
+def calibration_warning(before: Scene, result: CalibrationResult) -> str | None:
     """Warning about the use of a calibration; None if only intrinsics changed."""
     if not any(unknown.change for unknown in result.unknowns):
         return "The initial calibration was kept, since no other calibration fits these frames better."
@@ -177,7 +177,7 @@ def write_calibration(
         unchanged=not any(unknown.change for unknown in result.unknowns),
         dice={camera: mean_dice(residuals, camera) for camera in _cameras(residuals)},
         moved=moved_frames(sequence.scene, result.scene),
-        remark=remark(sequence.scene, result),
+        remark=calibration_warning(sequence.scene, result),
         residuals=residuals,
     )
     write_text(folder / "README.md", page)

@@ -235,15 +235,15 @@ def write_datumaro(dataset: Dataset, folder: OutputPath, progress: ExportProgres
 
 _LISTS = ("Main", "Segmentation")
 """Folders in `ImageSets` with image lists; each list has all images, since there is no split."""
-_MOST_CATEGORIES = 254
+_MAX_CATEGORIES = 254
 """Maximum number of categories; 0 is the background, and 255 is VOC's void."""
 
 
 def write_voc(dataset: Dataset, folder: OutputPath, progress: ExportProgress) -> None:
     """Write the dataset in Pascal VOC format, with lossless label images; images keep their file format."""
-    if len(dataset.categories) > _MOST_CATEGORIES:
+    if len(dataset.categories) > _MAX_CATEGORIES:
         raise CartsError(
-            f"Pascal VOC supports at most {_MOST_CATEGORIES} categories; given: {len(dataset.categories)}. "
+            f"Pascal VOC supports at most {_MAX_CATEGORIES} categories; given: {len(dataset.categories)}. "
             "Export COCO instead."
         )
     for view in dataset.views(progress):

@@ -46,8 +46,8 @@ parts."""
 _PATIENCE = 20
 """Wall-clock timeout as a multiple of the processor time limit, for busy machines."""
 _IDLE = 10.0
-_MOST_IDLE = 4
-_LARGEST_FILE = GIB
+_MAX_IDLE_WORKERS = 4
+_MAX_FILE_BYTES = GIB
 """Maximum temporary file of a library [bytes], in addition to a hundred times the size of the decoded file."""
 _ARRAY, _PATH = 1, 2
 _ENVIRONMENT = {
@@ -66,7 +66,7 @@ class Limits:
     """Processor time [s]."""
     memory: int = _MEMORY
     """Memory [bytes]."""
-    written: int = _LARGEST_FILE
+    written: int = _MAX_FILE_BYTES
     """Maximum temporary file [bytes]."""
 
     @staticmethod
@@ -77,7 +77,7 @@ class Limits:
         return Limits(
             _SECONDS + _SECONDS_PER_MIB * size / MIB,
             _MEMORY + _MEMORY_PER_BYTE * min(size, _COUNTED),
-            _LARGEST_FILE + 100 * size,
+            _MAX_FILE_BYTES + 100 * size,
         )
 
 
@@ -120,7 +120,7 @@ def acquire() -> "Decoder":
 def release(decoder: "Decoder") -> None:
     """Return an acquired decoder to the pool, or close it if the pool is full."""
     with _LOCK:
-        if len(_IDLE_DECODERS) < _MOST_IDLE:
+        if len(_IDLE_DECODERS) < _MAX_IDLE_WORKERS:
             _IDLE_DECODERS.append(decoder)
             return
     decoder.close()

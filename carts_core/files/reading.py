@@ -31,14 +31,14 @@ PNG = b"\x89PNG\r\n\x1a\n"
 JPEG = b"\xff\xd8"
 TIFF = {b"II*\0": "little", b"MM\0*": "big"}
 """Magic numbers and byte order of TIFF."""
-LARGEST_IMAGE = 40_000_000
+MAX_IMAGE_PIXELS = 40_000_000
 """Maximum number of pixels of an image or video frame; 8K has 33 million."""
 
 _OTHERS = ("TIFF", "BMP", "WEBP", "PPM")
 _START_OF_SCAN = 0xDA
 _NO_FRAME_HEADER = (0xC4, 0xC8, 0xCC)
 """Markers between 0xC0 and 0xCF that are not frame headers."""
-_MOST_SCANS = 200
+_MAX_SCANS = 200
 """Maximum number of scans of a progressive JPEG, since every scan is decoded."""
 _TIFF_TILE = (322, 323)
 _ORIENTATION = 0x0112
@@ -46,8 +46,8 @@ _EXIF = b"Exif\0\0"
 _ALPHA = (4, 6)
 """PNG colour types with transparency; type 3 is a palette."""
 _PALETTE = 3
-_MOST_TAGS = 1000
-_FAR_TOO_LARGE = (0, LARGEST_IMAGE)
+_MAX_TAGS = 1000
+_FAR_TOO_LARGE = (0, MAX_IMAGE_PIXELS)
 
 
 @dataclass(frozen=True)
@@ -114,7 +114,7 @@ def _tiff_orientation(content: bytes) -> int:
         return int.from_bytes(content[place : place + length], order)  # type: ignore[arg-type]
 
     first = number(4, 4)
-    for row in range(min(number(first, 2), _MOST_TAGS)):
+    for row in range(min(number(first, 2), _MAX_TAGS)):
         entry = first + 2 + 12 * row
         if number(entry, 2) == _ORIENTATION:
             return value if 1 <= (value := number(entry + 8, 2)) <= 8 else 1
@@ -127,9 +127,11 @@ def size_problem(content: bytes) -> str | None:
     if size is None:
         return "cannot be decoded; it must be a JPEG, PNG, TIFF, BMP, WebP or PPM image"
     if size == _FAR_TOO_LARGE:
-        return f"is too large; the limit is {LARGEST_IMAGE // 10**6} million pixels"
-    if content.startswith(PNG) and content[24:25] == b"\x10" and 2 * size[0] * size[1] > LARGEST_IMAGE:
-        return f"is {size[0]} x {size[1]} pixels of 16 bits; the limit is {LARGEST_IMAGE // 2 // 10**6} million pixels"
+        return f"is too large; the limit is {MAX_IMAGE_PIXELS // 10**6} million pixels"
+    if content.startswith(PNG) and content[24:25] == b"\x10" and 2 * size[0] * size[1] > MAX_IMAGE_PIXELS:
+        return (
+            f"is {size[0]} x {size[1]} pixels of 16 bits; the limit is {MAX_IMAGE_PIXELS // 2 // 10**6} million pixels"
+        )
     return pixels_problem(*size)
 
 
@@ -137,8 +139,8 @@ def pixels_problem(width: int, height: int) -> str | None:
     """Reason to refuse an image of this size [px]; None if it can be decoded."""
     if width < 1 or height < 1:
         return f"is {width} x {height} pixels"
-    if width * height > LARGEST_IMAGE:
-        return f"is {width} x {height} pixels; the limit is {LARGEST_IMAGE // 10**6} million pixels"
+    if width * height > MAX_IMAGE_PIXELS:
+        return f"is {width} x {height} pixels; the limit is {MAX_IMAGE_PIXELS // 10**6} million pixels"
     return None
 
 
@@ -148,7 +150,7 @@ def _size(content: bytes) -> tuple[int, int] | None:
         header = content[16:24] if content[12:16] == b"IHDR" else b""
         return (int.from_bytes(header[:4], "big"), int.from_bytes(header[4:], "big")) if len(header) == 8 else None
     if content.startswith(JPEG):
-        return None if content.count(b"\xff\xda") > _MOST_SCANS else _jpeg_size(content)
+        return None if content.count(b"\xff\xda") > _MAX_SCANS else _jpeg_size(content)
     return _other_size(content)
 
 
@@ -190,18 +192,18 @@ T = TypeVar("T")
 
 MIB = 2**20
 GIB = 2**30
-LARGEST_DEPTH = 32
+MAX_DEPTH = 32
 """Maximum nesting depth of TOML, JSON and YAML."""
-MOST_YAML_EVENTS = 500_000
+MAX_YAML_EVENTS = 500_000
 """Maximum number of YAML events: values, and starts and ends of lists and mappings."""
-MOST_JSON_PARTS = 3_000_000
+MAX_JSON_PARTS = 3_000_000
 """Maximum number of lists and objects in JSON."""
-MOST_INI_LINES = 10_000
-LARGEST_NAME = 255
+MAX_INI_LINES = 10_000
+MAX_NAME_LENGTH = 255
 """Maximum length of the name of a file or folder [bytes]."""
-LARGEST_PATH = 4096
+MAX_PATH_LENGTH = 4096
 """Maximum length of a path [bytes]."""
-LARGEST_WHOLE_NUMBER = 2**63 - 1
+MAX_INTEGER = 2**63 - 1
 
 
 @dataclass(frozen=True)
@@ -224,7 +226,7 @@ MESH = Kind("mesh", 128 * MIB)
 WEIGHTS = Kind("weights file", 512 * MIB)
 _POINTER = b"version https://git-lfs"
 """First bytes of a Git LFS pointer, the placeholder for a file that was not fetched."""
-_LARGEST_POINTER = 1024
+_MAX_POINTER_BYTES = 1024
 """Maximum size of a pointer [bytes]."""
 _POINTER_TEXT = "it is a Git LFS pointer without its content; run `git lfs pull` in its repository"
 BAG = Kind("ROS bag", 1024 * GIB)
@@ -270,7 +272,7 @@ def open_regular(path: Path, kind: Kind) -> BufferedReader:
             raise RefusedFileError("it is a pipe, socket or device, not a regular file")
         if status.st_size > kind.limit:
             raise _too_large(kind, f"has {status.st_size / MIB:.0f} MiB")
-        if status.st_size <= _LARGEST_POINTER and os.pread(descriptor, len(_POINTER), 0) == _POINTER:
+        if status.st_size <= _MAX_POINTER_BYTES and os.pread(descriptor, len(_POINTER), 0) == _POINTER:
             raise LfsPointerError(_POINTER_TEXT)
         return os.fdopen(descriptor, "rb")
     except BaseException:
@@ -311,11 +313,11 @@ def parse_toml(text: str) -> dict[str, Any]:
     # Time and memory of the parser grow quadratically with the number of parts of a key, so long keys are refused
     # first.
     if _LONG_KEY.search(text):
-        raise ValueError(f"a dotted key has more than {LARGEST_DEPTH} parts")
+        raise ValueError(f"a dotted key has more than {MAX_DEPTH} parts")
     try:
         values = tomllib.loads(text)
     except RecursionError as error:
-        raise ValueError(f"it is nested more than {LARGEST_DEPTH} deep") from error
+        raise ValueError(f"it is nested more than {MAX_DEPTH} deep") from error
     _check_values(values)
     return values
 
@@ -331,8 +333,8 @@ def parse_json(text: str | bytes, *, finite: bool = True) -> Any:
         ValueError: the text is not JSON, or exceeds the limits of this module.
     """
     parts = text.count("[") + text.count("{") if isinstance(text, str) else text.count(b"[") + text.count(b"{")
-    if parts > MOST_JSON_PARTS:
-        raise ValueError(f"it has more than {MOST_JSON_PARTS:,} arrays and objects")
+    if parts > MAX_JSON_PARTS:
+        raise ValueError(f"it has more than {MAX_JSON_PARTS:,} arrays and objects")
     try:
         with gc_paused():
             values = json.loads(text)
@@ -340,7 +342,7 @@ def parse_json(text: str | bytes, *, finite: bool = True) -> Any:
             if finite and not all_finite(values):
                 raise ValueError("a number in it is not finite")
     except RecursionError as error:
-        raise ValueError(f"it is nested more than {LARGEST_DEPTH} deep") from error
+        raise ValueError(f"it is nested more than {MAX_DEPTH} deep") from error
     return values
 
 
@@ -363,10 +365,10 @@ def parse_yaml(text: str) -> Any:
                 raise ValueError("it has %TAG directives, which are not supported")
             if isinstance(event, yaml.AliasEvent):
                 raise ValueError(f"it has the alias *{event.anchor}; aliases are not supported, so write the value out")
-            if depth > LARGEST_DEPTH:
-                raise ValueError(f"it is nested more than {LARGEST_DEPTH} deep")
-            if count > MOST_YAML_EVENTS:
-                raise ValueError(f"it has more than {MOST_YAML_EVENTS:,} values")
+            if depth > MAX_DEPTH:
+                raise ValueError(f"it is nested more than {MAX_DEPTH} deep")
+            if count > MAX_YAML_EVENTS:
+                raise ValueError(f"it has more than {MAX_YAML_EVENTS:,} values")
         values = yaml.load(text, Loader=_plain_yaml(parser))
     except ValueError:
         raise
@@ -410,9 +412,9 @@ def parse_xml(text: str) -> ElementTree.Element:
 
 
 def parse_ini(text: str) -> configparser.ConfigParser:
-    """Parse INI without interpolation; `ValueError` for invalid INI and more than `MOST_INI_LINES` lines."""
-    if text.count("\n") > MOST_INI_LINES:
-        raise ValueError(f"it has more than {MOST_INI_LINES:,} lines")
+    """Parse INI without interpolation; `ValueError` for invalid INI and more than `MAX_INI_LINES` lines."""
+    if text.count("\n") > MAX_INI_LINES:
+        raise ValueError(f"it has more than {MAX_INI_LINES:,} lines")
     parser = configparser.ConfigParser(inline_comment_prefixes=(";", "#"), interpolation=None)
     try:
         # The time of the parser grows quadratically with the length of a run of blanks.
@@ -450,22 +452,22 @@ def all_finite(root: Any) -> bool:
 def check_path(path: str | Path) -> None:
     """Check the lengths of a path and of its components; `ValueError` for excessive lengths."""
     text = str(path)
-    if len(text) <= LARGEST_NAME and text.isascii():
+    if len(text) <= MAX_NAME_LENGTH and text.isascii():
         return
     data = os.fsencode(text)
-    if len(data) > LARGEST_PATH or any(len(part) > LARGEST_NAME for part in data.split(b"/")):
-        raise ValueError(f"a name is longer than {LARGEST_NAME} bytes, or the path longer than {LARGEST_PATH}")
+    if len(data) > MAX_PATH_LENGTH or any(len(part) > MAX_NAME_LENGTH for part in data.split(b"/")):
+        raise ValueError(f"a name is longer than {MAX_NAME_LENGTH} bytes, or the path longer than {MAX_PATH_LENGTH}")
 
 
 _SURROGATE = re.compile("[\ud800-\udfff]")
 _KEY_PART = r"""(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')"""
-_LONG_KEY = re.compile(rf"(?<![\w-]){_KEY_PART}(?:[ \t]*+\.[ \t]*+{_KEY_PART}){{{LARGEST_DEPTH}}}")
+_LONG_KEY = re.compile(rf"(?<![\w-]){_KEY_PART}(?:[ \t]*+\.[ \t]*+{_KEY_PART}){{{MAX_DEPTH}}}")
 
 
 def _check_values(root: Any) -> None:
     """Check nesting depth, integers and strings, level by level without recursion."""
     level = [root]
-    for _ in range(LARGEST_DEPTH + 1):
+    for _ in range(MAX_DEPTH + 1):
         deeper: list[Any] = []
         for value in level:
             if isinstance(value, dict):
@@ -473,14 +475,14 @@ def _check_values(root: Any) -> None:
                 deeper += value.values()
             elif isinstance(value, list):
                 deeper += value
-            elif isinstance(value, int) and abs(value) > LARGEST_WHOLE_NUMBER:
+            elif isinstance(value, int) and abs(value) > MAX_INTEGER:
                 raise ValueError("an integer has more than 64 bits")
             elif isinstance(value, str) and not value.isascii() and _SURROGATE.search(value):
                 raise ValueError("a string has an unpaired surrogate")
         if not deeper:
             return
         level = deeper
-    raise ValueError(f"it is nested more than {LARGEST_DEPTH} deep")
+    raise ValueError(f"it is nested more than {MAX_DEPTH} deep")
 
 
 def _too_large(kind: Kind, what: str) -> RefusedFileError:

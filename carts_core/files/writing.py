@@ -274,7 +274,7 @@ def try_lock(descriptor: int) -> bool:
 
 _MARK = "carts-unfinished.json"
 _NAME = re.compile(r"\.carts-[0-9a-f]{32}")
-_MOST_MARK_BYTES = 10_000
+_MAX_MARK_BYTES = 10_000
 
 
 @dataclass(frozen=True)
@@ -387,7 +387,7 @@ def _read_mark(folder: int) -> _Mark | None:
     try:
         descriptor = os.open(_MARK, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC, dir_fd=folder)
         with os.fdopen(descriptor, "rb") as stream:
-            mark = _Mark(**json.loads(stream.read(_MOST_MARK_BYTES)))
+            mark = _Mark(**json.loads(stream.read(_MAX_MARK_BYTES)))
     except (OSError, ValueError, TypeError, RecursionError):
         return None
     return mark if mark.inode == own.st_ino and own.st_uid == os.geteuid() else None

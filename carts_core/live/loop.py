@@ -24,7 +24,7 @@ _FRESH = 0.01
 class Tracked:
     """Frame with its estimate and age."""
 
-    moment: StreamFrame
+    stream_frame: StreamFrame
     estimate: LiveEstimate
     age: float
     """Time since the arrival of the frame [s]."""
@@ -93,12 +93,12 @@ def follow(
         while True:
             # A frame whose result would be older than allowed is dropped.
             usual = float(np.percentile(list(taken), _USUAL)) if taken else 0.0
-            moment = latest.take(max(tracker.live.oldest_seconds - usual, _FRESH))
-            if moment is None:
+            stream_frame = latest.take(max(tracker.live.oldest_seconds - usual, _FRESH))
+            if stream_frame is None:
                 break
-            estimate = tracker.track(moment.frame, moment.camera_poses)
+            estimate = tracker.track(stream_frame.frame, stream_frame.camera_poses)
             taken.append(estimate.seconds)
-            tracked = Tracked(moment, estimate, time.monotonic() - moment.arrived)
+            tracked = Tracked(stream_frame, estimate, time.monotonic() - stream_frame.arrived)
             statistics.add(tracked)
             statistics.arrived, statistics.dropped = latest.arrived, latest.dropped
             for sink in sinks:

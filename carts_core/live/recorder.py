@@ -124,7 +124,7 @@ class Recorder:
 
     def _write_mounts(self, number: int, name: str, tracked: Tracked) -> None:
         """Write the mount pose of each camera, since every camera may begin to move."""
-        mounts = mounts_of(self._scene, tracked.moment.frame, tracked.moment.camera_poses)
+        mounts = mounts_of(self._scene, tracked.stream_frame.frame, tracked.stream_frame.camera_poses)
         for camera in self._scene.cameras:
             path = self._output / _motion_file(camera.name)
             if number == 0:
@@ -137,7 +137,7 @@ class Recorder:
             self._describe()
 
     def _write_one(self, tracked: Tracked) -> None:
-        number, frame, estimate = len(self._edits), tracked.moment.frame, tracked.estimate
+        number, frame, estimate = len(self._edits), tracked.stream_frame.frame, tracked.estimate
         name = f"{number:06d}"
         for camera, image in frame.images.items():
             content = cv2.imencode(".png", image[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 1])[1].tobytes()

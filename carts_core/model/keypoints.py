@@ -16,7 +16,7 @@ from torch import Tensor
 from .robot import Robot
 from .scene import Arm, Scene, SceneState
 
-MOST_KEYPOINTS = 6
+MAX_KEYPOINTS = 6
 """Maximum number of keypoints of an arm; the keypoints nearest to the tip are kept."""
 _SAME_POINT = 5e-4
 """Distance below which joints are merged into one point [m]."""
@@ -48,7 +48,7 @@ def keypoints(arm: Arm) -> tuple[Keypoint, ...]:
     points = [Keypoint(arm.name, f"{_named(robot, link)} tip", link, _tip(robot, link)) for link in last]
     for link, name in reversed(_joints(robot, depth)):
         points.append(Keypoint(arm.name, f"{name} joint", link, (0.0, 0.0, 0.0)))
-    return tuple(points[:MOST_KEYPOINTS])
+    return tuple(points[:MAX_KEYPOINTS])
 
 
 def project_keypoints(
@@ -124,7 +124,7 @@ SHAFT_EDGE = "shaft edge"
 SHAFT_MIDDLE = "shaft middle"
 _OUTER_SHARE = 90
 """Percentile of the distances of a shaft's vertices from its axis that is used as the radius."""
-_LEAST_SLENDERNESS = 5.0
+_MIN_SLENDERNESS = 5.0
 """Minimum ratio of length to width of a shaft [1]."""
 
 
@@ -210,7 +210,7 @@ def _shaft(arm: Arm) -> tuple[int, tuple[float, float, float], tuple[float, floa
         length = float(along.max() - along.min())
         around = np.linalg.norm((vertices - centre) - along[:, None] * directions[0], axis=-1)
         radius = float(np.percentile(around, _OUTER_SHARE))
-        if length > max(longest, 2 * radius * _LEAST_SLENDERNESS):
+        if length > max(longest, 2 * radius * _MIN_SLENDERNESS):
             longest = length
             ends = (centre + along.min() * directions[0], centre + along.max() * directions[0])
             start, end = (tuple(map(float, place)) for place in ends)

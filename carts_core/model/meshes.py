@@ -13,7 +13,7 @@ import trimesh
 import yourdfpy
 from jaxtyping import Float, Int
 
-from ..decoders.meshes import MOST_FACES, mesh_color, mesh_parts
+from ..decoders.meshes import MAX_FACES, mesh_color, mesh_parts
 from ..errors import RobotError
 from ..files.decoding import Limits, called
 from ..files.reading import MESH, is_regular, open_regular
@@ -130,9 +130,9 @@ _DEFAULT_COLOR = np.array([0.6, 0.6, 0.6])
 _OPAQUE = 0.99
 _AT_ONCE = 4
 """Maximum number of meshes that are decimated concurrently; each may take much memory."""
-MOST_KEPT = 10
+CLUSTERING_RATIO = 10
 """Ratio of triangles to the requested number above which meshes are first clustered [1]."""
-_CLUSTERED = MOST_KEPT / 2
+_CLUSTERED = CLUSTERING_RATIO / 2
 """Maximum ratio of triangles to the requested number after clustering [1]."""
 _FIRST_CELL = 0.25
 """Cell size of the first clustering, relative to the tolerance [1]."""
@@ -285,11 +285,11 @@ def build_link_meshes(
         RobotError: a mesh is degenerate, or so irregular that decimation takes too long or too many triangles remain.
     """
     before = sum(len(mesh.faces) for _, mesh, _ in parts)
-    if before > MOST_FACES:
-        raise RobotError(f"the meshes have more than {MOST_FACES:,} triangles in total. Export simpler meshes.")
+    if before > MAX_FACES:
+        raise RobotError(f"the meshes have more than {MAX_FACES:,} triangles in total. Export simpler meshes.")
     bound = tolerance if before > max_faces else None
     moved = [0.0] * len(parts)
-    if before > MOST_KEPT * max_faces:
+    if before > CLUSTERING_RATIO * max_faces:
         progress(f"{before} triangles in {len(parts)} meshes: clustering their vertices first")
         parts, moved = _clustered_parts(parts, int(_CLUSTERED * max_faces), tolerance)
     result, deviations = [], [0.0]

@@ -22,7 +22,7 @@ from ..package_imports import deferred_import
 from ..wording import listed, shown
 from . import mesh_cache
 from .instruments import robot_file
-from .meshes import MOST_KEPT, Decimation, LinkMesh, build_link_meshes, collada_asset, load_visual, mesh_path
+from .meshes import CLUSTERING_RATIO, Decimation, LinkMesh, build_link_meshes, collada_asset, load_visual, mesh_path
 
 with deferred_import("matplotlib", "pyplot"):  # The parser imports it only for plots; it takes 0.2 s.
     import pytorch_kinematics
@@ -160,14 +160,14 @@ def _mimic_matrix(model: yourdfpy.URDF, parameters: list[str]) -> tuple[Tensor, 
     return expand, offset
 
 
-_MOST_ELEMENTS = 100_000
-_MOST_LINKS = 1_000
+_MAX_ELEMENTS = 100_000
+_MAX_LINKS = 1_000
 _DEEPEST = 32
 _FARTHEST = 1e3
 """Maximum coordinate, size or angle of a robot [m], [rad]."""
-_LARGEST_FACTOR = 1e6
+_MAX_FACTOR = 1e6
 """Maximum scale of a mesh and factor of a mimic joint; the minimum is its inverse."""
-_SHORTEST_AXIS = 1e-6
+_MIN_AXIS_LENGTH = 1e-6
 _TYPES = ("revolute", "continuous", "prismatic", "fixed")
 _XACRO = "ros.org/wiki/xacro}"
 
@@ -183,8 +183,8 @@ def parsed_urdf(text: str, source: Path) -> Element:
         raise RobotError(
             f"robot {source} declares a document type or entities, which are not allowed in a URDF. Remove them."
         )
-    if text.count("<") > 2 * _MOST_ELEMENTS:
-        raise RobotError(f"robot {source} has more than {_MOST_ELEMENTS:,} elements. Export only the visual model.")
+    if text.count("<") > 2 * _MAX_ELEMENTS:
+        raise RobotError(f"robot {source} has more than {_MAX_ELEMENTS:,} elements. Export only the visual model.")
     try:
         root = ElementTree.fromstring(text)
     except (ElementTree.ParseError, ValueError, RecursionError) as error:
@@ -217,17 +217,17 @@ def _check_elements(root: Element, source: Path) -> None:
         level = [child for element in level for child in element]
         if not level:
             break
-    if level or count > _MOST_ELEMENTS:
+    if level or count > _MAX_ELEMENTS:
         raise RobotError(
-            f"robot {source} is nested more than {_DEEPEST} deep or has more than {_MOST_ELEMENTS} elements."
+            f"robot {source} is nested more than {_DEEPEST} deep or has more than {_MAX_ELEMENTS} elements."
         )
 
 
 def _check_tree(root: Element, source: Path) -> None:
     """Check that names are unique and that joints connect all links to one tree."""
     links, joints = root.findall("link"), root.findall("joint")
-    if not 1 <= len(links) <= _MOST_LINKS or len(joints) > _MOST_LINKS:
-        raise RobotError(f"robot {source} has {len(links)} links; allowed: 1 to {_MOST_LINKS}.")
+    if not 1 <= len(links) <= _MAX_LINKS or len(joints) > _MAX_LINKS:
+        raise RobotError(f"robot {source} has {len(links)} links; allowed: 1 to {_MAX_LINKS}.")
     for kind, elements in (("link", links), ("joint", joints)):
         counts = Counter(element.get("name", "") for element in elements)
         if wrong := [name for name, count in counts.items() if count > 1 or not name]:
@@ -273,7 +273,7 @@ def _check_mimics(joints: list[Element], source: Path) -> None:
         for _ in range(len(joints) + 1):
             if mimic is None:
                 break
-            _number(mimic, "multiplier", source, _LARGEST_FACTOR)
+            _number(mimic, "multiplier", source, _MAX_FACTOR)
             _number(mimic, "offset", source)
             if mimic.get("joint") not in moving:
                 raise RobotError(
@@ -291,7 +291,7 @@ def _check_joint(joint: Element, source: Path) -> None:
     if kind not in _TYPES:
         raise RobotError(f"robot {source}: joint {name!r} is of type {kind!r}; allowed: {', '.join(_TYPES)}.")
     if (axis := joint.find("axis")) is not None and (values := _vector(axis, "xyz", 3, source)):
-        if kind != "fixed" and math.hypot(*values) < _SHORTEST_AXIS:
+        if kind != "fixed" and math.hypot(*values) < _MIN_AXIS_LENGTH:
             raise RobotError(f"robot {source}: the axis of joint {name!r} has zero length: {axis.get('xyz')!r}.")
     if (limit := joint.find("limit")) is not None:
         lower, upper = (_number(limit, key, source, math.inf) for key in ("lower", "upper"))
@@ -307,11 +307,11 @@ def _check_geometry(geometry: Element, source: Path) -> None:
             scale = _floats(shape, "scale", source)
             if scale and (
                 len(scale) not in (1, 3)
-                or not 1 / _LARGEST_FACTOR <= min(map(abs, scale)) <= max(map(abs, scale)) <= _LARGEST_FACTOR
+                or not 1 / _MAX_FACTOR <= min(map(abs, scale)) <= max(map(abs, scale)) <= _MAX_FACTOR
             ):
                 raise _wrong(shape, "scale", source, "one or three nonzero factors of at most a million")
         for key, count in (("size", 3), ("radius", 1), ("length", 1)):
-            _vector(shape, key, count, source, smallest=1 / _LARGEST_FACTOR)
+            _vector(shape, key, count, source, smallest=1 / _MAX_FACTOR)
 
 
 def _floats(element: Element, key: str, source: Path) -> list[float]:
@@ -453,7 +453,7 @@ class Robot:
         if not meshes:
             raise RobotError(f"robot {urdf} has no visual mesh to render. Add <visual> elements.")
         remarks = _remarks(_mesh_files(model, urdf))
-        if decimation.before > MOST_KEPT * max_faces:
+        if decimation.before > CLUSTERING_RATIO * max_faces:
             remarks = (*remarks, f"{decimation}.")
         return Robot(model.robot.name, urdf, kinematics, link_names, meshes, decimation, remarks)
 

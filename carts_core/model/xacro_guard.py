@@ -20,7 +20,7 @@ _LONGEST = 100_000
 """Maximum length of a string or list in an expression."""
 _LARGEST = 2.0**63
 """Maximum integer in an expression."""
-_LONGEST_EXPRESSION = 2_000
+_MAX_EXPRESSION_LENGTH = 2_000
 LIBRARIES = {"expanded": ("xacro", "xacrodoc")}
 """Modules that a child process imports before its memory is measured."""
 _DECLARES = re.compile(r"<!(?:DOCTYPE|ENTITY)", re.IGNORECASE)
@@ -106,8 +106,8 @@ class Expression:
             SyntaxError, TypeError, ValueError, ArithmeticError, LookupError: the expression is invalid, or has no
                 value.
         """
-        if len(text) > _LONGEST_EXPRESSION:
-            raise RobotError(f"an expression is longer than {_LONGEST_EXPRESSION:,} characters")
+        if len(text) > _MAX_EXPRESSION_LENGTH:
+            raise RobotError(f"an expression is longer than {_MAX_EXPRESSION_LENGTH:,} characters")
         return self._of(ast.parse(text.strip(), mode="eval").body)
 
     def _of(self, node: ast.expr) -> Any:

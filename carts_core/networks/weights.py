@@ -49,7 +49,7 @@ _NETWORKS: dict[tuple[str, str], tuple[type[Architecture | SurfaceArchitecture],
 }
 """Format and version -> architecture and network."""
 _TYPES = (torch.float32, torch.float64, torch.float16, torch.bfloat16, torch.int64)
-_LARGEST_SIDE = 4096
+_MAX_SIDE = 4096
 _REMEDY = "Train weights with `carts train`, or reinstall carts to restore the shipped weights."
 
 
@@ -97,7 +97,7 @@ def read_weights(path: Path) -> Weights:
     kind, make_network = _NETWORKS[metadata["format"], metadata["version"]]
     architecture, working_size, training = _described(path, metadata, kind)
     network = _filled(path, make_network, architecture, shapes)
-    if len(working_size) != 2 or any(not 0 < n <= _LARGEST_SIDE or n % architecture.stride for n in working_size):
+    if len(working_size) != 2 or any(not 0 < n <= _MAX_SIDE or n % architecture.stride for n in working_size):
         raise WeightsError(
             f"weights file {path} has the working size {working_size}; allowed: two positive multiples of "
             f"{architecture.stride}. {_REMEDY}"

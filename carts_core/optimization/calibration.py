@@ -15,7 +15,7 @@ from ..model.keypoints import link_transforms
 from ..model.scene import Scene, SceneState
 from ..networks.extractor import FeatureExtractor
 from ..recording import Frame
-from ..recording.background import spread
+from ..recording.background import evenly_spaced
 from ..settings import (
     CALIBRATION,
     CALIBRATION_SETTINGS,
@@ -47,20 +47,20 @@ def calibrated_scene(whole: Scene, part: Scene, variables: Variables, offsets: t
     """
     start, state = variables.start, variables.state(offsets)
     arms = tuple(
-        replace(arm, T_world_base=_moved(arm.T_world_base, start, state, "T_world_base", index))
+        replace(arm, T_world_base=_changed_pose(arm.T_world_base, start, state, "T_world_base", index))
         for index, arm in enumerate(whole.arms)
     )
     cameras = {camera.name: camera for camera in whole.cameras}
     for index, name in enumerate(camera.name for camera in part.cameras):
         camera = cameras[name]
-        T_camera_world = _moved(camera.T_camera_world, start, state, "T_camera_world", index)
+        T_camera_world = _changed_pose(camera.T_camera_world, start, state, "T_camera_world", index)
         before, after = start.intrinsics[index], state.intrinsics[index]
         fx, fy, cx, cy = camera.intrinsics if torch.equal(before, after) else after.tolist()
         cameras[name] = replace(camera, T_camera_world=T_camera_world, intrinsics=(fx, fy, cx, cy))
     return replace(whole, arms=arms, cameras=tuple(cameras.values()))
 
 
-def _moved(given: np.ndarray, start: SceneState, state: SceneState, name: str, index: int) -> np.ndarray:
+def _changed_pose(given: np.ndarray, start: SceneState, state: SceneState, name: str, index: int) -> np.ndarray:
     before, after = getattr(start, name)[index], getattr(state, name)[index]
     if torch.equal(before, after):
         return given
@@ -272,7 +272,7 @@ class CalibrationOptimizer:
         """Verdict that accounts for arms outside the network's domain; given masks need no network."""
         if found.verdict is not Verdict.DOUBTFUL or self._problem.some_masked:
             return found
-        tried = [self._frames[index] for index in spread(len(self._frames), _TRIED)]
+        tried = [self._frames[index] for index in evenly_spaced(len(self._frames), _TRIED)]
         known = [check_domain(self._scene, frame, self._predictor, self.settings) for frame in tried]
         return without_knowledge(found, known)
 

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from ..model.scene import Scene
 from ..recording import Frame
-from ..recording.background import spread
+from ..recording.background import evenly_spaced
 from ..settings import FreeParameters, SurfaceSolver
 from ..settings.stages import Descend, Observe, SilhouetteSearch
 from .factors import Prior
@@ -262,7 +262,7 @@ class CalibrationProblem:
             found = [one.distances(part.problem.variables.state(part.at(trials))) for part, one in compared]
             return np.mean(found, axis=0)
 
-        deviation = self.variables.spread(stage.joints_deg, stage.frames_deg, distance)
+        deviation = self.variables.standard_deviations(stage.joints_deg, stage.frames_deg, distance)
         found = search_silhouettes(distances, deviation, self.variables.clamp, stage)
         if self._given_prior:
             return found
@@ -273,11 +273,11 @@ class CalibrationProblem:
 
     def _some(self, count: int) -> list[_FramePart]:
         """A subset of evenly spaced frames."""
-        return [self._parts[index] for index in spread(len(self._parts), count)]
+        return [self._parts[index] for index in evenly_spaced(len(self._parts), count)]
 
     def evidence(self, offsets: Float[Tensor, " n"]) -> list[Evidence]:
         """Evidence for and against a calibration from evenly spaced frames, with measured joints."""
-        losses = [float(loss) for loss in self.frame_losses(offsets)[spread(len(self._parts), _ASSESSED)]]
+        losses = [float(loss) for loss in self.frame_losses(offsets)[evenly_spaced(len(self._parts), _ASSESSED)]]
         parts = zip(self._some(_ASSESSED), losses, strict=True)
         return [part.problem.evidence(part.at(offsets), loss) for part, loss in parts]
 

@@ -73,9 +73,9 @@ class Prior:
         return 1.0 / torch.linalg.inv(self.precision.double()).diagonal().to(self.precision)
 
 
-_FIRST_DAMPING, _LEAST_DAMPING = 1e-2, 1e-4
+_FIRST_DAMPING, _MIN_DAMPING = 1e-2, 1e-4
 _SOFTER, _HARDER = 0.25, 8.0
-_LONGEST_STEP = 0.15
+_MAX_STEP = 0.15
 """Maximum change of an unknown in one step [rad], the range of validity of the linear model."""
 
 REJECTIONS = 3
@@ -108,7 +108,7 @@ class LevenbergMarquardt:
 
     def accepted(self) -> None:
         """Lower the damping after a step that lowered the objective."""
-        self._damping = max(self._damping * _SOFTER, _LEAST_DAMPING)
+        self._damping = max(self._damping * _SOFTER, _MIN_DAMPING)
 
     def rejected(self) -> None:
         """Raise the damping after a step that did not lower the objective."""
@@ -118,7 +118,7 @@ class LevenbergMarquardt:
         """Compute a step from a point with this quadratic model."""
         slope, curvature = gradient.double(), hessian.double()
         damped = curvature + self._damping * torch.diag(curvature.diagonal().clamp(min=1e-9))
-        change = shortened(bounded_step(offsets, slope, damped, self._lower, self._upper), _LONGEST_STEP)
+        change = shortened(bounded_step(offsets, slope, damped, self._lower, self._upper), _MAX_STEP)
         reduction = -float(slope @ change + 0.5 * change @ (curvature @ change))
         return Step(change.to(gradient), reduction)
 

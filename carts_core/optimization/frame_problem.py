@@ -382,7 +382,7 @@ class FrameProblem:
     def search_silhouettes(self, stage: SilhouetteSearch) -> Float[Tensor, " n"]:
         """Search for the offsets whose silhouettes are nearest to the masks."""
         compared, variables = self.silhouettes(stage.scale), self.variables
-        deviation = variables.spread(stage.joints_deg, stage.frames_deg, self.distance)
+        deviation = variables.standard_deviations(stage.joints_deg, stage.frames_deg, self.distance)
         return search_silhouettes(
             lambda trials: compared.distances(variables.state(trials)), deviation, variables.clamp, stage
         )

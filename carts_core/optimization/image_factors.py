@@ -46,7 +46,7 @@ _REDUCTIONS = (1, 2, 4, 8)
 _PIXELS_AT_ONCE = 1 << 20
 """Maximum number of pixels, over all states, that are rendered at once."""
 
-_SMALLEST_BLUR = 1.2
+_MIN_BLUR = 1.2
 """Minimum blur after reduction of the images [px of the reduced image]."""
 
 
@@ -74,7 +74,7 @@ class SurfaceFactor:
     ) -> None:
         images = observation.images
         blur = stage.blur * images.scale
-        reduction = max(r for r in _REDUCTIONS if r == 1 or blur / r >= _SMALLEST_BLUR)
+        reduction = max(r for r in _REDUCTIONS if r == 1 or blur / r >= _MIN_BLUR)
         self._variables, self._blur, self._robust = variables, blur / reduction, stage.robust
         self.area = (reduction / images.scale) ** 2
         self.noise = settings.mask_noise if observation.masked else settings.noise

@@ -16,7 +16,7 @@ from ..model.scene import Scene
 from ..networks.extractor import FeatureExtractor
 from ..provenance import Checkpoint
 from ..recording import Frame
-from ..recording.background import spread
+from ..recording.background import evenly_spaced
 from ..settings import FreeParameters, SequenceSettings, SolverSettings, surface_solver
 from .error_model import ErrorModel, Gaussian, Information, Smoother, combined, remove_measurement
 from .measurement import FrameEstimate, FrameSolver, Ignore, Measurement, Origin, Visit
@@ -203,7 +203,7 @@ class SequenceOptimizer:
             self._scene, self._predictor, self.settings, self.model, ignore or (lambda _: {}), backgrounds, checkpoint
         )
         self._queue, self._frames = list(gaps), len(gaps)
-        initial = {self._queue[place] for place in spread(len(self._queue), self.model.initial_frames)}
+        initial = {self._queue[place] for place in evenly_spaced(len(self._queue), self.model.initial_frames)}
         initial.update([index for index in self._queue if index in self._keyframes][:1])
         # No initial frames are needed for a single frame, or if the first frame is a keyframe.
         alone = len(initial) == 1 or self._queue[0] in self._keyframes
@@ -293,7 +293,7 @@ class SequenceOptimizer:
             return None
         corrections = self._smoother.smoothed()
         indices = sorted(corrections)
-        chosen = [indices[place] for place in spread(len(indices), min(_LOOKED_AT, len(indices)))]
+        chosen = [indices[place] for place in evenly_spaced(len(indices), min(_LOOKED_AT, len(indices)))]
         return statistics.median(
             [self._solver.base_frame_gain(*self._open(i), corrections[i].mean, self._free) for i in chosen]
         )

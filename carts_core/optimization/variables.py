@@ -190,7 +190,7 @@ class Variables:
                 expected[block.start : block.start + block.size] = math.radians(degrees)
         return expected
 
-    def spread(self, joints_deg: float, frames_deg: float, distance: float) -> Float[Tensor, " n"]:
+    def standard_deviations(self, joints_deg: float, frames_deg: float, distance: float) -> Float[Tensor, " n"]:
         """Standard deviations of a search [rad]; 0 for intrinsics.
 
         Args:

@@ -46,7 +46,7 @@ _WITH_CHANGE = (0.99, 27.9, 0.81, -1.84, -0.42, -2.85)
 logistic regressions on 503 frames with ground truth, none held out; see docs/explanation/decisions.md.
 """
 
-_LEAST_CHANGE, _CHANGE_SLOPE = 0.6, 40.0
+_MIN_CHANGE_OVERLAP, _CHANGE_SLOPE = 0.6, 40.0
 """Minimum overlap with change among correct fits, and slope of the log odds below it."""
 
 _MASK_MIDDLE, _MASK_SLOPE = 0.8, 22.0
@@ -68,7 +68,7 @@ def log_odds_of_failure(loss: float, arm: ArmEvidence, masked: bool) -> float:
     if arm.overlap_with_change is not None:
         values.append(arm.overlap_with_change)
         bias, *weights = _WITH_CHANGE
-        bias += _CHANGE_SLOPE * max(0.0, _LEAST_CHANGE - arm.overlap_with_change)
+        bias += _CHANGE_SLOPE * max(0.0, _MIN_CHANGE_OVERLAP - arm.overlap_with_change)
     return bias + sum(weight * value for weight, value in zip(weights, values, strict=True))
 
 
@@ -498,7 +498,7 @@ def check_domain(
     return DomainCheck(overlap, float((covered(images.images) * far).mean()))
 
 
-_MANY, _MOST_FAILED = 0.1, 0.5
+_MANY, _MAX_FAILED_FRACTION = 0.1, 0.5
 """Share of unreliable frames above which a sequence is doubtful, and share of failed frames above which it has failed
 [1]."""
 
@@ -534,7 +534,7 @@ def assess_sequence(frames: Sequence[Assessment]) -> SequenceAssessment:
     probability = float(np.mean([frame.probability for frame in frames]))
     against = Counter((frame.reason, frame.remedy) for frame in frames if frame.verdict is not Verdict.GOOD)
     share = len(frames) - counts[Verdict.GOOD]
-    if counts[Verdict.FAILED] >= _MOST_FAILED * len(frames):
+    if counts[Verdict.FAILED] >= _MAX_FAILED_FRACTION * len(frames):
         verdict = Verdict.FAILED
     elif share > _MANY * len(frames):
         verdict = Verdict.DOUBTFUL

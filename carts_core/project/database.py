@@ -180,10 +180,10 @@ changed."""
 SEALED = 3
 """First schema with digests."""
 
-LONGEST_VALUE = 128 * 2**20
+MAX_VALUE_LENGTH = 128 * 2**20
 """Maximum value of a row [bytes]."""
 _LIMITS = {
-    sqlite3.SQLITE_LIMIT_LENGTH: LONGEST_VALUE,
+    sqlite3.SQLITE_LIMIT_LENGTH: MAX_VALUE_LENGTH,
     sqlite3.SQLITE_LIMIT_SQL_LENGTH: 1_000_000,
     sqlite3.SQLITE_LIMIT_COLUMN: 100,
     sqlite3.SQLITE_LIMIT_EXPR_DEPTH: 100,

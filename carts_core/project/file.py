@@ -321,7 +321,7 @@ Statements = Sequence[tuple[str, Iterable[Sequence[object]]]]
 SealRow = tuple[bytes, bytes, bytes]
 """Row of the table `seal`."""
 
-LARGEST_LOG = 64 * 2**20
+MAX_LOG_BYTES = 64 * 2**20
 """Size above which the log is checkpointed into the file [bytes]."""
 
 
@@ -417,7 +417,7 @@ class ProjectFile:
 
     def checkpoint(self) -> None:
         """Checkpoint a large log into the file, and verify the file; `LostFile` if the content differs."""
-        if os.fstat(self._open_log()).st_size < LARGEST_LOG:
+        if os.fstat(self._open_log()).st_size < MAX_LOG_BYTES:
             return
         with suppress(sqlite3.Error):
             self._usable().execute("PRAGMA wal_checkpoint(TRUNCATE)")

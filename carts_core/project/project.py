@@ -41,7 +41,7 @@ class Change:
 Listener = Callable[[Change], None]
 
 
-LONGEST_NAME = 200
+MAX_NAME_LENGTH = 200
 """Maximum length of a step's name [characters]."""
 
 
@@ -67,7 +67,7 @@ class Project:
         self._edit = threading.RLock()
         self._listeners: list[Listener] = []
         self._store: Store | None = None
-        self._incident: str | None = None
+        self._storage_failure: str | None = None
         """Incident of the closed store."""
         self.state = self._opened(identity)
 
@@ -86,7 +86,7 @@ class Project:
 
     @property
     def path(self) -> Path:
-        """Path of the project file, which changes after a rescue; see `incident`."""
+        """Path of the project file, which changes after a rescue; see `storage_failure`."""
         return self._path if self._store is None else self._store.path
 
     @property
@@ -95,9 +95,9 @@ class Project:
         return self._store is not None
 
     @property
-    def incident(self) -> str | None:
+    def storage_failure(self) -> str | None:
         """Message describing the failure of the opened file and where edits are now saved; None without a failure."""
-        return self._incident if self._store is None else self._store.incident
+        return self._storage_failure if self._store is None else self._store.storage_failure
 
     @property
     def safe(self) -> bool:
@@ -106,7 +106,7 @@ class Project:
 
     def check(self) -> None:
         """Check that the file is unchanged since the last write; otherwise save the project to another file, see
-        `incident`.
+        `storage_failure`.
 
         Every edit includes this check.
 
@@ -121,7 +121,7 @@ class Project:
         """Save edits as one undo step, synchronized to disk on return.
 
         Args:
-            name: name in the history, such as "Drag PSM1"; shortened to `LONGEST_NAME` characters.
+            name: name in the history, such as "Drag PSM1"; shortened to `MAX_NAME_LENGTH` characters.
             edits: new values by key; see `ProjectState.changed` for omitted and additional edits.
             figures: frame -> quality figures with these edits, saved even without other changes.
 
@@ -143,7 +143,7 @@ class Project:
             if not title:
                 raise ProjectError("a step has an empty name. Give a name.")
             # Step names contain names of arms, joints and frames, which may be long.
-            title = title if len(title) <= LONGEST_NAME else f"{title[: LONGEST_NAME - 1]}…"
+            title = title if len(title) <= MAX_NAME_LENGTH else f"{title[: MAX_NAME_LENGTH - 1]}…"
             step = Step(state.position + 1, title, time.time())
             after = state.after(step, changed)
             known = by_revision(after, figures or {})
@@ -232,7 +232,7 @@ class Project:
         key = Key.verdict(frame)
         with self._edit:
             check_edit(self.state.identity, key, verdict)
-            entry = self.state.remark(key, verdict)
+            entry = self.state.entry_at_last_change(key, verdict)
             store = self._writer()
             store.commit(journal.add_remark(store.memory, key, entry))
             self._saved(self.state.with_entries({key: entry}), "figures", frames=[frame])
@@ -264,7 +264,7 @@ class Project:
                 try:
                     store.close()
                 finally:
-                    self._path, self._incident = store.path, store.incident
+                    self._path, self._storage_failure = store.path, store.storage_failure
 
     def __enter__(self) -> Self:
         return self

@@ -179,7 +179,7 @@ class ProjectState:
         entry = self._record(frame).entries.get(Key.verdict(frame))
         return None if entry is None or entry.step < self.revision(frame) else entry.value
 
-    def remark(self, key: Key[V], value: V) -> Entry:
+    def entry_at_last_change(self, key: Key[V], value: V) -> Entry:
         """Entry for a value that is assigned to the step that last changed its frame, so that undo affects both."""
         known = self._record(key.frame).entries.get(key)
         return Entry(max(self.revision(key.frame), 0 if known is None else known.step), value)

@@ -157,13 +157,13 @@ class Store:
     Attributes:
         memory: connection to the in-memory copy.
         path: file to which edits are written, which changes after a rescue.
-        incident: message describing the failure of the opened file; None without a failure.
+        storage_failure: message describing the failure of the opened file; None without a failure.
     """
 
     def __init__(self, memory: sqlite3.Connection, seal: Seal, position: int, file: ProjectFile) -> None:
         self.memory = memory
         self.path = file.path
-        self.incident: str | None = None
+        self.storage_failure: str | None = None
         self._what = "was lost"
         self._seal = seal
         self._position = position
@@ -190,7 +190,7 @@ class Store:
             except LostFile as lost:
                 self._rescue(str(lost))
         else:
-            raise ProjectError(f"project {self.path} is lost repeatedly. {self.incident}")
+            raise ProjectError(f"project {self.path} is lost repeatedly. {self.storage_failure}")
         with database.transaction(self.memory) as memory:
             for statement, rows in statements:
                 memory.executemany(statement, rows)
@@ -251,16 +251,16 @@ class Store:
                 f"either ({failure}). They are in memory. Free disk space, or make the folder writable; saving is "
                 "retried."
             )
-            if failed != self.incident:
+            if failed != self.storage_failure:
                 _log.error("%s", failed)
-            self.incident = failed
+            self.storage_failure = failed
             raise ProjectError(failed)
         self.path = self._file.path
-        self.incident = (
+        self.storage_failure = (
             f"Project {lost} {what} while it was open. Every edit was saved to {self.path}; further edits are "
             f"saved there. To open it again: --project '{self.path}'."
         )
-        _log.error("%s", self.incident)
+        _log.error("%s", self.storage_failure)
 
     def _moved_to(self, path: Path, content: bytes) -> ProjectFile | None:
         """Create a project file with all content at `path`; None if the name is taken."""

@@ -20,7 +20,7 @@ from .layers import IgnoreRegion, ImportedMask, Layer, MaskCorrection, PartLabel
 
 _Choice = TypeVar("_Choice", bound=StrEnum)
 
-LONGEST_NOTE = 10_000
+MAX_NOTE_LENGTH = 10_000
 """Maximum length of a note [characters]."""
 
 
@@ -188,15 +188,15 @@ UNREVIEWED = frozenset({ReviewState.UNTOUCHED, ReviewState.OPTIMIZED})
 
 @dataclass(frozen=True)
 class Review(JsonValue):
-    """Review state of a frame, with a note of at most `LONGEST_NOTE` characters."""
+    """Review state of a frame, with a note of at most `MAX_NOTE_LENGTH` characters."""
 
     state: ReviewState = ReviewState.UNTOUCHED
     note: str = ""
 
     def __post_init__(self) -> None:
         _set(self, "state", _choice(ReviewState, self.state, "review state"))
-        if not isinstance(self.note, str) or len(self.note) > LONGEST_NOTE:
-            raise ProjectError(f"a note must have at most {LONGEST_NOTE} characters. Shorten it.")
+        if not isinstance(self.note, str) or len(self.note) > MAX_NOTE_LENGTH:
+            raise ProjectError(f"a note must have at most {MAX_NOTE_LENGTH} characters. Shorten it.")
 
 
 @dataclass(frozen=True)
@@ -296,7 +296,7 @@ class ImportedKeypoints(JsonValue):
 
 VERDICTS = ("good", "doubtful", "failed")
 """Names of verdicts, as in `carts_core.optimization.Verdict`."""
-LONGEST_TEXT = 2_000
+MAX_TEXT_LENGTH = 2_000
 """Maximum length of a text [characters]."""
 
 
@@ -319,8 +319,8 @@ class FitVerdict(JsonValue):
         if self.verdict not in VERDICTS:
             raise ProjectError(f"a verdict is {self.verdict!r}, but must be one of: {', '.join(VERDICTS)}.")
         for text in (self.reason, self.remedy):
-            if not isinstance(text, str) or len(text) > LONGEST_TEXT:
-                raise ProjectError(f"reason and remedy must have at most {LONGEST_TEXT} characters. Shorten them.")
+            if not isinstance(text, str) or len(text) > MAX_TEXT_LENGTH:
+                raise ProjectError(f"reason and remedy must have at most {MAX_TEXT_LENGTH} characters. Shorten them.")
         _set(self, "cameras", tuple((str(name), value) for name, value in self.cameras))
         for value in (self.failure, *(value for _, value in self.cameras)):
             if not (isinstance(value, float | int) and 0.0 <= value <= 1.0):

@@ -2,7 +2,7 @@
 
 from .background import MeanBackground as MeanBackground
 from .background import background_of_recording as background_of_recording
-from .background import spread as spread
+from .background import evenly_spaced as evenly_spaced
 from .sequence import Frame as Frame
 from .sequence import FrameReader as FrameReader
 from .sequence import Sequence as Sequence

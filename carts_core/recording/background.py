@@ -17,7 +17,7 @@ FRAMES = 30
 MARGIN = 15 / 640
 """Uncertainty margin around the silhouette of an arm, relative to the width of the image."""
 
-_LARGEST_ERROR = 3
+_MAX_ERROR = 3
 """Maximum error of measured kinematics, in margins [1]."""
 
 _STAYS = 0.4
@@ -44,7 +44,7 @@ class MeanBackground:
     """Reason why the background is unreliable, as a sentence; None for a reliable background."""
 
 
-def spread(length: int, count: int = FRAMES) -> list[int]:
+def evenly_spaced(length: int, count: int = FRAMES) -> list[int]:
     """At most `count` different frame numbers, evenly spaced over `length`."""
     return sorted({round(float(index)) for index in np.linspace(0, length - 1, min(count, length))})
 
@@ -79,7 +79,7 @@ def background_of_recording(
     renderer = Renderer(scene, cameras=[camera])
     arms = [renderer.segment(state)[0] >= 0 for state in states]
     covers = [dilate_silhouette(silhouette) for silhouette in arms]
-    clear = len(arms) - np.sum([dilate_silhouette(silhouette, _LARGEST_ERROR) for silhouette in arms], axis=0)
+    clear = len(arms) - np.sum([dilate_silhouette(silhouette, _MAX_ERROR) for silhouette in arms], axis=0)
     used = len(arms) - np.sum(covers, axis=0)
     estimate, deviation = uncovered_median((image(place), cover) for place, cover in enumerate(covers))
     estimate = filled_in(estimate, used == 0)

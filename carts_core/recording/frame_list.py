@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from ..errors import SequenceError
 from ..files import allowed_names, name_fault
-from ..files.reading import LARGEST_NAME, check_path, is_regular
+from ..files.reading import MAX_NAME_LENGTH, check_path, is_regular
 from ..wording import closest, counted, shown
 from .kinematics_table import Table, read_table
 from .toml_table import TomlTable, check_file_name
@@ -59,8 +59,10 @@ def _check_format(pattern: str) -> None:
             raise KeyError(name)
         if conversion or "{" in (form or ""):
             raise ValueError("a placeholder may only have a width, such as 06d")
-        if any(len(width) > _WIDTH_DIGITS or int(width) > LARGEST_NAME for width in re.findall(r"[0-9]+", form or "")):
-            raise ValueError(f"a name is longer than {LARGEST_NAME} characters")
+        if any(
+            len(width) > _WIDTH_DIGITS or int(width) > MAX_NAME_LENGTH for width in re.findall(r"[0-9]+", form or "")
+        ):
+            raise ValueError(f"a name is longer than {MAX_NAME_LENGTH} characters")
 
 
 def is_per_frame(pattern: str) -> bool:
@@ -77,7 +79,7 @@ _FRAME_ALONE = "{frame}"
 """Pattern of ids that are the cells of their column."""
 _SHORT = 50
 """Number of digits up to which an id is never too long for a file name."""
-MOST_FRAMES = 1_000_000
+MAX_FRAMES = 1_000_000
 """Maximum number of frames of a sequence; nine hours at 30 frames per second."""
 
 
@@ -96,8 +98,8 @@ class FrameList:
     """Table with one row per frame; None for all frames of a video."""
 
     def __post_init__(self) -> None:
-        if len(self.frame_ids) > MOST_FRAMES:
-            raise SequenceError(f"{self.counted}; a sequence may have {MOST_FRAMES:,} frames. Divide the recording.")
+        if len(self.frame_ids) > MAX_FRAMES:
+            raise SequenceError(f"{self.counted}; a sequence may have {MAX_FRAMES:,} frames. Divide the recording.")
 
 
 @dataclass(frozen=True)
@@ -213,7 +215,7 @@ def numbers_of_frames(table: Table, column: str, key: str) -> tuple[int, ...]:
 
 
 _SHOWN_MISSING = 3
-_MOST_WILD_PARTS = 2
+_MAX_WILD_PARTS = 2
 
 
 def frame_files(
@@ -240,9 +242,9 @@ def _matching(base: Path, key: str) -> tuple[Path, list[Path]]:
     """Folder above the first wildcard, and the matching files in it, in natural order."""
     fixed = next(parent for parent in base.parents if not is_glob(str(parent)))
     wild = base.relative_to(fixed)
-    if "**" in wild.parts or len(wild.parts) > _MOST_WILD_PARTS:
+    if "**" in wild.parts or len(wild.parts) > _MAX_WILD_PARTS:
         raise SequenceError(
-            f"{key}: {str(wild)!r} has ** or wildcards before the last {_MOST_WILD_PARTS} parts of the path, which is "
+            f"{key}: {str(wild)!r} has ** or wildcards before the last {_MAX_WILD_PARTS} parts of the path, which is "
             "not allowed. Name the folder."
         )
 

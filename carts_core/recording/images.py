@@ -31,7 +31,7 @@ from ..files.reading import (
     read_bytes,
     size_problem,
 )
-from .background import spread
+from .background import evenly_spaced
 
 T = TypeVar("T")
 
@@ -107,7 +107,7 @@ _SAMPLED, _SAMPLED_MASKS = 12, 2
 opening."""
 _NEAR = 16
 """Distance from black or white within which values of compressed masks count as black or white."""
-_MOST_LABELS = 32
+_MAX_LABELS = 32
 _ONE_COLOUR = 0.35
 """Maximum distance between the colours of one label, relative to their brightest channel."""
 
@@ -312,7 +312,7 @@ def bits_of_files(files: Sequence[Path]) -> int:
 
 def spread_files(files: Sequence[Path], most: int = _SAMPLED) -> list[Path]:
     """Evenly spaced files, from the first to the last."""
-    return [files[row] for row in spread(len(files), most)]
+    return [files[row] for row in evenly_spaced(len(files), most)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -445,7 +445,7 @@ def _is_two_valued(grey: np.ndarray, raster: _Raster) -> bool:
     """Whether the areas of an image, apart from their borders, are either black or of its maximum brightness."""
     top = int(grey.max())
     flat = _flat_values(grey).astype(np.int64)
-    noisy = raster.traits.lossy or len(np.unique(grey)) > _MOST_LABELS
+    noisy = raster.traits.lossy or len(np.unique(grey)) > _MAX_LABELS
     tolerance = _NEAR if noisy else 0
     near = (flat <= tolerance) | (flat >= top - tolerance)
     return top == 0 or (top >= 0.5 * raster.white and bool(near.all()))

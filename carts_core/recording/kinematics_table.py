@@ -20,7 +20,7 @@ from ..model.robot import Robot, parsed_urdf
 from ..wording import closest, listed, shown
 from .toml_table import TomlTable
 
-MOST_CELLS = 10_000_000
+MAX_CELLS = 10_000_000
 """Maximum number of cells of a table; one hour at 100 rows per second allows 27 columns."""
 
 
@@ -97,8 +97,8 @@ def read_table(path: Path, delimiter: str = ",", what: str = "kinematics table")
                 rows.append(tuple(row))  # Python's garbage collector untracks tuples, but not lists.
                 lines.append(reader.line_num)
                 cells += len(row)
-                if cells > MOST_CELLS:
-                    raise SequenceError(f"{what} {path} has more than {MOST_CELLS:,} cells. Divide the recording.")
+                if cells > MAX_CELLS:
+                    raise SequenceError(f"{what} {path} has more than {MAX_CELLS:,} cells. Divide the recording.")
     except (FileNotFoundError, IsADirectoryError) as error:
         raise SequenceError(f"{what} {path} is missing. Correct the path in the sequence file.") from error
     except (OSError, ValueError, csv.Error) as error:

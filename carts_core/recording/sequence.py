@@ -15,7 +15,7 @@ from ..errors import SequenceError
 from ..model.camera import Camera
 from ..model.scene import Scene
 from ..wording import closest, counted
-from .background import MeanBackground, background_of_recording, spread
+from .background import MeanBackground, background_of_recording, evenly_spaced
 from .images import ByteCache, ImageFiles, ImageSource, read_file, read_image, read_mask
 from .matching import TimeMatching
 from .sequence_file import CameraInput, Description, read_description
@@ -247,7 +247,7 @@ class Sequence:
             image = read_image(path, getattr(entry.images[domain], "bits", None))
             self._check_size(image, camera.name, f"background {path}")
             return MeanBackground(camera.undistort(image), np.ones(image.shape[:2], bool))
-        indices = spread(len(self))
+        indices = evenly_spaced(len(self))
         states = [
             self.scene.state({arm: rows[index] for arm, rows in self.measured.items()}, mounts=self.mounts(index))
             for index in indices
@@ -312,7 +312,7 @@ class Sequence:
 
 AHEAD = 8
 """Number of frames to prefetch."""
-LONGEST_STRIDE = 10
+MAX_STRIDE = 10
 """Maximum step between frames from which the direction of travel is inferred."""
 
 
@@ -339,7 +339,7 @@ class FrameReader:
         moved = 0 if self._last is None else index - self._last
         self._last = index
         if moved:
-            self._stride = moved if abs(moved) <= LONGEST_STRIDE else 1
+            self._stride = moved if abs(moved) <= MAX_STRIDE else 1
         self._replace_plan((row, domain, cameras) for row in self._neighbours(index, cameras))
         return frame
 

@@ -379,18 +379,18 @@ def calibrated_sequence_file(
     document: dict[str, Any] = tomlkit.parse(read_text(path, SEQUENCE))
     source, target = path.parent.resolve(), folder.resolve()
 
-    def moved(value: str) -> str:
+    def relocate(value: str) -> str:
         return value if os.path.isabs(value) else Path(os.path.relpath(source / value, target)).as_posix()
 
     def move(table: dict[str, Any], *keys: str) -> None:
         for key in keys:
             value = table.get(key)
             if isinstance(value, str):
-                table[key] = moved(value)
+                table[key] = relocate(value)
             elif isinstance(value, dict):
                 # The value is a table of patterns by domain, or K as a table of numbers.
                 for name, entry in value.items():
-                    value[name] = moved(entry) if isinstance(entry, str) else entry
+                    value[name] = relocate(entry) if isinstance(entry, str) else entry
 
     move(document["kinematics"], "table", "truth")
     move(document.get("frames", {}), "table", "video")

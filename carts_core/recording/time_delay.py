@@ -24,11 +24,11 @@ WIDTH = 192
 """Width at which images are compared [px]."""
 _CELLS = 6, 5
 """Columns and rows of the grid over which flow is averaged."""
-_MOST_FRAMES, _STRETCHES = 600, 4
+_MAX_FRAMES, _STRETCHES = 600, 4
 """Maximum number of frames that are read, and number of intervals over which they are distributed."""
-_FEWEST_STEPS = 60
+_MIN_STEPS = 60
 """Minimum number of steps between frames."""
-_LONGEST_STEP = 0.25
+_MAX_STEP = 0.25
 """Maximum duration of a step between frames that counts as one motion [s]."""
 _BLOCKS = 10
 """Number of blocks of the jackknife."""
@@ -47,15 +47,15 @@ _POSTURES = 3
 _RIDGE = 1e-3
 _LEVER = 0.1
 """Lever arm by which rotations of a camera are converted to lengths [m]."""
-_FEWEST_KNOWN = 0.5
+_MIN_KNOWN_FRACTION = 0.5
 """Minimum share of the steps with logged rows."""
 _STILL = 0.02
 """Minimum flow that counts as motion [px]."""
-_FEWEST_EXPLAINED, _FEWEST_GAIN = 0.15, 0.1
+_MIN_EXPLAINED, _MIN_GAIN = 0.15, 0.1
 """Minimum share of flow explained by the best delay, and its smallest margin over other delays."""
-_MOST_DEVIATION = 0.04
+_MAX_DEVIATION = 0.04
 """Maximum standard deviation of a reliable estimate [s]."""
-_LEAST_DEVIATION = 0.001
+_MIN_DEVIATION = 0.001
 """Lower bound of the reported standard deviation [s]."""
 _WORTH_A_CHANGE = 3.0, 0.008
 """Minimum proposed change of the delay, in standard deviations and in seconds."""
@@ -123,8 +123,8 @@ def estimate_time_offset(
     present = sequence.checked_matching().time_offset
     assert sequence.timestamps is not None
     frames, steps = _chosen(sequence.timestamps)
-    if len(steps) < _FEWEST_STEPS:
-        return _unknown(present, f"there are {len(steps)} steps between frames; at least {_FEWEST_STEPS} are needed.")
+    if len(steps) < _MIN_STEPS:
+        return _unknown(present, f"there are {len(steps)} steps between frames; at least {_MIN_STEPS} are needed.")
     flows = _flows(sequence, camera or sequence.scene.cameras[0].name, domain, frames, steps, progress)
     if np.sqrt((flows**2).mean()) < _STILL:
         return _unknown(present, "nothing moves in the images.")
@@ -142,12 +142,12 @@ def _unknown(present: float, problem: str) -> TimeOffsetEstimate:
 
 def _chosen(times: Float[np.ndarray, " frames"]) -> tuple[list[int], Float[np.ndarray, "steps 2"]]:
     """Frames to read, and pairs of neighbouring frames that are close enough in time."""
-    count, long = len(times), len(times) > _MOST_FRAMES
-    length = _MOST_FRAMES // _STRETCHES if long else count
+    count, long = len(times), len(times) > _MAX_FRAMES
+    length = _MAX_FRAMES // _STRETCHES if long else count
     starts = np.linspace(0, count - length, _STRETCHES if long else 1).astype(int)
     frames = sorted({int(start) + index for start in starts for index in range(length)})
     pairs = [(a, b) for a, b in pairwise(frames) if b == a + 1]
-    near = [(a, b) for a, b in pairs if 0.0 < times[b] - times[a] <= _LONGEST_STEP]
+    near = [(a, b) for a, b in pairs if 0.0 < times[b] - times[a] <= _MAX_STEP]
     return frames, np.array(near, int).reshape(-1, 2)
 
 
@@ -206,7 +206,7 @@ class _Delays:
         return TimeOffsetEstimate(
             present,
             seconds,
-            max(deviation, _LEAST_DEVIATION),
+            max(deviation, _MIN_DEVIATION),
             curve[best],
             curve.get(present, 0.0),
             _problem(curve[best], list(curve.values()), abs(best - present) > largest - 1.5 * _GRID, deviation, others),
@@ -233,7 +233,7 @@ class _Delays:
         missing."""
         places, motion = self._motion(offset)
         there = np.asarray(np.isfinite(motion).all(1))
-        if there.mean() < _FEWEST_KNOWN:
+        if there.mean() < _MIN_KNOWN_FRACTION:
             return None
         if self._bases is None:
             # The normalization is the same for all offsets, so that they are comparable.
@@ -312,13 +312,13 @@ def _fitted(XX: np.ndarray, XY: np.ndarray) -> np.ndarray:
 def _problem(
     explained: float, curve: list[float], at_end: bool, deviation: float, others: tuple[float, ...]
 ) -> str | None:
-    if explained < _FEWEST_EXPLAINED or explained - float(np.median(curve)) < _FEWEST_GAIN:
+    if explained < _MIN_EXPLAINED or explained - float(np.median(curve)) < _MIN_GAIN:
         return "the motion of the arms does not explain the motion in the images. Check columns, signs and units."
     if at_end:
         return "the best delay is at the end of the search range. Give a larger range, or check the clocks."
     if others:
         listed = ", ".join(f"{offset:.2f} s" for offset in others[:3])
         return f"other delays explain as much ({listed}), as for periodic motion. Use a part with other motion."
-    if deviation > _MOST_DEVIATION:
+    if deviation > _MAX_DEVIATION:
         return f"the delays of parts of the recording differ (± {deviation:.2f} s). Check the clocks."
     return None

@@ -9,7 +9,7 @@ from ..files import allowed_names, name_fault
 from ..files.reading import SEQUENCE, all_finite, check_path, parse_toml, read_text
 from ..wording import closest, listed, shown
 
-_MOST_COMPARED = 200
+_MAX_COMPARED = 200
 """Maximum number of keys that are compared for misspellings."""
 _REQUIRED: Any = object()
 _KINDS = {str: "text", bool: "true or false", dict: "a table", list: "a list", float: "a number", int: "a whole number"}
@@ -62,7 +62,7 @@ class TomlTable:
         self._known.append(key)
         if key not in self._values:
             if default is _REQUIRED:
-                given = [name for name in self._values if name not in self._known][:_MOST_COMPARED]
+                given = [name for name in self._values if name not in self._known][:_MAX_COMPARED]
                 matches = difflib.get_close_matches(key, given, n=1, cutoff=0.5)
                 typo = f" Is {matches[0]!r} a misspelling of it?" if matches else ""
                 raise self.error(key, f"is missing. Add it (docs/reference/sequence_format.md).{typo}")

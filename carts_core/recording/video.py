@@ -27,7 +27,7 @@ from av.video.stream import VideoStream
 from jaxtyping import Float, UInt8
 
 from ..errors import SequenceError
-from ..files.reading import LARGEST_IMAGE, MIB, VIDEO, check_regular, is_regular, open_regular, pixels_problem
+from ..files.reading import MAX_IMAGE_PIXELS, MIB, VIDEO, check_regular, is_regular, open_regular, pixels_problem
 from ..wording import counted
 from .images import ByteCache
 
@@ -104,7 +104,7 @@ def open_video(path: Path, *, parsed: bool = True) -> tuple[InputContainer, Vide
         container.close()
         raise SequenceError(f"video {path} {problem}. {_remedy(path)}")
     # The size can change within a stream.
-    stream.codec_context.options = {"max_pixels": str(LARGEST_IMAGE)}
+    stream.codec_context.options = {"max_pixels": str(MAX_IMAGE_PIXELS)}
     stream.thread_type = "AUTO"
     return container, stream
 

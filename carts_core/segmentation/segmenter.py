@@ -13,7 +13,7 @@ from ..errors import SettingsError
 from ..model.parts import COVERAGE, SURFACE_CHANNELS
 from ..networks import FeatureExtractor
 
-MOST_POINTS = 100
+MAX_POINTS = 100
 """Maximum number of points in a prompt."""
 
 
@@ -36,8 +36,8 @@ class Prompt:
     def __post_init__(self) -> None:
         if not self.inside and self.box is None:
             raise SettingsError("a prompt needs a point on the object, or a box around it.")
-        if len(self.inside) + len(self.outside) > MOST_POINTS:
-            raise SettingsError(f"a prompt may have at most {MOST_POINTS} points. Start another prompt.")
+        if len(self.inside) + len(self.outside) > MAX_POINTS:
+            raise SettingsError(f"a prompt may have at most {MAX_POINTS} points. Start another prompt.")
         numbers = [value for place in (*self.inside, *self.outside, self.box or ()) for value in place]
         if not np.isfinite(numbers).all():
             raise SettingsError("a position of a prompt is not finite.")
@@ -59,7 +59,7 @@ class Segmenter(Protocol):
         ...
 
 
-_LONGEST_SIDE = 640
+_MAX_SIDE = 640
 """Longer side of the image in which outlines are refined [px]."""
 _ROUNDS = 3
 _BAND, _WIDE = 0.005, 0.2
@@ -95,7 +95,7 @@ class NetworkSegmenter:
     def segment(self, image: UInt8[np.ndarray, "height width 3"], prompt: Prompt) -> Bool[np.ndarray, "height width"]:
         """Mask of the object; see `Segmenter`."""
         height, width = image.shape[:2]
-        scale = min(1.0, _LONGEST_SIDE / max(height, width))
+        scale = min(1.0, _MAX_SIDE / max(height, width))
         size = round(width * scale), round(height * scale)
         small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
         likely = cv2.resize(self._likely(image), size, interpolation=cv2.INTER_LINEAR) > 0.5

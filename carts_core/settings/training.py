@@ -39,7 +39,7 @@ class SurfaceWeights(Ranged):
     """Smooth L1 of normals near instruments."""
 
 
-_MOST_LEVELS, _MOST_CHANNELS, _MOST_CONVOLUTIONS = 8, 1024, 16
+_MAX_LEVELS, _MAX_CHANNELS, _MAX_CONVOLUTIONS = 8, 1024, 16
 
 
 @dataclass(frozen=True)
@@ -61,14 +61,14 @@ class Architecture:
 
     def __post_init__(self) -> None:
         levels = len(self.widths)
-        if not 2 <= levels <= _MOST_LEVELS or any(not 1 <= width <= _MOST_CHANNELS for width in self.widths):
+        if not 2 <= levels <= _MAX_LEVELS or any(not 1 <= width <= _MAX_CHANNELS for width in self.widths):
             raise SettingsError(
-                f"widths are {self.widths}; give 2 to {_MOST_LEVELS} channel counts of 1 to {_MOST_CHANNELS}."
+                f"widths are {self.widths}; give 2 to {_MAX_LEVELS} channel counts of 1 to {_MAX_CHANNELS}."
             )
         for name, count in (("encoder_convolutions", levels), ("decoder_convolutions", levels - 1)):
             values = getattr(self, name)
-            if len(values) != count or any(not 1 <= n <= _MOST_CONVOLUTIONS for n in values):
-                raise SettingsError(f"{name} are {values}; give {count} counts of 1 to {_MOST_CONVOLUTIONS}.")
+            if len(values) != count or any(not 1 <= n <= _MAX_CONVOLUTIONS for n in values):
+                raise SettingsError(f"{name} are {values}; give {count} counts of 1 to {_MAX_CONVOLUTIONS}.")
         if not 0 <= self.local_contrast <= float(self.local_mean):
             raise SettingsError(
                 f"local_contrast is {self.local_contrast}; give 0 to 1, or 0 without local_mean; given: local_mean "
@@ -122,14 +122,14 @@ class SurfaceArchitecture:
     def __post_init__(self) -> None:
         widths = (*self.decoder, *self.conditioning)
         if (len(self.decoder), len(self.convolutions), len(self.conditioning)) != (4, 4, 3) or any(
-            not 1 <= width <= _MOST_CHANNELS for width in widths
+            not 1 <= width <= _MAX_CHANNELS for width in widths
         ):
             raise SettingsError(
                 f"decoder is {self.decoder} and conditioning {self.conditioning}; give four and three channel counts "
-                f"of 1 to {_MOST_CHANNELS}."
+                f"of 1 to {_MAX_CHANNELS}."
             )
-        if any(not 1 <= count <= _MOST_CONVOLUTIONS for count in self.convolutions):
-            raise SettingsError(f"convolutions are {self.convolutions}; give four counts of 1 to {_MOST_CONVOLUTIONS}.")
+        if any(not 1 <= count <= _MAX_CONVOLUTIONS for count in self.convolutions):
+            raise SettingsError(f"convolutions are {self.convolutions}; give four counts of 1 to {_MAX_CONVOLUTIONS}.")
 
     def to_json(self) -> str:
         """Encode as one line of JSON; the inverse of `from_json`."""

@@ -239,8 +239,8 @@ class LiveHandler(Handler):
     def _show_result(self, run: LiveRun, tracked: Tracked) -> None:
         context, estimate, live = self._context, tracked.estimate, self._context.state.live
         assert live is not None
-        mounts = mounts_of(self._session.scene, tracked.moment.frame, tracked.moment.camera_poses)
-        frame = replace(tracked.moment.frame, mounts=mounts)
+        mounts = mounts_of(self._session.scene, tracked.stream_frame.frame, tracked.stream_frame.camera_poses)
+        frame = replace(tracked.stream_frame.frame, mounts=mounts)
         measured = self._session.measured(frame)
         scene = self._session.with_joints(measured, dict(estimate.joint_positions))
         camera = context.state.camera if context.state.camera in frame.images else next(iter(frame.images))

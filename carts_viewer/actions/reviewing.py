@@ -12,7 +12,7 @@ from carts_core.model.keypoints import project_keypoints
 from carts_core.model.scene import SceneState
 from carts_core.optimization.keypoints import Pin, fit_keypoints
 from carts_core.project import Change, Key, Review, ReviewState, Source, next_unreviewed, worst_first
-from carts_core.project.values import LONGEST_NOTE
+from carts_core.project.values import MAX_NOTE_LENGTH
 from carts_viewer.actions import intents
 from carts_viewer.actions.context import Context, Handler, clamped
 from carts_viewer.actions.frame_filter import FrameFilter, matching_frames
@@ -80,7 +80,7 @@ class AnnotatingHandler(Handler):
 
     def _on_SetNote(self, intent: intents.SetNote) -> None:
         state = self._context.state
-        review = Review(state.review.state, str(intent.note)[:LONGEST_NOTE])
+        review = Review(state.review.state, str(intent.note)[:MAX_NOTE_LENGTH])
         self._mark("Note", review, gesture=(intents.SetNote, state.index))
 
     def _on_AcceptAndNext(self, intent: intents.AcceptAndNext) -> None:

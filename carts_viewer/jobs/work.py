@@ -29,7 +29,7 @@ from carts_core.project import (
     Source,
 )
 from carts_core.project.values import WHOLE_PROJECT
-from carts_core.recording import spread
+from carts_core.recording import evenly_spaced
 from carts_core.settings import CALIBRATION_SETTINGS
 from carts_core.stopping import PARENT
 from carts_viewer.actions.context import Context
@@ -95,7 +95,7 @@ def calibrate(context: Context, optimizers: OptimizerFactory, count: int) -> Gen
     session, state = context.session, context.state
     sequence = session.sequence
     cameras = [camera.name for camera in session.scene.cameras]
-    indices = spread(len(sequence), min(count, len(sequence)))
+    indices = evenly_spaced(len(sequence), min(count, len(sequence)))
     free = replace(
         state.free, base_frames=state.free.base_frames or not (state.free.extrinsics or state.free.intrinsics)
     )

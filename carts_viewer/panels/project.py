@@ -3,7 +3,7 @@
 import viser
 
 from carts_viewer.actions import intents
-from carts_viewer.editing import LONGEST_NAME
+from carts_viewer.editing import MAX_NAME_LENGTH
 from carts_viewer.panels.inputs import PanelPage, write
 from carts_viewer.panels.jobs import jobs_question, network_question
 from carts_viewer.session import Storage
@@ -87,7 +87,7 @@ class PeoplePanel:
             self._name = gui.add_text(
                 "Your name",
                 state.name,
-                hint=f"Shown before your steps in the history; up to {LONGEST_NAME} characters",
+                hint=f"Shown before your steps in the history; up to {MAX_NAME_LENGTH} characters",
             )
             page.columns([self._name], 1, narrow_labels=True)
             self._others = gui.add_html("")

@@ -40,7 +40,8 @@ class Site:
         shown: the shown page; None while a sequence is open.
         app: the viewer of the open sequence, if there is one.
         url: address of the page.
-        incident: message that names the file with the corrections of a closed sequence, if it is not its project.
+        storage_failure: message that names the file with the corrections of a closed sequence, if it is not its
+            project.
     """
 
     def __init__(
@@ -68,7 +69,7 @@ class Site:
         self._report, self._options = report, options
         self.url = self.page.url
         self.app: ViewerApp | None = None
-        self.incident: str | None = None
+        self.storage_failure: str | None = None
         self.shown: SitePage | None = None
         self._listening = False
         self._jobs: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
@@ -202,7 +203,7 @@ class Site:
             try:
                 app.close()
             finally:
-                self.incident = app.project.incident or self.incident
+                self.storage_failure = app.project.storage_failure or self.storage_failure
                 # Unfinished edits are saved by now.
                 with suppress(CartsError):
                     remember(app)

@@ -25,7 +25,7 @@ from carts_core.optimization.hand_eye import (
     PoseDeviation,
     agreement_with_points,
 )
-from carts_core.recording import Sequence, spread
+from carts_core.recording import Sequence, evenly_spaced
 from carts_core.recording.importing.found import FoundRecording, Note
 from carts_core.settings import CALIBRATION
 from carts_core.wording import counted
@@ -103,7 +103,7 @@ class CalibrationJob:
         extractor = self._load_networks()
         self._report(CalibrationProgress("Reading images", 0.0))
         frames = []
-        for index in spread(len(self._sequence), CALIBRATION_FRAMES):
+        for index in evenly_spaced(len(self._sequence), CALIBRATION_FRAMES):
             if self.cancelled:
                 return STOPPED
             frames.append(self._sequence.frame(index))

@@ -10,7 +10,7 @@ from dvrk_tree import XACRO, write_model
 
 from carts_core import package_imports as extras
 from carts_core.cli.command_line import BAD_INPUT, main
-from carts_core.decoders.meshes import MOST_FACES
+from carts_core.decoders.meshes import MAX_FACES
 from carts_core.errors import CartsError, RobotError
 from carts_core.model.dvrk_model import dvrk_urdf, list_instruments
 from carts_core.model.psm_kinematics import CLASSIC, JOINT_NAMES, SI, forward
@@ -130,7 +130,7 @@ def test_a_missing_extra_is_said_with_the_command_that_installs_it(monkeypatch):
 def test_the_real_trees_instruments_have_the_controllers_kinematics(shared_dir, tmp_path, number):
     path = tmp_path / "psm.urdf"
     path.write_text(dvrk_urdf(shared_dir / "robots/dvrk_model", number, tmp_path))
-    robot = Robot.load(path, max_faces=MOST_FACES)
+    robot = Robot.load(path, max_faces=MAX_FACES)
     geometry = replace(CLASSIC if number < "42" else SI, wrist_length=0.0091 if number[3:] == "006" else 0.0107)
     limits = np.array(geometry.limits)
     joints = limits[:, 0] + np.random.default_rng(0).random((50, 6)) * (limits[:, 1] - limits[:, 0])

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from carts_core.cli.command_line import main
-from carts_core.decoders.meshes import MOST_FACES
+from carts_core.decoders.meshes import MAX_FACES
 from carts_core.errors import RobotError, SequenceError
 from carts_core.model.dvrk_model import dvrk_urdf
 from carts_core.model.instruments import INSTRUMENTS, Instrument, builtin_urdf
@@ -151,7 +151,7 @@ def test_silhouettes_are_like_those_of_the_real_meshes(name: str, number: str, t
     urdf = tmp_path / "real.urdf"
     urdf.write_text(dvrk_urdf(DVRK_MODEL, number, tmp_path))
     # Decimating a real one would take a minute.
-    ours, real = loaded(name), Robot.load(urdf, max_faces=MOST_FACES)
+    ours, real = loaded(name), Robot.load(urdf, max_faces=MAX_FACES)
     rng = np.random.default_rng(1)
     overlaps = []
     for _ in range(8):

@@ -9,7 +9,7 @@ import torch
 import trimesh
 import yourdfpy
 
-from carts_core.decoders.meshes import MOST_FACES
+from carts_core.decoders.meshes import MAX_FACES
 from carts_core.errors import RobotError
 from carts_core.model.decimation import deviation
 from carts_core.model.psm_kinematics import JOINT_NAMES
@@ -80,7 +80,7 @@ SURROL += tuple(f"psm_tool_{name}_joint" for name in ("roll", "pitch", "yaw"))
 def test_forward_kinematics_of_other_models_is_the_dh_formula(
     shared_dir: Path, name: str, base_link: str, joints: tuple[str, ...], tip_link: str
 ) -> None:
-    robot = Robot.load(shared_dir / f"robots/{name}/psm.urdf", base_link=base_link, max_faces=MOST_FACES)
+    robot = Robot.load(shared_dir / f"robots/{name}/psm.urdf", base_link=base_link, max_faces=MAX_FACES)
     assert largest_error(robot, joints, tip_link, torch.float32) < 1e-6
 
 

@@ -9,7 +9,7 @@ import trimesh
 import yourdfpy
 from scipy.spatial import KDTree
 
-from carts_core.decoders.meshes import MOST_FACES
+from carts_core.decoders.meshes import MAX_FACES
 from carts_core.model.robot import Robot
 from carts_core.rendering import visibility
 from carts_core.resources import shipped_robot
@@ -99,7 +99,7 @@ def _view(robot: Robot, q: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 
 def test_silhouette_is_that_of_an_independent_model(shared_dir: Path) -> None:
     ours = Robot.load(shipped_robot())
-    other = Robot.load(shared_dir / "robots/psm_classic_lnd/psm.urdf", base_link="PSM1_base_link", max_faces=MOST_FACES)
+    other = Robot.load(shared_dir / "robots/psm_classic_lnd/psm.urdf", base_link="PSM1_base_link", max_faces=MAX_FACES)
     assert other.joint_names == JOINTS
     rng, dice = np.random.default_rng(1), []
     for q in _random_positions(20, seed=1):

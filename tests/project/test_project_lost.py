@@ -53,8 +53,8 @@ def _lose(folder: Path, way: str, suffix: str, seed: int) -> None:
         after += happened.is_set()
     timer.join()
     project.check()
-    assert project.incident is not None and way, f"{way} {suffix} was not noticed"
-    assert project.path != path and "rescued" in project.path.name and str(project.path) in project.incident
+    assert project.storage_failure is not None and way, f"{way} {suffix} was not noticed"
+    assert project.path != path and "rescued" in project.path.name and str(project.path) in project.storage_failure
     # As after a kill: what was acknowledged must be in the file by now.
     copy = folder / "copy"
     copy.mkdir()
@@ -92,12 +92,12 @@ def test_nothing_acknowledged_is_lost_in_112_losses(tmp_path: Path) -> None:
 def test_a_loss_is_noticed_and_rescued_without_an_edit(project: Project, project_path: Path) -> None:
     project.apply("Note", {Key.review(0): Review(note="a")})
     project.check()
-    assert project.incident is None
+    assert project.storage_failure is None
     project_path.unlink()
     project.check()
-    assert "was deleted while it was open" in (project.incident or "")
+    assert "was deleted while it was open" in (project.storage_failure or "")
     project.close()
-    assert "was deleted while it was open" in (project.incident or "")
+    assert "was deleted while it was open" in (project.storage_failure or "")
     with Project(IDENTITY, project.path, read_only=True) as again:
         assert again.state.review(0).note == "a"
 
@@ -127,7 +127,7 @@ def test_touching_a_project_is_no_loss(project: Project, project_path: Path) -> 
     os.utime(project_path)
     os.utime(project_path.with_name("small.carts-wal"))
     project.apply("Note", {Key.review(0): Review(note="b")})
-    assert project.incident is None and project.path == project_path
+    assert project.storage_failure is None and project.path == project_path
 
 
 def test_the_log_of_a_deleted_project_is_not_replayed(project: Project, project_path: Path) -> None:

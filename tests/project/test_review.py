@@ -60,14 +60,14 @@ def test_a_check_is_no_step_and_its_verdict_comes_and_goes_with_the_pose(project
     assert project.state.verdict(0) == FAILED
     project.close()
     with Project(IDENTITY, project_path) as again:
-        assert again.writable and again.incident is None and again.state.verdict(0) == FAILED
+        assert again.writable and again.storage_failure is None and again.state.verdict(0) == FAILED
         again.go_to(0)
         assert again.state.verdict(0) == GOOD
         again.apply("Optimize", {Key.joints(0, "PSM1"): _joints(0.3), Key.verdict(0): GOOD})
         again.record_verdict(0, FAILED)
         assert again.state.verdict(0) == FAILED
     with Project(IDENTITY, project_path) as again:
-        assert again.incident is None and again.state.verdict(0) == FAILED and len(again.history()) == 1
+        assert again.storage_failure is None and again.state.verdict(0) == FAILED and len(again.history()) == 1
 
 
 @pytest.mark.parametrize(

@@ -96,7 +96,7 @@ def test_a_sequence_is_opened_left_and_remembered_with_its_picture(
         site.post(lambda: site.open_sequence(path))
         site.wait()
         assert site.app is not None and site.app.notice is None
-    assert site.incident is None
+    assert site.storage_failure is None
     path.unlink()
     assert recent_projects() == []
 

@@ -246,7 +246,7 @@ def test_a_calibration_is_stopped_at_any_moment(
         eventually(lambda: "Stopping …" in site.document.content)
         eventually(lambda: jobs and jobs[-1].cancelled)
 
-    def spread(count: int, _: int) -> Iterator[int]:
+    def evenly_spaced(count: int, _: int) -> Iterator[int]:
         yield 0
         pressed()
         yield from range(1, count)
@@ -265,7 +265,7 @@ def test_a_calibration_is_stopped_at_any_moment(
             return super().result()
 
     if moment == "images are read":
-        monkeypatch.setattr(calibration, "spread", spread)
+        monkeypatch.setattr(calibration, "evenly_spaced", evenly_spaced)
     monkeypatch.setattr(calibration, "CalibrationOptimizer", Stopped)
     site.post(lambda: place.choose(*CALIBRATE))
     assert ended(site, "Stopped; the calibration from your points is unchanged.").calibration is None

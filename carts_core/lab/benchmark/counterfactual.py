@@ -19,7 +19,7 @@ from ...model.mesh_cache import cache_dir
 from ...model.scene import Scene
 from ...recording import Frame, MeanBackground
 from ...recording import Sequence as SequenceFile
-from ...recording.background import spread
+from ...recording.background import evenly_spaced
 from ...recording.images import read_image
 from ...rendering import Renderer
 from ...rendering.rasterizer import link_transforms, visible_points
@@ -153,7 +153,7 @@ class Counterfactual(AlteredSequence):
         self._config = SynthesisConfig(seed=seed, domain=strengths or DomainConfig())
         self._surface = RealSurface(
             sequence.scene.with_cameras([camera]),
-            [sequence.frame(i, cameras=()).measured for i in spread(len(sequence))],
+            [sequence.frame(i, cameras=()).measured for i in evenly_spaced(len(sequence))],
         )
         self._conditions = Conditions(self._config, _relief(seed))
         self._clean = sequence.background(camera)
@@ -181,7 +181,7 @@ class Counterfactual(AlteredSequence):
             nothing = np.zeros(self._clean.shape[:2], bool)
             moments = [
                 self._altered(domain, self._clean, nothing, None, index).astype(np.float32)
-                for index in spread(len(self), _MOMENTS)
+                for index in evenly_spaced(len(self), _MOMENTS)
             ]
             self._backgrounds[domain] = np.rint(np.mean(moments, axis=0)).astype(np.uint8)
         return dataclasses.replace(regular, image=self._backgrounds[domain])

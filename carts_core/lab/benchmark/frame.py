@@ -31,7 +31,7 @@ from ...optimization import (
 )
 from ...optimization.observability import Uncertainty
 from ...recording import Frame
-from ...recording.background import spread
+from ...recording.background import evenly_spaced
 from ...rendering import Renderer
 from ...settings import DescentSolver
 from ...wording import counted
@@ -234,7 +234,7 @@ def calibrated_scene(recording: Recording, camera: str, frames: int, extractor: 
 
     Neither masks nor true joint positions are used.
     """
-    chosen = [recording.frame(index, cameras=[camera]) for index in spread(len(recording), frames)]
+    chosen = [recording.frame(index, cameras=[camera]) for index in evenly_spaced(len(recording), frames)]
     backgrounds = Backgrounds.of(recording, [camera], "regular")
     optimizer = CalibrationOptimizer(recording.scene, chosen, extractor, cameras=[camera], backgrounds=backgrounds)
     for _ in optimizer:

@@ -17,7 +17,7 @@ from scipy.ndimage import binary_erosion, distance_transform_edt
 
 from ...errors import SettingsError
 from ...recording import Frame, MeanBackground, Sequence, background_of_recording
-from ...recording.background import spread
+from ...recording.background import evenly_spaced
 from ...recording.images import read_image
 
 Half = Literal["tuning", "held-out"]
@@ -356,7 +356,7 @@ class AnotherRoom(AlteredSequence):
         return np.ascontiguousarray(wide[:, left : left + known.width])
 
     def _make_background(self, room: str, camera: str) -> MeanBackground:
-        indices = spread(len(self))
+        indices = evenly_spaced(len(self))
         states = [self.scene.state(self._sequence.frame(index, cameras=()).measured) for index in indices]
         return background_of_recording(
             self.scene, camera, states, lambda place: self.frame(indices[place], room, [camera]).images[camera]

@@ -12,7 +12,7 @@ from ...files import holds_file, output_path
 from ...files.reading import IMAGE, SEQUENCE, read_bytes
 from ...model.mesh_cache import cache_dir
 from ...recording import Sequence
-from ...recording.background import spread
+from ...recording.background import evenly_spaced
 from ...settings import DOMAINS, EndoscopeConfig, MotionConfig, RenderConfig, SynthesisConfig
 from ...wording import counted
 from ..synthesis.scene import place_cameras
@@ -81,7 +81,7 @@ def synthetic_source(scope: Scope, seed: int = TEST_SEED) -> Source:
         )
     frames = scope.sequence_frames
     config = _config(scope, seed, f"fresh {seed}", frames, endoscope=EndoscopeConfig(stereo=True))
-    evaluated = spread(frames, scope.frames)
+    evaluated = evenly_spaced(frames, scope.frames)
     what = f"seed {seed}: two arms, {config.endoscope.width}x{config.endoscope.height}"
     taken = f"{len(evaluated)} of {counted(frames, 'frame')} by all methods, {counted(scope.samples, 'path')} per pixel"
     return Source(
@@ -168,9 +168,9 @@ def real_source(path: Path, scope: Scope, seed: int = TEST_SEED) -> Source:
         raise SettingsError(
             f"{path} has no masks for camera {camera.name!r}, so results cannot be scored. Give `masks`."
         )
-    frames = [masked[place] for place in spread(len(masked), scope.frames)]
+    frames = [masked[place] for place in evenly_spaced(len(masked), scope.frames)]
     consecutive = masked[: scope.consecutive]
-    hashed = *frames, *consecutive, *spread(len(sequence), scope.calibration_frames)
+    hashed = *frames, *consecutive, *evenly_spaced(len(sequence), scope.calibration_frames)
     code = code_fingerprint((*_SYNTHESIS, *_ALTERING_CODE))
 
     def open_(progress: Progress) -> Counterfactual:
@@ -203,7 +203,7 @@ def _rooms(folder: Path | None, scope: Scope, *parts: object) -> "tuple[list[Roo
 def synthetic_room_source(sequence: Source, folder: Path | None, scope: Scope, seed: int = TEST_SEED) -> Source:
     """Source with the instruments of the synthetic sequence in other rooms; arguments as for `room_sources`."""
     rooms, digest = _rooms(folder, scope, sequence.fingerprint, seed)
-    frames = [sequence.frames[place] for place in spread(len(sequence.frames), scope.room_frames)]
+    frames = [sequence.frames[place] for place in evenly_spaced(len(sequence.frames), scope.room_frames)]
 
     def open_(progress: Progress) -> AnotherRoom:
         recording = sequence.open(progress)
@@ -217,7 +217,7 @@ def synthetic_room_source(sequence: Source, folder: Path | None, scope: Scope, s
         frames,
         digest.hexdigest()[:32],
         open_,
-        consecutive=[sequence.consecutive[i] for i in spread(len(sequence.consecutive), scope.room_consecutive)],
+        consecutive=[sequence.consecutive[i] for i in evenly_spaced(len(sequence.consecutive), scope.room_consecutive)],
         rooms=[room.domain for room in rooms],
     )
 
@@ -238,8 +238,8 @@ def room_sources(path: Path, folder: Path | None, scope: Scope, seed: int = TEST
     for camera in (known.name for known in sequence.scene.cameras):
         if not (masked := _masked(sequence, camera)):
             continue
-        frames = [masked[place] for place in spread(len(masked), scope.room_frames + 2)[1:-1]]
-        together = [masked[place] for place in spread(len(masked), scope.room_consecutive)]
+        frames = [masked[place] for place in evenly_spaced(len(masked), scope.room_frames + 2)[1:-1]]
+        together = [masked[place] for place in evenly_spaced(len(masked), scope.room_consecutive)]
         sources.append(
             Source(
                 f"{ROOMS} {camera}",

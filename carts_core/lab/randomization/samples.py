@@ -305,7 +305,7 @@ def _classes(variant: Variant, view: GBuffer, mask: np.ndarray | None) -> np.nda
 SURFACE_UNIT = 127
 """Scale of surface maps stored as int8 in samples."""
 
-_LARGEST_ERROR = 3.0
+_MAX_ERROR = 3.0
 """Maximum scale of the error of the prior kinematics; 1 is about 3 degrees and 3 mm."""
 
 _UNKNOWN = 0.08
@@ -345,7 +345,7 @@ class SurfaceGenerator:
         """Prior surface map from erroneous kinematics, or zeros."""
         rng = self._observer.rng
         # Small errors are frequent, so that the network learns to be accurate.
-        scale = _LARGEST_ERROR * float(rng.random()) ** 1.5
+        scale = _MAX_ERROR * float(rng.random()) ** 1.5
         given = [
             perturbed(rng, geometry, placement, scale)
             for geometry, placement in zip(seen.variant.rendered, seen.claimed, strict=True)

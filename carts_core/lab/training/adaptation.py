@@ -21,7 +21,7 @@ from ...model.robot import Robot
 from ...model.scene import Arm, Scene, SceneState
 from ...networks.extractor import FeatureExtractor
 from ...optimization import Assessment, FrameOptimizer, Verdict
-from ...recording import Frame, Sequence, spread
+from ...recording import Frame, Sequence, evenly_spaced
 from ...rendering import Renderer
 from ...resources import shipped_weights
 from ...settings import TrainingConfig
@@ -126,7 +126,7 @@ def judge(
     assert config.images.recording is not None
     networks = [FeatureExtractor.load(path) for path in (before, after)]
     images, recording = list(synthetic_images(config, made)), Sequence.open(config.images.recording)
-    chosen = spread(len(recording), min(own, len(recording)))
+    chosen = evenly_spaced(len(recording), min(own, len(recording)))
     total, done = 2 * (len(images) + len(chosen)), count()
 
     def fits(network: FeatureExtractor) -> Fits:

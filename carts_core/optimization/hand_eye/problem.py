@@ -146,7 +146,7 @@ def _line_distance(
     return away * float(intrinsics[:2].mean()) / depth
 
 
-FEWEST_POINTS = 4
+MIN_POINTS = 4
 """Minimum number of points; three points allow up to four poses."""
 _RANDOM_SUBSETS = 40
 _KEPT = 4
@@ -188,14 +188,14 @@ def _subsets(view: View) -> Iterator[Bool[np.ndarray, " points"]]:
         yield points & (np.arange(len(points)) != row)
     random = np.random.default_rng(0)
     count = int(points.sum())
-    for _ in range(_RANDOM_SUBSETS if count > FEWEST_POINTS else 0):
+    for _ in range(_RANDOM_SUBSETS if count > MIN_POINTS else 0):
         chosen = np.zeros(len(points), bool)
-        chosen[random.choice(np.flatnonzero(points), min(count, FEWEST_POINTS + 1), replace=False)] = True
+        chosen[random.choice(np.flatnonzero(points), min(count, MIN_POINTS + 1), replace=False)] = True
         yield chosen
 
 
 def _perspective(view: View, rows: np.ndarray, intrinsics: np.ndarray) -> Iterator[np.ndarray]:
-    if rows.sum() < FEWEST_POINTS:
+    if rows.sum() < MIN_POINTS:
         return
     fx, fy, cx, cy = intrinsics
     K = np.array([[fx, 0.0, cx - HALF_PIXEL], [0.0, fy, cy - HALF_PIXEL], [0.0, 0.0, 1.0]])
@@ -275,9 +275,9 @@ class HandEyeProblem:
         for view in sorted(views, key=lambda view: (view.camera in unknown, -int(view.is_point.sum()))):
             count = int(view.is_point.sum())
             known = view.arm in self._T_world_base
-            if (known and view.camera not in unknown) or count < FEWEST_POINTS:
-                if count < FEWEST_POINTS and (not known or view.camera in unknown):
-                    self.missing[view.camera, view.arm] = FEWEST_POINTS - count
+            if (known and view.camera not in unknown) or count < MIN_POINTS:
+                if count < MIN_POINTS and (not known or view.camera in unknown):
+                    self.missing[view.camera, view.arm] = MIN_POINTS - count
                 continue
             poses = poses_of(view, self._intrinsics[view.camera], self.settings.pixel_error)
             if known:
@@ -305,22 +305,24 @@ class HandEyeProblem:
         scale = self.settings.pixel_error
 
         def residuals(step: np.ndarray) -> np.ndarray:
-            return (view.distances(moved(T, step, middle), self._intrinsics[view.camera]) / scale).ravel()
+            return (view.distances(apply_step(T, step, middle), self._intrinsics[view.camera]) / scale).ravel()
 
         fit = least_squares(residuals, np.zeros(6), loss="cauchy", f_scale=2.0, x_scale="jac", max_nfev=50)
-        return float(fit.cost), moved(T, fit.x, middle)
+        return float(fit.cost), apply_step(T, fit.x, middle)
 
     def poses(self, values: np.ndarray) -> tuple[dict[int, np.ndarray], dict[int, np.ndarray], np.ndarray]:
         """T_world_base by arm, T_camera_world by camera, intrinsics."""
         steps = values[: 6 * (len(self._arms) + len(self._free))].reshape(-1, 6)
         bases = {
-            arm: moved(self._T_world_base[arm], step, self.middles[arm])
+            arm: apply_step(self._T_world_base[arm], step, self.middles[arm])
             for arm, step in zip(self._arms, steps, strict=False)
         }
         cameras = dict(self._T_camera_world)
         for camera, step in zip(self._free, steps[len(self._arms) :], strict=True):
             arm = next(view.arm for view in self.views if view.camera == camera)
-            cameras[camera] = moved(cameras[camera], step, transform_point(self._T_world_base[arm], self.middles[arm]))
+            cameras[camera] = apply_step(
+                cameras[camera], step, transform_point(self._T_world_base[arm], self.middles[arm])
+            )
         intrinsics = self._intrinsics.copy()
         for camera, change in zip(self.focal, values[6 * len(steps) :], strict=True):
             intrinsics[camera, :2] *= np.exp(change)
@@ -343,7 +345,7 @@ class HandEyeProblem:
         return np.concatenate(self.distances(values, sides)).ravel() / self.settings.pixel_error
 
 
-def moved(T: np.ndarray, step: np.ndarray, middle: np.ndarray) -> np.ndarray:
+def apply_step(T: np.ndarray, step: np.ndarray, middle: np.ndarray) -> np.ndarray:
     """Rotate T about the transformed point `middle` by step[:3] [rad], and translate it by step[3:] [m]."""
     turn = Rotation.from_rotvec(step[:3]).as_matrix()
     place = transform_point(T, middle)
@@ -363,6 +365,6 @@ def _anchor(views: list[View], free: set[int]) -> int:
     camera has enough points."""
     points: dict[int, int] = {}
     for view in views:
-        if (count := int(view.is_point.sum())) >= FEWEST_POINTS:
+        if (count := int(view.is_point.sum())) >= MIN_POINTS:
             points[view.camera] = points.get(view.camera, 0) + count
     return max(points, key=lambda camera: (camera not in free, points[camera], -camera), default=-1)

@@ -252,7 +252,7 @@ def _sides(problem: HandEyeProblem) -> Iterator[tuple[int, ...]]:
 
 _LEVEL = 0.01
 """Significance level for disagreement of points with a calibration, individually or jointly [1]."""
-_MOST_DISAGREEING = 0.25
+_MAX_DISAGREEING_FRACTION = 0.25
 """Share of points that may disagree individually [1]; joint positions of real recordings are less accurate in some
 frames."""
 
@@ -281,7 +281,7 @@ class PointAgreement:
     @property
     def agrees(self) -> bool:
         """Whether the points agree with the calibration, most of them individually and all of them jointly."""
-        most = _MOST_DISAGREEING * np.isfinite(self.limits).sum()
+        most = _MAX_DISAGREEING_FRACTION * np.isfinite(self.limits).sum()
         return bool(len(self.disagreeing) <= most and self.rms_after <= max(self.rms_limit, self.rms_before))
 
 

@@ -19,13 +19,13 @@ from ...wording import shown
 from ..images import read_labels
 from ..importing.found import MALFORMED, cause, well_formed
 
-MOST_LABELS = 255
+MAX_LABELS = 255
 """Maximum number of labels of a layer, limited by its 8-bit pixels."""
-MOST_IMAGES = 100_000
+MAX_IMAGES = 100_000
 """Maximum number of images of a source."""
-MOST_SHAPES = 5_000
+MAX_SHAPES = 5_000
 """Maximum number of shapes of an image, and of polygons of an annotation."""
-MOST_KEYPOINTS = 200
+MAX_KEYPOINTS = 200
 """Maximum number of keypoints of an image."""
 
 
@@ -124,9 +124,9 @@ def mask_of_polygon(
     return np.cumsum(flips, axis=1)[:, :width] % 2 == 1
 
 
-_LARGEST_SIDE = 16384
+_MAX_SIDE = 16384
 """Maximum width or height of an image [px]."""
-_FEWEST_CORNERS = 3
+_MIN_CORNERS = 3
 
 
 _Part = tuple[str, Bool[np.ndarray, "height width"]]
@@ -151,20 +151,20 @@ def read_coco(path: Path, remarks: Counter[str]) -> Iterator[ForeignImage]:
 
 def _few_enough(images: Iterable[Any]) -> list[Any]:
     images = list(images)
-    if len(images) > MOST_IMAGES:
-        raise ValueError(f"it has {len(images)} images; {MOST_IMAGES} are allowed")
+    if len(images) > MAX_IMAGES:
+        raise ValueError(f"it has {len(images)} images; {MAX_IMAGES} are allowed")
     return images
 
 
 def _check_shapes(count: int) -> None:
-    if count > MOST_SHAPES:
-        raise ValueError(f"it has {count} shapes; {MOST_SHAPES} are allowed")
+    if count > MAX_SHAPES:
+        raise ValueError(f"it has {count} shapes; {MAX_SHAPES} are allowed")
 
 
 def _size(image: Any) -> tuple[int, int]:
     """Height and width of an image [px]."""
     size = int(image["height"]), int(image["width"])
-    if not all(0 < side <= _LARGEST_SIDE for side in size):
+    if not all(0 < side <= _MAX_SIDE for side in size):
         raise ValueError(f"its size is {size[1]} x {size[0]}")
     return size
 
@@ -188,8 +188,8 @@ def _coco_image(
             usable.append(annotation)
         except MALFORMED as error:
             remarks[f"{_annotation(annotation)} left out: {name}: {cause(error)}"] += 1
-    if len(points) > MOST_KEYPOINTS:
-        raise SequenceError(f"{where} has {len(points)} keypoints; {MOST_KEYPOINTS} are allowed. Export fewer.")
+    if len(points) > MAX_KEYPOINTS:
+        raise SequenceError(f"{where} has {len(points)} keypoints; {MAX_KEYPOINTS} are allowed. Export fewer.")
 
     def parts() -> Iterator[_Part]:
         for annotation in usable:
@@ -225,10 +225,10 @@ def _coco_mask(segmentation: Any, height: int, width: int) -> Bool[np.ndarray, "
     _check_shapes(len(polygons))
     mask = np.zeros((height, width), bool)
     for polygon in polygons:
-        if len(polygon) % 2 or len(polygon) < 2 * _FEWEST_CORNERS:
+        if len(polygon) % 2 or len(polygon) < 2 * _MIN_CORNERS:
             raise ValueError(f"a polygon has {len(polygon)} numbers, which are not x and y of three or more corners")
         points = np.asarray(polygon, np.float64).reshape(-1, 2)
-        if not np.isfinite(points).all() or np.abs(points).max() > 2 * _LARGEST_SIDE:
+        if not np.isfinite(points).all() or np.abs(points).max() > 2 * _MAX_SIDE:
             raise ValueError("a corner of a polygon is not finite or far outside the image")
         mask |= mask_of_polygon(points, height, width)
     return mask
@@ -268,8 +268,8 @@ def _cvat_image(path: Path, image: Element, remarks: Counter[str]) -> ForeignIma
     with well_formed(f"{path}: image {name!r} cannot be read", _EXPORT):
         size, points = _size(image.attrib), dict(_cvat_keypoints(image))
         _check_shapes(len(image))
-        if len(points) > MOST_KEYPOINTS:
-            raise ValueError(f"it has {len(points)} keypoints; {MOST_KEYPOINTS} are allowed")
+        if len(points) > MAX_KEYPOINTS:
+            raise ValueError(f"it has {len(points)} keypoints; {MAX_KEYPOINTS} are allowed")
 
     def parts() -> Iterator[_Part]:
         shapes = [shape for shape in image if shape.tag in ("mask", "polygon")]
@@ -300,7 +300,7 @@ def _cvat_mask(shape: Element, height: int, width: int) -> Bool[np.ndarray, "hei
 def _cvat_points(shape: Element) -> np.ndarray:
     rows = [corner.split(",") for corner in shape.get("points", "").split(";")]
     points = np.array([[float(x), float(y)] for x, y in rows])
-    if not np.isfinite(points).all() or np.abs(points).max() > 2 * _LARGEST_SIDE:
+    if not np.isfinite(points).all() or np.abs(points).max() > 2 * _MAX_SIDE:
         raise ValueError("a point is not finite or far outside the image")
     return points
 
@@ -320,7 +320,7 @@ def read_surgpose(path: Path, remarks: Counter[str]) -> Iterator[ForeignImage]:
     del remarks
     with well_formed(f"{path} has no keypoints in the format of SurgPose", "Expected: {frame: {1: [x, y], ...}}."):
         content = parse_yaml(read_text(path, VALUES))
-        if not isinstance(content, dict) or len(content) > MOST_IMAGES:
+        if not isinstance(content, dict) or len(content) > MAX_IMAGES:
             raise ValueError("it has no frames, or too many")
         frames = {int(frame): dict(points or {}) for frame, points in content.items()}
         found = [(frame, _surgpose_points(points)) for frame, points in sorted(frames.items())]
@@ -329,8 +329,8 @@ def read_surgpose(path: Path, remarks: Counter[str]) -> Iterator[ForeignImage]:
 
 
 def _surgpose_points(points: dict) -> dict[str, tuple[float, float]]:
-    if len(points) > MOST_KEYPOINTS:
-        raise ValueError(f"a frame has {len(points)} keypoints; {MOST_KEYPOINTS} are allowed")
+    if len(points) > MAX_KEYPOINTS:
+        raise ValueError(f"a frame has {len(points)} keypoints; {MAX_KEYPOINTS} are allowed")
     found = {}
     for name, place in points.items():
         if place is not None:
@@ -349,7 +349,7 @@ _DEEPEST = 4
 _MEANINGS = ("labels.json", "mappings.json", "mapping.json", "instrument_type_mapping.json")
 _TOOL = "_labels"
 _INSTRUMENT = "instrument"
-_MOST_UNNAMED = 32
+_MAX_UNNAMED = 32
 """Maximum number of unnamed values in an image; more are artefacts of interpolation."""
 _BACKGROUND = ("background", "background-tissue")
 _SCENE_PARTS = ("instrument", "clasper", "wrist", "shaft")
@@ -389,8 +389,8 @@ def _files(folder: Path) -> list[Path]:
             folders.clear()
         chosen = [name for name in names if name.lower().endswith((*_SUFFIXES, *_OTHER_SUFFIXES))]
         found += [Path(place) / name for name in chosen if not name.startswith(".")]
-        if len(found) > MOST_IMAGES:
-            raise SequenceError(f"{folder} has more than {MOST_IMAGES} masks. Name a folder with fewer.")
+        if len(found) > MAX_IMAGES:
+            raise SequenceError(f"{folder} has more than {MAX_IMAGES} masks. Name a folder with fewer.")
     # Sorted by frame: each tool has its own sibling folder.
     files = [file for file in found if is_regular(file)]
     return sorted(files, key=lambda file: (file.stem, file.parent.parent.as_posix(), file.as_posix()))
@@ -445,7 +445,7 @@ def _by_colour(image: np.ndarray, meaning: list[Any], file: Path) -> Iterator[_P
 def _by_value(image: np.ndarray, names: Mapping[int, str], tool: str, file: Path) -> Iterator[_Part]:
     values = [int(value) for value in np.unique(image) if value]
     unknown = [value for value in values if value not in names]
-    if len(unknown) > _MOST_UNNAMED:
+    if len(unknown) > _MAX_UNNAMED:
         raise SequenceError(
             f"{file} has {len(unknown)} values without a name, {values[0]} to {values[-1]}, as after resizing with "
             "interpolation. Resize labels by nearest neighbour, or name each value in labels.json."

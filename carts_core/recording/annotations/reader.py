@@ -14,7 +14,7 @@ from ...model.camera import HALF_PIXEL, Camera
 from ..importing.cameras import side_of
 from ..sequence import Sequence
 from .formats import (
-    MOST_LABELS,
+    MAX_LABELS,
     Annotations,
     ForeignImage,
     FrameAnnotation,
@@ -157,8 +157,8 @@ class _FrameReader:
                     )
                 labels = np.zeros(mask.shape, np.uint8) if labels is None else labels
                 if label and label not in self._labels:
-                    if len(self._labels) == MOST_LABELS:
-                        raise SequenceError(f"there are more than {MOST_LABELS} labels, such as {label!r}. Merge some.")
+                    if len(self._labels) == MAX_LABELS:
+                        raise SequenceError(f"there are more than {MAX_LABELS} labels, such as {label!r}. Merge some.")
                     self._labels.append(label)
                 if label:
                     labels[mask] = self._labels.index(label) + 1

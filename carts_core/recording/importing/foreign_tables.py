@@ -16,10 +16,10 @@ from ...package_imports import require_package
 from ...wording import shown
 from .found import PartError, well_formed
 
-_LONGEST_UNIT = 12
+_MAX_UNIT_LENGTH = 12
 """Maximum length of a unit [characters]."""
 _DATE = re.compile(r"\d{4}-\d\d-\d\d[T ]\d\d:\d\d:\d\d([.,]\d+)?(Z|[+-]\d\d:?\d\d)?")
-_LONGEST_NUMBER = 100
+_MAX_NUMBER_LENGTH = 100
 """Maximum length of a numeric cell [characters]; string arrays allocate the maximum length for each cell."""
 TABLE_SUFFIXES = (".csv", ".txt", ".tsv", ".parquet", ".npy", ".npz")
 
@@ -161,7 +161,7 @@ def _is_row_of_units(row: list[str], after: list[str], commas: bool) -> bool:
     return (
         len(numeric) >= 0.5 * len(after)
         and all(not _is_number(row[index], commas) for index in numeric if row[index])
-        and all(len(cell) <= _LONGEST_UNIT for cell in row)
+        and all(len(cell) <= _MAX_UNIT_LENGTH for cell in row)
         and any(row[index] for index in numeric)
     )
 
@@ -169,7 +169,7 @@ def _is_row_of_units(row: list[str], after: list[str], commas: bool) -> bool:
 def _typed(cells: list[str], commas: bool = False) -> np.ndarray:
     if not cells:
         return np.empty(0)
-    if max(map(len, cells)) > _LONGEST_NUMBER:
+    if max(map(len, cells)) > _MAX_NUMBER_LENGTH:
         return np.array(cells, object)
     for kind in (np.int64, np.float64):
         try:

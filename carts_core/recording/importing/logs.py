@@ -44,7 +44,7 @@ ACCEPTED = 2e-5
 """Maximum median deviation of the base frame for the correct instrument [m]."""
 _AMBIGUOUS = 2.0
 """Minimum ratio between the deviations of the second best and the best lengths."""
-_FEWEST_ROWS = 20
+_MIN_ROWS = 20
 
 WRIST_LENGTHS = (0.0091, 0.0093, 0.0100, 0.0107, 0.0112)
 """Wrist lengths of wristed 8 mm instruments, from wrist pitch to wrist yaw [m]."""
@@ -161,9 +161,9 @@ def check_instrument(
         joints: joint positions at the same times [rad, m]; at least 20 rows must have joints and a pose.
     """
     rows = int((np.isfinite(joints).all(1) & np.isfinite(Ts_reference_tip).all((1, 2))).sum())
-    if rows < _FEWEST_ROWS:
+    if rows < _MIN_ROWS:
         raise CartsError(
-            f"{counted(rows, 'row')} with both joints and a pose; at least {_FEWEST_ROWS} are needed. Record longer."
+            f"{counted(rows, 'row')} with both joints and a pose; at least {_MIN_ROWS} are needed. Record longer."
         )
     fits = {name: fit_base_frame(Ts_reference_tip, joints, geometry) for name, geometry in candidates.items()}
     return InstrumentCheck(dict(sorted(fits.items(), key=lambda item: item[1].deviation)))
@@ -172,7 +172,7 @@ def check_instrument(
 _SAME_BASE = 1e-3
 """Distance from the identity [m], [rad] below which a base frame is considered not set in the dVRK."""
 _CHECKED_ROWS = 5000
-_FEWEST_REACHABLE = 0.5
+_MIN_REACHABLE_FRACTION = 0.5
 _ACCURACY = "; the error of set-up joints is about 5 cm unless they are registered."
 _SAME_POINT = 1e-4
 """Distance from the tip below which a point is considered the tip [m]."""
@@ -273,7 +273,7 @@ def _checked_rows(log: ArmLog) -> tuple[np.ndarray, np.ndarray] | None:
     measured = _joints_at(poses, log.joints)
     rows = np.flatnonzero(np.isfinite(measured).all(1))
     rows = rows[np.linspace(0, len(rows) - 1, min(len(rows), _CHECKED_ROWS)).astype(int)] if len(rows) else rows
-    return None if len(rows) < _FEWEST_ROWS else (transforms(poses.values[rows]), measured[rows])
+    return None if len(rows) < _MIN_ROWS else (transforms(poses.values[rows]), measured[rows])
 
 
 def _joints_at(poses: Track, joints: Track) -> Float[np.ndarray, "rows 6"]:
@@ -405,7 +405,7 @@ def _joints_from_poses(log: ArmLog, T_camera_base: np.ndarray | None, geometry: 
     reached = found.reachable
     for entry in found.unreachable:
         job.warning(f"unreachable poses, left out: {entry}.", log.name)
-    if reached.mean() < _FEWEST_REACHABLE:
+    if reached.mean() < _MIN_REACHABLE_FRACTION:
         raise PartError(
             "recording",
             f"{log.name}: {int((~reached).sum())} of {counted(len(Ts), 'pose')} are unreachable "
