@@ -1,4 +1,4 @@
-"""Dispatches intents to handlers and advances long work: a controller per tab, one background for all tabs.
+"""Dispatches intents to handlers and advances long work: a controller per tab, one job runner for all tabs.
 
 Used on the worker's thread only; does not depend on widgets.
 """
@@ -10,7 +10,7 @@ from carts_core.errors import CartsError
 from carts_viewer.actions import intents
 from carts_viewer.actions.browsing import BrowsingHandler
 from carts_viewer.actions.context import Context, Handler
-from carts_viewer.actions.exchange import Deliver, ExportingHandler, ImportingHandler, shown_mask
+from carts_viewer.actions.import_export import Deliver, ExportingHandler, ImportingHandler, shown_mask
 from carts_viewer.actions.jobs import JobRequester, JobsHandler
 from carts_viewer.actions.live import LiveHandler
 from carts_viewer.actions.optimizing import OptimizingHandler
@@ -25,7 +25,7 @@ from carts_viewer.session import Session
 from carts_viewer.state import ViewState
 
 
-class Background:
+class JobRunner:
     """Works on jobs step by step, independent of the tabs that requested them."""
 
     def __init__(
@@ -43,11 +43,11 @@ class Background:
 
     @property
     def state(self) -> ViewState:
-        """State of the background; tabs share the fields in `_COMMON`."""
+        """State of the jobs; tabs share the fields in `_COMMON`."""
         return self._context.state
 
     def takes(self, intent: intents.Intent) -> bool:
-        """Whether the background handles an intent."""
+        """Whether the job runner handles an intent."""
         return any(handler.takes(intent) for handler in (self._jobs, self._propagating, self._exporting))
 
     def handle(self, intent: intents.Intent, person: Person, state: ViewState) -> None:
@@ -113,7 +113,7 @@ _ENDS_RUN = (
 )
 """Intents that first end the run of their tab."""
 _COMMON = ("jobs", "solve", "export", "networks", "network", "asked_network", "problems")
-"""Fields of the background's state that all tabs share."""
+"""Fields of the job runner's state that all tabs share."""
 WATCH_INTERVAL = 1.0
 """Interval between checks of the project file when nothing is edited [s]."""
 
@@ -127,13 +127,13 @@ class Controller(Handler):
         session: Session,
         renderer: OverlayRenderer,
         optimizers: OptimizerFactory,
-        background: Background,
+        job_runner: JobRunner,
         deliver: Deliver,
     ) -> None:
         context = Context(state, session, renderer)
         self._optimizing = OptimizingHandler(context, optimizers)
         super().__init__(context)
-        self._background = background
+        self._job_runner = job_runner
         self._editor = session.editor
         self._watch_at = 0.0
         self._storage_failure: str | None = None
@@ -168,25 +168,25 @@ class Controller(Handler):
         """
         if self._live.replaces(intent):
             return
-        if self._background.takes(intent):
+        if self._job_runner.takes(intent):
             self._forward(intent)
             return
         next((handler for handler in self._handlers if handler.takes(intent)), super()).handle(intent)
 
     def _forward(self, intent: intents.Intent) -> None:
-        """Pass an intent to the background, after saving the edits of this tab."""
+        """Pass an intent to the job runner, after saving the edits of this tab."""
         if isinstance(intent, _ENDS_RUN):
             self._optimizing.end("Stopped: a job was started")
             self._context.save()
             self._context.change(playing=False, error=None)
         try:
-            self._background.handle(intent, self._editor.person, self.state)
+            self._job_runner.handle(intent, self._editor.person, self.state)
         finally:
             self.follow()
 
     def follow(self) -> None:
-        """Update the state from the background and from edits of other users."""
-        state, shared = self.state, self._background.state
+        """Update the state from the job runner and from edits of other users."""
+        state, shared = self.state, self._job_runner.state
         if any(getattr(shared, name) != getattr(state, name) for name in _COMMON):
             self._share()
         people, person = self._editor.people, self._editor.person
@@ -200,8 +200,8 @@ class Controller(Handler):
             self._context.refresh()
 
     def _share(self) -> None:
-        """Copy the shared fields of the background's state."""
-        self._context.change(**{name: getattr(self._background.state, name) for name in _COMMON})
+        """Copy the shared fields of the job runner's state."""
+        self._context.change(**{name: getattr(self._job_runner.state, name) for name in _COMMON})
 
     def _on_SetName(self, intent: intents.SetName) -> None:
         chosen = " ".join(intent.name.split())[:MAX_NAME_LENGTH]

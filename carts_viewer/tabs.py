@@ -13,14 +13,14 @@ from carts_core.errors import CartsError
 from carts_core.optimization import Backgrounds, FreeParameters, SurfaceSolver
 from carts_core.recording import Sequence
 from carts_viewer.actions import intents
-from carts_viewer.actions.exchange import Deliver
+from carts_viewer.actions.import_export import Deliver
 from carts_viewer.actions.intents import Intent
-from carts_viewer.controller import Background, Controller
+from carts_viewer.controller import Controller, JobRunner
 from carts_viewer.editing import People, Person
 from carts_viewer.jobs.optimizers import OptimizerFactory
 from carts_viewer.panels.inputs import PanelPage
 from carts_viewer.panels.layout import Layout, choose_theme
-from carts_viewer.panels.page_state import restored_choices
+from carts_viewer.panels.script_state import restored_choices
 from carts_viewer.picture.display import PageDisplay
 from carts_viewer.picture.layers import Layer
 from carts_viewer.picture.overlay import OverlayRenderer
@@ -232,7 +232,7 @@ class Tabs:
     """All tabs and their shared state; used on the worker's thread only, except for `of_client` and `first`.
 
     Attributes:
-        background: long-running work.
+        job_runner: long-running work.
         people: users of the project.
         first: the initial tab, which is assigned to the first page.
     """
@@ -253,7 +253,7 @@ class Tabs:
         self.people = People(storage.project)
         session = Session(sequence, self.people, Person(0, present=False))
         self._session = session
-        self.background = Background(self._initial_state(session), session, renderer, optimizers, deliver)
+        self.job_runner = JobRunner(self._initial_state(session), session, renderer, optimizers, deliver)
         self._tabs: tuple[Tab, ...] = ()
         self.first = self._add()
 
@@ -303,7 +303,7 @@ class Tabs:
             CartsError: some work could not be saved; all other work is saved.
         """
         problems = []
-        for close in (self.background.close, self._session.close, *(tab.close for tab in self._tabs)):
+        for close in (self.job_runner.close, self._session.close, *(tab.close for tab in self._tabs)):
             try:
                 close()
             except CartsError as error:
@@ -338,7 +338,7 @@ class Tabs:
         person.present = False
         session = Session(self._sequence, self.people, person, self._folders)
         controller = Controller(
-            self._initial_state(session), session, self._renderer, self._optimizers, self.background, self._deliver
+            self._initial_state(session), session, self._renderer, self._optimizers, self.job_runner, self._deliver
         )
         tab = Tab(self._queue, session, person, controller)
         self._tabs = (*self._tabs, tab)

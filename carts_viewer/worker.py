@@ -18,7 +18,7 @@ MEMORY_KEPT = 10.0
 """Idle time after which freed memory is returned to the operating system [s]."""
 MEMORY_KEPT_AT_WORK = 30.0
 """Interval of the same during work with an open page, where it may delay a picture by some milliseconds [s]."""
-_STARTS_LONG_WORK = (intents.Optimizing, intents.Propagating, intents.Exporting, intents.Jobs)
+_STARTS_LONG_WORK = (intents.Optimizing, intents.SequenceIntent, intents.Exporting, intents.Jobs)
 """Classes of intents that may start long work."""
 
 
@@ -144,10 +144,10 @@ class Worker:
 
     def _advance_background(self) -> None:
         try:
-            self._tabs.background.advance()
+            self._tabs.job_runner.advance()
         except Exception as error:
             text = self._fail(error, *self._tabs)
-            self._tabs.background.fail(text)
+            self._tabs.job_runner.fail(text)
 
     def _set_resting(self, resting: bool) -> None:
         with self._rest:
@@ -156,7 +156,7 @@ class Worker:
 
     def _wait_time(self) -> float | None:
         """Time to wait for an intent [s]: 0 while there is work, at most until a page can take its next picture."""
-        waits = [self._tabs.background.wait_time()]
+        waits = [self._tabs.job_runner.wait_time()]
         for tab in self._tabs:
             waits += [tab.controller.wait_time(), tab.picture_wait()]
         return min((wait for wait in waits if wait is not None), default=None)

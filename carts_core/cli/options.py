@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from ..model.scene import Scene
     from ..networks.extractor import FeatureExtractor
     from ..optimization import GivenMasks, MaskPredictor
-    from ..optimization.measurement import Ignore
+    from ..optimization.sequence_frame import Ignore
     from ..project import ProjectState
     from ..project.masks import MaskLayer
     from ..recording import Frame, Sequence

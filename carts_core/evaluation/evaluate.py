@@ -26,7 +26,7 @@ from ..optimization import (
     SurfacePredictor,
     undetermined_joints,
 )
-from ..optimization.measurement import Ignore
+from ..optimization.sequence_frame import Ignore
 from ..recording import Frame, Sequence
 from ..rendering import Renderer
 

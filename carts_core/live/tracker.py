@@ -16,10 +16,10 @@ from jaxtyping import Float
 
 from ..model.scene import Scene, SceneState
 from ..networks.extractor import FeatureExtractor
-from ..optimization.error_model import ErrorModel, Gaussian, combined
-from ..optimization.measurement import FrameSolver, Measurement, Origin, Visit
+from ..optimization.kalman import ErrorModel, Gaussian, combined
 from ..optimization.observation import Backgrounds
 from ..optimization.predictor import SurfacePredictor, predictor_of
+from ..optimization.sequence_frame import Measurement, Origin, SequenceFrameSolver, Visit
 from ..optimization.variables import Variables
 from ..optimization.verdict import arm_is_elsewhere
 from ..recording import Frame
@@ -320,10 +320,10 @@ class LiveTracker:
         self._seen = attempt.time
         self._losses.append(measurement.loss)
 
-    def _solver(self, warm: tuple[Stage, ...], backgrounds: Backgrounds | None) -> FrameSolver:
+    def _solver(self, warm: tuple[Stage, ...], backgrounds: Backgrounds | None) -> SequenceFrameSolver:
         model = replace(self._model, warm=warm, cold=self.live.search)
         settings = replace(self.settings, stages=warm)
-        return FrameSolver(self._scene, self._predictor, settings, model, lambda _: {}, backgrounds)
+        return SequenceFrameSolver(self._scene, self._predictor, settings, model, lambda _: {}, backgrounds)
 
     def _variables(self, frame: Frame, camera_poses: Mapping[str, np.ndarray]) -> Variables:
         mounts = mounts_of(self._scene, frame, camera_poses)

@@ -18,9 +18,6 @@ from .frame import FrameOptimizer as FrameOptimizer
 from .frame import Iterate as Iterate
 from .frame import Progress as Progress
 from .frame_problem import propose_ignore as propose_ignore
-from .measurement import FrameEstimate as FrameEstimate
-from .measurement import Origin as Origin
-from .measurement import sequence_checkpoint as sequence_checkpoint
 from .observability import fit_words as fit_words
 from .observability import joint_words as joint_words
 from .observability import undetermined_joints as undetermined_joints
@@ -33,6 +30,9 @@ from .predictor import NetworkPredictor as NetworkPredictor
 from .predictor import SurfacePredictor as SurfacePredictor
 from .refinement import MaskRefiner as MaskRefiner
 from .sequence import SequenceOptimizer as SequenceOptimizer
+from .sequence_frame import FrameEstimate as FrameEstimate
+from .sequence_frame import Origin as Origin
+from .sequence_frame import sequence_checkpoint as sequence_checkpoint
 from .stages import StopReason as StopReason
 from .verdict import Assessment as Assessment
 from .verdict import DomainCheck as DomainCheck

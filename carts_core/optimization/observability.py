@@ -37,7 +37,7 @@ class Uncertainty:
     """Standard deviation [rad]; [m] for prismatic joints and translations."""
     expected: tuple[float, ...]
     """Prior standard deviation; at the end of a fit, rescaled by the size of the corrections."""
-    left: tuple[float, ...] | None = None
+    std_ratio: tuple[float, ...] | None = None
     """Ratio of posterior to prior standard deviation for the prior of the settings [1]; None if `expected` is that
     prior."""
 
@@ -45,7 +45,7 @@ class Uncertainty:
         """Observability of an unknown: whether its standard deviation decreases to a third, slightly, or hardly at
         all."""
         index = self.names.index(name)
-        share = self.std[index] / self.expected[index] if self.left is None else self.left[index]
+        share = self.std[index] / self.expected[index] if self.std_ratio is None else self.std_ratio[index]
         return "determined" if share < _DETERMINED else "weak" if share < _VISIBLE else "not visible"
 
     def joint_std(self, arm: str, joints: Sequence[str]) -> Float[np.ndarray, " dofs"]:
@@ -64,12 +64,12 @@ class Uncertainty:
             variances = (np.square(values) for values in (right, wrong))
             return tuple(np.sqrt(np.dot((1.0 - probability, probability), list(variances))).tolist())
 
-        left = None if self.left is None else mixed(self.left, [1.0] * len(self.left))
-        return replace(self, std=mixed(self.std, self.expected), left=left)
+        ratio = None if self.std_ratio is None else mixed(self.std_ratio, [1.0] * len(self.std_ratio))
+        return replace(self, std=mixed(self.std, self.expected), std_ratio=ratio)
 
     def rescaled(self, later: "Uncertainty") -> "Uncertainty":
         """Standard deviations under a rescaled prior; observability still refers to the original prior."""
-        return replace(later, left=tuple(std / given for std, given in zip(self.std, self.expected, strict=True)))
+        return replace(later, std_ratio=tuple(std / given for std, given in zip(self.std, self.expected, strict=True)))
 
 
 def undetermined_joints(

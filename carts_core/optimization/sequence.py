@@ -18,10 +18,10 @@ from ..provenance import Checkpoint
 from ..recording import Frame
 from ..recording.background import evenly_spaced
 from ..settings import FreeParameters, SequenceSettings, SolverSettings, surface_solver
-from .error_model import ErrorModel, Gaussian, Information, Smoother, combined, remove_measurement
-from .measurement import FrameEstimate, FrameSolver, Ignore, Measurement, Origin, Visit
+from .kalman import ErrorModel, Gaussian, Information, Smoother, combined, remove_measurement
 from .observation import Backgrounds
 from .predictor import SurfacePredictor, predictor_of
+from .sequence_frame import FrameEstimate, Ignore, Measurement, Origin, SequenceFrameSolver, Visit
 from .variables import Variables
 from .verdict import SequenceAssessment, Verdict, assess, assess_sequence
 
@@ -59,7 +59,7 @@ def visiting_gaps(times: Mapping[int, float | None], model: SequenceSettings) ->
 
 def initial_correction(
     corrections: Mapping[int, Float[np.ndarray, " n"]],
-    solver: FrameSolver,
+    solver: SequenceFrameSolver,
     open_frame: Callable[[int], tuple[Frame, Variables]],
     allowance: float,
 ) -> Float[np.ndarray, " n"]:
@@ -199,7 +199,7 @@ class SequenceOptimizer:
             raise SettingsError(
                 f"keyframe {min(unknown)} is not among the frames. Add it to the frames, or remove the keyframe."
             )
-        self._solver = FrameSolver(
+        self._solver = SequenceFrameSolver(
             self._scene, self._predictor, self.settings, self.model, ignore or (lambda _: {}), backgrounds, checkpoint
         )
         self._queue, self._frames = list(gaps), len(gaps)

@@ -20,10 +20,10 @@ from ..settings.stages import (
     Given,
     IgnoreOccluders,
     Observe,
-    OtherBackground,
     PreferStart,
     RandomRestart,
     RejectFailed,
+    RetryOtherBackground,
     SilhouetteSearch,
     Stage,
     first_descend,
@@ -102,7 +102,7 @@ class Fit:
     stop_reason: StopReason = StopReason.NOT_OPTIMIZED
     best: Point | None = None
     """Best point so far."""
-    reached: Point | None = None
+    best_of_descent: Point | None = None
     """Best point of the last descent."""
     edges: Linearization | None = None
     """Quadratic model of the edge factor around the estimate, after `AlignEdges`."""
@@ -129,7 +129,7 @@ class Fit:
     @property
     def loss(self) -> float:
         """Loss of the best point of the last descent [1]; infinite before the first descent."""
-        return float("inf") if self.reached is None else self.reached.evaluation.stage_loss
+        return float("inf") if self.best_of_descent is None else self.best_of_descent.evaluation.stage_loss
 
     def evaluate(self, stage: Descend | FirstOrder, *, gradient: bool = True) -> Point:
         """Evaluate the current estimate."""
@@ -145,7 +145,7 @@ class Fit:
     def start_over(self, start: Float[Tensor, " n"]) -> None:
         """Discard the estimate and restore the budget."""
         self.offsets, self.restarts, self.used = start, 0, 0
-        self.reached, self.edges = None, None
+        self.best_of_descent, self.edges = None, None
         self.solver.reset()
 
 
@@ -250,7 +250,7 @@ def run_observe(stage: Observe, fit: Fit) -> Iterator[Point]:
 @run_stage.register
 def run_descend(stage: Descend, fit: Fit) -> Iterator[Point]:
     """Levenberg-Marquardt on the objective under one blur, until the predicted reduction is small."""
-    # A smaller tolerance is used after a restart, since no later stage refines the result.
+    # After a jump of the estimate, the tolerance is at most the default.
     tolerance = min(stage.tolerance, Descend.tolerance) if fit.restarts else stage.tolerance
     best, rejections = None, 0
     for taken in range(1, stage.steps + 1):
@@ -266,7 +266,7 @@ def run_descend(stage: Descend, fit: Fit) -> Iterator[Point]:
         assert known.hessian is not None
         step = fit.solver.step(best.offsets, known.gradient, known.hessian)
         converged = rejections >= REJECTIONS or step.reduction < tolerance * known.value
-        fit.reached = best
+        fit.best_of_descent = best
         # This also applies after rejected steps, since the step is short and the next stage uses another blur.
         fit.offsets = fit.problem.variables.clamp(best.offsets + step.change)
         fit.stop_reason = StopReason.CONVERGED if converged else StopReason.ITERATIONS
@@ -298,12 +298,12 @@ def run_silhouette_search(stage: SilhouetteSearch, fit: Fit) -> Iterator[Point]:
 @run_stage.register
 def run_align_edges(stage: AlignEdges, fit: Fit) -> Iterator[Point]:
     """Align outlines with image edges, from the best point of the last descent."""
-    assert fit.reached is not None, "AlignEdges must follow a Descend stage"
+    assert fit.best_of_descent is not None, "AlignEdges must follow a Descend stage"
     if _one_frame(fit).predictor.masked:
         # The estimate is one step beyond the best point, and this step has not been evaluated.
-        fit.offsets = fit.reached.offsets
+        fit.offsets = fit.best_of_descent.offsets
         return
-    fit.offsets, fit.edges = _one_frame(fit).aligned(stage, fit.reached.offsets, fit.reached.evaluation)
+    fit.offsets, fit.edges = _one_frame(fit).aligned(stage, fit.best_of_descent.offsets, fit.best_of_descent.evaluation)
     yield from ()
 
 
@@ -318,7 +318,7 @@ def run_prefer_start(stage: PreferStart, fit: Fit) -> Iterator[Point]:
 @run_stage.register
 def run_evaluate(stage: Evaluate, fit: Fit) -> Iterator[Point]:
     """Evaluate the estimate, without changing it."""
-    kept, known = fit.stop_reason is StopReason.START_KEPT, fit.reached
+    kept, known = fit.stop_reason is StopReason.START_KEPT, fit.best_of_descent
     point = fit.evaluate(FINEST, gradient=kept)
     if known is not None and not kept:
         # Edges have no uncertainty model, so the uncertainty of the last descent is kept.
@@ -332,14 +332,14 @@ def run_evaluate(stage: Evaluate, fit: Fit) -> Iterator[Point]:
 
 
 @run_stage.register
-def run_other_background(stage: OtherBackground, fit: Fit) -> Iterator[Point]:
+def run_retry_other_background(stage: RetryOtherBackground, fit: Fit) -> Iterator[Point]:
     """Repeat a failed fit with the other background mode, and keep the better fit."""
     problem = _one_frame(fit)
     before = problem.evidence_at(fit.offsets)
     known = assess(before)
     if before.overlap_with_change is None or known.verdict is not Verdict.FAILED or known.nothing_there:
         return
-    first_run = fit.offsets, fit.reached, fit.edges, fit.stop_reason
+    first_run = fit.offsets, fit.best_of_descent, fit.edges, fit.stop_reason
     observation = problem.observation
     problem.toggle_background_mode()
     fit.start_over(problem.start)
@@ -350,7 +350,7 @@ def run_other_background(stage: OtherBackground, fit: Fit) -> Iterator[Point]:
     if not better:
         problem.toggle_background_mode()
         problem.observation = observation
-        fit.offsets, fit.reached, fit.edges, fit.stop_reason = first_run
+        fit.offsets, fit.best_of_descent, fit.edges, fit.stop_reason = first_run
 
 
 @run_stage.register
@@ -360,7 +360,7 @@ def run_reject_failed(stage: RejectFailed, fit: Fit) -> Iterator[Point]:
     if found is None:
         return
     verdict = fit.assessment = assess(problem.evidence(found.offsets, found.evaluation.loss))
-    if verdict.certain or fit.stop_reason is StopReason.NOT_OPTIMIZED:
+    if verdict.negligible_risk or fit.stop_reason is StopReason.NOT_OPTIMIZED:
         return
     if verdict.verdict is Verdict.FAILED and bool(found.offsets.any()):
         estimate, fit.offsets = fit.offsets, problem.start
@@ -385,7 +385,7 @@ def _judged(point: Point, verdict: Assessment) -> Point:
 def run_ignore_occluders(stage: IgnoreOccluders, fit: Fit) -> Iterator[Point]:
     """Ignore pixels that contradict the fit, and repeat the optimization."""
     problem = _one_frame(fit)
-    if fit.reached is not None and problem.ignore_occluders(fit.reached.evaluation):
+    if fit.best_of_descent is not None and problem.ignore_occluders(fit.best_of_descent.evaluation):
         fit.start_over(problem.start)
         yield from run_stages(stage.then, fit)
 

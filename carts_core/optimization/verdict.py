@@ -265,7 +265,7 @@ class Assessment:
     """Whether no arm is in view or detected."""
 
     @property
-    def certain(self) -> bool:
+    def negligible_risk(self) -> bool:
         """Whether the probability of failure is so small that standard deviations need not account for it."""
         return self.verdict is Verdict.GOOD and self.probability < _UNCERTAIN
 
@@ -274,7 +274,7 @@ class Assessment:
 
         The uncertainty of a certain fit is unchanged; that of a failed fit becomes the prior.
         """
-        if self.certain:
+        if self.negligible_risk:
             return known
         return known.doubted(1.0 if self.verdict is Verdict.FAILED else self.probability)
 

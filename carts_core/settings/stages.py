@@ -20,7 +20,7 @@ class Given(StrEnum):
 class Observe(Ranged):
     """Predict the surface map of the images: per pixel, the coverage of each part of the arms and the normal
     (`carts_core.model.parts`). `Descend` and `AlignEdges` do not run the network; `RandomRestart` and `PreferStart`
-    make another observation, and verdicts (`OtherBackground`, `RejectFailed`) run the network for their evidence.
+    make another observation, and verdicts (`RetryOtherBackground`, `RejectFailed`) run the network for their evidence.
     """
 
     scale: Annotated[float, Range(0.1, 8)] = 1.5
@@ -111,7 +111,7 @@ class AlignEdges(Ranged):
 
 @dataclass(frozen=True)
 class PreferStart(Ranged):
-    """Return to the start if it explains the image as well as the estimate, unless a calibration is free."""
+    """Return to the start if it explains the image as well as the estimate; skipped if a calibration is free."""
 
     improvement: Annotated[float, Range(0, 1e6, above=True)] = 5.0
     """Minimum improvement of the objective for which the estimate is kept [1]."""
@@ -125,7 +125,7 @@ class PreferStart(Ranged):
 
 
 @dataclass(frozen=True)
-class OtherBackground:
+class RetryOtherBackground:
     """If the fit has failed and the empty background is known: repeat it with the other background mode (replaced in
     the image, or subtracted from the predictions). The second run is kept if it has not failed and its arms overlap
     more with the change relative to the background, which false detections do not affect."""
@@ -173,7 +173,7 @@ Stage = (
     | SilhouetteSearch
     | AlignEdges
     | PreferStart
-    | OtherBackground
+    | RetryOtherBackground
     | IgnoreOccluders
     | Evaluate
     | RejectFailed
@@ -223,12 +223,12 @@ SEARCH: tuple[Stage, ...] = (
 _FITTED: tuple[Stage, ...] = (*SEARCH, AlignEdges(), Observe(), FINEST)
 _ALONE: tuple[Stage, ...] = (*_FITTED, AlignEdges(), PreferStart())
 
-FRAME: tuple[Stage, ...] = (*_ALONE, OtherBackground(then=_ALONE), Evaluate(), RejectFailed())
+FRAME: tuple[Stage, ...] = (*_ALONE, RetryOtherBackground(then=_ALONE), Evaluate(), RejectFailed())
 """Stages for a single frame (default).
 
 `SilhouetteSearch` acts only if given masks are the target, `RandomRestart` only if the fit is bad, and
-`OtherBackground` only if the fit has failed and the empty background is known. Once the budget of evaluations is spent,
-all stages except `RejectFailed` are skipped.
+`RetryOtherBackground` only if the fit has failed and the empty background is known. Once the budget of evaluations is
+spent, all stages except `RejectFailed` are skipped.
 """
 
 OCCLUDED: tuple[Stage, ...] = (

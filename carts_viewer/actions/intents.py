@@ -409,7 +409,7 @@ class RemovePins(Intent):
     """Remove the placed keypoints; joints stay."""
 
 
-class Propagating(Intent):
+class SequenceIntent(Intent):
     """An intent about sequence mode."""
 
 
@@ -419,14 +419,14 @@ class SetKeyframe(Intent):
     on: bool | None = None
 
 
-class Solve(Propagating):
+class Solve(SequenceIntent):
     """Solve many frames together; kept frames (keyframes, accepted frames) do not change."""
 
     whole: bool = False
     """Whether to solve all frames instead of those between the kept frames around the shown one."""
 
 
-class StopSolving(Propagating):
+class StopSolving(SequenceIntent):
     """Stop solving, and save the solved frames."""
 
 
@@ -436,13 +436,13 @@ class SetDirection(Intent):
     direction: Direction
 
 
-class TakeSolved(Propagating):
+class TakeSolved(SequenceIntent):
     """Apply the solved pose of a frame that fits worse than before; None for all listed frames."""
 
     index: int | None = None
 
 
-class DiscardSolved(Propagating):
+class DiscardSolved(SequenceIntent):
     """Discard the solved poses of all listed frames."""
 
 
@@ -524,7 +524,7 @@ class Export(Exporting):
 
     format: FormatName
     frames: str
-    """Frames to write, one of `exchange.FRAME_CHOICES`."""
+    """Frames to write, one of `import_export.FRAME_CHOICES`."""
     parts: Parts = "arms"
     """Granularity of the categories."""
     images: bool = False

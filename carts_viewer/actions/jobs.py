@@ -12,8 +12,8 @@ from carts_core.project import frames_in
 from carts_core.project.state import UNREVIEWED
 from carts_viewer.actions import intents
 from carts_viewer.actions.context import Context, Handler
-from carts_viewer.actions.exchange import ExportingHandler
 from carts_viewer.actions.frame_filter import matching_frames
+from carts_viewer.actions.import_export import ExportingHandler
 from carts_viewer.actions.sequence import PropagatingHandler
 from carts_viewer.editing import Person
 from carts_viewer.jobs.companions import Decisions

@@ -3,17 +3,17 @@
 import viser
 
 from carts_viewer.panels.browse import BrowsePanel, OverlayPanel
-from carts_viewer.panels.exchange import ExportPanel, ImportPanel
 from carts_viewer.panels.fit import FitPanel, LivePanel
 from carts_viewer.panels.help import HelpPanel, set_hints
+from carts_viewer.panels.import_export import ExportPanel, ImportPanel
 from carts_viewer.panels.inputs import Panel, PanelPage
 from carts_viewer.panels.jobs import JobsPanel
 from carts_viewer.panels.joints import JointsPanel, KeypointsPanel, ValuesPanel
 from carts_viewer.panels.optimize import CurvesPanel, FreePanel, OptimizePanel, SettingsPanel
-from carts_viewer.panels.page_state import PageState
 from carts_viewer.panels.paint import PaintPanel
 from carts_viewer.panels.project import HistoryPanel, MessagePanel, PeoplePanel, SavedPanel
 from carts_viewer.panels.review import FindPanel, ReviewPanel
+from carts_viewer.panels.script_state import ScriptState
 from carts_viewer.panels.sequence import KeyframesPanel
 from carts_viewer.panels.timeline import TimelineData
 from carts_viewer.session import Session, Storage
@@ -76,7 +76,7 @@ class Layout:
         right.dock_right()
         right.set_width(_WIDTH)
         self.timeline = TimelineData(page, session)
-        self.panels = [*panels, self.joints, PageState(page, session), self.timeline]
+        self.panels = [*panels, self.joints, ScriptState(page, session), self.timeline]
 
 
 def _review(page: PanelPage, session: Session, state: ViewState) -> list[Panel]:

@@ -244,7 +244,8 @@ class Page:
             callback(client.client_id)
 
     def _add_channel(self) -> None:
-        """Add the invisible field whose value is a tab's newest event, with the tab's key and its count of events."""
+        """Add the hidden text field that all tabs share: JSON with the tab's key, a counter that makes each value
+        distinct, and the event."""
         self._channel = self.server.gui.add_text("channel", "", visible=False)
 
     def clear(self, title: str) -> None:

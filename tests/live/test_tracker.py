@@ -19,7 +19,7 @@ from carts_core.live import Effort, LiveTracker, LiveVerdict
 from carts_core.model.scene import SceneState
 from carts_core.networks import FeatureExtractor
 from carts_core.optimization import ImagePredictor
-from carts_core.optimization.measurement import FrameSolver, Measurement
+from carts_core.optimization.sequence_frame import Measurement, SequenceFrameSolver
 from carts_core.recording import Frame, Sequence
 from carts_core.rendering import Renderer
 
@@ -170,14 +170,14 @@ def concurrent(tiny_sequence: Callable[..., Path]) -> Iterator[Stream]:
 
 def test_a_search_beside_the_stream_keeps_no_frame_waiting(concurrent: Stream, monkeypatch: pytest.MonkeyPatch) -> None:
     searching, go_on = Event(), Event()
-    cold = FrameSolver.cold
+    cold = SequenceFrameSolver.cold
 
     def slow(*arguments: Any, **options: Any) -> Measurement:
         searching.set()
         assert go_on.wait(60)
         return cold(*arguments, **options)
 
-    monkeypatch.setattr(FrameSolver, "cold", slow)
+    monkeypatch.setattr(SequenceFrameSolver, "cold", slow)
     first = [concurrent.next() for _ in range(3)]
     assert searching.wait(60), "the search has begun"
     assert [verdict for verdict, _, _ in first] == [LiveVerdict.LOST] * 3, "what was measured is not relied on"

@@ -18,7 +18,7 @@ from carts_core.optimization import Backgrounds, FrameOptimizer, ImagePredictor,
 from carts_core.optimization.observation import Background, FrameImages, without_background
 from carts_core.recording import Sequence
 from carts_core.rendering import Renderer
-from carts_core.settings.stages import OtherBackground
+from carts_core.settings.stages import RetryOtherBackground
 
 DVRK = Path(__file__).parents[1] / "sequences" / "dvrk_stereo.toml"
 SIZE = {"width": 320, "height": 240}
@@ -183,7 +183,9 @@ def test_the_fit_that_overlaps_more_with_the_change_is_kept(tiny_sequence: Calla
     image[mask] = 10
     settings = SurfaceSolver()
     if not again:
-        settings = replace(settings, stages=tuple(s for s in settings.stages if not isinstance(s, OtherBackground)))
+        settings = replace(
+            settings, stages=tuple(s for s in settings.stages if not isinstance(s, RetryOtherBackground))
+        )
     optimizer = FrameOptimizer(
         scene,
         replace(frame, images={"left": image}),

@@ -9,7 +9,7 @@ import pytest
 from short_sequence import ARM, FRAMES, Truths, optimizer
 
 from carts_core.optimization import FrameOptimizer, FreeParameters, SequenceOptimizer, SequenceSettings, SurfaceSolver
-from carts_core.optimization.measurement import FrameSolver, Origin, SingleFrameFit
+from carts_core.optimization.sequence_frame import Origin, SequenceFrameSolver, SingleFrameFit
 from carts_core.optimization.variables import Variables
 from carts_core.optimization.verdict import Verdict
 from carts_core.recording import Frame, Sequence
@@ -77,11 +77,11 @@ def test_frames_with_dependents_are_not_solved_alone(truths: Off, monkeypatch: p
 
 def watched(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """Positions of the frames that are solved alone from now on."""
-    tried, alone = [], FrameSolver.run_frame_stages
+    tried, alone = [], SequenceFrameSolver.run_frame_stages
 
-    def counted(solver: FrameSolver, frame: Frame, variables: Variables) -> SingleFrameFit | None:
+    def counted(solver: SequenceFrameSolver, frame: Frame, variables: Variables) -> SingleFrameFit | None:
         tried.append(frame.index)
         return alone(solver, frame, variables)
 
-    monkeypatch.setattr(FrameSolver, "run_frame_stages", counted)
+    monkeypatch.setattr(SequenceFrameSolver, "run_frame_stages", counted)
     return tried

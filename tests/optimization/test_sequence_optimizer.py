@@ -19,8 +19,8 @@ from carts_core.optimization import (
     SequenceSettings,
     SurfaceSolver,
 )
-from carts_core.optimization.measurement import FrameEstimate, FrameSolver, Origin
 from carts_core.optimization.sequence import initial_correction
+from carts_core.optimization.sequence_frame import FrameEstimate, Origin, SequenceFrameSolver
 from carts_core.optimization.variables import Variables
 from carts_core.optimization.verdict import Verdict
 from carts_core.recording import Frame
@@ -182,7 +182,7 @@ def test_where_it_starts_suits_all_frames_that_were_solved_alone(truths: Truths,
         state = scene.state(states[index])
         return truths.load(index), Variables(scene, state, FreeParameters(), settings.length_scale)
 
-    solver = FrameSolver(scene, truths, settings, SequenceSettings(), lambda _: {})
+    solver = SequenceFrameSolver(scene, truths, settings, SequenceSettings(), lambda _: {})
     found = initial_correction({0: wrong, 2: right, 4: right}, solver, open_frame, allowance=2.0)
     assert np.array_equal(found, wrong if jumped else right)
 

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from carts_core.optimization.error_model import ErrorModel, Gaussian, Information, Smoother
+from carts_core.optimization.kalman import ErrorModel, Gaussian, Information, Smoother
 from carts_core.settings import SequenceSettings
 
 N = 3

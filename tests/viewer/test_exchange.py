@@ -33,7 +33,7 @@ from carts_core.project import (
 from carts_core.recording import Sequence
 from carts_core.recording.annotations import read_annotations
 from carts_core.settings import Masks
-from carts_viewer.actions import exchange as exporting
+from carts_viewer.actions import import_export as exporting
 from carts_viewer.actions import intents
 from carts_viewer.app import ViewerApp
 from carts_viewer.picture.layers import Layer, imported, label_color

@@ -12,7 +12,6 @@ from carts_core.optimization import BASE_FRAME_GAIN
 from carts_core.optimization.observability import Uncertainty
 from carts_core.project import Figures, FitVerdict, Key, Review, ReviewState, Source
 from carts_viewer.actions import intents
-from carts_viewer.actions.exchange import FRAME_CHOICES, export_warnings
 from carts_viewer.actions.frame_filter import (
     BY_HAND,
     NO_REVIEW,
@@ -23,6 +22,7 @@ from carts_viewer.actions.frame_filter import (
     matching_frames,
     review_name,
 )
+from carts_viewer.actions.import_export import FRAME_CHOICES, export_warnings
 from carts_viewer.jobs.comparison import Fit
 from carts_viewer.panels.fit import fit_text
 from carts_viewer.panels.optimize import note, undetermined_lines

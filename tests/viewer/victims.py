@@ -27,7 +27,7 @@ from carts_core.files import MARKER
 from carts_core.project import Key, ProjectState, ReviewState
 from carts_viewer.actions import intents
 from carts_viewer.app import ViewerApp
-from carts_viewer.panels.exchange import ExportPanel
+from carts_viewer.panels.import_export import ExportPanel
 from carts_viewer.panels.project import SavedPanel
 from carts_viewer.picture.strokes import Target
 from carts_viewer.serving import serve

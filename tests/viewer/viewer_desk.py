@@ -9,7 +9,7 @@ from carts_core.recording import Sequence
 from carts_core.settings import SolverName
 from carts_core.settings.stages import FirstOrder
 from carts_viewer.actions import intents
-from carts_viewer.controller import Background, Controller
+from carts_viewer.controller import Controller, JobRunner
 from carts_viewer.editing import People, Person
 from carts_viewer.jobs.optimizers import OptimizerFactory
 from carts_viewer.picture.layers import Layer
@@ -48,8 +48,8 @@ class Desk:
         def deliver(*file: Any) -> None:
             self.delivered.append(file)
 
-        self.background = Background(state, own, self.renderer, factory, deliver)
-        self.controller = Controller(state, self.session, self.renderer, factory, self.background, deliver)
+        self.job_runner = JobRunner(state, own, self.renderer, factory, deliver)
+        self.controller = Controller(state, self.session, self.renderer, factory, self.job_runner, deliver)
 
     @classmethod
     def open(cls, sequence: Path, *, project: Path | None = None, **networks: Any) -> "Desk":
@@ -84,26 +84,26 @@ class Desk:
 
     def wait_time(self) -> float | None:
         """How long nothing needs to be done, here and in the background."""
-        waits = (self.controller.wait_time(), self.background.wait_time())
+        waits = (self.controller.wait_time(), self.job_runner.wait_time())
         return min((wait for wait in waits if wait is not None), default=None)
 
     def advance(self) -> None:
         """Do one bit of what goes on here, and one in the background."""
         try:
             self.controller.advance()
-            self.background.advance()
+            self.job_runner.advance()
         finally:
             self.controller.follow()
 
     def fail(self, error: Exception) -> None:
         """An error of what goes on, as the worker hands it on."""
         self.controller.fail(error, stop=True)
-        self.background.fail(str(error))
+        self.job_runner.fail(str(error))
         self.controller.follow()
 
     def close(self) -> None:
         """Save everything that is under way."""
-        self.background.close()
+        self.job_runner.close()
         self.controller.close()
 
     @property

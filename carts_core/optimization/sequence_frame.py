@@ -45,7 +45,7 @@ class Measurement:
     """Measurement of one frame at the end of a descent."""
 
     correction: Float[np.ndarray, " n"]
-    """Maximum a posteriori estimate of the correction [rad]."""
+    """Correction at which the frame is linearized [rad]: the best evaluated, aligned or given one."""
     information: Information
     """Information of the image alone, linearized at the correction and scaled for correlated pixels."""
     loss: float
@@ -133,13 +133,13 @@ class FrameSolver:
         """Find the correction near `start` [n]; `wide` uses a larger margin around the arms, and more steps."""
         prior = _prior(expected, variables)
         fit = self._run(frame, variables, prior, self._wide if wide else self._warm, start)
-        assert fit.reached is not None
-        seen = _information(fit.reached.offsets, fit.reached.evaluation, prior)
-        correction = fit.reached.offsets
+        assert fit.best_of_descent is not None
+        seen = _information(fit.best_of_descent.offsets, fit.best_of_descent.evaluation, prior)
+        correction = fit.best_of_descent.offsets
         if fit.edges is not None:
             correction, precision = fit.offsets, _double(fit.edges.hessian)
             seen += Information(precision, precision @ _double(correction) - _double(fit.edges.gradient))
-        loss = fit.reached.evaluation.stage_loss
+        loss = fit.best_of_descent.evaluation.stage_loss
         return Measurement(_double(correction), seen.scaled(self._share), loss, fit.used)
 
     @_checkpointed
@@ -160,8 +160,8 @@ class FrameSolver:
         stages = reduced(self._cold, _QUICK_SCALE) if quick else self._cold
         start = np.zeros(len(variables))
         fit = self._run(frame, variables, _prior(expected, variables), stages, start, cancelled)
-        assert fit.reached is not None
-        end = self.warm(frame, variables, expected, _double(fit.reached.offsets))
+        assert fit.best_of_descent is not None
+        end = self.warm(frame, variables, expected, _double(fit.best_of_descent.offsets))
         return replace(end, iterations=fit.used + end.iterations)
 
     def run_frame_stages(self, frame: Frame, variables: Variables) -> SingleFrameFit | None:

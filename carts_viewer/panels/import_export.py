@@ -5,7 +5,7 @@ import viser
 from carts_core.export import FORMATS, FormatName
 from carts_core.project import Key, ProjectState, ReviewState
 from carts_viewer.actions import intents
-from carts_viewer.actions.exchange import FRAME_CHOICES, export_warnings, frames_within
+from carts_viewer.actions.import_export import FRAME_CHOICES, export_warnings, frames_within
 from carts_viewer.panels.inputs import PanelPage
 from carts_viewer.session import Session, Storage
 from carts_viewer.state import ViewState

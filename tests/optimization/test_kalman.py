@@ -4,7 +4,6 @@ import math
 
 import numpy as np
 import pytest
-
 from carts_core.optimization.error_model import (
     ErrorModel,
     Gaussian,
@@ -12,6 +11,7 @@ from carts_core.optimization.error_model import (
     information_shares,
     remove_measurement,
 )
+
 from carts_core.settings import SequenceSettings
 
 N, FRAMES = 3, 5

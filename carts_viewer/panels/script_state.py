@@ -14,7 +14,7 @@ from carts_viewer.state import Reach, ViewState
 from carts_viewer.transport.page import TabPage
 
 
-class PageState:
+class ScriptState:
     """Sends state to the page's scripts when it has changed."""
 
     def __init__(self, page: TabPage, session: Session) -> None:
