@@ -61,7 +61,7 @@ class Soak:
         return float(np.median(megabytes[-some:]) / np.median(megabytes[begin : begin + some])) - 1.0
 
     @property
-    def standard_deviations(self) -> float:
+    def spread(self) -> float:
         """Greatest difference of two memories after warm-up, as a share of the least."""
         settled = [megabytes for _, megabytes in self.megabytes[int(_WARM_UP * len(self.megabytes)) :]]
         return max(settled) / min(settled) - 1.0

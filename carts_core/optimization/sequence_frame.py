@@ -20,10 +20,10 @@ from ..recording import Frame
 from ..rendering import Renderer
 from ..settings import FreeParameters, SequenceSettings, SurfaceSolver
 from ..settings.stages import COMPARE, FINEST, Observe, Stage, first_observe, reduced
-from .error_model import Gaussian, Information
 from .factors import Prior
 from .frame import base_frame_gain
 from .frame_problem import FrameProblem
+from .kalman import Gaussian, Information
 from .observability import Evaluation, Uncertainty
 from .observation import Backgrounds
 from .predictor import SurfacePredictor
@@ -80,13 +80,13 @@ def sequence_checkpoint(path: OutputPath, made_with: str) -> Checkpoint:
 
 
 def _checkpointed(
-    method: "Callable[Concatenate[FrameSolver, Frame, Variables, P], Found]",
-) -> "Callable[Concatenate[FrameSolver, Frame, Variables, P], Found]":
-    """Decorator that caches results of a `FrameSolver` method in its checkpoint; cached results are bit-identical."""
+    method: "Callable[Concatenate[SequenceFrameSolver, Frame, Variables, P], Found]",
+) -> "Callable[Concatenate[SequenceFrameSolver, Frame, Variables, P], Found]":
+    """Decorator that caches results of a solver's method in its checkpoint; cached results are bit-identical."""
 
     @wraps(method)
     def looked_up(
-        self: "FrameSolver", frame: Frame, variables: Variables, *arguments: P.args, **options: P.kwargs
+        self: "SequenceFrameSolver", frame: Frame, variables: Variables, *arguments: P.args, **options: P.kwargs
     ) -> Found:
         compute = partial(method, self, frame, variables, *arguments, **options)
         if self._checkpoint is None:
@@ -102,7 +102,7 @@ def _checkpointed(
     return looked_up
 
 
-class FrameSolver:
+class SequenceFrameSolver:
     """Solves single frames of a sequence.
 
     Args:

@@ -4,14 +4,14 @@ import math
 
 import numpy as np
 import pytest
-from carts_core.optimization.error_model import (
+
+from carts_core.optimization.kalman import (
     ErrorModel,
     Gaussian,
     Information,
     information_shares,
     remove_measurement,
 )
-
 from carts_core.settings import SequenceSettings
 
 N, FRAMES = 3, 5
