@@ -26,7 +26,7 @@ from carts_viewer.state import ViewState
 
 
 class JobRunner:
-    """Works on jobs step by step, independent of the tabs that requested them."""
+    """Works on jobs step by step, independently of the tabs that requested them."""
 
     def __init__(
         self,
@@ -262,7 +262,7 @@ class Controller(Handler):
             self._context.change(playing=False)
 
     def leave(self) -> None:
-        """End the run of a closed tab and save its pose. Errors as `close`."""
+        """End the run of a closed tab and save its pose. Errors as in `close`."""
         if self._optimizing.active:
             self._optimizing.end("Stopped: its tab was closed; Run starts from the current pose")
 
@@ -281,11 +281,11 @@ class Controller(Handler):
         self._context.change(busy=text)
 
     def score(self) -> None:
-        """Compare the pose with ground truth, unless already done; errors as `handle`."""
+        """Compare the pose with ground truth, unless already done; errors as in `handle`."""
         self._context.score()
 
     def map(self) -> None:
-        """Compute the maps of the chosen layer; errors as `handle`."""
+        """Compute the maps of the chosen layer; errors as in `handle`."""
         if not self._live.active:
             self._optimizing.map()
 

@@ -71,9 +71,9 @@ class People:
     def apply(
         self, person: Person, name: str, edits: Edits, figures: Mapping[int, Figures] | None = None
     ) -> Change | None:
-        """Save a step of a user, with the user's name if it is chosen or several users are present.
+        """Save a step of a user, with the user's name if the user has chosen one or several users are present.
 
-        Errors as `Project.apply`.
+        Errors as in `Project.apply`.
         """
         person.undone.clear()
         return self._apply(person, name, edits, figures)
@@ -112,7 +112,7 @@ class People:
         return change
 
     def redo(self, person: Person) -> Change | None:
-        """Redo the last step that this user has undone; None if there is no such step. Errors as `undo`."""
+        """Redo the last step that this user has undone; None if there is no such step. Errors as in `undo`."""
         if person.undone:
             number = person.undone[-1]
             person.undone.pop()
@@ -193,7 +193,7 @@ MAX_DRAFT_LENGTH = 5.0
 
 
 class Editor:
-    """Edits of one user: the project, and at most one draft, an unfinished gesture.
+    """Edits of one user in a project, with at most one draft (an unfinished gesture).
 
     Attributes:
         project: receives finished gestures.
@@ -273,7 +273,7 @@ class Editor:
         self.drop()
 
     def apply(self, name: str, edits: Edits, figures: Mapping[int, Figures] | None = None) -> Change | None:
-        """Save edits as one undo step of this user, without a draft; errors as `Project.apply`."""
+        """Save edits as one undo step of this user, without a draft; errors as in `Project.apply`."""
         return self.people.apply(self.person, name, edits, figures)
 
     def claim(self) -> None:
@@ -296,11 +296,11 @@ class Editor:
         return None if self._dropped() else self.people.undo(self.person)
 
     def redo(self) -> Change | None:
-        """Redo this user's last undone step; drafts and errors as `undo`."""
+        """Redo this user's last undone step; drafts and errors as in `undo`."""
         return None if self._dropped() else self.people.redo(self.person)
 
     def go_to(self, position: int) -> Change | None:
-        """Undo or redo until this number of steps is in effect; drafts as `undo`.
+        """Undo or redo until this number of steps is in effect; drafts as in `undo`.
 
         Raises:
             CartsError: steps of another present user are in between.

@@ -64,7 +64,7 @@ def serve_site(
         options: See `ServerOptions`.
 
     Raises:
-        SystemExit: as `serve`.
+        SystemExit: see `serve`.
     """
     # Not needed by the viewer of one sequence.
     from carts_viewer.start.site import Site  # noqa: PLC0415
@@ -75,7 +75,7 @@ def serve_site(
 
 
 def _serve(opened: "Callable[[], ViewerApp | Site]", ready: Callable[[], str], *, open_browser: bool) -> None:
-    """Open, serve, save and close; `ready` returns the message to print after opening. Errors as `serve`."""
+    """Open, serve, save and close; `ready` returns the message to print after opening. Errors as in `serve`."""
     log_to_stderr()
     with GracefulShutdown() as end:
         try:
@@ -95,7 +95,7 @@ def _serve(opened: "Callable[[], ViewerApp | Site]", ready: Callable[[], str], *
 
 
 def _close(served: "ViewerApp | Site") -> None:
-    """Save and close. Errors as `serve`."""
+    """Save and close. Errors as in `serve`."""
     try:
         served.close()
         problem = served.storage_failure

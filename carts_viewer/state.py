@@ -59,7 +59,7 @@ def other_pose(compare: Compare, measured: SceneState, before_run: SceneState | 
 
 
 def composed(own: Rgba, other: Rgba, share: float) -> Rgba:
-    """Overlay of the other pose up to a share of the width, of the current pose beyond, and a line between them."""
+    """Overlay of the other pose on the left, of the current pose on the right, and of a line between them."""
     column = round(share * own.shape[1])
     both = np.concatenate([other[:, :column], own[:, column:]], axis=1)
     if 0 < column < own.shape[1]:
@@ -88,7 +88,7 @@ class JointRange:
     joint: str
     revolute: bool
     lower: float
-    """[rad] or [m]; joints without limits get half a revolution or one metre to either side."""
+    """Lower limit [rad or m]; without limits, the range is half a revolution or one metre to either side of zero."""
     upper: float
 
     @property
@@ -109,7 +109,7 @@ def joint_range(arm: Arm, joint: int) -> JointRange:
     """Range of the joint with this index."""
     lower, upper = (float(value) for value in arm.robot.joint_limits[joint])
     revolute = arm.robot.joint_types[joint] == "revolute"
-    # A slider needs limits; the default is half a revolution or one metre to either side.
+    # A slider needs limits; the default is half a revolution or one metre to either side of zero.
     room = math.pi if revolute else 1.0
     return JointRange(
         arm.name,
@@ -267,7 +267,7 @@ def _tensors(scene: SceneState) -> tuple[torch.Tensor, ...]:
 
 @dataclass(frozen=True)
 class Scores:
-    """Scores of a pose against ground truth; None if there is none."""
+    """Scores of a pose against ground truth; a score is None without ground truth."""
 
     dice: float | None = None
     """Dice overlap of the rendered mask and the ground truth in the shown camera, 0..1."""
@@ -279,7 +279,7 @@ class Scores:
 
 @dataclass(frozen=True)
 class Curves:
-    """One entry per iterate of the current run."""
+    """Curves of the current run, with one entry per iterate."""
 
     loss: tuple[float, ...] = ()
     stages: tuple[int, ...] = ()
@@ -428,9 +428,9 @@ class ViewState:
     keypoints: KeypointState = field(default_factory=KeypointState)
     brush: Brush = field(default_factory=Brush)
     maps: Maps | None = None
+    """Maps of the shown pose, frame and domain; None until needed."""
     refined: RefinedMasks | None = None
     """Masks for the layer *Refined mask*; outdated after a change of frame or pose, see `refined_mask`."""
-    """Maps of the shown pose, frame and domain; None until needed."""
     scores: Scores | None = None
     """Scores of the shown pose; None until computed, after its picture was sent."""
     networks: tuple[str, ...] = ()
@@ -438,7 +438,7 @@ class ViewState:
     network: str = ""
     """The network in use."""
     asked_network: str = ""
-    """The chosen network, if it is not used before its weights are accepted; otherwise empty."""
+    """The chosen network if its weights are not accepted yet; otherwise empty."""
     problems: tuple[str, ...] = ()
     """Messages about damaged files beside the project."""
     unfamiliar: tuple[str, ...] = ()

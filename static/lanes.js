@@ -3,7 +3,7 @@
 (() => {
   "use strict";
 
-  const KEPT = 800; // pictures
+  const KEPT = 800; // maximum number of cached pictures
   const AT_ONCE = 2;
   const WAIT = 90; // delay before a curve is requested again during a zoom [ms]
   const COLOURS = ["#8b98a5", "#2dd4a7"]; // of measured and corrected values

@@ -46,11 +46,11 @@
     strip = document.createElement("div");
     strip.className = "carts-strip";
     strip.innerHTML = `<div class="carts-strip-head">
-        <button data-do="first" title="Start the range at this frame; it limits playback, solving, optimizing and exporting. Key: (">(&nbsp;Start</button>
+        <button data-do="first" title="Start the range at this frame; the range limits playback, solving, optimizing and exporting. Key: (">(&nbsp;Start</button>
         <button data-do="last" title="End the range at this frame. Key: )">End&nbsp;)</button>
         <button data-do="whole" title="Remove the range">×</button>
         <span class="carts-range"></span>
-        <select aria-label="Curve" title="Draw a curve over all frames: a joint, the loss, or the fit"></select>
+        <select aria-label="Curve" title="Draw a curve over all frames: a joint, the loss, Dice or the probability of failure"></select>
         <button data-do="lanes" title="Show or hide thumbnails and curve" aria-label="Thumbnails and curve">▾</button>
         <button data-do="legend" title="Meaning of colours and marks" aria-expanded="false">Legend</button>
         <output></output>
@@ -102,11 +102,11 @@
       .flatMap((number) => [" ", key(colours[number], names[number])]);
     const rows = [
       ["White tick", "kept: an accepted frame, a keyframe, or a frame moved by hand; solving does not change it"],
-      ["Bar", "misfit: higher is worse; low and faint if the fit of the current pose is unknown, none if nothing is known. Its colour is the review state, or the source of the joints:", ...keys(REVIEW, NAMES)],
+      ["Bar", "misfit, where higher is worse; low and faint if the fit of the current pose is unknown, absent if nothing is known. Its colour shows the review state or, without a review, the source of the joints:", ...keys(REVIEW, NAMES)],
       ["Stripe below", "the verdict on the fit:", ...keys(FIT, VERDICTS)],
       ["Stripe below that", "the source of the joints:", ...keys(SOURCE, ["", NAMES[5], NAMES[1], NAMES[6]])],
-      ["Line at the bottom", "the whole sequence, in the colours of the verdicts or, if there is none, of the reviews; the box marks the part shown above"],
-      ["Bands", "teal: the shown frame; pink: being solved; amber: ends of the range, dimmed outside of it"],
+      ["Line at the bottom", "the whole sequence, in the colour of each frame's verdict or, without a verdict, of its review; the box marks the part shown above"],
+      ["Bands", "teal: the shown frame; pink: frames being solved; amber: ends of the range; frames outside of the range are dimmed"],
     ];
     card.append(...rows.flatMap(([name, ...about]) => [make("dt", {}, name), make("dd", {}, ...about)]));
     return card;

@@ -8,9 +8,9 @@
     ["canvas", "The picture", "The recorded image with the arm rendered at its joint positions. Wheel: zoom; drag: pan; " +
       "a click chooses a camera."],
     [".carts-verdict", "The verdict", "The reliability of the fit: good, doubtful or failed, with a reason and a remedy. " +
-      "It is derived from the images, not from the solver, and refers to the mask. The tab Values marks joints that the " +
+      "The verdict refers to the mask, and is derived from the images, not from the solver. The tab Values marks joints that the " +
       "images hardly determine."],
-    ["Run", "Run", "The optimizer moves the joints until the rendered arm and the images agree (key R). Curves below show its progress."],
+    ["Run", "Run", "The optimizer moves the joints until the rendered arm and the images agree (key R). The curves below show its progress."],
     ["Joints", "Joints", "Move joints by hand. Shift+click on the image places a keypoint of the arm."],
     [".carts-strip", "The timeline", "All frames: high bars indicate bad fits, and frames without a bar have no fit yet. Drag to scrub, wheel to zoom, Shift+drag for a range. " +
       "Legend explains colours and marks."],
@@ -19,7 +19,7 @@
     ["Jobs", "Jobs", "Long tasks run here while you continue: many frames, calibrations, exports."],
     ["Export", "Export", "Masks, keypoints and kinematics for other tools. Every edit is saved at once and can be undone."],
     [".carts-review-bar", "Review", "The verdict, and your review of the frame; accepting shows the next unreviewed frame."],
-    [".carts-review-bar [data-do=controls]", "All controls", "Everything else is behind this button, in tabs: fit, review, values, jobs, export, help."],
+    [".carts-review-bar [data-do=controls]", "All controls", "This button shows all other controls, in tabs: fit, review, values, jobs, export, help."],
     [".carts-bar [data-do=help]", "More", "This button, or the key ?, opens the key sheet. Every control has a hint, shown when the pointer " +
       "rests on it."],
   ];

@@ -36,7 +36,7 @@ Work = Callable[[Job], Outcome]
 def worker_died(job: Job) -> Outcome:
     """Outcome of a job whose worker died in every attempt."""
     return Outcome(
-        job.name, "failed", f"its worker process died {ATTEMPTS} times, perhaps for lack of memory; see its log"
+        job.name, "failed", f"its worker process died {ATTEMPTS} times, perhaps due to a lack of memory; see its log"
     )
 
 
@@ -136,7 +136,7 @@ def _threads_of_children(threads: int) -> Iterator[None]:
 
 
 def _serve(connection: Connection, work: Callable[[Job], Outcome], parent: int) -> None:
-    """Run jobs until the connection or the parent ends."""
+    """Run jobs until the connection is closed or the parent process ends."""
     with stopped_by_signals(), suppress(Stopped):
         end_with_parent(parent)
         while True:

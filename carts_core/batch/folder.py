@@ -53,7 +53,7 @@ class JobState:
     attempts: Annotated[int, msgspec.Meta(ge=0)] = 0
     """Number of starts since the job last finished or failed; more than 1 if a worker was lost."""
     error: str = ""
-    """Reason of a failure."""
+    """Reason for a failure."""
     worker: str = ""
     """Machine and process of the last run."""
     heartbeat: float = 0.0
@@ -180,7 +180,7 @@ class Findings:
 
 
 def read_findings(folder: OutputPath) -> Findings | None:
-    """Read the results of the job in a folder; None before its end. `OSError` or `ValueError` if the file is
+    """Read the results of the job in a folder; None if it has not finished. `OSError` or `ValueError` if the file is
     damaged."""
     path = folder / FINDINGS_FILE
     if not holds_file(path):
@@ -277,7 +277,7 @@ class KnownJob:
 
     @property
     def error(self) -> str:
-        """Last line of the job's error, or reason why its results cannot be read; empty without either."""
+        """Last line of the job's error, or reason why its results cannot be read; empty if there is neither."""
         lines = self.state.error.strip().splitlines()
         return lines[-1][:_MAX_ERROR_LENGTH] if lines else self.damage
 
@@ -343,7 +343,7 @@ def read_jobs(folder: Path) -> list[Job]:
 
 
 _MADE = {"calibrate": "calibration", "import": "recording"}
-"""Step -> folder with its sequence file; the results of a job refer to the first existing file of these."""
+"""Step -> folder with its sequence file; the results of a job refer to the first of these files that exists."""
 
 
 def sequence_file(folder: OutputPath, job: Job) -> Path:

@@ -49,7 +49,7 @@ def read_manifest(path: Path, output: Path | None = None) -> list[Job]:
     try:
         content = parse_toml(read_text(path, SETTINGS))
     except (OSError, ValueError) as error:
-        raise SettingsError(f"manifest {path} cannot be read: {error}. Give a TOML file; docs: batch.") from error
+        raise SettingsError(f"manifest {path} cannot be read: {error}. Give a TOML file (docs: batch).") from error
     if content.get("format") != FORMAT:
         raise SettingsError(
             f"manifest {path} has the format {shown(content.get('format'))}; write format = {FORMAT!r}."
@@ -59,7 +59,7 @@ def read_manifest(path: Path, output: Path | None = None) -> list[Job]:
         raise SettingsError(f"manifest {path} has no [[jobs]]. Add at least one, with recordings and steps.")
     strangers = set(content) - {"format", "jobs"}
     if strangers:
-        raise SettingsError(f"manifest {path} has {listed(sorted(strangers))}; allowed: format and [[jobs]].")
+        raise SettingsError(f"manifest {path} contains {listed(sorted(strangers))}; allowed: format and [[jobs]].")
     found = [
         job for number, table in enumerate(tables, 1) for job in _jobs(path, output, f"{path}, jobs {number}", table)
     ]
@@ -69,7 +69,7 @@ def read_manifest(path: Path, output: Path | None = None) -> list[Job]:
 
 def _jobs(manifest: Path, output: Path | None, where: str, table: dict[str, Any]) -> Iterator[Job]:
     if strangers := set(table) - _KEYS:
-        raise SettingsError(f"{where} has {listed(sorted(strangers))}; allowed: {listed(sorted(_KEYS))}.")
+        raise SettingsError(f"{where} contains {listed(sorted(strangers))}; allowed: {listed(sorted(_KEYS))}.")
     steps = _steps(where, _texts(where, table, "steps", None))
     options = _options(where, table.get("options", {}), steps)
     recordings = _recordings(manifest, output, where, _texts(where, table, "recordings", None))
@@ -100,7 +100,7 @@ def _options(where: str, given: Any, steps: tuple[Step, ...]) -> dict[str, tuple
     if not isinstance(given, dict):
         raise SettingsError(f"{where}: options is {shown(given)}; give a table with a list of strings per step.")
     if strangers := [name for name in given if name not in steps]:
-        raise SettingsError(f"{where}: options given for {strangers[0]!r}; its steps are {', '.join(steps)}.")
+        raise SettingsError(f"{where}: options are given for {strangers[0]!r}, but the steps are {', '.join(steps)}.")
     return {step: _texts(f"{where}, options", given, step, None) for step in given}
 
 
@@ -118,13 +118,16 @@ def _recordings(manifest: Path, output: Path | None, where: str, patterns: tuple
 
 
 def _name(recording: Path, domain: str, camera: str) -> str:
-    """Name of a job: recording (folder of a `sequence.toml`, else the stem), domain and camera, joined by hyphens."""
+    """Name of a job: recording, domain and camera, joined by hyphens.
+
+    A recording is named by the folder of its `sequence.toml`, or by the stem of any other file.
+    """
     stem = recording.parent.name if recording.name == "sequence.toml" else recording.stem
     return "-".join(part for part in (stem, domain, camera if camera != "all" else "") if part)
 
 
 def shard(jobs: list[Job], text: str) -> list[Job]:
-    """Shard `i/n` of the jobs: every n-th job from the i-th on, 1 <= i <= n. Each job is in exactly one shard."""
+    """Shard `i/n` of the jobs: every n-th job, starting with the i-th (1 <= i <= n). Each job is in one shard."""
     first, _, count = text.partition("/")
     if not (first.isdecimal() and count.isdecimal() and 1 <= int(first) <= int(count)):
         raise SettingsError(f"--shard {text!r} is invalid. Give I/N with 1 <= I <= N, such as 2/8.")

@@ -179,10 +179,10 @@ def _statistics(corrections: Sequence[float], deviations: Sequence[float]) -> di
 def _joint_table(joints: Mapping[str, _Values]) -> Table | None:
     headings = {
         "mean": "mean",
-        "deviation": "deviation",
-        "median_size": "median size",
-        "largest_size": "largest",
-        "median_reported": "median standard deviation",
+        "deviation": "standard deviation",
+        "median_size": "median absolute value",
+        "largest_size": "largest absolute value",
+        "median_reported": "median reported standard deviation",
     }
     rows = []
     for name, values in joints.items():

@@ -30,20 +30,21 @@ class Batch(RangedOptions):
     manifest: Annotated[Path, tyro.conf.Positional]
     """Manifest of recordings, cameras, domains and steps (docs: batch)."""
     output: Path | None = None
-    """Output folder; by default `runs/batch/NAME`, with the name of the manifest. Each job has its own folder in
+    """Output folder; by default `runs/batch/NAME`, where NAME is that of the manifest. Each job has its own folder in
     `jobs`."""
     workers: Annotated[int, Range(0)] = 0
-    """Parallel jobs; by default the number of cores."""
+    """Number of parallel jobs; by default the number of cores."""
     threads: Count = 1
-    """Threads per job. One thread is most efficient with more jobs than cores."""
+    """Number of threads per job. One thread is most efficient if there are more jobs than cores."""
     shard: str = "1/1"
-    """Run every N-th job, starting with the I-th, as `I/N`. Shards may run on all machines that share the folder."""
+    """Shard `I/N`: run every N-th job, starting with the I-th. Machines that share the folder can run one shard
+    each."""
     scheduler: str | None = None
     """Run jobs with dask.distributed: address of its scheduler, or `local` for workers on this machine."""
     project: Literal["beside", "none"] = "beside"
     """Corrections for jobs that only evaluate or export: `beside` for the project beside the recording, or `none`."""
     again: bool = False
-    """Repeat finished steps, which recomputes results with changed inputs."""
+    """Run finished steps again; results whose inputs have changed are recomputed."""
     report_only: bool = False
     """Only write the report on finished jobs."""
 
@@ -94,8 +95,8 @@ class Batch(RangedOptions):
 
             engine = Cluster(work, self.scheduler, workers, self.threads)
         if self.project == "beside" and (those := sum(with_project(job) is not None for job in jobs)):
-            counts_of = f"{those} of {counted(len(jobs), 'job')} use the corrections of the project beside"
-            console.print(f"{counts_of}; see the logs for counts; --project none uses the measured joints")
+            counts_of = f"{those} of {counted(len(jobs), 'job')} use the project beside the recording"
+            console.print(f"{counts_of} (see the logs). To use the measured joints: --project none")
         failed, counts = {}, Counter()
         kept = f"{folder} holds the finished jobs; rerun the command to resume"
         with message_if_stopped(kept), Bar(console=console) as bar:
@@ -105,7 +106,7 @@ class Batch(RangedOptions):
                 bar.update(task, advance=1, description=f"jobs, {counts['failed']} failed")
                 if outcome.status == "failed":
                     failed[outcome.job] = outcome.error
-        words = {"done": "done", "known": "already there", "busy": "run by another process", "failed": "failed"}
+        words = {"done": "done", "known": "done earlier", "busy": "run by another process", "failed": "failed"}
         console.print(", ".join(f"{counts[status]} {words[status]}" for status in words if counts[status]))
         return failed
 

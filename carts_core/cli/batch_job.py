@@ -45,7 +45,7 @@ _COMMANDS: dict[Step, type] = {
 _GIVEN = ("--output", "-o", "--overwrite", "--json", "--kinematics", "--mode", "--camera", "--domain")
 """Options that a job sets itself."""
 _CORRECTING: tuple[Step, ...] = ("import", "calibrate", "optimize", "sequence")
-"""Steps after which a job evaluates and exports their results."""
+"""Steps whose results the job evaluates and exports, in place of the project beside the recording."""
 _CODE = ("**/*.py",)
 
 
@@ -137,7 +137,7 @@ def _steps(job: Job, folder: OutputPath, state: RunningJob, work: BatchWork) -> 
         known = state.state.steps.get(step)
         if work.again or known is None or known.key != key:
             began = time.perf_counter()
-            # The findings describe earlier results. If the process is killed, they are written when the job resumes.
+            # The findings describe earlier results. After a kill, they are written again when the job resumes.
             remove_file(folder / FINDINGS_FILE)
             with _logged(folder / f"{step}.log"):
                 _parsed(step, [*_arguments(job, step, sequence, folder), *options]).run()

@@ -39,7 +39,7 @@ class HandEye:
     output: Path | None = None
     """Folder to write to; by default `runs/NAME/hand_eye`."""
     overwrite: bool = False
-    """Replace an earlier result there."""
+    """Replace an earlier result in the folder."""
     focal_length: bool = False
     """Also estimate the focal lengths, and print their standard deviations. Requires points at several depths."""
     free_cameras: tuple[str, ...] = ()
@@ -106,11 +106,11 @@ class TimeOffset:
     """
 
     sequence: SequencePath
-    """Sequence file whose table rows are matched with frames by time ([frames])."""
+    """Sequence file; table rows must be matched to frames by time ([frames])."""
     output: Annotated[Path | None, tyro.conf.arg(aliases=["-o"])] = None
     """Folder to create for a sequence file with the proposed time_offset; by default the offset is only printed."""
     overwrite: bool = False
-    """Replace an earlier result there."""
+    """Replace an earlier result in the folder."""
     camera: str | None = None
     """Camera whose images are used; by default the first camera."""
     domain: str | None = None
@@ -162,7 +162,7 @@ class Calibrate:
     output: Path | None = None
     """Folder to write to; by default `runs/NAME/calibration`."""
     overwrite: bool = False
-    """Replace an earlier calibration there."""
+    """Replace an earlier calibration in the folder."""
     frames: str | None = None
     """Frames used for the calibration: `spread:20` (default) for 20 evenly spaced frames, or frame ids as in `carts
     evaluate`: `all`, `001-010,015`, `::3`."""
@@ -199,7 +199,7 @@ class Calibrate:
         output = output_folder(self.output, sequence.name, "calibration")
         observer = self.network.observer(self.solving.chosen, sequence)
         prior = read_prior(sequence)
-        # Cameras with known poses before the hand-eye calibration are locked.
+        # Cameras whose poses were known before the hand-eye calibration are locked.
         known_cameras = [name for name in cameras if prior is not None and name not in prior.free_cameras]
         free = replace(self.free, locked_cameras=tuple(dict.fromkeys((*self.free.locked_cameras, *known_cameras))))
         observer.check(sequence, indices, cameras, [self.domain])
@@ -230,7 +230,7 @@ class Calibrate:
             if text is not None and not self.beyond_hand_eye:
                 raise SettingsError(
                     f"{text[0].upper()}{text[1:]} Nothing was written. Check the clicked points, the joints and the "
-                    "masks, or use --beyond-hand-eye to write it anyway."
+                    "masks, or write it anyway with --beyond-hand-eye."
                 )
             residuals = frame_residuals(sequence, frames, result)
             named = [sequence.frame_ids[index] for index in indices]

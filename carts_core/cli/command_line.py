@@ -38,7 +38,7 @@ def settings_reference() -> str:
     parts = [
         "Settings in the tables [solver] and [sequence] of `--settings FILE`; --print-settings writes all of them.",
         *(described(kind) for kind in (SurfaceSolver, DescentSolver, SequenceSettings)),
-        "Stages: tables [[solver.stages]] whose key `stage` is the stage's name:",
+        "Stages: tables [[solver.stages]], whose key `stage` is the name of the stage:",
         *(described(kind) for kind in get_args(Stage)),
     ]
     return "\n\n".join(parts)
@@ -78,7 +78,7 @@ COMMANDS: dict[str, type] = {
 Command: Any = reduce(or_, (Annotated[kind, tyro.conf.subcommand(name)] for name, kind in COMMANDS.items()))
 
 _AT_ONCE = (View, Live, RobotCommand, Robots)
-"""Commands without a message at the start."""
+"""Commands that do not announce their start."""
 _INVALID_CHOICE = re.compile(r"invalid choice '(?P<given>[^']*)' for .*?Expected one of \((?P<known>[^)]*)\)")
 """Pattern of tyro's error message, without the surrounding box."""
 

@@ -49,7 +49,7 @@ class Render:
         sequence = self.source.corrected(sequence, frames, console)
         with (
             locked_folder(folder),
-            message_if_stopped(f"the pictures in {folder} are complete files; others are missing"),
+            message_if_stopped(f"the images written to {folder} so far are complete; the remaining ones are missing"),
         ):
             for domain in self.select.domain_names(sequence):
                 for camera in self.select.camera_names(sequence.scene):
@@ -91,11 +91,11 @@ class Export:
     """`named`: labels refer to the images of the recording, and formats that require images beside their labels (bop,
     voc, yolo) get copies; `copied`: copies for every format; `none`: no images. Copies are bit-identical."""
     frame_rate: float | None = None
-    """Frame rate of a video [1/s]; by default the frame rate of the recording, or 25 without times."""
+    """Frame rate of a video [1/s]; by default the frame rate of the recording, or 25 if it has no timestamps."""
     masks: Masks = "auto"
     """Masks of the formats masks, coco, yolo, voc, cvat and datumaro: `rendered` at the corrected pose, or `refined`
     near their outline by the network; `auto` refines the masks of frames with the verdict *good*. Rendered masks of
-    refined views are in the folder `rendered`."""
+    refined views are written to the folder `rendered`."""
     network: Annotated[Network, tyro.conf.arg(name="")] = field(default_factory=Network)
     overwrite: bool = False
     """Replace an earlier export."""
@@ -136,7 +136,7 @@ class Export:
         sources = [dataset.mask_source(frame, camera) for _, frame, camera in dataset.steps]
         if FORMATS[self.format].refines and (refined := sources.count("refined")):
             number = f"{refined} of {counted(len(sources), 'mask')}"
-            console.print(f"{number} refined near the outline; the rendered masks are in the folder `rendered`")
+            console.print(f"{number} were refined near the outline; the rendered masks are in the folder `rendered`")
         console.print(f"wrote {path}")
 
     def _frames(

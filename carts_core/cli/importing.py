@@ -88,7 +88,7 @@ class ImportMasks:
     project: Path | None = None
     """Project file; by default the project beside the sequence."""
     camera: str | None = None
-    """Camera of the images, if file and folder names do not contain it."""
+    """Camera of the images, if its name does not occur in the names of files and folders."""
     replace: bool = False
     """Replace earlier imports. Painted layers are not changed."""
 

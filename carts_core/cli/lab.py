@@ -53,9 +53,9 @@ class Train(RangedOptions):
     output: Annotated[Path, tyro.conf.Positional] = Path("runs/train")
     """Folder for checkpoints, weights and the training report."""
     for_: Annotated[Path | None, tyro.conf.arg(name="for", metavar="SEQUENCE")] = None
-    """Sequence file to which the shipped network is adapted: robots, cameras, distances and empty backgrounds. Training
-    stops when validation no longer improves, after 400 steps (`--steps`), or after `--minutes` of CPU time. The weights
-    are accepted if no fit gets worse.
+    """Sequence file whose robots, cameras, distances and empty backgrounds the network is adapted to. Training stops
+    when validation no longer improves, after 400 steps (`--steps`), or after `--minutes` of CPU time. The weights are
+    accepted if no fit gets worse.
     """
     fits: Count = 8
     """With `--for`: number of synthetic images for the comparison of fits; half as many frames of the recording are
@@ -76,7 +76,7 @@ class Train(RangedOptions):
             task = bar.add_task("training", total=self.training.steps)
 
             def report(progress: TrainingProgress) -> None:
-                text = f"loss {progress.loss:.3f}, {progress.seconds_per_step:.2f} s a step"
+                text = f"loss {progress.loss:.3f}, {progress.seconds_per_step:.2f} s per step"
                 bar.update(task, completed=progress.step, total=progress.steps, description=text)
 
             result = train(self.training, self.output, report)
@@ -116,8 +116,8 @@ class Train(RangedOptions):
         for line in found.lines:
             console.print(line, soft_wrap=True)
         if found.worse:
-            console.print(f"rejected, because worse: {'; '.join(found.worse)}", soft_wrap=True)
-            console.print(f"The weights are in {found.weights}. Keep using the previous network.", soft_wrap=True)
+            console.print(f"rejected because of worse results: {'; '.join(found.worse)}", soft_wrap=True)
+            console.print(f"The weights are in {found.weights}. Continue to use the previous network.", soft_wrap=True)
             return
         console.print(f"weights: {found.weights}")
         console.print(f"To use them: carts optimize {recording} --weights {found.weights}", soft_wrap=True)
@@ -166,7 +166,7 @@ class Bench:
     report_only: bool = False
     """Only write the report, from earlier measurements."""
     frames: int | None = None
-    """Number of frames per sequence; by default as in the scope."""
+    """Number of frames per sequence; by default that of the quick or full benchmark."""
     seed: int | None = None
     """Seed of the synthetic sequence."""
     baselines: tuple[Path, ...] = ()
@@ -206,7 +206,7 @@ class Bench:
         benchmark = Benchmark(scope, sources, extractor, results, runs, baselines)
         if results.unreadable:
             console.print(
-                f"{results.path}: {counted(results.unreadable, 'torn line')} ignored; those runs are measured again"
+                f"{results.path}: {counted(results.unreadable, 'unreadable line')} ignored; measurements are repeated"
             )
         stages, hand_eye = folder / "stages.json", folder / "hand_eye.json"
         if not self.report_only:

@@ -29,9 +29,9 @@ class Live(RangedOptions):
     joints_port: int | None = None
     """With `camera` and `video`: port on 127.0.0.1 for joints and results."""
     rate: Annotated[float | None, Range(0, 1000, above=True)] = None
-    """Replay: frame rate [1/s]; by default the frame rate of the recording."""
+    """Frame rate of a replay [1/s]; by default the frame rate of the recording."""
     loops: Count = 1
-    """Replay: number of repetitions."""
+    """Number of repetitions of a replay."""
     output: Path | None = None
     """File for results, one JSON object per line; by default the standard output. With a socket, results are also sent
     to all clients.
@@ -45,7 +45,7 @@ class Live(RangedOptions):
     camera: tuple[str, ...] = Selection.camera
     """Cameras, by name."""
     domain: str | None = None
-    """Replay: domain, by name; by default the first domain of the sequence."""
+    """Domain of a replay, by name; by default the first domain of the sequence."""
     free: Annotated[FrameFreeParameters, tyro.conf.arg(name="")] = field(default_factory=FrameFreeParameters)
     network: Annotated[Network, tyro.conf.arg(name="")] = field(default_factory=Network)
 

@@ -122,7 +122,7 @@ class Evaluate:
                 verdict_line(where, [score.verdict for score in seen], [score.not_determined for score in seen]),
             )
         if any(score.verdict not in (None, "good") for score in scores):
-            print_hints(console, "--json FILE also writes the reasons of verdicts.")
+            print_hints(console, "--json FILE also writes the reasons for the verdicts.")
         required = self.solving.chosen.needs_background
         for group in [] if observer.masked else camera_groups(cameras, self.together):
             for domain in domains:

@@ -106,7 +106,7 @@ class FrameInputs:
         return self._common
 
     def of(self, index: int) -> InputHashes:
-        """Fingerprints of an individually corrected frame; `SequenceError` if an image is missing."""
+        """Fingerprints of the inputs of an individually corrected frame; `SequenceError` if an image is missing."""
         sequence, domain = self._setup.sequence, self._setup.domain
         start = self._setup.frame(index, cameras=()).measured
         joints = [(name, start[name], sequence.measured[name][index]) for name in sorted(start)]
@@ -119,7 +119,7 @@ class FrameInputs:
         return origin
 
     def of_all(self, indices: Several[int]) -> InputHashes:
-        """Fingerprints of jointly corrected frames, each of which depends on the inputs of all frames."""
+        """Fingerprints of the inputs of jointly corrected frames; each frame depends on the inputs of all frames."""
         each = [self.of(index) for index in indices]
         sequence = self._setup.sequence
         stamps = sequence.timestamps
@@ -150,7 +150,7 @@ def changes(before: InputHashes, now: InputHashes) -> str | None:
 
 
 def row_fingerprint(scene: Scene, row: KinematicsRow) -> str:
-    """Fingerprint of a table row, with the precision of the file."""
+    """Fingerprint of a table row, at the precision of the file."""
     values = np.concatenate([position_values(scene, row), std_values(scene, row)])
     verdict = [row.verdict] if row.verdict else []
     return fingerprint(row.frame_id, row.source, [f"{value:.9g}" for value in values], *verdict)
@@ -423,7 +423,7 @@ class OptimizeRun:
         others = [row.frame_id for row in output.rows if row.frame_id not in chosen]
         reasons = Counter(fault for frame_id in others if (fault := output.outdated_reason(frame_id, common)))
         for reason, count in reasons.items():
-            note = f"{counted(count, 'frame')} outside of this run are outdated: {reason}"
+            note = f"results of {counted(count, 'frame')} outside of this run are outdated: {reason}"
             self._console.print(f"{output.folder}: {note}")
 
     def _kept(self, part: _Part) -> str:

@@ -90,10 +90,10 @@ def chosen_frames(frames: str | None, positions: str | None, ids: Names[str]) ->
         raise SettingsError("--frames and --positions are mutually exclusive. Give only one of them.")
     if positions is not None:
         numbers = [str(position) for position in range(1, len(ids) + 1)]
-        return _chosen("--positions", positions, numbers, "Positions count from 1, as in the viewer; they are")
+        return _chosen("--positions", positions, numbers, "Positions count from 1, as in the viewer; they range from")
     text = ALL if frames is None else frames
     try:
-        return _chosen("--frames", text, ids, "Frames have the names of the recording, as in the viewer:")
+        return _chosen("--frames", text, ids, "Frames are named as in the recording and the viewer:")
     except SettingsError as error:
         numbers = re.fullmatch(r"\d+(-\d+)?(,\d+(-\d+)?)*", text) and [int(one) for one in re.findall(r"\d+", text)]
         if not numbers or max(numbers) >= len(ids):
@@ -169,7 +169,7 @@ class ProjectOption:
             with Project.open(sequence, path, read_only=True) as project:
                 return project.state
         except ProjectError as error:
-            raise ProjectError(f"{error} To ignore it: --project {NO_PROJECT}.") from error
+            raise ProjectError(f"{error} To ignore the project: --project {NO_PROJECT}.") from error
 
     def sentence(self, sequence: "Sequence", project: "ProjectState | None", frames: Names[int]) -> str | None:
         """Message on the project in use and the review states of the selected frames; None without a project."""
@@ -369,7 +369,7 @@ def _table(given: tuple[str, ...], name: str) -> dict[str, Any]:
         strangers = set(content) - {"solver", "sequence", "free"}
         if strangers or not all(isinstance(table, dict) for table in content.values()):
             wrong = ", ".join(sorted(strangers)) or "values outside tables"
-            raise SettingsError(f"--settings {text} has {wrong}; allowed: the tables [solver], [sequence] and [free].")
+            raise SettingsError(f"--settings {text} contains {wrong}; allowed: tables [solver], [sequence], [free].")
         found.update(content.get(name, {}))
     return found
 
@@ -436,9 +436,9 @@ class Observer:
             # recording.
             if without and (self.every or (self.given is not None and len(without) == len(frames))):
                 raise SettingsError(
-                    f"{len(without)} of {counted(len(frames), 'frame')} have no {self._origin} of camera "
-                    f"{camera!r}; the first is frame {sequence.frame_ids[without[0]]}. Choose "
-                    "others with --frames and --camera, or use the network for them with --observe both."
+                    f"{len(without)} of {counted(len(frames), 'frame')} have no {self._origin} for camera "
+                    f"{camera!r}; the first is frame {sequence.frame_ids[without[0]]}. Choose other frames or "
+                    "cameras with --frames and --camera, or use the network for these frames with --observe both."
                 )
 
     @property
@@ -464,7 +464,7 @@ class Observer:
             if not without or len(without) == len(cameras):
                 return []
             return [
-                f"Frame {sequence.frame_ids[index]} has no {self._origin} of camera {', '.join(without)}, so all "
+                f"Frame {sequence.frame_ids[index]} has no {self._origin} for camera {', '.join(without)}, so all "
                 f"cameras fitted together ({', '.join(cameras)}) use the network in this frame, even those with masks. "
                 "Leave out that camera with --camera, or give masks for it."
             ]
@@ -512,8 +512,8 @@ class ObservationOptions(Network):
         """
         if self.observe != "network" and not isinstance(settings, SurfaceSolver):
             raise SettingsError(
-                f"--observe {self.observe} requires the solver surface, occluded or none; the given one compares image "
-                "features. Leave out --solver or --observe."
+                f"--observe {self.observe} requires the solver surface, occluded or none; the given solver compares "
+                "image features. Leave out --solver or --observe."
             )
         if self.observe == "masks" and self.weights:
             raise SettingsError("--observe masks loads no network, but --weights was given. Remove one of the options.")

@@ -122,9 +122,9 @@ def constant_correction_hint(where: str, sequence: recording.Sequence, rows: Seq
     names, units = joint_columns(scene), np.where(prismatic, "mm", "deg")
     found = ", ".join(f"{names[joint]} {typical[joint]:+.1f} {units[joint]}" for joint in constant)
     return (
-        f"{where}: corrections are large and nearly constant over the frames: {found}. Joints also compensate for "
-        "wrong intrinsics, base frames and joint zeros; check these before you rely on joint positions. Masks are "
-        "unaffected."
+        f"{where}: corrections are large and nearly constant over the frames: {found}. Joint corrections also "
+        "compensate for wrong intrinsics, base frames and joint zeros; check these before you rely on joint positions. "
+        "Masks are unaffected."
     )
 
 

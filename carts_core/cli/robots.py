@@ -54,7 +54,7 @@ class Robots:
 
         with (
             locked_folder(folder),
-            message_if_stopped(f"the pictures in {folder} are complete files; others are missing"),
+            message_if_stopped(f"the images written to {folder} so far are complete; the remaining ones are missing"),
         ):
             for name in track(names, "pictures", console=console):
                 write_bytes(folder / f"{name}.png", image_png(portrait(Robot.load(SCHEME + name))))

@@ -234,7 +234,7 @@ def write_datumaro(dataset: Dataset, folder: OutputPath, progress: ExportProgres
 
 
 _LISTS = ("Main", "Segmentation")
-"""Folders in `ImageSets` with image lists; each list has all images, since there is no split."""
+"""Folders in `ImageSets` with image lists; each list contains all images, since there is no split."""
 _MAX_CATEGORIES = 254
 """Maximum number of categories; 0 is the background, and 255 is VOC's void."""
 
@@ -284,7 +284,7 @@ def _object(category: Category, mask: np.ndarray) -> dict[str, Any]:
 
 
 def _name(category: Category) -> str:
-    return category.name.replace(":", "_")  # separates the columns of labelmap.txt
+    return category.name.replace(":", "_")  # a colon separates the columns of labelmap.txt
 
 
 def _palette() -> UInt8[np.ndarray, "256 3"]:

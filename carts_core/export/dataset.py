@@ -41,7 +41,7 @@ class ExportFrame(KinematicsRow):
     review: str | None = field(default=None, kw_only=True)
     """Name of the review state, such as accepted; None without a project."""
     dice: float | None = field(default=None, kw_only=True)
-    """Minimum Dice with the recorded masks over the cameras [1]; None if unknown."""
+    """Lowest Dice with the recorded mask of a camera [1]; None if unknown."""
     masks: Mapping[str, Bool[ndarray, "height width"]] = field(default_factory=dict, kw_only=True)
     """Camera -> corrected mask at the camera's size; rendered masks are used for other cameras."""
     part_labels: Mapping[str, UInt8[ndarray, "height width"]] = field(default_factory=dict, kw_only=True)
@@ -53,7 +53,7 @@ class ExportFrame(KinematicsRow):
 
 
 def measured_frames(sequence: Sequence, indices: Iterable[int]) -> list[ExportFrame]:
-    """Frames with measured joint positions."""
+    """Frames of `indices` with their measured joint positions."""
     return [
         ExportFrame(
             sequence.frame_ids[index],
@@ -66,7 +66,7 @@ def measured_frames(sequence: Sequence, indices: Iterable[int]) -> list[ExportFr
 
 
 def corrected_frames(sequence: Sequence, indices: Iterable[int], rows: Iterable[KinematicsRow]) -> list[ExportFrame]:
-    """Frames of `indices` with a table row, which has their joint positions.
+    """Frames of `indices` that have a table row, with the joint positions of that row.
 
     Raises:
         SequenceError: a row refers to a frame that is not in the sequence, or two rows to the same frame.
@@ -76,8 +76,8 @@ def corrected_frames(sequence: Sequence, indices: Iterable[int], rows: Iterable[
     for row in rows:
         if row.frame_id not in known:
             raise SequenceError(
-                f"the kinematics contain frame {row.frame_id!r}, which {sequence.path} does not have. Give the table "
-                "of this sequence."
+                f"the kinematics contain frame {row.frame_id!r}, which is not in {sequence.path}. Give the table of "
+                "this sequence."
             )
         if row.frame_id in by_id:
             raise SequenceError(f"the kinematics contain frame {row.frame_id!r} twice. Remove one of the rows.")
@@ -224,15 +224,13 @@ class Dataset:
     parts: Parts = "arms"
     """Granularity of the categories."""
     images: Images = "named"
-    """Whether labels refer to the recording's images or to copies, or no images are written, if supported by the
-    format.
-    """
+    """References to the recording's images, copies of the images, or no images, as far as the format supports it."""
     frame_rate: float | None = None
     """Frame rate of a video [1/s]; None for the recorded rate."""
     masks: Masks = "rendered"
     """Masks that are refined; painted and given masks are not changed."""
     load_networks: Callable[[], FeatureExtractor] | None = None
-    """Loads the networks for the first mask to refine; without it, masks are rendered."""
+    """Function that loads the networks when the first mask is refined; without it, masks are rendered."""
     rendered_folder: OutputPath | None = None
     """Folder for the rendered masks of refined views."""
 
@@ -242,7 +240,7 @@ class Dataset:
         known = {camera.name for camera in self.sequence.scene.cameras}
         if unknown := {camera for frame in self.frames for camera in frame.masks} - known:
             raise SettingsError(
-                f"masks were given for cameras {', '.join(sorted(unknown))}, which {self.sequence.path} does not have. "
+                f"masks were given for cameras {', '.join(sorted(unknown))}, which are not in {self.sequence.path}. "
                 f"Its cameras are: {', '.join(sorted(known))}."
             )
         if self.frame_rate is not None and not 0.1 <= self.frame_rate <= 1000.0:
@@ -460,7 +458,7 @@ def labelled(
     """
     if mask.shape != rendered.shape or mask.dtype != bool:
         raise CartsError(
-            f"{where}: the mask is {mask.dtype} {mask.shape}, the camera's images are {rendered.shape}. "
+            f"{where}: the mask is {mask.dtype} {mask.shape}, but the camera's images are {rendered.shape}. "
             "Give a Boolean mask of the camera's height and width."
         )
     if not mask.any():

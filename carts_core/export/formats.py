@@ -142,7 +142,7 @@ class ExportFormat:
     images: bool = False
     """Whether the format refers to images."""
     refines: bool = False
-    """Whether masks can be refined; other formats describe poses, whose masks are rendered."""
+    """Whether masks can be refined; formats that describe poses contain rendered masks."""
 
 
 FORMATS: dict[FormatName, ExportFormat] = {
@@ -158,7 +158,7 @@ FORMATS: dict[FormatName, ExportFormat] = {
     "npz": ExportFormat("Kinematics, NumPy", write_kinematics_npz, ".npz"),
     "json": ExportFormat("Kinematics, JSON", write_kinematics_json, ".json"),
     "dvrk": ExportFormat("Base frames for the dVRK", write_dvrk, ".json"),
-    "dvrk-2.3": ExportFormat("Base frames for the dVRK until 2.3", write_dvrk_2_3, ".json"),
+    "dvrk-2.3": ExportFormat("Base frames for the dVRK up to 2.3", write_dvrk_2_3, ".json"),
     "dvrk-suj": ExportFormat("Fixed set-up joints for the dVRK", write_dvrk_suj, ".json"),
     "video": ExportFormat("Overlay video", write_video),
 }

@@ -34,7 +34,7 @@ class KinematicsRow:
     source: str
     """Source of the values: measured, edited or optimized."""
     joint_positions: Mapping[str, np.ndarray]
-    """Arm name -> [dofs], [rad, m]."""
+    """Arm name -> joint positions [dofs], [rad, m]."""
     joint_std: Mapping[str, np.ndarray] | None = None
     """Arm name -> standard deviation of the joint positions [dofs], [rad, m]; NaN or no entry if unknown."""
     verdict: str | None = None

@@ -33,7 +33,7 @@ def overlay(
     mask: Bool[np.ndarray, "height width"],
     opacity: float,
 ) -> UInt8[np.ndarray, "height width 3"]:
-    """Blend the rendering over the image inside the mask, RGB."""
+    """Blend an RGB rendering over an RGB frame inside the mask."""
     return np.where(mask[..., None], cv2.addWeighted(frame, 1.0 - opacity, image, opacity, 0.0), frame)
 
 

@@ -31,7 +31,7 @@ class Tracked:
 
 
 Sink = Callable[[Tracked], None]
-"""Callback for results, called on the thread of the tracker."""
+"""Callback for results, called on the tracker's thread."""
 
 
 @dataclass

@@ -44,7 +44,7 @@ class FrameMessage(msgspec.Struct, tag="frame", forbid_unknown_fields=True):
     """Message with images, joint positions, or both."""
 
     time: float
-    """Time stamp on the sender's clock [s]."""
+    """Timestamp on the sender's clock [s]."""
     joints: dict[str, dict[str, float]] = {}
     """Arm -> joint -> position [rad, m]; omitted joints keep their value."""
     images: dict[str, ImageMessage] = {}
@@ -60,7 +60,7 @@ class ResultMessage(msgspec.Struct, tag="result"):
 
     id: str
     time: float
-    """Time stamp of the frame [s]."""
+    """Timestamp of the frame [s]."""
     age: float
     """Time from the frame's arrival to this message [s]."""
     verdict: str
@@ -133,7 +133,7 @@ def decoded(camera: str, image: ImageMessage) -> UInt8[np.ndarray, "height width
     if image.encoding == "rgb8":
         if image.width < 1 or image.height < 1 or len(image.data) != 3 * image.width * image.height:
             raise StreamError(
-                f"image of {camera}: {len(image.data)} bytes do not match {image.width} x {image.height} pixels of "
+                f"image of {camera}: {len(image.data)} bytes do not match {image.width} x {image.height} pixels in "
                 "rgb8."
             )
         return np.frombuffer(image.data, np.uint8).reshape(image.height, image.width, 3)
@@ -242,8 +242,8 @@ class Assembler:
                 largest = PLAUSIBLE[robot.joint_types[names.index(joint)]] if joint in names else -1.0
                 if not abs(value) <= largest:
                     raise StreamError(
-                        f"{name}: joint {joint!r} is {value}; its joints are {', '.join(names)}, in rad or m, at most "
-                        f"{PLAUSIBLE['revolute']:.3g} rad and {PLAUSIBLE['prismatic']:.3g} m."
+                        f"{name}: joint {joint!r} is {value}. Give values for the joints {', '.join(names)}, of at "
+                        f"most {PLAUSIBLE['revolute']:.3g} rad or {PLAUSIBLE['prismatic']:.3g} m."
                     )
                 self._joints[name][names.index(joint)] = value
             self._known.add(name)
@@ -252,7 +252,7 @@ class Assembler:
         known = [camera.name for camera in self._sequence.scene.cameras]
         for name, rows in message.camera_poses.items():
             if name not in known:
-                raise StreamError(f"camera_poses of {name!r}: the cameras are {', '.join(known)}.")
+                raise StreamError(f"camera_poses: there is no camera {name!r}; the cameras are {', '.join(known)}.")
             try:
                 self._poses[name] = rigid_transform(rows, f"camera_poses of {name!r}")
             except SettingsError as error:
@@ -261,7 +261,7 @@ class Assembler:
     def _image(self, name: str, message: FrameMessage) -> np.ndarray:
         if name not in message.images:
             raise StreamError(
-                f"a frame has no image of camera {name!r}. Send one per camera: {', '.join(self._cameras)}."
+                f"a frame has no image of camera {name!r}. Send one image per camera: {', '.join(self._cameras)}."
             )
         return self.undistorted(name, decoded(name, message.images[name]))
 

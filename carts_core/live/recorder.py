@@ -41,7 +41,7 @@ _VERDICTS = {
         "failed", "The arms were lost during live tracking; joints are the measured values.", _AGAIN, 1.0
     ),
 }
-"""Recorded verdicts; the probabilities are not calibrated and only used to sort the worst frames first."""
+"""Recorded verdicts; the probabilities are not calibrated, and are used only to sort the worst frames first."""
 
 
 class Recorder:

@@ -44,7 +44,7 @@ _LINGER = 1.0
 
 
 class _Client:
-    """Connection with its queue of outgoing messages, and time of the client's last message [s]."""
+    """Client: queue of outgoing messages, and time of the last received message [s]."""
 
     def __init__(self) -> None:
         self.waiting: queue.Queue[bytes | None] = queue.Queue(_WAITING)
@@ -53,7 +53,7 @@ class _Client:
 
 
 class StreamServer:
-    """Server on 127.0.0.1: source of frames, to whose clients results are sent.
+    """Server on 127.0.0.1 that receives frames from clients and sends them the results.
 
     Args:
         assembler: assembler of messages.
@@ -176,7 +176,7 @@ def _put_newest(waiting: queue.Queue, item: object) -> None:
 _log = logging.getLogger(__name__)
 
 _NAMED = 20
-"""Maximum number of logged unusable frames."""
+"""Maximum number of unusable frames that are logged."""
 _POLL = 0.01
 """Polling interval of a folder [s]."""
 _SUFFIXES = (".png", ".jpg", ".jpeg")
@@ -201,10 +201,10 @@ class Replay(_Closable):
         cameras: cameras to replay.
         domain: domain to replay.
         rate: frame rate [1/s]; None for the recorded frame rate.
-        loops: number of repetitions, with time stamps that continue to increase.
+        loops: number of repetitions, with timestamps that continue to increase.
 
     Raises:
-        SettingsError: the recording has no times, and no rate is given.
+        SettingsError: the recording has no timestamps, and no rate is given.
     """
 
     def __init__(
@@ -216,7 +216,7 @@ class Replay(_Closable):
         if rate is not None:
             self._times = np.arange(count) / rate
         elif sequence.timestamps is None:
-            raise SettingsError(f"{sequence.name} has no times. Give its frame rate (--rate).")
+            raise SettingsError(f"{sequence.name} has no timestamps. Give its frame rate (--rate).")
         else:
             self._times = sequence.timestamps - sequence.timestamps[0]
         last_gap = self._times[-1] - self._times[-2] if count > 1 else 1.0
@@ -349,7 +349,7 @@ class Folder(_Closable):
 
 @dataclass(frozen=True)
 class OpenStream:
-    """Source with its optional server."""
+    """Source of frames, and its server if it has one."""
 
     source: Source
     server: StreamServer | None = None
@@ -386,7 +386,7 @@ def open_stream(
         loops: number of repetitions of a replay.
 
     Raises:
-        SettingsError: a device, a folder or a port cannot be used, or a replay has no times.
+        SettingsError: a device, a folder or a port cannot be used, or a replay has no timestamps.
     """
     if address.kind is StreamKind.REPLAY:
         return OpenStream(Replay(sequence, cameras, domain, rate=rate, loops=loops))

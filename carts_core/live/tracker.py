@@ -53,7 +53,7 @@ class LiveEstimate:
 
     frame_id: str
     time: float
-    """Time stamp [s]."""
+    """Timestamp [s]."""
     verdict: LiveVerdict
     effort: Effort
     loss: float
@@ -91,7 +91,7 @@ def change(before: Picture, now: Picture) -> float:
 _REMEMBERED = 60
 """Number of recent good fits whose median loss is the reference."""
 _LOOKED = 1.0
-"""Interval of checks for an arm elsewhere in the image [s]."""
+"""Interval between checks for an arm elsewhere in the image [s]."""
 
 
 @dataclass(frozen=True)
@@ -100,7 +100,7 @@ class _Attempt:
 
     effort: Effort
     time: float
-    """Time stamp of the frame [s]."""
+    """Timestamp of the frame [s]."""
     state: Gaussian
     """Predicted state of the error model."""
     gap: float
@@ -130,7 +130,7 @@ class LiveTracker:
         settings: noise, weights and working size; the stages are those of `live`.
         model: model of the measurement error.
         live: stages, and thresholds for lost arms.
-        free: unknowns.
+        free: free parameters.
         backgrounds: backgrounds of the cameras; detections in them are false positives.
         cameras: names of the cameras to use, all by default.
         concurrent: whether recovery runs on a separate thread, while later frames are doubtful or lost; otherwise
@@ -166,7 +166,7 @@ class LiveTracker:
         self._filtered: Gaussian | None = None
         """State of the error model after the last good frame."""
         self._seen = -math.inf
-        """Time stamp of the last good frame [s]."""
+        """Timestamp of the last good frame [s]."""
         self._searched = self._looked = -math.inf
         self._elsewhere = False
         """Whether the last check found an arm out of view and a prediction elsewhere."""
@@ -185,7 +185,7 @@ class LiveTracker:
         """Estimate the next frame.
 
         Args:
-            frame: images, measured joint positions and time stamp.
+            frame: images, measured joint positions and timestamp.
             camera_poses: camera name -> T_camera_world [m], for cameras whose pose differs from that in the scene.
                 In this case backgrounds are not used, since moving cameras have no background.
 
@@ -226,7 +226,7 @@ class LiveTracker:
     def _arm_is_elsewhere(
         self, frame: Frame, variables: Variables, correction: np.ndarray, loss: float, now: float
     ) -> bool:
-        """Whether an arm is out of view, but an arm is predicted elsewhere; checked at intervals."""
+        """Whether an arm is out of view at its pose, but the network predicts one elsewhere; checked at intervals."""
         if now - self._looked >= _LOOKED:
             solver = self._solvers[Effort.SMALL, self._moving]
             missing = solver.arms_out_of_view(variables, correction)

@@ -181,7 +181,7 @@ SEALED = 3
 """First schema with digests."""
 
 MAX_VALUE_LENGTH = 128 * 2**20
-"""Maximum value of a row [bytes]."""
+"""Maximum size of a value in a row [bytes]."""
 _LIMITS = {
     sqlite3.SQLITE_LIMIT_LENGTH: MAX_VALUE_LENGTH,
     sqlite3.SQLITE_LIMIT_SQL_LENGTH: 1_000_000,
@@ -201,7 +201,7 @@ _NEVER = {
     sqlite3.SQLITE_CREATE_VTABLE,
 }
 _STEPS_BETWEEN_LOOKS = 10_000
-"""Number of SQLite virtual machine instructions between checks of the time limit, which take tens of microseconds."""
+"""Number of SQLite virtual machine instructions (tens of microseconds) between checks of the time limit."""
 _DISK_FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO}
 
 

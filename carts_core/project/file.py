@@ -93,7 +93,7 @@ def _check(found: os.stat_result, path: Path) -> None:
     }
     raise ProjectError(
         f"{path} is {kinds.get(stat.S_IFMT(found.st_mode), 'a device or socket')}. A project and its companion files "
-        "must be regular files with a single hard link; nothing was changed. Move it away, "
+        "must be regular files with a single hard link; nothing was changed. Move this file away, "
         "or copy the project to a new file."
     )
 
@@ -141,8 +141,7 @@ _PAGE_SIZES = frozenset(1 << n for n in range(9, 17))
 
 
 def _recovered(main: bytes, log: bytes) -> tuple[bytearray, bool]:
-    """Recover the database after all committed transactions of a log, like SQLite; also returns whether the log is
-    damaged.
+    """Apply all committed transactions of a log to a database, like SQLite; also returns whether the log is damaged.
 
     Logs start empty, so that at most one incomplete transaction follows the committed transactions.
     """
@@ -326,7 +325,7 @@ MAX_LOG_BYTES = 64 * 2**20
 
 
 class LostFile(ProjectError):
-    """The file on disk is not, or may not be, the opened file. The message is a clause on its cause."""
+    """The file on disk is not, or may not be, the opened file. The message states the cause as a clause."""
 
 
 class ProjectFile:
@@ -446,7 +445,7 @@ class ProjectFile:
         self._release()
 
     def dismiss(self) -> None:
-        """Close the file without edits of this process."""
+        """Close a file to which this process has written no edits."""
         if self._connection is not None and _lies_at(self.path, self._descriptor):
             with suppress(sqlite3.Error):
                 self._connection.close()

@@ -71,14 +71,14 @@ class SequenceIdentity:
     def difference(self, other: "SequenceIdentity") -> str | None:
         """First difference from `other`, as a clause; None for the same recording."""
         if len(self.frame_ids) != len(other.frame_ids):
-            return f"{counted(len(self.frame_ids), 'frame')} against {len(other.frame_ids)}"
+            return f"{counted(len(self.frame_ids), 'frame')} in one and {len(other.frame_ids)} in the other"
         for index, (own, others) in enumerate(zip(self.frame_ids, other.frame_ids, strict=True)):
             if own != others:
                 return f"frame number {index} is named {own!r} in one and {others!r} in the other"
         if self.arms != other.arms:
-            return f"arms {_list(self.arms)} against {_list(other.arms)}"
+            return f"arms {_list(self.arms)} in one and {_list(other.arms)} in the other"
         if self.cameras != other.cameras:
-            return f"cameras {_list(self.cameras)} against {_list(other.cameras)}"
+            return f"cameras {_list(self.cameras)} in one and {_list(other.cameras)} in the other"
         if self.kinematics_sha256 != other.kinematics_sha256:
             return "the kinematics tables differ"
         return None

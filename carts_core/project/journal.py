@@ -1,4 +1,4 @@
-"""Journal of all steps with their changes. The state results from the steps up to a position, which undo changes.
+"""Journal of all steps with their changes. The state is given by the steps up to a position, which undo and redo move.
 
 Changes are returned as a `Transaction`, which is run on the file and on its in-memory copy.
 """
@@ -155,7 +155,7 @@ def add_figures(
 
 
 def add_remark(memory: sqlite3.Connection, key: Key[Any], entry: Entry) -> Transaction:
-    """Set a value as part of an existing step, which replaces the step's previous value."""
+    """Set a value as part of an existing step, in place of the value that the step has set before."""
     script, row = Transaction(), (key.kind.value, int(key.frame), str(key.name), entry.step)
     found = "SELECT digest FROM changes WHERE kind = ? AND frame = ? AND name = ? AND step = ?"
     script.subtract(memory.execute(found, row))

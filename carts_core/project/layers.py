@@ -17,7 +17,7 @@ _HEADER = b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR"
 
 @dataclass(frozen=True)
 class Layer:
-    """Painted layer, created by `of` of its subclasses; `ProjectError` if the bytes are not a PNG."""
+    """Painted layer, created by the method `of` of a subclass; `ProjectError` if the bytes are not a PNG."""
 
     png: bytes
 
@@ -54,7 +54,7 @@ class MaskCorrection(Layer):
         if added.shape != removed.shape or added.ndim != 2 or (added & removed).any():
             raise ProjectError(
                 f"pixels added (shape {added.shape}) and removed ({removed.shape}) must be disjoint masks "
-                "of the same size. A later stroke removes its pixels from the other mask."
+                "of the same size. Remove the pixels of a later stroke from the other mask."
             )
         return cls(_png(added * _ADDED + removed * _REMOVED))
 

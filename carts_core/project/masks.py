@@ -81,7 +81,7 @@ def file_masks(source: Path, recording: Recording) -> GivenMasks:
 
 
 def ignored_labels(layer: ImportedMask, names: Sequence[str]) -> Bool[np.ndarray, "height width"]:
-    """Pixels of a layer whose label name means that they are ignored, such as `ignore`."""
+    """Pixels of a layer whose label is one of the names for ignored pixels, such as `ignore`."""
     numbers = [number for number, name in enumerate(names, start=1) if name.casefold() in _LEFT_OUT]
     return np.isin(layer.labels(), numbers)
 
@@ -150,7 +150,8 @@ class ImportReport:
         if not self.changed:
             text = f"The project already has these {' and '.join(parts)}; nothing was changed."
         if self.unknown:
-            text += f" {counted(len(self.unknown), 'image')} skipped that match no frame, such as {self.unknown[0]}."
+            skipped = counted(len(self.unknown), "image")
+            text += f" Skipped {skipped} without a matching frame, such as {self.unknown[0]}."
         if self.remarks:
             more = f"; and {len(self.remarks) - _SHOWN} more" if len(self.remarks) > _SHOWN else ""
             text += f" Remarks: {'; '.join(self.remarks[:_SHOWN])}{more}."
@@ -187,7 +188,7 @@ def import_annotations(
         first = state.identity.frame_ids[others[0].frame]
         raise ProjectError(
             f"{counted(len(others), 'earlier import')} would be replaced, the first in frame {first}, camera "
-            f"{others[0].name}. Allow it with Replace (--replace), or undo that import."
+            f"{others[0].name}. Allow this with Replace (--replace), or undo that import."
         )
     change = project.apply(f"Import from {source}"[:200], edits)
     labels = edits[Key.imported_labels()].names

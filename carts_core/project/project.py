@@ -31,7 +31,7 @@ class Change:
 
     action: Action
     step: Step | None
-    """The step that was done or undone; the outermost of several steps."""
+    """The step that was done or undone; the last of several steps that were done or undone together."""
     keys: frozenset[Key[Any]]
     """Keys whose values may have changed."""
     frames: tuple[int, ...]
@@ -50,7 +50,7 @@ class Project:
 
     Attributes:
         state: current state, an immutable snapshot that is read without a lock.
-        read_only_reason: sentence on the reason why edits cannot be saved; None if the project is writable.
+        read_only_reason: reason why edits cannot be saved, as a sentence; None if the project is writable.
 
     Args:
         read_only: open without writing; later edits of other processes are not loaded.
@@ -169,7 +169,7 @@ class Project:
             state = self.state
             if not 0 <= position <= len(state.steps):
                 raise ProjectError(
-                    f"the history has {counted(len(state.steps), 'step')}; position {position} is not among them."
+                    f"the history has {counted(len(state.steps), 'step')}, so there is no position {position}."
                 )
             if position == state.position:
                 return None
@@ -192,7 +192,7 @@ class Project:
         with self._edit:
             state = self.state
             if not 1 <= number <= state.position:
-                raise ProjectError(f"step {number} is not done; {counted(state.position, 'step')} are.")
+                raise ProjectError(f"step {number} is not in effect; the last step in effect is {state.position}.")
             memory = self._writer().memory
             edits, later = journal.before(memory, number, state.position)
             if later is not None:
@@ -255,7 +255,7 @@ class Project:
         return remove
 
     def close(self) -> None:
-        """Close the file, so that others can write it; the state stays readable. `ProjectError` if saved edits are
+        """Close the file, so that others can write to it; the state stays readable. `ProjectError` if saved edits are
         lost."""
         with self._edit:
             if self._store is not None:

@@ -136,7 +136,7 @@ class ProjectState:
         return None if entry is None else entry.value
 
     def changed(self, edits: Edits) -> dict[Key[Any], Any]:
-        """Edits that change values, and the given verdicts on changed poses even if these verdicts are equal.
+        """Edits that change values, and the given verdicts on changed poses even if the verdicts are unchanged.
 
         Changing an accepted frame withdraws its acceptance in the same step, unless an edit sets its review.
         """

@@ -48,7 +48,7 @@ class Rescued:
 
     @property
     def text(self) -> str:
-        """Report as a clause."""
+        """Summary of the rescue, as a clause."""
         named = ", ".join(self.lost[:_LISTED]) + (" and more" if len(self.lost) > _LISTED else "")
         missing = f"{len(self.lost)} could not be read ({named})" if self.lost else "missing rows are unknown"
         return f"{counted(self.kept, 'row')} could be read; {missing}"
@@ -190,7 +190,7 @@ class Store:
             except LostFile as lost:
                 self._rescue(str(lost))
         else:
-            raise ProjectError(f"project {self.path} is lost repeatedly. {self.storage_failure}")
+            raise ProjectError(f"project {self.path} was lost repeatedly. {self.storage_failure}")
         with database.transaction(self.memory) as memory:
             for statement, rows in statements:
                 memory.executemany(statement, rows)
@@ -381,6 +381,6 @@ def _damaged(
         return database.DamagedProject(f"{begin} {rescued.text}, but {target} could not be written. Free disk space.")
     was = "is now" if new else "was rescued earlier and is"
     return database.DamagedProject(
-        f"{begin} {rescued.text}; that {was} in {target}. Restore a backup copy, or continue with the "
-        f"rescued file: --project '{target}'."
+        f"{begin} {rescued.text}. The readable content {was} in {target}. Restore a backup copy, or continue with "
+        f"the rescued file: --project '{target}'."
     )

@@ -167,7 +167,7 @@ class TimeOffset(JsonValue):
 
 @dataclass(frozen=True)
 class Keyframe(JsonValue):
-    """Whether a frame is a keyframe by the user's choice; see `ProjectState.is_keyframe`."""
+    """User's choice whether a frame is a keyframe; see `ProjectState.is_keyframe`."""
 
     held: bool
 
@@ -489,7 +489,8 @@ def check_edit(identity: SequenceIdentity, key: Key[Any], value: object) -> None
         known = list(identity.arms if key.kind in _OF_ARM else identity.cameras)
     if key.name not in known:
         what = "arm" if key.kind in _OF_ARM else "camera"
-        raise ProjectError(f"the sequence has no {what} {key.name!r} for {key.kind}; there are: {', '.join(known)}.")
+        there = f"its {what}s are: {', '.join(known)}"
+        raise ProjectError(f"the sequence has no {what} {key.name!r} for {key.kind}; {there}.")
     if value is not None:
         _check_value(identity, key, value)
 

@@ -87,9 +87,7 @@ class BrowsingHandler(Handler):
                 raise
             # Half-typed numbers are often far off, so no error is shown before the field is left.
             now = f"{sequence.matching.time_offset:g} s"
-            text = (
-                f"With {seconds:g} s, some frames have no joint positions near their times. The offset remains {now}."
-            )
+            text = f"With {seconds:g} s, some frames have no joint positions at their times. The offset remains {now}."
             _log.info("%s %s", text, error)
             self._context.change(time_error=text)
             return

@@ -23,11 +23,11 @@ class OpenRun(Protocol):
         """End the run, if any, and save its pose; `reason` is text for the user."""
 
     def forget(self) -> None:
-        """Forget the start of the run, since another frame is shown."""
+        """Discard the start of the run when another frame is shown."""
 
 
 class Context:
-    """State that handlers replace, and edits that they make; used on the worker's thread only.
+    """State that the handlers share, and edits on their behalf; used on the worker's thread only.
 
     Attributes:
         state: what the page shows.
@@ -74,7 +74,7 @@ class Context:
             scene: the pose.
             gesture: edits of the same gesture are one step, saved when it ends; None for a complete gesture.
             source: origin of the pose.
-            pins: whether the pose was fitted to pins; otherwise they are removed.
+            pins: whether the pose was fitted to pins; otherwise all pins are removed.
 
         Raises:
             ProjectError: the edit could not be saved.
@@ -92,7 +92,7 @@ class Context:
         loss: float | None = None,
         maps: Maps | None = None,
     ) -> None:
-        """Change the project; arguments and errors as `set_pose`. `loss` and `maps` belong to the new pose."""
+        """Change the project; arguments and errors as in `set_pose`. `loss` and `maps` belong to the new pose."""
         if self._editor.gesture != gesture:
             self.save()
         self._loss = loss
@@ -125,7 +125,7 @@ class Context:
         self.change(project=editor.view, unsaved=editor.unsaved, can_undo=editor.can_undo, can_redo=editor.can_redo)
 
     def leave_frame(self) -> None:
-        """Save the shown frame before another one is shown. Errors as `save`."""
+        """Save the shown frame before another one is shown. Errors as in `save`."""
         self.save()
         # In a read-only project the draft could not be saved.
         self._editor.drop()

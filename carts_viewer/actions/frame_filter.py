@@ -45,7 +45,7 @@ def review_name(project: ProjectState, index: int) -> str:
 
 
 def is_copied(project: ProjectState, index: int) -> bool:
-    """Whether joint positions of a frame were copied from another frame: propagated, without settings of a solver."""
+    """Whether the joint positions of a frame were copied from another frame, that is, propagated without a solver."""
     made = [correction.provenance for correction in project.joints(index).values()]
     return any(one.source is Source.PROPAGATED and one.settings is None for one in made)
 

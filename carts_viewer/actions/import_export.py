@@ -34,7 +34,7 @@ FRAME_CHOICES = {
     "Needs work": frozenset({ReviewState.NEEDS_WORK}),
     "Unreviewed": UNREVIEWED,
 }
-"""Choices of the frames to export, as review states."""
+"""Label -> review states of the exported frames."""
 MASKS_CHOICES: tuple[Masks, ...] = ("auto", "refined", "rendered")
 """Choices of masks: refined if the verdict is good, refined, or as rendered."""
 PARTS_CHOICES: tuple[Parts, ...] = ("arms", "parts", "links")
@@ -53,7 +53,7 @@ _TIME_SLICE = 0.05
 
 
 Deliver = Callable[[int, str, bytes], None]
-"""Sends a file to a tab: client id, file name, content."""
+"""Function that sends a file to a tab; its arguments are client id, file name and content."""
 
 
 class ExportingHandler(Handler):
@@ -66,7 +66,7 @@ class ExportingHandler(Handler):
         self._intent: intents.Export | None = None
 
     def wait_time(self) -> float | None:
-        """0 during an export, otherwise None."""
+        """Time until the next step is due [s]: 0 during an export, otherwise None."""
         return None if self._job is None else 0.0
 
     def advance(self) -> None:
@@ -136,7 +136,7 @@ class ExportingHandler(Handler):
         if not chosen:
             where = "" if intent.range is None else ", in the timeline's range"
             raise SettingsError(
-                f"No frames to export ({intent.frames.lower()}{where}). Review frames, or choose others."
+                f"No frames to export ({intent.frames.lower()}{where}). Review frames, or choose other frames."
             )
         cameras = [state.camera] if intent.shown_camera else [camera.name for camera in session.scene.cameras]
         scene = calibrated_scene(session.scene, view).with_cameras(cameras)
@@ -173,14 +173,14 @@ class ExportingHandler(Handler):
 
 
 def frames_within(project: ProjectState, frames: str, part: tuple[int, int] | None) -> list[int]:
-    """Indices of the frames of a choice (`FRAME_CHOICES`) in an inclusive range; None for the whole sequence."""
+    """Indices of the frames of a choice (`FRAME_CHOICES`) in the inclusive range `part`, by default in all frames."""
     first, last = part or (0, len(project.identity.frame_ids) - 1)
     return [index for index in frames_in(project, FRAME_CHOICES[frames]) if first <= index <= last]
 
 
 def shown_mask(context: Context) -> tuple[str, bytes]:
-    """Mask of the shown frame and camera as a PNG file: name and content. It is refined if that layer is shown and the
-    mask was not painted."""
+    """Name and content of a PNG file with the mask of the shown frame and camera. The mask is refined if the layer
+    *Refined mask* is shown and the mask was not painted."""
     state, sequence = context.state, context.session.sequence
     name = file_name(f"{sequence.name}_{state.frame.frame_id}_{state.camera}") + ".png"
     mask = context.renderer.mask(state.pose.scene, state.camera, state.mask_correction)

@@ -24,7 +24,7 @@ class Intent(Event):
 
     @property
     def key(self) -> Hashable | None:
-        """A newer intent replaces a pending one with the same key; None for intents that are never replaced."""
+        """Key by which a newer intent replaces a pending one; None for intents that are never replaced."""
         if not self.keyed_by:
             return None if self.keyed_by is None else type(self)
         return (type(self), *(getattr(self, name) for name in self.keyed_by))
@@ -41,11 +41,11 @@ class Refresh(Latest):
 
 
 class Drawn(Latest):
-    """A tab has drawn the newest overlay; wakes the worker, which may send the next."""
+    """Report that a tab has drawn the newest overlay, so that the worker may send the next one."""
 
 
 class Released(Latest):
-    """A slider or field was released; the next edit starts a new undo step."""
+    """Report that a slider or field was released; the next edit starts a new undo step."""
 
 
 class SetName(Latest):
@@ -170,7 +170,7 @@ class BackToMeasured(Intent):
 
 
 class Perturb(Intent):
-    """Offset every joint by this many degrees or millimetres, with random signs from the seed."""
+    """Offset every joint by `degrees` [deg] or as many millimetres, with random signs determined by `seed`."""
 
     degrees: float
     seed: int
@@ -391,11 +391,11 @@ class ChooseKeypoint(Intent):
     """Choose the keypoint that `PointAt` places."""
 
     label: str | None
-    """None: the keypoint nearest to the pointer."""
+    """Label of the keypoint; None for the keypoint nearest to the pointer."""
 
 
 class PointAt(Latest):
-    """Place the chosen keypoint in an image; repeated during a drag, then `Released`."""
+    """Place the chosen keypoint in an image; repeated during a drag, and followed by `Released`."""
 
     u: float
     """Column [px]."""
@@ -406,7 +406,7 @@ class PointAt(Latest):
 
 
 class RemovePins(Intent):
-    """Remove the placed keypoints; joints stay."""
+    """Remove the placed keypoints; the pose is kept."""
 
 
 class SequenceIntent(Intent):
@@ -574,7 +574,7 @@ class ShowMatching(Intent):
 
 
 class ReviewMatching(Intent):
-    """Set the review state of all frames that match the filter, as one undo step; notes stay."""
+    """Set the review state of all frames that match the filter, as one undo step; notes are kept."""
 
     state: ReviewState
 
@@ -589,7 +589,7 @@ class StartLive(Intent):
     source: str
     """As in `carts live --source`: `replay`, `socket:PORT` or `camera:NUMBER`."""
     joints_port: int | None = None
-    """With a camera: port of 127.0.0.1 that receives joint positions."""
+    """With a camera: port on 127.0.0.1 that receives joint positions."""
     repeat: bool = False
     """Whether a replay is repeated endlessly."""
     rate: float | None = None

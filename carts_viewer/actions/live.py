@@ -110,7 +110,7 @@ class ShowRecording(Protocol):
     """Function that shows the recording again."""
 
     def __call__(self, *, again: bool) -> None:
-        """As `BrowsingHandler.show`."""
+        """See `BrowsingHandler.show`."""
 
 
 class LiveHandler(Handler):

@@ -21,7 +21,7 @@ _REASONS = {
     "not optimized": "Evaluated only: this solver does not optimize",
     "converged": "Ended: no step reduces the loss further",
     "failed": "Ended: the image contradicts the result",
-    "start kept": "Initial pose kept: the optimized pose hardly fits better",
+    "start kept": "Initial pose kept: the optimized pose does not fit much better",
     "cancelled": "Cancelled",
 }
 
@@ -46,7 +46,7 @@ class OptimizingHandler(Handler):
         return self._run is not None
 
     def wait_time(self) -> float | None:
-        """0 during a run, otherwise None."""
+        """Time until the next iteration is due [s]: 0 during a run, otherwise None."""
         return 0.0 if self._context.state.run.phase is Phase.RUNNING else None
 
     def advance(self) -> None:
@@ -69,7 +69,7 @@ class OptimizingHandler(Handler):
                 self._context.save()
 
     def forget(self) -> None:
-        """Forget the start of the run, since another frame is shown."""
+        """Discard the start of the run when another frame is shown."""
         self._before = None
 
     def map(self) -> None:
@@ -89,7 +89,7 @@ class OptimizingHandler(Handler):
             run = self._make((state.camera,))
             iterate = run.optimizer.step()
         except CartsError:
-            # For example, the weights are missing. The layer is changed, so that not every picture repeats the attempt.
+            # For example, the weights are missing. The layer is changed to avoid an attempt for every picture.
             self._context.change(layer=Layer.MASK)
             raise
         self._context.change(maps=None if iterate is None else Maps(iterate, run.cameras, of_run=False), busy=None)

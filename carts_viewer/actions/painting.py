@@ -26,7 +26,7 @@ _CLEARED = {Target.MASK: "Clear the mask correction", Target.IGNORE: "Clear the 
 
 
 class PaintingHandler(Handler):
-    """Handler of painting."""
+    """Handler of painting tools, strokes and prompts."""
 
     def __init__(self, context: Context, segmenter: Callable[[], Segmenter]) -> None:
         super().__init__(context)
@@ -107,7 +107,7 @@ class PaintingHandler(Handler):
     def _step(self, stroke: Stroke) -> str:
         """Name of a stroke in the history."""
         if stroke.prompt:
-            return "Segment by a prompt"
+            return "Segment with a prompt"
         if stroke.label and not stroke.erase and stroke.target is Target.MASK:
             names = {one.number: one.name for one in part_classes(self._session.scene.arms)}
             return f"Paint {names[stroke.label]}"

@@ -27,14 +27,14 @@ class PropagatingHandler(Handler):
         self._optimizers = optimizers
         self._comparison = Comparison(context.session, context.renderer, optimizers)
         self._held: dict[int, Outcome] = {}
-        """Results by frame that fit worse than the previous pose and are not applied."""
+        """Frame -> result that fits worse than the previous pose and is not applied."""
         self._run: SequenceRun | None = None
         self._work: Iterator[None] = iter(())
         self._before: ProjectState = context.session.editor.view
         """The project at the start of the run."""
 
     def wait_time(self) -> float | None:
-        """0 while frames are being solved, otherwise None."""
+        """Time until the next step is due [s]: 0 while frames are being solved, otherwise None."""
         return None if self._run is None else 0.0
 
     def advance(self) -> None:
@@ -53,7 +53,7 @@ class PropagatingHandler(Handler):
             self._report(running=False, text=reason)
 
     def finish(self) -> None:
-        """Stop, and save the solved frames. Errors as `advance`."""
+        """Stop, and save the solved frames. Errors as in `advance`."""
         if self._run is not None:
             self._run.cancel()
             for _ in self._work:
@@ -62,7 +62,7 @@ class PropagatingHandler(Handler):
     # ---- Intents ---------------------------------------------------------------------------------------------------
 
     def solve(self, whole: bool, at: int, part: range | None = None) -> None:
-        """Start to solve all frames, or those between the kept frames around the frame `at`, within `part` if given.
+        """Start solving all frames, or those between the kept frames around the frame `at`, within `part` if given.
 
         Raises:
             CartsError: there is nothing to solve, or edits could not be saved.
@@ -71,7 +71,8 @@ class PropagatingHandler(Handler):
             raise CartsError("Frames are already being solved. Wait, or stop solving first.")
         project = self._session.editor.project
         if not project.writable:
-            raise ProjectError(f"Solved frames could not be saved: {project.read_only_reason}")
+            reason = project.read_only_reason
+            raise ProjectError(f"The project cannot be changed, so solved frames could not be saved. {reason}")
         self._context.end_run("Stopped: solving was started")
         self._context.save()
         view = self._session.editor.view
@@ -171,7 +172,7 @@ class PropagatingHandler(Handler):
         if now.records.get(WHOLE_PROJECT) is not self._before.records.get(WHOLE_PROJECT):
             self.drop("Stopped: the calibration was changed")
             raise CartsError(
-                "The calibration was changed meanwhile, so the solved frames are outdated. Solve them again."
+                "The calibration was changed in the meantime, so the solved frames are outdated. Solve them again."
             )
 
     def _save(self, run: SequenceRun, outcomes: Mapping[int, Outcome]) -> str:
@@ -209,9 +210,7 @@ class PropagatingHandler(Handler):
         taken = {i: outcome for i, outcome in self._held.items() if intent.index is None or i == intent.index}
         taken = {i: outcome for i, outcome in taken.items() if now.joints(i) == self._before.joints(i)}
         if not taken:
-            raise CartsError(
-                "There is no solved pose to take: the frame was changed meanwhile, or the list was closed."
-            )
+            raise CartsError("There is no solved pose to take: the frame was changed since, or the list was closed.")
         self._context.end_run("Stopped: solved poses were taken")
         self._context.save()
         edits: dict[Key[Any], Any] = {}

@@ -1,4 +1,4 @@
-"""Files that the viewer reads beside a recording: the user's decisions on their content, and damaged files.
+"""Files beside a recording: decisions of the user on their content, and handling of damaged files.
 
 Recordings are shared and copied, so their files may be from another user. Each decision is a file in `decisions/`
 of the user's data folder, named by the SHA-256 digest of the content that was accepted or refused.

@@ -143,7 +143,7 @@ class Comparison:
         return replace(fit, dice=min(known, default=None))
 
     def own_run(self, index: int, state: ViewState) -> Iterator[tuple[Fit, Edits, str | None] | None]:
-        """Run on one frame individually; yields None after each step, then the fit, its edits and `Fit.worse_than`.
+        """Run on one frame individually; yields None after each step, then the fit, its edits and `worse_than`.
 
         Raises:
             CartsError: an image, the weights or a setting is not usable.

@@ -30,7 +30,7 @@ _FILE = Kind("list of jobs", 8 * 2**20)
 MAX_CALIBRATION_FRAMES = 500
 """Maximum number of frames of a calibration."""
 MAX_TRAINING_TIME = 240
-"""Maximum time of training [min]."""
+"""Maximum training time [min]."""
 _MAX_NETWORK_NUMBER = 999_999
 """Maximum number of an adapted network."""
 
@@ -40,7 +40,7 @@ _MAX_NETWORK_NUMBER = 999_999
 
 @dataclass(frozen=True)
 class SolveOptions:
-    """Options of solving frames together."""
+    """Options for solving frames together."""
 
     whole: bool = False
     at: int = 0
@@ -51,7 +51,7 @@ class SolveOptions:
 
 @dataclass(frozen=True)
 class OptimizeOptions:
-    """Options of optimizing frames individually."""
+    """Options for optimizing frames individually."""
 
     frames: tuple[int, ...]
     """Frame indices."""

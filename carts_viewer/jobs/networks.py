@@ -16,7 +16,7 @@ STARTED = "As started"
 """Label of the initial network: the shipped network, or that of `--weights`."""
 _WEIGHTS_FILE = "surface.safetensors"
 _ADAPTED = "Adapted {}"
-_FILE = Kind("choice of a network", 2**12)
+_FILE = Kind("network selection", 2**12)
 _MAX_NAME = 40
 """Maximum length of a network's name [characters]."""
 
@@ -53,7 +53,7 @@ class Networks:
             if remembered != STARTED and not optimizers.given_surface():
                 self._resume(remembered)
         except (OSError, CartsError) as error:
-            self.problem = f"The last chosen network {remembered!r} cannot be used: {error}."
+            self.problem = f"The network {remembered!r}, which was selected last, cannot be used: {error}."
 
     def update_names(self) -> None:
         """Update `names` from the folders beside the project."""
@@ -144,5 +144,5 @@ class Networks:
             return STARTED
         except (OSError, ValueError) as error:
             effect = "The viewer's initial network is used"
-            self.problem = set_aside_damaged(self._file.path, "choice of a network", error, effect, writable=self._kept)
+            self.problem = set_aside_damaged(self._file.path, "network selection", error, effect, writable=self._kept)
             return STARTED

@@ -133,7 +133,7 @@ class SequenceRun:
         self.cancelled = False
 
     def cancel(self) -> None:
-        """Stop; the results so far remain in the optimizer's `estimates`."""
+        """Stop the run; the results so far remain in the optimizer's `estimates`."""
         self.cancelled = True
         self.optimizer.cancel()
 

@@ -130,7 +130,7 @@ def calibrate(context: Context, optimizers: OptimizerFactory, count: int) -> Gen
         yield Progress(most, most, f"Nothing was changed. {verdict}")
         return
     if session.editor.view.records.get(WHOLE_PROJECT) is not before.records.get(WHOLE_PROJECT):
-        raise CartsError("The calibration was changed meanwhile, so this result is outdated. Calibrate again.")
+        raise CartsError("The calibration was changed in the meantime, so this result is outdated. Calibrate again.")
     context.save()
     accepted, solved = (_count(session.editor.view, states) for states in ({_ACCEPTED}, {_ACCEPTED, _OPTIMIZED}))
     session.editor.apply(f"Calibrate on {len(indices)} frames", edits)
@@ -180,7 +180,7 @@ _CHECKPOINT_TIME = 30.0
 def adapt(sequence: Path, folder: Path, minutes: float) -> Generator[Progress]:
     """Adapt the network in a child process and report progress; closing the generator stops the process.
 
-    Stopped training is resumed in its folder for the given minutes.
+    Training that was stopped earlier is resumed in its folder for the given minutes.
 
     Raises:
         CartsError: training failed.
@@ -209,7 +209,7 @@ def _outcome(folder: Path) -> str:
         worse, gain = "; ".join(report["worse"]), str(report["gain"])
     except (OSError, ValueError, TypeError, KeyError):
         return ""
-    return f"rejected, because worse: {worse}" if worse else gain
+    return f"rejected because of worse results: {worse}" if worse else gain
 
 
 class _Training:

@@ -115,12 +115,12 @@ class BrowsePanel:
 
 
 _CALENDAR = 1e8
-"""Timestamps from this value on are times since 1970, as in ROS, and are shown as dates [s]."""
+"""Minimum timestamp that is interpreted as the time since 1970, as in ROS, and shown as a date [s]."""
 
 
 def _time(stamp: float, began: float) -> str:
-    """Time of a frame since the first frame, and its date if known, as HTML."""
-    since = f"{stamp - began:.3f} s after the first"
+    """Time of a frame relative to the first frame, and its date if known, as HTML."""
+    since = f"{stamp - began:.3f} s after the first frame"
     if stamp < _CALENDAR:
         return f"at {stamp:.3f} s"
     date = f"{datetime.fromtimestamp(stamp, UTC):%Y-%m-%d %H:%M:%S} UTC"
@@ -135,7 +135,7 @@ _RAMPS = {
 
 
 class OverlayPanel:
-    """Layer and opacity of the overlay with a legend, and comparison with another pose."""
+    """Layer, opacity and legend of the overlay, and comparison with another pose."""
 
     def __init__(self, page: PanelPage, session: Session, state: ViewState) -> None:
         gui = page.gui
@@ -176,7 +176,7 @@ class OverlayPanel:
             return " ".join(swatch(label_color(one.number), one.name) for one in self._classes)
         if state.layer is Layer.TRUTH:
             if state.camera not in (with_imported(state.frame, self._session.scene, state.project).masks or {}):
-                return "This frame has no mask to compare with."
+                return "This frame has no ground-truth mask."
             return " ".join(swatch(color, name.capitalize()) for name, color in TRUTH_COLORS.items())
         if state.layer is Layer.IMPORTED:
             return self._describe_imported(state)

@@ -24,11 +24,11 @@ class LivePanel:
             self._source = gui.add_dropdown(
                 "Source",
                 [_REPLAY, _SOCKET, _CAMERA],
-                hint="Replay of this recording, messages of another program, or a camera of this machine",
+                hint="Replay of this recording, messages from another program, or a camera of this machine",
             )
             self._device = gui.add_number("Device", 0, min=0, max=63, step=1, hint="Number of the camera, from 0")
             self._port = gui.add_number(
-                "Port", _PORT, min=1024, max=65535, step=1, hint="Port of 127.0.0.1 that receives messages"
+                "Port", _PORT, min=1024, max=65535, step=1, hint="Port on 127.0.0.1 that receives messages"
             )
             self._repeat = gui.add_checkbox("Repeat", False, hint="Restart when the recording ends")
             self._rate = gui.add_number(
@@ -78,17 +78,17 @@ def live_text(live: LiveState) -> str:
         return f'<div class="carts-verdict unknown" role="status"><b>Live</b> {escaped(live.text)}</div>'
     reason = {
         "good": "The arms are tracked.",
-        "doubtful": "The image does not support the fit; the prediction from earlier frames is shown.",
-        "lost": "The arms are not found; the measured joints with the last correction are shown.",
+        "doubtful": "The fit does not match the image; the prediction from earlier frames is shown.",
+        "lost": "The arms were not found; the measured joints with the last correction are shown.",
     }[live.verdict]
     style = {"good": "good", "doubtful": "doubtful", "lost": "failed"}[live.verdict]
-    age = f"{1000.0 * live.age:.0f} ms after the frame"
+    age = f"latency {1000.0 * live.age:.0f} ms"
     return f'<div class="carts-verdict {style}" role="status"><b>Live: {live.verdict}</b> {reason} <i>{age}</i></div>'
 
 
 _MEANING = (
     "Agreement of the fit with the images. Good: the mask is reliable. Doubtful: inspect it. Failed: do not use it. "
-    "Undetermined joints stay near their measured values; their standard deviations are under Values."
+    "Undetermined joints stay near their measured values; the tab Values shows their standard deviations."
 )
 
 
@@ -117,7 +117,7 @@ class FitPanel:
         # The button stays visible, so that the elements below do not move under the pointer.
         self._check.visible = True
         self._check.disabled = running or state.verdict is not None
-        self._check.label = "Check the fit" if state.verdict is None else "The fit is checked"
+        self._check.label = "Check the fit" if state.verdict is None else "Fit checked"
         known = {name: found.standard_deviations or () for name, found in state.project.joints(state.index).items()}
         self._text.content = fit_text(
             state.verdict,
@@ -154,7 +154,7 @@ def fit_text(
         chips.append(f'<span class="carts-key">{mark}{escaped(name)}{said}{dice}</span>')
     line = f'<div class="carts-cameras">{"".join(chips)}</div>' if len(chips) > 1 or cameras else ""
     if scores and line:
-        line += "<small>Dice: overlap of the rendered arms with the recording's mask, as a check.</small>"
+        line += "<small>Dice: overlap of the rendered arms with the recording's mask, for comparison.</small>"
     if verdict is None:
         name = "running" if running else "not checked"
         if busy is not None:

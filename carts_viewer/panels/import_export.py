@@ -20,12 +20,12 @@ _WRITTEN = (
     "Masks, keypoints and poses are those of the arms at the current joint positions; masks include "
     "painted corrections, and may be refined. The recording's own masks are not exported."
 )
-_THIS_FRAME = "Mask of the shown camera: 255 is arm, 0 background. It is refined while that layer is shown."
-_NOT_KEPT = "This project is temporary: download its exports before the viewer is closed."
+_THIS_FRAME = "Mask of the shown camera: 255 is arm, 0 is background. It is refined if the layer Refined mask is shown."
+_NOT_KEPT = "This project is temporary: download its exports before you close the viewer."
 
 
 class ExportPanel:
-    """Exports of frames in any format with progress, and of the shown frame's mask."""
+    """Exports frames in any format, with progress, and the shown frame's mask."""
 
     def __init__(self, page: PanelPage, session: Session, storage: Storage) -> None:
         gui = page.gui
@@ -46,7 +46,7 @@ class ExportPanel:
             self._masks = gui.add_dropdown(
                 "Masks",
                 list(_MASKS),
-                hint="Refined: corrected near the outline by the network. If good: in frames whose verdict is good",
+                hint="Refined: corrected near the outline by the network. Refined if good: only if the verdict is good",
             )
             self._images = gui.add_checkbox("Copy images", False)
             self._count = gui.add_html("")
@@ -119,7 +119,7 @@ class ExportPanel:
 
 
 _BY_NAME = "By name"
-_HINT = "Path in the recording's folder: a COCO (.json) or CVAT (.xml) file, keypoints of SurgPose, or a folder of PNGs"
+_HINT = "Path in the recording's folder: a COCO (.json) or CVAT (.xml) file, SurgPose keypoints, or a folder of PNGs"
 
 
 class ImportPanel:

@@ -19,7 +19,7 @@ _MAX_LISTED = 5
 _UNREVIEWED, _RANGE = "Unreviewed", "Range in the timeline"
 _FRAMES: dict[str, intents.Frames] = {
     _UNREVIEWED: "unreviewed",
-    "Found (Review, Find)": "found",
+    "Frames found (Review, Find)": "found",
     _RANGE: "range",
     "All": "all",
 }
@@ -53,21 +53,21 @@ class JobsPanel:
                 color="teal",
             )
             self._count = gui.add_number(
-                "Calibrate on [frames]",
+                "Calibration frames",
                 intents.Calibrate().frames,
                 min=1,
                 max=MAX_CALIBRATION_FRAMES,
                 step=1,
-                hint="Spread evenly over the whole sequence, independent of the range",
+                hint="Number of frames, evenly spread over the whole sequence regardless of the range",
             )
             page.button("Calibrate", lambda _: intents.Calibrate(int(self._count.value)), icon=viser.Icon.RULER_MEASURE)
             self._minutes = gui.add_number(
-                "Adapt for [min]",
+                "Training limit [min]",
                 intents.Adapt().minutes,
                 min=1,
                 max=MAX_TRAINING_TIME,
                 step=1,
-                hint="Limit of processor time; training stops earlier if it no longer improves",
+                hint="Limit of processor time; training stops earlier if validation no longer improves",
             )
             page.button(
                 "Adapt the network",
@@ -79,8 +79,8 @@ class JobsPanel:
                 '<p class="carts-caption"><b>Optimize individually</b> fits every frame separately; to fit '
                 "neighbouring frames jointly, see Review, <b>Solve</b>. <b>Calibrate</b> fits the poses of the arms' "
                 "bases (base frames), or the parameters ticked under Free parameters, to frames of the whole "
-                "sequence. All masks change: solve again afterwards, and accept frames again. Solving and exports "
-                "are also queued here.</p>"
+                "sequence. This changes all masks: afterwards, solve and accept frames again. Solving and exports are "
+                "also queued here.</p>"
             )
         self._network = gui.add_dropdown(
             "Network", [STARTED], visible=False, hint="Network of all tabs; the choice is saved"
@@ -102,7 +102,7 @@ class JobsPanel:
             self._again = page.button(
                 "Start again", lambda _: intents.RepeatJob(self._number()), icon=viser.Icon.REFRESH
             )
-            self._forget = page.button("Clear ended", intents.RemoveEndedJobs())
+            self._forget = page.button("Clear ended jobs", intents.RemoveEndedJobs())
             page.row(self._cancel, self._again)
             self._log = gui.add_html("")
         page.on_input(self._network, intents.UseNetwork)
@@ -170,8 +170,8 @@ def jobs_question(state: ViewState) -> str:
     more = len(titles) - _MAX_LISTED
     shown = "; ".join(titles[:_MAX_LISTED]) + (f"; and {more} more" if more > 0 else "")
     return (
-        f"Jobs in the list beside this project were not queued by you on this computer and are not run: {shown}. "
-        "Run or discard them."
+        "These jobs in the list beside this project are not run, since you did not queue them on this computer: "
+        f"{shown}. Run or discard them."
     )
 
 
@@ -180,8 +180,8 @@ def network_question(state: ViewState) -> str:
     if not state.asked_network:
         return ""
     return (
-        f"The network {state.asked_network!r} beside this project was not trained or accepted by you on this computer, "
-        f"so the network {state.network!r} is used. Accept it if you trust its author."
+        f"You have neither trained nor accepted the network {state.asked_network!r} beside this project on this "
+        f"computer, so the network {state.network!r} is used. Accept it only if you trust its author."
     )
 
 

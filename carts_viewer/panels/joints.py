@@ -129,7 +129,7 @@ def _tidy(value: float) -> float:
 
 
 _UNSURE = 1.0
-"""Standard deviation above which a joint counts as undetermined [deg], [mm]; less than half the usual error of arms."""
+"""Standard deviation above which a joint counts as undetermined [deg, mm]; less than half of a typical error."""
 _EXPECTED = SurfaceSolver()
 _UNUSUAL = (
     2.0 * _EXPECTED.prior_deg,
@@ -137,10 +137,10 @@ _UNUSUAL = (
 )
 """Threshold of unusually large corrections: two standard deviations of the solver's prior [deg], [mm]."""
 _EXPLAINED = (
-    f"± is one standard deviation. <span class='carts-unsure'>Amber ±</span> (above {_UNSURE:g}° or mm): the images "
-    "hardly determine this joint. Its value is a guess, but hardly affects the mask.<br>"
+    f"± is one standard deviation. <span class='carts-unsure'>Amber ±</span> (above {_UNSURE:g}° or {_UNSURE:g} mm): "
+    "the images hardly determine this joint. Its value is a guess, but hardly affects the mask.<br>"
     f"<span class='carts-unsure'>Amber change</span>: more than {_UNUSUAL[0]:.0f}° or {_UNUSUAL[1]:.0f} mm, which is "
-    "rare in real arms. Smaller changes are usual."
+    "rare in real arms. Smaller changes are common."
 )
 
 

@@ -37,7 +37,7 @@ MASKS = {"Recording": "recording", "Imported": "imported", "Painted": "painted"}
 """Labels of the masks that a run fits."""
 UNDETERMINED = "Not determined by this image"
 """Label of unknowns that the images do not determine."""
-_CONSEQUENCE = "The mask hardly depends on these, so it can be correct although their values are guesses."
+_CONSEQUENCE = "The mask hardly depends on these parameters, so it can be correct even if their values are guesses."
 _RUN = "Press Run to fit the arm to this frame."
 _BEFORE_RUN = {
     ReviewState.ACCEPTED: "This frame is accepted. Run fits it again; if its pose changes, it must be accepted again.",
@@ -118,12 +118,12 @@ def status_line(state: ViewState) -> str:
     elif state.run.reason:
         parts.append(escaped(state.run.reason))
     if state.run_outdated and phase is Phase.IDLE:
-        parts.append("changed since")
+        parts.append("changed since the run")
     return " · ".join(parts) or _BEFORE_RUN.get(state.review.state, _RUN)
 
 
 def undetermined_lines(state: ViewState, session: Session) -> str:
-    """Unknowns that the images of a run do not determine, with their changes, as HTML; empty while running."""
+    """Unknowns that the images of a run do not determine, with their changes, as HTML; empty during a run."""
     known = None if state.maps is None or not state.maps.of_run else state.maps.iterate.uncertainty
     if known is None or state.run.phase is Phase.RUNNING:
         return ""
@@ -146,7 +146,7 @@ def _moved(unknown: str, state: ViewState, session: Session) -> str:
     before, now = (session.joints(scene)[arm][places[0]] for scene in (state.run.start, state.pose.scene))
     limits = found[places[0]]
     by, unit = limits.to_shown(now - before), "°" if limits.revolute else " mm"
-    return " (stayed)" if abs(by) < 0.05 else f" (moved by {by:+.1f}{unit})"
+    return " (unchanged)" if abs(by) < 0.05 else f" (moved by {by:+.1f}{unit})"
 
 
 def _spoken(unknown: str) -> str:
@@ -291,7 +291,7 @@ _QUANTITIES = (("Loss", "1", _TEAL), ("Dice", "1", _BLUE), ("Joint error", "°",
 
 
 class CurvesPanel:
-    """Small charts, one per quantity; values appear at the pointer, markers show stages and the result."""
+    """Small charts, one per quantity; values appear at the pointer, and markers show stages and the result."""
 
     def __init__(self, gui: viser.GuiApi) -> None:
         self._shown: tuple[Curves | None, bool] = (None, False)
@@ -320,7 +320,7 @@ def note(curves: Curves, outdated: bool) -> str:
     if outdated:
         return "Outdated: the pose, the image or a setting has changed since the run."
     if curves.comparable:
-        return "○ start of a stage · ● result. After a run, all losses are recomputed and comparable."
+        return "○ start of a stage · ● result. After a run, all losses are recomputed, so they are comparable."
     return "○ start of a stage; during a run, losses are comparable only within a stage."
 
 

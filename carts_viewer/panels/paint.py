@@ -20,12 +20,12 @@ _ICONS = {
 }
 _HINTS = {
     Tool.OFF: "Select a tool to correct the mask, or to mark occluders for the optimizer to ignore.",
-    Tool.BRUSH: "<b>Drag</b> to paint, with <b>Shift</b> to erase.",
-    Tool.ERASER: "<b>Drag</b> to erase, with <b>Shift</b> to paint.",
-    Tool.POLYGON: "<b>Click</b> corners; <b>double click</b> or <b>Enter</b> closes, with <b>Shift</b> to cut out. "
-    "<b>Backspace</b> removes the last corner.",
+    Tool.BRUSH: "<b>Drag</b> to paint; hold <b>Shift</b> to erase.",
+    Tool.ERASER: "<b>Drag</b> to erase; hold <b>Shift</b> to paint.",
+    Tool.POLYGON: "<b>Click</b> the corners; <b>double click</b> or <b>Enter</b> fills the polygon, with <b>Shift</b> "
+    "erases it. <b>Backspace</b> removes the last corner.",
     Tool.PROMPT: "<b>Click</b> an object to add it, or drag a <b>box</b> to replace the layer inside it. Further "
-    "clicks refine the object: on it, or with <b>Shift</b> (or Alt) off it; <b>Enter</b> starts the next object. "
+    "clicks on the object, or with <b>Shift</b> (or Alt) beside it, refine it; <b>Enter</b> starts the next object. "
     "<b>Shift</b>+click on another object removes it.",
 }
 _ANY = "Any arm"
@@ -54,8 +54,8 @@ class PaintPanel:
             self._class = gui.add_dropdown(
                 "Class",
                 list(self._classes),
-                hint="Painted class: a part of an arm (layer Parts), or any arm. Pixels of Any arm belong to the "
-                "nearest arm in the overlay, also in an export with a category per arm",
+                hint="Painted class: a part of an arm (layer Parts), or any arm. Pixels of Any arm are assigned to "
+                "the nearest arm in the overlay, also in exports with a category per arm",
             )
             self._size = gui.add_slider("Size [px]", *DIAMETERS, 1, state.brush.diameter)
             self._text = gui.add_html("")

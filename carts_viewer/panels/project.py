@@ -110,7 +110,7 @@ class PeoplePanel:
             + (" <b>(this frame)</b>" if index == state.index else "")
             for name, index in state.others
         ]
-        text = "<br>".join(rows) if rows else "No other user."
+        text = "<br>".join(rows) if rows else "No other users."
         self._others.content = f'<p class="carts-caption">{text}</p>'
 
 

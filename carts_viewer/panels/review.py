@@ -31,7 +31,7 @@ _COLORS = {
     ReviewState.ACCEPTED: "#2dd4a7",
     ReviewState.REJECTED: "#ef4444",
 }
-"""Colours by `review_name`, in the order of the counts; as in the timeline."""
+"""Colours by `review_name`, in the order of the counts; the timeline uses the same colours."""
 
 
 class ReviewPanel:

@@ -24,7 +24,7 @@ class CalibrationHint:
             f"Calibrate on {frames} frames",
             intents.Calibrate(frames),
             visible=False,
-            hint="A job, and one undo step; the page remains usable. For other numbers of frames, see Jobs, Calibrate.",
+            hint="Runs as a job, and is one undo step. For other numbers of frames, see Jobs, Calibration frames.",
         )
         self._watched: int | None = None
 
@@ -57,7 +57,7 @@ class CalibrationHint:
 
 
 def newest_calibration(jobs: tuple[Job, ...]) -> Job | None:
-    """The newest calibration if it is waiting or running, or is the newest of all jobs."""
+    """The newest calibration if it is waiting, running or the newest of all jobs; otherwise None."""
     shown = [job for job in jobs if job.state is not JobState.ASKED]
     found = (job for job in reversed(shown) if job.kind == "calibrate" and (not job.over or job is shown[-1]))
     return next(found, None)
@@ -173,7 +173,7 @@ class KeyframesPanel:
         if state.index not in state.part:
             return f"{name} is limited to the range, but this frame lies outside of it"
         if not kept:
-            return f"{name} needs a kept frame; none is kept {'yet' if state.range is None else 'in the range'}"
+            return f"{name} requires a kept frame; there is none {'yet' if state.range is None else 'in the range'}"
         where = f"{name}, {escaped(self._ids[frames[0]])} to {escaped(self._ids[frames[-1]])}"
         return f"{where}: " + (
             f"{counted(count, 'frame')} would be fitted, {len(frames) - count} kept" if count else "every frame is kept"

@@ -280,8 +280,8 @@ class TimelineData:
 
 
 def frame_code(project: ProjectState, frame: int, scene: Scene) -> int:
-    """Bit field of review, verdict, source, kept, misfit (1 to 255, 0 unknown), and number of undetermined joints plus
-    one (0 unknown)."""
+    """Bit field of review, verdict, source, whether the frame is kept, misfit (1 to 255, 0 unknown), and number of
+    undetermined joints plus one (0 unknown)."""
     record = project.records.get(frame)
     if record is None:
         return 0

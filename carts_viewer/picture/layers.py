@@ -184,7 +184,7 @@ def _fill(picture: Rgba, mask: Bool[np.ndarray, "height width"], color: tuple[in
 
 @lru_cache(maxsize=2)
 def _hatch(height: int, width: int) -> Bool[np.ndarray, "height width"]:
-    """Lines at 45 degrees."""
+    """Mask of hatching lines at 45 degrees."""
     step = max(3, round(max(height, width) / 160))
     rows, columns = np.ogrid[:height, :width]
     return (rows + columns) // step % 2 == 0

@@ -104,7 +104,7 @@ class OverlayRenderer:
     def refined(
         self, state: SceneState, camera: str, mask: Bool[np.ndarray, "height width"] | None, opacity: float
     ) -> layers.Rgba:
-        """Picture of a refined mask with the outline of the rendered mask; of the rendered mask if `mask` is None."""
+        """Picture of a refined mask with the outline of the rendered mask; the rendered mask if `mask` is None."""
         rendered = self.arm_ids(state, camera)
         if mask is None or not (rendered >= 0).any():
             return layers.mask(rendered, opacity)

@@ -118,8 +118,8 @@ def read_stroke(painted: Painted, frames: int, cameras: Mapping[str, Camera], cl
     shaped = count <= 2 if painted.prompt else count >= 3 or not painted.polygon
     if camera is None or painted.frame >= frames or painted.label > classes or not shaped:
         raise SettingsError(
-            f"the message is not a stroke over one of {frames} frames of {', '.join(cameras)}. Draw it with this "
-            "viewer's page."
+            f"the message is not a stroke in one of {frames} frames of a camera ({', '.join(cameras)}). Draw it in "
+            "this viewer's page."
         )
     size = np.array([camera.width, camera.height], float)
     return Stroke(

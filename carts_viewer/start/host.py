@@ -21,7 +21,7 @@ class SitePage(Protocol):
         """Carry out a choice in the document; a tab can send arbitrary strings."""
 
     def click(self, u: float, v: float) -> None:
-        """Handle a click in the image, at shares of its width and height."""
+        """Handle a click in the image at (u, v), relative to its width and height."""
 
     def fail(self, error: Exception) -> None:
         """Show an error."""
@@ -65,7 +65,7 @@ class Host(Protocol):
 
 
 Wanted = Callable[[Entry], bool]
-"""Returns whether a file may be picked."""
+"""Function that returns whether a file may be picked."""
 
 
 class FileBrowser:

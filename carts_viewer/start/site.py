@@ -191,7 +191,7 @@ class Site:
         except CartsError as error:
             page.fail(error)
         except Exception as error:
-            _log.exception("Unexpected error of the page")
+            _log.exception("Unexpected error in the page")
             page.fail(error)
 
     def _leave(self) -> None:
@@ -216,6 +216,6 @@ class Site:
             try:
                 job()
             except Exception as error:
-                _log.exception("Unexpected error of the page")
+                _log.exception("Unexpected error in the page")
                 with suppress(Exception):
                     self.show_start(f"{type(error).__name__}: {error}")

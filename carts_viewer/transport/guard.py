@@ -275,7 +275,7 @@ def gated(
                     return data
                 if not getattr(self, "warned", False):
                     self.warned = True
-                    _log.warning("Refused a message of a tab: %.200r", reason)
+                    _log.warning("Refused a message from a tab: %.200r", reason)
 
     def serve(*arguments: Any, process_request: Any = None, **options: Any) -> Any:
         def guarded(connection: Any, request: Request) -> Any:

@@ -296,7 +296,7 @@ class Page:
             try:
                 event = decoder.decode(channel.value)[2]
             except (msgspec.DecodeError, ValueError, RecursionError) as error:
-                _log.info("Refused an event of a tab: %.200s", error)
+                _log.info("Refused an event from a tab: %.200s", error)
                 return
             callback(update.client_id, event)
 

@@ -21,7 +21,7 @@ from viser.infra._async_message_buffer import AsyncMessageBuffer
 
 
 def list_icons_once() -> None:
-    """Make viser list its archive of icons once instead of once per icon, which takes 0.5 s per tab."""
+    """Make viser list its archive of icons only once; listing it for every icon takes 0.5 s per tab."""
     _gui_api.svg_from_icon = _gui_handles.svg_from_icon = _icon  # pyright: ignore[reportPrivateImportUsage]
 
 

@@ -69,7 +69,7 @@ class CalibrationJob:
         load_networks: Callable[[], FeatureExtractor],
         report: Callable[[CalibrationProgress], None],
     ) -> None:
-        """Start the calibration; `report` is called on its thread with every progress, of which the last is `ended`."""
+        """Start the calibration; `report` is called on its thread with every progress; the last one is `ended`."""
         self._sequence, self._scene, self._known = sequence, scene, known
         self._load_networks = load_networks
         self._report = report
@@ -157,7 +157,7 @@ class CalibrationReport:
     verdict: str
     """good, doubtful or failed; empty if there is no verdict."""
     reason: str
-    """Reason of the verdict, with a remedy."""
+    """Reason for the verdict, with a remedy."""
     poses: tuple[PoseReport, ...]
     before: tuple[float | None, ...]
     """Initial residuals of the points [px]; None for unused points."""
@@ -166,7 +166,7 @@ class CalibrationReport:
     disagreeing: tuple[int, ...]
     """Indices of points whose residual has grown beyond the noise of clicks."""
     objection: str
-    """Reason why the points contradict the calibration; empty if they agree."""
+    """Description of the contradiction between points and calibration; empty if they agree."""
 
 
 def report_of(result: CalibrationResult, clicking: Clicking, points: Rows[ImagePoint]) -> CalibrationReport:
@@ -195,20 +195,20 @@ def report_of(result: CalibrationResult, clicking: Clicking, points: Rows[ImageP
 def _objection(
     result: CalibrationResult, compared: PointAgreement, clicking: Clicking, points: Rows[ImagePoint]
 ) -> str:
-    """Reason why the points contradict the calibration; empty if they agree."""
+    """Description of the contradiction between points and calibration; empty if they agree."""
     before, after, limits = compared.before, compared.after, compared.limits
     if compared.disagreeing and not compared.agrees:
         worst = max(compared.disagreeing, key=lambda row: after[row] / limits[row])
         point = points[worst]
         name = f"{point.landmark} in frame {clicking.sequence.frame_ids[point.frame]} ({point.camera})"
         return (
-            f"{len(compared.disagreeing)} of {counted(len(points), 'point')} moved farther from the clicks than their "
+            f"{len(compared.disagreeing)} of {counted(len(points), 'point')} moved farther from the clicks than click "
             f"noise explains: the {name} from {before[worst]:.1f} to {after[worst]:.1f} px, "
             f"with {limits[worst]:.1f} px allowed."
         )
     if not compared.agrees:
         return (
-            "All points together moved farther from the clicks than their noise explains: RMS "
+            "All points together moved farther from the clicks than click noise explains: RMS "
             f"{compared.rms_before:.1f} to {compared.rms_after:.1f} px, with {compared.rms_limit:.1f} px allowed."
         )
     assert clicking.result is not None
@@ -256,7 +256,7 @@ def calibrated_scene(scene: Scene, calibration: Mapping[str, Any]) -> Scene:
 def calibrated_recording(
     recording: FoundRecording, before: Scene, calibration: Mapping[str, Any], text: str
 ) -> FoundRecording:
-    """The recording with a calibration (`as_plain`) instead of placeholders; errors as `calibrated_scene`.
+    """The recording with a calibration (`as_plain`) instead of placeholders; errors as in `calibrated_scene`.
 
     Args:
         before: scene of the recording.

@@ -154,11 +154,11 @@ def guess(draft: Draft) -> Guess:
             problems.setdefault(("kinematics" if table is None else "columns", ""), problem_of(error))
     if table is not None and meanings is not None and not meanings.arms:
         problems["columns", ""] = (
-            "Neither six joints nor a tip pose are recognized among the columns. Choose a column for each joint."
+            "The columns contain neither six recognizable joints nor a tip pose. Choose a column for each joint."
         )
     trials = jigsaws_trials(source) if kind == JIGSAWS.name and recording is None else ()
     if len(trials) > 1:
-        problems = {_WHOLE: f"The folder has {len(trials)} trials of JIGSAWS. Choose a trial."}
+        problems = {_WHOLE: f"The folder contains {len(trials)} JIGSAWS trials. Choose a trial."}
     return Guess(kind, recording, problems, table, meanings, trials)
 
 

@@ -69,7 +69,7 @@ class Draft:
         try:
             plain = parse_json(text)
             if plain.pop("format") != _FORMAT:
-                raise ValueError("it is of another version")
+                raise ValueError("it was saved by another version")
             draft = typed(plain, Draft)
             for named in _texts([plain["source"], plain["options"]]):
                 check_path(named)

@@ -239,11 +239,11 @@ class HandEyeStep:
     def write(self, draft: Draft) -> Path:
         """Write the sequence and return its file; `CartsError` if this fails."""
         if self._running():
-            raise SettingsError("the calibration is still running. Stop it, or wait for its end.")
+            raise SettingsError("the calibration is still running. Stop it, or wait until it ends.")
         folder = target_folder(self._host.roots, Path(draft.source), draft.name)
         count = len(draft.points)
         if draft.calibration is not None:
-            text = f"{count} points clicked in carts view, and a calibration over {CALIBRATION_FRAMES} frames"
+            text = f"{count} points clicked in carts view, and a calibration on {CALIBRATION_FRAMES} frames"
             calibration = draft.calibration
         elif self._clicking.result is not None:
             text, calibration = f"{count} points clicked in carts view", as_plain(self._clicking.result.scene)

@@ -64,14 +64,14 @@ def test_shards_have_every_job_once_and_impossible_ones_are_refused(archive: Pat
     [
         ("", r"has no \[\[jobs\]\]"),
         ("jobs = 3", r"has no \[\[jobs\]\]"),
-        ("stuff = 1\n" + JOBS, "has stuff; allowed: format"),
-        (JOBS + "camera = 'left'", "has camera; allowed: cameras, domains"),
+        ("stuff = 1\n" + JOBS, "contains stuff; allowed: format"),
+        (JOBS + "camera = 'left'", "contains camera; allowed: cameras, domains"),
         (JOBS + "cameras = 'left'", "cameras is 'left'; give a list"),
         (JOBS + "cameras = []", r"cameras is \[\]; give a list"),
         (JOBS.replace("export", "train"), "step 'train' is unknown; allowed: import, calibrate"),
         (JOBS.replace('"sequence", "export"', '"export", "sequence"'), "in which they run: sequence, export"),
         (JOBS.replace("*/", "missing/"), "matches no file"),
-        (JOBS + "[jobs.options]\noptimize = ['--together']", "options given for 'optimize'; its steps are"),
+        (JOBS + "[jobs.options]\noptimize = ['--together']", "options are given for 'optimize', but the steps are"),
         (JOBS + "options = 1", "options is 1; give a table"),
     ],
 )

@@ -88,7 +88,7 @@ def test_a_batch_writes_what_the_plain_commands_write_and_does_nothing_twice(
     said()
     monkeypatch.setattr(Pool, "run", lambda pool, jobs: map(pool._work, jobs))
     main(command)
-    assert "2 already there" in said()
+    assert "2 done earlier" in said()
     assert before and {path: path.stat().st_mtime_ns for path in before} == before
 
 
@@ -249,5 +249,5 @@ def test_a_stopped_batch_goes_on_and_comes_to_the_same_end(sequence: Path, tmp_p
     assert process.returncode in (0, 128 + signal.SIGTERM), errors
     assert process.returncode == 0 or "holds the finished jobs; rerun the command to resume" in errors
     finished = run(path, "--output", tmp_path / "stopped", "--workers", "1")
-    assert finished.returncode == 0 and "already there" in finished.stdout
+    assert finished.returncode == 0 and "done earlier" in finished.stdout
     assert results(tmp_path / "stopped") == results(tmp_path / "whole")

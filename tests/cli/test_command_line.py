@@ -272,7 +272,7 @@ def test_frames_are_chosen_by_id_and_by_position_counted_from_1() -> None:
         ("3:", None, "there is no '3:'"),
         ("001-002,010-001", None, "001 comes before 010. Give 001-010"),
         ("0-1,3", None, r"Earlier versions counted from 0; the equivalent is --frames 001-002,a-2\."),
-        (None, "0-2", "there is no '0'. Positions count from 1, as in the viewer; they are 1 to 5"),
+        (None, "0-2", "there is no '0'. Positions count from 1, as in the viewer; they range from 1 to 5"),
         (None, "6", "there is no '6'"),
         ("001", "1", "mutually exclusive"),
     ],

@@ -88,7 +88,7 @@ def test_masks_of_the_recording_are_fitted_without_a_network_and_made_again_when
     for name, option in (("optimize", "--output"), ("evaluate", "--json"), ("calibrate", "--output")):
         place = tmp_path / "not made"
         text = refused(name, masked, "--observe", "masks", "--frames", "001-002", option, place)
-        assert "1 of 2 frames have no mask of camera 'left'" in text and "002" in text and not place.exists()
+        assert "1 of 2 frames have no mask for camera 'left'" in text and "002" in text and not place.exists()
 
 
 def test_a_network_is_loaded_where_it_is_asked_for(masked: Path, said: Said) -> None:
@@ -126,7 +126,7 @@ def test_painted_masks_are_fitted_and_frames_without_one_are_named_or_left_to_th
     found = scores(sequence, "--observe", "masks", "--masks", "painted", "--frames", "001")
     assert found["mean"]["dice_before"] < 0.95 and found["mean"]["dice_after"] > 0.97
     text = refused("evaluate", sequence, "--observe", "masks", "--masks", "painted")
-    assert "1 of 2 frames have no painted mask of camera 'left'; the first is frame 002." in text
+    assert "1 of 2 frames have no painted mask for camera 'left'; the first is frame 002." in text
     assert "--observe both" in text
     found = scores(sequence, "--observe", "both", "--masks", "painted", "--settings", "iterations=2")
     painted, other = found["frames"]
@@ -167,7 +167,7 @@ def test_masks_of_some_cameras_are_said_to_be_unused_where_all_look_together(
     path.write_text(text[: text.rindex("masks = ")] + text[text.index("\n", text.rindex("masks = ")) + 1 :])
     together = ["--observe", "both", "--together", "--settings", "iterations=1"]
     main(["optimize", str(path), "--output", str(tmp_path / "out"), *together])
-    assert "has no mask of camera right, so all cameras fitted together" in said()
+    assert "has no mask for camera right, so all cameras fitted together" in said()
 
 
 def test_what_does_not_go_together_or_is_not_there_is_refused(sequence: Path, tmp_path: Path, refused: Refused) -> None:
@@ -184,7 +184,7 @@ def test_what_does_not_go_together_or_is_not_there_is_refused(sequence: Path, tm
     assert not sequence.with_suffix(".carts").exists()
     with Project.open(Sequence.open(sequence)):
         text = refused(*masks, "--masks", "imported")
-    assert "2 of 2 frames have no imported mask of camera 'left'; the first is frame 001" in text
+    assert "2 of 2 frames have no imported mask for camera 'left'; the first is frame 001" in text
     strange = tmp_path / "strange"
     strange.mkdir()
     assert cv2.imwrite(str(strange / "other.png"), np.zeros((128, 160), np.uint8))

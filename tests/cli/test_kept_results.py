@@ -156,7 +156,7 @@ def test_other_settings_have_the_chosen_frames_redone_and_the_others_are_told(
     before = (folder / "masks" / "003.png").read_bytes()
     printed = optimize("--perturb-deg", "2", "--frames", "001-002")
     assert "2 of 2 frames redone: the settings changed" in printed
-    assert "1 frame outside of this run are outdated: the settings changed" in printed
+    assert "results of 1 frame outside of this run are outdated: the settings changed" in printed
     assert (folder / "masks" / "003.png").read_bytes() == before
     assert json.loads((folder / "settings.json").read_text())["perturb_deg"] == 2
     printed = optimize("--perturb-deg", "2")

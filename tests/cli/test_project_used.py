@@ -124,4 +124,4 @@ def test_a_project_that_cannot_be_used_is_named(
     Path("other.carts").write_bytes(b"no project")
     export = "export", corrected, "out", "--format", "csv"
     assert "gone.carts is missing" in refused(*export, "--project", "gone.carts")
-    assert "To ignore it: --project none." in refused("render", corrected, "--project", "other.carts")
+    assert "To ignore the project: --project none." in refused("render", corrected, "--project", "other.carts")

@@ -90,7 +90,7 @@ def test_an_export_of_no_frames_is_refused(sequence: Sequence) -> None:
 
 def test_masks_of_an_unknown_camera_are_refused(dataset: Dataset) -> None:
     frame = replace(dataset.frames[0], masks={"middle": np.zeros((127, 161), bool)})
-    with pytest.raises(SettingsError, match=r"masks were given for cameras middle, which .* does not have"):
+    with pytest.raises(SettingsError, match=r"masks were given for cameras middle, which are not in"):
         replace(dataset, frames=(frame,))
 
 
@@ -104,7 +104,7 @@ def test_rows_of_unknown_or_repeated_frames_are_refused(sequence: Sequence) -> N
     row = KinematicsRow(sequence.frame_ids[0], "optimized", {})
     with pytest.raises(SequenceError, match="twice"):
         corrected_frames(sequence, range(3), [row, row])
-    with pytest.raises(SequenceError, match=r"'999', which .* does not have"):
+    with pytest.raises(SequenceError, match=r"'999', which is not in"):
         corrected_frames(sequence, range(3), [replace(row, frame_id="999")])
 
 

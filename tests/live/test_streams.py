@@ -180,10 +180,10 @@ def test_an_image_and_joints_make_a_frame(sequence: Sequence, assembler: Assembl
     ("values", "message"),
     [
         ({"joints": {"PSM9": {}}}, "there is no arm 'PSM9'; the arms are PSM1"),
-        ({"joints": {"PSM1": {"elbow": 0.0}}}, "joint 'elbow' is 0.0; its joints are"),
+        ({"joints": {"PSM1": {"elbow": 0.0}}}, "joint 'elbow' is 0.0. Give values for the joints"),
         ({"joints": {"PSM1": {"yaw": float("nan")}}}, "joint 'yaw' is nan"),
-        ({"joints": {"PSM1": {"yaw": 1e300}}}, "joint 'yaw' is 1e\\+300; .* at most 12.6 rad"),
-        ({"joints": {"PSM1": {"insertion": 141.0}}}, "joint 'insertion' is 141.0; .* and 2 m"),
+        ({"joints": {"PSM1": {"yaw": 1e300}}}, "joint 'yaw' is 1e\\+300. .* at most 12.6 rad"),
+        ({"joints": {"PSM1": {"insertion": 141.0}}}, "joint 'insertion' is 141.0. .* or 2 m"),
         ({"camera_poses": {"left": [[1.0]]}}, "camera_poses of 'left' has shape"),
         ({"camera_poses": {"left": (2 * np.eye(4)).tolist()}}, "camera_poses of 'left' is not rigid"),
         ({"camera_poses": {"up": np.eye(4).tolist()}}, "the cameras are left"),

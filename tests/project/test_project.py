@@ -123,10 +123,10 @@ def test_listeners_hear_of_every_save_after_it_is_done_and_cannot_spoil_it(proje
     [
         (Key.joints(3, "PSM1"), JOINTS, "no frame number 3; its frames are 0 to 2"),
         (Key.joints(-1, "PSM1"), JOINTS, "no frame number -1"),
-        (Key.joints(0, "PSM9"), JOINTS, "no arm 'PSM9' for joints; there are: PSM1, PSM2"),
+        (Key.joints(0, "PSM9"), JOINTS, "no arm 'PSM9' for joints; its arms are: PSM1, PSM2"),
         (Key.joints(0, "PSM2"), JOINTS, "arm 'PSM2' has 2 joints .yaw, pitch., but 3 joint positions were given"),
         (Key.joints(0, "PSM1"), ACCEPTED, "joints must be a JointCorrection, not a Review"),
-        (Key.intrinsics("right"), None, "no camera 'right' for intrinsics; there are: left"),
+        (Key.intrinsics("right"), None, "no camera 'right' for intrinsics; its cameras are: left"),
         (Key.ignore_region(0, "left"), IgnoreRegion.of(np.ones((4, 4), bool)), "4 x 4 pixels, .* 'left' have 8 x 6"),
         (replace(Key.base_frame("PSM1"), frame=0), None, "applies to all frames"),
     ],
@@ -223,5 +223,5 @@ def test_a_step_whose_values_were_changed_since_is_not_taken_back(project: Proje
     project.apply("Reject", {Key.review(1): Review(ReviewState.REJECTED)})
     with pytest.raises(ProjectError, match=r"step 1 \(Accept\) cannot be reverted alone: step 2 \(Reject\)"):
         project.reverting(1)
-    with pytest.raises(ProjectError, match="step 3 is not done; 2 steps are"):
+    with pytest.raises(ProjectError, match="step 3 is not in effect; the last step in effect is 2"):
         project.reverting(3)

@@ -60,8 +60,8 @@ def test_single_settings_need_no_file() -> None:
         ("[[solver.stages]]\nstage = 'Descend'", "requires a blur"),
         ("[[solver.stages]]\nstage = 'Descend'\nblur = 2.0\nspeed = 1", "has no setting 'speed'.*Settings: blur"),
         ("[solver]\nstages = 3", "must be a list of tables"),
-        ("[slover]\nprior_deg = 1", "has slover; allowed: the tables"),
-        ("prior_deg = 1", "has prior_deg; allowed: the tables"),
+        ("[slover]\nprior_deg = 1", "contains slover; allowed: tables"),
+        ("prior_deg = 1", "contains prior_deg; allowed: tables"),
         ("[solver", "is not TOML"),
     ],
 )

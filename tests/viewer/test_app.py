@@ -170,7 +170,7 @@ def test_captions_have_times_remarks_and_the_offset_between_clocks(open_viewer: 
     other = open_viewer(prepare=as_ros)
     with RawTab(other.url):
         other.queue.put(intents.ShowFrame(1))
-        assert "0.100 s after the first, 2016-06-28 00:00:00 UTC" in caption(other)
+        assert "0.100 s after the first frame, 2016-06-28 00:00:00 UTC" in caption(other)
         assert not other.view.page.find("Time offset [s]").visible
 
 

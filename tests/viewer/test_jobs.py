@@ -308,7 +308,7 @@ def test_a_damaged_choice_is_kept_and_the_first_network_runs(planted: Path) -> N
         file.write_text(content)
         found = networks(planted)
         assert (found.used, found.asked) == (STARTED, "")
-        assert "choice of a network work_network.json" in found.problem
+        assert "network selection work_network.json" in found.problem
         assert file.with_name(f"work_network.json.damaged-{number}").read_text() == content and not file.exists()
 
 

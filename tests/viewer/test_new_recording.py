@@ -87,12 +87,12 @@ def test_two_folders_a_table_and_calibrations_become_a_sequence_with_its_arm_in_
     visitor.reads("Click the tip")
     dismiss_warning(visitor.page)
     click_what_is_asked_for(visitor, made.scene, true, 0.5)
-    visitor.reads("All planned points are clicked")
+    visitor.reads("All planned points have been clicked")
     # Taken back and done again, and still there after a restart.
     points = place_of(visitor).draft.points
     visitor.press("Undo")
     eventually(lambda: place_of(visitor).draft.points, lambda now: now == points[:-1])
-    expect(visitor.page.locator("main").get_by_text("All planned points are clicked")).to_have_count(0)
+    expect(visitor.page.locator("main").get_by_text("All planned points have been clicked")).to_have_count(0)
     visitor.press("All recordings")
     visitor.press("Continue day 3")
     visitor.reads("Click the shaft edge")

@@ -39,7 +39,7 @@ def test_a_frame_is_checked_and_optimized_and_the_page_shows_what_is_out_of_date
     check.click()
     eventually(lambda: app.state.verdict, timeout=90)
     # The button says why it cannot be pressed.
-    expect(tab.page.get_by_role("button", name="The fit is checked", exact=True)).to_be_disabled()
+    expect(tab.page.get_by_role("button", name="Fit checked", exact=True)).to_be_disabled()
     shown = eventually(lambda: tab.page.evaluate(_FIT), lambda fit: fit > 0)
     # While a run moves the frame, the verdict is an old one; a reset brings it back.
     tab.put(intents.Step())
@@ -173,7 +173,7 @@ def test_a_range_is_what_is_solved_exported_and_queued(open_tab: OpenTab) -> Non
     tab.put(intents.Solve())
     expect(tab.page.get_by_text("the shown frame lies outside of it").last).to_be_visible()
     tab.put(intents.DismissError(), intents.ShowFrame(5))
-    expect(tab.page.get_by_text("none is kept in the range")).to_be_visible()
+    expect(tab.page.get_by_text("there is none in the range")).to_be_visible()
     tab.put(intents.SetReview(ReviewState.ACCEPTED))
     expect(tab.page.get_by_text("Solve between, 005 to 008: 3 frames would be fitted, 1 kept")).to_be_visible()
     # The bright button is what the range was most likely chosen for.
@@ -214,7 +214,7 @@ def test_jobs_of_another_user_are_asked_for_and_jobs_and_choices_survive_the_ser
     expect(tab.page.get_by_text("need your confirmation")).to_be_visible()
     assert [job.state for job in app.state.jobs] == [JobState.ASKED]
     tab.open("Jobs")
-    expect(tab.page.get_by_text("and are not run: Export all as")).to_be_visible()
+    expect(tab.page.get_by_text("did not queue them on this computer: Export all as")).to_be_visible()
     tab.button("Run jobs")
     eventually(lambda: app.state.jobs[0].state, lambda state: state is JobState.DONE, 60)
     expect(tab.page.get_by_text("need your confirmation")).to_have_count(0)

@@ -355,7 +355,7 @@ def test_clicks_are_about_one_thing_until_it_is_finished_and_each_is_a_step(prom
     prompted.do(_point(3, (20.0, 12.0), erase=True))
     assert discs.asked[-1] == Prompt(inside=((20.0, 20.0), (34.0, 20.0)), outside=((20.0, 12.0),))
     assert not _ignored(prompted)[12, 20] and _ignored(prompted)[24, 20] and _ignored(prompted)[20, 34]
-    assert [step.name for step in prompted.saved.steps] == ["Segment by a prompt, frame 001"] * 3
+    assert [step.name for step in prompted.saved.steps] == ["Segment with a prompt, frame 001"] * 3
     # The next one begins anew and adds to what is there.
     before = _ignored(prompted)
     prompted.do(intents.NextObject(), _point(4, (50.0, 40.0)))

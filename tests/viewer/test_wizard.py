@@ -58,7 +58,7 @@ def test_a_table_of_unknown_columns_is_shown_with_values_and_the_cameras_stay(tm
     draft = recording(tmp_path / "rec", [f"{letter} thing" for letter in "abcdef"], JOINTS)
     found = guess(draft)
     assert found.recording is not None and [camera.name for camera in found.recording.cameras] == ["left"]
-    assert "Neither six joints" in found.problems["columns", ""]
+    assert "neither six recognizable joints" in found.problems["columns", ""]
     form = check_form(draft, found, {})
     assert "c thing (0.12)" in form and "log.csv" in form and "64 × 48" in form and " --" not in form
     joints = [(f"column {joint}", f"{letter} thing") for joint, letter in zip(JOINT_NAMES, "abcdef", strict=True)]

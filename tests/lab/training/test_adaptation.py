@@ -209,7 +209,7 @@ def test_weights_are_offered_only_where_nothing_is_worse(
     assert (tmp_path / "run" / "surface.safetensors").is_file() == (tips == 2.0)
     assert (tmp_path / "run" / "refused.safetensors").is_file() == (tips == 10.9)
     assert ("To use them: carts optimize" in said) == (tips == 2.0)
-    assert ("rejected, because worse: tips of synthetic images (2.7 -> 10.9 px)" in said) == (tips == 10.9)
+    assert ("rejected because of worse results: tips of synthetic images (2.7 -> 10.9 px)" in said) == (tips == 10.9)
 
 
 def test_made_images_to_judge_by_are_whole_and_always_the_same(tmp_path: Path):
