@@ -106,7 +106,7 @@
       ["Stripe below", "the verdict on the fit:", ...keys(FIT, VERDICTS)],
       ["Stripe below that", "the source of the joints:", ...keys(SOURCE, ["", NAMES[5], NAMES[1], NAMES[6]])],
       ["Line at the bottom", "the whole sequence, in the colour of each frame's verdict or, without a verdict, of its review; the box marks the part shown above"],
-      ["Bands", "teal: the shown frame; pink: frames being solved; amber: ends of the range; frames outside of the range are dimmed"],
+      ["Bands", "teal: the shown frame; pink: frames being solved; amber: ends of the range; frames beyond them are dimmed"],
     ];
     card.append(...rows.flatMap(([name, ...about]) => [make("dt", {}, name), make("dd", {}, ...about)]));
     return card;
