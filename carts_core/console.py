@@ -32,7 +32,7 @@ _BETWEEN_LINES = 10.0
 """Interval between progress lines written to a file or a pipe [s]."""
 _KEPT = "\n\t"
 _HIDDEN_CATEGORIES = ("Cc", "Cf", "Cs", "Zl", "Zp")
-"""Control, format and surrogate characters, and separators of lines and paragraphs."""
+"""Unicode categories of escaped characters: control, format and surrogate characters, line and paragraph separators."""
 _MARKDOWN = re.compile(r"([\\`*{}\[\]#|!]|(?<![A-Za-z0-9])_|_(?![A-Za-z0-9]))")
 """Characters with a meaning in Markdown, except underscores inside a word."""
 
@@ -70,7 +70,7 @@ class PlainColumn(TextColumn):
     """Progress-bar column whose text is not parsed as markup."""
 
     def render(self, task: Task) -> Text:
-        """Text of a task."""
+        """Render the column's text for a task."""
         return Text(visible(self.text_format.format(task=task)), style="progress.description")
 
 

@@ -72,8 +72,8 @@ def inference_threads() -> int:
 def _keep_memory() -> None:
     """Make glibc keep the memory of images instead of returning it to the system.
 
-    The system clears each new page on first access, with which a rendering of 640x480 px took 29 ms instead of 16 ms.
-    `MALLOC_...` variables of the environment take precedence.
+    The system clears each new page on first access, which increased the time of a 640x480 px rendering from 16 ms to 29
+    ms. `MALLOC_...` variables of the environment take precedence.
     """
     mallopt = _of_malloc("mallopt")
     if mallopt is None:

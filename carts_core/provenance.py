@@ -162,7 +162,7 @@ class Checkpoint:
 
 
 def _encoded(value: Any) -> Any:
-    """Encode a value as JSON, with all bits of float64 values."""
+    """Encode a value as JSON, without loss of float64 precision."""
     if isinstance(value, np.ndarray):
         assert value.dtype == np.float64
         return {"array": value.ravel().tolist(), "shape": value.shape}

@@ -11,7 +11,7 @@ import numpy as np
 from ..files.reading import BAG, GIB, check_regular
 
 LIBRARIES = dict.fromkeys(("topics", "rows", "image_times", "message"), ("rosbags.highlevel", "rosbags.typesys"))
-"""Modules per function that are imported before the memory limit applies."""
+"""Function -> modules to import before the memory limit applies."""
 _SAMPLED = 20
 """Number of image headers that are read from a large bag."""
 
@@ -35,9 +35,9 @@ def rows(path: Path, wanted: dict[str, tuple[str, str]]) -> dict[str, Any]:
             `pose` or `text`.
 
     Returns:
-        For each name, the last text, or, for each list of joint names in the messages (empty except for `joints`), an
-        array [messages, 1 + values] of times [s] and joint positions, a jaw angle, or a pose (x y z, quaternion x y z
-        w).
+        Result by name. For `text`, it is the last text. Otherwise, it is a list of pairs: a tuple of joint names (empty
+        except for `joints`), and an array [messages, 1 + values] of times [s] and joint positions, a jaw angle, or a
+        pose (x y z, quaternion x y z w).
 
     Raises:
         Exception: as `topics`.
@@ -92,7 +92,7 @@ def image_times(path: Path, topic: str) -> tuple[np.ndarray, np.ndarray]:
 
 
 def message(path: Path, topic: str, time: int | None = None) -> dict[str, Any] | None:
-    """Fields of a message by name; None without a message.
+    """Fields of a message by name; None if there is no such message.
 
     Args:
         path: path of the bag.
@@ -112,7 +112,7 @@ def message(path: Path, topic: str, time: int | None = None) -> dict[str, Any] |
 
 @lru_cache(1)
 def _opened(path: Path) -> Any:
-    """Reader of a bag, which is kept open for further calls."""
+    """Reader of a bag; the bag is kept open for later calls."""
     from rosbags.highlevel import AnyReader  # noqa: PLC0415 - an extra
     from rosbags.typesys import Stores, get_typestore  # noqa: PLC0415
 
@@ -134,7 +134,7 @@ def _plain(value: Any) -> Any:
 
 
 def _stamp(decoded: Any, time: int) -> float:
-    """Time in the header of a message, or the record time without a header [s]."""
+    """Time in the header of a message, or the record time if there is no header [s]."""
     stamp = getattr(getattr(decoded, "header", None), "stamp", None)
     nanoseconds = time if stamp is None or stamp.sec == 0 else stamp.sec * 10**9 + stamp.nanosec
     return nanoseconds * 1e-9

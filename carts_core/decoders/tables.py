@@ -11,7 +11,7 @@ from ..files.reading import CALIBRATION, TABLE, read_bytes
 MAX_CELLS, MAX_ROWS, MAX_COLUMNS = 10_000_000, 1_500_000, 10_000
 """Maximum number of values, rows and columns of a table."""
 LIBRARIES = {"read_parquet": ("pyarrow.parquet",), "read_matlab": ("scipy.io",)}
-"""Modules per function that are imported before the memory limit applies."""
+"""Function -> modules to import before the memory limit applies."""
 
 
 def read_parquet(path: Path) -> dict[str, Any]:

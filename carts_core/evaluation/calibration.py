@@ -106,7 +106,7 @@ def moved_frames(before: Scene, after: Scene) -> list[tuple[str, float, float]]:
 
 
 def beyond_prior(before: Scene, result: CalibrationResult, known: Mapping[str, Float[np.ndarray, "6 6"]]) -> str | None:
-    """Warning about base frames that moved farther than the hand-eye calibration allows; None without such base frames.
+    """Warning about base frames that moved farther than the hand-eye calibration allows; None if there are none.
 
     Args:
         before: scene with the previous calibration.
@@ -118,8 +118,8 @@ def beyond_prior(before: Scene, result: CalibrationResult, known: Mapping[str, F
         angle, way = pose_distance(before.arm(arm).T_world_base, result.scene.arm(arm).T_world_base)
         turn, shift = (np.sqrt(np.trace(known[arm][part, part])) for part in (slice(3), slice(3, 6)))
         said.append(
-            f"the base frame of {arm} moves by {angle:.1f} deg and {way:.1f} mm, but its hand-eye calibration has "
-            f"standard deviations of {np.degrees(turn):.1f} deg and {1e3 * shift:.1f} mm"
+            f"the calibration moves the base frame of {arm} by {angle:.1f} deg and {way:.1f} mm, but its hand-eye "
+            f"calibration has standard deviations of {np.degrees(turn):.1f} deg and {1e3 * shift:.1f} mm"
         )
     return f"{'; '.join(said)}." if said else None
 
@@ -127,7 +127,7 @@ def beyond_prior(before: Scene, result: CalibrationResult, known: Mapping[str, F
 def calibration_warning(before: Scene, result: CalibrationResult) -> str | None:
     """Warning about the use of a calibration; None if only intrinsics changed."""
     if not any(unknown.change for unknown in result.unknowns):
-        return "The initial calibration was kept, since no other calibration fits these frames better."
+        return "The initial calibration was kept, since no better calibration was found."
     if not moved_frames(before, result.scene):
         return None
     return (

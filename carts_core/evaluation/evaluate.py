@@ -294,7 +294,7 @@ def to_json(scores: Names[FrameScore]) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Setup:
-    """Solver with settings, and recording, domain and cameras of its frames.
+    """Solver and its settings, with the recording, domain and cameras of the frames.
 
     Initial joint positions are the `measured` positions of the frames; see `evaluate` for other arguments.
     """

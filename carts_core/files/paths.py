@@ -20,7 +20,7 @@ _REFUSED = re.compile(r"[/\\\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]")
 
 
 def home() -> Path:
-    """The user's home folder; without one, the root folder, to which nothing is written."""
+    """The user's home folder; if there is none, the root folder, to which nothing is written."""
     try:
         return Path.home()
     except RuntimeError:
@@ -52,8 +52,8 @@ def name_fault(text: str, most_bytes: int = NAME_BYTES) -> str | None:
 def allowed_names(most_bytes: int = NAME_BYTES) -> str:
     """Description of the names allowed by `name_fault`, for error messages."""
     return (
-        f"Names are used in file names: 1 to {most_bytes} bytes, without / or \\, control characters, or a leading "
-        "dot. Rename it"
+        f"Names are used in file names, so they must have 1 to {most_bytes} bytes, and no / or \\, control characters "
+        "or leading dot. Rename it"
     )
 
 

@@ -271,7 +271,7 @@ def open_regular(path: Path, kind: Kind) -> BufferedReader:
         if not stat.S_ISREG(status.st_mode):
             raise RefusedFileError("it is a pipe, socket or device, not a regular file")
         if status.st_size > kind.limit:
-            raise _too_large(kind, f"has {status.st_size / MIB:.0f} MiB")
+            raise _too_large(kind, f"is {status.st_size / MIB:.0f} MiB")
         if status.st_size <= _MAX_POINTER_BYTES and os.pread(descriptor, len(_POINTER), 0) == _POINTER:
             raise LfsPointerError(_POINTER_TEXT)
         return os.fdopen(descriptor, "rb")
@@ -317,7 +317,7 @@ def parse_toml(text: str) -> dict[str, Any]:
     try:
         values = tomllib.loads(text)
     except RecursionError as error:
-        raise ValueError(f"it is nested more than {MAX_DEPTH} deep") from error
+        raise ValueError(f"it is nested more than {MAX_DEPTH} levels deep") from error
     _check_values(values)
     return values
 
@@ -342,7 +342,7 @@ def parse_json(text: str | bytes, *, finite: bool = True) -> Any:
             if finite and not all_finite(values):
                 raise ValueError("a number in it is not finite")
     except RecursionError as error:
-        raise ValueError(f"it is nested more than {MAX_DEPTH} deep") from error
+        raise ValueError(f"it is nested more than {MAX_DEPTH} levels deep") from error
     return values
 
 
@@ -366,7 +366,7 @@ def parse_yaml(text: str) -> Any:
             if isinstance(event, yaml.AliasEvent):
                 raise ValueError(f"it has the alias *{event.anchor}; aliases are not supported, so write the value out")
             if depth > MAX_DEPTH:
-                raise ValueError(f"it is nested more than {MAX_DEPTH} deep")
+                raise ValueError(f"it is nested more than {MAX_DEPTH} levels deep")
             if count > MAX_YAML_EVENTS:
                 raise ValueError(f"it has more than {MAX_YAML_EVENTS:,} values")
         values = yaml.load(text, Loader=_plain_yaml(parser))
@@ -384,7 +384,7 @@ def _plain_yaml(parser: Any) -> Any:
 
     class PlainLoader(parser):
         def flatten_mapping(self, node: Any) -> None:
-            """Leave merge keys, so that they fail for lack of a constructor."""
+            """Leave merge keys unresolved, so that they raise an error for lack of a constructor."""
 
     def whole(loader: Any, node: Any) -> int | str:
         text = loader.construct_scalar(node).replace("_", "")
@@ -456,7 +456,7 @@ def check_path(path: str | Path) -> None:
         return
     data = os.fsencode(text)
     if len(data) > MAX_PATH_LENGTH or any(len(part) > MAX_NAME_LENGTH for part in data.split(b"/")):
-        raise ValueError(f"a name is longer than {MAX_NAME_LENGTH} bytes, or the path longer than {MAX_PATH_LENGTH}")
+        raise ValueError(f"a name is longer than {MAX_NAME_LENGTH} bytes, or the path is longer than {MAX_PATH_LENGTH}")
 
 
 _SURROGATE = re.compile("[\ud800-\udfff]")
@@ -482,7 +482,7 @@ def _check_values(root: Any) -> None:
         if not deeper:
             return
         level = deeper
-    raise ValueError(f"it is nested more than {MAX_DEPTH} deep")
+    raise ValueError(f"it is nested more than {MAX_DEPTH} levels deep")
 
 
 def _too_large(kind: Kind, what: str) -> RefusedFileError:

@@ -53,7 +53,8 @@ _NEW = os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
 _MODE = 0o666
 _OWN_DESCRIPTORS = Path("/proc/self/fd")
 _NAMELESS = getattr(os, "O_TMPFILE", 0) if _OWN_DESCRIPTORS.is_dir() else 0
-"""Flag for unnamed temporary files, which are linked when complete, so that a kill leaves no file; 0 without support.
+"""Flag for unnamed temporary files, which are linked when complete, so that a killed process leaves no file; 0 if not
+supported.
 """
 
 
@@ -474,7 +475,8 @@ def _check_free(folder: int, output: OutputPath, overwrite: bool) -> None:
             marker = status(inside, MARKER)
         if marker is None or not stat.S_ISREG(marker.st_mode):
             raise OutputError(
-                f"{output} is a folder without {MARKER}, and other folders are never replaced. Choose a new folder."
+                f"{output} is a folder without {MARKER}; only folders written by an export are replaced. Choose a new "
+                "folder."
             )
     elif not stat.S_ISREG(found.st_mode):
         raise OutputError(f"{output} is {kind_of(found)}, which is never replaced. Choose another output.")

@@ -102,12 +102,10 @@ def implausible_intrinsics(
         )
     for what, value, side in (("cx", cx, width), ("cy", cy, height)):
         if not CENTRE_RANGE[0] * side <= value <= CENTRE_RANGE[1] * side:
-            place = "outside of" if not 0 <= value <= side else "near the edge of"
+            place = "outside" if not 0 <= value <= side else "near the edge of"
             return f"the principal point {cx:g}, {cy:g} px, {place} {size} ({what})"
     if distortion and _folds(width, height, intrinsics, distortion):
-        return (
-            f"distortion {list(distortion)} that maps two positions in {size} to one; the distortion model may be wrong"
-        )
+        return f"distortion {list(distortion)} that is not one-to-one in {size}; the distortion model may be wrong"
     return None
 
 
@@ -158,7 +156,10 @@ class Camera:
                 "Both must be positive, in pixels."
             )
         if max(map(abs, self.intrinsics)) > FARTHEST or min(self.intrinsics[:2]) < 1 / FARTHEST:
-            raise SettingsError(f"the intrinsics are {self.intrinsics}. Give fx, fy, cx, cy [px] within {FARTHEST:g}.")
+            raise SettingsError(
+                f"the intrinsics are {self.intrinsics}. Give fx, fy, cx, cy [px] with magnitudes of at most "
+                f"{FARTHEST:g}."
+            )
         if len(self.distortion) not in DISTORTION_LENGTHS or not np.isfinite(self.distortion).all():
             raise SettingsError(
                 f"there are {len(self.distortion)} distortion coefficients. Give 0, 4, 5, 8, 12 or 14 finite numbers, "

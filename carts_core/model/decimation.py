@@ -11,7 +11,7 @@ from ..files.decoding import DecodingLimitError, Limits, called
 from ..files.reading import GIB
 
 LIBRARIES = {"fewest_triangles": ("fast_simplification", "scipy.spatial")}
-"""Modules that a child process imports before its memory is measured."""
+"""Function -> modules to import before the memory limit applies."""
 _SECONDS = 12.0
 """Constant part of the CPU time limit [s]."""
 _SECONDS_PER_FACE = 1e-4

@@ -91,8 +91,8 @@ def choose_instrument(model: Path, number: str) -> Instrument:
     if not chosen.has_tip:
         others = ", ".join(f"{key} ({other.name})" for key, other in instruments.items() if other.has_tip)
         raise RobotError(
-            f"instrument {number} ({chosen.name}) has no tip meshes in {model}, only boxes of 5 mm, which match no "
-            f"image. Instruments with meshes: {others}."
+            f"instrument {number} ({chosen.name}) has no tip meshes in {model}, only 5 mm boxes, which do not resemble "
+            f"the instrument. Instruments with meshes: {others}."
         )
     return chosen
 

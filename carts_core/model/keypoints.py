@@ -148,7 +148,7 @@ class Landmark:
     hint: str
     """Description of the position, displayed in the page."""
     points: tuple[tuple[int, tuple[float, float, float]], ...]
-    """Link and position in the link's frame [m]; a point is the mean of all positions, a line has two positions, the
+    """Link and position in the link's frame [m]. A point is the mean of all positions; a line has two positions, the
     ends of its axis."""
     radius: float = 0.0
     """Radius of the cylinder [m]."""
@@ -193,7 +193,7 @@ def landmarks(arm: Arm) -> Mapping[str, Landmark]:
 def link_transforms(
     arm: Arm, joint_positions: Float[np.ndarray, "frames dofs"]
 ) -> Float[np.ndarray, "frames links 4 4"]:
-    """Ts_base_link [m] in double precision."""
+    """Transforms from the links to the base frame, in double precision [m]."""
     return arm.robot.forward_kinematics(torch.as_tensor(np.asarray(joint_positions, np.float64))).numpy()
 
 

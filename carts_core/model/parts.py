@@ -55,9 +55,9 @@ def link_classes(arms: Sequence[Arm]) -> Int[np.ndarray, " links"]:
 def link_parts(robot: Robot) -> Int[np.ndarray, " links"]:
     """Index into `PARTS` of each link with a mesh, from the number of degrees of freedom that move it.
 
-    Links moved by all but the last two degrees of freedom are the wrist, links moved by more are the jaws with their
-    bearing, and all other links are the shaft. For instruments without moving jaws (such as a hook), links that move
-    with the shaft (the longest mesh, if slender) are not part of the wrist.
+    Links moved by all but the last two degrees of freedom belong to the wrist, links moved by more belong to the jaws
+    and their bearing, and all other links belong to the shaft. For instruments without moving jaws (such as a hook),
+    links that move with the shaft (the longest mesh, if slender) are not part of the wrist.
     """
     dofs = len(robot.joint_names)
     probes = torch.cat([torch.zeros(1, dofs), _PROBE * torch.eye(dofs)]).double()

@@ -64,7 +64,7 @@ class PsmGeometry:
             )
         if any(abs(value) >= np.pi / 2 for index in (1, 4) for value in self.limits[index]):
             raise SettingsError(
-                "limits of pitch and wrist_pitch must be within 90 degrees, since poses beyond are ambiguous."
+                "limits of pitch and wrist_pitch must be within 90 degrees, since poses beyond these are ambiguous."
             )
 
 
@@ -241,7 +241,7 @@ def _solve_link(
 
 
 def _roll_turns(roll: np.ndarray, limits: tuple[float, float], continuous: bool, near: float) -> np.ndarray:
-    """Add full revolutions to the roll, so that it is without jumps if `continuous`, and within the limits if
+    """Add full revolutions to the roll, so that it does not jump if `continuous`, and is within the limits if
     possible."""
     known = np.isfinite(roll)
     if not known.any():

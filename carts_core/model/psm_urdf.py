@@ -1,4 +1,4 @@
-"""Common part of the URDFs of PSMs: links and joints from the remote centre to the instrument's base."""
+"""Common part of the URDFs of PSMs: links and joints from the remote centre of motion to the instrument's base."""
 
 import math
 from collections.abc import Iterator
@@ -35,7 +35,7 @@ def joint(
 
 
 def remote_center_chain(geometry: PsmGeometry) -> Iterator[ElementTree.Element]:
-    """Links and joints from the remote centre to the instrument's base, as in the dVRK's controller."""
+    """Links and joints from the remote centre of motion to the instrument's base, as in the dVRK's controller."""
     places = (
         ("yaw", "revolute", "0 0 0", right_angle_rpy(0, -1, 1)),
         ("pitch", "revolute", "0 0 0", right_angle_rpy(0, -1, -1)),

@@ -24,7 +24,8 @@ from . import mesh_cache
 from .instruments import robot_file
 from .meshes import CLUSTERING_RATIO, Decimation, LinkMesh, build_link_meshes, collada_asset, load_visual, mesh_path
 
-with deferred_import("matplotlib", "pyplot"):  # The parser imports it only for plots; it takes 0.2 s.
+# The kinematics parser needs matplotlib only for plots, and the import takes 0.2 s.
+with deferred_import("matplotlib", "pyplot"):
     import pytorch_kinematics
 
 NO_LIMIT = 1e3
@@ -219,12 +220,12 @@ def _check_elements(root: Element, source: Path) -> None:
             break
     if level or count > _MAX_ELEMENTS:
         raise RobotError(
-            f"robot {source} is nested more than {_DEEPEST} deep or has more than {_MAX_ELEMENTS} elements."
+            f"robot {source} is nested more than {_DEEPEST} levels deep or has more than {_MAX_ELEMENTS} elements."
         )
 
 
 def _check_tree(root: Element, source: Path) -> None:
-    """Check that names are unique and that joints connect all links to one tree."""
+    """Check that names are unique and that joints connect all links into one tree."""
     links, joints = root.findall("link"), root.findall("joint")
     if not 1 <= len(links) <= _MAX_LINKS or len(joints) > _MAX_LINKS:
         raise RobotError(f"robot {source} has {len(links)} links; allowed: 1 to {_MAX_LINKS}.")
@@ -244,7 +245,7 @@ def _check_tree(root: Element, source: Path) -> None:
     roots = [name for link in links if (name := link.get("name", "")) not in parents]
     if len(roots) != 1:
         found = "no link without a parent" if not roots else f"several links without a parent: {listed(roots)}"
-        raise RobotError(f"robot {source} has {found}. Its joints must connect all links to one tree.")
+        raise RobotError(f"robot {source} has {found}. Its joints must connect all links into one tree.")
     # Each link is the child of at most one joint, so links that do not reach the root form a loop.
     for start in parents:
         link = start

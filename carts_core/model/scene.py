@@ -45,7 +45,7 @@ class Light:
 class SceneState:
     """Optimizable values of a scene: a point, or a batch of points, in parameter space.
 
-    Fields are tensors that may carry gradients; `*batch` are hypotheses.
+    Fields are tensors that may carry gradients; `*batch` dimensions are hypotheses.
     """
 
     joint_positions: tuple[Float[Tensor, "*batch dofs"], ...]

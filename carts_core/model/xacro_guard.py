@@ -22,7 +22,7 @@ _LARGEST = 2.0**63
 """Maximum integer in an expression."""
 _MAX_EXPRESSION_LENGTH = 2_000
 LIBRARIES = {"expanded": ("xacro", "xacrodoc")}
-"""Modules that a child process imports before its memory is measured."""
+"""Function -> modules to import before the memory limit applies."""
 _DECLARES = re.compile(r"<!(?:DOCTYPE|ENTITY)", re.IGNORECASE)
 
 _BINARY: dict[type[ast.operator], Callable[[Any, Any], Any]] = {
@@ -149,7 +149,7 @@ class Expression:
     def _symbol(self, name: str) -> Any:
         value = self._symbols[name]
         if not isinstance(value, str | bool | int | float | list | tuple | Mapping | None):
-            raise RobotError(f"{name!r} is not a property with a value")
+            raise RobotError(f"{name!r} is not a property, or has no value")
         return value
 
     def _entry(self, value: ast.expr, name: str) -> Any:

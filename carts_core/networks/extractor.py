@@ -55,7 +55,7 @@ class _Maps(nn.Module):
 
 
 class OnnxSurface:
-    """Surface network in ONNX Runtime, with the value of `inference_threads` at creation.
+    """Surface network in ONNX Runtime, with the number of threads that `inference_threads` returns at creation.
 
     The graph is exported once and stored in the cache, under the fingerprint of the weights.
 

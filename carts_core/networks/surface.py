@@ -46,7 +46,7 @@ STEM = 32
 
 
 _EPSILON, _MOMENTUM = 1e-3, 0.01
-"""Of the batch norms of EfficientNet-Lite."""
+"""Epsilon and momentum of the batch norms of EfficientNet-Lite [1]."""
 
 
 def _normalized(inputs: int, outputs: int, kernel: int = 1, stride: int = 1, groups: int = 1) -> nn.Sequential:
@@ -117,7 +117,7 @@ class SurfaceNetwork(ImageNetwork):
         self.reduce = nn.ModuleList(nn.Conv2d(*pair, 1, bias=False) for pair in ((at16, at8), (at8, at4), (at4, at2)))
         counts = reversed(self.architecture.convolutions)
         self.decoder = nn.ModuleList(_refining(width, n) for (width, _, _), n in zip(widths, counts, strict=True))
-        # Each position at stride 2 has four pixels.
+        # Each position at stride 2 covers four pixels.
         self.out = nn.Conv2d(at2, 4 * _OUTPUTS, 1)
         self.gain = nn.Parameter(torch.tensor([_PRIOR] * _CLASSES + [1.0] * 3).view(1, _OUTPUTS, 1, 1))
 

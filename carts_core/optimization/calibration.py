@@ -281,7 +281,7 @@ class CalibrationOptimizer:
         return iter(self.step, None)
 
     def result(self) -> CalibrationResult:
-        """Result at the best iterate of the finest descent reached; `SettingsError` before the first step."""
+        """Result at the best iterate of the finest descent that was run; `SettingsError` before the first step."""
         if self.best is None or self._problem.present is None:
             raise SettingsError("no step was made. Call `step` first.")
         offsets = self.best.offsets

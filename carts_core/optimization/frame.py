@@ -164,7 +164,9 @@ class FrameOptimizer:
             given = scene, frame.images, predictor, self._variables, settings, ignore
             self._problem = FrameProblem(*given, factors=further, backgrounds=known, live=live)
         elif further:
-            raise SettingsError(f"the loss {settings.loss} does not support further factors. Use the solver `surface`.")
+            raise SettingsError(
+                f"the loss {settings.loss} does not support additional factors. Use the solver `surface`."
+            )
         elif isinstance(networks, FeatureExtractor):
             self._problem = FeatureProblem(scene, frame.images, known.images, networks, self._variables, settings)
         else:

@@ -177,7 +177,7 @@ class FrameProblem:
     Args:
         ignore: camera name -> pixels that show an occluder.
         prior: prior of the unknowns, by default the prior of the settings.
-        backgrounds: mean backgrounds of the cameras; predictions in them are false positives.
+        backgrounds: mean backgrounds of the cameras; arms predicted in them are false positives.
         live: whether coarse stages are also compared under a fine blur for display, which increases the time by a
             third.
 

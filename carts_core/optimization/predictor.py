@@ -162,7 +162,7 @@ class MaskPredictor:
         """Predictor for one frame.
 
         Raises:
-            SettingsError: a camera has no mask of the frame and there is no network, or a mask has the wrong size.
+            SettingsError: a camera has no mask for the frame and there is no network, or a mask has the wrong size.
         """
         network = None if self._network is None else self._network.for_frame(frame, cameras)
         given = (frame.masks or {}) if self._masks is None else self._masks(frame.index)
@@ -171,14 +171,14 @@ class MaskPredictor:
             return network
         if missing:
             raise SettingsError(
-                f"frame {frame.frame_id} has no {self._origin} of camera {missing[0]!r} to fit. Give a mask, leave out "
-                "the frame or camera, or observe both masks and the network."
+                f"frame {frame.frame_id} has no {self._origin} for camera {missing[0]!r} to fit. Give a mask, leave "
+                "out the frame or camera, or observe both masks and the network."
             )
         for name in cameras:
             if given[name].shape != frame.images[name].shape[:2]:
                 raise SettingsError(
-                    f"the mask of camera {name!r} in frame {frame.frame_id} has shape {given[name].shape}, its image "
-                    f"{frame.images[name].shape[:2]}. Give a mask of the image's size."
+                    f"the mask of camera {name!r} in frame {frame.frame_id} has shape {given[name].shape}, but its "
+                    f"image has {frame.images[name].shape[:2]}. Give a mask of the image's size."
                 )
         masks = tuple(np.asarray(given[name], np.float32) for name in cameras)
         return _FrameMasks(masks, network, self.device)

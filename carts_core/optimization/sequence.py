@@ -50,8 +50,8 @@ def visiting_gaps(times: Mapping[int, float | None], model: SequenceSettings) ->
     for (a, before), (b, after) in pairwise(known.items()):
         if not before < after:
             raise SettingsError(
-                f"frame {b} has the time {after:g} s, after frame {a} at {before:g} s. Times must increase; correct "
-                "them in the sequence."
+                f"the time of frame {b}, {after:g} s, is not after that of frame {a}, {before:g} s. Times must "
+                "increase; correct them in the sequence."
             )
     order = list(known) if model.direction == "forward" else list(reversed(known))
     return {index: abs(known[index] - known[previous]) for previous, index in pairwise([order[0], *order])}

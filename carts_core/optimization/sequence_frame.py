@@ -130,7 +130,7 @@ class SequenceFrameSolver:
     def warm(
         self, frame: Frame, variables: Variables, expected: Gaussian, start: np.ndarray, *, wide: bool = False
     ) -> Measurement:
-        """Find the correction near `start` [n]; `wide` uses a larger margin around the arms, and more steps."""
+        """Find the correction near `start` [n]; with `wide`, use a larger margin around the arms, and more steps."""
         prior = _prior(expected, variables)
         fit = self._run(frame, variables, prior, self._wide if wide else self._warm, start)
         assert fit.best_of_descent is not None
@@ -152,7 +152,8 @@ class SequenceFrameSolver:
         quick: bool = False,
         cancelled: Callable[[], bool] = lambda: False,
     ) -> Measurement:
-        """Find the correction, starting at the measured values; `quick` uses smaller images except in the last stages.
+        """Find the correction, starting at the measured values; with `quick`, use smaller images except in the last
+        stages.
 
         Raises:
             CancelledError: `cancelled` returned True after an evaluation.
@@ -165,7 +166,7 @@ class SequenceFrameSolver:
         return replace(end, iterations=fit.used + end.iterations)
 
     def run_frame_stages(self, frame: Frame, variables: Variables) -> SingleFrameFit | None:
-        """Run the stages of the settings, like `FrameOptimizer`; None without an evaluation."""
+        """Run the stages of the settings, like `FrameOptimizer`; None if nothing was evaluated."""
         fit = self._run(frame, variables, None, self._settings.stages, np.zeros(len(variables)))
         if fit.best is None:
             return None
@@ -184,7 +185,7 @@ class SequenceFrameSolver:
 
     @_checkpointed
     def losses(self, frame: Frame, variables: Variables, corrections: Sequence[np.ndarray]) -> list[float]:
-        """Losses of corrections [n] in a smaller image, each with an observation conditioned on it."""
+        """Losses of corrections [n] in a smaller image, each under an observation conditioned on that correction."""
         problem, found = self._problem(frame, variables, None), []
         for correction in corrections:
             offsets = _offsets(correction, variables)

@@ -210,7 +210,7 @@ def _of_arm(
     """Evidence on one arm from coverage maps under pixel weights.
 
     Args:
-        rendered, conditioned, alone: coverage: rendered, predicted with condition, and predicted without.
+        rendered, conditioned, alone: rendered coverage, and coverage predicted with and without the condition.
     """
     rendered, conditioned, alone = rendered * here, conditioned * here, alone * here
     overlap = None
@@ -280,8 +280,8 @@ class Assessment:
 
 
 _UNCERTAIN, _POSSIBLE, _LIKELY = 0.1, 0.13, 0.5
-"""Probabilities of failure from which standard deviations account for a wrong fit, a fit is doubtful, and a fit has
-failed [1]; see docs/explanation/decisions.md."""
+"""Minimum probabilities of failure at which standard deviations account for a wrong fit, a fit is doubtful, and a fit
+has failed [1]; see docs/explanation/decisions.md."""
 
 
 def assess(found: Evidence) -> Assessment:
@@ -310,7 +310,7 @@ def _assessed(found: Evidence, doubtful_from: float, contradicts: str, supports:
     """Verdict on a fit or a calibration.
 
     Args:
-        doubtful_from: probability of failure from which the verdict is doubtful [1].
+        doubtful_from: minimum probability of failure for a doubtful verdict [1].
         contradicts, supports: subject and verb of the reason's sentence.
     """
     probability = 1.0 / (1.0 + math.exp(-log_odds_of_failure(found.loss, found, found.masked)))
@@ -352,7 +352,7 @@ _MOST, _MORE = 0.5, 2.0
 _NOTHING_THERE: tuple[tuple[Callable[[Evidence], bool], str, str], ...] = (
     (
         lambda found: found.start_area < OUT_OF_VIEW,
-        "No arm is in view: at the measured joints, the arms are outside of the image or behind the camera.",
+        "No arm is in view: at the measured joints, the arms are outside the image or behind the camera.",
         "Check T_camera_world, T_world_base and the units of the joints, or leave the frame out.",
     ),
     (
@@ -392,8 +392,8 @@ _REMEDY = (
     "neighbours (sequence mode; Solve in the viewer) if not done yet."
 )
 _REMEDY_FAILED = (
-    "Run the optimizer. If it has run, move the arm roughly by hand and run again, check the calibration, or give an "
-    "image of the empty scene in the recording's file (background)."
+    "Run the optimizer. If it has run, move the arm roughly by hand and run again, check the calibration, or add an "
+    "image of the empty scene to the sequence file (`background`)."
 )
 
 _CALIBRATION_REMEDY = (
@@ -407,7 +407,7 @@ def _weakest(found: Evidence) -> str:
         return "the rendering and the given mask differ."
     against = {
         "the network's prediction lies elsewhere.": found.agreement,
-        "the network's prediction without the fit as prior differs from it.": found.unconditioned,
+        "the network's prediction without the fit as prior differs from the fit.": found.unconditioned,
     }
     if found.overlap_with_change is not None:
         against["the difference from the empty background lies elsewhere."] = found.overlap_with_change

@@ -76,7 +76,7 @@ def is_glob(pattern: str) -> bool:
 
 
 _FRAME_ALONE = "{frame}"
-"""Pattern of ids that are the cells of their column."""
+"""Pattern with which ids equal the cells of their column."""
 _SHORT = 50
 """Number of digits up to which an id is never too long for a file name."""
 MAX_FRAMES = 1_000_000
@@ -99,7 +99,9 @@ class FrameList:
 
     def __post_init__(self) -> None:
         if len(self.frame_ids) > MAX_FRAMES:
-            raise SequenceError(f"{self.counted}; a sequence may have {MAX_FRAMES:,} frames. Divide the recording.")
+            raise SequenceError(
+                f"{self.counted}; a sequence may have at most {MAX_FRAMES:,} frames. Divide the recording."
+            )
 
 
 @dataclass(frozen=True)
@@ -184,7 +186,9 @@ def _frames_of_video(section: TomlTable) -> FrameList:
     path = section.path(section.take("video", str))
     for key in ("table", "frame", "timestamp", "video_frame", "delimiter"):
         if key in section:
-            raise section.error(key, "cannot be combined with `video`, of which all frames are used. Remove one.")
+            raise section.error(
+                key, "cannot be combined with `video`, since all frames of the video are used. Remove one."
+            )
     pattern = _take_pattern(section)
     index = index_video(path)
     if index.timestamps is None:
@@ -209,7 +213,7 @@ def numbers_of_frames(table: Table, column: str, key: str) -> tuple[int, ...]:
     """Read the video frame numbers of the rows from a column of a table."""
     numbers = table.numbers(column, key)
     if (wrong := np.flatnonzero((numbers < 0) | (numbers != np.round(numbers)))).size:
-        text = f", column {column!r}: {numbers[wrong[0]]:g} is not a frame number. Frames of a video count from 0."
+        text = f", column {column!r}: {numbers[wrong[0]]:g} is not a frame number. Frame numbers of a video start at 0."
         raise table.error(text, wrong[0])
     return tuple(int(number) for number in numbers)
 

@@ -58,7 +58,7 @@ class Cropped:
         left, top, width, height = self.crop
         if left + width > image.shape[1] or top + height > image.shape[0]:
             raise SequenceError(
-                f"{self.name(index)} has {image.shape[1]} x {image.shape[0]} pixels, but `crop` extends to "
+                f"{self.name(index)} is {image.shape[1]} x {image.shape[0]} pixels, but `crop` extends to "
                 f"{left + width} x {top + height}. Correct crop = [left, top, width, height] in the sequence file."
             )
         return np.ascontiguousarray(image[top : top + height, left : left + width])
@@ -179,7 +179,9 @@ def decode_message(message: Any, what: str) -> UInt8[np.ndarray, "height width 3
     encoding = message.encoding.lower()
     if encoding not in _ENCODINGS:
         known = ", ".join(_ENCODINGS)
-        raise SequenceError(f"{what} has the encoding {message.encoding!r}. Supported are: {known}. Convert the bag.")
+        raise SequenceError(
+            f"{what} has the encoding {message.encoding!r}. Supported encodings: {known}. Convert the bag."
+        )
     channels, conversion = _ENCODINGS[encoding]
     height, width, step = int(message.height), int(message.width), int(message.step)
     data = np.asarray(message.data, np.uint8)

@@ -103,8 +103,8 @@ _HEADER = 2**18
 DEPTHS = (8, 10, 12, 14, 16)
 """Bit depths of cameras."""
 _SAMPLED, _SAMPLED_MASKS = 12, 2
-"""Number of images of a camera of which the bit depth is measured, and of masks checked for grey borders, on
-opening."""
+"""Number of images per camera in which the bit depth is measured, and number of masks checked for grey borders, when a
+sequence is opened."""
 _NEAR = 16
 """Distance from black or white within which values of compressed masks count as black or white."""
 _MAX_LABELS = 32
@@ -223,7 +223,7 @@ class LabelImage:
     colours: UInt8[np.ndarray, "height width 3"]
     """Colour of each pixel, RGB."""
     remarks: tuple[str, ...]
-    """Changes and decisions, as clauses that follow the file's name."""
+    """Remarks on changes and on the interpretation, as clauses that follow the file's name."""
 
 
 def read_labels(path: Path) -> LabelImage:
@@ -235,7 +235,7 @@ def read_labels(path: Path) -> LabelImage:
         grey, mask = raster.indices, None
         remarks.append("labels are palette indices")
     elif raster.opaque is not None:
-        remarks.append("the mask is the opaque part (alpha)")
+        remarks.append("the mask is taken from the alpha channel")
     elif grey is not None and mask is not None:
         if mask.any() and grey.max() < raster.white - _NEAR:
             mask = None
@@ -418,7 +418,7 @@ def _eight_bits(
     used = needed if bits is None else bits()
     if needed > used:
         raise SequenceError(
-            f"{what} has values of {needed} bits, but the bit depth of its camera is {used}. Set `bits = {needed}` in "
+            f"{what} has {needed}-bit values, but the bit depth of its camera is {used}. Set `bits = {needed}` in "
             "the camera's table of the sequence file."
         )
     return (raster.pixels >> (used - 8)).astype(np.uint8)

@@ -292,7 +292,7 @@ def take_joints(table: TomlTable, robot: Robot) -> JointColumns:
         largest = PLAUSIBLE[_joint(defaults, name, robot).kind]
         values[name] = float(defaults.take(name, float))
         if abs(values[name]) > largest:
-            raise defaults.error(name, f"is {values[name]:g}; allowed is up to {largest:.3g} [rad or m].")
+            raise defaults.error(name, f"is {values[name]:g}; allowed: up to {largest:.3g} [rad or m].")
         if name in mapping:
             raise defaults.error(name, "is given, but the joint also has a column in [arms.joints]. Remove one.")
     for name in robot.joint_names:

@@ -239,7 +239,7 @@ def take_camera_motion(table: TomlTable, rows: Rows) -> Samples | None:
         positions = _numbers(section, "ecm_joints", poses, joints, len(JOINT_NAMES))
         for joint, largest in zip(JOINT_NAMES, np.abs(positions).max(0), strict=True):
             if largest > (allowed := PLAUSIBLE["prismatic" if joint == "insertion" else "revolute"]):
-                text = f"has {joint} at {largest:.4g}; {allowed:.3g} is allowed. Give [rad] and [m]."
+                text = f"has {joint} at {largest:.4g}; at most {allowed:.3g} is allowed. Give [rad] and [m]."
                 raise section.error("ecm_joints", text)
         Ts = forward(positions)
     else:
@@ -257,13 +257,14 @@ def _poses(section: TomlTable, table: Table) -> Float[np.ndarray, "rows 4 4"]:
         lengths = np.linalg.norm(rotations, axis=1)
     if (wrong := np.flatnonzero(~(np.abs(lengths - 1.0) <= _NORM_TOLERANCE))).size:
         raise table.error(
-            f": the norm of the quaternion is {lengths[wrong[0]]:.4g}, but must be 1. Name its columns as "
+            f": the norm of the quaternion is {lengths[wrong[0]]:.4g}, but must be 1. List its columns as "
             "`orientation`, in the order x, y, z, w.",
             wrong[0],
         )
     if (far := np.flatnonzero(~(np.abs(positions).max(1) <= _FARTHEST))).size:
         raise table.error(
-            f": the camera is {np.abs(positions[far[0]]).max():.4g} m away, {_FARTHEST:g} m is allowed. If the columns "
+            f": the camera is {np.abs(positions[far[0]]).max():.4g} m away; at most {_FARTHEST:g} m is allowed. If the "
+            "columns "
             'are in mm, set length_unit = "mm".',
             far[0],
         )

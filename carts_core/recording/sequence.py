@@ -21,7 +21,7 @@ from .matching import TimeMatching
 from .sequence_file import CameraInput, Description, read_description
 
 CACHE_BYTES = 192 * 2**20
-"""Memory for decoded images and masks of one sequence."""
+"""Maximum memory for decoded images and masks of one sequence [bytes]."""
 
 
 @dataclass(frozen=True)
@@ -376,5 +376,5 @@ class FrameReader:
                 index, domain, cameras = self._plan.popleft()
             try:
                 self._sequence.frame(index, domain, list(cameras))
-            except Exception:  # Reading the frame again raises it again.
+            except Exception:  # Reading the frame again raises the error again.
                 continue

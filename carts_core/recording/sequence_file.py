@@ -170,7 +170,7 @@ def _path(table: TomlTable, key: str, pattern: str, domain: str, camera: str) ->
 
 
 def _by_domain(table: TomlTable, key: str, domains: tuple[str, ...], required: bool = False) -> dict[str, str]:
-    """Domain -> pattern: a text applies to all domains, a table has one for each."""
+    """Domain -> pattern. A string applies to all domains; a table has one pattern per domain."""
     value = table.take(key, (str, dict)) if required else table.take(key, (str, dict), {})
     if isinstance(value, str):
         if required and len(domains) > 1 and "{domain" not in value:

@@ -195,7 +195,7 @@ class _Delays:
         if not tried:
             return _unknown(present, "the table has no rows at the times of the frames.")
         if not next(iter(tried.values()))[0].size:
-            return _unknown(present, "nothing moves in the table.")
+            return _unknown(present, "no joint moves in the table.")
         curve = {offset: _predicted(parts) for offset, parts in tried.items()}
         best = max(curve, key=lambda offset: curve[offset])
         seconds = self._refined(best, np.ones(_BLOCKS, bool))

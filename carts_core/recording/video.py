@@ -64,7 +64,7 @@ class VideoIndex:
 
     @property
     def timestamps(self) -> Float[np.ndarray, " frames"] | None:
-        """Presentation times [s], of which the first is not always 0; None if unknown."""
+        """Presentation times [s], which need not start at 0; None if unknown."""
         return None if self.pts is None else np.array(self.pts, np.float64) * float(self.time_base)
 
 
@@ -125,7 +125,7 @@ def decoded_frames(container: InputContainer, stream: VideoStream) -> Iterator[V
 
 @lru_cache(maxsize=_REMEMBERED)
 def _index(path: Path, modified: int, size: int) -> VideoIndex:
-    del modified, size  # They are part of the key.
+    del modified, size  # Both are part of the cache key.
     index = _by_table(path) or _by_packets(path, parsed=False) or _by_packets(path, parsed=True)
     return _by_decoding(path) if index is None else index
 
@@ -227,7 +227,7 @@ _ONE = 2**16
 """Fixed-point 1 in a display matrix."""
 _NOT_SQUARE = "the display matrix is not a rotation by a multiple of 90 deg; frames are used as stored."
 _KEPT_BYTES = 32 * 2**20
-"""Memory for decoded frames, which makes stepping backwards cheap."""
+"""Maximum memory for decoded frames, which speeds up stepping backwards [bytes]."""
 
 
 class Video:
@@ -259,7 +259,7 @@ class Video:
         self._open: tuple[InputContainer, VideoStream] | None = None
         self._frames: Iterator[tuple[int, VideoFrame]] = iter(())
         self._last: int | None = None
-        """Number of the last decoded frame; None before the first after a seek."""
+        """Number of the last decoded frame; None after a seek."""
         if (count := self._index.count) <= max(numbers):
             raise SequenceError(
                 f"video {path} has {counted(count, 'frame')}, but the sequence has frame number {max(numbers)} "
@@ -376,7 +376,7 @@ class Video:
 
 @lru_cache(maxsize=_REMEMBERED)
 def _file_digest(path: Path, modified: int, size: int) -> str:
-    del modified, size  # They are part of the key.
+    del modified, size  # Both are part of the cache key.
     with open_regular(path, VIDEO) as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 

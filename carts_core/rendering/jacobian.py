@@ -262,7 +262,7 @@ def place_outline(inverse_depth, pixel, kernels, nearness, position, normal):
         inverse_depth [cameras, height, width]: 1 / depth [1/m].
         pixel [K]: indices into the flattened images, farther from their border than the kernels reach.
         kernels [3, side, side]: a Gaussian and its derivatives in x and y.
-        nearness: share of the pixel's inverse depth from which another pixel counts as equally near [1].
+        nearness: minimum share of the pixel's inverse depth for another pixel to count as equally near [1].
         position, normal [2, K]: output: position of the outline [px], and unit vectors away from the nearer surface.
     """
     height, width = inverse_depth.shape[1:]

@@ -23,7 +23,7 @@ NEAR = 1e-3
 
 
 _WIDE = 8
-"""Width of a bounding box [px] from which on the entry and exit of each row are computed."""
+"""Minimum width of a bounding box for which the entry and exit of each row are computed [px]."""
 
 
 @compiled
@@ -41,7 +41,7 @@ def _first_and_last(value, slope, first, last):
 
 @compiled
 def _fill_triangle(face, u, v, inverse_z, a, b, c, two_sided, face_ids, inverse_depth):
-    """Z-buffer a projected triangle (corners a, b, c of the points u, v with 1/z); its back only if `two_sided`."""
+    """Z-buffer a projected triangle with corners a, b, c (indices into u, v and 1/z); its back only if `two_sided`."""
     area = (u[b] - u[a]) * (v[c] - v[a]) - (u[c] - u[a]) * (v[b] - v[a])
     # The image's y axis points down, so counterclockwise corners span a negative area.
     if area == 0.0 or (area > 0.0 and not two_sided):

@@ -22,7 +22,7 @@ SECONDS: Mapping[Clock, float] = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 
 @dataclass(frozen=True)
 class ImportOptions:
-    """Options of an import, for information that is missing in the recording."""
+    """Options of an import, for information that is missing from the recording."""
 
     source: str | None = None
     """Source format (listed by `carts import` without arguments); detected by default."""

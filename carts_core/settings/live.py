@@ -68,7 +68,7 @@ class LiveSettings(Ranged):
     """Stages of a tracker, and thresholds for lost arms."""
 
     small: tuple[Stage, ...] = WARM
-    """Stages for a frame near its prediction."""
+    """Stages for a frame whose state is near its prediction."""
     full: tuple[Stage, ...] = WARM_WIDE
     """Stages after a bad fit with `small`."""
     search: tuple[Stage, ...] = LIVE_SEARCH

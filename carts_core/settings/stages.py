@@ -246,15 +246,15 @@ _WIDE = Observe(margin=27, attention=27)
 """Observation with a larger margin around the arms."""
 
 WARM_WIDE: tuple[Stage, ...] = (_WIDE, Descend(blur=0.8, steps=2), AlignEdges())
-"""Like `WARM`, for a frame with a larger distance from its prediction."""
+"""Like `WARM`, for a frame whose state is farther from its prediction."""
 
 WARM: tuple[Stage, ...] = (
     Observe(scale=0.6, margin=10, attention=10),
     Descend(blur=1.2, steps=1),
     AlignEdges(steps=6),
 )
-"""Stages for a frame of a sequence or stream near its prediction: one small observation, one step, and edge
-alignment."""
+"""Stages for a frame of a sequence or stream whose state is near its prediction: one small observation, one step, and
+edge alignment."""
 
 LIVE_SEARCH: tuple[Stage, ...] = reduced(SEARCH[: SEARCH.index(_RESTART) + 1], 1.0)
 """Stages for a frame of a live stream with lost arms; `WARM` follows."""

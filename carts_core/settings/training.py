@@ -71,8 +71,8 @@ class Architecture:
                 raise SettingsError(f"{name} are {values}; give {count} counts of 1 to {_MAX_CONVOLUTIONS}.")
         if not 0 <= self.local_contrast <= float(self.local_mean):
             raise SettingsError(
-                f"local_contrast is {self.local_contrast}; give 0 to 1, or 0 without local_mean; given: local_mean "
-                f"{self.local_mean}."
+                f"local_contrast is {self.local_contrast} and local_mean is {self.local_mean}; give a local_contrast "
+                "of 0 to 1, or 0 without local_mean."
             )
 
     @property
@@ -214,7 +214,7 @@ class ImageSettings(Ranged):
     crossing: Share = 0.5
     """Share of pairs of arms that cross in the image."""
     chains: Share = 0.0
-    """Share of scenes with a random serial robot instead of `robots`, .3 to 2 m from the camera."""
+    """Share of scenes with a random serial robot instead of `robots`, 0.3 to 2 m from the camera."""
     enlarged: Share = 0.0
     """Share of images at up to twice the working size, as in the final observation of a frame."""
     things: Share = 0.35

@@ -174,9 +174,7 @@ def test_names_of_any_script_are_allowed(name: str) -> None:
     ],
 )
 def test_other_names_are_refused_with_what_is_allowed(name: str, why: str) -> None:
-    with pytest.raises(
-        OutputError, match=rf"(?s)the name of a camera is .*{why}.*1 to 200 bytes, without /.*Rename it"
-    ):
+    with pytest.raises(OutputError, match=rf"(?s)the name of a camera is .*{why}.*1 to 200 bytes, and no /.*Rename it"):
         check_name(name, "a camera")
 
 

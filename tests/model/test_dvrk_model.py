@@ -54,7 +54,7 @@ def test_without_an_instrument_the_command_lists_those_of_the_tree(model, capsys
 @pytest.mark.parametrize(
     ("number", "message"),
     [
-        ("400001", r"only boxes of 5 mm.*Instruments with meshes: 400093 \(Prograsp Forceps\), 420093"),
+        ("400001", r"only 5 mm boxes.*Instruments with meshes: 400093 \(Prograsp Forceps\), 420093"),
         ("123456", r"is not in .*It contains: 400001, 400093, 420093"),
     ],
 )

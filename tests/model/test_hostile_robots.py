@@ -72,7 +72,7 @@ def test_the_right_robot_loads(urdf: Path):
             '<robot name="two" xmlns:xacro="http://www.ros.org/wiki/xacro"><xacro:include filename="x"/>',
             "is a xacro file. Expand it first: xacro two.urdf > robot.urdf",
         ),
-        ("<link", "<a>" * 50_000 + "</a>" * 50_000 + "<link", "nested more than 32 deep"),
+        ("<link", "<a>" * 50_000 + "</a>" * 50_000 + "<link", "nested more than 32 levels deep"),
     ],
 )
 def test_a_wrong_urdf_is_refused_in_words(urdf: Path, before: str, after: str, part: str):

@@ -187,12 +187,12 @@ TRIANGLE = [10, 10, 40, 10, 40, 40]
     [
         ({"segmentation": {"size": [HEIGHT, WIDTH], "counts": [5, 7]}}, "the run lengths do not sum to 96 x 72 pixels"),
         ({"segmentation": {"size": [9, 9], "counts": "1"}}, "a mask is 9 x 9 in an image of 96 x 72"),
-        ({"segmentation": [[10, 10, 40, 10, 40]]}, "a polygon has 5 numbers, which are not x and y"),
+        ({"segmentation": [[10, 10, 40, 10, 40]]}, "a polygon has 5 numbers, but needs x and y"),
         ({"segmentation": [[1, 2, 3, 4]]}, "a polygon has 4 numbers"),
         ({"segmentation": [[1e300] * 6]}, "is not finite or far outside"),
         ({"segmentation": [TRIANGLE], "category_id": 9}, "category 9 is not in the file"),
         ({"segmentation": [TRIANGLE], "image_id": 8}, "image 8 is not in the file"),
-        ({"keypoints": [1, 2, 2] * 3}, "3 keypoints have 2 names"),
+        ({"keypoints": [1, 2, 2] * 3}, "there are 3 keypoints, but 2 names"),
         ({"keypoints": [1, 2]}, "its keypoints have 2 numbers"),
     ],
 )

@@ -128,8 +128,8 @@ BLURRED = cv2.GaussianBlur(WHITE, (0, 0), 1.2)
     [
         ("white.png", png(WHITE), ""),
         ("borders.png", png(BLURRED), "grey borders"),
-        ("cut_out.png", png(np.dstack([np.full((HEIGHT, WIDTH, 3), 255, np.uint8), WHITE])), "opaque part"),
-        ("photograph.png", png(CUT_OUT), "opaque part"),
+        ("cut_out.png", png(np.dstack([np.full((HEIGHT, WIDTH, 3), 255, np.uint8), WHITE])), "alpha channel"),
+        ("photograph.png", png(CUT_OUT), "alpha channel"),
         ("deep.png", png(WHITE.astype(np.uint16) * 257), ""),
         ("compressed.jpg", pillow(WHITE, "JPEG", quality=80), "grey borders"),
         ("one_bit.png", pillow(WHITE, "PNG", "1"), ""),
@@ -217,7 +217,7 @@ def test_a_frame_with_more_bits_than_the_others_asks_for_them(tiny_sequence: Cal
     for number in range(1, 31):
         file = path.parent / f"regular/left/{number:03d}.png"
         cv2.imwrite(str(file), read_image(file).astype(np.uint16) * (200 if number == 2 else 16))
-    with pytest.raises(SequenceError, match=r"002.png has values of 16 bits.*Set `bits = 16`"):
+    with pytest.raises(SequenceError, match=r"002.png has 16-bit values.*Set `bits = 16`"):
         Sequence.open(path).frame(1)
     path.write_text(path.read_text().replace("[[cameras]]", "[[cameras]]\nbits = 16"))
     assert Sequence.open(path).frame(1).images["left"].mean() > 50

@@ -81,7 +81,7 @@ def test_an_arm_that_stands_still_gives_no_delay(recording: Path) -> None:
     header, first, *rest = log.read_text().splitlines()
     still = [f"{row.split(',')[0]},{first.split(',', 1)[1]}" for row in [first, *rest]]
     log.write_text("\n".join([header, *still]) + "\n")
-    assert estimate_time_offset(Sequence.open(recording)).problem == "nothing moves in the table."
+    assert estimate_time_offset(Sequence.open(recording)).problem == "no joint moves in the table."
 
 
 def test_few_frames_give_no_delay(recording: Path) -> None:

@@ -79,7 +79,7 @@ class Baseline(nn.Module):
 
     Raises:
         CartsError: the optional dependencies are not installed.
-        SettingsError: timm does not provide the encoder, or the encoder does not suit the baseline.
+        SettingsError: timm does not provide the encoder, or the encoder does not work in the baseline.
     """
 
     mean: Tensor
@@ -161,8 +161,8 @@ def _made(settings: BaselineNetwork, make: Any) -> Any:
         return make()
     except (ValueError, RuntimeError, TypeError, KeyError, AssertionError) as error:
         raise SettingsError(
-            f"the encoder {settings.timm_encoder!r} does not suit the {settings.name} baseline with {settings.size} px "
-            f"({error}). Choose an encoder of the {settings.name} family."
+            f"the encoder {settings.timm_encoder!r} does not work in the {settings.name} baseline with {settings.size} "
+            f"px ({error}). Choose an encoder of the {settings.name} family."
         ) from error
 
 

@@ -260,7 +260,7 @@ def train_baseline(
         OutputError: `output` cannot be written to, or another process trains there.
     """
     if network.size != SIZE:
-        raise SettingsError(f"size is {network.size}, but training frames have {SIZE} px. Use the default size.")
+        raise SettingsError(f"size is {network.size}, but training frames are {SIZE} px. Use the default size.")
     torch.set_num_threads(training.threads)
     with locked_folder(output):
         run = _Run(network, training, frames, output)

@@ -17,7 +17,7 @@ from ..synthesis.domains import expose, linear, smooth_noise, smoothstep
 from .sources import Recording
 
 OCCLUSION = "occlusion"
-"""Name of the domain."""
+"""Name of the domain with occluded instruments."""
 SHARE = 0.3
 """Covered share of the visible pixels of the instruments [1]."""
 _SENSOR = dataclasses.replace(SensorConfig(), vignette=0.0)
@@ -122,7 +122,7 @@ _KINDS = (_gauze, _tissue, _cloth)
 
 
 CROSSING = "crossing arms"
-"""Name of the domain."""
+"""Name of the domain with crossing arms."""
 _HIDDEN = 0.15, 0.9
 """Range of the share of an arm that is occluded by the other arm [1]."""
 _SHOWN = 0.02, 0.25
@@ -211,7 +211,7 @@ def with_other_instruments(scene: Scene, index: int) -> Scene:
 
 
 def contradicting_frame(recording: Recording, kind: str, index: int, camera: str) -> Frame:
-    """Frame of the regular domain whose image contradicts its kinematics, in a way of `WRONG`.
+    """Frame of the regular domain whose image contradicts its kinematics in one of the ways in `WRONG`.
 
     Masks match the image of the returned frame.
     """

@@ -186,10 +186,12 @@ def hand_eye_table(runs: list[HandEyeRun]) -> Table | None:
             rows.append(
                 {
                     "target and start": condition.name,
-                    "near enough": f"{len(right)} of {len(found)}",
+                    "within tolerance": f"{len(right)} of {len(found)}",
                     "largest angle [deg]": f"{max(run.angle_deg for run in right):.2f}" if right else NO_VALUE,
                     "largest distance [mm]": f"{1e3 * max(run.distance for run in right):.1f}" if right else NO_VALUE,
-                    "verdicts on others": ", ".join(f"{count} {verdict}" for verdict, count in others.items()),
+                    "verdicts on the other starts": ", ".join(
+                        f"{count} {verdict}" for verdict, count in others.items()
+                    ),
                 }
             )
     return table_of("hand_eye", rows, views=_VIEWS)

@@ -325,7 +325,7 @@ _RUNS = 10
 
 
 def stored(path: OutputPath, name: str, of: list[str]) -> Any:
-    """Value `name` of a JSON file; None if the file is missing or was written for other inputs `of`."""
+    """Value `name` of a JSON file; None if the file is missing or was written for inputs other than `of`."""
     try:
         content = parse_json(read_bytes(path.path, VALUES))
         return content[name] if content["of"] == of else None

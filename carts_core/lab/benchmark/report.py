@@ -237,8 +237,7 @@ def write_report(
     machines = sorted({measurement.machine for measurement in measurements})
     warnings = {
         "The benchmark is incomplete; rerun the command to resume.": len(rows) < facts.planned,
-        "Runs come from different machines or numbers of threads, so their times are not comparable.": len(machines)
-        > 1,
+        "Runs used different machines or numbers of threads, so their times are not comparable.": len(machines) > 1,
     }
     document = {
         "format": "carts-benchmark/1",

@@ -281,7 +281,8 @@ _PARALLAX = 24
 """Shift of the room between consecutive cameras [px]."""
 
 _RIM = 2
-"""Width of the rim whose colours are replaced by colours further inside, to remove the old background [px]."""
+"""Width of the mask's boundary strip, whose colours are replaced by colours farther inside, to remove the old
+background [px]."""
 
 _SEAM = 0.8
 """Standard deviation of the blur of the mask's edge [px]."""
@@ -370,7 +371,7 @@ def pasted(
     if not mask.any():
         return room.astype(np.float32)
     inside = np.asarray(binary_erosion(mask, iterations=_RIM), bool)
-    # The colour of pixels near the rim is that of the nearest pixel farther inside.
+    # Pixels near the boundary take the colour of the nearest pixel farther inside.
     nearest = distance_transform_edt(~(inside if inside.any() else mask), return_distances=False, return_indices=True)
     arm = image[tuple(np.asarray(nearest))].astype(np.float32)
     gain = np.clip(np.sqrt(max(float(np.median(room)), 1.0) / max(float(np.median(image)), 1.0)), *_MATCH)

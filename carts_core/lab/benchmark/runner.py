@@ -25,8 +25,8 @@ _UNDER_OCCLUDERS = ("ours", "ours_given", "ours_proposed")
 def plan(scope: Scope, sources: Items[Source], baselines: Items[str] = ()) -> list[Run]:
     """Plan all runs, ordered by frame, so that a stopped benchmark has measurements of every kind.
 
-    Frames with a subset of the methods follow, then frames corrected together, other rooms, and instruments absent from
-    the training data. `baselines` are the names in `scope.BASELINES` with given weights.
+    These runs are followed by frames with a subset of the methods, frames corrected together, other rooms, and
+    instruments absent from the training data. `baselines` are the names in `scope.BASELINES` with given weights.
     """
     rooms, families = ([s for s in sources if s.name.startswith(kind)] for kind in (ROOMS, FAMILY))
     sources = [source for source in sources if source not in (*rooms, *families)]

@@ -20,7 +20,7 @@ PAPERS_STEPS = 50
 
 @dataclass(frozen=True)
 class Run:
-    """Application of a method to a frame from a start."""
+    """Application of a method to a frame, from an initial estimate."""
 
     source: str
     """`synthetic`, `real`, `rooms` and a camera, or `family` and an instrument."""
@@ -168,7 +168,7 @@ METHODS = {
     "ours_given": Method("ours, occluder given", _ours, occluders_given=True),
     "ours_proposed": Method("ours, ignore mask proposed", lambda _: solver(SolverName.OCCLUDED)),
     "stereo": Method("ours, all cameras", _ours, every_camera=True),
-    "stereo_posed": Method("ours, all cameras, posed", _ours, every_camera=True, poses=True),
+    "stereo_posed": Method("ours, all cameras, free poses", _ours, every_camera=True, poses=True),
     "calibrated": Method("one calibration, joints as measured", _start, calibrated=True),
     "calibrated_ours": Method("one calibration, then ours", _ours, calibrated=True),
     "sequence": Method("ours, sequence mode", _ours, as_sequence=True),

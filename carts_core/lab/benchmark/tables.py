@@ -163,12 +163,12 @@ def pair_table(data: Measurements) -> Table | None:
         rows.append(
             {
                 "frames": source,
-                "error at the start": start_label(error),
+                "initial error": start_label(error),
                 "pairs": str(len(chosen)),
                 "s, paper's setting": f"{median(pair.papers for pair in chosen):.2f}" if chosen else NO_VALUE,
                 "s, ours": f"{median(reached):.2f}" if reached else NO_VALUE,
                 "times faster": f"{median(pair.ratio for pair in chosen):.1f}" if chosen else NO_VALUE,
-                "never there": str(len(chosen) - len(reached)),
+                "never reached": str(len(chosen) - len(reached)),
                 f"steps to within {NEAR_FINAL}": f"{median(steps):g}",
             }
         )
@@ -183,7 +183,7 @@ def worse_table(data: Measurements) -> Table | None:
             "domain": DOMAIN_LABELS[m.run.domain],
             "frame": str(m.run.frame),
             "method": METHODS[m.run.method].label,
-            "error at the start": start_label(m.run.error_deg),
+            "initial error": start_label(m.run.error_deg),
             "initial Dice": DICE.text([m.start]),
             "Dice": DICE.text([m.final]),
         }
@@ -199,7 +199,8 @@ def stage_table(stages: dict[str, float]) -> Table | None:
 
 
 def occlusion_table(data: Measurements) -> Table | None:
-    """Scores of the default solver with unknown occluders, with given occluder pixels, and with a proposal."""
+    """Scores of the default solver with unknown occluders, with given occluder pixels, and with a proposed ignore
+    mask."""
     methods = "ours", "ours_given", "ours_proposed"
     return _table(data, "occlusion", OCCLUSION, methods, (DICE, JOINT_MAE))
 
@@ -235,7 +236,7 @@ def _table(
                 row: Row = {
                     "frames": source,
                     "number": str(len(frames)),
-                    "error at the start": start_label(error),
+                    "initial error": start_label(error),
                     "method": label,
                 }
                 rows.append(row | {figure.heading: figure.text(found) for figure in figures})
@@ -263,14 +264,14 @@ def sequence_table(data: Measurements) -> Table | None:
             {
                 "frames": source,
                 "domain": DOMAIN_LABELS[domain],
-                "error at the start": start_label(error),
+                "initial error": start_label(error),
                 "method": METHODS[method].label,
                 "number": str(len(together)),
                 "Dice": Cell(DICE.text(after), f"before: {DICE.text(before)}"),
                 "joint MAE [deg]": Cell(JOINT_MAE.text(after), f"before: {JOINT_MAE.text(before)}"),
                 "visible joints [deg]": VISIBLE_MAE.text(after),
                 "s per warm frame": Cell(f"{median(warm):.2f}" if warm else NO_VALUE, counted(len(warm), "frame")),
-                "also alone": str(len(both)),
+                "in both": str(len(both)),
                 "Dice alone": DICE.text(alone[m.run.frame].final for m in both),
                 "Dice together": DICE.text(m.final for m in both),
             }
@@ -293,7 +294,7 @@ def room_table(data: Measurements) -> Table | None:
                     "camera": source.removeprefix(ROOMS).strip(),
                     "rooms": half,
                     "number": str(len({m.run.domain for m in alone})),
-                    "Dice before": DICE.text(m.start for m in alone),
+                    "initial Dice": DICE.text(m.start for m in alone),
                     "ours": worse(alone),
                     "ACS, our schedule": DICE.text(scores(acs)),
                     "ours, sequence mode": worse(together),
@@ -320,9 +321,9 @@ def image_alone_table(data: Measurements) -> Table | None:
                     "frames": source,
                     "domain": DOMAIN_LABELS[domain],
                     "best image-only network": label,
-                    "its Dice": f"{known[best]:.1f}",
+                    "Dice of this network": f"{known[best]:.1f}",
                     "ours": f"{ours[domain]:.1f}",
-                    "who wins": f"{winner}, by {abs(ahead):.1f}",
+                    "winner": f"{winner}, by {abs(ahead):.1f}",
                 }
             )
     return table_of("image_alone", rows)
@@ -335,7 +336,7 @@ def family_table(data: Measurements) -> Table | None:
             "instrument": source.removeprefix(FAMILY).strip(),
             "domain": domain,
             "runs": str(len(runs)),
-            "Dice before": f"{100 * mean(m.start.dice for m in runs if m.start):.1f}",
+            "initial Dice": f"{100 * mean(m.start.dice for m in runs if m.start):.1f}",
             "ours": f"{100 * mean(m.final.dice for m in runs):.1f}",
         }
         for source in data.sources(FAMILY)
@@ -359,7 +360,7 @@ def verdict_table(data: Measurements) -> Table | None:
                 "good": str(len(good)),
                 "good, but wrong": str(len(wrong_masks(good))),
                 "good, but worse than initially": str(sum(run.made_worse for run in good)),
-                "area under the ROC": NO_VALUE if known is None else f"{known:.3f}",
+                "area under the ROC curve": NO_VALUE if known is None else f"{known:.3f}",
             }
         )
     return table_of("verdicts", rows if groups else [], right=MIN_CORRECT_DICE)
@@ -371,8 +372,8 @@ def deviation_table(data: Measurements) -> Table | None:
         {
             "condition": name,
             "joint positions": str(known[0]),
-            "within one": f"{100 * known[1]:.0f} %",
-            "within two": f"{100 * known[2]:.0f} %",
+            "within 1 SD": f"{100 * known[1]:.0f} %",
+            "within 2 SD": f"{100 * known[2]:.0f} %",
         }
         for name, runs in with_verdict(data).items()
         if (known := within(runs)) is not None

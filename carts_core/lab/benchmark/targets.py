@@ -113,8 +113,8 @@ def _speed(data: Measurements) -> Iterator[Target]:
         "speedup",
         _median(pair.ratio for pair in found),
         f"median over {counted(len(found), 'pair')} of runs in which the paper's setting gained at least {MIN_GAIN} "
-        f"Dice: time to its best Dice in {PAPERS_STEPS} iterations; {sum(pair.ours is None for pair in found)} never "
-        "reach it and count as 0",
+        f"Dice: time to its best Dice in {PAPERS_STEPS} iterations; in {sum(pair.ours is None for pair in found)}, our "
+        "solver never reaches this Dice, which counts as 0",
     )
     counts = [steps_to_final(m) for m in data.of(method="ours", error_deg=2.0)]
     yield target_of("iterations", _median(counts), f"median over {counted(len(counts), 'run')}", near=NEAR_FINAL)
@@ -126,9 +126,9 @@ def _speed(data: Measurements) -> Iterator[Target]:
         [m.final.seconds for m in runs if m.stopped == "warm" and on_gpu(m.machine) == gpu] for gpu in (False, True)
     )
     whole = f"; the mean of all frames, including searches for a start, is {mean(every):.2f} s" if every else ""
-    basis = f"median over {counted(len(warm), 'frame')}, reading the image included{whole}"
+    basis = f"median over {counted(len(warm), 'frame')}, including reading the image{whole}"
     yield target_of("warm_seconds", _median(warm), basis)
-    basis = f"from the median over {len(on_card)} warm frames, reading the image included"
+    basis = f"from the median over {len(on_card)} warm frames, including reading the image"
     yield target_of("frames_per_second", 1.0 / median(on_card) if on_card else None, basis)
 
 
@@ -257,7 +257,7 @@ def _ahead(data: Measurements, source: str) -> Target:
     }
     others = [method for method in worst if method != "ours"]
     if not others or "ours" not in worst:
-        return target_of("ahead", None, "no runs of both", source=source)
+        return target_of("ahead", None, "no runs of both methods", source=source)
     best = max(others, key=lambda method: dice[method][worst[method]])
     ours, theirs = (
         f"{dice[method][worst[method]]:.1f} ({METHODS[method].label}, {DOMAIN_LABELS[worst[method]]})"

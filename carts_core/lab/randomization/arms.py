@@ -121,9 +121,10 @@ FOCAL_LENGTH = (0.7, 2.0)
 OUTSIDE = 0.12
 """Maximum distance of a wrist outside the image, relative to the image size [1]."""
 ROBOT_DEPTH = (0.3, 2.0)
-"""Range of the distance between the aimed point and the camera for robots other than instruments [m]."""
+"""Range of the distance from the camera of the point by which a robot other than an instrument is placed [m]."""
 _TIP_AIMED = 0.25
-"""Share of instruments that are placed by a point of their jaws, so that only the tips of long jaws are in view."""
+"""Share of instruments that are placed by a point of their jaws instead of the wrist, so that only the tips of long
+jaws are in view."""
 _CROSSED = 0.05
 """Maximum distance of a crossing point from the wrist [m]."""
 _STIFF = 0.3
@@ -146,7 +147,7 @@ class Variant:
 
 
 def random_variant(rng: np.random.Generator, robots: Sequence[Robot], arms: int, width: int, height: int) -> Variant:
-    """Scene with a number of arms, which are `robots` with random colours and thickness."""
+    """Scene with `arms` arms, drawn from `robots`, with random colours and thickness."""
     chosen = [robots[int(rng.integers(len(robots)))] for _ in range(arms)]
     observed = [_vary(rng, robot) for robot in chosen]
     rendered = observed if rng.random() < PERFECT_MODEL else [_vary(rng, robot) for robot in chosen]

@@ -38,7 +38,7 @@ def bleed(rng: np.random.Generator, image: Image, coverage: Float[np.ndarray, "h
 
 
 def _patches(rng: np.random.Generator, width: int, height: int, share: float, cells: float) -> np.ndarray:
-    """Patches with smooth edges that cover approximately a share of the image, in [0, 1]."""
+    """Patches with smooth edges that cover approximately the given share of the image, in [0, 1]."""
     noise = smooth_noise(rng, width, height, cells, int(rng.integers(1, 4)))
     level = np.quantile(noise, 1 - share) if share > 0 else noise.max()
     return np.clip((noise - level) * np.float32(rng.uniform(1.5, 12)), 0, 1)

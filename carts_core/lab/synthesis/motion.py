@@ -322,7 +322,7 @@ def _draw_arm(robot: Robot, config: SynthesisConfig, rng: np.random.Generator) -
 
 
 def _placed(robot: Robot, tip: Float[np.ndarray, "3"], camera: Camera, rng: np.random.Generator, scale: float) -> Arm:
-    """Arm that enters from beside the camera, with its tip, given in the base frame [m], at the work point."""
+    """Arm whose shaft enters from beside the camera and whose `tip` (in the base frame [m]) is at the work point."""
     right, down, forward = camera.T_camera_world[:3, :3]
     side = rng.choice((-1.0, 1.0))
     direction = -side * right - 0.5 * down + 0.35 * forward + rng.normal(0.0, _TURN / 3, 3)

@@ -85,15 +85,16 @@ class Judgement:
         was, now, moved = self.before, self.after, self.tips_moved
         pixels, steady = "of the pixels", _EDGES * was.edges <= now.edges <= was.edges
         checks = {
-            f"masks of synthetic images (Dice {was.dice:.3f} -> {now.dice:.3f})": now.dice < was.dice - _DICE,
-            f"parts of synthetic images ({was.made_parts:.3f} -> {now.made_parts:.3f} {pixels})": now.made_parts
+            f"masks in synthetic images (Dice {was.dice:.3f} -> {now.dice:.3f})": now.dice < was.dice - _DICE,
+            f"part accuracy in synthetic images ({was.made_parts:.3f} -> {now.made_parts:.3f} {pixels})": now.made_parts
             < was.made_parts - _PARTS,
-            f"tips of synthetic images ({was.made_tips:.1f} -> {now.made_tips:.1f} px)": now.made_tips
+            f"tip error in synthetic images ({was.made_tips:.1f} -> {now.made_tips:.1f} px)": now.made_tips
             > was.made_tips + _TIPS,
-            f"verdicts of the recording ({was.good} -> {now.good} good)": now.good < was.good,
-            f"parts of the recording ({was.parts:.3f} -> {now.parts:.3f} {pixels})": now.parts < was.parts - _PARTS,
-            f"edges of the recording ({was.edges:.2f} -> {now.edges:.2f})": now.edges < _EDGES * was.edges,
-            f"tips of the recording (moved by {moved:.1f} px without stronger edges)": moved > _MOVED and steady,
+            f"verdicts on the recording ({was.good} -> {now.good} good)": now.good < was.good,
+            f"predicted parts in the recording ({was.parts:.3f} -> {now.parts:.3f} {pixels})": now.parts
+            < was.parts - _PARTS,
+            f"edge strength in the recording ({was.edges:.2f} -> {now.edges:.2f})": now.edges < _EDGES * was.edges,
+            f"tips in the recording (moved by {moved:.1f} px without stronger edges)": moved > _MOVED and steady,
         }
         return [text for text, worse in checks.items() if worse]
 
@@ -101,17 +102,18 @@ class Judgement:
         """Summary of the metrics before and after."""
         was, now = self.before, self.after
         return [
-            f"fits of synthetic images: Dice {was.dice:.3f} -> {now.dice:.3f}, parts {was.made_parts:.3f} -> "
-            f"{now.made_parts:.3f}, tips {was.made_tips:.1f} -> {now.made_tips:.1f} px",
-            f"fits of {len(was.tips)} frames of the recording: {was.good} -> {now.good} good, parts {was.parts:.3f} -> "
-            f"{now.parts:.3f}, edges {was.edges:.2f} -> {now.edges:.2f}, tips moved by {self.tips_moved:.1f} px",
+            f"fits of synthetic images: Dice {was.dice:.3f} -> {now.dice:.3f}, part accuracy {was.made_parts:.3f} -> "
+            f"{now.made_parts:.3f}, tip error {was.made_tips:.1f} -> {now.made_tips:.1f} px",
+            f"fits of {len(was.tips)} frames of the recording: {was.good} -> {now.good} good, "
+            f"predicted parts {was.parts:.3f} -> {now.parts:.3f}, edge strength {was.edges:.2f} -> {now.edges:.2f}, "
+            f"tips moved by {self.tips_moved:.1f} px",
         ]
 
 
 def judge(
     config: TrainingConfig, before: Path, after: Path, *, made: int, own: int, progress: Progress = lambda *_: None
 ) -> Judgement:
-    """Compare fits to synthetic images and frames of the recording between two weights files.
+    """Compare the fits that two weights files give on synthetic images and on frames of the recording.
 
     Args:
         config: settings of the adaptation run, with its recording, robots and images.
@@ -244,7 +246,7 @@ def _tips_in_view(scene: Scene, state: SceneState) -> Float[np.ndarray, "tips 2"
 
 
 STEPS = 400
-"""Default number of steps if neither steps nor time are given."""
+"""Default number of steps if neither steps nor a time limit is given."""
 _VALIDATION_EVERY = 40
 BACKGROUNDS = "backgrounds"
 """Name of the run's folder with backgrounds of the recording, without arms."""

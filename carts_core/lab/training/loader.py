@@ -31,7 +31,7 @@ _MEMORY = 300
 class _Samples(Dataset):
     """Data set of training samples by number, so that a resumed run uses the same samples as an uninterrupted run.
 
-    One of `reuse` samples is generated; the other samples are drawn from the newest `_MEMORY` generated samples and
+    One in `reuse` samples is generated; the other samples are drawn from the newest `_MEMORY` generated samples and
     mirrored at random. Batches are distributed over the workers in turn, and each worker draws from its own samples.
     """
 

@@ -116,7 +116,7 @@ class FeatureTask:
     }
     """Validation metrics: name -> heading in the report."""
     score: ClassVar[str] = "dice_observed"
-    """Name of the metric by which networks are compared, of which higher values are better."""
+    """Name of the metric by which networks are compared; higher values are better."""
 
     def network(self, config: TrainingConfig) -> FeatureNetwork:
         """Network with random weights."""
@@ -196,7 +196,7 @@ class FeatureTask:
                     ("its prediction", _confusion(predicted[0], truth[0])),
                     ("hybrid", shown[1]),
                     ("its prediction", _confusion(predicted[1], truth[1])),
-                    ("cosine of features", similarity),
+                    ("cosine similarity of features", similarity),
                 ]
             )
         return rows
@@ -225,7 +225,7 @@ class SurfaceTask:
     columns: ClassVar[dict[str, str]] = {
         "dice": "Dice of the arms",
         "dice_given": "Dice of the given kinematics",
-        "part_accuracy": "part accuracy of pixels",
+        "part_accuracy": "pixel accuracy of parts",
         **{f"dice_{part}": f"Dice of the part {part}" for part in PARTS},
         "tip_error": "tip error [px]",
         "normal_error_deg": "normal error [deg]",

@@ -243,8 +243,7 @@ class _Run:
         return network
 
     def _score(self, entry: dict[str, float]) -> float:
-        """Score of a validation, of which higher values are better; minus infinity if a metric is worse than at the
-        start."""
+        """Score of a validation (higher values are better); minus infinity if a metric is worse than at the start."""
         worse = self.history.first is not None and self.task.worse(entry, self.history.first)
         return -math.inf if worse else entry[self.task.score]
 

@@ -286,8 +286,8 @@ class HandEyeProblem:
                 poses.append((0.0, beside))
             if not poses:
                 raise SettingsError(
-                    f"no pose of {self.scene.arms[view.arm].name} in {self.scene.cameras[view.camera].name} fits "
-                    "its points, which coincide or are collinear. Click other points, in other frames."
+                    f"no pose of {self.scene.arms[view.arm].name} in {self.scene.cameras[view.camera].name} can be "
+                    "computed from its points, which coincide or are collinear. Click other points, in other frames."
                 )
             T_camera_base = min((self._refined(view, T) for _, T in poses), key=lambda entry: entry[0])[1]
             if not known:

@@ -71,7 +71,8 @@ class Annotations:
     unknown: list[str]
     """Names of images without a matching frame; complete after the iteration."""
     remarks: Counter[str] = field(default_factory=Counter)
-    """Decisions on masks and reasons for omitted annotations, with their counts; complete after the iteration."""
+    """Remarks on how masks were interpreted and why annotations were omitted, with their counts; complete after the
+    iteration."""
 
 
 _BITS, _MORE, _SIGN, _FIRST = 5, 0x20, 0x10, 48
@@ -152,13 +153,13 @@ def read_coco(path: Path, remarks: Counter[str]) -> Iterator[ForeignImage]:
 def _few_enough(images: Iterable[Any]) -> list[Any]:
     images = list(images)
     if len(images) > MAX_IMAGES:
-        raise ValueError(f"it has {len(images)} images; {MAX_IMAGES} are allowed")
+        raise ValueError(f"it has {len(images)} images; at most {MAX_IMAGES} are allowed")
     return images
 
 
 def _check_shapes(count: int) -> None:
     if count > MAX_SHAPES:
-        raise ValueError(f"it has {count} shapes; {MAX_SHAPES} are allowed")
+        raise ValueError(f"it has {count} shapes; at most {MAX_SHAPES} are allowed")
 
 
 def _size(image: Any) -> tuple[int, int]:
@@ -189,7 +190,7 @@ def _coco_image(
         except MALFORMED as error:
             remarks[f"{_annotation(annotation)} left out: {name}: {cause(error)}"] += 1
     if len(points) > MAX_KEYPOINTS:
-        raise SequenceError(f"{where} has {len(points)} keypoints; {MAX_KEYPOINTS} are allowed. Export fewer.")
+        raise SequenceError(f"{where} has {len(points)} keypoints; at most {MAX_KEYPOINTS} are allowed. Export fewer.")
 
     def parts() -> Iterator[_Part]:
         for annotation in usable:
@@ -226,10 +227,10 @@ def _coco_mask(segmentation: Any, height: int, width: int) -> Bool[np.ndarray, "
     mask = np.zeros((height, width), bool)
     for polygon in polygons:
         if len(polygon) % 2 or len(polygon) < 2 * _MIN_CORNERS:
-            raise ValueError(f"a polygon has {len(polygon)} numbers, which are not x and y of three or more corners")
+            raise ValueError(f"a polygon has {len(polygon)} numbers, but needs x and y of at least three vertices")
         points = np.asarray(polygon, np.float64).reshape(-1, 2)
         if not np.isfinite(points).all() or np.abs(points).max() > 2 * _MAX_SIDE:
-            raise ValueError("a corner of a polygon is not finite or far outside the image")
+            raise ValueError("a vertex of a polygon is not finite or far outside the image")
         mask |= mask_of_polygon(points, height, width)
     return mask
 
@@ -237,11 +238,11 @@ def _coco_mask(segmentation: Any, height: int, width: int) -> Bool[np.ndarray, "
 def _coco_keypoints(annotation: dict[str, Any], category: Any) -> dict[str, tuple[float, float]]:
     values = np.asarray(annotation.get("keypoints") or [], np.float64)
     if values.size % 3:
-        raise ValueError(f"its keypoints have {values.size} numbers, which are not x, y and visibility of each")
+        raise ValueError(f"its keypoints have {values.size} numbers, but need x, y and visibility for each")
     values = values.reshape(-1, 3)
     names = [str(name) for name in category.get("keypoints") or range(1, len(values) + 1)]
     if len(names) < len(values):
-        raise ValueError(f"{len(values)} keypoints have {len(names)} names")
+        raise ValueError(f"there are {len(values)} keypoints, but {len(names)} names")
     return {
         f"{category['name']}.{name}": (float(u), float(v))
         for name, (u, v, seen) in zip(names, values, strict=False)
@@ -258,7 +259,7 @@ def read_cvat(path: Path, remarks: Counter[str]) -> Iterator[ForeignImage]:
         images = _few_enough(root.findall("image"))
         name, times = Counter(image.get("name") for image in images).most_common(1)[0]
         if times > 1:
-            raise ValueError(f"it has image {shown(str(name))} {times} times")
+            raise ValueError(f"it contains image {shown(str(name))} {times} times")
     for image in images:
         yield _cvat_image(path, image, remarks)
 
@@ -360,7 +361,7 @@ def read_mask_folder(path: Path, remarks: Counter[str], *, confined: bool = Fals
     """Read the mask images below a folder; files of the same name in sibling folders belong to the same frame.
 
     Args:
-        remarks: counts of files with a change or decision, added during decoding.
+        remarks: counter of remarks on how files were interpreted, updated during decoding.
         confined: whether links are ignored, and names of values are not searched for above the folder.
     """
     # The folder with links in an export of carts has the finest labels.

@@ -25,7 +25,7 @@ from .formats import (
 )
 
 _INSIDE = {"annotations/instances_default.json", "annotations.xml"}
-"""File to read inside a folder that is an export."""
+"""Files to read in the folder of an export."""
 _OWN_EXPORT = "export.json"
 
 
@@ -111,7 +111,9 @@ class _FrameReader:
                 done.add(at)
                 joined = []
             if found in done:
-                raise SequenceError(f"{image.name} belongs to an earlier frame. Name the images by their frames.")
+                raise SequenceError(
+                    f"{image.name} belongs to a frame that was already read. Name the images after their frames."
+                )
             at, joined = found, [*joined, image]
         if at is not None:
             yield self._joined(at, joined)

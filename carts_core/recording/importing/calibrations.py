@@ -43,7 +43,7 @@ class Calibration:
     size: tuple[int, int] | None = None
     """Width and height of the calibrated images [px]."""
     T_right_left: Float[np.ndarray, "4 4"] | None = None
-    """Pose of the left camera in the right camera [m]; None if not given."""
+    """Pose of the left camera in the frame of the right camera [m]; None if not given."""
     R: Float[np.ndarray, "3 3"] | None = None
     """Rectification: rotation from the camera's frame to the common frame of the pair."""
     P: Float[np.ndarray, "3 4"] | None = None
@@ -67,7 +67,9 @@ def read_calibration(path: Path, side: str) -> Calibration:
             raise ValueError("it has no named values")
         return _from_names(content, side)
     except MALFORMED as error:
-        raise SequenceError(f"calibration {path} cannot be used: {cause(error)}. Supported are: {_KINDS}.") from error
+        raise SequenceError(
+            f"calibration {path} cannot be used: {cause(error)}. Supported formats: {_KINDS}."
+        ) from error
 
 
 def calibration_from_info(info: Any) -> Calibration | None:
@@ -91,7 +93,7 @@ def check_model(model: str, camera_model: str = "") -> None:
     if not pinhole or model.lower() not in _MODELS:
         given = f"distortion model {model!r}" if pinhole else f"camera model {camera_model!r}"
         raise ValueError(
-            f"it has the {given}; allowed are pinholes with plumb_bob or rational_polynomial (radtan in Kalibr). "
+            f"it has the {given}; allowed are pinhole models with plumb_bob or rational_polynomial (radtan in Kalibr). "
             "Rectify the images, or calibrate them with an allowed model"
         )
 
@@ -141,7 +143,7 @@ def _from_names(content: Mapping[str, Any], side: str) -> Calibration:
     elif K is None and {"fx", "fy", "cx", "cy"} <= set(content):
         K = np.array([content[name] for name in ("fx", "fy", "cx", "cy")], np.float64)
     if K is None:
-        raise ValueError(f"it has none of camera_matrix, K, M1 and cam0, but {', '.join(map(str, content))}")
+        raise ValueError(f"it has none of camera_matrix, K, M1 and cam0, only {', '.join(map(str, content))}")
     found = _calibration(K, D, _size(content))
     if side == "right":
         R, T = _first(content, ("R", "R_stereo")), _first(content, ("T", "t", "T_stereo"))
@@ -182,12 +184,13 @@ def _from_camodocal(content: Mapping[str, Any]) -> Calibration:
 
 
 def _calibration(K: np.ndarray, D: np.ndarray | None, size: tuple[int, int] | None) -> Calibration:
-    """Calibration from a matrix of 9 numbers, or fx, fy, cx, cy; `ValueError` for models that OpenCV does not have."""
+    """Calibration from a matrix of 9 numbers, or fx, fy, cx, cy; `ValueError` for models that OpenCV does not
+    support."""
     numbers, remarks = np.asarray(K, np.float64).reshape(-1), ()
     if numbers.size == 9:
         matrix = numbers.reshape(3, 3)
         if matrix[0, 2] == matrix[1, 2] == 0 and matrix[2, 0] != 0 and matrix[2, 1] != 0:
-            matrix, remarks = matrix.T, ("its matrix has the principal point in the last row, and is transposed.",)
+            matrix, remarks = matrix.T, ("its matrix has the principal point in the last row; it was transposed.",)
         if np.abs(matrix[[1, 2, 2], [0, 0, 1]]).max() > 1e-6 * abs(matrix[0, 0]) or abs(matrix[2, 2] - 1) > 1e-6:
             raise ValueError(f"its matrix is {matrix.tolist()}, which is not [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]")
         if abs(matrix[0, 1]) > 1e-3 * abs(matrix[0, 0]):
@@ -201,7 +204,8 @@ def _calibration(K: np.ndarray, D: np.ndarray | None, size: tuple[int, int] | No
     if len(coefficients) not in DISTORTION_LENGTHS or not np.isfinite(coefficients).all():
         allowed = ", ".join(map(str, DISTORTION_LENGTHS))
         raise ValueError(
-            f"it has {len(coefficients)} distortion coefficients; allowed are {allowed}, k1 k2 p1 p2 k3 ..."
+            f"it has {len(coefficients)} distortion coefficients; allowed are {allowed}, in the order k1 k2 p1 p2 k3 "
+            "..."
         )
     fx, fy, cx, cy = (float(value) for value in numbers)
     return Calibration((fx, fy, cx, cy), coefficients, size, remarks=remarks)
@@ -240,7 +244,7 @@ def _projection(values: np.ndarray | None) -> np.ndarray | None:
 
 
 def _from_ini(path: Path, side: str) -> Calibration:
-    """Calibration from the dVRK's MATLAB stereo calibration: pixels are counted from 1, lengths are in millimetres."""
+    """Calibration from the dVRK's MATLAB stereo calibration, with pixels counted from 1 and lengths in millimetres."""
     parser = parse_ini(read_text(path, CALIBRATION))
     section = parser["StereoRight" if side == "right" else "StereoLeft"]
 
@@ -315,7 +319,7 @@ def read_base_frames(path: Path, axes: Axes | None = None) -> tuple[DvrkBaseFram
     content = read_json(path)
     found = _entries(content, path)
     if not found:
-        raise SequenceError(f"{path} has no base frame. Supported are: {_BASE_FRAME_KINDS}.")
+        raise SequenceError(f"{path} has no base frame. Supported formats: {_BASE_FRAME_KINDS}.")
     axes = axes or _axes_of(content, path)
     T = T_DVRK_OPENCV if axes == "dvrk" else np.eye(4)
     try:

@@ -34,7 +34,7 @@ def side_of(name: str) -> str | None:
 
 
 def camera_from_info(camera: FoundCamera, info: Any, job: Import, *, rectified: bool) -> FoundCamera:
-    """Copy of a camera with the calibration of a `sensor_msgs/CameraInfo`; unchanged if that is None or
+    """Copy of a camera with the calibration of a `sensor_msgs/CameraInfo`; unchanged if `info` is None or
     uncalibrated."""
     what = f"camera_info of {camera.name}"
     try:
@@ -74,7 +74,7 @@ def _calibrated(camera: FoundCamera, found: Calibration, what: str, job: Import,
     if rectified and found.P is not None:
         fx, _, cx, _, _, fy, cy, *_ = map(float, found.P.reshape(-1))
         intrinsics, distortion, R = (fx, fy, cx, cy), (), np.eye(3)
-        job.guessed(f"images are rectified, according to their name; P of {what} is used.", camera.name)
+        job.guessed(f"the image names indicate rectified images; P of {what} is used.", camera.name)
     given = job.options.calibration_size.get(camera.name)
     size = found.size
     if given is not None:
@@ -101,7 +101,7 @@ def _scaled(camera: FoundCamera, size: tuple[int, int], what: str, job: Import) 
         raise PartError(
             "calibration",
             f"{what} is for images of {size[0]} x {size[1]}, but those of {camera.name} are {camera.size[0]} x "
-            f"{camera.size[1]}, which is another aspect ratio (cropped or rotated?).",
+            f"{camera.size[1]}, which have another aspect ratio (cropped or rotated?).",
             f"Give the calibration of these images: --calibration {camera.name} FILE.",
             about=camera.name,
         )
@@ -109,7 +109,7 @@ def _scaled(camera: FoundCamera, size: tuple[int, int], what: str, job: Import) 
     shift = 0.5 - camera.pixel_center
     intrinsics = (fx * x, fy * y, (cx + shift) * x - shift, (cy + shift) * y - shift)
     text = f"{what} is for images of {size[0]} x {size[1]}; it is scaled to {camera.size[0]} x {camera.size[1]}"
-    job.guessed(f"{text}, as if they were resized and not cropped.", camera.name)
+    job.guessed(f"{text}, assuming that the images were resized, not cropped.", camera.name)
     return replace(camera, intrinsics=intrinsics)
 
 
@@ -127,7 +127,7 @@ def check_intrinsics(camera: FoundCamera, job: Import) -> None:
     raise PartError(
         "calibration",
         f"the calibration of {camera.name} has {problem}. Give another calibration, or the size of the calibration "
-        f"images, from which it is scaled; with the size of these images ({camera.size[0]}x{camera.size[1]}) it is "
+        f"images, to scale it; if you give the size of these images ({camera.size[0]}x{camera.size[1]}), it is "
         "accepted unchanged.",
         f"Options: --calibration {camera.name} FILE, --calibration-size {camera.name} WIDTHxHEIGHT.",
         about=camera.name,
@@ -139,7 +139,7 @@ def placed_cameras(cameras: tuple[FoundCamera, ...], job: Import) -> tuple[Found
 
     If the pose of another camera is not given, it follows from the rectification of both cameras:
     T_right_left = R_right^T [I | t] R_left, with t from the last column of P. A camera of unknown pose gets the pose of
-    the first camera, and its pose is estimated by hand-eye calibration.
+    the first camera, until hand-eye calibration estimates its pose.
     """
     first = next((camera for camera in cameras if camera.name == "left"), cameras[0])
     return tuple(camera if camera is first else _placed(camera, first, job) for camera in cameras)
@@ -152,12 +152,12 @@ def _placed(camera: FoundCamera, first: FoundCamera, job: Import) -> FoundCamera
     if not lacking:
         T = _from_rectification(first, camera)
         angle = np.degrees(np.arccos(np.clip((np.trace(T[:3, :3]) - 1) / 2, -1, 1)))
-        text = f"{1e3 * np.linalg.norm(T[:3, 3]):.2f} mm from {first.name} and rotated by {angle:.2f} deg"
-        job.found(f"{text}, from the rectification of both.", camera.name)
+        text = f"{1e3 * np.linalg.norm(T[:3, 3]):.2f} mm from {first.name}, rotated by {angle:.2f} deg"
+        job.found(f"{text}, computed from the rectification of both cameras.", camera.name)
         return replace(camera, T_camera_world=T)
     why = "" if camera.intrinsics is None else f" ({' and '.join(lacking)}: no rectification and projection)"
     job.missing(
-        f"no pose relative to {first.name}{why}; the pose of {first.name} is the placeholder.",
+        f"no pose relative to {first.name}{why}; the pose of {first.name} is a placeholder.",
         camera.name,
         remedy=f"Give a stereo calibration (--calibration {camera.name} FILE), or click points (New recording, "
         "carts hand-eye).",

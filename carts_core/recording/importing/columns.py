@@ -73,7 +73,7 @@ def guess_columns(table: ForeignTable, options: ImportOptions) -> ColumnMeanings
     known = [joint.name for joints in others.values() for joint in joints] or [*JOINT_NAMES, "jaw", *_POSE_ORDER]
     for meaning, column in options.columns.items():
         if meaning not in ("time", "frame", *known):
-            problem = f"{meaning} is not a meaning of a column. Allowed are: {', '.join(known)}, time, frame."
+            problem = f"{meaning} is not a known meaning of a column. Allowed are: {', '.join(known)}, time, frame."
             raise PartError("columns", problem, "Correct --columns.")
         if column not in table.columns:
             raise PartError("columns", f"{table.path} has no column {column!r}. It has: {', '.join(table.columns)}.")
@@ -318,7 +318,7 @@ def arm_log(
     named = [f"{column} {table.units.get(column, '')}".strip() for column in columns]
     values = in_si(raw, joints, job, arm=arm, columns=named, instrument=other is None)
     option = f"--columns {order[0]} COLUMN ..."
-    job.found(f"joints are {', '.join(columns)}.", arm, option, given=stated.issuperset(columns))
+    job.found(f"joint positions are read from {', '.join(columns)}.", arm, option, given=stated.issuperset(columns))
     logged = track(times, values)
     if other is not None:
         return ArmLog(arm, joints=logged, names=tuple(joint.name for joint in joints), si=True)
@@ -342,7 +342,7 @@ def _pose_log(
     poses = track(times, values)
     seen = arm in options.base
     frame = "camera, since a base frame is given" if seen else "arm's base"
-    text = f"the tip pose is {', '.join(columns)}, in the frame of the {frame}."
+    text = f"the tip pose is read from {', '.join(columns)}, in the frame of the {frame}."
     job.found(text, arm, "" if seen else f"--base {arm} FILE", given=seen and stated.issuperset(columns))
     log = ArmLog(arm, poses=poses if seen else None, local_poses=None if seen else poses, si=True)
     if "jaw" not in found:

@@ -77,7 +77,7 @@ def read_foreign_table(path: Path) -> ForeignTable:
     except (OSError, ValueError, csv.Error) as error:
         kinds = ", ".join(TABLE_SUFFIXES)
         raise PartError(
-            "kinematics", f"table {path} cannot be read ({error}). Supported are {kinds}. Export it again."
+            "kinematics", f"table {path} cannot be read ({error}). Supported formats: {kinds}. Export it again."
         ) from error
     table = columns if isinstance(columns, ForeignTable) else ForeignTable(path, columns)
     if not len(table):
@@ -123,7 +123,7 @@ def _csv(path: Path) -> ForeignTable:
         body, numbers = body[1:], numbers[1:]
     columns = {name: _typed([row[index] for row in body], commas) for index, name in enumerate(header)}
     if any("," in cell for row in body[:5] for cell in row) and commas:
-        remarks.append("decimal commas are read as points")
+        remarks.append("decimal commas are read as decimal points")
     dates = tuple(
         name for index, name in enumerate(header) if body and all(_DATE.fullmatch(row[index]) for row in body)
     )
@@ -151,7 +151,7 @@ def _even(rows: list[list[str]], numbers: list[int]) -> tuple[list[list[str]], l
         remarks.append("an empty cell at the end of its rows is ignored")
     for number, row in zip(numbers, rows, strict=True):
         if len(row) != width:
-            raise ValueError(f"its line {number} has {len(row)} cells, the first has {width}")
+            raise ValueError(f"line {number} has {len(row)} cells, but the first line has {width}")
     return rows, remarks
 
 

@@ -54,7 +54,7 @@ class PartError(SequenceError):
     """Unusable part of a recording.
 
     Attributes:
-        part: the part, or `recording`.
+        part: name of the part, or `recording`.
         problem: cause and remedy, without command-line options.
         about: name of the camera; empty for all.
         remedy: further sentence with command-line options.

@@ -52,7 +52,9 @@ def find(path: Path, options: ImportOptions | None = None) -> FoundRecording:
     for name in ("images", "kinematics", "columns", "clock", "time_offset", "frame_rate"):
         if name not in source.uses and _is_given(options, name):
             what = name.replace("_", " ")
-            problem = f"the option {what} is not used for {source.label}, since the recording has this information."
+            problem = (
+                f"the option {what} is not used for {source.label}, since the recording contains this information."
+            )
             remedy = f"Leave out {_option(name)}, or choose another format: --source."
             raise PartError(parts.get(name, "columns"), problem, remedy)
     try:

@@ -30,7 +30,7 @@ def in_si(
     """Convert logged positions of an arm to radians and metres, with the signs of the robot.
 
     Args:
-        columns: names of a table's columns, of which the units are guessed; empty for messages, which are in SI units.
+        columns: names of a table's columns, whose units are guessed; empty for messages, which are in SI units.
         instrument: whether large angles are assumed to be degrees; angles of other robots may be percentages of their
             range.
     """
@@ -53,7 +53,7 @@ def in_si(
         factors = ANGLE_UNITS if joint.revolute else LENGTH_UNITS
         if columns and not options.units and not instrument and re.search(r"(?i)gripper\.pos$", columns[index]):
             result[:, index] = joint.from_percent(2.0 * values[:, index] - 100.0)
-            job.guessed(f"{joint.name} is in percent of its range, from 0.", arm, f"--units {joint.name} UNIT")
+            job.guessed(f"{joint.name} is in percent of its range (0 to 100).", arm, f"--units {joint.name} UNIT")
         elif unit == PERCENT:
             result[:, index] = joint.from_percent(values[:, index])
         elif unit in factors:
@@ -105,9 +105,9 @@ def _unknown_unit(values: np.ndarray, joints: Sequence[Joint], arm: str, chosen:
     joint, column = joints[worst], values[:, worst]
     return PartError(
         "columns",
-        f"{arm}: the unit of the angles is not known, since {why}: {joint.name} is from {np.nanmin(column):.4g} to "
-        f"{np.nanmax(column):.4g}, and its limits are {joint.lower:.4g} to {joint.upper:.4g} rad. Give the unit: deg, "
-        "percent (-100 to 100 of the range of each joint) or rad.",
+        f"{arm}: the unit of the angles is not known, since {why}: positions of {joint.name} range from "
+        f"{np.nanmin(column):.4g} to {np.nanmax(column):.4g}, and its limits are {joint.lower:.4g} to "
+        f"{joint.upper:.4g} rad. Give the unit: deg, percent (-100 to 100 of the range of each joint) or rad.",
         "Option: --angle-unit.",
     )
 
@@ -141,7 +141,7 @@ def length_unit(highest: float, limit: float, arm: str, what: str, orders: Seque
     also = f" Or choose other columns: {' or '.join(orders)} would fit." if orders else ""
     raise PartError(
         "columns",
-        f"{arm}: the unit of {what} is ambiguous: its values reach {highest:.4g}, and its limit is {limit:.3g} m. "
+        f"{arm}: the unit of {what} is ambiguous: its values reach {highest:.4g}, but its limit is {limit:.3g} m. "
         f"Give the unit: {listed}.{also}",
         "Options: --length-unit, --columns." if orders else "Option: --length-unit.",
     )
@@ -160,8 +160,8 @@ def check_limits(arm: FoundArm, job: Import) -> bool:
         joint, own = joints[index], values[:, index]
         remedies = {**_other_readings(joint, own), **orders}
         text = (
-            f"{joint.name} is from {own.min():.4g} to {own.max():.4g} {joint.unit}, and the robot's limits are "
-            f"{joint.lower:.4g} to {joint.upper:.4g} {joint.unit}"
+            f"positions of {joint.name} range from {own.min():.4g} to {own.max():.4g} {joint.unit}, and the robot's "
+            f"limits are {joint.lower:.4g} to {joint.upper:.4g} {joint.unit}"
         )
         text += f"; {' or '.join(remedies)} would fit." if remedies else ". Check the columns."
         options = " or ".join(dict.fromkeys(remedies.values()))

@@ -250,7 +250,7 @@ def arm_from_log(log: ArmLog, job: Import) -> FoundArm:
             job.found(f"jaw angles below 0 (down to {jaw.min():.2f} rad, while grasping) are set to 0.", log.name)
             values[:, -1] = np.maximum(values[:, -1], 0.0)
     else:
-        job.missing("no jaw angle; the jaw is drawn closed.", log.name)
+        job.missing("no jaw angle was recorded; the jaw is rendered closed.", log.name)
     return FoundArm(log.name, columns, values, joints.times, robot, T_camera_base, base_from)
 
 
@@ -288,14 +288,17 @@ def _with_tip_poses(log: ArmLog, job: Import) -> ArmLog:
     elif (both := _checked_rows(log)) is not None and not _is_base_constant(*both):
         inverted = np.linalg.inv(both[0])
         if _is_base_constant(inverted, both[1]):
-            job.warning("measured_cp has inverse transforms (the reference in the tip frame); inverted.", log.name)
+            job.warning(
+                "measured_cp contains inverse transforms (the reference in the tip frame); they were inverted.",
+                log.name,
+            )
             return replace(log, poses=_inverse_of(log.poses), local_poses=_inverse_of(log.local_poses))
         fits = [fit_tool_point(*both, geometry) for geometry in CANDIDATES.values()]
         point, moves = min(fits, key=lambda fit: fit[1])
         if moves > ACCEPTED or np.linalg.norm(point) < _SAME_POINT:
             return log
         x, y, z = 1e3 * point
-        text = f"poses are of a point at {x:.1f}, {y:.1f}, {z:.1f} mm from the tip, along the tool's axes x, y, z"
+        text = f"poses refer to a point at {x:.1f}, {y:.1f}, {z:.1f} mm from the tip, along the tool's axes x, y, z"
         job.found(f"{text}; they are converted to the tip.", log.name, "--tool-point")
     else:
         return log
@@ -337,7 +340,11 @@ def _geometry(log: ArmLog, job: Import) -> PsmGeometry:
     check = check_instrument(*both, candidates)
     if check.decides:
         deviation = 1e3 * check.fits[check.best].deviation
-        job.found(f"joints and tip poses agree with a {check.best} (base constant to {deviation:.4f} mm).", log.name)
+        job.found(
+            f"joints and tip poses are consistent with a {check.best} (deviation of the base frame: {deviation:.4f} "
+            "mm).",
+            log.name,
+        )
         chosen = candidates[check.best]
     elif (warning := check.warning(name)) is not None:
         job.warning(warning, log.name)
@@ -404,7 +411,7 @@ def _joints_from_poses(log: ArmLog, T_camera_base: np.ndarray | None, geometry: 
     found = inverse(Ts, geometry)
     reached = found.reachable
     for entry in found.unreachable:
-        job.warning(f"unreachable poses, left out: {entry}.", log.name)
+        job.warning(f"unreachable poses were left out: {entry}.", log.name)
     if reached.mean() < _MIN_REACHABLE_FRACTION:
         raise PartError(
             "recording",

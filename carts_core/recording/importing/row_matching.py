@@ -21,7 +21,7 @@ from .foreign_tables import ForeignTable
 from .found import FoundArm, Import, PartError
 
 _STAMPED_DIGITS = 13
-"""Minimum number of digits of numbers in image names that are times."""
+"""Minimum number of digits at which numbers in image names are considered times."""
 _LONGEST = 1e6
 """Maximum duration of a recording [s]."""
 _LEAST: Mapping[Clock, tuple[float, float]] = {"ns": (1e17, 9e5), "us": (1e14, 9e2), "ms": (1e11, 0.9), "s": (1e8, 0.0)}
@@ -75,7 +75,7 @@ def frame_times(images: Images, ids: tuple[str, ...], job: Import) -> FrameTimes
     if images.pattern and all(len(frame) >= _STAMPED_DIGITS for frame in ids):
         numbers = np.array([int(frame) for frame in ids], np.float64)
         clock = guess_clock(numbers)
-        job.guessed(f"names of the images are times in {clock}.")
+        job.guessed(f"image names are times in {clock}.")
         return _without_rate(replace(found, times=numbers * SECONDS[clock], source="the images' names"), job)
     name, video = images.path.name, None
     if images.times is not None:
@@ -91,7 +91,7 @@ def frame_times(images: Images, ids: tuple[str, ...], job: Import) -> FrameTimes
             own = (len(video) - 1) / (video[-1] - video[0])
             if abs(own / rate - 1) > 0.01:
                 job.warning(f"{name} has {own:.4g} images/s; the given frame rate of {rate:g} images/s is used.")
-        job.found(f"times of the images are those of {rate:g} images/s.")
+        job.found(f"times of the images are those at {rate:g} images/s.")
         return replace(found, times=times, source="the given frame rate", given=True)
     if video is not None:
         job.found(f"times of the images are those of {name}.")
@@ -161,7 +161,7 @@ def row_seconds(
         row = int(np.flatnonzero(steps < 0)[0]) + 1
         raise PartError(
             "columns",
-            f"{table.path.name}, column {column!r}: times go back from {values[row - 1]} to {values[row]}, row "
+            f"{table.path.name}, column {column!r}: times decrease from {values[row - 1]} to {values[row]} in row "
             f"{row + 1}. Sort the rows, or choose another column.",
             "Option: --columns time COLUMN.",
         )
@@ -179,8 +179,8 @@ def match_rows(frames: FrameTimes, table: ForeignTable, meanings: ColumnMeanings
     if explicit and named is None:
         raise PartError(
             "columns",
-            f"{table.path.name}: column {column!r} has no names of images, which are {frames.stems[0]} to "
-            f"{frames.stems[-1]}. Choose another column.",
+            f"{table.path.name}: column {column!r} does not contain the image names, which range from "
+            f"{frames.stems[0]} to {frames.stems[-1]}. Choose another column.",
             "Option: --columns frame COLUMN.",
         )
     span = None if frames.times is None or len(frames.times) < 2 else float(frames.times[-1] - frames.times[0])
@@ -205,13 +205,13 @@ def match_rows(frames: FrameTimes, table: ForeignTable, meanings: ColumnMeanings
             raise PartError(
                 "columns",
                 f"{table.path.name}: column {column!r} counts {len(table)} rows and there are "
-                f"{counted(len(frames.ids), 'image')}, so it does not match rows with images. Give the frame rate of "
+                f"{counted(len(frames.ids), 'image')}, so it cannot assign rows to images. Give the frame rate of "
                 "the images, or confirm the column.",
                 f"Options: --frame-rate, --columns frame {column!r}.",
             )
         return _by_image(frames, table, named, times, f"column {column!r}", job, stated=explicit)
     if in_order:
-        return _by_image(frames, table, np.arange(len(table)), times, "their order", job, stated=False)
+        return _by_image(frames, table, np.arange(len(table)), times, "the order of rows and images", job, stated=False)
     lacking = "the images have no times" if times is not None else "the table has no times"
     raise PartError(
         "columns",
@@ -233,7 +233,7 @@ def _by_time(
     offset = job.options.time_offset
     if offset is None:
         offset = float(times[0] - frames.times[0]) if apart else 0.0
-        text = "the clocks do not overlap; the first row is assumed to be at the first image" if apart else "0 s"
+        text = "the clocks do not overlap; the first row is assigned to the first image" if apart else "0 s"
         job.guessed(f"time offset: {text}.", option="--time-offset")
     return RowMatch(times, False, frames.times, float(offset))
 
@@ -329,7 +329,7 @@ def by_rows(
         problem = "no frame has joint positions of all arms."
         raise PartError("recording", problem, "Import fewer arms: --arms.")
     if not keep.all():
-        job.warning(f"{int((~keep).sum())} of {len(keep)} frames left out: no joint positions.")
+        job.warning(f"left out {int((~keep).sum())} of {len(keep)} frames: no joint positions.")
     kept = np.flatnonzero(keep)
     timed = times is not None and bool(np.isfinite(times[kept]).all() and (np.diff(times[kept]) > 0).all())
     result = []

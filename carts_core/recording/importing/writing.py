@@ -30,12 +30,13 @@ from .joint_units import check_limits, urdf_of
 
 _ROWS = 200
 _NEAREST, _FARTHEST = 0.01, 0.6
-"""Depths at which an endoscope sees an instrument [m]."""
+"""Range of plausible depths of an instrument in endoscope images [m]."""
 _BORDER = 0.5
-"""Margin around the image in which a tip still counts as in view, as a share of the image size; base frames have errors
-of centimetres."""
+"""Margin around the image in which a tip still counts as in view, as a share of the image size; large, since base
+frames have errors of centimetres."""
 _IN_VIEW, _OUT = 0.5, 0.1
-"""Share of rows with the tip in view that suffices, and share below which the base frame is doubted."""
+"""Minimum share of rows with the tip in view for another interpretation of a base frame, and maximum share at which the
+base frame is questioned [1]."""
 
 
 def tips_of(arm: FoundArm) -> Float[np.ndarray, "rows 3"]:
@@ -176,7 +177,7 @@ def _frames_with_kinematics(recording: FoundRecording, job: Import) -> FoundReco
             "Give --time-offset or --clock.",
         )
     job.warning(
-        f"{int((~keep).sum())} of {counted(len(keep), 'frame')} left out: no joint positions within {MAX_GAP} s."
+        f"left out {int((~keep).sum())} of {counted(len(keep), 'frame')}: no joint positions within {MAX_GAP} s."
     )
     ids = tuple(frame for frame, kept in zip(recording.frame_ids, keep, strict=True) if kept)
     cameras = []
@@ -193,7 +194,7 @@ def _with_intrinsics(camera: FoundCamera, job: Import) -> FoundCamera:
     width, height = camera.size
     focal = FOCAL_WIDTHS * width
     job.missing(
-        f"no calibration; a focal length of {focal:.0f} px is the placeholder.",
+        f"no calibration; a focal length of {focal:.0f} px is a placeholder.",
         camera.name,
         remedy=f"Give --calibration {camera.name} FILE, or estimate it with carts calibrate.",
         placeholder="intrinsics",
@@ -217,7 +218,7 @@ def _placed(arm: FoundArm, number: int, job: Import) -> FoundArm:
     T[:3, :3] = turn[0].as_matrix()
     T[:3, 3] = [0.0, 0.0, max(_DISTANCE, 0.5 * float(np.linalg.norm(tip)))] - T[:3, :3] @ tip
     job.missing(
-        "no base frame (hand-eye calibration); a pose in front of the camera is the placeholder.",
+        "no base frame (hand-eye calibration); a pose in front of the camera is a placeholder.",
         arm.name,
         remedy=f"Give --base {arm.name} FILE, or place the arm in carts view and refine with carts calibrate.",
         placeholder="T_world_base",

@@ -181,7 +181,7 @@ def _cameras(bag: Bag, job: Import) -> tuple[tuple[FoundCamera, ...], np.ndarray
         record, stamps = times[name]
         chosen = order if name == leader else nearest(frame_times, stamps)
         if name != leader and (late := np.abs(stamps[chosen] - frame_times).max()) > 0.02:
-            job.warning(f"images are up to {late:.3f} s from those of {leader}.", name)
+            job.warning(f"times of images differ by up to {late:.3f} s from those of {leader}.", name)
         info = _camera_info(bag, topics[name])
         first = decode_message(bag.message(topics[name]), f"{path}, {topics[name]}")
         size = (first.shape[1], first.shape[0])

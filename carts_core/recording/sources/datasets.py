@@ -77,11 +77,11 @@ def _read_surgpose(path: Path, job: Import) -> FoundRecording:
     times = frame_times(images["left"], ids, job).times
     if len(rows) != len(ids):
         text = f"{file.name} has {len(rows)} rows, and the videos have {len(ids)} images."
-        job.warning(f"{text} Each row is assigned to the image with its number. Check the delay.")
+        job.warning(f"{text} Each row is assigned to the image with the same number. Check the delay.")
     found, kept_ids, kept = by_rows(arms, ids, job, times)
     job.warning(
-        "the kinematics of SurgPose need compensation, its base frames differ between trajectories, and the rows of "
-        "many are up to 71 frames late.",
+        "the kinematics of SurgPose need compensation, its base frames differ between trajectories, and in many "
+        "trajectories the rows are up to 71 frames late.",
         remedy="Estimate the delay with carts time-offset.",
     )
     numbered = [replace(camera, numbers=kept) for camera in cameras]
@@ -151,7 +151,9 @@ def _read_jigsaws(path: Path, job: Import) -> FoundRecording:
         problem = f"{path} has {len(trials)} trials of JIGSAWS: {names}. Import one of them."
         raise PartError("recording", problem, f"Command: carts import {shlex.quote(str(trials[0]))}")
     if not trials:
-        raise SequenceError(f"{path} has no kinematics/AllGestures/TRIAL.txt. Give the root of JIGSAWS, or a trial.")
+        raise SequenceError(
+            f"{path} has no kinematics/AllGestures/TRIAL.txt. Give the root folder of JIGSAWS, or a trial."
+        )
     path = trials[0]
     with well_formed(f"{path} is not a table of numbers"):
         rows = np.array([line.split() for line in read_text(path, TABLE).splitlines() if line.strip()], np.float64)
@@ -365,7 +367,7 @@ def _domain_images(path: Path, domains: list[str], folders: dict[str, str], job:
             )
         ids = common_ids(found, path)
         if any(len(each.ids) != len(ids) for each in found.values()):
-            text = f"{counted(len(ids), 'frame')} in all of {', '.join(domains)}; others are left out."
+            text = f"{counted(len(ids), 'frame')} exist in all of {', '.join(domains)}; other frames are left out."
             job.warning(text, camera)
         place = "{domain}" if len(domains) > 1 else domains[0]
         images[camera] = Images(path, f"{place}/{folder}/{first.pattern}", ids, first.size)
@@ -444,7 +446,7 @@ def _arm(name: str, values: np.ndarray, ids: tuple[str, ...], file: Path, job: I
         rows = numbers
     else:
         raise SequenceError(
-            f"{file} has {len(values)} rows for {len(ids)} images, whose numbers go to {numbers.max()}. "
+            f"{file} has {len(values)} rows for {len(ids)} images, whose highest number is {numbers.max()}. "
             "Remove images without kinematics."
         )
     columns = (*JOINT_NAMES, "jaw")[: values.shape[1]]
@@ -465,7 +467,7 @@ def _read_ambf(path: Path, job: Import) -> FoundRecording:
     file = path / "kinematics.npy"
     values = read_array(file)
     if values.ndim != 2 or values.shape[1] % _AMBF_COLUMNS or values.dtype.kind not in "fiu":
-        raise SequenceError(f"{file} has the shape {values.shape}; expected are eight columns of numbers per arm.")
+        raise SequenceError(f"{file} has the shape {values.shape}; expected: eight columns of numbers per arm.")
     arms = []
     for number in range(values.shape[1] // _AMBF_COLUMNS):
         own = values[:, _AMBF_COLUMNS * number : _AMBF_COLUMNS * (number + 1)].astype(np.float64)

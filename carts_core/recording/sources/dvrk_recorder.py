@@ -89,7 +89,7 @@ def _stream(video: Path, sidecar: Path, job: Import) -> _Stream:
         times = np.array([_frame_time(frame) for frame in frames])
     layout = str(content.get("side_by_side") or "undefined")
     if layout not in ("undefined", *_SIDES):
-        raise SequenceError(f"sidecar {sidecar}: side_by_side is {layout!r}; known are undefined, LR and RL.")
+        raise SequenceError(f"sidecar {sidecar}: side_by_side is {layout!r}; allowed are undefined, LR and RL.")
     latency = content.get("estimated_latency_ms")
     latency = float(latency) * 1e-3 if isinstance(latency, int | float) else 0.0
     if (dropped := content.get("frames_dropped")) not in (0, None):
@@ -153,7 +153,7 @@ def _cameras(streams: list[_Stream], job: Import) -> tuple[tuple[FoundCamera, ..
         stream, crop, size = parts[name]
         rows = nearest(leader.times, stream.times)
         if (late := np.abs(stream.times[rows] - leader.times).max()) > _FAR:
-            job.warning(f"images are up to {late:.3f} s from those of {order[0]}.", name)
+            job.warning(f"times of images differ by up to {late:.3f} s from those of {order[0]}.", name)
         camera = FoundCamera(name, size, stream.video, crop=crop, numbers=stream.numbers[rows])
         cameras.append(calibration_of(camera, job))
         where = "" if crop is None else f" from column {crop[0]}"

@@ -222,7 +222,7 @@ def _read(path: Path, job: Import) -> FoundRecording:
 def _note_missing_kinematics(path: Path, job: Import) -> None:
     """Report why no kinematics were found, with the columns of the tables that were considered."""
     if job.options.kinematics == NO_TABLE:
-        job.found("kinematics are left out, as given.")
+        job.found("kinematics are left out, as requested.")
         return
     tables = [table for table in map(_readable, _tables(path)) if table is not None and len(table.columns) > 1]
     if not tables:

@@ -63,7 +63,8 @@ def _read(path: Path, job: Import) -> FoundRecording:
 
 
 def _times(episode: _Episode, rate: float, job: Import) -> np.ndarray:
-    """Times of the rows, and thereby images, of an episode [s]: from their column, else from the frame rate."""
+    """Times of an episode's rows, which are also those of its images [s]: from their column, else from the frame
+    rate."""
     even = np.arange(len(episode.table)) / rate
     if "timestamp" not in episode.table.columns:
         return even
@@ -75,7 +76,7 @@ def _times(episode: _Episode, rate: float, job: Import) -> np.ndarray:
     times = times - times[0]
     if (late := np.abs(times - even).max()) > 0.5 / rate:
         job.warning(
-            f"times of the column timestamp are up to {late:.3f} s from those of {rate:g} images/s. They are used; "
+            f"times of the column timestamp are up to {late:.3f} s from those at {rate:g} images/s. They are used; "
             "row n is assigned to image n of the episode."
         )
         return times

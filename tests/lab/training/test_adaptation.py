@@ -180,13 +180,13 @@ def _judgement(moved: float = 0.0, **now: float) -> Judgement:
     [
         (_judgement(), []),
         (_judgement(dice=0.98, made_tips=2.0, edges=2.2, moved=5.0), []),
-        (_judgement(dice=0.98, made_tips=10.9), ["tips of synthetic images (2.7 -> 10.9 px)"]),
-        (_judgement(dice=0.96), ["masks of synthetic images (Dice 0.970 -> 0.960)"]),
-        (_judgement(made_parts=0.9), ["parts of synthetic images (0.950 -> 0.900 of the pixels)"]),
-        (_judgement(good=3), ["verdicts of the recording (4 -> 3 good)"]),
-        (_judgement(parts=0.1), ["parts of the recording (0.700 -> 0.100 of the pixels)"]),
-        (_judgement(edges=1.5), ["edges of the recording (2.00 -> 1.50)"]),
-        (_judgement(moved=5.0), ["tips of the recording (moved by 7.1 px without stronger edges)"]),
+        (_judgement(dice=0.98, made_tips=10.9), ["tip error in synthetic images (2.7 -> 10.9 px)"]),
+        (_judgement(dice=0.96), ["masks in synthetic images (Dice 0.970 -> 0.960)"]),
+        (_judgement(made_parts=0.9), ["part accuracy in synthetic images (0.950 -> 0.900 of the pixels)"]),
+        (_judgement(good=3), ["verdicts on the recording (4 -> 3 good)"]),
+        (_judgement(parts=0.1), ["predicted parts in the recording (0.700 -> 0.100 of the pixels)"]),
+        (_judgement(edges=1.5), ["edge strength in the recording (2.00 -> 1.50)"]),
+        (_judgement(moved=5.0), ["tips in the recording (moved by 7.1 px without stronger edges)"]),
     ],
 )
 def test_what_is_worse_is_named(judgement: Judgement, worse: list[str]):
@@ -209,7 +209,9 @@ def test_weights_are_offered_only_where_nothing_is_worse(
     assert (tmp_path / "run" / "surface.safetensors").is_file() == (tips == 2.0)
     assert (tmp_path / "run" / "refused.safetensors").is_file() == (tips == 10.9)
     assert ("To use them: carts optimize" in said) == (tips == 2.0)
-    assert ("rejected because of worse results: tips of synthetic images (2.7 -> 10.9 px)" in said) == (tips == 10.9)
+    assert ("rejected because of worse results: tip error in synthetic images (2.7 -> 10.9 px)" in said) == (
+        tips == 10.9
+    )
 
 
 def test_made_images_to_judge_by_are_whole_and_always_the_same(tmp_path: Path):

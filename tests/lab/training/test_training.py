@@ -213,4 +213,4 @@ def test_a_surface_network_learns_and_reports(tmp_path: Path):
     history = json.loads(json.dumps(load_checkpoint(tmp_path).history.losses))  # pyright: ignore
     assert history[-1]["loss"] < history[0]["loss"]
     assert read_weights(result.weights).network.kind == "surface"
-    assert "part accuracy of pixels" in result.report.read_text()
+    assert "pixel accuracy of parts" in result.report.read_text()

@@ -239,7 +239,7 @@ def test_six_columns_that_differ_in_a_number_are_joints_whatever_they_are_called
     write_csv(tmp_path / "rec/log.csv", header, np.column_stack([range(5), q, q[:, :2]]))
     found = find(tmp_path / "rec")
     assert found.arms[0].values is not None and np.abs(found.arms[0].values - q).max() < 1e-9
-    assert any("joints are Motor no. 0, Motor no. 1" in str(note) for note in found.notes)
+    assert any("joint positions are read from Motor no. 0, Motor no. 1" in str(note) for note in found.notes)
 
 
 def test_the_default_output_has_the_whole_name_of_a_folder_with_a_dot(folder, tmp_path, monkeypatch):

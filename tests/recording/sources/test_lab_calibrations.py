@@ -69,7 +69,7 @@ def test_the_pose_of_the_right_camera_follows_from_the_rectification_of_both(tmp
     wanted, _ = cv2.projectPoints(point, R, T, K, np.array(D))
     seen, _ = cv2.projectPoints(point, right.T_camera_world[:3, :3], right.T_camera_world[:3, 3], K, np.array(D))
     assert np.abs(wanted - seen).max() < 1e-6
-    assert "right: 5.21 mm from left and rotated by 2.2" in said(found)
+    assert "right: 5.21 mm from left, rotated by 2.2" in said(found)
 
 
 @pytest.mark.parametrize("lacking", ["left", "right"])
@@ -263,13 +263,13 @@ WRONG: list[tuple[str, Any, str]] = [
     (
         "other.json",
         json.dumps({**OWN, "K": [[1400, 0, 660], [0, 1410, 470], [0, 0, 1]]}),
-        "outside of images of 640 x 480",
+        "outside images of 640 x 480",
     ),
     ("aspect.json", json.dumps({**OWN, "K": [[700, 0, 330], [0, 350, 235], [0, 0, 1]]}), "differ by 100%"),
-    ("cropped.json", json.dumps({**OWN, "width": 1280, "height": 720}), "which is another aspect ratio"),
+    ("cropped.json", json.dumps({**OWN, "width": 1280, "height": 720}), "which have another aspect ratio"),
     ("three.json", json.dumps({**OWN, "distortion": [1, 2, 3]}), "3 distortion coefficients; allowed are 0, 4, 5"),
     ("skew.json", json.dumps({**OWN, "K": [[700, 30, 330], [0, 705, 235], [0, 0, 1]]}), "a skew of 30"),
-    ("folds.json", json.dumps({**OWN, "distortion": [-2.5, 0.1, 0, 0]}), "maps two positions"),
+    ("folds.json", json.dumps({**OWN, "distortion": [-2.5, 0.1, 0, 0]}), "is not one-to-one"),
     ("objects.mat", objects_of_matlab, r"before saving: s = toStruct\(stereoParams\)"),
     ("new.mat", b"MATLAB 7.3 MAT-file, Platform: GLNXA64".ljust(600, b"\0"), "-v7"),
     ("pointer.yaml", "version https://git-lfs.github.com/spec/v1\noid sha256:00\nsize 12\n", "git lfs pull"),
@@ -296,7 +296,7 @@ def test_the_size_of_the_calibrated_images_answers_what_a_file_does_not_state(tm
     assert found.cameras[0].intrinsics == pytest.approx((700, 705, 330, 235))
     as_it_is = imported(tmp_path, {"left": path}, calibration_size={"left": "640x480"})
     assert as_it_is.cameras[0].intrinsics == pytest.approx((1400, 1410, 660.5, 470.5))
-    assert "outside of images of 640 x 480" in said(as_it_is)
+    assert "outside images of 640 x 480" in said(as_it_is)
     with pytest.raises(CartsError, match="give width and height, such as 640x480"):
         ImportOptions(calibration_size={"left": "large"})
 

@@ -261,12 +261,12 @@ def with_a_gap(found: FoundRecording) -> None:
     assert found.frame_times is not None
     assert np.diff(found.frame_times) == pytest.approx([1 / 30, 1 / 30 + 0.5, 1 / 30], abs=1e-6)
     assert np.abs(measured(found)[:, :6] - joints_at(found.frame_times)).max() < 1e-5
-    says(found, "warning: times of the column timestamp are up to 0.500 s from those of 30 images/s")
+    says(found, "warning: times of the column timestamp are up to 0.500 s from those at 30 images/s")
 
 
 def without_gap(found: FoundRecording) -> None:
     assert found.frame_times is not None and len(found.frame_ids) == FRAMES - 1
-    says(found, "1 gap of up to 0.32 s in the log", "1 of 8 frames left out")
+    says(found, "1 gap of up to 0.32 s in the log", "left out 1 of 8 frames")
 
 
 def slowly(found: FoundRecording) -> None:
@@ -294,7 +294,7 @@ ROWS: dict[str, tuple[Callable[[Path], dict], Check | str]] = {
     ),
     "counted as the images": (counted_from(1, 1, "img"), of_each_row("by column 'img'")),
     "frames of a video from 1": (video_counted_from_one, of_each_row("column 'frame' counts from 1")),
-    "a video of another rate than its rows": (video_of_another_rate, of_each_row("by their order")),
+    "a video of another rate than its rows": (video_of_another_rate, of_each_row("by the order of rows and images")),
     "two rows for each image": (two_rows_for_each, of_each_row("8 rows of an image that already has a row")),
     "twice as many rows": (more_rows_without_times, "8 images and log.csv has 16 rows, and the table has no times"),
     "fewer rows": (fewer_rows_with_names, lambda found: is_motion(found, np.arange(FRAMES - 2) / RATE)),
@@ -308,7 +308,7 @@ ROWS: dict[str, tuple[Callable[[Path], dict], Check | str]] = {
     "a gap in the log": (timed(change=gapped), without_gap),
     "times that go back": (
         timed(change=lambda times: times[::-1]),
-        "column 't': times go back from 2.99 to 2.98, row 2",
+        "column 't': times decrease from 2.99 to 2.98 in row 2",
     ),
     "L26 dates": (dates, of_the_log()),
     "L11 a gap in a LeRobot episode": (gap_in_lerobot, with_a_gap),
@@ -348,10 +348,13 @@ def degrees_row(text: str) -> str:
 
 
 WRITTEN: dict[str, tuple[Callable[[Path], dict], Check | str]] = {
-    "a byte order mark": (written(lambda text: f"\ufeff{text}"), of_each_row("joints are yaw, pitch")),
+    "a byte order mark": (
+        written(lambda text: f"\ufeff{text}"),
+        of_each_row("joint positions are read from yaw, pitch"),
+    ),
     "L16 semicolons and decimal commas": (
         written(lambda text: text.replace(",", ";").replace(".", ",")),
-        of_each_row("decimal commas are read as points"),
+        of_each_row("decimal commas are read as decimal points"),
     ),
     "tabs": (written(lambda text: text.replace(",", "\t"), "log.tsv"), of_each_row()),
     "blanks": (written(lambda text: text.replace(",", "  "), "log.txt"), of_each_row()),
@@ -379,7 +382,7 @@ WRITTEN: dict[str, tuple[Callable[[Path], dict], Check | str]] = {
     ),
     "a ragged row": (
         written(lambda text: text.replace("\n3,", "\n3,0,0,")),
-        r"log.csv cannot be read \(its line 4 has",
+        r"log.csv cannot be read \(line 4 has",
     ),
 }
 
@@ -461,12 +464,16 @@ def named_columns(folder: Path) -> dict:
 JOINTS: dict[str, tuple[Callable[[Path], dict], Check | str]] = {
     "L20 negative insertion": (
         joint_table(negative_insertion),
-        lambda found: says(found, "warning: PSM1: insertion is from -0.1", "the opposite sign", "--flip insertion"),
+        lambda found: says(
+            found, "warning: PSM1: positions of insertion range from -0.1", "the opposite sign", "--flip insertion"
+        ),
     ),
     "negative insertion, turned": (joint_table(negative_insertion, flip=("insertion",)), of_each_row()),
     "L20 a jaw of 5.4 rad": (
         joint_table(jaw_in_degrees),
-        lambda found: says(found, "jaw is from 5.4 to 5.4 rad", "deg (interpreted as 0.0942", "--units jaw deg"),
+        lambda found: says(
+            found, "positions of jaw range from 5.4 to 5.4 rad", "deg (interpreted as 0.0942", "--units jaw deg"
+        ),
     ),
     "a jaw in degrees, said": (
         joint_table(jaw_in_degrees, units={"jaw": "deg"}),
@@ -482,7 +489,9 @@ JOINTS: dict[str, tuple[Callable[[Path], dict], Check | str]] = {
     ),
     "swapped columns, said to be metres": (
         joint_table(swapped, length_unit="m"),
-        lambda found: says(found, "warning: PSM1: insertion is", "exchanged columns of insertion and roll"),
+        lambda found: says(
+            found, "warning: PSM1: positions of insertion range from", "exchanged columns of insertion and roll"
+        ),
     ),
     "L19 names beside positions": (named_columns, of_each_row()),
     "L21 states of a motor out of 100": (so101_state, "unit of the angles is not known.*deg, percent.*--angle-unit"),
@@ -538,7 +547,7 @@ def test_poses_of_another_tool_point_are_brought_to_the_tip_and_said(tmp_path: P
     found = find(write_bag(tmp_path / "bag", BagKind(tool_point=0.0102, cameras=("left",), local=False)))
     T = found.arms[0].T_world_base
     assert T is not None and np.abs(T - T_CAMERA_BASE).max() < 2e-5
-    says(found, "poses are of a point at 0.0, 0.0, 10.2 mm from the tip", "--tool-point")
+    says(found, "poses refer to a point at 0.0, 0.0, 10.2 mm from the tip", "--tool-point")
     poses_alone = BagKind(tool_point=0.0102, joints=False, cameras=("left",))
     found = find(write_bag(tmp_path / "poses", poses_alone), ImportOptions(tool_point=0.0102))
     assert found.frame_times is not None
@@ -565,7 +574,7 @@ def test_rows_of_images_get_times_for_a_time_offset(tmp_path: Path, make: Callab
         ({"base": {"PSM9": Path("x.json")}}, "rec has no arm 'PSM9'. It has: PSM1. Correct --base"),
         ({"calibration": {"middle": Path("y.yaml")}}, "no camera 'middle'. It has: camera. Correct --calibration"),
         ({"arms": {"PSM1": "nose", "PSM2": "ear"}}, "rec has no arm 'PSM2'.*Correct --arms"),
-        ({"columns": {"yawn": "yaw"}}, "yawn is not a meaning of a column. Allowed are: yaw"),
+        ({"columns": {"yawn": "yaw"}}, "yawn is not a known meaning of a column. Allowed are: yaw"),
         ({"flip": ("knee",)}, "knee is not a joint.*--flip"),
         ({"units": {"yaw": "mm"}}, "unit of yaw is mm; allowed are rad.*--units"),
         ({"time_offset": 0.1}, "a time offset needs times.*--frame-rate"),

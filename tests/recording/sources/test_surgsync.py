@@ -99,7 +99,7 @@ def test_clips_and_episodes_bring_joints_jaw_calibration_and_hand_eye(tmp_path, 
     assert left.intrinsics == pytest.approx((110, 110, 48, 36)) and left.distortion[0] == -0.1
     assert np.allclose(right.T_camera_world[:3, 3], [-0.005, 0, 0])
     assert np.allclose(sequence.scene.arms[0].T_world_base, T_CAMERA_BASE)
-    assert any("agree with a 9.1 mm wrist" in str(note) for note in found.notes)
+    assert any("are consistent with a 9.1 mm wrist" in str(note) for note in found.notes)
     assert not [note for note in found.notes if note.kind == "missing"]
 
 
