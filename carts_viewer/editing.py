@@ -83,11 +83,11 @@ class People:
         self._makers[self.project.state.position] = person
 
     def can_undo(self, person: Person) -> bool:
-        """Whether there may be a step that this user can undo."""
+        """Whether this user may have a step to undo."""
         return self.project.state.position > 0 and (not self.several or self._last(person, free=True) is not None)
 
     def can_redo(self, person: Person) -> bool:
-        """Whether there is a step that this user can redo."""
+        """Whether this user has a step to redo."""
         return bool(person.undone) or self._next_is_free(person)
 
     def undo(self, person: Person) -> Change | None:
@@ -263,7 +263,7 @@ class Editor:
         """Save the draft as one undo step. In a read-only project it remains a draft.
 
         Raises:
-            ProjectError: the draft could not be saved, and remains.
+            ProjectError: the draft could not be saved, and is kept.
         """
         if self._view is None or not self.project.writable:
             return

@@ -37,7 +37,7 @@ from carts_viewer.state import NETWORK, Observed, Pose, Target, joint_range
 class Session:
     """Frames of a sequence with their corrections from the project.
 
-    A frame's pose is the measured one until it is corrected; corrections do not depend on camera or domain.
+    A frame's pose is the measured pose until it is corrected; corrections do not depend on camera or domain.
 
     Attributes:
         scene: arms and cameras of the sequence.

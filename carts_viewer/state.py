@@ -446,9 +446,9 @@ class ViewState:
     jobs: tuple[Job, ...] = ()
     """Jobs, oldest first."""
     can_undo: bool = False
-    """Whether there may be a step that this user can undo."""
+    """Whether this user may have a step to undo."""
     can_redo: bool = False
-    """Whether there is a step that this user can redo."""
+    """Whether this user has a step to redo."""
     name: str = ""
     """Name of this user."""
     others: tuple[tuple[str, int], ...] = ()
@@ -481,7 +481,7 @@ class ViewState:
 
     @property
     def streaming(self) -> bool:
-        """Whether frame and pose are those of a live stream, which are not in the project."""
+        """Whether frame and pose belong to a live stream, and thus are not in the project."""
         return self.live is not None and self.live.on
 
     @property

@@ -135,7 +135,7 @@ class Tab:
         self._shown: ViewState | None = None
         self._pictured: ViewState | None = None
         self._left_at: float | None = None
-        """Time at which the page was closed [s, monotonic]; None while it is open, and once its run is ended."""
+        """Time at which the page was closed [s, monotonic]; None while the page is open and after the run was ended."""
         self._gone = False
         """Whether the page was closed for good, so that scores are not needed."""
 

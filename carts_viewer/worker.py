@@ -17,7 +17,7 @@ _log = logging.getLogger(__name__)
 MEMORY_KEPT = 10.0
 """Idle time after which freed memory is returned to the operating system [s]."""
 MEMORY_KEPT_AT_WORK = 30.0
-"""Interval between returns of memory during work with an open page, which may delay a picture by milliseconds [s]."""
+"""Interval between returns of memory during work with an open page [s]; each may delay a picture by milliseconds."""
 _STARTS_LONG_WORK = (intents.Optimizing, intents.SequenceIntent, intents.Exporting, intents.Jobs)
 """Classes of intents that may start long work."""
 

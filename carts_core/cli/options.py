@@ -322,7 +322,7 @@ class SolverOptions:
         return changed(free, _table(self.settings, "free"), "[free]")
 
     def check_surface(self, what: str) -> None:
-        """Check that the solver is `surface`, which `what` requires because it estimates standard deviations."""
+        """Check that the solver is `surface`, whose standard deviations `what` requires."""
         if not isinstance(self.chosen, SurfaceSolver):
             raise SettingsError(
                 f"{what} requires --solver surface, but --solver {self.solver} was given. Remove one of the options."
@@ -412,7 +412,7 @@ class Observer:
         return (lambda _: {}) if self.given is None else self.given.ignored
 
     def completed(self, frame: "Frame") -> "Frame":
-        """Copy of a frame in which cameras without a recorded mask get the given masks."""
+        """Copy of a frame, with the given masks for cameras without a recorded mask."""
         return frame if self.given is None else self.given.filled(frame)
 
     def mask_inputs(

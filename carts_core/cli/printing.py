@@ -38,7 +38,7 @@ def kept_start_hint(where: str, stopped: Sequence[str]) -> str | None:
 def verdict_line(
     where: str, verdicts: Sequence[str | None], undetermined: Sequence[Sequence[str] | None]
 ) -> str | None:
-    """Summary of the mask verdicts and numbers of undetermined joints (None: unknown) of runs; None if no run was
+    """Summary of the mask verdicts and of the undetermined joints of runs (None if unknown); None if no run was
     assessed.
     """
     runs = [(verdict, joints) for verdict, joints in zip(verdicts, undetermined, strict=True) if verdict is not None]

@@ -18,7 +18,7 @@ class Robots:
     """List the built-in robots, for `robot = "builtin:NAME"` in a sequence file."""
 
     pictures: Path | None = None
-    """Folder in which a picture of each robot is written, NAME.png."""
+    """Folder for pictures of the robots, NAME.png."""
 
     def run(self) -> None:
         """Print the list, and write pictures if a folder is given."""

@@ -49,7 +49,7 @@ class ExportFrame(KinematicsRow):
     classes override rendered classes, and painted pixels belong to the mask.
     """
     ignored: Mapping[str, Bool[ndarray, "height width"]] = field(default_factory=dict, kw_only=True)
-    """Camera -> pixels that show an occluder, which are not refined."""
+    """Camera -> pixels of occluders, where masks are not refined."""
 
 
 def measured_frames(sequence: Sequence, indices: Iterable[int]) -> list[ExportFrame]:

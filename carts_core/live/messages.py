@@ -281,7 +281,7 @@ class Assembler:
 
 
 class LatestFrame:
-    """Buffer with the latest frame of a source, which is read on a separate thread.
+    """Buffer with the latest frame of a source; reads the source on a separate thread.
 
     Args:
         source: source that is read, and closed with the buffer.

@@ -36,7 +36,7 @@ class SequenceIdentity:
 
     @staticmethod
     def of(sequence: "Sequence") -> "SequenceIdentity":
-        """Compute the identity of an open sequence, which reads its kinematics tables again."""
+        """Compute the identity of an open sequence; its kinematics tables are read again."""
         root = parse_toml(read_text(sequence.path, SEQUENCE))
         tables = [root["kinematics"]["table"], *(arm["table"] for arm in root["arms"] if arm.get("table"))]
         digest = hashlib.sha256()

@@ -86,7 +86,7 @@ class Project:
 
     @property
     def path(self) -> Path:
-        """Path of the project file, which changes after a rescue; see `storage_failure`."""
+        """Path of the project file; changes after a rescue, see `storage_failure`."""
         return self._path if self._store is None else self._store.path
 
     @property

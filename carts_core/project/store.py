@@ -156,7 +156,7 @@ class Store:
 
     Attributes:
         memory: connection to the in-memory copy.
-        path: file to which edits are written, which changes after a rescue.
+        path: file to which edits are written; changes after a rescue.
         storage_failure: message describing the failure of the opened file; None without a failure.
     """
 
@@ -230,7 +230,7 @@ class Store:
         return self._file
 
     def _rescue(self, what: str) -> None:
-        """Write the project to a new file that replaces the lost file."""
+        """Write the project to a new file, which is used instead of the lost file."""
         lost = self.path
         if self._file is not None:
             self._what = what

@@ -217,7 +217,7 @@ class Figures:
 
 @lru_cache(maxsize=1024)
 def _shared_provenance(source: str, settings: str | None, weights_sha256: str | None) -> Provenance:
-    """Intern provenances, so that equal values share one object, which saves memory."""
+    """Intern provenances: equal values share one object to save memory."""
     return Provenance(Source(source), settings, weights_sha256)
 
 

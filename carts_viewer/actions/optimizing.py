@@ -42,7 +42,7 @@ class OptimizingHandler(Handler):
 
     @property
     def active(self) -> bool:
-        """Whether there is a run, which may be paused."""
+        """Whether a run is in progress or paused."""
         return self._run is not None
 
     def wait_time(self) -> float | None:

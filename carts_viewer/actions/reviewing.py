@@ -123,7 +123,7 @@ class AnnotatingHandler(Handler):
         self._mark(_REVIEW_STEPS[state], Review(state, note))
 
     def _mark(self, name: str, review: Review, *, gesture: object = None) -> None:
-        """Set the review of the shown frame, which ends a run."""
+        """Set the review of the shown frame, and end the run on it."""
         self._context.end_run("Stopped: the frame was reviewed")
         # An empty review is stored as None, so that clearing it again adds no step.
         edits = {Key.review(self._context.state.index): None if review == Review() else review}

@@ -66,7 +66,7 @@ class Optimizer(Protocol):
         ...
 
     def comparable_losses(self) -> list[float]:
-        """Losses of all iterates against the last observation, which makes them comparable."""
+        """Losses of all iterates, computed with the last observation so that they are comparable."""
         ...
 
 
@@ -229,7 +229,7 @@ class OptimizerFactory:
     def domain_warnings(
         self, sequence: Recording, scene: Scene, index: int, domain: str, cameras: Sequence[str]
     ) -> tuple[str, ...]:
-        """Warnings if these arms or images are outside the domain of the network, from one frame; cached.
+        """Warnings that arms or images are outside the domain of the network, based on one frame; cached.
 
         Raises:
             CartsError: weights or an image is not usable.

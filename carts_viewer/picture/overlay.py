@@ -41,7 +41,7 @@ class OverlayRenderer:
     def classes(
         self, state: SceneState, camera: str, correction: MaskCorrection | None, painted: PartLabels | None
     ) -> Int[np.ndarray, "height width"]:
-        """Number of the class (`carts_core.model.parts.PartClass`) of every pixel, as it is exported; 0 for none.
+        """Class number (`carts_core.model.parts.PartClass`) of every pixel, as in an export; 0 for no class.
 
         Pixels added to the mask of an image without rendered arms have no class.
         """

@@ -167,7 +167,7 @@ def _bracketed(host: str) -> str:
 
 
 def _hostname(host: str) -> str | None:
-    """Host name in a `Host` header; None if it is not a name with an optional port."""
+    """Host name in a `Host` header; None if the header is not a name with an optional port."""
     try:
         parts = urlsplit(f"//{host}")
         _ = parts.port  # Raises if the port is invalid.

@@ -234,7 +234,7 @@ def _poses(result: CalibrationResult, clicking: Clicking, points: Rows[ImagePoin
 
 
 def calibrated_scene(scene: Scene, calibration: Mapping[str, Any]) -> Scene:
-    """The scene with a calibration (`as_plain`); `SettingsError` if it is malformed or of other arms or cameras."""
+    """The scene with a calibration (`as_plain`); `SettingsError` if malformed or of other arms or cameras."""
     try:
         arms = tuple(
             replace(arm, T_world_base=rigid_transform(calibration["arms"][arm.name], f"T_world_base of {arm.name}"))

@@ -80,11 +80,11 @@ class Draft:
             ) from error
 
     def uncalibrated(self, **changes: Any) -> "Draft":
-        """The draft with other fields and without its calibration, which becomes invalid."""
+        """The draft with changed fields and without its calibration, which the changes invalidate."""
         return replace(self, **{"calibration": None, "offered": None, "report": None, **changes})
 
     def with_options(self, **changes: Any) -> "Draft":
-        """The draft with other options and without its calibration; clicked points stay."""
+        """The draft with changed options and without its calibration; clicked points are kept."""
         return self.uncalibrated(options=replace(self.options, **changes))
 
 
