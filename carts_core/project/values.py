@@ -135,7 +135,7 @@ class CorrectedTransform(JsonValue):
 
     @property
     def matrix(self) -> Float[np.ndarray, "4 4"]:
-        """Transform as a new matrix."""
+        """Transform as a new 4 x 4 matrix [m]."""
         return np.array(self.transform)
 
 
@@ -204,7 +204,7 @@ class Figures:
     """Quality of the fit of a frame; finite numbers."""
 
     loss: float | None = None
-    """Loss of the optimizer."""
+    """Loss of the optimizer [1]."""
     dice: float | None = None
     """Dice with the ground-truth mask, 0 to 1; None without ground truth."""
 
@@ -313,7 +313,7 @@ class FitVerdict(JsonValue):
     failure: float = 0.0
     """Probability that the mask is wrong (Dice below 0.9) [1]."""
     cameras: tuple[tuple[str, float], ...] = ()
-    """Verdicts by camera, if there are several cameras."""
+    """Camera and its probability of failure [1], if there are several cameras."""
 
     def __post_init__(self) -> None:
         if self.verdict not in VERDICTS:
