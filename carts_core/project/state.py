@@ -352,8 +352,8 @@ _SOURCE_ORDER = (Source.HAND, Source.PROPAGATED, Source.OPTIMIZER, Source.MEASUR
 
 
 def corrected_sequence(sequence: Sequence, project: ProjectState) -> Sequence:
-    """Recording with the project's time offset, calibration and joint positions; `SequenceError` if no table row
-    matches a frame."""
+    """Recording with the project's time offset, calibration and joint positions; `SequenceError` if a frame has no
+    matching table row."""
     offset = project.get(Key.time_offset())
     if offset is not None and sequence.matching is not None and offset.seconds != sequence.matching.time_offset:
         sequence = sequence.with_time_offset(offset.seconds)

@@ -471,7 +471,7 @@ class Adapt(Jobs):
     """Adapt the network to the recording."""
 
     minutes: int = 15
-    """Limit of processor time [min]."""
+    """Processor time limit [min]."""
 
 
 class UseNetwork(Jobs):

@@ -72,7 +72,7 @@ class AdaptOptions:
     """Options of the adaptation of the network."""
 
     minutes: int
-    """Time limit [min]."""
+    """Processor time limit [min]."""
     folder: int
     """Number of the folder of the network."""
 

@@ -67,7 +67,7 @@ class JobsPanel:
                 min=1,
                 max=MAX_TRAINING_TIME,
                 step=1,
-                hint="Limit of processor time; training stops earlier if validation no longer improves",
+                hint="Processor time limit; training stops earlier if validation no longer improves",
             )
             page.button(
                 "Adapt the network",

@@ -78,7 +78,7 @@ class BatchPage:
         self.show()
 
     def click(self, u: float, v: float) -> None:
-        """Ignored, since no image is shown."""
+        """Do nothing, since no image is shown."""
 
     def fail(self, error: Exception) -> None:
         """Show an error."""

@@ -221,7 +221,7 @@ class StartPage:
         self._browser = None if self._browser is not None else new
 
     def click(self, u: float, v: float) -> None:
-        """Ignored, since no image is shown."""
+        """Do nothing, since no image is shown."""
 
     def fail(self, error: Exception) -> None:
         """Show an error."""
@@ -229,7 +229,7 @@ class StartPage:
         self.show()
 
     def close(self) -> None:
-        """Does nothing."""
+        """Do nothing."""
 
     def _card(self, project: RecentProject) -> tuple[RecentProject, str, str]:
         """Current entry of a project, the error if the project cannot be read, and the URL of the thumbnail."""

@@ -121,7 +121,7 @@ class Guess:
 
 
 def problem_of(error: CartsError) -> str:
-    """Message of an error without options of the command line, which do not apply in the page."""
+    """Message of an error, without advice on command-line options, which do not exist in the page."""
     return error.problem if isinstance(error, PartError) else str(error)
 
 
