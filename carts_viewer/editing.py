@@ -138,8 +138,8 @@ class People:
         ]
         if others:
             raise CartsError(
-                f"Steps of other active users are in between: {', '.join(sorted(set(others)))}. Revert your own steps "
-                "with Undo, or wait until they have left."
+                f"This would affect steps of other active users: {', '.join(sorted(set(others)))}. Revert your own "
+                "steps with Undo, or wait until they have left."
             )
         person.undone.clear()
         return project.go_to(position)
@@ -303,7 +303,7 @@ class Editor:
         """Undo or redo until this number of steps is in effect; drafts as in `undo`.
 
         Raises:
-            CartsError: steps of another present user are in between.
+            CartsError: steps of another present user would be undone or redone.
             ProjectError: the change could not be saved, or the project is read-only.
         """
         if self._dropped():

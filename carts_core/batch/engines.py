@@ -166,7 +166,7 @@ class Cluster:
         self._work, self._scheduler, self._workers, self._threads = work, scheduler, workers, threads
 
     def run(self, jobs: Sequence[Job]) -> Iterator[Outcome]:
-        """Run all jobs; yields outcomes in order of completion. `SettingsError` if the scheduler does not answer."""
+        """Run all jobs; yields outcomes in order of completion. `SettingsError` if the scheduler does not respond."""
         # These optional dependencies are not needed by worker processes on this machine.
         import dask.config  # noqa: PLC0415
         from distributed import Client, KilledWorker, LocalCluster, as_completed  # noqa: PLC0415
@@ -187,7 +187,7 @@ class Cluster:
                 client = held.enter_context(Client(address, timeout="10s"))
             except (OSError, ValueError) as error:
                 raise SettingsError(
-                    f"--scheduler {self._scheduler}: the scheduler does not answer ({error}). Start it with `dask "
+                    f"--scheduler {self._scheduler}: the scheduler does not respond ({error}). Start it with `dask "
                     "scheduler`, and workers with `dask worker ADDRESS --nthreads 1`, or use `local`."
                 ) from error
             futures = {client.submit(self._work, job, key=f"carts-{job.name}", pure=False): job for job in jobs}
