@@ -188,7 +188,7 @@ class People:
         return change
 
 
-MAX_DRAFT_LENGTH = 5.0
+MAX_DRAFT_SECONDS = 5.0
 """Time without a change after which a draft is saved [s]."""
 
 
@@ -284,7 +284,7 @@ class Editor:
         """Time until the draft is saved even if its gesture does not end [s]; None if there is no draft to save."""
         if self._view is None or not self.project.writable:
             return None
-        return max(0.0, self._changed_at + MAX_DRAFT_LENGTH - time.monotonic())
+        return max(0.0, self._changed_at + MAX_DRAFT_SECONDS - time.monotonic())
 
     def undo(self) -> Change | None:
         """Undo this user's last step, or drop a draft that cannot be saved.

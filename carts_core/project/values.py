@@ -484,10 +484,9 @@ def check_edit(identity: SequenceIdentity, key: Key[Any], value: object) -> None
     if key.kind not in _OF_FRAME and key.frame != WHOLE_PROJECT:
         raise ProjectError(f"{key.kind} applies to all frames, so no frame can be given ({key.frame}).")
     if key.kind in _OF_NOBODY:
-        known = [""]
-    else:
-        known = list(identity.arms if key.kind in _OF_ARM else identity.cameras)
-    if key.name not in known:
+        if key.name:
+            raise ProjectError(f"{key.kind} belongs to no arm or camera, so no name can be given ({key.name!r}).")
+    elif key.name not in (known := identity.arms if key.kind in _OF_ARM else identity.cameras):
         what = "arm" if key.kind in _OF_ARM else "camera"
         there = f"its {what}s are: {', '.join(known)}"
         raise ProjectError(f"the sequence has no {what} {key.name!r} for {key.kind}; {there}.")

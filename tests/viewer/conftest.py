@@ -111,7 +111,7 @@ def open_tab(browser: Browser, open_viewer: OpenViewer, monkeypatch: pytest.Monk
     Without a viewer one is opened, with the options of `open_viewer`. The browser has seen the page before, unless it
     is a `new` one. `asked` gets every address that the page asks for; `query` is appended to the page's address.
     """
-    monkeypatch.setattr(editing, "MAX_DRAFT_LENGTH", 1e6)
+    monkeypatch.setattr(editing, "MAX_DRAFT_SECONDS", 1e6)
     with ExitStack() as stack:
 
         def make(

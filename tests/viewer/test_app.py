@@ -218,10 +218,10 @@ def test_closing_ends_runs_and_reading_in_advance_and_saves_the_gesture_under_wa
     assert not app.wait_until_shown().unsaved
     app.queue.put(intents.ShowFrame(1))
     # A gesture without an end is saved after a while.
-    monkeypatch.setattr(editing, "MAX_DRAFT_LENGTH", 0.2)
+    monkeypatch.setattr(editing, "MAX_DRAFT_SECONDS", 0.2)
     app.queue.put(intents.SetJoint("PSM1", 0, 0.3))
     eventually(lambda: len(app.project.state.steps) == 2 and not app.state.unsaved)
-    monkeypatch.setattr(editing, "MAX_DRAFT_LENGTH", 1e6)
+    monkeypatch.setattr(editing, "MAX_DRAFT_SECONDS", 1e6)
     app.queue.put(intents.SetJoint("PSM1", 0, 0.2))
     app.wait_until_shown()
     app.close()
