@@ -273,7 +273,10 @@ def test_a_refinement_keeps_to_what_the_points_left_open_and_to_known_cameras(
     with pytest.raises(SystemExit):
         main(again)
     said = " ".join(capsys.readouterr().err.split())
-    assert "he base frame of PSM1 moves by" in said and "its hand-eye calibration has standard deviations" in said
+    assert (
+        "he calibration moves the base frame of PSM1 by" in said
+        and "its hand-eye calibration has standard deviations" in said
+    )
     assert "--beyond-hand-eye" in said and not (tmp_path / "moved").exists()
 
 

@@ -90,10 +90,10 @@ def test_with_a_network_the_mask_says_where_and_the_network_which_part(sequence:
 
 def test_frames_without_a_usable_mask_are_named(sequence: Sequence) -> None:
     frame = replace(sequence.frame(1), masks=None)
-    with pytest.raises(SettingsError, match=r"frame 002 has no mask of camera 'left' to fit\. Give a mask"):
+    with pytest.raises(SettingsError, match=r"frame 002 has no mask for camera 'left' to fit\. Give a mask"):
         FrameOptimizer(sequence.scene, frame, {}, MaskPredictor())
     small = MaskPredictor(masks=lambda _: {"left": np.zeros((24, 32), bool)})
-    with pytest.raises(SettingsError, match=r"has shape \(24, 32\), its image \(240, 320\)"):
+    with pytest.raises(SettingsError, match=r"has shape \(24, 32\), but its image has \(240, 320\)"):
         FrameOptimizer(sequence.scene, frame, {}, small)
 
 

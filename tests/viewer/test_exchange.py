@@ -337,10 +337,10 @@ def test_imported_masks_are_fitted_without_a_network_and_the_project_keeps_what_
 
 def test_what_cannot_be_fitted_is_said(at_desk: Desk) -> None:
     at_desk.do(intents.SetObserved("masks", "imported"))
-    with pytest.raises(CartsError, match=r"frame 001 has no imported mask of camera 'left' to fit\. Give a mask"):
+    with pytest.raises(CartsError, match=r"frame 001 has no imported mask for camera 'left' to fit\. Give a mask"):
         at_desk.do(intents.Run())
     at_desk.do(intents.SetObserved("masks", "recording"))
-    with pytest.raises(CartsError, match=r"frame 001 has no mask of camera 'left'"):
+    with pytest.raises(CartsError, match=r"frame 001 has no mask for camera 'left'"):
         at_desk.do(intents.Run())
     at_desk.do(intents.SetSetting("solver", "acs"))
     with pytest.raises(CartsError, match=r"cannot fit masks\. Choose the solver Surface maps"):
