@@ -93,10 +93,13 @@ class Export:
     frame_rate: float | None = None
     """Frame rate of a video [1/s]; by default the frame rate of the recording, or 25 if it has no timestamps."""
     masks: Masks = "auto"
-    """Masks of the formats masks, coco, yolo, voc, cvat and datumaro: `rendered` at the corrected pose, or `refined`
-    near their outline by the network; `auto` refines the masks of frames with the verdict *good*. Rendered masks of
-    refined views are written to the folder `rendered`."""
+    """Masks of the formats masks, coco, yolo, voc, cvat, datumaro and lerobot: `rendered` at the corrected pose, or
+    `refined` near their outline by the network; `auto` refines the masks of frames with the verdict *good*. Rendered
+    masks of refined views are written to the folder `rendered`."""
     network: Annotated[Network, tyro.conf.arg(name="")] = field(default_factory=Network)
+    recording: Path | None = None
+    """Recording to whose tables the results are added (lerobot); by default the one that the sequence was imported
+    from."""
     overwrite: bool = False
     """Replace an earlier export."""
     select: Annotated[Selection, tyro.conf.arg(name="")] = field(default_factory=Selection)
@@ -106,6 +109,8 @@ class Export:
         from ..export import FORMATS, Dataset, ExportProgress, export
         from ..recording import Sequence
 
+        if self.recording is not None and not FORMATS[self.format].source:
+            raise SettingsError(f"--recording: the format {self.format} is not written into a recording. Leave it out.")
         console = Terminal()
         sequence = Sequence.open(self.sequence, progress=console.print)
         domains = self.select.domain_names(sequence)
@@ -123,6 +128,7 @@ class Export:
             frame_rate=self.frame_rate,
             masks=self.masks,
             load_networks=self.network.load,
+            recording=self.recording,
         )
         with Bar(console=console) as bar:
             task = bar.add_task(f"{self.format}, {counted(len(frames), 'frame')}", total=None)

@@ -1,6 +1,7 @@
 """Tables and arrays from Parquet, NumPy and MATLAB files."""
 
 import io
+import json
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,11 @@ from ..files.reading import CALIBRATION, TABLE, read_bytes
 
 MAX_CELLS, MAX_ROWS, MAX_COLUMNS = 10_000_000, 1_500_000, 10_000
 """Maximum number of values, rows and columns of a table."""
-LIBRARIES = {"read_parquet": ("pyarrow.parquet",), "read_matlab": ("scipy.io",)}
+LIBRARIES = {
+    "read_parquet": ("pyarrow.parquet",),
+    "extended_parquet": ("pyarrow.parquet",),
+    "read_matlab": ("scipy.io",),
+}
 """Function -> modules to import before the memory limit applies."""
 
 
@@ -44,6 +49,69 @@ def read_parquet(path: Path) -> dict[str, Any]:
         nested = pyarrow.types.is_list(kind) or pyarrow.types.is_fixed_size_list(kind)
         columns[name] = _matrix(column.to_pylist()) if nested else column.to_numpy()
     return columns
+
+
+def extended_parquet(path: Path, columns: dict[str, list[Any]]) -> bytes:
+    """Content of a Parquet file with further columns; other columns, row groups and metadata are kept.
+
+    Args:
+        path: the file.
+        columns: name -> `["numbers", values]` with an array [rows] or [rows, values], or `["texts", texts, index]` or
+            `["images", files, index]` with the distinct values and the index of each row's value [rows]. An image is a
+            struct of `bytes` and `path`, as in the package `datasets`. Existing columns of the same names are replaced.
+
+    Raises:
+        OSError, ValueError: the file cannot be read, or has another number of rows.
+    """
+    import pyarrow  # noqa: PLC0415 - an extra
+    import pyarrow.parquet  # noqa: PLC0415
+
+    try:
+        file = pyarrow.parquet.ParquetFile(io.BytesIO(read_bytes(path, TABLE)))
+        lengths = [file.metadata.row_group(number).num_rows for number in range(file.metadata.num_row_groups)]
+        check_size(file.metadata.num_rows)
+        table = file.read()
+        described = json.loads((table.schema.metadata or {}).get(b"huggingface", b"{}"))
+        features = described.get("info", {}).get("features", {})
+        for name, (kind, values, *index) in columns.items():
+            array = _arrow(kind, values, *index)
+            place = table.schema.get_field_index(name)
+            table = table.append_column(name, array) if place < 0 else table.set_column(place, name, array)
+            if features:
+                sequence = "List" if '"List"' in json.dumps(features) else "Sequence"
+                features[name] = _feature(kind, values, sequence)
+        if features:
+            metadata = {**table.schema.metadata, b"huggingface": json.dumps(described).encode()}
+            table = table.replace_schema_metadata(metadata)
+        content = io.BytesIO()
+        with pyarrow.parquet.ParquetWriter(content, table.schema) as writer:
+            for start, length in zip(np.cumsum([0, *lengths]), lengths, strict=False):
+                writer.write_table(table.slice(int(start), length), row_group_size=max(length, 1))
+    except (pyarrow.ArrowException, AttributeError, TypeError, KeyError) as error:
+        raise ValueError(str(error)) from error
+    return content.getvalue()
+
+
+def _arrow(kind: str, values: Any, index: np.ndarray | None = None) -> Any:
+    """Arrow array of a column of `extended_parquet`."""
+    import pyarrow  # noqa: PLC0415 - an extra
+
+    if kind == "numbers":
+        flat = pyarrow.array(np.ascontiguousarray(values).reshape(-1))
+        return flat if values.ndim == 1 else pyarrow.FixedSizeListArray.from_arrays(flat, values.shape[1])
+    found = pyarrow.array(values, pyarrow.string() if kind == "texts" else pyarrow.binary()).take(pyarrow.array(index))
+    if kind == "texts":
+        return found
+    paths = pyarrow.nulls(len(found), pyarrow.string())
+    return pyarrow.StructArray.from_arrays([found, paths], ["bytes", "path"])
+
+
+def _feature(kind: str, values: Any, sequence: str) -> dict[str, Any]:
+    """Description of a column of `extended_parquet` in the metadata of the package `datasets`."""
+    if kind != "numbers":
+        return {"dtype": "string", "_type": "Value"} if kind == "texts" else {"_type": "Image"}
+    value = {"dtype": str(values.dtype), "_type": "Value"}
+    return value if values.ndim == 1 else {"feature": value, "length": int(values.shape[1]), "_type": sequence}
 
 
 def _matrix(rows: list[list[Any] | None]) -> Any:

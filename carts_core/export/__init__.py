@@ -15,6 +15,7 @@ from .encodings import mask_png as mask_png
 from .formats import FORMATS as FORMATS
 from .formats import ExportFormat as ExportFormat
 from .formats import export as export
+from .formats import formats_of as formats_of
 from .kinematics import KinematicsRow as KinematicsRow
 from .kinematics import kinematics_csv as kinematics_csv
 from .kinematics import read_kinematics_csv as read_kinematics_csv

@@ -233,6 +233,9 @@ class Dataset:
     """Function that loads the networks when the first mask is refined; without it, masks are rendered."""
     rendered_folder: OutputPath | None = None
     """Folder for the rendered masks of refined views."""
+    recording: Path | None = None
+    """Recording that the sequence was imported from, for formats that add results to it; by default that of the
+    sequence file."""
 
     def __post_init__(self) -> None:
         if not self.frames:

@@ -14,6 +14,8 @@ from jaxtyping import Float
 from ..errors import CartsError
 from ..files import MARKER, OutputPath, output_stream, published, published_file, write_text
 from ..model.camera import T_DVRK_OPENCV
+from ..recording import Sequence as Recording
+from ..recording.importing.importer import detect
 from ..settings import FormatName
 from .annotation_formats import (
     write_bop,
@@ -27,6 +29,7 @@ from .annotation_formats import (
 )
 from .dataset import Dataset, ExportFrame, ExportProgress
 from .kinematics import JOINED, joint_columns, joint_units, kinematics_csv, position_values, std_values
+from .lerobot_format import write_lerobot
 from .video import write_video
 
 
@@ -143,6 +146,9 @@ class ExportFormat:
     """Whether the format refers to images."""
     refines: bool = False
     """Whether masks can be refined; formats that describe poses contain rendered masks."""
+    source: str = ""
+    """Format of the imported recording (as in `carts import`) to whose tables the results are added; empty for formats
+    that any sequence can be exported to."""
 
 
 FORMATS: dict[FormatName, ExportFormat] = {
@@ -161,7 +167,18 @@ FORMATS: dict[FormatName, ExportFormat] = {
     "dvrk-2.3": ExportFormat("Base frames for the dVRK up to 2.3", write_dvrk_2_3, ".json"),
     "dvrk-suj": ExportFormat("Fixed set-up joints for the dVRK", write_dvrk_suj, ".json"),
     "video": ExportFormat("Overlay video", write_video),
+    "lerobot": ExportFormat("LeRobot data set", write_lerobot, refines=True, source="lerobot"),
 }
+
+
+def formats_of(sequence: Recording) -> dict[FormatName, ExportFormat]:
+    """Formats to which a sequence can be exported: those with a `source` only if it was imported from one."""
+    path = sequence.recording
+    try:
+        source = "" if path is None else detect(path).name
+    except CartsError:
+        source = ""
+    return {name: known for name, known in FORMATS.items() if known.source in ("", source)}
 
 
 def export(

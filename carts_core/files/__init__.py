@@ -24,5 +24,6 @@ from .writing import set_aside as set_aside
 from .writing import text_of_cell as text_of_cell
 from .writing import try_lock as try_lock
 from .writing import write_bytes as write_bytes
+from .writing import write_link as write_link
 from .writing import write_new as write_new
 from .writing import write_text as write_text

@@ -136,6 +136,17 @@ def output_stream(path: OutputPath | Path) -> Iterator[BinaryIO]:
         os.fsync(folder)
 
 
+def write_link(path: OutputPath, target: Path) -> None:
+    """Create a symbolic link to an input file in an unpublished folder (see `published`).
+
+    Raises:
+        OutputError: the link cannot be created.
+    """
+    assert path.draft, "links are only part of outputs that are published as a whole"
+    with explained(path), opened_folder(path.parent, make=True) as folder:
+        os.symlink(os.path.abspath(target), path.name, dir_fd=folder)
+
+
 def append_line(path: OutputPath | Path, line: bytes, *, sync: bool = True) -> None:
     """Append a line to a file, created if missing, and synchronize the file to disk if `sync`.
 
@@ -506,7 +517,9 @@ def _sync(folder: int, name: str) -> None:
         return
     for _, _, files, descriptor in os.fwalk(name, dir_fd=folder):
         for file in files:
-            _sync_file(descriptor, file)
+            found = status(descriptor, file)
+            if found is not None and not stat.S_ISLNK(found.st_mode):
+                _sync_file(descriptor, file)
         os.fsync(descriptor)
 
 

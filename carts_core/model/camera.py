@@ -5,7 +5,7 @@ from functools import lru_cache
 
 import cv2
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike
 
 from ..errors import SettingsError
@@ -194,6 +194,13 @@ class Camera:
             return cv2.remap(image.astype(np.uint8), *maps, cv2.INTER_NEAREST).astype(bool)
         return cv2.remap(image, *maps, interpolation)
 
+    def distorted_mask(self, mask: Bool[np.ndarray, "height width"]) -> Bool[np.ndarray, "height width"]:
+        """Mask of a recorded image, from a mask of the undistorted image; the inverse of `undistort` up to rounding."""
+        if not any(self.distortion):
+            return mask
+        columns, rows = _distortion_maps(self.width, self.height, self.intrinsics, self.distortion)
+        return cv2.remap(mask.astype(np.uint8), columns, rows, cv2.INTER_NEAREST).astype(bool)
+
     def resized(self, width: int, height: int) -> "Camera":
         """Copy of the camera at another image resolution, without distortion."""
         x, y = width / self.width, height / self.height
@@ -209,3 +216,16 @@ def _undistortion_maps(
     fx, fy, cx, cy = intrinsics
     K = np.array([[fx, 0.0, cx - HALF_PIXEL], [0.0, fy, cy - HALF_PIXEL], [0.0, 0.0, 1.0]])
     return cv2.initUndistortRectifyMap(K, np.array(distortion), np.eye(3), K, (width, height), cv2.CV_32FC1)
+
+
+@lru_cache(maxsize=8)
+def _distortion_maps(
+    width: int, height: int, intrinsics: tuple[float, ...], distortion: tuple[float, ...]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Column and row in the undistorted image of each pixel of a recorded image."""
+    fx, fy, cx, cy = intrinsics
+    K = np.array([[fx, 0.0, cx - HALF_PIXEL], [0.0, fy, cy - HALF_PIXEL], [0.0, 0.0, 1.0]])
+    rows, columns = np.mgrid[0:height, 0:width]
+    pixels = np.stack([columns.ravel(), rows.ravel()], 1).astype(np.float64)
+    found = cv2.undistortPoints(pixels[:, None], K, np.array(distortion), P=K).reshape(height, width, 2)
+    return found[..., 0].astype(np.float32), found[..., 1].astype(np.float32)

@@ -73,6 +73,7 @@ class Sequence:
         truth: arm -> true joint positions of all frames, for arms with ground truth; None without ground truth.
         remarks: sentences on changes to images and masks before they are used (rotation, scaling to 8 bits,
             deinterlacing), and on unusual calibrations.
+        recording: file or folder of the foreign recording that was imported, or None; it may be missing.
     """
 
     def __init__(self, description: Description) -> None:
@@ -89,6 +90,7 @@ class Sequence:
         truth = {name: arm.truth for name, arm in description.arms.items() if arm.truth is not None}
         self.truth = {name: samples.at_frames(*times) for name, samples in truth.items()} or None
         self.remarks = description.remarks
+        self.recording = description.recording
         moving = {name: camera.motion for name, camera in description.cameras.items() if camera.motion is not None}
         self._mounts = {name: np.linalg.inv(samples.at_frames(*times)) for name, samples in moving.items()}
         self._description = description

@@ -287,6 +287,8 @@ class Description:
     arms: Mapping[str, ArmInput]
     remarks: tuple[str, ...] = ()
     """Remarks on changes to images and masks before they are used, and on unusual calibrations."""
+    recording: Path | None = None
+    """File or folder of the foreign recording that was imported; None if not stated. It need not exist."""
 
 
 def read_description(path: Path, progress: Callable[[str], None] | None = None) -> Description:
@@ -296,6 +298,8 @@ def read_description(path: Path, progress: Callable[[str], None] | None = None) 
     name = root.take("name", str, path.stem)
     check_file_name(root, "name", "is", name)
     root.take("description", str, "")
+    recording = root.take("recording", str, None)
+    recording = None if recording is None else root.path(recording)
     domains = _take_domains(root)
     frames_section = root.take_table("frames") if "frames" in root else None
     rows = take_rows(root.take_table("kinematics"), frames_section)
@@ -311,7 +315,7 @@ def read_description(path: Path, progress: Callable[[str], None] | None = None) 
         for remark in remarks:
             progress(f"note: {remark}")
     by_name = {entry.camera.name: entry for entry in cameras}, {entry.arm.name: entry for entry in arms}
-    return Description(path, name, scene, domains, rows.frames, rows.matching, *by_name, remarks)
+    return Description(path, name, scene, domains, rows.frames, rows.matching, *by_name, remarks, recording)
 
 
 def _take_domains(root: TomlTable) -> tuple[str, ...]:
@@ -392,6 +396,7 @@ def calibrated_sequence_file(
                 for name, entry in value.items():
                     value[name] = relocate(entry) if isinstance(entry, str) else entry
 
+    move(document, "recording")
     move(document["kinematics"], "table", "truth")
     move(document.get("frames", {}), "table", "video")
     if time_offset is not None:

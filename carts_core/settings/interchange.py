@@ -99,6 +99,7 @@ FormatName = Literal[
     "dvrk-2.3",
     "dvrk-suj",
     "video",
+    "lerobot",
 ]
 """Names of the export formats."""
 

@@ -2,7 +2,7 @@
 
 import viser
 
-from carts_core.export import FORMATS, FormatName
+from carts_core.export import FORMATS, FormatName, formats_of
 from carts_core.project import Key, ProjectState, ReviewState
 from carts_viewer.actions import intents
 from carts_viewer.actions.import_export import FRAME_CHOICES, export_warnings, frames_within
@@ -14,7 +14,7 @@ from carts_viewer.transport.document import escaped
 _PARTS = {"Arm": "arms", "Part": "parts", "Link": "links"}
 _MASKS = {"Refined if good": "auto", "Refined": "refined", "As rendered": "rendered"}
 _DVRK = ("dvrk", "dvrk-2.3", "dvrk-suj")
-_WITHOUT_PARTS = ("masks", "coco-keypoints", "bop", "csv", "npz", "json", *_DVRK, "video")
+_WITHOUT_PARTS = ("masks", "coco-keypoints", "bop", "csv", "npz", "json", *_DVRK, "video", "lerobot")
 """Formats without categories, or with a fixed choice of categories."""
 _WRITTEN = (
     "Masks, keypoints and poses are those of the arms at the current joint positions; masks include "
@@ -32,7 +32,9 @@ class ExportPanel:
         cameras = len(session.scene.cameras)
         self._camera_names = [camera.name for camera in session.scene.cameras]
         self._kept = storage.scratch is None
-        self._formats: dict[str, FormatName] = {known.label: name for name, known in FORMATS.items()}
+        self._formats: dict[str, FormatName] = {
+            known.label: name for name, known in formats_of(session.sequence).items()
+        }
         self._counted: ProjectState | None = None
         self._chosen = ""
         self._range: tuple[int, int] | None = None
@@ -66,7 +68,9 @@ class ExportPanel:
         name = self._formats.get(self._format.value)
         self._parts.visible = name not in _WITHOUT_PARTS
         self._masks.visible = name is not None and FORMATS[name].refines
-        self._images.visible = name is not None and (FORMATS[name].images or name == "masks")
+        self._images.visible = name is not None and (
+            FORMATS[name].images or name == "masks" or bool(FORMATS[name].source)
+        )
         self._within.visible = state.range is not None
         self._range = state.range if self._within.value else None
         self._show_count(state)

@@ -219,6 +219,8 @@ class FoundRecording:
     """T_world_mount [m] of the mount that carries all cameras; None for static cameras."""
     domains: Mapping[str, str] = field(default_factory=dict)
     """Domain -> value of {domain} in patterns; empty for a single domain."""
+    path: Path | None = None
+    """File or folder that was imported; None if not known."""
 
 
 @dataclass(frozen=True)

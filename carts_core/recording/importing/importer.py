@@ -46,7 +46,8 @@ def detect(path: Path, name: str | None = None) -> Source:
 
 def find(path: Path, options: ImportOptions | None = None) -> FoundRecording:
     """Read a recording and complete it with defaults; nothing is written. `CartsError` for unusable content."""
-    options = _with_places(path.absolute(), options or ImportOptions())
+    path = path.absolute()
+    options = _with_places(path, options or ImportOptions())
     source = detect(path, options.source)
     parts: dict[str, Part] = {"images": "images", "kinematics": "kinematics"}
     for name in ("images", "kinematics", "columns", "clock", "time_offset", "frame_rate"):
@@ -58,7 +59,7 @@ def find(path: Path, options: ImportOptions | None = None) -> FoundRecording:
             remedy = f"Leave out {_option(name)}, or choose another format: --source."
             raise PartError(parts.get(name, "columns"), problem, remedy)
     try:
-        recording = source.read(path.absolute(), Import(options))
+        recording = replace(source.read(path, Import(options)), path=path)
         _check_names(recording, options)
         return completed(recording, options)
     except OSError as error:

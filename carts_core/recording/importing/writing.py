@@ -348,6 +348,7 @@ def _toml(recording: FoundRecording, place: Path) -> str:
     return render_page(
         "imported_sequence.toml",
         recording=recording,
+        path="" if recording.path is None else _relative(recording.path, place),
         arms=arms,
         cameras=cameras,
         timed=[arm for arm in recording.arms if arm.times is not None],

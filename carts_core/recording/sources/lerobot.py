@@ -17,12 +17,12 @@ from ..importing.found import FoundArm, FoundCamera, FoundRecording, Import, Par
 from ..importing.logs import arm_from_log, nearest
 from ..importing.row_matching import by_rows
 
-_STATE = "observation.state"
+STATE = "observation.state"
 _EPISODE = re.compile(r"episode_(\d+)\.parquet$")
 
 
 @dataclass(frozen=True, eq=False)
-class _Episode:
+class Episode:
     """Episode with its rows, and its location in the videos."""
 
     index: int
@@ -32,37 +32,52 @@ class _Episode:
     """Feature -> video, and number of the episode's first frame in the video."""
 
 
-def _root(path: Path) -> Path:
+def data_set_root(path: Path) -> Path:
     """Folder of the data set, given this folder or an episode file."""
     if path.is_file() and _EPISODE.search(path.name):
         return next((parent for parent in path.parents if (parent / "meta/info.json").is_file()), path)
     return path
 
 
-def _read(path: Path, job: Import) -> FoundRecording:
-    require_package("pyarrow", "import")
-    root = _root(path)
+def read_info(root: Path) -> tuple[dict[str, Any], dict[str, Any], float]:
+    """Read `meta/info.json` of a data set: its content, the features by name, and the frame rate [1/s]."""
     with well_formed(f"{root / 'meta/info.json'} is not a LeRobot description with features and fps"):
         info = parse_json(read_text(root / "meta/info.json", VALUES))
-        features, rate = dict(info["features"]), float(info["fps"])
-    wanted = _EPISODE.search(path.name)
-    cameras = [key for key, value in features.items() if isinstance(value, dict) and value.get("dtype") == "video"]
+        return info, dict(info["features"]), float(info["fps"])
+
+
+def read_episode(path: Path, info: dict[str, Any]) -> Episode:
+    """Read the episode of a data set's folder (its first one) or of an episode file."""
+    root, wanted = data_set_root(path), _EPISODE.search(path.name)
+    cameras = [
+        key
+        for key, value in dict(info["features"]).items()
+        if isinstance(value, dict) and value.get("dtype") == "video"
+    ]
     episode = _episode(root, info, cameras, int(wanted.group(1)) if wanted else 0)
-    rows = len(episode.table)
-    if not rows:
+    if not len(episode.table):
         raise SequenceError(f"{root}: episode {episode.index} has no rows. Name another one.")
+    return episode
+
+
+def _read(path: Path, job: Import) -> FoundRecording:
+    require_package("pyarrow", "import")
+    root = data_set_root(path)
+    info, features, rate = read_info(root)
+    episode = read_episode(path, info)
+    rows = len(episode.table)
     if (total := info.get("total_episodes", 1)) != 1:
         job.found(f"episode {episode.index} of {total}; to import another one, give its .parquet file.")
     ids = tuple(f"{number:06d}" for number in range(rows))
     arms = _arms(root, features, episode, job)
-    times = _times(episode, rate, job)
+    times = episode_times(episode, rate, job)
     arms, kept_ids, kept = by_rows(arms, ids, job, times)
     found = _cameras(root, episode, kept, times, job)
     kind = f"a LeRobot data set ({info.get('codebase_version', 'unknown version')})"
     return job.recording(kind, f"{root.name}-{episode.index:06d}", found, arms, kept_ids, times[kept])
 
 
-def _times(episode: _Episode, rate: float, job: Import) -> np.ndarray:
+def episode_times(episode: Episode, rate: float, job: Import) -> np.ndarray:
     """Times of an episode's rows, which are also those of its images [s]: from their column, else from the frame
     rate."""
     even = np.arange(len(episode.table)) / rate
@@ -84,12 +99,12 @@ def _times(episode: _Episode, rate: float, job: Import) -> np.ndarray:
     return even
 
 
-def _episode(root: Path, info: dict[str, Any], cameras: list[str], index: int) -> _Episode:
+def _episode(root: Path, info: dict[str, Any], cameras: list[str], index: int) -> Episode:
     chunk = index // max(int(info.get("chunks_size", 1000)), 1)
     old = root / f"data/chunk-{chunk:03d}/episode_{index:06d}.parquet"
     if old.is_file():
         videos = {key: (root / f"videos/chunk-{chunk:03d}/{key}/episode_{index:06d}.mp4", 0) for key in cameras}
-        return _Episode(index, _parquet(old), videos)
+        return Episode(index, _parquet(old), videos)
     # v3.0: many episodes in one file; meta/episodes has their positions.
     listed = sorted((root / "meta/episodes").rglob("*.parquet"))
     for file in listed:
@@ -102,7 +117,7 @@ def _episode(root: Path, info: dict[str, Any], cameras: list[str], index: int) -
     )
 
 
-def _v3(root: Path, row: dict[str, Any], cameras: list[str], rate: float, index: int) -> _Episode:
+def _v3(root: Path, row: dict[str, Any], cameras: list[str], rate: float, index: int) -> Episode:
     with well_formed(f"{root}: meta/episodes lacks values of episode {index}", "Copy the data set again."):
         chunk, file = int(row["data/chunk_index"]), int(row["data/file_index"])
         table = _parquet(root / f"data/chunk-{chunk:03d}/file-{file:03d}.parquet")
@@ -114,7 +129,7 @@ def _v3(root: Path, row: dict[str, Any], cameras: list[str], rate: float, index:
                 f"chunk-{int(row[f'videos/{key}/chunk_index']):03d}/file-{int(row[f'videos/{key}/file_index']):03d}.mp4"
             )
             videos[key] = (root / f"videos/{key}/{place}", round(float(row[f"videos/{key}/from_timestamp"]) * rate))
-    return _Episode(index, table, videos)
+    return Episode(index, table, videos)
 
 
 def _parquet(path: Path) -> ForeignTable:
@@ -122,35 +137,40 @@ def _parquet(path: Path) -> ForeignTable:
         return ForeignTable(path, read_parquet(path))
 
 
-def _names(value: Any) -> list[str]:
+def feature_names(value: Any) -> list[str]:
     """Column names of a feature, which may be nested in lists or under a key."""
     if isinstance(value, str):
         return [value]
     if isinstance(value, dict):
         value = list(value.values())
-    return [name for entry in value or () for name in _names(entry)]
+    return [name for entry in value or () for name in feature_names(entry)]
 
 
-def _arms(root: Path, features: dict[str, Any], episode: _Episode, job: Import) -> tuple[FoundArm, ...]:
-    if _STATE not in features or _STATE not in episode.table.columns:
-        raise SequenceError(f"{root} has no feature {_STATE}. Its features are: {', '.join(features)}.")
-    names = _names(features[_STATE].get("names"))
-    with well_formed(f"{root}: rows of {_STATE} differ in length", "Copy the data set again."):
-        values = np.array(episode.table.columns[_STATE].tolist(), np.float64)
+def state_table(root: Path, features: dict[str, Any], episode: Episode) -> ForeignTable:
+    """Columns of `observation.state` by their names; `SequenceError` if they are missing or inconsistent."""
+    if STATE not in features or STATE not in episode.table.columns:
+        raise SequenceError(f"{root} has no feature {STATE}. Its features are: {', '.join(features)}.")
+    names = feature_names(features[STATE].get("names"))
+    with well_formed(f"{root}: rows of {STATE} differ in length", "Copy the data set again."):
+        values = np.array(episode.table.columns[STATE].tolist(), np.float64)
     if values.ndim != 2 or len(names) != values.shape[1]:
         raise SequenceError(
-            f"{root}: {_STATE} has {values.shape[-1]} columns and {len(names)} names in meta/info.json. Correct them."
+            f"{root}: {STATE} has {values.shape[-1]} columns and {len(names)} names in meta/info.json. Correct them."
         )
-    table = ForeignTable(root / "meta/info.json", {name: values[:, index] for index, name in enumerate(names)})
+    return ForeignTable(root / "meta/info.json", {name: values[:, index] for index, name in enumerate(names)})
+
+
+def _arms(root: Path, features: dict[str, Any], episode: Episode, job: Import) -> tuple[FoundArm, ...]:
+    table = state_table(root, features, episode)
     meanings = guess_columns(table, job.options)
     if not meanings.arms:
         raise PartError(
             "columns",
-            f"{root}: {_STATE} has the columns {samples(table)}, among which neither six joints of a PSM nor a tip "
+            f"{root}: {STATE} has the columns {samples(table)}, among which neither six joints of a PSM nor a tip "
             "pose are recognized.",
             "Name them: --columns yaw COLUMN ..., or give the robot: --robot NAME FILE.urdf.",
         )
-    times = np.arange(len(values), dtype=float)
+    times = np.arange(len(table), dtype=float)
     arms = []
     for recorded, columns in meanings.arms.items():
         if (name := job.arm_name(recorded)) is not None:
@@ -159,13 +179,15 @@ def _arms(root: Path, features: dict[str, Any], episode: _Episode, job: Import) 
     return tuple(arms)
 
 
-def _cameras(
-    root: Path, episode: _Episode, kept: np.ndarray, times: np.ndarray, job: Import
-) -> tuple[FoundCamera, ...]:
+def videos_by_camera(episode: Episode) -> dict[str, str]:
+    """Camera -> feature with its video, as named by an import without options."""
+    return {side_of(key) or key.rsplit(".", 1)[-1]: key for key in episode.videos}
+
+
+def _cameras(root: Path, episode: Episode, kept: np.ndarray, times: np.ndarray, job: Import) -> tuple[FoundCamera, ...]:
     rows = len(times)
-    own = {side_of(key) or key.rsplit(".", 1)[-1]: key for key in episode.videos}
     cameras = []
-    for name, key in sorted((job.options.images or own).items()):
+    for name, key in sorted((job.options.images or videos_by_camera(episode)).items()):
         if key not in episode.videos:
             raise SequenceError(f"{root} has no video {key!r}. It has: {', '.join(episode.videos) or 'none'}.")
         video, start = episode.videos[key]
@@ -192,7 +214,7 @@ SOURCE = Source(
     "lerobot",
     "a LeRobot data set, v2.1 or v3.0",
     "a folder with meta/info.json, or an episode's .parquet file in one",
-    lambda path: (_root(path) / "meta/info.json").is_file(),
+    lambda path: (data_set_root(path) / "meta/info.json").is_file(),
     ("images", "columns", "time_offset"),
     _read,
 )

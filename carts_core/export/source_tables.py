@@ -1,0 +1,312 @@
+"""Recorded tables of an imported sequence: their rows, and the corrected values of their columns.
+
+An import converts recorded columns to joint positions [rad, m]. To write results back, the conversion of each column is
+identified by comparing the column with the imported positions of all frames: a joint's column is `scale * position +
+offset`, and the tip poses of an arm are T_reference_base T_base_tip(joint positions) T_tip_point. A recording whose
+columns are not related to the sequence in this way is another recording, and is refused.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from numpy import ndarray
+from scipy.spatial.transform import Rotation
+
+from ..errors import SequenceError
+from ..model.psm_kinematics import JOINT_NAMES, PsmGeometry, forward
+from ..model.robot import Robot
+from ..recording import Sequence as Recording
+from ..recording.importing.columns import ColumnMeanings, guess_columns
+from ..recording.importing.foreign_tables import ForeignTable
+from ..recording.importing.found import PartError
+from ..recording.importing.logs import ACCEPTED, CANDIDATES, fit_base_frame, fit_tool_point, transforms
+from ..recording.kinematics_table import LENGTH_UNITS
+from ..settings.interchange import ImportOptions
+from ..wording import counted
+from .dataset import ExportFrame
+
+POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
+"""Components of a tip pose: position and quaternion."""
+_SCALES = tuple(sign * scale for scale in (1.0, 180.0 / np.pi, 1e3, 1e2, 10.0) for sign in (1.0, -1.0))
+"""Scales of columns in the units of the importer, with both signs [1 per rad or m]."""
+_ROUNDING, _SINGLE = 2e-9, 2e-7
+"""Rounding of imported positions [rad, m], and relative rounding of single-precision columns."""
+_SAME_TIME = 1e-5
+"""Maximum difference of times that were rounded to single precision [s]."""
+_MIN_TOOL_POINT_ROWS = 4
+"""Minimum number of rows for the estimate of a point of the tool, which has three parameters."""
+_IDENTITY = 1e-6
+"""Deviation from the identity [m, 1] below which a fitted transform is considered the identity."""
+
+
+def source_of(recording: Path | None, sequence: Recording) -> Path:
+    """Path of the recording that a sequence was imported from: the given one, else that of the sequence file.
+
+    Raises:
+        SequenceError: no recording is known, or it does not exist.
+    """
+    path = recording or sequence.recording
+    if path is None:
+        raise SequenceError(
+            f"{sequence.path} does not name the recording it was imported from, and this format adds the results to "
+            "its tables. Give the recording: --recording PATH, or the key `recording` in the sequence file."
+        )
+    if not path.exists():
+        raise SequenceError(f"the recording {path} is missing. Give its current path: --recording PATH.")
+    return path.absolute()
+
+
+def as_imported(sequence: Recording) -> Recording:
+    """The sequence with the joint positions of its file at a time offset of 0, which are those of the recorded rows."""
+    opened = Recording.open(sequence.path)
+    return opened if opened.matching is None else opened.with_time_offset(0.0)
+
+
+def rows_of_frames(
+    sequence: Recording, rows: int, times: Float[ndarray, " rows"] | None, where: object
+) -> Int[ndarray, " frames"]:
+    """Row of each frame, for recordings whose frame ids are row numbers from 0.
+
+    Args:
+        sequence: the sequence, whose timestamps count from its first frame.
+        rows: number of rows of the recording.
+        times: times of the rows [s]; not compared if None.
+        where: the recording, for errors.
+
+    Raises:
+        SequenceError: a frame has no row, or a frame and its row differ in time.
+    """
+    numbers = [int(frame) if frame.isdecimal() else -1 for frame in sequence.frame_ids]
+    if wrong := [frame for frame, row in zip(sequence.frame_ids, numbers, strict=True) if not 0 <= row < rows]:
+        raise SequenceError(
+            f"{where} has {counted(rows, 'row')}, but frame {wrong[0]!r} of {sequence.path} is not one of them. Give "
+            "the recording from which the sequence was imported: --recording PATH."
+        )
+    found = np.array(numbers, int)
+    if times is not None and sequence.timestamps is not None:
+        own = times[found] - times[found].min()
+        late = np.abs(own - (sequence.timestamps - sequence.timestamps.min()))
+        if late.max() > _SAME_TIME + 1e-6 * own.max():
+            worst = int(late.argmax())
+            raise SequenceError(
+                f"frame {sequence.frame_ids[worst]!r} of {sequence.path} and its row of {where} are "
+                f"{late[worst]:.4g} s apart. Give the recording from which the sequence was imported: --recording PATH."
+            )
+    return found
+
+
+@dataclass(frozen=True, eq=False)
+class JointMap:
+    """Conversion of one joint: column = scale * position + offset."""
+
+    arm: str
+    joint: str
+    index: int
+    """Index of the joint in `Robot.joint_names`."""
+    column: str
+    scale: float
+    offset: float
+
+
+@dataclass(frozen=True, eq=False)
+class PoseMap:
+    """Conversion of the joint positions of a PSM to tip poses."""
+
+    arm: str
+    joints: tuple[int, ...]
+    """Indices of the six joints of the PSM in `Robot.joint_names`."""
+    columns: tuple[str, ...]
+    """Columns of the pose, in the order of `POSE`."""
+    geometry: PsmGeometry
+    T_reference_base: Float[ndarray, "4 4"]
+    T_tip_point: Float[ndarray, "4 4"]
+    scale: float
+    """Scale of lengths [1 per m]."""
+
+    def poses(self, joints: Float[ndarray, "rows 6"]) -> Float[ndarray, "rows 7"]:
+        """Poses at joint positions [rad, m], in the units of the columns."""
+        Ts = self.T_reference_base @ forward(joints, self.geometry) @ self.T_tip_point
+        return np.column_stack([Ts[:, :3, 3] * self.scale, Rotation.from_matrix(Ts[:, :3, :3]).as_quat()])
+
+
+@dataclass(frozen=True, eq=False)
+class ColumnMaps:
+    """Conversions of the columns of a table."""
+
+    joints: tuple[JointMap, ...] = ()
+    poses: tuple[PoseMap, ...] = ()
+
+    @property
+    def meanings(self) -> dict[str, str]:
+        """Column -> `ARM.JOINT`, or `ARM.tip.COMPONENT`."""
+        tips = {c: f"{one.arm}.tip.{part}" for one in self.poses for c, part in zip(one.columns, POSE, strict=True)}
+        return {**{one.column: f"{one.arm}.{one.joint}" for one in self.joints}, **tips}
+
+    def corrected(
+        self,
+        columns: Mapping[str, Float[ndarray, " rows"]],
+        frames: Sequence[ExportFrame],
+        rows: Int[ndarray, " frames"],
+    ) -> dict[str, Float[ndarray, " rows"]]:
+        """Corrected columns; recorded values remain in rows without a corrected frame.
+
+        Args:
+            columns: the recorded columns.
+            frames: exported frames; those with the source `measured` are not corrected.
+            rows: row of each exported frame.
+        """
+        own = [(frame, row) for frame, row in zip(frames, rows.tolist(), strict=True) if frame.source != "measured"]
+        found = {name: np.asarray(columns[name], np.float64).copy() for name in self.meanings}
+        if not own:
+            return found
+        changed = np.array([row for _, row in own])
+        positions = {
+            arm: np.stack([frame.joint_positions[arm] for frame, _ in own]) for arm in own[0][0].joint_positions
+        }
+        for joint in self.joints:
+            found[joint.column][changed] = joint.scale * positions[joint.arm][:, joint.index] + joint.offset
+        for pose in self.poses:
+            values = pose.poses(positions[pose.arm][:, pose.joints])
+            recorded = np.stack([columns[name][changed] for name in pose.columns[3:]], 1)
+            # A quaternion and its negative are the same rotation; the recorded sign is kept.
+            values[:, 3:] *= np.where((values[:, 3:] * recorded).sum(1) < 0, -1.0, 1.0)[:, None]
+            for name, corrected in zip(pose.columns, values.T, strict=True):
+                found[name][changed] = corrected
+        return found
+
+
+def column_maps(table: ForeignTable, sequence: Recording, rows: Int[ndarray, " frames"], where: object) -> ColumnMaps:
+    """Identify the columns of a table by their names and values.
+
+    Args:
+        table: table with a row per image.
+        sequence: the sequence `as_imported`.
+        rows: row of each frame of the sequence.
+        where: the recording, for errors.
+
+    Returns:
+        The conversions; without any if no column is recognized by its name.
+
+    Raises:
+        SequenceError: columns are recognized, but their values are not those of the sequence.
+    """
+    arms = {arm.name: arm for arm in sequence.scene.arms}
+    others = {
+        name: str(arm.robot.urdf) for name, arm in arms.items() if not set(JOINT_NAMES) <= set(arm.robot.joint_names)
+    }
+    try:
+        meanings = guess_columns(table, ImportOptions(robot=others))
+    except PartError:
+        return ColumnMaps()
+    joints: list[JointMap] = []
+    poses: list[PoseMap] = []
+    for recorded, columns in meanings.arms.items():
+        name = recorded or "PSM1"
+        if name not in arms and len(arms) == len(meanings.arms) == 1:
+            (name,) = arms
+        if name in arms:
+            measured = sequence.measured[name]
+            joints += joint_maps(name, arms[name].robot, columns, table, measured, rows)
+            if set(POSE) <= set(columns) and set(JOINT_NAMES) <= set(arms[name].robot.joint_names):
+                places = tuple(columns[part] for part in POSE)
+                values = np.stack([table.numbers(column).astype(np.float64)[rows] for column in places], 1)
+                found = pose_map(name, arms[name].robot, places, values, measured)
+                poses += [] if found is None else [found]
+    if not joints and not poses and _named(meanings, arms):
+        raise SequenceError(
+            f"the joint positions of {sequence.path} are not those of {where}. Give the recording from which the "
+            "sequence was imported: --recording PATH."
+        )
+    return ColumnMaps(tuple(joints), tuple(poses))
+
+
+def _named(meanings: ColumnMeanings, arms: Mapping[str, object]) -> bool:
+    """Whether a table has columns of an arm of the sequence."""
+    return any((name or "PSM1") in arms for name in meanings.arms) or len(meanings.arms) == len(arms) == 1
+
+
+def joint_maps(
+    arm: str,
+    robot: Robot,
+    columns: Mapping[str, str],
+    table: ForeignTable,
+    measured: Float[ndarray, "frames dofs"],
+    rows: Int[ndarray, " frames"],
+) -> list[JointMap]:
+    """Conversions of the joints of an arm (joint -> column) whose values fit; empty unless those of all joints but the
+    jaw fit."""
+    found: list[JointMap] = []
+    names = [name for name in robot.joint_names if name in columns]
+    for name in names:
+        index = robot.joint_names.index(name)
+        values, positions = table.numbers(columns[name]).astype(np.float64)[rows], measured[:, index]
+        used = np.ones(len(values), bool)
+        if name == "jaw" and (positions > 0).any():
+            used = positions > 0  # Negative jaw angles are imported as 0.
+        limits = robot.joint_limits[index].tolist()
+        fit = _linear(values[used], positions[used], limits)
+        if fit is not None:
+            found.append(JointMap(arm, name, index, columns[name], *fit))
+        elif name != "jaw":
+            return []
+    return found
+
+
+def _linear(
+    values: Float[ndarray, " n"], positions: Float[ndarray, " n"], limits: Sequence[float]
+) -> tuple[float, float] | None:
+    """Scale and offset that convert positions to the values of a column; None if no known unit fits."""
+    candidates = [(scale, 0.0) for scale in _SCALES]
+    lower, upper = limits
+    if np.isfinite([lower, upper]).all() and upper > lower:
+        percent = 200.0 / (upper - lower)
+        candidates += [(sign * percent, -sign * percent * (upper + lower) / 2) for sign in (1.0, -1.0)]
+    for scale, offset in candidates:
+        rounding = abs(scale) * _ROUNDING + _SINGLE * np.abs(values)
+        if (np.abs(scale * positions + offset - values) <= rounding).all():
+            return scale, offset
+    return None
+
+
+def pose_map(
+    arm: str,
+    robot: Robot,
+    columns: tuple[str, ...],
+    values: Float[ndarray, "frames 7"],
+    measured: Float[ndarray, "frames dofs"],
+) -> PoseMap | None:
+    """Conversion of the joint positions of a PSM to recorded tip poses in any frame; None if no instrument fits.
+
+    The instrument and unit of the smallest deviation are chosen. Poses of another point of the tool are only tried if
+    those of the tip do not fit.
+
+    Args:
+        values: recorded poses: position, and quaternion x y z w.
+        measured: joint positions of the same frames [rad, m].
+    """
+    indices = tuple(robot.joint_names.index(name) for name in JOINT_NAMES)
+    joints = measured[:, indices]
+    known: Bool[ndarray, " frames"] = np.isfinite(values).all(1) & (np.linalg.norm(values[:, 3:], axis=1) > 0.5)
+    if not known.any():
+        return None
+    best: PoseMap | None = None
+    deviation = ACCEPTED
+    for move in (False, True) if known.sum() >= _MIN_TOOL_POINT_ROWS else (False,):
+        for unit in LENGTH_UNITS.values():
+            Ts = transforms(np.column_stack([values[known, :3] * unit, values[known, 3:]]))
+            for geometry in CANDIDATES.values():
+                T_tip_point = np.eye(4)
+                if move:
+                    T_tip_point[:3, 3] = fit_tool_point(Ts, joints[known], geometry)[0]
+                fit = fit_base_frame(Ts @ np.linalg.inv(T_tip_point), joints[known], geometry)
+                if fit.deviation < deviation:
+                    T = fit.T_reference_base
+                    T = np.eye(4) if np.abs(T - np.eye(4)).max() < _IDENTITY else T
+                    best = PoseMap(arm, indices, columns, geometry, T, T_tip_point, 1.0 / unit)
+                    deviation = 0.5 * fit.deviation
+        if best is not None:
+            return best
+    return None
