@@ -318,7 +318,7 @@ def _problem(
         return "the best delay is at the end of the search range. Give a larger range, or check the clocks."
     if others:
         listed = ", ".join(f"{offset:.2f} s" for offset in others[:3])
-        return f"other delays explain as much ({listed}), as for periodic motion. Use a part with other motion."
+        return f"other delays are as good ({listed}), as for periodic motion. Use a part with other motion."
     if deviation > _MAX_DEVIATION:
         return f"the delays of parts of the recording differ (± {deviation:.2f} s). Check the clocks."
     return None

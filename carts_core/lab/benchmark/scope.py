@@ -196,5 +196,5 @@ METHODS |= BASELINES
 MAIN = ("unet", "start", "l1", "paper", "ours")
 """Methods of the main table, which treat each frame separately in one camera."""
 RENDERING = "surface"
-"""Mask of the surface network for an image and the rendering at the measured joint positions, which are the inputs of
-Colleoni et al."""
+"""Method whose mask is predicted by the surface network from the image and the rendering at the measured joint
+positions, the inputs of Colleoni et al."""

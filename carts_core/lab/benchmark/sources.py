@@ -175,7 +175,7 @@ def real_source(path: Path, scope: Scope, seed: int = TEST_SEED) -> Source:
     code = code_fingerprint((*_SYNTHESIS, *_ALTERING_CODE))
 
     def open_(progress: Progress) -> Counterfactual:
-        progress("backdrop of the real frames", 0, 1)
+        progress("rendering the backdrop of the real frames", 0, 1)
         return Counterfactual(sequence, camera.name, backdrop(camera.width, camera.height, seed), seed)
 
     taken = f"{len(frames)} of {counted(len(masked), 'frame')} with masks evaluated with all methods"

@@ -169,7 +169,7 @@ def pair_table(data: Measurements) -> Table | None:
                 "s, ours": f"{median(reached):.2f}" if reached else NO_VALUE,
                 "times faster": f"{median(pair.ratio for pair in chosen):.1f}" if chosen else NO_VALUE,
                 "never reached": str(len(chosen) - len(reached)),
-                f"steps to within {NEAR_FINAL}": f"{median(steps):g}",
+                f"iterations to within {NEAR_FINAL}": f"{median(steps):g}",
             }
         )
     return table_of("pairs", rows, steps=PAPERS_STEPS, gained=MIN_GAIN)

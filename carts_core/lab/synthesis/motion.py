@@ -253,7 +253,7 @@ _FREE = 1.5
 """Maximum motion of a joint without limits, to either side [rad, m]."""
 
 _ERROR = {"revolute": (0.02, 0.004, 0.0005), "prismatic": (0.002, 0.0004, 0.00005)}
-"""Default bias, drift and noise of a joint [rad, m], used if the settings are those of an instrument."""
+"""Default bias, drift and noise of a joint [rad, m], used if the settings are the defaults."""
 
 _TURN = 0.6
 """Random range (three standard deviations) of the direction from which the arm enters the image [rad]."""
@@ -265,8 +265,7 @@ def enlargement(config: EndoscopeConfig) -> float:
 
 
 def measurement_error(robot: Robot, error: MeasurementError) -> MeasurementError:
-    """Given measurement error; typical values for the robot's joint types if the settings are those of an
-    instrument."""
+    """The given measurement error, or typical values for the robot's joint types if the settings are the defaults."""
     if error != MeasurementError():
         return error
     values = [_ERROR[kind] for kind in robot.joint_types]

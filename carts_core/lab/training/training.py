@@ -69,7 +69,7 @@ Panels = list[list[tuple[str, np.ndarray]]]
 
 
 def write_report(folder: OutputPath, config: dict, history: History, columns: dict[str, str], examples: Panels) -> Path:
-    """Write `curves.png`, `predictions.jpg` and `README.md`; returns the path of the page."""
+    """Write `curves.png`, `predictions.jpg` and `README.md`; returns the path of `README.md`."""
     with output_stream(folder / "curves.png") as stream:
         _curves(history, columns).savefig(stream, format="png", dpi=110)
     with output_stream(folder / "predictions.jpg") as stream:

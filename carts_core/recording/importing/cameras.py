@@ -127,8 +127,8 @@ def check_intrinsics(camera: FoundCamera, job: Import) -> None:
     raise PartError(
         "calibration",
         f"the calibration of {camera.name} has {problem}. Give another calibration, or the size of the calibration "
-        f"images, to scale it; if you give the size of these images ({camera.size[0]}x{camera.size[1]}), it is "
-        "accepted unchanged.",
+        f"images, so that it can be scaled; if you give the size of these images ({camera.size[0]}x{camera.size[1]}), "
+        "it is accepted unchanged.",
         f"Options: --calibration {camera.name} FILE, --calibration-size {camera.name} WIDTHxHEIGHT.",
         about=camera.name,
     )

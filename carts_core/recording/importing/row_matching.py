@@ -83,7 +83,7 @@ def frame_times(images: Images, ids: tuple[str, ...], job: Import) -> FrameTimes
         video = images.times[[position[frame] for frame in ids]]
         spacing = np.diff(video)
         if len(spacing) and np.ptp(spacing) > 0.1 * np.median(spacing):
-            job.found(f"times of the images are those of {name}.")
+            job.found(f"image times are taken from {name}.")
             return _without_rate(replace(found, times=video, source=name), job)
     if rate is not None:
         times = _numbered(ids, job) / rate
@@ -91,10 +91,10 @@ def frame_times(images: Images, ids: tuple[str, ...], job: Import) -> FrameTimes
             own = (len(video) - 1) / (video[-1] - video[0])
             if abs(own / rate - 1) > 0.01:
                 job.warning(f"{name} has {own:.4g} images/s; the given frame rate of {rate:g} images/s is used.")
-        job.found(f"times of the images are those at {rate:g} images/s.")
+        job.found(f"image times are computed from {rate:g} images/s.")
         return replace(found, times=times, source="the given frame rate", given=True)
     if video is not None:
-        job.found(f"times of the images are those of {name}.")
+        job.found(f"image times are taken from {name}.")
         return replace(found, times=video, source=name, nominal=True)
     return found
 
@@ -264,7 +264,7 @@ def _by_image(
         if len(finite) and (np.diff(finite) > 0).all():
             taken = own
             if frames.times is not None:
-                job.found(f"times of the images are those of their rows instead of those of {frames.source}.")
+                job.found(f"image times are taken from their rows instead of {frames.source}.")
     return RowMatch(np.where(positions >= 0, positions.astype(float), np.nan), True, taken)
 
 

@@ -196,8 +196,8 @@ def _cameras(root: Path, episode: Episode, kept: np.ndarray, times: np.ndarray, 
         images = find_images(video)
         if len(images.ids) < start + rows:
             raise SequenceError(
-                f"video {video} has {len(images.ids)} frames, but episode {episode.index} is frames {start} to "
-                f"{start + rows - 1}. Copy it again."
+                f"video {video} has {len(images.ids)} frames, but episode {episode.index} consists of frames {start} "
+                f"to {start + rows - 1}. Copy it again."
             )
         job.found(f"{key}, {images.size[0]} x {images.size[1]}.", name)
         numbers = start + kept

@@ -80,7 +80,7 @@ MUTATIONS: dict[str, tuple[Callable[[Path], object], str]] = {
     "missing video": (remove(VIDEO), r"episode_000000\.mp4 is missing"),
     "short video": (
         lambda p: write_video(p / VIDEO, [image(0), image(1)], 30),
-        "has 2 frames, but episode 0 is frames 0 to 3",
+        "has 2 frames, but episode 0 consists of frames 0 to 3",
     ),
     "poses elsewhere": (
         lambda p: write_parquet(p / FIRST, {"observation.state": [[1.0, 2, 3, 0, 0, 0, 1, 0]] * 4}),
