@@ -8,7 +8,7 @@ import tyro
 from rich.console import Console
 
 from ..console import Terminal
-from ..settings.interchange import ImportOptions
+from ..settings.interchange import AnnotationFormat, ImportOptions
 from .options import SequencePath
 
 if TYPE_CHECKING:
@@ -77,8 +77,9 @@ def _rate(times: "np.ndarray") -> float:
 class ImportMasks:
     """Import masks and keypoints into the project of a sequence, as layers separate from painted layers.
 
-    Reads COCO (.json), CVAT for images (.xml), folders of PNG masks, EndoVis 2017 and 2018, and keypoints of SurgPose.
-    The import is one undo step in `carts view`.
+    Reads COCO, LabelMe, X-AnyLabeling and Label Studio (.json), CVAT for images (.xml), YOLO segmentation labels,
+    folders of mask images, EndoVis 2017 and 2018, and keypoints of SurgPose. The import is one undo step in `carts
+    view`.
     """
 
     sequence: SequencePath
@@ -89,6 +90,8 @@ class ImportMasks:
     """Project file; by default the project beside the sequence."""
     camera: str | None = None
     """Camera of the images, if its name does not occur in the names of files and folders."""
+    format: AnnotationFormat | None = None
+    """Format of the source; recognized by content by default."""
     replace: bool = False
     """Replace earlier imports. Painted layers are not changed."""
 
@@ -100,7 +103,7 @@ class ImportMasks:
 
         console = Terminal()
         sequence = Sequence.open(self.sequence, progress=console.print)
-        found = read_annotations(self.source, sequence, self.camera)
+        found = read_annotations(self.source, sequence, self.camera, format=self.format)
         with Project.open(sequence, self.project) as project:
             report = import_annotations(project, found, source=self.source.name, replace=self.replace)
             console.print(report.sentence())

@@ -123,7 +123,7 @@ def _tiff_orientation(content: bytes) -> int:
 
 def size_problem(content: bytes) -> str | None:
     """Reason to refuse an image, as a clause that follows the file name; None if it can be decoded."""
-    size = _size(content)
+    size = encoded_size(content)
     if size is None:
         return "cannot be decoded; it must be a JPEG, PNG, TIFF, BMP, WebP or PPM image"
     if size == _FAR_TOO_LARGE:
@@ -144,7 +144,8 @@ def pixels_problem(width: int, height: int) -> str | None:
     return None
 
 
-def _size(content: bytes) -> tuple[int, int] | None:
+def encoded_size(content: bytes) -> tuple[int, int] | None:
+    """Width and height in the header of an encoded image; None if they cannot be read."""
     if content.startswith(PNG):
         # IHDR is always the first chunk.
         header = content[16:24] if content[12:16] == b"IHDR" else b""
@@ -219,6 +220,7 @@ SEQUENCE = Kind("sequence file", MIB)
 VALUES = Kind("JSON file", 64 * MIB)
 TABLE = Kind("table", 256 * MIB)
 IMAGE = Kind("image", 256 * MIB)
+LABELS = Kind("label file", 16 * MIB)
 CALIBRATION = Kind("calibration", 4 * MIB)
 SETTINGS = Kind("settings file", MIB)
 ROBOT = Kind("URDF", 16 * MIB)

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 MaskLayer = Literal["imported", "painted"]
 """Source of masks in a project."""
 
-_LEFT_OUT = {"ignore", "ignored", "void"}
+_LEFT_OUT = {"ignore", "ignored", "void", "__ignore__"}
 """Names of labels for pixels that are neither instrument nor background."""
 
 Masks = dict[str, Bool[np.ndarray, "height width"]]

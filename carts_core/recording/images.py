@@ -25,6 +25,7 @@ from ..files.reading import (
     PNG,
     TIFF,
     ImageTraits,
+    encoded_size,
     image_traits,
     open_regular,
     png_chunks,
@@ -186,6 +187,19 @@ def decode_image(content: bytes, what: str) -> UInt8[np.ndarray, "height width 3
     return _eight_bits(_raster(content, what, colour=True), what)
 
 
+def decode_mask(content: bytes, what: str, largest: tuple[int, int]) -> Bool[np.ndarray, "height width"]:
+    """Pixels other than 0 of an encoded grey or palette image in memory; images above the height and width `largest`
+    [px] raise `SequenceError` and are not decoded."""
+    size = encoded_size(content)
+    if size is not None and (size[0] > largest[1] or size[1] > largest[0]):
+        raise SequenceError(f"{what} is {size[0]} x {size[1]} pixels; at most {largest[1]} x {largest[0]} are allowed.")
+    raster = _raster(content, what, colour=False)
+    values = raster.grey if raster.indices is None else raster.indices
+    if values is None:
+        raise SequenceError(f"{what} has colours. Save it as a grey image.")
+    return values > 0
+
+
 def read_mask(path: Path) -> Bool[np.ndarray, "height width"]:
     """Read a mask file: instruments are white, of one colour, or opaque on transparent; values of at least 128 of 255
     count as white. Label images raise `SequenceError`."""
@@ -224,6 +238,8 @@ class LabelImage:
     """Colour of each pixel, RGB."""
     remarks: tuple[str, ...]
     """Remarks on changes and on the interpretation, as clauses that follow the file's name."""
+    lossy: bool = False
+    """Whether compression changed the values."""
 
 
 def read_labels(path: Path) -> LabelImage:
@@ -231,8 +247,8 @@ def read_labels(path: Path) -> LabelImage:
     raster = _decode(path, colour=False)
     grey, remarks = raster.grey, _orientation_remarks([raster.traits])
     mask = _white_part(raster, f"mask {path}")
-    if grey is None and raster.indices is not None:
-        grey, mask = raster.indices, None
+    if (indices := _label_indices(raster, mask)) is not None:
+        grey, mask = indices, None
         remarks.append("labels are palette indices")
     elif raster.opaque is not None:
         remarks.append("the mask is taken from the alpha channel")
@@ -243,7 +259,7 @@ def read_labels(path: Path) -> LabelImage:
             remarks.append(f"grey borders; values of at least {(raster.white + 1) // 2} are instrument")
     colours = raster.pixels if raster.pixels.ndim == 3 else np.repeat(raster.pixels[..., None], 3, -1)
     colours = colours if colours.dtype == np.uint8 else (colours >> 8).astype(np.uint8)
-    return LabelImage(mask, grey, colours, tuple(remarks))
+    return LabelImage(mask, grey, colours, tuple(remarks), raster.traits.lossy)
 
 
 def mask_remarks(files: Iterable[Path]) -> tuple[str, ...]:
@@ -405,6 +421,16 @@ _TO_UPRIGHT: dict[int, Callable[[np.ndarray], np.ndarray]] = {
 """EXIF orientation -> rotation or reflection of the stored image to the upright image."""
 
 
+def _label_indices(raster: _Raster, mask: np.ndarray | None) -> np.ndarray | None:
+    """Palette indices of a label image; None without a palette, for a palette of grey values in their order, and for a
+    mask in black and white."""
+    indices, grey = raster.indices, raster.grey
+    if indices is None or grey is None:
+        return indices
+    binary = mask is not None and len(np.unique(indices)) <= 2
+    return None if binary or np.array_equal(indices, grey) else indices
+
+
 def _fewest_bits(largest: int) -> int:
     return next(depth for depth in DEPTHS if largest < 2**depth)
 
@@ -448,7 +474,8 @@ def _is_two_valued(grey: np.ndarray, raster: _Raster) -> bool:
     noisy = raster.traits.lossy or len(np.unique(grey)) > _MAX_LABELS
     tolerance = _NEAR if noisy else 0
     near = (flat <= tolerance) | (flat >= top - tolerance)
-    return top == 0 or (top >= 0.5 * raster.white and bool(near.all()))
+    black = top <= (_NEAR if raster.traits.lossy else 0)
+    return black or (top >= 0.5 * raster.white and bool(near.all()))
 
 
 def _flat_values(grey: np.ndarray) -> np.ndarray:

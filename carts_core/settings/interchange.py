@@ -15,6 +15,9 @@ LengthUnit = Literal["m", "dm", "cm", "mm"]
 Axes = Literal["opencv", "dvrk"]
 """Camera axes: x right, y down (OpenCV), or x left, y up (dVRK); z is the viewing direction in both."""
 
+AnnotationFormat = Literal["coco", "cvat", "label-studio", "labelme", "masks", "surgpose", "yolo"]
+"""Formats of imported annotations; X-AnyLabeling is an extension of LabelMe, and `masks` a folder of mask images."""
+
 NO_TABLE = Path("none")
 """Value of `kinematics` for images without joint data."""
 SECONDS: Mapping[Clock, float] = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}

@@ -348,10 +348,10 @@ class ImportingHandler(Handler):
         session = self._session
         given = intent.path.strip()[:_MAX_PATH_LENGTH]
         if not given:
-            raise CartsError("Enter the path of the masks: a COCO or CVAT file, or a folder of PNG masks.")
+            raise CartsError("Enter the path of the masks: an annotation file, or a folder of masks or labels.")
         # The folder is resolved, since it may be reached through a link.
         path = session.roots.checked(session.sequence.path.parent.resolve() / Path(given))
-        found = read_annotations(path, session.sequence, intent.camera, confined=True)
+        found = read_annotations(path, session.sequence, intent.camera, format=intent.format, confined=True)
         self._context.end_run("Stopped: masks were imported")
         self._context.save()
         report = import_annotations(session.editor.project, found, source=path.name, replace=intent.replace)

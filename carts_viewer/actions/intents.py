@@ -9,7 +9,7 @@ from typing import Any, ClassVar, Literal
 
 from carts_core.export import FormatName, Parts
 from carts_core.project import ReviewState
-from carts_core.settings import Direction, Masks
+from carts_core.settings import AnnotationFormat, Direction, Masks
 from carts_viewer.picture.layers import Layer
 from carts_viewer.picture.strokes import Stroke, Target, Tool
 from carts_viewer.state import Against, Reach
@@ -554,6 +554,8 @@ class ImportMasks(Intent):
     """Path of the file or folder, relative to the sequence's folder, or absolute in an allowed folder."""
     camera: str | None = None
     """Camera of the masks; None to infer it from the file names."""
+    format: AnnotationFormat | None = None
+    """Format of the source; None to recognize it by content."""
     replace: bool = False
     """Whether previously imported layers may be replaced."""
 

@@ -4,6 +4,7 @@ import viser
 
 from carts_core.export import FORMATS, FormatName, formats_of
 from carts_core.project import Key, ProjectState, ReviewState
+from carts_core.settings import AnnotationFormat
 from carts_viewer.actions import intents
 from carts_viewer.actions.import_export import FRAME_CHOICES, export_warnings, frames_within
 from carts_viewer.panels.inputs import PanelPage
@@ -123,7 +124,22 @@ class ExportPanel:
 
 
 _BY_NAME = "By name"
-_HINT = "Path in the recording's folder: a COCO (.json) or CVAT (.xml) file, SurgPose keypoints, or a folder of PNGs"
+_HINT = (
+    "Path in the recording's folder: a file of COCO, LabelMe or Label Studio (.json), CVAT (.xml) or SurgPose, or a "
+    "folder of LabelMe files, YOLO labels or mask images"
+)
+_BY_CONTENT = "By content"
+_FORMATS: dict[str, AnnotationFormat | None] = {
+    _BY_CONTENT: None,
+    "COCO": "coco",
+    "CVAT": "cvat",
+    "Label Studio": "label-studio",
+    "LabelMe": "labelme",
+    "Mask images": "masks",
+    "SurgPose": "surgpose",
+    "YOLO": "yolo",
+}
+"""Choices of the format of imported annotations."""
 
 
 class ImportPanel:
@@ -137,13 +153,15 @@ class ImportPanel:
             self._camera = gui.add_dropdown(
                 "Camera", [_BY_NAME, *cameras], visible=len(cameras) > 1, hint="Camera whose images were annotated"
             )
+            self._format = gui.add_dropdown("Source format", [*_FORMATS], hint="Format of the annotations")
             self._replace = gui.add_checkbox("Replace", False, hint="Replace earlier imports")
             self._import = page.button("Import masks", lambda _: self._intent(), icon=viser.Icon.FILE_IMPORT)
             self._text = gui.add_html("")
 
     def _intent(self) -> intents.ImportMasks:
         camera = None if self._camera.value == _BY_NAME else self._camera.value
-        return intents.ImportMasks(str(self._path.value), camera, bool(self._replace.value))
+        chosen = _FORMATS.get(str(self._format.value))
+        return intents.ImportMasks(str(self._path.value), camera, chosen, bool(self._replace.value))
 
     def show(self, state: ViewState) -> None:
         """Update the text."""

@@ -19,7 +19,7 @@ from carts_core.files.reading import Kind, RefusedFileError, parse_json, parse_t
 from carts_core.model.meshes import mesh_path, read_mesh
 from carts_core.model.robot import Robot
 from carts_core.networks.weights import read_weights
-from carts_core.recording.annotations.formats import read_coco
+from carts_core.recording.annotations.recognition import recognized
 from carts_core.recording.images import read_image
 from carts_core.recording.importing.foreign_tables import read_foreign_table
 from carts_core.recording.importing.importer import find
@@ -171,7 +171,7 @@ POINTER = "version https://git-lfs.github.com/spec/v1\noid sha256:4d7a214614ab\n
         ("sequence.toml", read_toml),
         ("table.csv", read_foreign_table),
         ("table.parquet", read_foreign_table),
-        ("masks.json", lambda path: next(read_coco(path, Counter()))),
+        ("masks.json", lambda path: recognized(path, None, Counter())),
     ],
 )
 def test_git_lfs_pointers_are_recognized_everywhere(tmp_path: Path, name: str, read: Callable[[Path], object]):

@@ -1,6 +1,7 @@
 """Small files of every kind that can be read, which are large or slow for a decoder that takes them as they are."""
 
 import atexit
+import base64
 import io
 import json
 import shutil
@@ -93,7 +94,7 @@ READERS: dict[str, Callable[[Path], object]] = {
     "urdf": lambda path: parsed_urdf(read_text(path, ROBOT), path),
     "xacro": _expanded,
     **{kind: lambda path: read_mesh(path, np.ones(3), "a test") for kind in ("dae", "obj", "stl", "ply", "glb")},
-    **dict.fromkeys(("coco", "cvat", "surgpose"), _annotations),
+    **dict.fromkeys(("coco", "cvat", "surgpose", "labelme", "label studio", "yolo"), _annotations),
     "safetensors": read_weights,
     "onnx": _onnx,
     "project": _project,
@@ -110,6 +111,21 @@ def _text(name: str, text: str | bytes | Callable[[], str | bytes]) -> Maker:
         _fill(folder)
         (folder / name).write_bytes(content if isinstance(content, bytes) else content.encode())
         return folder / name
+
+    return make
+
+
+def _yolo(text: str | Callable[[], str]) -> Maker:
+    """Writes a data set of YOLO with this content of a label file, or of the YAML file if it has `names`."""
+
+    def make(folder: Path) -> Path:
+        content = text() if callable(text) else text
+        _fill(folder)
+        (folder / "labels").mkdir()
+        named = content.startswith("names")
+        (folder / "data.yaml").write_text(content if named else "names: [a]")
+        (folder / "labels" / "001.txt").write_text("0 0.1 0.1 0.9 0.1 0.9 0.9" if named else content)
+        return folder / "data.yaml"
 
     return make
 
@@ -764,6 +780,53 @@ SURGPOSE = {
 }
 
 
+def _labelme(*shapes: dict[str, Any], times: int = 1, **changes: Any) -> str:
+    head = {"version": "5.5.0", "flags": {}, "imagePath": "001.png", "imageData": None}
+    return json.dumps(head | {"imageHeight": 48, "imageWidth": 64, "shapes": [*shapes] * times} | changes)
+
+
+def _png_text(side: int) -> str:
+    content = cv2.imencode(".png", np.zeros((side, side), np.uint8))[1].tobytes()
+    return base64.b64encode(content).decode()
+
+
+_TRIANGLE_SHAPE = {"label": "a", "shape_type": "polygon", "points": [[1, 1], [60, 1], [60, 40]]}
+LABELME = {
+    "huge image": lambda: _labelme(_TRIANGLE_SHAPE, imageHeight=10**9, imageWidth=10**9),
+    "many shapes": lambda: _labelme(_TRIANGLE_SHAPE, times=60_000),
+    "large polygon": lambda: _labelme({"label": "a", "points": [[1, 2], [50, 40]] * 200_000}),
+    "large mask": lambda: _labelme(
+        {"label": "a", "shape_type": "mask", "points": [[0, 0], [5999, 5999]], "mask": _png_text(6000)}, times=200
+    ),
+    "large circles": lambda: _labelme(
+        {"label": "a", "shape_type": "circle", "points": [[30, 30], [30_000, 30]]}, times=5_000
+    ),
+    "large picture": lambda: _labelme(_TRIANGLE_SHAPE, imageData="A" * 4_000_000),
+}
+
+
+def _studio(value: dict[str, Any], times: int = 1, **region: Any) -> str:
+    one = {"original_width": 64, "original_height": 48, "to_name": "image", "type": "brushlabels", "value": value}
+    return json.dumps([{"data": {"image": "001.png"}, "annotations": [{"result": [one | region] * times}]}])
+
+
+_HEAD = [0, 0, 48, 0, 0x38 | 0x1, 0x1B, 0xF8 | 0x7]
+"""Beginning of the run lengths of 48 x 64 pixels."""
+LABEL_STUDIO = {
+    "huge count": lambda: _studio({"rle": [255] * 2_000}, original_width=10**6, original_height=1000),
+    "false count": lambda: _studio({"rle": [255] * 1_000_000}),
+    "long runs": lambda: _studio({"rle": [*_HEAD, *[0] * 1_000_000]}),
+    "many regions": lambda: _studio({"points": [[1, 1], [90, 1], [90, 90]]}, times=20_000),
+    "many tasks": lambda: json.dumps([{"data": {"image": "001.png"}, "annotations": []}] * 200_000),
+    "large ellipses": lambda: _studio({"x": 50, "y": 50, "radiusX": 4000, "radiusY": 4000}, times=5_000),
+}
+YOLO = {
+    "many lines": lambda: "0 0.1 0.1 0.9 0.1 0.9 0.9\n" * 60_000,
+    "large polygon": lambda: "0 " + "0.1 0.2 " * 400_000,
+    "many names": lambda: "names: [" + "a, " * 200_000 + "a]",
+}
+
+
 def _tensors(header: str | dict[str, Any], length: int | None = None, body: bytes = bytes(64)) -> bytes:
     text = (header if isinstance(header, str) else json.dumps(header)).encode()
     return struct.pack("<Q", len(text) if length is None else length) + text + body
@@ -885,6 +948,9 @@ RIGHT: dict[str, Maker] = {
     "coco": _text("a.json", _coco),
     "cvat": _text("a.xml", _cvat('<polygon label="a" points="1,1;60,1;60,40"/>')),
     "surgpose": _text("a.yaml", "0: {1: [1, 2]}"),
+    "labelme": _text("a.json", lambda: _labelme(_TRIANGLE_SHAPE)),
+    "label studio": _text("a.json", lambda: _studio({"points": [[1, 1], [90, 1], [90, 90]]})),
+    "yolo": _yolo("0 0.1 0.1 0.9 0.1 0.9 0.9\n"),
     "onnx": _text("a.onnx", lambda: _graph(_filled(4))),
     "project": _changed_project(),
     "batch": _text("job.json", '{"format": "carts-job/1"}'),
@@ -944,6 +1010,9 @@ CASES: dict[str, dict[str, Maker]] = {
     "coco": _named("a.json", COCO),
     "cvat": _named("a.xml", CVAT) | _repeated("a.xml", _CVAT_HEAD),
     "surgpose": _named("a.yaml", SURGPOSE) | _repeated("a.yaml", "0: {1: "),
+    "labelme": _named("a.json", LABELME),
+    "label studio": _named("a.json", LABEL_STUDIO),
+    "yolo": {name: _yolo(text) for name, text in YOLO.items()},
     "safetensors": _named("a.safetensors", SAFETENSORS),
     "onnx": _named("a.onnx", ONNX),
     "project": PROJECT,

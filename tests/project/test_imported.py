@@ -1,5 +1,6 @@
 """Masks and keypoints of others, as layers of a project."""
 
+import json
 from collections.abc import Callable
 from pathlib import Path
 
@@ -121,3 +122,22 @@ def test_the_command_imports_masks(sequence: Sequence, tmp_path: Path, capsys: p
     main(["import-masks", str(sequence.path), str(tmp_path / "theirs"), "--replace"])
     with Project.open(sequence, read_only=True) as project:
         assert len(project.history()) == 2
+
+
+def test_the_command_asks_for_the_format_where_several_are_possible(
+    sequence: Sequence, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_masks(tmp_path / "theirs" / "masks", 10)
+    corners = [[0, 0], [96, 0], [96, 20], [0, 20]]
+    shape = {"label": "shaft", "points": corners, "shape_type": "polygon", "group_id": None, "flags": {}}
+    content = {"version": "5.5.0", "flags": {}, "shapes": [shape], "imagePath": "001.jpg", "imageData": None}
+    content |= {"imageHeight": 72, "imageWidth": 96}
+    (tmp_path / "theirs" / "001.json").write_text(json.dumps(content))
+    arguments = ["import-masks", str(sequence.path), str(tmp_path / "theirs")]
+    with pytest.raises(SystemExit):
+        main(arguments)
+    assert "several formats (labelme, masks)" in capsys.readouterr().err
+    main([*arguments, "--format", "labelme"])
+    assert "Imported 1 mask from LabelMe (shaft)." in capsys.readouterr().out
+    with Project.open(sequence, read_only=True) as project:
+        assert marked_rows(project, 0) == 20

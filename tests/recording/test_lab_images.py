@@ -165,6 +165,7 @@ LABELS[50:70, 70:90] = 1
         (png(LABELS.astype(np.uint8)), ["label 1", "label 7"]),
         (palette(LABELS.astype(np.uint8), [0, 0, 0, 128, 0, 0, *[0] * 15, 64, 128, 0]), ["label 1", "label 7"]),
         (png(np.where(LABELS == 7, 255, LABELS).astype(np.uint8)), ["label 1", "label 255"]),
+        (palette(LABELS.astype(np.uint8), [0, 0, 0, 60, 60, 60, *[9] * 15, 200, 200, 200]), ["label 1", "label 7"]),
     ],
 )
 def test_labels_keep_their_values_and_are_no_mask(
@@ -179,6 +180,41 @@ def test_labels_keep_their_values_and_are_no_mask(
     assert np.array_equal(frame.labels, np.where(LABELS == 7, 2, LABELS))
     with pytest.raises(SequenceError, match="Masks are 0"):
         read_mask(place / "001.png")
+
+
+def test_the_colours_of_a_palette_do_not_merge_labels(tiny_sequence: Callable[..., Path], tmp_path: Path) -> None:
+    place = tmp_path / "others" / "left"
+    place.mkdir(parents=True)
+    white = [0, 0, 0, *[255] * 21]
+    (place / "001.png").write_bytes(palette(LABELS.astype(np.uint8), white))
+    (tmp_path / "others" / "labels.json").write_text('{"shaft": 1, "wrist": 7}')
+    found = read_annotations(tmp_path / "others", Sequence.open(tiny_sequence(masks=False)))
+    (frame,) = found.frames
+    assert found.label_names == ["shaft", "wrist"] and frame.labels is not None
+    assert np.array_equal(frame.labels, np.where(LABELS == 7, 2, LABELS))
+    assert list(found.remarks) == ["labels are palette indices"]
+
+
+def test_a_palette_of_grey_values_in_their_order_is_none(tiny_sequence: Callable[..., Path], tmp_path: Path) -> None:
+    place = tmp_path / "others" / "left"
+    place.mkdir(parents=True)
+    (place / "001.png").write_bytes(palette(BLURRED, [level for level in range(256) for _ in range(3)]))
+    found = read_annotations(tmp_path / "others", Sequence.open(tiny_sequence(masks=False)))
+    (frame,) = found.frames
+    assert found.label_names == ["instrument"] and frame.labels is not None
+    assert np.array_equal(frame.labels > 0, BLURRED >= 128)
+
+
+def test_jpeg_is_read_for_black_and_white_alone(tiny_sequence: Callable[..., Path], tmp_path: Path) -> None:
+    place = tmp_path / "others" / "left"
+    place.mkdir(parents=True)
+    sequence = Sequence.open(tiny_sequence(masks=False))
+    (place / "001.jpg").write_bytes(pillow(LABELS.astype(np.uint8) * 30, "JPEG", quality=80))
+    with pytest.raises(SequenceError, match=r"which JPEG compression has changed\. Save labels as PNG"):
+        list(read_annotations(tmp_path / "others", sequence).frames)
+    (place / "001.jpg").write_bytes(pillow(np.uint8(3) * DISC, "JPEG", quality=80))
+    (frame,) = read_annotations(tmp_path / "others", sequence).frames
+    assert frame.labels is not None and not frame.labels.any()
 
 
 def test_interpolated_labels_are_refused(tiny_sequence: Callable[..., Path], tmp_path: Path) -> None:

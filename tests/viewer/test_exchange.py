@@ -276,6 +276,23 @@ def test_labels_have_colours_and_keypoints_are_crosses() -> None:
     assert len({label_color(number) for number in range(1, 40)}) == 39
 
 
+def test_the_format_is_chosen_where_a_folder_has_several(plain: Desk) -> None:
+    folder = plain.session.sequence.path.parent / "theirs"
+    folder.mkdir()
+    corners = [[30, 20], [60, 20], [60, 50], [30, 50]]
+    shape = {"label": "shaft", "points": corners, "shape_type": "polygon", "group_id": None, "flags": {}}
+    content = {"version": "3.2.1", "flags": {}, "checked": True, "shapes": [shape], "imagePath": "001.png"}
+    content |= {"imageData": None, "imageHeight": 72, "imageWidth": 96}
+    (folder / "001.json").write_text(json.dumps(content))
+    assert cv2.imwrite(str(folder / "002.png"), np.full((72, 96), 255, np.uint8))
+    with pytest.raises(CartsError, match=r"several formats .* Source format"):
+        plain.do(intents.ImportMasks("theirs"))
+    plain.do(intents.ImportMasks("theirs", format="labelme"))
+    assert plain.state.imported == "Imported 1 mask from X-AnyLabeling (shaft)."
+    plain.do(intents.ImportMasks("theirs", format="masks"))
+    assert "from a folder of masks (shaft, instrument)" in plain.state.imported
+
+
 def test_masks_below_an_allowed_folder_are_imported(tiny_sequence: Callable[..., Path], tmp_path: Path) -> None:
     path = tiny_sequence(masks=False)
     folder = path.parent.rename(tmp_path.parent / f"{tmp_path.name}_recording")

@@ -3,146 +3,45 @@
 import math
 import os
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 from xml.etree.ElementTree import Element
 
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool
 
 from ...errors import SequenceError
-from ...files.reading import VALUES, is_regular, parse_json, parse_xml, parse_yaml, read_text
+from ...files.reading import VALUES, is_regular, parse_json, parse_xml, read_text
 from ...model.camera import HALF_PIXEL
 from ...wording import shown
 from ..images import read_labels
-from ..importing.found import MALFORMED, cause, well_formed
+from ..importing.found import well_formed
+from .images import (
+    BACKGROUND,
+    MAX_IMAGES,
+    MAX_KEYPOINTS,
+    ForeignImage,
+    Part,
+    check_keypoints,
+    few_enough,
+    or_left_out,
+)
+from .shapes import check_shapes, check_size, checked_points, mask_of_polygon, mask_of_runs, runs_of_text
 
-MAX_LABELS = 255
-"""Maximum number of labels of a layer, limited by its 8-bit pixels."""
-MAX_IMAGES = 100_000
-"""Maximum number of images of a source."""
-MAX_SHAPES = 5_000
-"""Maximum number of shapes of an image, and of polygons of an annotation."""
-MAX_KEYPOINTS = 200
-"""Maximum number of keypoints of an image."""
-
-
-@dataclass(frozen=True)
-class ForeignImage:
-    """An annotated image of a source."""
-
-    name: str
-    """File name in the source."""
-    parts: Callable[[], Iterable[tuple[str, Bool[np.ndarray, "height width"]]]] = tuple
-    """Labels and their pixels, decoded on demand; later parts cover earlier ones. An empty label marks unlabelled
-    pixels; an image without parts has no mask."""
-    keypoints: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-    """Name -> column and row [px], from the upper left corner of the image."""
-    frame: str = ""
-    """Id of the frame; empty if the source does not give it."""
-    camera: str = ""
-    """Name of the camera; empty if the source does not give it."""
-
-
-@dataclass(frozen=True, eq=False)
-class FrameAnnotation:
-    """Annotations of one frame in one camera."""
-
-    frame: int
-    """Index in the sequence."""
-    camera: str
-    labels: UInt8[np.ndarray, "height width"] | None
-    """Label of each pixel of the undistorted image, from 1; 0 elsewhere. None without masks."""
-    keypoints: Mapping[str, tuple[float, float]]
-    """Name -> column and row in the undistorted image [px]."""
-
-
-@dataclass(frozen=True, eq=False)
-class Annotations:
-    """Annotations of a source for a sequence. Frames are decoded during the iteration, which is possible once."""
-
-    kind: str
-    """Name of the source's format."""
-    frames: Iterator[FrameAnnotation]
-    label_names: list[str]
-    """Names of the labels from 1; complete after the iteration."""
-    unknown: list[str]
-    """Names of images without a matching frame; complete after the iteration."""
-    remarks: Counter[str] = field(default_factory=Counter)
-    """Remarks on how masks were interpreted and why annotations were omitted, with their counts; complete after the
-    iteration."""
-
-
-_BITS, _MORE, _SIGN, _FIRST = 5, 0x20, 0x10, 48
-"""Constants of COCO's run-length text: five bits per character, with offset "0"."""
-
-
-def runs_of_text(text: str) -> list[int]:
-    """Decode COCO's compressed run lengths; `ValueError` for other texts."""
-    runs: list[int] = []
-    value = place = 0
-    for character in text:
-        code = ord(character) - _FIRST
-        if not 0 <= code < 2 * _MORE or place > 40:
-            raise ValueError(f"the character {character!r} does not occur in run lengths")
-        value |= (code & (_MORE - 1)) << place
-        place += _BITS
-        if not code & _MORE:
-            if code & _SIGN:
-                value -= 1 << place
-            runs.append(value + (runs[-2] if len(runs) > 2 else 0))
-            value = place = 0
-    if place:
-        raise ValueError("the run lengths end within a number")
-    return runs
-
-
-def mask_of_runs(runs: Sequence[int], height: int, width: int, *, by_columns: bool) -> Bool[np.ndarray, "height width"]:
-    """Mask from alternating run lengths, beginning with background; `ValueError` if their sum is not the image size."""
-    lengths = np.asarray(runs, np.int64)
-    if lengths.ndim != 1 or (lengths < 0).any() or (lengths > height * width).any() or lengths.sum() != height * width:
-        raise ValueError(f"the run lengths do not sum to {width} x {height} pixels")
-    flat = np.repeat(np.arange(len(lengths)) % 2 == 1, lengths)
-    return flat.reshape(width, height).T if by_columns else flat.reshape(height, width)
-
-
-def mask_of_polygon(
-    points: Float[np.ndarray, "corners 2"], height: int, width: int
-) -> Bool[np.ndarray, "height width"]:
-    """Pixels whose centres are inside a polygon, by the even-odd rule; the origin of its corners is the upper left
-    corner of the image [px]."""
-    flips = np.zeros((height, width + 1), np.int32)
-    ends = np.roll(points, -1, axis=0)
-    for (x0, y0), (x1, y1) in zip(points, ends, strict=True):
-        low, high = min(y0, y1), max(y0, y1)
-        rows = np.arange(max(0, int(np.ceil(low - 0.5))), min(height, int(np.ceil(high - 0.5))))
-        if len(rows):
-            # Column where the edge crosses the middle of the row; pixel centres to the right are on its other side.
-            crossing = x0 + (rows + 0.5 - y0) * (x1 - x0) / (y1 - y0)
-            np.add.at(flips, (rows, np.clip(np.ceil(crossing - 0.5), 0, width).astype(int)), 1)
-    return np.cumsum(flips, axis=1)[:, :width] % 2 == 1
-
-
-_MAX_SIDE = 16384
-"""Maximum width or height of an image [px]."""
-_MIN_CORNERS = 3
-
-
-_Part = tuple[str, Bool[np.ndarray, "height width"]]
+_MIN_VERTICES = 3
 _EXPORT = "Export it again."
 
 
-def read_coco(path: Path, remarks: Counter[str]) -> Iterator[ForeignImage]:
+def read_coco(path: Path, content: Any, remarks: Counter[str]) -> Iterator[ForeignImage]:
     """Read the images of a COCO file; reasons for omitted annotations are added to `remarks`."""
     with well_formed(f"{path} is not a COCO file", _EXPORT):
-        content = parse_json(read_text(path, VALUES))
         names = {int(entry["id"]): entry for entry in content["categories"]}
         marked: dict[int, list[dict[str, Any]]] = defaultdict(list)
         for annotation in content["annotations"]:
             marked[int(annotation["image_id"])].append(annotation)
-        images = _few_enough(content["images"])
+        images = few_enough(content["images"])
         for absent in sorted(marked.keys() - {int(image["id"]) for image in images}):
             why = f"image {absent} is not in the file"
             remarks.update(f"{_annotation(annotation)} left out: {why}" for annotation in marked[absent])
@@ -150,24 +49,9 @@ def read_coco(path: Path, remarks: Counter[str]) -> Iterator[ForeignImage]:
         yield _coco_image(path, image, marked[int(image["id"])], names, remarks)
 
 
-def _few_enough(images: Iterable[Any]) -> list[Any]:
-    images = list(images)
-    if len(images) > MAX_IMAGES:
-        raise ValueError(f"it has {len(images)} images; at most {MAX_IMAGES} are allowed")
-    return images
-
-
-def _check_shapes(count: int) -> None:
-    if count > MAX_SHAPES:
-        raise ValueError(f"it has {count} shapes; at most {MAX_SHAPES} are allowed")
-
-
 def _size(image: Any) -> tuple[int, int]:
     """Height and width of an image [px]."""
-    size = int(image["height"]), int(image["width"])
-    if not all(0 < side <= _MAX_SIDE for side in size):
-        raise ValueError(f"its size is {size[1]} x {size[0]}")
-    return size
+    return check_size(int(image["height"]), int(image["width"]))
 
 
 def _annotation(annotation: dict[str, Any]) -> str:
@@ -180,30 +64,26 @@ def _coco_image(
     where = f"{path}: image {image.get('file_name')!r}"
     with well_formed(f"{where} cannot be read", _EXPORT):
         size, name = _size(image), str(image["file_name"])
-        _check_shapes(len(marked))
+        check_shapes(len(marked))
     points: dict[str, tuple[float, float]] = {}
     usable = []
     for annotation in marked:
-        try:
+        with or_left_out(f"{_annotation(annotation)} of {name}", remarks):
             points |= _coco_keypoints(annotation, _category(annotation, names))
             usable.append(annotation)
-        except MALFORMED as error:
-            remarks[f"{_annotation(annotation)} left out: {name}: {cause(error)}"] += 1
-    if len(points) > MAX_KEYPOINTS:
-        raise SequenceError(f"{where} has {len(points)} keypoints; at most {MAX_KEYPOINTS} are allowed. Export fewer.")
+    with well_formed(f"{where} cannot be read", "Export fewer."):
+        check_keypoints(points)
 
-    def parts() -> Iterator[_Part]:
+    def parts(height: int, width: int) -> Iterator[Part]:
         for annotation in usable:
-            try:
-                mask = _coco_mask(annotation.get("segmentation"), *size)
+            mask, label = None, ""
+            with or_left_out(f"{_annotation(annotation)} of {name}", remarks):
+                mask = _coco_mask(annotation.get("segmentation"), height, width)
                 label = str(_category(annotation, names)["name"])
-            except MALFORMED as error:
-                remarks[f"{_annotation(annotation)} left out: {name}: {cause(error)}"] += 1
-                continue
             if mask is not None:
                 yield label, mask
 
-    return ForeignImage(name, parts, points, str(image.get("frame", "")), str(image.get("camera", "")))
+    return ForeignImage(name, parts, points, str(image.get("frame", "")), str(image.get("camera", "")), size)
 
 
 def _category(annotation: dict[str, Any], names: dict[int, Any]) -> Any:
@@ -223,15 +103,12 @@ def _coco_mask(segmentation: Any, height: int, width: int) -> Bool[np.ndarray, "
         return mask_of_runs(runs, height, width, by_columns=True)
     # Some tools write a single polygon without the enclosing list.
     polygons = [segmentation] if all(isinstance(value, int | float) for value in segmentation) else segmentation
-    _check_shapes(len(polygons))
+    check_shapes(len(polygons))
     mask = np.zeros((height, width), bool)
     for polygon in polygons:
-        if len(polygon) % 2 or len(polygon) < 2 * _MIN_CORNERS:
+        if len(polygon) % 2 or len(polygon) < 2 * _MIN_VERTICES:
             raise ValueError(f"a polygon has {len(polygon)} numbers, but needs x and y of at least three vertices")
-        points = np.asarray(polygon, np.float64).reshape(-1, 2)
-        if not np.isfinite(points).all() or np.abs(points).max() > 2 * _MAX_SIDE:
-            raise ValueError("a vertex of a polygon is not finite or far outside the image")
-        mask |= mask_of_polygon(points, height, width)
+        mask |= mask_of_polygon(checked_points(polygon), height, width)
     return mask
 
 
@@ -256,7 +133,7 @@ def read_cvat(path: Path, remarks: Counter[str]) -> Iterator[ForeignImage]:
         root = parse_xml(read_text(path, VALUES))
         if root.tag != "annotations" or root.find("image") is None:
             raise ValueError("there is no <image> in <annotations>; export as 'CVAT for images 1.1'")
-        images = _few_enough(root.findall("image"))
+        images = few_enough(root.findall("image"))
         name, times = Counter(image.get("name") for image in images).most_common(1)[0]
         if times > 1:
             raise ValueError(f"it contains image {shown(str(name))} {times} times")
@@ -268,22 +145,19 @@ def _cvat_image(path: Path, image: Element, remarks: Counter[str]) -> ForeignIma
     name = image.get("name", "")
     with well_formed(f"{path}: image {name!r} cannot be read", _EXPORT):
         size, points = _size(image.attrib), dict(_cvat_keypoints(image))
-        _check_shapes(len(image))
-        if len(points) > MAX_KEYPOINTS:
-            raise ValueError(f"it has {len(points)} keypoints; {MAX_KEYPOINTS} are allowed")
+        check_shapes(len(image))
+        check_keypoints(points)
 
-    def parts() -> Iterator[_Part]:
+    def parts(height: int, width: int) -> Iterator[Part]:
         shapes = [shape for shape in image if shape.tag in ("mask", "polygon")]
         for shape in sorted(shapes, key=lambda shape: int(shape.get("z_order", "0"))):
-            try:
-                mask = _cvat_mask(shape, *size)
-            except MALFORMED as error:
-                label = shape.get("label", "no label")
-                remarks[f"a {shape.tag} ({label}) of {name} left out: {cause(error)}"] += 1
-                continue
-            yield shape.get("label", "instrument"), mask
+            mask = None
+            with or_left_out(f"a {shape.tag} ({shape.get('label', 'no label')}) of {name}", remarks):
+                mask = _cvat_mask(shape, height, width)
+            if mask is not None:
+                yield shape.get("label", "instrument"), mask
 
-    return ForeignImage(name, parts, points)
+    return ForeignImage(name, parts, points, size=size)
 
 
 def _cvat_mask(shape: Element, height: int, width: int) -> Bool[np.ndarray, "height width"]:
@@ -300,10 +174,7 @@ def _cvat_mask(shape: Element, height: int, width: int) -> Bool[np.ndarray, "hei
 
 def _cvat_points(shape: Element) -> np.ndarray:
     rows = [corner.split(",") for corner in shape.get("points", "").split(";")]
-    points = np.array([[float(x), float(y)] for x, y in rows])
-    if not np.isfinite(points).all() or np.abs(points).max() > 2 * _MAX_SIDE:
-        raise ValueError("a point is not finite or far outside the image")
-    return points
+    return checked_points([[float(x), float(y)] for x, y in rows])
 
 
 def _cvat_keypoints(image: Element) -> Iterator[tuple[str, tuple[float, float]]]:
@@ -316,11 +187,10 @@ def _cvat_keypoints(image: Element) -> Iterator[tuple[str, tuple[float, float]]]
             yield (label if len(points) == 1 else f"{label}.{number}"), (float(u), float(v))
 
 
-def read_surgpose(path: Path, remarks: Counter[str]) -> Iterator[ForeignImage]:
+def read_surgpose(path: Path, content: Any, remarks: Counter[str]) -> Iterator[ForeignImage]:
     """Read the frames of a keypoint file; `remarks` stays unchanged."""
     del remarks
     with well_formed(f"{path} has no keypoints in the format of SurgPose", "Expected: {frame: {1: [x, y], ...}}."):
-        content = parse_yaml(read_text(path, VALUES))
         if not isinstance(content, dict) or len(content) > MAX_IMAGES:
             raise ValueError("it has no frames, or too many")
         frames = {int(frame): dict(points or {}) for frame, points in content.items()}
@@ -347,12 +217,11 @@ _OTHER_SUFFIXES = (".tif", ".tiff", ".jpg", ".jpeg")
 """Suffixes used only in folders without files of the preferred suffixes, since such a folder may contain images and
 masks."""
 _DEEPEST = 4
-_MEANINGS = ("labels.json", "mappings.json", "mapping.json", "instrument_type_mapping.json")
+MEANINGS = ("labels.json", "mappings.json", "mapping.json", "instrument_type_mapping.json")
 _TOOL = "_labels"
 _INSTRUMENT = "instrument"
 _MAX_UNNAMED = 32
 """Maximum number of unnamed values in an image; more are artefacts of interpolation."""
-_BACKGROUND = ("background", "background-tissue")
 _SCENE_PARTS = ("instrument", "clasper", "wrist", "shaft")
 """Prefixes of EndoVis 2018 labels that belong to an instrument; all others are anatomy or thread."""
 
@@ -364,10 +233,7 @@ def read_mask_folder(path: Path, remarks: Counter[str], *, confined: bool = Fals
         remarks: counter of remarks on how files were interpreted, updated during decoding.
         confined: whether links are ignored, and names of values are not searched for above the folder.
     """
-    # The folder with links in an export of carts has the finest labels.
-    finest = path / "links" if (path / "labels.json").is_file() and (path / "links").is_dir() else path
-    usable = [file for file in _files(finest) if not (confined and file.is_symlink())]
-    files = [file for file in usable if file.suffix.lower() in _SUFFIXES] or usable
+    files = mask_files(path, confined=confined)
     if not files:
         known = ", ".join((*_SUFFIXES, *_OTHER_SUFFIXES))
         raise SequenceError(f"{path} has no masks ({known}). Give the folder with the masks.")
@@ -378,9 +244,16 @@ def read_mask_folder(path: Path, remarks: Counter[str], *, confined: bool = Fals
             with well_formed(f"{above} cannot be read", "Correct it or remove it."):
                 meanings[above] = parse_json(read_text(above, VALUES))
         meaning = None if above is None else meanings[above]
-        yield ForeignImage(
-            file.relative_to(path.parent).as_posix(), lambda file=file, meaning=meaning: _parts(file, meaning, remarks)
-        )
+        parts = partial(_parts, file, meaning, remarks)
+        yield ForeignImage(file.relative_to(path.parent).as_posix(), parts)
+
+
+def mask_files(path: Path, *, confined: bool = False) -> list[Path]:
+    """Image files below a folder of masks, sorted by frame."""
+    # The folder with links in an export of carts has the finest labels.
+    finest = path / "links" if (path / "labels.json").is_file() and (path / "links").is_dir() else path
+    usable = [file for file in _files(finest) if not (confined and file.is_symlink())]
+    return [file for file in usable if file.suffix.lower() in _SUFFIXES] or usable
 
 
 def _files(folder: Path) -> list[Path]:
@@ -400,7 +273,7 @@ def _files(folder: Path) -> list[Path]:
 def _meaning_file(file: Path, top: Path, confined: bool) -> Path | None:
     """File with the names of the values, in the mask's folder or a parent folder up to `top`."""
     for folder in file.parents:
-        for name in _MEANINGS:
+        for name in MEANINGS:
             if is_regular(folder / name) and not (confined and (folder / name).is_symlink()):
                 return folder / name
         if folder == top:
@@ -408,9 +281,15 @@ def _meaning_file(file: Path, top: Path, confined: bool) -> Path | None:
     return None
 
 
-def _parts(file: Path, meaning: Any, remarks: Counter[str]) -> Iterator[_Part]:
+def _parts(file: Path, meaning: Any, remarks: Counter[str], height: int, width: int) -> Iterator[Part]:
+    del height, width
     image = read_labels(file)
     tool = next((part.removesuffix(_TOOL) for part in file.parts[::-1] if part.endswith(_TOOL)), "")
+    if image.lossy and image.mask is None:
+        raise SequenceError(
+            f"{file} has several colours or grey values, which JPEG compression has changed. Save labels as PNG; JPEG "
+            "is read only for masks in black and white."
+        )
     yield "", np.zeros(image.colours.shape[:2], bool)
     with well_formed(f"the label names for the values in {file} cannot be read", "Correct them."):
         if isinstance(meaning, list):
@@ -430,7 +309,7 @@ def _parts(file: Path, meaning: Any, remarks: Counter[str]) -> Iterator[_Part]:
             yield from _by_value(image.values, names, tool, file)
 
 
-def _by_colour(image: np.ndarray, meaning: list[Any], file: Path) -> Iterator[_Part]:
+def _by_colour(image: np.ndarray, meaning: list[Any], file: Path) -> Iterator[Part]:
     """Labels of instruments, given entries with `name` and `color`."""
     rows = [(tuple(map(int, entry["color"])), str(entry["name"])) for entry in meaning]
     known = {r * 65536 + g * 256 + b: name for (r, g, b), name in (row for row in rows if len(row[0]) == 3)}
@@ -443,7 +322,7 @@ def _by_colour(image: np.ndarray, meaning: list[Any], file: Path) -> Iterator[_P
             yield known[value], code == value
 
 
-def _by_value(image: np.ndarray, names: Mapping[int, str], tool: str, file: Path) -> Iterator[_Part]:
+def _by_value(image: np.ndarray, names: Mapping[int, str], tool: str, file: Path) -> Iterator[Part]:
     values = [int(value) for value in np.unique(image) if value]
     unknown = [value for value in values if value not in names]
     if len(unknown) > _MAX_UNNAMED:
@@ -453,7 +332,7 @@ def _by_value(image: np.ndarray, names: Mapping[int, str], tool: str, file: Path
         )
     for value in values:
         name = names.get(value, f"label {value}")
-        if name.lower() not in _BACKGROUND:
+        if name.lower() not in BACKGROUND:
             yield f"{tool}.{name}" if tool else name, image == value
 
 

@@ -2,7 +2,7 @@
 
 import re
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path, PurePosixPath
 
 import cv2
@@ -13,32 +13,21 @@ from ...errors import SequenceError
 from ...model.camera import HALF_PIXEL, Camera
 from ..importing.cameras import side_of
 from ..sequence import Sequence
-from .formats import (
-    MAX_LABELS,
-    Annotations,
-    ForeignImage,
-    FrameAnnotation,
-    read_coco,
-    read_cvat,
-    read_mask_folder,
-    read_surgpose,
-)
+from .images import BACKGROUND, MAX_LABELS, Annotations, ForeignImage, FrameAnnotation
+from .recognition import AnnotationFormat, recognized
 
 _INSIDE = {"annotations/instances_default.json", "annotations.xml"}
 """Files to read in the folder of an export."""
 _OWN_EXPORT = "export.json"
 
 
-_FORMATS: dict[str, tuple[str, Callable[[Path, Counter[str]], Iterator[ForeignImage]]]] = {
-    ".json": ("COCO", read_coco),
-    ".xml": ("CVAT for images", read_cvat),
-    ".yaml": ("keypoints of SurgPose", read_surgpose),
-}
-"""Suffix -> name and reader of a file format."""
-
-
 def read_annotations(
-    source: Path, sequence: Sequence, camera: str | None = None, *, confined: bool = False
+    source: Path,
+    sequence: Sequence,
+    camera: str | None = None,
+    *,
+    format: AnnotationFormat | None = None,
+    confined: bool = False,
 ) -> Annotations:
     """Read masks and keypoints for the frames of a sequence.
 
@@ -46,13 +35,15 @@ def read_annotations(
     Annotations of images with distortion are undistorted, unless they were exported by carts.
 
     Args:
-        source: a COCO file, a CVAT file, keypoints of SurgPose, a folder of masks, or the folder of an export.
+        source: a file of COCO, CVAT, LabelMe, X-AnyLabeling or Label Studio, keypoints of SurgPose, a folder of LabelMe
+            files, YOLO labels or mask images, or the folder of an export.
         sequence: sequence with the frames.
         camera: camera of the images, if their names do not contain it.
+        format: format of the source, recognized by its content by default.
         confined: whether links, and files next to the source, are ignored.
 
     Raises:
-        SequenceError: the source has another format or cannot be read; also raised while frames are iterated.
+        SequenceError: the source has another format, several, or cannot be read; also raised while frames are iterated.
     """
     if camera is not None:
         sequence.recorded_camera(camera)
@@ -60,16 +51,7 @@ def read_annotations(
         raise SequenceError(f"{source} is missing. Give the file or folder of the masks or keypoints.")
     place = next((source / name for name in sorted(_INSIDE) if (source / name).is_file()), source)
     remarks: Counter[str] = Counter()
-    if place.is_dir():
-        kind, images = "a folder of masks", read_mask_folder(place, remarks, confined=confined)
-    elif place.suffix.lower() in _FORMATS:
-        kind, read = _FORMATS[place.suffix.lower()]
-        images = read(place, remarks)
-    else:
-        raise SequenceError(
-            f"{source} has no masks or keypoints in a supported format. Give a COCO file (.json), a CVAT file (.xml), "
-            "keypoints of SurgPose (.yaml), or a folder of PNG masks."
-        )
+    kind, images = recognized(place, format, remarks, confined=confined)
     own = any((folder / _OWN_EXPORT).is_file() for folder in (place, *list(place.parents)[:3]))
     labels: list[str] = []
     unknown: list[str] = []
@@ -151,13 +133,14 @@ class _FrameReader:
         points: dict[str, tuple[float, float]] = {}
         for image in images:
             points |= image.keypoints
-            for label, mask in image.parts():
-                if mask.shape != (camera.height, camera.width):
-                    raise SequenceError(
-                        f"{image.name} is {mask.shape[1]} x {mask.shape[0]} pixels, but images of camera {name!r} are "
-                        f"{camera.width} x {camera.height}. Give masks of the size of the images."
-                    )
+            if image.size is not None:
+                _check_size(image.name, image.size, camera)
+            for label, mask in image.parts(camera.height, camera.width):
+                _check_size(image.name, mask.shape, camera)
                 labels = np.zeros(mask.shape, np.uint8) if labels is None else labels
+                if label.casefold() in BACKGROUND:
+                    labels[mask] = 0
+                    continue
                 if label and label not in self._labels:
                     if len(self._labels) == MAX_LABELS:
                         raise SequenceError(f"there are more than {MAX_LABELS} labels, such as {label!r}. Merge some.")
@@ -168,6 +151,15 @@ class _FrameReader:
             labels = None if labels is None else camera.undistort(labels, cv2.INTER_NEAREST)
             points = _undistorted(points, camera)
         return FrameAnnotation(index, name, labels, points)
+
+
+def _check_size(name: str, size: tuple[int, ...], camera: Camera) -> None:
+    """Check that an annotated image of a height and width [px] has the size of the camera's images."""
+    if size != (camera.height, camera.width):
+        raise SequenceError(
+            f"{name} is {size[1]} x {size[0]} pixels, but images of camera {camera.name!r} are {camera.width} x "
+            f"{camera.height}. Give masks of the size of the images."
+        )
 
 
 def _undistorted(points: dict[str, tuple[float, float]], camera: Camera) -> dict[str, tuple[float, float]]:
