@@ -1,6 +1,7 @@
 """Recordings of the shipped robot in foreign formats, each written by its owners' own writer where there is one."""
 
 import atexit
+import hashlib
 import shutil
 import tempfile
 from collections.abc import Callable, Sequence
@@ -296,3 +297,9 @@ def copied(make: Callable[[Path], Path], folder: Path) -> Path:
     source, path = _made(make)
     shutil.copytree(source, folder)
     return folder / path.relative_to(source)
+
+
+def digests(folder: Path) -> dict[str, str]:
+    """SHA-256 of every file of a folder."""
+    files = [file for file in folder.rglob("*") if file.is_file()]
+    return {str(file.relative_to(folder)): hashlib.sha256(file.read_bytes()).hexdigest() for file in files}

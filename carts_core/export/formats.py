@@ -30,6 +30,7 @@ from .annotation_formats import (
 from .dataset import Dataset, ExportFrame, ExportProgress
 from .kinematics import JOINED, joint_columns, joint_units, kinematics_csv, position_values, std_values
 from .lerobot_format import write_lerobot
+from .surgsync_format import write_surgsync
 from .video import write_video
 
 
@@ -168,6 +169,7 @@ FORMATS: dict[FormatName, ExportFormat] = {
     "dvrk-suj": ExportFormat("Fixed set-up joints for the dVRK", write_dvrk_suj, ".json"),
     "video": ExportFormat("Overlay video", write_video),
     "lerobot": ExportFormat("LeRobot data set", write_lerobot, refines=True, source="lerobot"),
+    "surgsync": ExportFormat("SurgSync recording", write_surgsync, refines=True, source="surgsync"),
 }
 
 

@@ -9,7 +9,6 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from shutil import copyfileobj
 from typing import Any
 
 import numpy as np
@@ -18,9 +17,9 @@ from numpy import ndarray
 
 from ..decoders import tables
 from ..errors import SequenceError
-from ..files import OutputPath, output_stream, write_bytes, write_link, write_text
+from ..files import OutputPath, write_bytes, write_text
 from ..files.decoding import Limits, called
-from ..files.reading import TABLE, VALUES, VIDEO, is_regular, open_regular, parse_json, read_bytes, read_text
+from ..files.reading import VALUES, is_regular, parse_json, read_text
 from ..package_imports import require_package
 from ..recording.images import decode_image
 from ..recording.importing.foreign_tables import read_parquet
@@ -40,6 +39,7 @@ from ..settings.interchange import ImportOptions
 from .dataset import Dataset, ExportProgress
 from .encodings import image_png
 from .kinematics import joint_columns, position_values, std_values
+from .recording_copy import below, copy_files
 from .source_tables import ColumnMaps, as_imported, column_maps, rows_of_frames, source_of
 
 CORRECTED_STATE = "observation.state_corrected"
@@ -101,8 +101,10 @@ def write_lerobot(dataset: Dataset, folder: OutputPath, progress: ExportProgress
     files = sorted((root / "data").rglob("*.parquet"))
     for file in files:
         content = _extended(file, results, statistics, by_episode)
-        _write_below(folder, root, file, content)
-    _copy_other_files(dataset, root, folder, set(files))
+        write_bytes(below(folder, root, file), content)
+    replaced = {root / name for name in ("meta/info.json", _STATISTICS, _EPISODE_STATISTICS, DESCRIPTION)}
+    parts, media = ("meta", "data", "videos", "images", "README.md"), ("videos", "images")
+    copy_files(root, folder, dataset.images, parts=parts, media=media, skip={*files, *replaced})
     features |= _features(results)
     write_text(folder / "meta" / "info.json", json.dumps({**info, "features": features}, indent=4, ensure_ascii=False))
     _write_statistics(root, folder, statistics, by_episode)
@@ -352,32 +354,3 @@ def _description(results: _Results) -> str:
         "recorded_columns": [name for name in results.state_names if name not in meanings],
     }
     return json.dumps(content, indent=1, ensure_ascii=False)
-
-
-def _copy_other_files(dataset: Dataset, root: Path, folder: OutputPath, written: set[Path]) -> None:
-    """Copy the remaining files of the data set; videos are linked, unless images are to be copied or left out."""
-    replaced = {root / name for name in ("meta/info.json", _STATISTICS, _EPISODE_STATISTICS, DESCRIPTION)}
-    for part in ("meta", "data", "videos", "images"):
-        for file in sorted((root / part).rglob("*")):
-            if file in written or file in replaced or not is_regular(file):
-                continue
-            if part in ("meta", "data"):
-                _write_below(folder, root, file, read_bytes(file, TABLE))
-            elif dataset.images == "copied":
-                with open_regular(file, VIDEO) as source, output_stream(_below(folder, root, file)) as stream:
-                    copyfileobj(source, stream)
-            elif dataset.images == "named":
-                write_link(_below(folder, root, file), file)
-    if is_regular(root / "README.md"):
-        write_bytes(folder / "README.md", read_bytes(root / "README.md", VALUES))
-
-
-def _below(folder: OutputPath, root: Path, file: Path) -> OutputPath:
-    """Path in the output of a file of the data set."""
-    for name in file.relative_to(root).parts:
-        folder = folder / name
-    return folder
-
-
-def _write_below(folder: OutputPath, root: Path, file: Path, content: bytes) -> None:
-    write_bytes(_below(folder, root, file), content)

@@ -103,6 +103,7 @@ FormatName = Literal[
     "dvrk-suj",
     "video",
     "lerobot",
+    "surgsync",
 ]
 """Names of the export formats."""
 

@@ -1,6 +1,5 @@
 """Results written into copies of LeRobot data sets, read back with pyarrow in LeRobot's layout."""
 
-import hashlib
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -11,7 +10,7 @@ import pyarrow.parquet
 import pytest
 from corrected_frames import corrected
 from lerobot_sets import JOINTS, LENGTHS, POSES, dataset
-from recordings import pose_of
+from recordings import digests, pose_of
 
 from carts_core.cli import main
 from carts_core.errors import CartsError
@@ -44,11 +43,6 @@ def pixels(entry: dict[str, bytes]) -> np.ndarray:
     picture = cv2.imdecode(np.frombuffer(entry["bytes"], np.uint8), cv2.IMREAD_UNCHANGED)
     assert picture is not None
     return picture
-
-
-def digests(folder: Path) -> dict[str, str]:
-    files = [file for file in folder.rglob("*") if file.is_file()]
-    return {str(file.relative_to(folder)): hashlib.sha256(file.read_bytes()).hexdigest() for file in files}
 
 
 @pytest.mark.parametrize("version", ["v2.1", "v3.0"])

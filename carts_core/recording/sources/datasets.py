@@ -28,7 +28,17 @@ from ..images import mask_remarks, read_mask, spread_files
 from ..importing.cameras import Images, cameras_of, common_ids, find_images, image_files, subfolders
 from ..importing.columns import order_of_names
 from ..importing.foreign_tables import read_array, read_foreign_table
-from ..importing.found import FoundArm, FoundCamera, FoundRecording, Import, PartError, Source, read_json, well_formed
+from ..importing.found import (
+    FoundArm,
+    FoundCamera,
+    FoundRecording,
+    Import,
+    PartError,
+    Source,
+    Track,
+    read_json,
+    well_formed,
+)
 from ..importing.joint_units import in_si, psm_joints
 from ..importing.logs import ArmLog, arm_from_log, track
 from ..importing.row_matching import by_rows, frame_times
@@ -209,19 +219,41 @@ JIGSAWS = Source(
 )
 
 
-_ARMS, _SIDES = ("PSM1", "PSM2", "PSM3"), ("left", "right")
+SURGSYNC_ARMS = ("PSM1", "PSM2", "PSM3")
+"""Arms of SurgSync's recordings."""
+_SIDES = ("left", "right")
 _CALIBRATION_FOLDERS = ("calibration", "camera_calibration")
 _TRACKS = ("joints", "poses", "local_poses", "jaw")
 _LENGTHS = {"joints": 6, "poses": 7, "local_poses": 7, "jaw": 1}
 
 
 def _detect_surgsync(path: Path) -> bool:
-    packed = (path / "video_raw").is_dir() and any((path / f"{arm}.parquet").is_file() for arm in _ARMS)
+    packed = (path / "video_raw").is_dir() and any((path / f"{arm}.parquet").is_file() for arm in SURGSYNC_ARMS)
     return packed or (bool(image_files(path / "image/left")) and (path / "kinematic").is_dir())
 
 
+def is_packed(path: Path) -> bool:
+    """Whether a recording of SurgSync is a packed episode; otherwise it is a raw clip."""
+    return (path / "video_raw").is_dir()
+
+
+def surgsync_tracks(path: Path, arm: str, ids: tuple[str, ...]) -> dict[str, Any]:
+    """Time series (`Track`) of an arm in a recording of SurgSync: `joints`, `jaw`, `poses` and `local_poses`; None if
+    missing.
+
+    Args:
+        path: folder of the recording.
+        arm: name of the arm in the recording.
+        ids: names of the frames of a raw clip.
+
+    Returns:
+        The series; times are row numbers of a packed episode, or indices into `ids` of a raw clip.
+    """
+    return _packed(path, arm) if is_packed(path) else _raw(path, arm, ids)
+
+
 def _read_surgsync(path: Path, job: Import) -> FoundRecording:
-    packed = (path / "video_raw").is_dir()
+    packed = is_packed(path)
     places = {side: path / f"video_raw/stereo_{side}.mkv" if packed else path / "image" / side for side in _SIDES}
     images = {side: find_images(place) for side, place in places.items() if place.exists()}
     if not images:
@@ -236,14 +268,14 @@ def _read_surgsync(path: Path, job: Import) -> FoundRecording:
     files = sorted(path.rglob("*-registration-open-cv.json")) or sorted(path.rglob("*-registration-dVRK.json"))
     job = job.with_options(base={**{file.name.partition("-")[0]: file for file in files}, **job.options.base})
     arms: list[FoundArm] = []
-    for recorded in _ARMS:
+    for recorded in SURGSYNC_ARMS:
         if (name := job.arm_name(recorded)) is None:
             continue
-        tracks = _packed(path, recorded) if packed else _raw(path, recorded, ids)
+        tracks = surgsync_tracks(path, recorded, ids)
         if any(found is not None for found in tracks.values()):
             arms.append(arm_from_log(ArmLog(name, **tracks), job))
     if not arms:
-        raise SequenceError(f"{path} has no kinematics of {', '.join(_ARMS)}. Copy all of it again.")
+        raise SequenceError(f"{path} has no kinematics of {', '.join(SURGSYNC_ARMS)}. Copy all of it again.")
     times = frame_times(next(iter(images.values())), ids, job).times
     found, kept_ids, kept = by_rows(arms, ids, job, times)
     if packed:
