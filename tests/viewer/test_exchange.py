@@ -8,14 +8,16 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import pyarrow.parquet
 import pytest
+from lerobot_sets import dataset as lerobot_set
 from viewer_desk import Desk
 from viewer_tab import OpenViewer, decoded, widget
 from waiting import eventually
 
 from carts_core.errors import CartsError, SettingsError
 from carts_core.evaluation import dice
-from carts_core.export import ExportFormat, FormatName, read_kinematics_csv
+from carts_core.export import ExportFormat, FormatName, formats_of, read_kinematics_csv
 from carts_core.export.formats import FORMATS as REGISTERED
 from carts_core.project import (
     Figures,
@@ -32,6 +34,7 @@ from carts_core.project import (
 )
 from carts_core.recording import Sequence
 from carts_core.recording.annotations import read_annotations
+from carts_core.recording.importing.importer import import_recording
 from carts_core.settings import Masks
 from carts_viewer.actions import import_export as exporting
 from carts_viewer.actions import intents
@@ -411,3 +414,14 @@ def test_a_result_of_an_optimizer_says_which_network_was_run_unless_masks_alone_
     for settings in ({"observe": "both"}, {}):
         with pytest.raises(CartsError, match="requires its settings and the hash"):
             Provenance.made_by_optimizer(settings, None)
+
+
+def test_a_data_set_is_exported_from_the_page_with_the_corrections_of_the_project(tmp_path: Path) -> None:
+    file, _ = import_recording(lerobot_set(tmp_path / "set"), tmp_path / "sequence")
+    desk = Desk.open(file)
+    assert "lerobot" in formats_of(desk.session.sequence)
+    path = exported(desk, intents.Export("lerobot", "All"))
+    rows = pyarrow.parquet.read_table(path / "data/chunk-000/episode_000000.parquet").to_pydict()
+    assert path.name == "lerobot" and rows["carts.corrected"] == [False] * 4
+    measured = desk.session.sequence.measured["PSM1"]
+    np.testing.assert_allclose(rows["carts.joint_positions"], measured, rtol=0, atol=1e-7)

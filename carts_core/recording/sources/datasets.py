@@ -35,7 +35,6 @@ from ..importing.found import (
     Import,
     PartError,
     Source,
-    Track,
     read_json,
     well_formed,
 )
