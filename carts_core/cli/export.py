@@ -93,8 +93,8 @@ class Export:
     frame_rate: float | None = None
     """Frame rate of a video [1/s]; by default the frame rate of the recording, or 25 if it has no timestamps."""
     masks: Masks = "auto"
-    """Masks of the formats masks, coco, yolo, voc, cvat, datumaro, lerobot and surgsync: `rendered` at the corrected
-    pose, or `refined` near their outline by the network; `auto` refines the masks of frames with the verdict
+    """Masks of the formats masks, coco, yolo, voc, cvat, datumaro, rosbag2, lerobot and surgsync: `rendered` at the
+    corrected pose, or `refined` near their outline by the network; `auto` refines the masks of frames with the verdict
     *good*. Rendered masks of refined views are written to the folder `rendered`."""
     network: Annotated[Network, tyro.conf.arg(name="")] = field(default_factory=Network)
     recording: Path | None = None

@@ -30,6 +30,7 @@ from .annotation_formats import (
 from .dataset import Dataset, ExportFrame, ExportProgress
 from .kinematics import JOINED, joint_columns, joint_units, kinematics_csv, position_values, std_values
 from .lerobot_format import write_lerobot
+from .rosbag_format import write_rosbag2
 from .surgsync_format import write_surgsync
 from .video import write_video
 
@@ -168,6 +169,7 @@ FORMATS: dict[FormatName, ExportFormat] = {
     "dvrk-2.3": ExportFormat("Base frames for the dVRK up to 2.3", write_dvrk_2_3, ".json"),
     "dvrk-suj": ExportFormat("Fixed set-up joints for the dVRK", write_dvrk_suj, ".json"),
     "video": ExportFormat("Overlay video", write_video),
+    "rosbag2": ExportFormat("ROS 2 bag (MCAP)", write_rosbag2, refines=True),
     "lerobot": ExportFormat("LeRobot data set", write_lerobot, refines=True, source="lerobot"),
     "surgsync": ExportFormat("SurgSync recording", write_surgsync, refines=True, source="surgsync"),
 }

@@ -161,6 +161,12 @@ class BagImages:
         data = np.asarray(fields.pop("data"), np.uint8).tobytes()
         return hashlib.sha256(repr(fields).encode() + data).hexdigest()
 
+    def times_of(self, index: int) -> tuple[int, int]:
+        """Record time and header stamp of a frame's message [ns]; the record time twice without a stamp."""
+        stamp = getattr(self._message(index), "header", {}).get("stamp", {})
+        header = int(stamp.get("sec", 0)) * 10**9 + int(stamp.get("nanosec", 0))
+        return self._times[index], header or self._times[index]
+
     def _message(self, index: int) -> Any:
         message = self._bag.message(self.topic, self._times[index])
         if message is None:

@@ -102,6 +102,7 @@ FormatName = Literal[
     "dvrk-2.3",
     "dvrk-suj",
     "video",
+    "rosbag2",
     "lerobot",
     "surgsync",
 ]

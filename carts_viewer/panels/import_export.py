@@ -15,7 +15,19 @@ from carts_viewer.transport.document import escaped
 _PARTS = {"Arm": "arms", "Part": "parts", "Link": "links"}
 _MASKS = {"Refined if good": "auto", "Refined": "refined", "As rendered": "rendered"}
 _DVRK = ("dvrk", "dvrk-2.3", "dvrk-suj")
-_WITHOUT_PARTS = ("masks", "coco-keypoints", "bop", "csv", "npz", "json", *_DVRK, "video", "lerobot", "surgsync")
+_WITHOUT_PARTS = (
+    "masks",
+    "coco-keypoints",
+    "bop",
+    "csv",
+    "npz",
+    "json",
+    *_DVRK,
+    "video",
+    "rosbag2",
+    "lerobot",
+    "surgsync",
+)
 """Formats without categories, or with a fixed choice of categories."""
 _WRITTEN = (
     "Masks, keypoints and poses are those of the arms at the current joint positions; masks include "
