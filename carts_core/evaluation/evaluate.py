@@ -29,6 +29,7 @@ from ..optimization import (
 from ..optimization.sequence_frame import Ignore
 from ..recording import Frame, Sequence
 from ..rendering import Renderer
+from ..reprs import short_repr
 
 Joints = dict[str, np.ndarray]
 """Arm name -> joint positions [rad, m]."""
@@ -311,6 +312,8 @@ class Setup:
     seed: int = 0
     ignore: Ignore = lambda _: {}
     """Frame index -> camera name -> pixels excluded from comparison."""
+
+    __repr__ = short_repr
 
     def frame(self, index: int, cameras: Names[str] | None = None) -> Frame:
         """Frame at an index of the sequence, with images of the given cameras (all by default)."""

@@ -26,6 +26,7 @@ from ..project import Key, MaskCorrection, ProjectState, Source
 from ..project.state import corrected_state, source_of
 from ..recording import Sequence
 from ..rendering import Renderer
+from ..reprs import short_repr
 from ..settings import Images, Masks, Parts
 from ..wording import counted
 from .encodings import image_png, mask_png
@@ -50,6 +51,8 @@ class ExportFrame(KinematicsRow):
     """
     ignored: Mapping[str, Bool[ndarray, "height width"]] = field(default_factory=dict, kw_only=True)
     """Camera -> pixels of occluders, where masks are not refined."""
+
+    __repr__ = short_repr
 
 
 def measured_frames(sequence: Sequence, indices: Iterable[int]) -> list[ExportFrame]:

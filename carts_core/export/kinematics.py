@@ -18,6 +18,7 @@ from ..files import csv_cell, text_of_cell
 from ..files.reading import TABLE, open_regular
 from ..model.scene import Scene
 from ..optimization.observability import undetermined_joints
+from ..reprs import short_repr
 from ..wording import shortened
 
 _TEXT_COLUMNS = ["verdict", "not_determined"]
@@ -39,6 +40,8 @@ class KinematicsRow:
     """Arm name -> standard deviation of the joint positions [dofs], [rad, m]; NaN or no entry if unknown."""
     verdict: str | None = None
     """Verdict on the mask: good, doubtful or failed; None if it was not assessed."""
+
+    __repr__ = short_repr
 
     def undetermined(self, scene: Scene) -> list[str] | None:
         """`ARM.JOINT` of the joints not determined by the images; None if no standard deviation is known."""

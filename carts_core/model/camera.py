@@ -10,9 +10,14 @@ from numpy.typing import ArrayLike
 
 from ..errors import SettingsError
 from ..files.reading import pixels_problem
+from ..reprs import short_repr
+from ..wording import shown
 
 HALF_PIXEL = 0.5
 """Offset of pixel centres: +0.5 here and 0 in OpenCV, so OpenCV's principal point is smaller by this offset [px]."""
+
+PIXEL_CENTERS = (0.0, HALF_PIXEL)
+"""Coordinates of the centre of the first pixel in the two conventions: OpenCV's and the one used here [px]."""
 
 DISTORTION_LENGTHS = (0, 4, 5, 8, 12, 14)
 """Numbers of coefficients of OpenCV's distortion models."""
@@ -79,6 +84,42 @@ def rigid_transform(value: ArrayLike, what: str) -> Float[np.ndarray, "4 4"]:
     return matrix
 
 
+def pinhole_intrinsics(K: ArrayLike, pixel_center: float, what: str = "K") -> tuple[float, float, float, float]:
+    """Convert an intrinsic matrix to fx, fy, cx, cy [px] with pixel centres at +0.5.
+
+    Args:
+        K: intrinsic matrix [3, 3], or fx, fy, cx, cy, in [px].
+        pixel_center: coordinate of the centre of the first pixel in the convention of `K`: 0 for pixel centres at
+            integers (OpenCV, ROS, MATLAB minus 1), 0.5 for an image that spans [0, width] (COLMAP, OpenGL).
+
+    Raises:
+        SettingsError: `K` is neither of both, not finite, has skew or is transposed, or `pixel_center` is another
+            number.
+    """
+    if pixel_center not in PIXEL_CENTERS:
+        raise SettingsError(
+            f"pixel_center is {pixel_center!r}. Give 0 if pixel centres are at integers (OpenCV, ROS), or 0.5 if the "
+            "centre of the first pixel is at (0.5, 0.5)."
+        )
+    try:
+        given = np.array(K, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise SettingsError(f"{what} is {shown(K)}. Give 3 rows of 3 numbers, or fx, fy, cx, cy [px].") from error
+    if given.shape not in ((3, 3), (4,)) or not np.isfinite(given).all():
+        raise SettingsError(
+            f"{what} is {shown(given.tolist())}, of shape {given.shape}. Give 3 rows of 3 finite numbers, or fx, fy, "
+            "cx, cy [px]."
+        )
+    fx, fy, cx, cy = given.tolist() if given.shape == (4,) else given[(0, 1, 0, 1), (0, 1, 2, 2)].tolist()
+    if given.shape == (3, 3) and not np.allclose(given, [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], atol=1e-6 * abs(fx)):
+        raise SettingsError(
+            f"{what} is {shown(given.tolist())}, but must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels, without "
+            "skew and not transposed."
+        )
+    offset = HALF_PIXEL - pixel_center
+    return fx, fy, cx + offset, cy + offset
+
+
 def implausible_intrinsics(
     width: int, height: int, intrinsics: tuple[float, float, float, float], distortion: tuple[float, ...] = ()
 ) -> str | None:
@@ -143,6 +184,8 @@ class Camera:
     distortion: tuple[float, ...] = ()
     """OpenCV's distortion coefficients k1 k2 p1 p2 [k3 ...] of the recorded image; empty without distortion."""
 
+    __repr__ = short_repr
+
     def __post_init__(self) -> None:
         if self.width < 1 or self.height < 1:
             raise SettingsError(f"the image size is {self.width} x {self.height}. Both must be at least 1 pixel.")
@@ -169,9 +212,14 @@ class Camera:
 
     @property
     def K(self) -> Float[np.ndarray, "3 3"]:
-        """Intrinsic matrix [px], with pixel centres at +0.5."""
+        """Intrinsic matrix [px], with pixel centres at +0.5; see `K_opencv` for OpenCV's convention."""
         fx, fy, cx, cy = self.intrinsics
         return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+
+    @property
+    def K_opencv(self) -> Float[np.ndarray, "3 3"]:
+        """Intrinsic matrix [px] in OpenCV's convention, with pixel centres at integers."""
+        return _opencv_matrix(self.intrinsics)
 
     def undistort(self, image: np.ndarray, interpolation: int = cv2.INTER_LINEAR) -> np.ndarray:
         """Undistort an image [height, width, ...]; unchanged if the camera has no distortion.
@@ -213,8 +261,7 @@ class Camera:
 def _undistortion_maps(
     width: int, height: int, intrinsics: tuple[float, ...], distortion: tuple[float, ...]
 ) -> tuple[np.ndarray, np.ndarray]:
-    fx, fy, cx, cy = intrinsics
-    K = np.array([[fx, 0.0, cx - HALF_PIXEL], [0.0, fy, cy - HALF_PIXEL], [0.0, 0.0, 1.0]])
+    K = _opencv_matrix(intrinsics)
     return cv2.initUndistortRectifyMap(K, np.array(distortion), np.eye(3), K, (width, height), cv2.CV_32FC1)
 
 
@@ -223,9 +270,13 @@ def _distortion_maps(
     width: int, height: int, intrinsics: tuple[float, ...], distortion: tuple[float, ...]
 ) -> tuple[np.ndarray, np.ndarray]:
     """Column and row in the undistorted image of each pixel of a recorded image."""
-    fx, fy, cx, cy = intrinsics
-    K = np.array([[fx, 0.0, cx - HALF_PIXEL], [0.0, fy, cy - HALF_PIXEL], [0.0, 0.0, 1.0]])
+    K = _opencv_matrix(intrinsics)
     rows, columns = np.mgrid[0:height, 0:width]
     pixels = np.stack([columns.ravel(), rows.ravel()], 1).astype(np.float64)
     found = cv2.undistortPoints(pixels[:, None], K, np.array(distortion), P=K).reshape(height, width, 2)
     return found[..., 0].astype(np.float32), found[..., 1].astype(np.float32)
+
+
+def _opencv_matrix(intrinsics: tuple[float, ...]) -> Float[np.ndarray, "3 3"]:
+    fx, fy, cx, cy = intrinsics
+    return np.array([[fx, 0.0, cx - HALF_PIXEL], [0.0, fy, cy - HALF_PIXEL], [0.0, 0.0, 1.0]])

@@ -17,6 +17,7 @@ from ..decoders.meshes import MAX_FACES, mesh_color, mesh_parts
 from ..errors import RobotError
 from ..files.decoding import Limits, called
 from ..files.reading import MESH, is_regular, open_regular
+from ..reprs import short_repr
 from ..wording import shown
 from .decimation import DecimationError, decimated
 
@@ -152,6 +153,8 @@ class LinkMesh:
     """Linear RGB in [0, 1]."""
     closed: bool
     """Whether the mesh encloses a volume, so that the backs of triangles are never visible."""
+
+    __repr__ = short_repr
 
 
 def is_closed(vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]) -> bool:

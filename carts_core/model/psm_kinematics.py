@@ -20,6 +20,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from ..errors import SettingsError
+from ..reprs import short_repr
 
 JOINT_NAMES = ("yaw", "pitch", "insertion", "roll", "wrist_pitch", "wrist_yaw")
 """Names of the joints, in the order of all arrays in this module."""
@@ -101,6 +102,8 @@ class InverseKinematics:
     joints: Float[np.ndarray, "rows 6"]
     """Joint positions [rad], [m]; NaN in unreachable rows."""
     unreachable: tuple[Unreachable, ...]
+
+    __repr__ = short_repr
 
     @property
     def reachable(self) -> Bool[np.ndarray, " rows"]:

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 
 from ..errors import RobotError
+from ..reprs import short_repr
 from ..wording import closest
 from .camera import Camera
 from .robot import Robot
@@ -23,6 +24,8 @@ class Arm:
     robot: Robot
     T_world_base: Float[np.ndarray, "4 4"]
     """Base frame of the arm (F_B of the paper)."""
+
+    __repr__ = short_repr
 
 
 @dataclass(frozen=True)
@@ -58,6 +61,8 @@ class SceneState:
     """fx, fy, cx, cy of the full-size image [px]."""
     T_mount_world: Float[Tensor, "*batch cameras 4 4"]
     """Measured poses of the camera mounts in this frame; the identity for static cameras."""
+
+    __repr__ = short_repr
 
     @property
     def T_view_world(self) -> Float[Tensor, "*batch cameras 4 4"]:
@@ -99,6 +104,8 @@ class Scene:
     arms: tuple[Arm, ...]
     cameras: tuple[Camera, ...]
     light: Light = field(default_factory=Light)
+
+    __repr__ = short_repr
 
     def arm(self, name: str) -> Arm:
         """Look up an arm by name.

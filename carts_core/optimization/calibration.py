@@ -16,6 +16,7 @@ from ..model.scene import Scene, SceneState
 from ..networks.extractor import FeatureExtractor
 from ..recording import Frame
 from ..recording.background import evenly_spaced
+from ..reprs import short_repr
 from ..settings import (
     CALIBRATION,
     CALIBRATION_SETTINGS,
@@ -105,6 +106,8 @@ class CalibrationIterate:
     seconds: float
     """Duration of this iteration [s]."""
 
+    __repr__ = short_repr
+
 
 @dataclass(frozen=True)
 class UnknownChange:
@@ -145,6 +148,8 @@ class CalibrationResult:
     """Arms whose base frame has moved farther than its known covariance allows."""
     deviations: Mapping[tuple[str, str], PoseDeviation] = field(default_factory=dict)
     """(arm, camera) -> standard deviations of the arm's pose relative to that camera, at the mean tip position."""
+
+    __repr__ = short_repr
 
 
 class CalibrationOptimizer:

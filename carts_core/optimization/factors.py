@@ -8,6 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.optim.adam import adam
 
+from ..reprs import short_repr
 from ..settings import DescentSolver
 
 
@@ -21,6 +22,8 @@ class Linearization:
     """Gradient of the cost [1/rad]."""
     hessian: Float[Tensor, "n n"]
     """Gauss-Newton approximation of the Hessian [1/rad^2]."""
+
+    __repr__ = short_repr
 
     def __add__(self, other: "Linearization") -> "Linearization":
         return Linearization(self.cost + other.cost, self.gradient + other.gradient, self.hessian + other.hessian)

@@ -14,6 +14,7 @@ from ..errors import SettingsError
 from ..model.scene import Scene, SceneState
 from ..networks.extractor import FeatureExtractor
 from ..recording import Frame
+from ..reprs import short_repr
 from ..settings import FreeParameters, SolverSettings, SurfaceSolver
 from ..settings.stages import FINEST, Descend
 from .factors import Factor, bounded_step
@@ -88,6 +89,8 @@ class Iterate:
     attention: Float[np.ndarray, "cameras h w"]
     similarity: Float[np.ndarray, "cameras h w"]
     """Cosine similarity of features, or 1 minus the squared difference of surface maps; at most 1."""
+
+    __repr__ = short_repr
 
     def joint_positions(self) -> dict[str, np.ndarray]:
         """Arm name -> joint positions [dofs], [rad, m]."""

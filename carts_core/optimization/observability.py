@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from ..reprs import short_repr
 from ..settings import SurfaceSolver
 from ..wording import counted
 from .factors import Prior
@@ -40,6 +41,8 @@ class Uncertainty:
     std_ratio: tuple[float, ...] | None = None
     """Ratio of posterior to prior standard deviation for the prior of the settings [1]; None if `expected` is that
     prior."""
+
+    __repr__ = short_repr
 
     def observability(self, name: str) -> Observability:
         """Observability of an unknown: whether its standard deviation decreases to a third, slightly, or hardly at

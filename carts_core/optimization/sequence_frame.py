@@ -18,6 +18,7 @@ from ..model.scene import Scene, SceneState
 from ..provenance import Checkpoint, fingerprint
 from ..recording import Frame
 from ..rendering import Renderer
+from ..reprs import short_repr
 from ..settings import FreeParameters, SequenceSettings, SurfaceSolver
 from ..settings.stages import COMPARE, FINEST, Observe, Stage, first_observe, reduced
 from .factors import Prior
@@ -309,6 +310,8 @@ class FrameEstimate:
     """Time spent on the frame over all visits, including reading [s]."""
     assessment: Assessment | None = None
     """Verdict; None before all frames are visited."""
+
+    __repr__ = short_repr
 
     def judged(self, assessment: Assessment, scene: Scene) -> "FrameEstimate":
         """Estimate with a verdict, and standard deviations that account for a wrong fit.

@@ -4,7 +4,7 @@ import math
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
-from enum import Enum
+from enum import StrEnum
 
 import numpy as np
 import torch
@@ -234,7 +234,7 @@ def _share(part: Float[Tensor, "cameras 1 h w"], whole: Float[Tensor, "cameras 1
     return total(part * whole) / max(total(whole), 1e-6)
 
 
-class Verdict(Enum):
+class Verdict(StrEnum):
     """Reliability of a fit."""
 
     GOOD = "good"

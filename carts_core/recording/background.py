@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 
 from ..errors import SequenceError
 from ..model.scene import Scene, SceneState
+from ..reprs import short_repr
 
 FRAMES = 30
 """Maximum number of frames, evenly spaced over the recording, for the median background."""
@@ -42,6 +43,8 @@ class MeanBackground:
     """Pixels that show no arm, even with the expected error of measured kinematics."""
     problem: str | None = None
     """Reason why the background is unreliable, as a sentence; None for a reliable background."""
+
+    __repr__ = short_repr
 
 
 def evenly_spaced(length: int, count: int = FRAMES) -> list[int]:

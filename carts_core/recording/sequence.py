@@ -14,6 +14,8 @@ from jaxtyping import Bool, Float, UInt8
 from ..errors import SequenceError
 from ..model.camera import Camera
 from ..model.scene import Scene
+from ..notebook import MEASURED_COLOUR, Picture, display
+from ..reprs import short_repr
 from ..wording import closest, counted
 from .background import MeanBackground, background_of_recording, evenly_spaced
 from .images import ByteCache, ImageFiles, ImageSource, read_file, read_image, read_mask
@@ -45,6 +47,8 @@ class Frame:
     """Acquisition time [s]; None if not known."""
     mounts: dict[str, Float[np.ndarray, "4 4"]] = field(default_factory=dict)
     """Camera -> T_mount_world [m], for moving cameras."""
+
+    __repr__ = short_repr
 
 
 @dataclass(frozen=True)
@@ -137,6 +141,50 @@ class Sequence:
     def __repr__(self) -> str:
         frames, cameras, domains = counted(len(self), "frame"), ", ".join(self._cameras), ", ".join(self.domains)
         return f"Sequence({self.name!r}, {frames}, cameras {cameras}, domains {domains})"
+
+    def _repr_html_(self) -> str:
+        """The first frame with the outline of the measured arms, and a table of the contents."""
+        picture, sentences = None, [*self.remarks]
+        try:
+            picture = self._measured_picture()
+            sentences.append(f"Frame {self.frame_ids[0]}, outline: measured arms (orange).")
+        except SequenceError as error:
+            sentences.append(str(error))
+        return display(f"{self.name}: {counted(len(self), 'frame')}", picture, sentences, self._contents())
+
+    def _measured_picture(self) -> Picture:
+        from ..rendering import Renderer  # noqa: PLC0415 - reading recordings requires no renderer
+
+        camera = self.scene.cameras[0].name
+        frame = self.frame(0, cameras=[camera])
+        renderer = Renderer(self.scene, cameras=[camera])
+        state = self.scene.with_cameras([camera]).state(frame.measured, mounts=frame.mounts)
+        return Picture(frame.images[camera], [(renderer.segment(state)[0] >= 0, MEASURED_COLOUR)])
+
+    def _contents(self) -> list[dict[str, str]]:
+        """Rows of the table of contents for notebooks."""
+        cameras = [
+            {
+                "content": "camera",
+                "name": name,
+                "description": f"{entry.camera.width} x {entry.camera.height} px"
+                + (", distorted" if any(entry.camera.distortion) else "")
+                + (", moving" if name in self._mounts else "")
+                + (", with masks" if any(self.has_masks(name, domain) for domain in self.domains) else ""),
+            }
+            for name, entry in self._cameras.items()
+        ]
+        arms = [
+            {
+                "content": "arm",
+                "name": arm.name,
+                "description": f"{arm.robot.name}, {counted(len(self.measured_joints[arm.name]), 'measured joint')}"
+                + (", with ground truth" if arm.name in (self.truth or {}) else ""),
+            }
+            for arm in self.scene.arms
+        ]
+        domains = [{"content": "domain", "name": name, "description": ""} for name in self.domains]
+        return [*cameras, *arms, *domains]
 
     def frame(self, index: int, domain: str | None = None, cameras: Iterable[str] | None = None) -> Frame:
         """Read a frame with the images of some cameras (all by default) in a domain (the first by default).

@@ -12,7 +12,15 @@ import tomlkit
 
 from ..errors import RobotError, SequenceError, SettingsError
 from ..files.reading import SEQUENCE, VALUES, is_regular, parse_json, read_text
-from ..model.camera import FARTHEST, HALF_PIXEL, Camera, implausible_intrinsics, rigid_transform
+from ..model.camera import (
+    FARTHEST,
+    HALF_PIXEL,
+    PIXEL_CENTERS,
+    Camera,
+    implausible_intrinsics,
+    pinhole_intrinsics,
+    rigid_transform,
+)
 from ..model.instruments import SCHEME, robot_file
 from ..model.robot import Robot
 from ..model.scene import Arm, Light, Scene
@@ -107,11 +115,14 @@ def _take_intrinsics(table: TomlTable) -> tuple[float, float, float, float]:
                 f"is {shown(K)}, but must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], without skew and not transposed.",
             )
     center = table.take("pixel_center", float, HALF_PIXEL)
-    if center not in (0.0, HALF_PIXEL):
+    if center not in PIXEL_CENTERS:
         raise table.error(
             "pixel_center", f"is {center!r}, but must be 0.5 (carts) or 0.0 (OpenCV, ROS, MATLAB minus 1)."
         )
-    return float(fx), float(fy), float(cx) + HALF_PIXEL - center, float(cy) + HALF_PIXEL - center
+    try:
+        return pinhole_intrinsics((fx, fy, cx, cy), center, table.name("K"))
+    except SettingsError as error:
+        raise SequenceError(str(error)) from error
 
 
 def _is_number(value: object) -> bool:

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from ..compiled import compiled
 from ..model.parts import NORMALS
+from ..reprs import short_repr
 from .rasterizer import VisiblePoints, as_array
 
 _HALF = np.float32(0.5)
@@ -112,6 +113,8 @@ class Tangents:
     intrinsics: Float[Tensor, "unknowns cameras 4"]
     """Derivatives of the intrinsics at the rendered size [px]."""
 
+    __repr__ = short_repr
+
 
 @dataclass(frozen=True)
 class JacobianBlock:
@@ -123,6 +126,8 @@ class JacobianBlock:
     top: int
     """Row of the upper left corner of the window in the maps [px]; `left` is its column."""
     values: Float[Tensor, "g cameras 6 rows columns"]
+
+    __repr__ = short_repr
 
     def dense(self, unknowns: int, like: Float[Tensor, "cameras 6 height width"]) -> Tensor:
         """Derivative of whole maps with respect to all unknowns, [unknowns, cameras, 6, height, width]."""
@@ -342,6 +347,8 @@ class Outline:
     """Index into `carts_core.model.parts.PARTS`."""
     motion: Float[Tensor, "unknowns K"]
     """Motion along the normal [px per unit of each unknown]."""
+
+    __repr__ = short_repr
 
     def at(self, step: Float[Tensor, " unknowns"]) -> "Outline":
         """Outlines moved by a small step of the unknowns."""

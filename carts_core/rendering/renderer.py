@@ -11,6 +11,7 @@ from torch import Tensor
 from ..model.keypoints import Keypoint
 from ..model.parts import NORMALS, SURFACE_CHANNELS
 from ..model.scene import Scene, SceneState
+from ..reprs import short_repr
 from .jacobian import JacobianBlock, Outline, Tangents, map_jacobian, normal_motion, outline_faces, outline_position
 from .rasterizer import SceneGeometry, link_transforms, phong, rasterize, vertices_in_camera, visible_points
 
@@ -73,6 +74,8 @@ class SurfaceRendering:
     jacobian: tuple[JacobianBlock, ...]
     """Derivatives of the maps with respect to the unknowns; empty if not requested."""
 
+    __repr__ = short_repr
+
 
 def surface_values(parts: Int[Tensor, " K"], normal: Float[Tensor, "3 K"]) -> Float[Tensor, "6 K"]:
     """Surface map values of points, from their parts (index into `carts_core.model.parts.PARTS`) and their normals,
@@ -107,6 +110,8 @@ class Rendering:
     """1 / depth of the visible surface [1/m], 0 for background; without gradient."""
     face_arms: Int[Tensor, " F"]
     """Arm of each triangle."""
+
+    __repr__ = short_repr
 
     @property
     def arm_ids(self) -> Int[Tensor, "*batch cameras height width"]:

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from carts_core.errors import SettingsError
-from carts_core.model.camera import Camera, rigid_transform
+from carts_core.model.camera import Camera, pinhole_intrinsics, rigid_transform
 
 INTRINSICS = (110.0, 115.0, 63.0, 46.0)
 BARREL = (-0.3, 0.08, 0.002, -0.001)
@@ -87,3 +87,20 @@ def test_an_impossible_camera_is_refused(changes, message):
 def test_a_transform_that_is_not_made_of_numbers_is_refused():
     with pytest.raises(SettingsError, match="T_world_base is not a matrix of numbers"):
         rigid_transform([["a", "b"], ["c"]], "T_world_base")
+
+
+def test_a_mask_returns_to_the_recorded_image():
+    distorted = camera(distortion=BARREL)
+    x, y = np.meshgrid(np.arange(128), np.arange(96))
+    recorded = np.hypot(x - 80, y - 30) < 15
+    returned = distorted.distorted_mask(distorted.undistort(recorded))
+    assert (returned != recorded).sum() < 0.03 * recorded.sum()
+    assert (distorted.undistort(recorded) != recorded).sum() > 0.06 * recorded.sum()
+    assert camera().distorted_mask(recorded) is recorded
+
+
+def test_intrinsics_of_both_pixel_conventions_are_converted_to_centres_at_one_half():
+    K = np.array([[110.0, 0.0, 63.0], [0.0, 115.0, 46.0], [0.0, 0.0, 1.0]])
+    assert pinhole_intrinsics(K, 0.0) == (110.0, 115.0, 63.5, 46.5)
+    assert pinhole_intrinsics((110, 115, 63, 46), 0.5) == INTRINSICS
+    np.testing.assert_array_equal(camera(intrinsics=pinhole_intrinsics(K, 0.0)).K_opencv, K)

@@ -15,6 +15,7 @@ from ...errors import SequenceError, SettingsError
 from ...files.decoding import decoded
 from ...files.reading import CALIBRATION, VALUES, is_regular, parse_ini, parse_json, parse_xml, parse_yaml, read_text
 from ...model.camera import DISTORTION_LENGTHS, T_DVRK_OPENCV, rigid_transform
+from ...reprs import short_repr
 from ...settings.interchange import Axes
 from .found import MALFORMED, PartError, cause, read_json
 
@@ -308,6 +309,8 @@ class DvrkBaseFrame:
     T_camera_base: Float[np.ndarray, "4 4"]
     """Pose of the base in the camera frame, with OpenCV's axes [m]; equals `T_world_base` if the camera frame is the
     world."""
+
+    __repr__ = short_repr
 
 
 def read_base_frames(path: Path, axes: Axes | None = None) -> tuple[DvrkBaseFrame, ...]:

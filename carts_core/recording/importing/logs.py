@@ -12,6 +12,7 @@ from ...errors import CartsError, SequenceError
 from ...model import ecm_kinematics
 from ...model.camera import T_DVRK_OPENCV
 from ...model.psm_kinematics import CLASSIC, JOINT_NAMES, PsmGeometry, forward, inverse
+from ...reprs import short_repr
 from ...wording import counted
 from ..matching import at_times, neighbours
 from .calibrations import read_base_frames
@@ -64,6 +65,8 @@ class BaseFrame:
     """Base frame in the reference frame of the poses [m]."""
     deviation: float
     """Median distance of the base in a row from the estimate [m]."""
+
+    __repr__ = short_repr
 
 
 def fit_base_frame(
