@@ -9,6 +9,7 @@ PUBLIC = (
     "errors",
     "evaluation",
     "export",
+    "fitting",
     "model.camera",
     "model.dvrk_model",
     "model.keypoints",
