@@ -16,14 +16,14 @@ _MAX_TEXT = 120
 _MAX_DEPTH = 4
 
 
-def short_repr(item: Any) -> str:
+def short_repr(self: Any) -> str:
     """`repr` of a dataclass instance; assign it to `__repr__` in the body of the class.
 
     Arrays and tensors are shown as `float32[480, 640]`, vectors of at most 8 values with 4 digits, and long collections
     by their first items.
     """
-    inside = ", ".join(f"{field.name}={_short(getattr(item, field.name))}" for field in fields(item) if field.repr)
-    return f"{type(item).__name__}({inside})"
+    inside = ", ".join(f"{field.name}={_short(getattr(self, field.name))}" for field in fields(self) if field.repr)
+    return f"{type(self).__name__}({inside})"
 
 
 def _short(value: Any, depth: int = 0) -> str:

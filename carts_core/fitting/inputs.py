@@ -184,7 +184,7 @@ def arms_of(
                     f"{what} is a mapping, but T_camera_base is a single transform. For several arms, give "
                     "T_camera_base, urdf and joints as mappings from arm name."
                 )
-        given = {ARM: joints}
+        given: dict[str, Any] = {ARM: joints}
     else:
         given = _per_arm(joints, Ts, "joints")
     urdfs = _per_arm(urdf, Ts, "urdf") if isinstance(urdf, Mapping) else dict.fromkeys(Ts, urdf)

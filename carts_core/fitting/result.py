@@ -86,22 +86,22 @@ class Fit:
         return {arm.name: ids == index for index, arm in enumerate(self.scene.arms)}
 
     @property
-    def joints(self) -> Float[np.ndarray, " dofs"] | Any:
+    def joints(self) -> Any:
         """Corrected joint positions [rad, m]; form as described above."""
         return self._in_given_form(self.result.joint_positions())
 
     @property
-    def std(self) -> Float[np.ndarray, " dofs"] | Any:
+    def std(self) -> Any:
         """Standard deviations of `joints` [rad, m], NaN if unknown; form as described above."""
         return self._in_given_form(self.result.joint_std())
 
     @property
-    def measured_joints(self) -> Float[np.ndarray, " dofs"] | Any:
+    def measured_joints(self) -> Any:
         """Measured joint positions [rad, m]; form as described above."""
         return self._in_given_form(self.measured)
 
     @property
-    def T_camera_base(self) -> Float[np.ndarray, "4 4"] | Any:
+    def T_camera_base(self) -> Any:
         """Transform from an arm's base to the camera [m]; for several arms, a dictionary by arm."""
         state = self.result.state
         Ts = (state.T_view_world[0] @ state.T_world_base).double().cpu().numpy()

@@ -29,9 +29,10 @@ def code_cells() -> list[str]:
 def run_cell(source: str, namespace: dict[str, Any]) -> Any:
     """Run a cell; the value of its last expression, which a kernel would show, or None."""
     tree = ast.parse(source)
-    last = tree.body.pop() if isinstance(tree.body[-1], ast.Expr) and not source.rstrip().endswith(";") else None
-    exec(compile(tree, NOTEBOOK.name, "exec"), namespace)
-    return None if last is None else eval(compile(ast.Expression(last.value), NOTEBOOK.name, "eval"), namespace)
+    last = tree.body[-1]
+    shown = ast.Expression(last.value) if isinstance(last, ast.Expr) and not source.endswith(";") else None
+    exec(compile(ast.Module(tree.body[: -1 if shown else None], []), NOTEBOOK.name, "exec"), namespace)
+    return None if shown is None else eval(compile(shown, NOTEBOOK.name, "eval"), namespace)
 
 
 def test_the_notebook_fits_and_shows_an_image() -> None:

@@ -52,6 +52,10 @@ def tiny(shipped_psm: Robot) -> dict[str, Any]:
     }
 
 
+def fitted_with(tiny: dict[str, Any], **changes: Any) -> carts.Fit:
+    return carts.fit(**{**tiny, **changes})
+
+
 @pytest.fixture(scope="module")
 def fitted(tiny: dict[str, Any]) -> carts.Fit:
     return carts.fit(**tiny)
@@ -107,7 +111,7 @@ def shift_between(before: np.ndarray, after: np.ndarray) -> np.ndarray:
 
 def test_the_other_pixel_convention_is_half_a_pixel_away(tiny: dict[str, Any]) -> None:
     (fx, _, cx), (_, fy, cy), _ = tiny["K"]
-    opencv, explicit, other = (carts.fit(**tiny | options) for options in ({}, {"pixel_center": 0}, CENTER))
+    opencv, explicit, other = (fitted_with(tiny, **options) for options in ({}, {"pixel_center": 0}, CENTER))
     assert opencv.camera.intrinsics == explicit.camera.intrinsics == (fx, fy, cx + 0.5, cy + 0.5)
     assert other.camera.intrinsics == (fx, fy, cx, cy)
     shift = shift_between(other.measured_mask, opencv.measured_mask)
@@ -132,7 +136,7 @@ def test_points_projected_by_opencv_lie_in_the_middle_of_the_mask(tiny: dict[str
 def test_four_numbers_and_a_camera_give_the_same_as_a_matrix(tiny: dict[str, Any], fitted: carts.Fit) -> None:
     fx, fy, cx, cy = tiny["K"][(0, 1, 0, 1), (0, 1, 2, 2)]
     for K in ((fx, fy, cx, cy), fitted.camera):
-        assert carts.fit(**tiny | {"K": K}).camera.intrinsics == fitted.camera.intrinsics
+        assert fitted_with(tiny, K=K).camera.intrinsics == fitted.camera.intrinsics
 
 
 def test_a_principal_point_of_the_other_convention_warns_unless_the_convention_is_given(
@@ -140,10 +144,10 @@ def test_a_principal_point_of_the_other_convention_warns_unless_the_convention_i
 ) -> None:
     K = fitted.camera.K  # With pixel centres at 0.5.
     with pytest.warns(UserWarning, match=UNKNOWN_CENTER) as caught:
-        found = carts.fit(**tiny | {"K": K})
+        found = fitted_with(tiny, K=K)
     assert caught[0].filename == __file__
     assert UNKNOWN_CENTER in found.remarks[0] and UNKNOWN_CENTER in found._repr_html_()
-    assert carts.fit(**tiny | {"K": K, "pixel_center": 0.5}).camera.intrinsics == fitted.camera.intrinsics
+    assert fitted_with(tiny, K=K, pixel_center=0.5).camera.intrinsics == fitted.camera.intrinsics
 
 
 @pytest.mark.parametrize(
@@ -161,21 +165,21 @@ def test_a_principal_point_of_the_other_convention_warns_unless_the_convention_i
 )
 def test_wrong_intrinsics_are_refused(tiny: dict[str, Any], changed: dict[str, Any], message: str) -> None:
     with pytest.raises(SettingsError, match=message):
-        carts.fit(**tiny | changed)
+        fitted_with(tiny, **changed)
 
 
 def test_a_camera_has_its_own_size_and_convention(tiny: dict[str, Any], fitted: carts.Fit) -> None:
     with pytest.raises(SettingsError, match="Leave out pixel_center"):
-        carts.fit(**tiny | {"K": fitted.camera, "pixel_center": 0})
+        fitted_with(tiny, K=fitted.camera, pixel_center=0)
     with pytest.raises(SettingsError, match=r"has 64 x 48 pixels, but the image 128 x 96"):
-        carts.fit(**tiny | {"K": fitted.camera.resized(64, 48)})
+        fitted_with(tiny, K=fitted.camera.resized(64, 48))
 
 
 def test_with_distortion_the_mask_belongs_to_the_given_image(tiny: dict[str, Any], fitted: carts.Fit) -> None:
     distortion = (-0.25, 0.05, 0.0, 0.0)
     recorded = Camera("camera", WIDTH, HEIGHT, fitted.camera.intrinsics, np.eye(4), distortion)
     mask = recorded.distorted_mask(tiny["mask"])
-    found = carts.fit(**tiny | {"mask": mask, "distortion": distortion})
+    found = fitted_with(tiny, mask=mask, distortion=distortion)
     assert dice(found.mask, mask) > 0.998 and dice(mask, tiny["mask"]) < 0.992
     assert found.camera.distortion == distortion and found.scene.cameras[0].distortion == ()
 
@@ -187,13 +191,13 @@ def test_images_and_masks_may_be_files(tiny: dict[str, Any], fitted: carts.Fit, 
     image, mask = tmp_path / "image.png", tmp_path / "mask.png"
     cv2.imwrite(str(image), tiny["image"][..., ::-1])
     mask.write_bytes(mask_png(tiny["mask"]))
-    found = carts.fit(**tiny | {"image": str(image), "mask": mask})
+    found = fitted_with(tiny, image=str(image), mask=mask)
     assert np.array_equal(found.image, tiny["image"]) and np.array_equal(found.joints, fitted.joints)
 
 
 def test_the_image_is_copied(tiny: dict[str, Any]) -> None:
     image = tiny["image"].copy()
-    found = carts.fit(**tiny | {"image": image})
+    found = fitted_with(tiny, image=image)
     image[:] = 0
     assert np.array_equal(found.image, tiny["image"])
 
@@ -222,7 +226,7 @@ def test_wrong_images_and_masks_are_refused(
     tiny: dict[str, Any], changed: dict[str, Any], error: type[CartsError], message: str
 ) -> None:
     with pytest.raises(error, match=message):
-        carts.fit(**tiny | changed)
+        fitted_with(tiny, **changed)
 
 
 # --- Arms ---
@@ -230,7 +234,7 @@ def test_wrong_images_and_masks_are_refused(
 
 def test_joints_by_name_come_back_by_name(tiny: dict[str, Any], fitted: carts.Fit, shipped_psm: Robot) -> None:
     named = dict(reversed(list(zip(shipped_psm.joint_names, tiny["joints"], strict=True))))
-    found = carts.fit(**tiny | {"joints": named, "urdf": shipped_psm.urdf})
+    found = fitted_with(tiny, joints=named, urdf=shipped_psm.urdf)
     assert found.joints == dict(zip(shipped_psm.joint_names, fitted.joints, strict=True))
     assert found.std.keys() == found.measured_joints.keys() == named.keys()
 
@@ -239,7 +243,7 @@ def test_several_arms_are_mappings_by_arm(tiny: dict[str, Any]) -> None:
     beside = np.array(tiny["T_camera_base"])
     beside[0, 3] += 0.01
     both = {"T_camera_base": {"a": tiny["T_camera_base"], "b": beside}, "joints": dict.fromkeys("ab", tiny["joints"])}
-    found = carts.fit(**tiny | both | {"urdf": "builtin:psm_lnd"})
+    found = fitted_with(tiny, **both, urdf="builtin:psm_lnd")
     assert list(found.joints) == list(found.std) == list(found.T_camera_base) == ["a", "b"]
     assert found.joints["a"].shape == tiny["joints"].shape
     assert not (found.arm_masks["a"] & found.arm_masks["b"]).any()
@@ -267,12 +271,12 @@ def test_several_arms_are_mappings_by_arm(tiny: dict[str, Any]) -> None:
 )
 def test_wrong_arms_are_refused(tiny: dict[str, Any], changed: dict[str, Any], message: str) -> None:
     with pytest.raises((SettingsError, RobotError), match=message):
-        carts.fit(**tiny | changed)
+        fitted_with(tiny, **changed)
 
 
 def test_degrees_and_millimetres_are_recognized_by_the_limits(tiny: dict[str, Any]) -> None:
     with pytest.warns(UserWarning) as caught:
-        carts.fit(**tiny | {"joints": tiny["joints"] * 1000})
+        fitted_with(tiny, joints=tiny["joints"] * 1000)
     texts = [str(warning.message) for warning in caught]
     assert any("joints: insertion is" in text and "if they are millimetres, divide" in text for text in texts) or any(
         "if they are degrees, convert them with np.radians" in text for text in texts
@@ -281,7 +285,7 @@ def test_degrees_and_millimetres_are_recognized_by_the_limits(tiny: dict[str, An
 
 def test_an_arm_out_of_view_is_a_failed_fit_with_a_hint_at_the_inverse(tiny: dict[str, Any]) -> None:
     with pytest.warns(UserWarning, match=r"no arm is in view.*T_base_camera may have been given"):
-        found = carts.fit(**tiny | {"T_camera_base": np.linalg.inv(tiny["T_camera_base"])})
+        found = fitted_with(tiny, T_camera_base=np.linalg.inv(tiny["T_camera_base"]))
     assert found.verdict == "failed" and "T_camera_base" in found.remedy
     np.testing.assert_allclose(found.joints, tiny["joints"], atol=1e-6)
 
@@ -317,7 +321,7 @@ def test_a_fit_is_shown_as_overlay_and_table(fitted: carts.Fit, shipped_psm: Rob
 def test_names_cannot_add_markup(tiny: dict[str, Any]) -> None:
     name = "<script>alert(1)</script>"
     arms = {"T_camera_base": {name: tiny["T_camera_base"]}, "joints": {name: tiny["joints"]}}
-    text = carts.fit(**tiny | arms)._repr_html_()
+    text = fitted_with(tiny, **arms)._repr_html_()
     assert "script" not in Tags(text).seen and "&lt;script&gt;" in text
 
 
@@ -338,7 +342,8 @@ def test_a_plot_draws_the_outlines_on_given_axes(fitted: carts.Fit, monkeypatch:
     figure, ax = plt.subplots()
     try:
         assert fitted.plot(ax) is ax
-        assert [text.get_text() for text in ax.get_legend().get_texts()] == ["measured", "corrected"]
+        legend = ax.get_legend()
+        assert legend is not None and [text.get_text() for text in legend.get_texts()] == ["measured", "corrected"]
         corrected = np.concatenate([path.vertices for path in ax.collections[1].get_paths()])
         rows, columns = np.nonzero(fitted.mask)
         # Axes of OpenCV's convention: the outline is half a pixel outside of the centres of the outermost pixels.
