@@ -84,7 +84,8 @@ def fit(
         networks: the networks, or a predictor of surface maps; the shipped networks by default, loaded once.
 
     Returns:
-        The fit: `mask`, `joints`, `std`, `verdict`, `plot()`. A failed fit keeps the measured joint positions.
+        Result with `mask`, `joints`, `std`, `verdict` and `plot()`. If the fit has failed, it holds the measured joint
+        positions, unless they fit worse.
 
     Raises:
         SettingsError: an argument has a wrong type, shape or value.
@@ -146,7 +147,7 @@ def fit_frame(
         mask, ignore, settings, free, networks: as in `fit`; masks refer to the undistorted image.
 
     Returns:
-        The fit. Its image is undistorted, and joint positions are dictionaries of arrays by arm.
+        Result of which the image is undistorted, and joint positions are dictionaries of arrays by arm.
 
     Raises:
         SequenceError: there is no such frame, camera or domain, or an image is missing or damaged.

@@ -41,9 +41,9 @@ class JointRow(NamedTuple):
 class Fit:
     """Fit of robot arms to an image, by `carts_core.fit` or `carts_core.fit_frame`.
 
-    A failed fit keeps the measured joint positions, so check `verdict`. Joint positions are in the form in which
-    they were given: arrays in the order of the URDF, or dictionaries by joint name; for several arms, dictionaries of
-    these by arm.
+    If a fit has failed, it holds the measured joint positions, unless they fit worse, so check `verdict`. Joint
+    positions are in the form in which they were given: arrays in the order of the URDF, or dictionaries by joint name;
+    for several arms, dictionaries of these by arm.
     """
 
     image: UInt8[np.ndarray, "height width 3"]
