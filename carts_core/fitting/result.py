@@ -163,7 +163,7 @@ class Fit:
             ax: axes to draw on; by default those of a new figure.
 
         Returns:
-            The axes; `fit.plot().figure.savefig("fit.png")` writes a file.
+            The axes, of which `figure` is the figure to show or to write to a file.
         """
         if ax is None:
             import matplotlib.pyplot as plt  # noqa: PLC0415 - takes half a second
