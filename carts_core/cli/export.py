@@ -93,13 +93,13 @@ class Export:
     frame_rate: float | None = None
     """Frame rate of a video [1/s]; by default the frame rate of the recording, or 25 if it has no timestamps."""
     masks: Masks = "auto"
-    """Masks of the formats masks, coco, yolo, voc, cvat, datumaro, rosbag2, lerobot and surgsync: `rendered` at the
-    corrected pose, or `refined` near their outline by the network; `auto` refines the masks of frames with the verdict
-    *good*. Rendered masks of refined views are written to the folder `rendered`."""
+    """Masks of the formats masks, coco, yolo, voc, cvat, datumaro, rosbag2, lerobot, surgsync and recorded-csv:
+    `rendered` at the corrected pose, or `refined` near their outline by the network; `auto` refines the masks of frames
+    with the verdict *good*. Rendered masks of refined views are written to the folder `rendered`."""
     network: Annotated[Network, tyro.conf.arg(name="")] = field(default_factory=Network)
     recording: Path | None = None
-    """Recording to which the results are added (lerobot, surgsync); by default the one that the sequence was imported
-    from."""
+    """Recording to which the results are added (lerobot, surgsync, recorded-csv); by default the one that the sequence
+    was imported from."""
     overwrite: bool = False
     """Replace an earlier export."""
     select: Annotated[Selection, tyro.conf.arg(name="")] = field(default_factory=Selection)

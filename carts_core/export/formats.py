@@ -30,6 +30,7 @@ from .annotation_formats import (
 from .dataset import Dataset, ExportFrame, ExportProgress
 from .kinematics import JOINED, joint_columns, joint_units, kinematics_csv, position_values, std_values
 from .lerobot_format import write_lerobot
+from .recorded_csv_format import write_recorded_csv
 from .rosbag_format import write_rosbag2
 from .surgsync_format import write_surgsync
 from .video import write_video
@@ -172,6 +173,7 @@ FORMATS: dict[FormatName, ExportFormat] = {
     "rosbag2": ExportFormat("ROS 2 bag (MCAP)", write_rosbag2, refines=True),
     "lerobot": ExportFormat("LeRobot data set", write_lerobot, refines=True, source="lerobot"),
     "surgsync": ExportFormat("SurgSync recording", write_surgsync, refines=True, source="surgsync"),
+    "recorded-csv": ExportFormat("Recorded tables, CSV", write_recorded_csv, refines=True, source="folder"),
 }
 
 

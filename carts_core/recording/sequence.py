@@ -225,6 +225,11 @@ class Sequence:
         cameras = {name: camera.motion for name, camera in self._cameras.items() if camera.motion is not None}
         return Logged(arms, {name: motion.logged_at(times) for name, motion in cameras.items()})
 
+    def logged_rows(self, arm: str) -> tuple[Float[np.ndarray, " rows"] | None, Float[np.ndarray, "rows dofs"]]:
+        """Rows of an arm's table: times [s], None if row n belongs to frame n, and joint positions [rad, m]."""
+        rows = self._description.arms[arm].measured
+        return rows.times, rows.values
+
     def checked_matching(self) -> TimeMatching:
         """Matching of frames and rows by time; `SequenceError` if rows are not matched by time."""
         if self.matching is None:

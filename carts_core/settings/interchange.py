@@ -105,6 +105,7 @@ FormatName = Literal[
     "rosbag2",
     "lerobot",
     "surgsync",
+    "recorded-csv",
 ]
 """Names of the export formats."""
 

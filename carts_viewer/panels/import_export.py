@@ -27,6 +27,7 @@ _WITHOUT_PARTS = (
     "rosbag2",
     "lerobot",
     "surgsync",
+    "recorded-csv",
 )
 """Formats without categories, or with a fixed choice of categories."""
 _WRITTEN = (

@@ -21,6 +21,8 @@ _MAX_UNIT_LENGTH = 12
 _DATE = re.compile(r"\d{4}-\d\d-\d\d[T ]\d\d:\d\d:\d\d([.,]\d+)?(Z|[+-]\d\d:?\d\d)?")
 _MAX_NUMBER_LENGTH = 100
 """Maximum length of a numeric cell [characters]; string arrays allocate the maximum length for each cell."""
+DECIMAL_COMMAS = "decimal commas are read as decimal points"
+"""Remark on a table with decimal commas."""
 TABLE_SUFFIXES = (".csv", ".txt", ".tsv", ".parquet", ".npy", ".npz")
 
 
@@ -105,7 +107,7 @@ def _csv(path: Path) -> ForeignTable:
         return ForeignTable(path, {})
     if lines[0].startswith("#"):
         lines[0] = lines[0].lstrip("# ")
-    delimiter = _delimiter(lines[:50])
+    delimiter = delimiter_of(lines[:50])
     tables.check_size(len(lines), lines[0].count(delimiter or " ") + 1)
     cells = map(str.split, lines) if delimiter is None else csv.reader(lines, delimiter=delimiter)
     rows, remarks = _even([[cell.strip() for cell in row] for row in cells], numbers)
@@ -123,7 +125,7 @@ def _csv(path: Path) -> ForeignTable:
         body, numbers = body[1:], numbers[1:]
     columns = {name: _typed([row[index] for row in body], commas) for index, name in enumerate(header)}
     if any("," in cell for row in body[:5] for cell in row) and commas:
-        remarks.append("decimal commas are read as decimal points")
+        remarks.append(DECIMAL_COMMAS)
     dates = tuple(
         name for index, name in enumerate(header) if body and all(_DATE.fullmatch(row[index]) for row in body)
     )
@@ -132,7 +134,7 @@ def _csv(path: Path) -> ForeignTable:
     return ForeignTable(path, columns, units, dates, tuple(remarks), tuple(numbers))
 
 
-def _delimiter(lines: list[str]) -> str | None:
+def delimiter_of(lines: list[str]) -> str | None:
     """Separator of cells; None for blanks. Semicolons and tabs take precedence over commas, which may be decimal
     commas."""
     for mark in ";\t":

@@ -48,7 +48,8 @@ def _files(path: Path, suffixes: tuple[str, ...]) -> list[Path]:
     return [file for folder in _folders(path) for file in files_with(folder, suffixes)]
 
 
-def _tables(path: Path) -> list[Path]:
+def tables_of(path: Path) -> list[Path]:
+    """Tables in a folder and its visible subfolders, down to two levels."""
     return _files(path, TABLE_SUFFIXES)
 
 
@@ -115,7 +116,7 @@ def kinematics_table(path: Path, options: ImportOptions) -> ForeignTable | None:
         return None
     if options.kinematics is not None:
         return read_foreign_table(options.kinematics if options.kinematics.is_file() else path / options.kinematics)
-    tables = [table for table in map(_readable, _tables(path)) if table is not None]
+    tables = [table for table in map(_readable, tables_of(path)) if table is not None]
     known = (table for table in tables if guess_columns(table, replace(options, columns={})).arms)
     return next(known, None) or next(filter(_is_wide, tables), None)
 
@@ -141,10 +142,10 @@ def _kinematics(path: Path, job: Import) -> list[tuple[ForeignTable, ColumnMeani
         table = kinematics_table(path, options)
         found = [] if table is None else [(table, guess_columns(table, options))]
     else:
-        tables = [table for table in map(_readable, _tables(path)) if table is not None]
+        tables = [table for table in map(_readable, tables_of(path)) if table is not None]
         found = [(table, guess_columns(table, options)) for table in tables]
         if not any(meanings.arms for _, meanings in found):
-            for file in _tables(path):
+            for file in tables_of(path):
                 if file.suffix.lower() in (".csv", ".tsv", ".parquet"):
                     read_foreign_table(file)  # This raises the error of an unreadable table.
             found = [(table, meanings) for table, meanings in found if _is_wide(table)][:1]
@@ -177,7 +178,7 @@ def _kinematics(path: Path, job: Import) -> list[tuple[ForeignTable, ColumnMeani
 
 def _frames(path: Path, images: Images, ids: tuple[str, ...], kinematics: list[Path], job: Import) -> FrameTimes:
     """Frames and their times, from a table with as many rows as images, else from the rate of a video."""
-    for file in _tables(path):
+    for file in tables_of(path):
         table = None if file in kinematics else _readable(file)
         if table is None:
             continue
@@ -224,7 +225,7 @@ def _note_missing_kinematics(path: Path, job: Import) -> None:
     if job.options.kinematics == NO_TABLE:
         job.found("kinematics are left out, as requested.")
         return
-    tables = [table for table in map(_readable, _tables(path)) if table is not None and len(table.columns) > 1]
+    tables = [table for table in map(_readable, tables_of(path)) if table is not None and len(table.columns) > 1]
     if not tables:
         job.missing(f"no table of joints or poses in {path}.", remedy="Give one: --kinematics FILE.")
         return
@@ -280,7 +281,7 @@ SOURCE = Source(
     "folder",
     "images or videos with a table of kinematics",
     "a folder with images or videos and a .csv, .parquet, .npy or .npz file, two levels deep",
-    lambda path: path.is_dir() and bool(_image_places(path)) and bool(_tables(path)),
+    lambda path: path.is_dir() and bool(_image_places(path)) and bool(tables_of(path)),
     ("images", "kinematics", "columns", "clock", "time_offset", "frame_rate"),
     _read,
 )
