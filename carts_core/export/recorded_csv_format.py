@@ -134,7 +134,7 @@ def _rows(
 ) -> Int[ndarray, " logged"] | None:
     """Row of the table for each logged row of the sequence; None if they do not correspond."""
     numbers = np.stack([table.numbers(column).astype(np.float64) for column in named.values()], 1)
-    used: Bool[ndarray, " rows"] = np.isfinite(numbers).all(1)
+    used = np.asarray(np.isfinite(numbers).all(1))
     if times is not None and meanings.time is not None:
         seconds = row_seconds(table, meanings.time, None, Import(ImportOptions()))
         assert seconds is not None
