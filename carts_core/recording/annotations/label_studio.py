@@ -24,6 +24,10 @@ _UPLOAD_PREFIX = re.compile(r"[0-9a-f]{8}-(?=.)")
 _CHANNELS, _WORD_BITS, _HEADER_BITS = 4, 8, 53
 """Brush masks encode red, green, blue and opacity of each pixel, in words of eight bits; the header has the number of
 words (32 bits), bits of a word less one (5), and four lengths of counts less one (4 each)."""
+_LENGTH_BITS = 0x237F
+"""Counts of 3, 4, 8 and 16 bits, less one each, as Label Studio writes them."""
+_LONGEST, _RUN_BITS, _REPEATED_LONG = 2**16, 27, 0b111 << 24
+"""Words in a run with a count of 16 bits, bits of such a run, and its first three bits: repeated, fourth length."""
 
 
 def is_label_studio(content: Any) -> bool:
@@ -91,7 +95,7 @@ def _chosen(task: Any, what: str, remarks: Counter[str]) -> Any:
 
 def _image_name(data: dict[str, Any], control: str) -> str:
     """Name of the image of a control (`<Image name=...>`), from the fields of its task."""
-    names = {key: _file_of(value) for key, value in data.items() if isinstance(value, str)}
+    names = {key: file_of_address(value) for key, value in data.items() if isinstance(value, str)}
     images = {key: name for key, name in names.items() if name.lower().endswith(_IMAGE)}
     chosen = next((key for key in (control, "image") if key in images), None)
     if len(images) == 1:
@@ -105,8 +109,9 @@ def _image_name(data: dict[str, Any], control: str) -> str:
     return images[chosen]
 
 
-def _file_of(address: str) -> str:
-    """Path of the file in an address, without the prefix of uploads; local files have it in their query."""
+def file_of_address(address: str) -> str:
+    """Path of the file in a URL or path, without the prefix that Label Studio adds to uploads; addresses of local
+    files have the path in their query."""
     try:
         parts = urlsplit(address)
     except ValueError:
@@ -188,6 +193,20 @@ def _mask(value: dict[str, Any], height: int, width: int) -> Bool[np.ndarray, "h
         corner, extent = _pixels([[value["x"], value["y"]], [value["width"], value["height"]]], size)
         return mask_of_polygon(corners_of_box(corner, extent, angle), height, width)
     raise ValueError("its type is not supported; draw polygons, rectangles, ellipses or brush masks")
+
+
+def brush_of_mask(mask: Bool[np.ndarray, "height width"]) -> list[int]:
+    """Bytes of the run-length encoding of a brush mask, as Label Studio stores them; masked pixels are opaque."""
+    words = np.repeat(mask.ravel(), _CHANNELS)
+    starts = np.flatnonzero(np.diff(words, prepend=~words[:1]))
+    # Runs are divided, since a length has 16 bits at most.
+    starts = np.union1d(starts, np.arange(0, len(words), _LONGEST))
+    lengths = np.diff(starts, append=len(words))
+    runs = _REPEATED_LONG | (lengths - 1) << _WORD_BITS | np.where(words[starts], 255, 0)
+    head = (len(words) << 5 | _WORD_BITS - 1) << 16 | _LENGTH_BITS
+    bits = [int(bit) for bit in f"{head:0{_HEADER_BITS}b}"]
+    body = runs[:, None] >> np.arange(_RUN_BITS - 1, -1, -1) & 1
+    return np.packbits(np.concatenate([bits, body.ravel()]).astype(np.uint8)).tolist()
 
 
 def opacity_of_brush(codes: Any, height: int, width: int) -> UInt8[np.ndarray, "height width"]:

@@ -14,6 +14,7 @@ from ...model.camera import HALF_PIXEL, Camera
 from ..importing.cameras import side_of
 from ..sequence import Sequence
 from .images import BACKGROUND, MAX_LABELS, Annotations, ForeignImage, FrameAnnotation
+from .label_studio import file_of_address
 from .recognition import AnnotationFormat, recognized
 
 _INSIDE = {"annotations/instances_default.json", "annotations.xml"}
@@ -59,6 +60,12 @@ def read_annotations(
     return Annotations(kind, reader.frames(images), labels, unknown, remarks)
 
 
+def find_frame(image: str, sequence: Sequence) -> tuple[int, str] | None:
+    """Index of the frame and name of the camera of an image, given its name, path or address; None for other images."""
+    matcher = _FrameReader(sequence, None, "", [], [], undistorted=False)
+    return matcher.place(ForeignImage(file_of_address(image)))
+
+
 class _FrameReader:
     """Converts images of a source into frames of a sequence."""
 
@@ -84,7 +91,7 @@ class _FrameReader:
         joined: list[ForeignImage] = []
         done: set[tuple[int, str]] = set()
         for image in images:
-            found = self._place(image)
+            found = self.place(image)
             if found is None:
                 self._unknown.append(image.name)
                 continue
@@ -100,7 +107,8 @@ class _FrameReader:
         if at is not None:
             yield self._joined(at, joined)
 
-    def _place(self, image: ForeignImage) -> tuple[int, str] | None:
+    def place(self, image: ForeignImage) -> tuple[int, str] | None:
+        """Frame and camera of an image; None if it does not match."""
         camera = self._camera_of(image)
         if camera is None:
             return None
