@@ -19,6 +19,7 @@ from carts_core.export.kinematics import joint_columns
 from carts_core.model.psm_kinematics import forward
 from carts_core.recording import Sequence
 from carts_core.recording.importing.importer import import_recording
+from carts_core.recording.sequence_file import calibrated_sequence_file
 from carts_core.settings.interchange import ImportOptions
 
 STATE = "observation.state_corrected"
@@ -229,3 +230,14 @@ def test_missing_and_unknown_recordings_are_errors_in_words(tmp_path, tiny_seque
     with pytest.raises(CartsError, match=r"frame '003' of .* and its row of episode 0 .* are 0\.1333 s apart"):
         export(replace(data, recording=dataset(tmp_path / "set")), "lerobot", tmp_path / "out")
     assert not (tmp_path / "out").exists()
+
+
+def test_a_calibrated_copy_of_the_sequence_file_keeps_the_recording(tmp_path):
+    path = dataset(tmp_path / "set")
+    file, _ = import_recording(path, tmp_path / "sequence")
+    scene = Sequence.open(file).scene
+    copy = tmp_path / "elsewhere/deeper/sequence.toml"
+    copy.parent.mkdir(parents=True)
+    copy.write_text(calibrated_sequence_file(file, copy.parent, scene, scene))
+    found = Sequence.open(copy).recording
+    assert found is not None and found.resolve() == path

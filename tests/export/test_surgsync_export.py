@@ -109,3 +109,18 @@ def test_another_recording_is_refused(tmp_path, make):
     with pytest.raises(CartsError, match=r"are not those of .*--recording PATH"):
         export(data, "surgsync", tmp_path / "out")
     assert not (tmp_path / "out").exists()
+
+
+def test_files_outside_of_the_recording_are_not_copied(tmp_path):
+    path = clip(tmp_path / "source")
+    data = imported(path, tmp_path / "sequence")
+    (tmp_path / "secret").write_text("key")
+    for name in ("notes.txt", "camera_calibration/notes.yaml"):
+        (path / name).symlink_to(tmp_path / "secret")
+        with pytest.raises(CartsError, match="is a link to a file outside of the recording"):
+            export(data, "surgsync", tmp_path / "out")
+        (path / name).unlink()
+    (path / "notes").symlink_to(tmp_path, target_is_directory=True)
+    with pytest.raises(CartsError, match="is a link to a file outside of the recording"):
+        export(data, "surgsync", tmp_path / "out")
+    assert not (tmp_path / "out").exists()
