@@ -5,7 +5,8 @@ from difflib import get_close_matches
 from itertools import islice
 
 _MAX_COMPARED_LENGTH, _MAX_COMPARED = 100, 200
-"""Maximum length and number of names searched for misspellings, since the cost grows with the product of lengths."""
+"""Maximum length of a misspelt name, and maximum number of known names that it is compared with; the cost grows with
+the product of lengths."""
 
 
 def counted(number: int, what: str) -> str:

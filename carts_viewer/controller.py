@@ -281,11 +281,11 @@ class Controller(Handler):
         self._context.change(busy=text)
 
     def score(self) -> None:
-        """Compare the pose with ground truth, unless already done; errors as in `handle`."""
+        """Compare the pose with ground truth, unless already done; errors are those of `handle`."""
         self._context.score()
 
     def map(self) -> None:
-        """Compute the maps of the chosen layer; errors as in `handle`."""
+        """Compute the maps of the chosen layer; errors are those of `handle`."""
         if not self._live.active:
             self._optimizing.map()
 

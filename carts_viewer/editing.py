@@ -273,7 +273,7 @@ class Editor:
         self.drop()
 
     def apply(self, name: str, edits: Edits, figures: Mapping[int, Figures] | None = None) -> Change | None:
-        """Save edits as one undo step of this user, without a draft; errors as in `Project.apply`."""
+        """Save edits as one undo step of this user, without a draft; errors are those of `Project.apply`."""
         return self.people.apply(self.person, name, edits, figures)
 
     def claim(self) -> None:

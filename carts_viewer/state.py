@@ -452,7 +452,7 @@ class ViewState:
     name: str = ""
     """Name of this user."""
     others: tuple[tuple[str, int], ...] = ()
-    """Names and frames of the other present users."""
+    """Names and frames of the other users who are present."""
     busy: str | None = None
     """Current preparation of the worker, as text for the user."""
     export: ExportState | None = None

@@ -166,7 +166,7 @@ class Worker:
             tab.publish(lambda work, tab=tab: self._attempt(work, tab))
 
     def _attempt(self, work: Callable[[], None], *tabs: Tab, stop: bool = False) -> None:
-        """Call a function; errors are shown in these tabs."""
+        """Call a function; errors are shown in `tabs`."""
         try:
             work()
         except Exception as error:

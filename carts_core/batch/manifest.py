@@ -51,9 +51,8 @@ def read_manifest(path: Path, output: Path | None = None) -> list[Job]:
     except (OSError, ValueError) as error:
         raise SettingsError(f"manifest {path} cannot be read: {error}. Give a TOML file (docs: batch).") from error
     if content.get("format") != FORMAT:
-        raise SettingsError(
-            f"manifest {path} has the format {shown(content.get('format'))}; write format = {FORMAT!r}."
-        )
+        has = f"the format {shown(content['format'])}" if "format" in content else "no format"
+        raise SettingsError(f"manifest {path} has {has}; write format = {FORMAT!r}.")
     tables = content.get("jobs")
     if not isinstance(tables, list) or not tables or not all(isinstance(table, dict) for table in tables):
         raise SettingsError(f"manifest {path} has no [[jobs]]. Add at least one, with recordings and steps.")

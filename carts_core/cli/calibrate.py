@@ -116,8 +116,8 @@ class TimeOffset:
     domain: str | None = None
     """Domain of the images; by default the first domain."""
     largest: float = 0.5
-    """Search range around the current time_offset [s], extended to at most 3 s if no delay in this range explains the
-    motion."""
+    """Half-width of the search range around the current time_offset [s], extended to at most 3 s if no delay in this
+    range explains the motion."""
 
     def run(self) -> None:
         """Print the estimate, and write a sequence file if a folder is given."""

@@ -210,7 +210,7 @@ class FrameFolder:
 
     @contextmanager
     def locked(self) -> Iterator[None]:
-        """Lock the folder against other processes and read existing results; errors as in the class."""
+        """Lock the folder against other processes and read existing results; errors are those of the class."""
         with locked_folder(self.folder):
             self._check_settings()
             self._goes_on = holds_file(self._table) and not self._overwrite

@@ -58,7 +58,7 @@ class Selection:
     """Domains, by name, or `all`; by default the first domain of the sequence."""
 
     def frame_indices(self, sequence: "Sequence") -> list[int]:
-        """Indices of the selected frames; errors as in `chosen_frames`."""
+        """Indices of the selected frames; errors are those of `chosen_frames`."""
         return chosen_frames(self.frames, self.positions, sequence.frame_ids)
 
     def camera_names(self, scene: "Scene") -> list[str]:

@@ -209,7 +209,7 @@ def evaluate(
 
 
 def _estimates(setup: "Setup", frames: Names[int]) -> Iterator[tuple[Frame, Estimate]]:
-    """Solve frames; yields each frame, with its initial joint positions as `measured`, and its estimate."""
+    """Solve frames, and yield each frame, with its initial joint positions as `measured`, and its estimate."""
     if setup.model is None:
         _ = setup.backgrounds  # The computation of the background is not part of a frame's time.
         for index in frames:

@@ -147,7 +147,7 @@ class Decoder:
         self._folder = ""
 
     def call(self, function: Callable[..., Any], *arguments: Any, limits: Limits) -> Any:
-        """Run a function in the child and return its result; errors as in `decoded`."""
+        """Run a function in the child and return its result; errors are those of `decoded`."""
         request = _packed([os.getcwd(), function.__module__, function.__qualname__, arguments, *vars(limits).values()])
         try:
             if (reply := self._reply(request, limits)) is None:

@@ -288,14 +288,14 @@ def check_regular(path: Path, kind: Kind) -> None:
 
 
 def read_bytes(path: Path, kind: Kind) -> bytes:
-    """Read a file; errors as in `open_regular`."""
+    """Read a file; errors are those of `open_regular`."""
     with open_regular(path, kind) as file:
         size = os.fstat(file.fileno()).st_size
         content = file.read(size + 1)  # Reading allocates memory of the requested size.
         if len(content) > size:
             content += file.read(kind.limit + 1 - len(content))
     if len(content) > kind.limit:
-        raise _too_large(kind, "grows while it is read")
+        raise _too_large(kind, "grew while it was read")
     return content
 
 
@@ -382,7 +382,7 @@ def parse_yaml(text: str) -> Any:
 
 @cache
 def _plain_yaml(parser: Any) -> Any:
-    """Create a loader without merge keys that parses numbers in linear time."""
+    """Create a loader that rejects merge keys and parses numbers in linear time."""
 
     class PlainLoader(parser):
         def flatten_mapping(self, node: Any) -> None:

@@ -323,7 +323,7 @@ class FeatureExtractor:
         return self._features.features(images.contiguous(memory_format=torch.channels_last))
 
     def probability(self, images: Float[Tensor, "batch 3 h w"]) -> Float[Tensor, "batch 1 h w"]:
-        """Probability of an instrument in each pixel. Arguments and errors as `features`."""
+        """Probability of an instrument in each pixel. Arguments and errors are those of `features`."""
         return self._features.logits(images.contiguous(memory_format=torch.channels_last)).sigmoid()
 
     @torch.no_grad()
@@ -332,7 +332,7 @@ class FeatureExtractor:
     ) -> Float[Tensor, "batch 6 h w"]:
         """Predict surface maps from images and the surface maps of prior poses.
 
-        The result is on the device of the images. Arguments and errors as `SurfaceNetwork.forward`.
+        The result is on the device of the images. Arguments and errors are those of `SurfaceNetwork.forward`.
         """
         if self._faster is not None:
             self._surface.check_input(images, 3)

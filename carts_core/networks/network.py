@@ -120,7 +120,7 @@ class FeatureNetwork(UNet):
         return self.decoded(self.standardized(images))[0]
 
     def logits(self, images: Float[Tensor, "batch 3 h w"]) -> Float[Tensor, "batch 1 h w"]:
-        """Log odds of an instrument in each pixel. Arguments and errors as `features`."""
+        """Log odds of an instrument in each pixel. Arguments and errors are those of `features`."""
         return self.head(self.features(images))
 
     def forward(self, images: Float[Tensor, "batch 3 h w"]) -> Float[Tensor, "batch 1 h w"]:

@@ -183,7 +183,7 @@ class UNetSurface(UNet):
         self.out = nn.Conv2d(_HIDDEN, _OUTPUTS, 1)
 
     def forward(self, images: Float[Tensor, "batch 3 h w"], given: Float[Tensor, "batch 6 h w"]) -> SurfaceLogits:
-        """Predict surface maps of images. Arguments and errors as `SurfaceNetwork.forward`."""
+        """Predict surface maps of images. Arguments and errors are those of `SurfaceNetwork.forward`."""
         fine, coarse = self.decoded(torch.cat([self.standardized(images), given], 1))
         grown = functional.interpolate(self.coarse(coarse), scale_factor=2, mode="bilinear", align_corners=False)
         hidden = (grown + self.fine(fine)).relu()

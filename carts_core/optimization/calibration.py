@@ -288,7 +288,7 @@ class CalibrationOptimizer:
     def result(self) -> CalibrationResult:
         """Result at the best iterate of the finest descent that was run; `SettingsError` before the first step."""
         if self.best is None or self._problem.present is None:
-            raise SettingsError("no step was made. Call `step` first.")
+            raise SettingsError("no step was taken. Call `step` first.")
         offsets = self.best.offsets
         evaluation = self._problem.evaluate(offsets, self._problem.present)
         assert evaluation.hessian is not None

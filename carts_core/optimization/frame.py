@@ -131,7 +131,7 @@ class FrameOptimizer:
             stage's resolution, which saves a third of the time. The result is the same.
 
     Raises:
-        SettingsError: an image or background is missing or of the wrong size, nothing is free, or factors are
+        SettingsError: an image or background is missing or of the wrong size, no parameter is free, or factors are
             given to a `DescentSolver`.
         RobotError: `start` lacks an arm or has the wrong number of joint positions.
     """

@@ -23,7 +23,7 @@ class FramePredictor(Protocol):
     @property
     def masked(self) -> bool:
         """Whether coverage comes from given masks. In this case the whole image is compared, without dehazing,
-        backgrounds and edges."""
+        backgrounds or edges."""
         ...
 
     @property

@@ -148,7 +148,7 @@ class SequenceOptimizer:
     First, a few evenly spaced frames are solved individually; the first frame starts at the correction that fits all of
     these best. Each later frame starts at its predicted correction, with the covariance of the prediction as prior.
     After the last frame all corrections are smoothed backwards, and frames whose images contradict the result are
-    visited again. Finally, all estimates are assessed. Failed frames are solved individually if only joints are free;
+    optimized again. Finally, all estimates are assessed. Failed frames are solved individually if only joints are free;
     if the sequence failed, frames that still fail return to their measured values. Frames in `keyframes` are not
     changed.
 
@@ -168,8 +168,8 @@ class SequenceOptimizer:
 
     Raises:
         RobotError: a keyframe lacks an arm, or has the wrong number of joint positions.
-        SettingsError: there are no frames, a keyframe is not among them, times do not increase, nothing is free, or the
-            settings belong to another solver.
+        SettingsError: there are no frames, a keyframe is not among them, times do not increase, no parameter is free,
+            or the settings belong to another solver.
     """
 
     def __init__(
@@ -299,7 +299,7 @@ class SequenceOptimizer:
         )
 
     def _assessed(self) -> Iterator[FrameEstimate]:
-        """Assess all estimates, then solve failed frames individually if only joints are free; yields each new
+        """Assess all estimates, then solve failed frames individually if only joints are free; yield each new
         estimate."""
         failed, corrections = [], self._smoother.smoothed()
         for index, estimate in self.estimates.items():

@@ -224,7 +224,7 @@ def start_explains_as_well(problem: FrameProblem, offsets: Float[Tensor, " n"], 
 
 
 def run_stages(stages: Sequence[Stage], fit: Fit) -> Iterator[Point]:
-    """Run stages in order; yields each evaluated point."""
+    """Run stages in order, and yield each evaluated point."""
     for stage in stages:
         if fit.exhausted and not isinstance(stage, RejectFailed):
             continue
@@ -236,7 +236,7 @@ def run_stages(stages: Sequence[Stage], fit: Fit) -> Iterator[Point]:
 
 @singledispatch
 def run_stage(stage: object, fit: Fit) -> Iterator[Point]:
-    """Run one stage; yields each evaluated point."""
+    """Run one stage, and yield each evaluated point."""
     raise TypeError(f"{stage!r} is not a stage")
 
 

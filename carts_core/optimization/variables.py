@@ -48,7 +48,7 @@ class Variables:
         names: name of each unknown.
 
     Raises:
-        SettingsError: nothing is free, or `free` names a joint that does not exist.
+        SettingsError: no parameter is free, or `free` names a joint that does not exist.
         RobotError: `free` names an arm or a camera that does not exist.
     """
 

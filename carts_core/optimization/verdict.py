@@ -99,7 +99,7 @@ class Evidence(ArmEvidence):
     loss: float
     """Cost of the surface factor per pixel of the arms, without the prior [1]; see `Evaluation.loss`."""
     predicted: float
-    """Share of the rendered arms in the network's unconditioned prediction [1]."""
+    """Share of the rendered arms' area that the unconditioned network also predicts as arms [1]."""
     changed: float | None
     """Share of the rendered arms that differs from the mean background [1]; None if the background is unknown."""
     still_in_view: float = 1.0
@@ -377,8 +377,8 @@ _NOTHING_THERE: tuple[tuple[Callable[[Evidence], bool], str, str], ...] = (
     (
         lambda found: found.still_in_view < MIN_AREA_RATIO,
         "An arm that was in view initially has left the image.",
-        "Check that the image, or the fitted mask, shows all arms; move the arm roughly by hand and run again, or "
-        "check T_camera_world and T_world_base.",
+        "Check that the image, or the fitted mask, shows all arms; place the arm roughly in the viewer and run again, "
+        "or check T_camera_world and T_world_base.",
     ),
     (
         lambda found: found.changed is not None and found.changed < _UNSEEN,
@@ -388,12 +388,12 @@ _NOTHING_THERE: tuple[tuple[Callable[[Evidence], bool], str, str], ...] = (
 )
 
 _REMEDY = (
-    "Inspect the overlay. Run the optimizer if it has not run, move the arm by hand, or fit the frame with its "
+    "Inspect the overlay. Run the optimizer if it has not run, place the arm in the viewer, or fit the frame with its "
     "neighbours (sequence mode; Solve in the viewer) if not done yet."
 )
 _REMEDY_FAILED = (
-    "Run the optimizer. If it has run, move the arm roughly by hand and run again, check the calibration, or add an "
-    "image of the empty scene to the sequence file (`background`)."
+    "Run the optimizer. If it has run, place the arm roughly in the viewer and run again, check the calibration, or "
+    "add an image of the empty scene to the sequence file (`background`)."
 )
 
 _CALIBRATION_REMEDY = (
@@ -406,7 +406,7 @@ def _weakest(found: Evidence) -> str:
     if found.masked:
         return "the rendering and the given mask differ."
     against = {
-        "the network's prediction lies elsewhere.": found.agreement,
+        "the network predicts the arms elsewhere.": found.agreement,
         "the network's prediction without the fit as prior differs from the fit.": found.unconditioned,
     }
     if found.overlap_with_change is not None:

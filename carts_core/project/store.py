@@ -305,7 +305,7 @@ def open_or_begin(path: Path, identity: SequenceIdentity) -> tuple[ProjectState,
 
 
 def read_project(path: Path, identity: SequenceIdentity | None) -> ProjectState:
-    """Read the state of the project of a sequence, or of any sequence; errors as in `open_or_begin`."""
+    """Read the state of the project of a sequence, or of any sequence; errors are those of `open_or_begin`."""
     memory, state, _ = _load(path, identity, keep_what_is_left=False)
     memory.close()
     return state

@@ -269,6 +269,7 @@ def check_present(key: str, files: tuple[Path, ...], frames: FrameList, hint: st
         shown = ", ".join(f"{file} (frame {frame_id})" for file, frame_id in missing[:_SHOWN_MISSING])
         rest = f" and {len(missing) - _SHOWN_MISSING} more" if len(missing) > _SHOWN_MISSING else ""
         raise SequenceError(
-            f"{key}: {len(missing)} of {counted(len(files), 'file')} missing: {shown}{rest}, but {frames.counted}, and "
-            f"each needs a file. Restore the files, correct the pattern, or remove the rows.{hint}"
+            f"{key}: {len(missing)} of {counted(len(files), 'file')} {'is' if len(missing) == 1 else 'are'} missing: "
+            f"{shown}{rest}. Each frame needs a file ({frames.counted}). Restore the files, correct the pattern, or "
+            f"remove the rows.{hint}"
         )

@@ -336,7 +336,7 @@ class _Raster:
     """A decoded image file, upright."""
 
     pixels: np.ndarray
-    """[height, width] or [height, width, 3], RGB, of 8 or 16 bits."""
+    """[height, width] or [height, width, 3], RGB, with 8 or 16 bits per channel."""
     opaque: np.ndarray | None
     """Opaque pixels; None if all pixels are opaque."""
     indices: np.ndarray | None

@@ -271,7 +271,7 @@ class JointColumns:
         return tuple(name for name in self.robot.joint_names if name in mapped)
 
     def read(self, table: Table) -> Float[np.ndarray, "rows dofs"]:
-        """Read the joint positions of all rows [rad], [m], in the robot's order; errors as `JointColumn.read`."""
+        """Read the joint positions of all rows [rad], [m], in the robot's order; raises as `JointColumn.read`."""
         names = self.robot.joint_names
         positions = np.tile([self.defaults.get(name, 0.0) for name in names], (len(table), 1))
         for column in self.columns:

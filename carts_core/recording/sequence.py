@@ -288,7 +288,7 @@ class Sequence:
         self._cache.clear()
 
     def mean_background(self, camera: str, domain: str | None = None) -> MeanBackground:
-        """Background with its known pixels and reliability; errors as `background`."""
+        """Background with its known pixels and reliability; errors are those of `background`."""
         domain = self._domain(domain)
         with self._background_lock:
             if (camera, domain) not in self._backgrounds:
@@ -388,7 +388,7 @@ class FrameReader:
         self._stride = 1
 
     def frame(self, index: int, domain: str, *cameras: str) -> Frame:
-        """Read a frame with the images of some cameras; errors as `Sequence.frame`."""
+        """Read a frame with the images of some cameras; errors are those of `Sequence.frame`."""
         self._replace_plan(())
         frame = self._sequence.frame(index, domain, list(cameras))
         moved = 0 if self._last is None else index - self._last

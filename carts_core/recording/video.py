@@ -409,7 +409,7 @@ def _one_field(frame: VideoFrame, *, bottom: bool) -> UInt8[np.ndarray, "height 
 
 
 def _display_matrix(frame: VideoFrame) -> Float[np.ndarray, "2 2"]:
-    """Rotation and mirroring from stored to displayed columns and rows; the identity by default."""
+    """2x2 matrix of rotation and mirroring from stored to displayed columns and rows; the identity by default."""
     for entry in cast(Iterable[SideData], frame.side_data):
         if entry.type.name == "DISPLAYMATRIX" and entry.buffer_size == 36:
             values = np.frombuffer(bytes(entry), np.int32).reshape(3, 3)[:2, :2].T

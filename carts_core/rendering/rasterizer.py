@@ -212,7 +212,7 @@ class SceneGeometry:
     face_links: Int[Tensor, " F"]
     face_arms: Int[Tensor, " F"]
     face_parts: Int[Tensor, " F"]
-    """Index into `carts_core.model.parts.PARTS`."""
+    """Index of each face into `carts_core.model.parts.PARTS`."""
     face_surfaces: Int[Tensor, " F"]
     """Index of the closed surface of each triangle, -1 for none; its back is not visible from outside."""
     face_colors: Float[Tensor, "3 F"]

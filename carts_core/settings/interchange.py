@@ -37,7 +37,7 @@ class ImportOptions:
     """Camera -> size of the images used for calibration, such as 640x480, if the calibration file does not contain
     it."""
     kinematics: Path | None = None
-    """Table of joint positions or tip poses (CSV, Parquet, NPY); `none` for images alone."""
+    """Table of joint positions or tip poses (CSV, Parquet, NPY); `none` to import only images."""
     columns: Mapping[str, str] = field(default_factory=dict)
     """Joint, `time` or `frame` -> column of the table."""
     angle_unit: AngleUnit | None = None

@@ -52,8 +52,8 @@ class SequenceSettings(Ranged):
     """Like `correlation_seconds`, for the reported standard deviations [s]; longer, since errors of the network persist
     while an instrument is seen from the same side."""
     initial_frames: Annotated[int, Range(1, 20)] = 5
-    """Number of evenly spaced frames that are solved individually to initialize the first frame; 1 uses only the first
-    frame [1]."""
+    """Number of evenly spaced frames that are solved individually to initialize the first frame [1]; 1 uses only the
+    first frame."""
     cold_factor: Annotated[float, Range(1, 100)] = 2.0
     """Multiple of the median loss above which a frame gets a cold start [1]."""
     direction: Direction = "forward"
@@ -158,7 +158,7 @@ class SurfaceSolver(Ranged):
 
     @property
     def needs_background(self) -> bool:
-        """Whether the mean background is compared."""
+        """Whether the solver requires a mean background."""
         return False
 
 
@@ -201,7 +201,7 @@ class DescentSolver(Ranged):
 
     @property
     def needs_background(self) -> bool:
-        """Whether the mean background is compared."""
+        """Whether the solver requires a mean background."""
         return True
 
     @staticmethod

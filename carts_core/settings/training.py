@@ -236,7 +236,7 @@ class ImageSettings(Ranged):
         super().__post_init__()
         if self.width % 16 or self.height % 16 or min(self.width, self.height) <= 0:
             raise SettingsError(
-                f"training images of {self.width}x{self.height} px; give positive multiples of 16 for both."
+                f"training images have {self.width}x{self.height} px; both lengths must be positive multiples of 16."
             )
         if self.field_width < self.width:
             raise SettingsError(f"field_width is {self.field_width}; give at least the width, {self.width}.")

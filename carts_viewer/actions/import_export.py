@@ -20,6 +20,7 @@ from carts_core.project.state import calibrated_scene
 from carts_core.project.values import UNREVIEWED
 from carts_core.recording.annotations import read_annotations
 from carts_core.settings import Masks
+from carts_core.wording import shown
 from carts_viewer.actions import intents
 from carts_viewer.actions.context import Context, Handler
 from carts_viewer.jobs.optimizers import OptimizerFactory
@@ -108,7 +109,8 @@ class ExportingHandler(Handler):
             raise CartsError("An export is already running. Wait, or cancel it first.")
         known = intent.format in FORMATS and intent.frames in FRAME_CHOICES and intent.parts in PARTS_CHOICES
         if not known or intent.masks not in MASKS_CHOICES:
-            raise SettingsError(f"Unsupported export: {intent}.")
+            wanted = ", ".join(map(shown, (intent.format, intent.frames, intent.parts, intent.masks)))
+            raise SettingsError(f"Unsupported export (format, frames, categories, masks): {wanted}.")
         self._context.end_run("Stopped: an export was started")
         self._context.save()
         make, count = self._dataset(intent)
@@ -246,11 +248,13 @@ def export_warnings(project: ProjectState, frames: Sequence[int], cameras: Colle
     open_ones = len(frames) - accepted
     if open_ones:
         found.append(f"{open_ones} of {len(frames)} frames {'is' if open_ones == 1 else 'are'} not accepted")
-    for verdict, text in (("failed", "failed"), ("doubtful", "are doubtful")):
+    for verdict in ("failed", "doubtful"):
         those = [i for i in recorded if (known := project.verdict(i)) is not None and known.verdict == verdict]
-        found += _line(project, those, f"of these frames {text}")
+        have = "has" if len(those) == 1 else "have"
+        found += _line(project, those, f"of the exported frames {have} the verdict {verdict}")
     partly = [i for i in recorded if not _seen_by_all(project, i, cameras)]
-    return found + _line(project, partly, "of these frames were fitted to fewer cameras than exported")
+    were = "was" if len(partly) == 1 else "were"
+    return found + _line(project, partly, f"of the exported frames {were} fitted to only some of the exported cameras")
 
 
 def _seen_by_all(project: ProjectState, frame: int, cameras: Collection[str]) -> bool:

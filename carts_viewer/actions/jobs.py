@@ -87,7 +87,7 @@ class JobsHandler(Handler):
         self._publish()
 
     def ask(self, intent: intents.Intent, requester: JobRequester) -> None:
-        """Carry out an intent with the state of the requester's tab; errors as in `handle`."""
+        """Carry out an intent with the state of the requester's tab; errors are those of `handle`."""
         self._requester = requester
         self.handle(intent)
 

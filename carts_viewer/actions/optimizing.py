@@ -274,8 +274,8 @@ class OptimizingHandler(Handler):
         return found
 
     def _on_Assess(self, intent: intents.Assess) -> None:
-        self.end("Stopped: the fit was checked")
-        self._optimizers.report("Comparing with the images")
+        self.end("Stopped: a check of the fit was started")
+        self._optimizers.report("Comparing the pose with the images")
         state = self._context.state
         target = self._session.target(state.observed)
         found = self._check.fit(state.index, state.domain, state.pose, state.settings, target)

@@ -153,7 +153,7 @@ class _PromptedObject:
     before: Layers
     """The layers before the object was added."""
     after: Layers
-    """The layers with the object."""
+    """The layers after the object was added."""
 
 
 class Prompting:

@@ -292,7 +292,7 @@ class OptimizerFactory:
         return self._frame_optimizer(task, predictor)
 
     def assess(self, task: FrameTask) -> tuple[Assessment, float]:
-        """Assessment and loss of a pose, which is not changed; errors as in `make`."""
+        """Assessment and loss of a pose, which is not changed; errors are those of `make`."""
         surface = task.settings if isinstance(task.settings, SurfaceSolver) else SurfaceSolver()
         fixed = replace(task, settings=replace(surface, stages=NONE), free=FreeParameters())
         optimizer = self._frame_optimizer(fixed, self.predictor(task.target))

@@ -58,7 +58,7 @@ class JobsPanel:
                 min=1,
                 max=MAX_CALIBRATION_FRAMES,
                 step=1,
-                hint="Number of frames, evenly spread over the whole sequence regardless of the range",
+                hint="Number of frames, evenly spaced over the whole sequence regardless of the range",
             )
             page.button("Calibrate", lambda _: intents.Calibrate(int(self._count.value)), icon=viser.Icon.RULER_MEASURE)
             self._minutes = gui.add_number(

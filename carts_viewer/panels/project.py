@@ -31,7 +31,7 @@ class SavedPanel:
         """Update the widgets."""
         path = self._storage.project.path
         asked = jobs_question(state) or network_question(state)
-        decide = "Jobs or a network of another user need your confirmation: see Jobs." if asked else None
+        decide = "Jobs or a network of another user need your confirmation; see the tab Jobs." if asked else None
         notice = " ".join(filter(None, (self._storage.notice, *state.problems, decide))) or None
         if notice != self._noticed:
             self._noticed = notice

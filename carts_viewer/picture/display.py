@@ -1,4 +1,4 @@
-"""Sends changed pictures and widgets to a tab, as fast as the tab draws."""
+"""Sends changed pictures and widgets to a tab, no faster than the tab draws them."""
 
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -44,7 +44,7 @@ class PageDisplay:
         self._rate_limit.drawn()
 
     def ready_in(self) -> float:
-        """Time until the page can take another picture [s]."""
+        """Time until the page can receive another picture [s]."""
         return self._rate_limit.ready_in()
 
     def show_picture(self, state: ViewState) -> None:

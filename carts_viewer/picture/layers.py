@@ -39,7 +39,7 @@ TRUTH_COLORS = {
 """The paper's colours for the comparison with a ground-truth mask."""
 
 ADDED_COLOR, REMOVED_COLOR, IGNORED_COLOR = (190, 242, 60), (239, 68, 68), (168, 85, 247)
-"""Colours of pixels added to the mask, removed from it, or excluded from the optimizer."""
+"""Colours of pixels added to the mask, removed from it, or excluded from the optimization."""
 RENDERED_COLOR = (255, 255, 255)
 """Colour of the outline of the rendered mask in the layer *Refined mask*."""
 

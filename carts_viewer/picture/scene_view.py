@@ -1,4 +1,4 @@
-"""The 3D scene of the page: the frame and its overlay in front of the lens, and behind them arms and cameras.
+"""The 3D scene of the page: the images of the frame with their overlays, and behind them arms and cameras.
 
 viser's world frame is that of the shown camera (OpenCV axes), so the endoscope view looks from the origin along z. The
 recording's world frame is a node that is moved when another camera is shown.
@@ -18,7 +18,7 @@ from carts_viewer.picture.layers import ARM_COLORS, Rgba
 from carts_viewer.transport.viser_private import image_file
 
 LENS = "/lens"
-"""Lines from the lens to the corners of the frame; hidden like `WORLD`."""
+"""Lines from the camera centre to the corners of its image; hidden like `WORLD`."""
 FRAME = "/frame"
 OVERLAY = "/overlay"
 GRID = "/grid"
@@ -49,7 +49,7 @@ class SceneView:
     """3D scene of a tab."""
 
     def __init__(self, shown: viser.SceneApi, scene: Scene, state: SceneState, camera: str) -> None:
-        """`state` determines the distance of the frame from the lens."""
+        """`state` determines the distance of the images from the camera centre."""
         self._shown = shown
         self._scene = scene
         self._depth = max(_DEPTH_SHARE * _distance_of_arms(scene, state, camera), _MIN_DEPTH)
@@ -64,18 +64,18 @@ class SceneView:
         self._add_grid()
 
     def show_frame(self, image: UInt8[np.ndarray, "height width 3"], camera: Camera) -> None:
-        """Put an image of this camera in front of the lens."""
+        """Show an image of this camera on its image plane (the base of its frustum)."""
         self._put(FRAME, image, camera, self._depth, "jpeg")
 
     def show_overlay(self, picture: Rgba, camera: Camera) -> None:
-        """Put an overlay for this camera's image between the image and the lens."""
+        """Show an overlay of this camera's image, slightly nearer to the camera centre than the image."""
         self._put(OVERLAY, picture, camera, _OVERLAY_SHARE * self._depth, "png")
 
     def show_beside(self, camera: Camera, active: Camera, image: np.ndarray | None, overlay: Rgba | None) -> None:
         """Show another camera's image and overlay beside those of the active camera; None leaves them unchanged.
 
         Images form a grid in the order of the cameras. Each is scaled to the size of the active camera's image, which
-        remains in front of the lens.
+        remains on its image plane.
         """
         names = [own.name for own in self._scene.cameras]
         place, width, height = self._beside(names.index(camera.name), names.index(active.name), camera, active)
@@ -177,7 +177,7 @@ class SceneView:
         return True
 
     def _outline(self, name: str, camera: Camera, color: tuple[int, int, int]) -> viser.LineSegmentsHandle:
-        """Lines from a lens to the corners of its image at the frame's depth, and around the image."""
+        """Lines from a camera centre to the corners of its image at the frame's depth, and around the image."""
         fx, fy, cx, cy = camera.intrinsics
         z = self._depth
         corners = [

@@ -88,7 +88,7 @@ class FileBrowser:
         self.problem = ""
 
     def begin_in(self, folder: Path) -> None:
-        """List this folder, if it is allowed."""
+        """List this folder if it is allowed; otherwise, list the first allowed folder."""
         self.browse(str(folder))
         if self.problem:
             self.folder, self.problem = self.roots.folders[0], ""

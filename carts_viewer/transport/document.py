@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 class Document:
-    """HTML document over the page in all tabs; initially empty."""
+    """HTML document shown over the page in all tabs; initially empty."""
 
     def __init__(self, page: Page) -> None:
         self.page = page

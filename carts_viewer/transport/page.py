@@ -261,7 +261,7 @@ class Page:
         self._set_initial_view()
 
     def _set_initial_view(self) -> None:
-        """Set OpenCV's axes and the initial view along the lens."""
+        """Set OpenCV's axes and the initial view along the optical axis."""
         self.server.scene.set_up_direction("-y")
         initial = self.server.initial_camera
         initial.up, initial.position, initial.look_at = (0.0, -1.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.1)

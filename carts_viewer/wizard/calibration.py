@@ -256,7 +256,7 @@ def calibrated_scene(scene: Scene, calibration: Mapping[str, Any]) -> Scene:
 def calibrated_recording(
     recording: FoundRecording, before: Scene, calibration: Mapping[str, Any], text: str
 ) -> FoundRecording:
-    """The recording with a calibration (`as_plain`) instead of placeholders; errors as in `calibrated_scene`.
+    """The recording with a calibration (`as_plain`) instead of placeholders; errors are those of `calibrated_scene`.
 
     Args:
         before: scene of the recording.

@@ -53,7 +53,7 @@ class Draft:
     offered: Mapping[str, Any] | None = None
     """A calibration that contradicts the clicked points, until it is kept or discarded."""
     report: CalibrationReport | None = None
-    """Report of the kept or offered calibration."""
+    """Report of `calibration` or `offered`."""
 
     def to_json(self) -> str:
         """The draft in JSON format."""

@@ -198,7 +198,7 @@ def test_invalid_shapes_of_labelme_are_left_out(
         ({"imageHeight": 10, "imageWidth": 12}, "is 12 x 10 pixels, but images of camera 'left' are 96 x 72"),
         ({"imageHeight": 10**9}, "its size is 96 x 1000000000"),
         ({"shapes": [shape("a", [[1, 1]], "point")] * 5001}, "it has 5001 shapes; at most 5000 are allowed"),
-        ({"shapes": [shape("a", [[1, 1]], "point")] * 201}, "it has 201 keypoints; at most 200 are allowed"),
+        ({"shapes": [shape("a", [[1, 1]], "point")] * 201}, "the image has 201 keypoints; at most 200 are allowed"),
         ({"flags": float("nan")}, "is not readable JSON"),
     ],
 )
@@ -356,7 +356,7 @@ POLYGON = {"points": percent(TRIANGLE), "polygonlabels": ["a"]}
     ("value", "further", "message"),
     [
         ({"rle": [255] * 7}, {}, "the run lengths have 4294967295 values, not four for each of 96 x 72 pixels"),
-        ({"rle": RUNS[:-9]}, {}, "the run lengths end within the image"),
+        ({"rle": RUNS[:-9]}, {}, "the run lengths do not cover the image exactly"),
         ({"rle": []}, {}, "the run lengths have 0 values"),
         ({"rle": 10**12}, {}, "its run lengths are not a list of bytes"),
         ({"rle": [*RUNS[:10], 256]}, {}, "left out"),

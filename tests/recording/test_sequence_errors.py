@@ -115,9 +115,9 @@ def extra_image(folder: Path) -> None:
 WRONG: list[tuple[Callable[[Path], object], list[str]]] = [
     (
         lambda folder: [(folder / f"regular/left/00{row}.png").unlink() for row in range(2, 7)],
-        ["5 of 6 files missing: FOLDER/regular/left/002.png (frame 002)", "and 2 more", "remove the rows"],
+        ["5 of 6 files are missing: FOLDER/regular/left/002.png (frame 002)", "and 2 more", "remove the rows"],
     ),
-    (lambda folder: (folder / "masks/left/002.png").unlink(), ["1 of 6 files missing", "sparse_masks = true"]),
+    (lambda folder: (folder / "masks/left/002.png").unlink(), ["1 of 6 files is missing", "sparse_masks = true"]),
     (extra_image, ["'regular/left/*.png' matches 7 files", "has 6 rows"]),
     (edit_file(lambda text: text.replace("[kinematics]", "[kinematics")), ["not readable TOML", "line 4"]),
     (

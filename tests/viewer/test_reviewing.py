@@ -291,8 +291,11 @@ def test_frames_that_failed_or_were_fitted_to_one_camera_are_named_before_an_exp
     project.apply("Check", {Key.verdict(index): verdict for index, verdict in verdicts.items()})
     assert export_warnings(desk.saved, range(3), cameras) == [
         "2 of 3 frames are not accepted",
-        "1 of these frames failed: 002",
-        "1 of these frames are doubtful: 003",
-        "1 of these frames were fitted to fewer cameras than exported: 001",
+        "1 of the exported frames has the verdict failed: 002",
+        "1 of the exported frames has the verdict doubtful: 003",
+        "1 of the exported frames was fitted to only some of the exported cameras: 001",
     ]
     assert export_warnings(desk.saved, [0], ["left"]) == ["1 of 1 frames is not accepted"]
+    project.apply("Check", {Key.verdict(1): FitVerdict("doubtful", "", "", 0.2)})
+    found = export_warnings(desk.saved, range(3), cameras)
+    assert "2 of the exported frames have the verdict doubtful: 002, 003" in found

@@ -1,6 +1,6 @@
 """Real frames, altered in memory to the conditions of the synthetic domains.
 
-Surfaces are derived from measured kinematics and masks; replaced backgrounds are path-traced tissue.
+Surfaces are derived from measured kinematics and masks; replacement backgrounds are path-traced tissue.
 """
 
 import dataclasses

@@ -337,9 +337,10 @@ class SourceBench:
         )
 
     def _segment(self, run: Run, frame: Frame, truth: GroundTruth) -> Measurement:
-        """Score the mask predicted by a network for one image, at the training resolution of the network.
+        """Score the mask that a network predicts for one image at its training resolution.
 
-        The input of networks with kinematics includes the rendering at the measured joint positions.
+        The mask is scored at the resolution of the image. The input of networks with kinematics includes the rendering
+        at the measured joint positions.
         """
         extractor, trained = self._extractor, self._baselines.get(run.method)
         device, image = extractor.device, frame.images[truth.camera]

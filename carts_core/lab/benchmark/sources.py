@@ -83,7 +83,7 @@ def synthetic_source(scope: Scope, seed: int = TEST_SEED) -> Source:
     config = _config(scope, seed, f"fresh {seed}", frames, endoscope=EndoscopeConfig(stereo=True))
     evaluated = evenly_spaced(frames, scope.frames)
     what = f"seed {seed}: two arms, {config.endoscope.width}x{config.endoscope.height}"
-    used = f"{len(evaluated)} of {counted(frames, 'frame')} evaluated with all methods"
+    used = f"all methods evaluated on {len(evaluated)} of {counted(frames, 'frame')}"
     taken = f"{used}, {counted(scope.samples, 'path')} per pixel"
     return Source(
         SYNTHETIC,
@@ -178,7 +178,7 @@ def real_source(path: Path, scope: Scope, seed: int = TEST_SEED) -> Source:
         progress("rendering the backdrop of the real frames", 0, 1)
         return Counterfactual(sequence, camera.name, backdrop(camera.width, camera.height, seed), seed)
 
-    taken = f"{len(frames)} of {counted(len(masked), 'frame')} with masks evaluated with all methods"
+    taken = f"all methods evaluated on {len(frames)} of {counted(len(masked), 'frame')} with masks"
     return Source(
         REAL,
         f"{sequence.name}, camera {camera.name}, {taken}",

@@ -143,8 +143,8 @@ DICE = Figure("Dice", "dice", 100.0, 1)
 NSD = Figure(f"NSD at {TOLERANCE:g} px", "nsd", 100.0, 1)
 WIDE_NSD = Figure(f"NSD at {WIDE_TOLERANCE:g} px", "nsd_wide", 100.0, 1)
 JOINT_MAE = Figure("joint MAE [deg]", "joint_mae_deg")
-VISIBLE_MAE = Figure("visible joints [deg]", "visible_joint_mae_deg")
-TIP_DEPTH = Figure("depth of the tips [mm]", "tip_depth_mm")
+VISIBLE_MAE = Figure("MAE of visible joints [deg]", "visible_joint_mae_deg")
+TIP_DEPTH = Figure("tip depth error [mm]", "tip_depth_mm")
 
 
 def start_label(error_deg: float | None) -> str:

@@ -269,7 +269,7 @@ def sequence_table(data: Measurements) -> Table | None:
                 "number": str(len(together)),
                 "Dice": Cell(DICE.text(after), f"before: {DICE.text(before)}"),
                 "joint MAE [deg]": Cell(JOINT_MAE.text(after), f"before: {JOINT_MAE.text(before)}"),
-                "visible joints [deg]": VISIBLE_MAE.text(after),
+                "MAE of visible joints [deg]": VISIBLE_MAE.text(after),
                 "s per warm frame": Cell(f"{median(warm):.2f}" if warm else NO_VALUE, counted(len(warm), "frame")),
                 "in both": str(len(both)),
                 "Dice alone": DICE.text(alone[m.run.frame].final for m in both),

@@ -1,4 +1,4 @@
-"""Arms in training images: variants of colours and proportions, meshes, and poses (random or from a recording)."""
+"""Generates arms for training images: variants of colours and proportions, meshes, and poses (random or recorded)."""
 
 import copy
 from collections.abc import Sequence

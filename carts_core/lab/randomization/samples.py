@@ -81,7 +81,7 @@ class Observer:
         self._variants: dict[tuple[int, int], tuple[Variant, int]] = {}
 
     def __call__(self, number: int | None = None) -> Observation:
-        """Generate the observation with a number, from 0; by default the next observation."""
+        """Generate observation `number`, counted from 0; by default, the next one."""
         number = self._next if number is None else number
         self._next = number + 1
         self.rng = np.random.default_rng((*self._seed, _OBSERVATIONS, number))
@@ -239,7 +239,7 @@ class PairGenerator:
         self._settings = settings
 
     def __call__(self, number: int | None = None) -> TrainingPair:
-        """Generate the training pair with a number, from 0; by default the next pair."""
+        """Generate training pair `number`, counted from 0; by default, the next one."""
         seen = self._observer(number)
         rng, settings = self._observer.rng, self._settings
         rendered = seen.placements
@@ -331,7 +331,7 @@ class SurfaceGenerator:
         self._observer = Observer(robots, settings, seed)
 
     def __call__(self, number: int | None = None) -> SurfaceSample:
-        """Generate the surface sample with a number, from 0; by default the next sample."""
+        """Generate surface sample `number`, counted from 0; by default, the next one."""
         return self.samples(number, 1)[0]
 
     def samples(self, number: int | None, priors: int) -> list[SurfaceSample]:

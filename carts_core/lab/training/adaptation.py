@@ -38,7 +38,7 @@ _DICE, _PARTS, _TIPS, _EDGES = 0.002, 0.01, 0.2, 0.98
 """Thresholds of "worse": decrease of Dice and of the share of parts [1], increase of the tip error [px], and ratio of
 edge strengths [1]."""
 _MOVED = 3.0
-"""Tip displacement in the recording beyond which edge support must increase [px]."""
+"""Tip displacement in the recording beyond which edge strength must increase [px]."""
 
 Progress = Callable[[str, int, int], None]
 """Callback with a description, the number of finished fits, and the total."""
@@ -343,9 +343,10 @@ def gain(before: dict[str, float], now: dict[str, float]) -> str:
 
 
 def offer(config: TrainingConfig, result: TrainingResult, progress: Progress, made: int, own: int) -> Offer:
-    """Compare fits with the initial and the adapted weights; adapted weights with a worse metric are set aside.
+    """Compare fits with the initial and the adapted weights; if a metric is worse, reject the adapted weights.
 
-    `config` is the result of `adapted_to`, `result` the result of the run; other arguments are those of `judge`.
+    Rejected weights are stored under another name. `config` is the result of `adapted_to`, `result` the result of the
+    run; other arguments are those of `judge`.
     """
     assert config.start is not None
     aside = output_path(result.weights.parent, REFUSED)

@@ -128,7 +128,7 @@ def _make(folder: Path, config: TrainingConfig, index: int) -> None:
 
 
 def augmented(rng: np.random.Generator, image: np.ndarray) -> np.ndarray:
-    """Randomize contrast, exposure and white balance of an image uint8, and sometimes convert it to grey."""
+    """Randomize contrast, exposure and white balance of a uint8 RGB image, and sometimes convert it to grey."""
     values = image.astype(np.float32)
     mean = values.mean((0, 1), keepdims=True)
     values = mean + (values - mean) * np.float32(rng.uniform(*_CONTRAST))

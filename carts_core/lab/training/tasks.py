@@ -123,7 +123,7 @@ class FeatureTask:
         return FeatureNetwork(config.architecture)
 
     def generator(self, config: TrainingConfig, stream: Sequence[int]) -> PairGenerator:
-        """Generator of pairs by number, from 0; different streams are independent."""
+        """Generator of pairs by number, counted from 0; different streams are independent."""
         return PairGenerator([Robot.load(path) for path in config.robots], config.images, stream)
 
     def flipped(self, sample: TrainingPair, horizontally: bool, vertically: bool) -> TrainingPair:
@@ -237,7 +237,7 @@ class SurfaceTask:
         return SurfaceNetwork(config.surface_architecture)
 
     def generator(self, config: TrainingConfig, stream: Sequence[int]) -> SurfaceGenerator:
-        """Generator of samples by number, from 0."""
+        """Generator of samples by number, counted from 0."""
         return SurfaceGenerator([Robot.load(path) for path in config.robots], config.images, stream)
 
     def flipped(self, sample: SurfaceSample, horizontally: bool, vertically: bool) -> SurfaceSample:

@@ -234,7 +234,7 @@ class _Run:
     def kept(self) -> str:
         """Message on the files of a stopped run."""
         if self.loop.step == 0:
-            return f"no step was made; any weights in {self.output} are the initial weights"
+            return f"no step was taken; any weights in {self.output} are the initial weights"
         return f"{self.output} holds {counted(self.loop.step, 'step')}; rerun the command to resume"
 
     def _averaged(self) -> ImageNetwork:

@@ -89,7 +89,7 @@ def few_enough(images: Iterable[T]) -> list[T]:
 def check_keypoints(keypoints: Mapping[str, Any]) -> None:
     """Check the number of keypoints of an image; `ValueError` if there are too many."""
     if len(keypoints) > MAX_KEYPOINTS:
-        raise ValueError(f"it has {len(keypoints)} keypoints; at most {MAX_KEYPOINTS} are allowed")
+        raise ValueError(f"the image has {len(keypoints)} keypoints; at most {MAX_KEYPOINTS} are allowed")
 
 
 @contextmanager

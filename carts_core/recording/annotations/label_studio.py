@@ -236,7 +236,7 @@ def opacity_of_brush(codes: Any, height: int, width: int) -> UInt8[np.ndarray, "
             values[filled:end] = window >> (37 - length - _WORD_BITS) & 0xFF
         place += 3 + length + _WORD_BITS * (1 if repeated else end - filled)
         if end > total or place > 8 * len(content):
-            raise ValueError("the run lengths end within the image, or continue after it")
+            raise ValueError("the run lengths do not cover the image exactly")
         if not repeated:
             first, shift = place - _WORD_BITS * (end - filled), place & 7
             words = np.frombuffer(padded, np.uint8, end - filled + 1, first >> 3).astype(np.uint16)

@@ -94,7 +94,7 @@ def check_model(model: str, camera_model: str = "") -> None:
     if not pinhole or model.lower() not in _MODELS:
         given = f"distortion model {model!r}" if pinhole else f"camera model {camera_model!r}"
         raise ValueError(
-            f"it has the {given}; allowed are pinhole models with plumb_bob or rational_polynomial (radtan in Kalibr). "
+            f"it has the {given}; allowed: pinhole models with plumb_bob or rational_polynomial (radtan in Kalibr). "
             "Rectify the images, or calibrate them with an allowed model"
         )
 
@@ -188,6 +188,10 @@ def _calibration(K: np.ndarray, D: np.ndarray | None, size: tuple[int, int] | No
     """Calibration from a matrix of 9 numbers, or fx, fy, cx, cy; `ValueError` for models that OpenCV does not
     support."""
     numbers, remarks = np.asarray(K, np.float64).reshape(-1), ()
+    if numbers.size not in (4, 9):
+        raise ValueError(f"its camera matrix has {numbers.size} numbers; 9 numbers, or fx, fy, cx and cy, are required")
+    if not np.isfinite(numbers).all():
+        raise ValueError("its camera matrix contains a number that is not finite; all must be finite")
     if numbers.size == 9:
         matrix = numbers.reshape(3, 3)
         if matrix[0, 2] == matrix[1, 2] == 0 and matrix[2, 0] != 0 and matrix[2, 1] != 0:
@@ -197,16 +201,13 @@ def _calibration(K: np.ndarray, D: np.ndarray | None, size: tuple[int, int] | No
         if abs(matrix[0, 1]) > 1e-3 * abs(matrix[0, 0]):
             raise ValueError(f"its matrix has a skew of {matrix[0, 1]:g}; calibrate without skew")
         numbers = matrix[[0, 1, 0, 1], [0, 1, 2, 2]]
-    if numbers.size != 4 or not np.isfinite(numbers).all():
-        raise ValueError(f"its matrix has {numbers.size} numbers; 9 finite numbers are required")
     if min(numbers[:2]) <= 0:
         raise ValueError(f"its focal lengths are {numbers[0]:g} and {numbers[1]:g} px, which must be positive")
     coefficients = () if D is None else tuple(float(value) for value in np.asarray(D).reshape(-1))
     if len(coefficients) not in DISTORTION_LENGTHS or not np.isfinite(coefficients).all():
         allowed = ", ".join(map(str, DISTORTION_LENGTHS))
         raise ValueError(
-            f"it has {len(coefficients)} distortion coefficients; allowed are {allowed}, in the order k1 k2 p1 p2 k3 "
-            "..."
+            f"it has {len(coefficients)} distortion coefficients; allowed: {allowed}, in the order k1 k2 p1 p2 k3 ..."
         )
     fx, fy, cx, cy = (float(value) for value in numbers)
     return Calibration((fx, fy, cx, cy), coefficients, size, remarks=remarks)
@@ -376,5 +377,5 @@ def _axes_of(content: dict[str, Any], path: Path) -> Axes:
         "recording",
         f"{path}: neither its content nor its name (-open-cv.json or -dVRK.json) states the camera axes. Give them: "
         "opencv (x right, y down) or dvrk (x left, y up).",
-        "Option: --axes.",
+        "Use --axes.",
     )

@@ -129,7 +129,7 @@ def check_intrinsics(camera: FoundCamera, job: Import) -> None:
         f"the calibration of {camera.name} has {problem}. Give another calibration, or the size of the calibration "
         f"images, so that it can be scaled; if you give the size of these images ({camera.size[0]}x{camera.size[1]}), "
         "it is accepted unchanged.",
-        f"Options: --calibration {camera.name} FILE, --calibration-size {camera.name} WIDTHxHEIGHT.",
+        f"Use --calibration {camera.name} FILE or --calibration-size {camera.name} WIDTHxHEIGHT.",
         about=camera.name,
     )
 
@@ -282,7 +282,7 @@ def common_ids(images: Mapping[str, Images], path: Path) -> tuple[str, ...]:
 def cameras_of(
     images: Mapping[str, Images], job: Import, calibrations: Mapping[str, Path] | None = None
 ) -> tuple[FoundCamera, ...]:
-    """Cameras with their images and their given or found calibrations."""
+    """Cameras with their images and their given or detected calibrations."""
     job = job.with_options(calibration={**(calibrations or {}), **job.options.calibration})
     cameras = []
     for name, each in images.items():

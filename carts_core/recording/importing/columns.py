@@ -128,7 +128,7 @@ def order_of_names(names: tuple[str, ...], joints: tuple[str, ...] = JOINT_NAMES
             "kinematics",
             f"joint states have the names {', '.join(names)}, which do not match {', '.join(joints)} by name or order. "
             "Correct the names, or import the positions from a table.",
-            "Option: --kinematics.",
+            "Use --kinematics.",
         )
     return None
 
@@ -212,7 +212,7 @@ def _named_places(table: ForeignTable) -> dict[str, str]:
                 "columns",
                 f"{table.path}, column {column!r} has several names ({', '.join(sorted(names)[:3])}), so the meaning "
                 "of positions differs between rows. Reorder the positions, or choose columns with a constant order.",
-                "Option: --columns.",
+                "Use --columns.",
             )
         place = re.compile(rf"(?i){re.escape(match[1])}(?:joint_?)?positions?[._ \[]*0*{int(match[3])}\]?")
         for other in table.columns:

@@ -61,7 +61,7 @@ class ForeignTable:
                 "columns",
                 f"{self.path}, column {column!r} has cells that are not numbers: {len(wrong)} of {len(values)}, the "
                 f"first in {where}: {shown(str(values[row]))}. Correct them, or choose another column.",
-                "Option: --columns.",
+                "Use --columns.",
             ) from error
 
 

@@ -171,7 +171,7 @@ class FoundCamera:
     """File name pattern of the masks, relative to `images.parent` or absolute; empty without masks."""
     sparse_masks: bool = False
     bits: int | None = None
-    """Bit depth of 16-bit images; None for 8-bit images."""
+    """Number of significant bits of images stored with 16 bits; None for 8-bit images."""
     crop: tuple[int, int, int, int] | None = None
     """Left, top, width and height of the camera's part of each image [px]; None for the whole image."""
     topic: str = ""

@@ -60,7 +60,7 @@ def in_si(
             result[:, index] *= factors[unit]
         else:
             allowed = f"{', '.join(factors)} and {PERCENT}"
-            problem = f"the unit of {joint.name} is {unit}; allowed are {allowed}."
+            problem = f"the unit of {joint.name} is {unit}; allowed: {allowed}."
             raise PartError("columns", problem, f"Correct --units {joint.name}.")
         if joint.name in options.flip:
             result[:, index] *= -1.0
@@ -108,7 +108,7 @@ def _unknown_unit(values: np.ndarray, joints: Sequence[Joint], arm: str, chosen:
         f"{arm}: the unit of the angles is not known, since {why}: positions of {joint.name} range from "
         f"{np.nanmin(column):.4g} to {np.nanmax(column):.4g}, and its limits are {joint.lower:.4g} to "
         f"{joint.upper:.4g} rad. Give the unit: deg, percent (-100 to 100 of the range of each joint) or rad.",
-        "Option: --angle-unit.",
+        "Use --angle-unit.",
     )
 
 
@@ -143,7 +143,7 @@ def length_unit(highest: float, limit: float, arm: str, what: str, orders: Seque
         "columns",
         f"{arm}: the unit of {what} is ambiguous: its values reach {highest:.4g}, but its limit is {limit:.3g} m. "
         f"Give the unit: {listed}.{also}",
-        "Options: --length-unit, --columns." if orders else "Option: --length-unit.",
+        "Use --length-unit or --columns." if orders else "Use --length-unit.",
     )
 
 

@@ -356,7 +356,7 @@ def _geometry(log: ArmLog, job: Import) -> PsmGeometry:
             "the shipped robot has a wrist of 9.1 mm and this instrument one of "
             f"{1e3 * chosen.wrist_length:.1f} mm. Generate the URDF of this instrument with carts robot and select it.",
             log.name,
-            remedy=f"Option: --robot {log.name} FILE.urdf.",
+            remedy=f"Use --robot {log.name} FILE.urdf.",
         )
     return chosen
 

@@ -163,7 +163,7 @@ def row_seconds(
             "columns",
             f"{table.path.name}, column {column!r}: times decrease from {values[row - 1]} to {values[row]} in row "
             f"{row + 1}. Sort the rows, or choose another column.",
-            "Option: --columns time COLUMN.",
+            "Use --columns time COLUMN.",
         )
     if repeated := int((steps == 0).sum()):
         text = f"{counted(repeated, 'row')} with the time of the previous row; the first of each is used"
@@ -181,7 +181,7 @@ def match_rows(frames: FrameTimes, table: ForeignTable, meanings: ColumnMeanings
             "columns",
             f"{table.path.name}: column {column!r} does not contain the image names, which range from "
             f"{frames.stems[0]} to {frames.stems[-1]}. Choose another column.",
-            "Option: --columns frame COLUMN.",
+            "Use --columns frame COLUMN.",
         )
     span = None if frames.times is None or len(frames.times) < 2 else float(frames.times[-1] - frames.times[0])
     times = row_seconds(table, meanings.time, options.clock, job, span)
@@ -207,7 +207,7 @@ def match_rows(frames: FrameTimes, table: ForeignTable, meanings: ColumnMeanings
                 f"{table.path.name}: column {column!r} counts {len(table)} rows and there are "
                 f"{counted(len(frames.ids), 'image')}, so it cannot assign rows to images. Give the frame rate of "
                 "the images, or confirm the column.",
-                f"Options: --frame-rate, --columns frame {column!r}.",
+                f"Use --frame-rate or --columns frame {column!r}.",
             )
         return _by_image(frames, table, named, times, f"column {column!r}", job, stated=explicit)
     if in_order:
@@ -218,7 +218,7 @@ def match_rows(frames: FrameTimes, table: ForeignTable, meanings: ColumnMeanings
         f"the recording has {counted(len(frames.ids), 'image')} and {table.path.name} has "
         f"{counted(len(table), 'row')}, and {lacking}. Make the numbers equal, choose the column of times or of "
         "image names, or give the frame rate of the images.",
-        "Options: --columns time COLUMN, --columns frame COLUMN, --frame-rate.",
+        "Use --columns time COLUMN, --columns frame COLUMN or --frame-rate.",
     )
 
 

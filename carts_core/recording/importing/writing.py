@@ -135,7 +135,7 @@ def completed(recording: FoundRecording, options: ImportOptions) -> FoundRecordi
             "columns",
             f"{recording.name}: a time offset needs times, but rows and images are matched without times. Give the "
             "frame rate of the images, or leave out the offset.",
-            "Options: --frame-rate, --time-offset.",
+            "Use --frame-rate, or leave out --time-offset.",
         )
     known = tuple(
         replace(arm, beyond_limits=not check_limits(arm, job)) if arm.values is not None else arm

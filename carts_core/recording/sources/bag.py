@@ -65,7 +65,7 @@ def _separate_images(
     times = frame_times(first, ids, job).times
     if times is None:
         problem = f"images in {first.path} have no times. Give their frame rate."
-        raise PartError("columns", problem, "Option: --frame-rate.")
+        raise PartError("columns", problem, "Use --frame-rate.")
     return cameras_of(images, job), ids, times
 
 
@@ -209,7 +209,7 @@ def _read(path: Path, job: Import) -> FoundRecording:
         if beside is None:
             if job.options.frame_rate is not None:
                 problem = "a frame rate is not used, since the images of the bag have times. Leave it out."
-                raise PartError("columns", problem, "Option: --frame-rate.")
+                raise PartError("columns", problem, "Use --frame-rate.")
             cameras, frame_times = _cameras(bag, job)
             ids = tuple(f"{number:06d}" for number in range(len(frame_times)))
         else:

@@ -74,7 +74,7 @@ def _read_surgpose(path: Path, job: Import) -> FoundRecording:
     names = sorted({str(arm) for row in rows.values() for arm in row} & wanted)
     if not names:
         problem = f"{file} has no joint positions of {', '.join(sorted(wanted))}. Copy it again, or choose other arms."
-        raise PartError("recording", problem, "Option: --arms.")
+        raise PartError("recording", problem, "Use --arms.")
     arms = []
     for recorded in names:
         own = {frame: row[recorded] for frame, row in rows.items() if recorded in row}
@@ -130,7 +130,7 @@ def _endovis_calibration(camera: FoundCamera, file: Path, job: Import) -> FoundC
             T[:3, 3] = np.array(values["Extrinsic-T"][:3]) * 1e-3
     except (OSError, ValueError, KeyError) as error:
         problem = f"{file} has no readable {error}. Copy it again, or choose another calibration."
-        remedy = f"Option: --calibration {camera.name} FILE."
+        remedy = f"Use --calibration {camera.name} FILE."
         raise PartError("calibration", problem, remedy, about=camera.name) from error
     job.found(f"calibration from {file.name}.", camera.name)
     return replace(camera, intrinsics=(fx, fy, cx, cy), distortion=distortion, T_camera_world=T)
@@ -398,13 +398,13 @@ def _domain_images(path: Path, domains: list[str], folders: dict[str, str], job:
             )
         ids = common_ids(found, path)
         if any(len(each.ids) != len(ids) for each in found.values()):
-            text = f"{counted(len(ids), 'frame')} exist in all of {', '.join(domains)}; other frames are left out."
-            job.warning(text, camera)
+            text = f"frames that are not in all domains ({', '.join(domains)}) are left out"
+            job.warning(f"{text}, so {counted(len(ids), 'frame')} can be used.", camera)
         place = "{domain}" if len(domains) > 1 else domains[0]
         images[camera] = Images(path, f"{place}/{folder}/{first.pattern}", ids, first.size)
     if not images:
         raise SequenceError(
-            f"{path}: no camera has images in all of {', '.join(domains)}. Remove the incomplete domains."
+            f"{path}: no camera has images in all domains ({', '.join(domains)}). Remove the incomplete domains."
         )
     return images
 

@@ -89,7 +89,7 @@ def _stream(video: Path, sidecar: Path, job: Import) -> _Stream:
         times = np.array([_frame_time(frame) for frame in frames])
     layout = str(content.get("side_by_side") or "undefined")
     if layout not in ("undefined", *_SIDES):
-        raise SequenceError(f"sidecar {sidecar}: side_by_side is {layout!r}; allowed are undefined, LR and RL.")
+        raise SequenceError(f"sidecar {sidecar}: side_by_side is {layout!r}; allowed: undefined, LR and RL.")
     latency = content.get("estimated_latency_ms")
     latency = float(latency) * 1e-3 if isinstance(latency, int | float) else 0.0
     if (dropped := content.get("frames_dropped")) not in (0, None):

@@ -260,7 +260,7 @@ def _matched(
             "columns",
             f"the rows of {names} are matched with the images differently: by frame or by time, or with different time "
             "offsets. Give all tables times of the same clock, or choose one table.",
-            "Options: --time-offset, --kinematics FILE.",
+            "Use --time-offset or --kinematics FILE.",
         )
     return tuple(arms), first
 

@@ -85,14 +85,14 @@ def episode_times(episode: Episode, rate: float, job: Import) -> np.ndarray:
         return even
     times = episode.table.numbers("timestamp").astype(np.float64)
     if times.shape != even.shape or not np.isfinite(times).all() or (np.diff(times) <= 0).any():
-        text = "the column timestamp does not increase and is not used; times follow from the rate"
+        text = "the column timestamp does not increase and is not used; times are computed from the rate"
         job.warning(f"{text}, {rate:g} images/s.")
         return even
     times = times - times[0]
     if (late := np.abs(times - even).max()) > 0.5 / rate:
         job.warning(
-            f"times of the column timestamp are up to {late:.3f} s from those at {rate:g} images/s. They are used; "
-            "row n is assigned to image n of the episode."
+            f"the column timestamp deviates by up to {late:.3f} s from a constant rate of {rate:g} images/s. It is "
+            "used nevertheless; row n is assigned to image n of the episode."
         )
         return times
     # Single-precision times are not more accurate than the frame rate.

@@ -136,7 +136,7 @@ def test_a_bag_without_images_gets_those_of_a_video_beside_it(tmp_path: Path, ca
 def test_images_beside_a_bag_without_times_are_asked_for_their_rate(tmp_path: Path) -> None:
     path = write_bag(tmp_path / "bag", BagKind(cameras=("right",)))
     write_images(tmp_path / "pictures", 5)
-    with pytest.raises(CartsError, match=r"have no times\. Give their frame rate\. Option: --frame-rate"):
+    with pytest.raises(CartsError, match=r"have no times\. Give their frame rate\. Use --frame-rate"):
         import_recording(path, tmp_path / "out", ImportOptions(images={"left": "pictures"}))
     file, _ = import_recording(path, tmp_path / "out", ImportOptions(images={"left": "pictures"}, frame_rate=20))
     assert np.array_equal(Sequence.open(file).frame(3).images["left"], image(3))

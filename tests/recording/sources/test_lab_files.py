@@ -261,7 +261,7 @@ def with_a_gap(found: FoundRecording) -> None:
     assert found.frame_times is not None
     assert np.diff(found.frame_times) == pytest.approx([1 / 30, 1 / 30 + 0.5, 1 / 30], abs=1e-6)
     assert np.abs(measured(found)[:, :6] - joints_at(found.frame_times)).max() < 1e-5
-    says(found, "warning: times of the column timestamp are up to 0.500 s from those at 30 images/s")
+    says(found, "warning: the column timestamp deviates by up to 0.500 s from a constant rate of 30 images/s")
 
 
 def without_gap(found: FoundRecording) -> None:
@@ -576,7 +576,7 @@ def test_rows_of_images_get_times_for_a_time_offset(tmp_path: Path, make: Callab
         ({"arms": {"PSM1": "nose", "PSM2": "ear"}}, "rec has no arm 'PSM2'.*Correct --arms"),
         ({"columns": {"yawn": "yaw"}}, "yawn is not a known meaning of a column. Allowed are: yaw"),
         ({"flip": ("knee",)}, "knee is not a joint.*--flip"),
-        ({"units": {"yaw": "mm"}}, "unit of yaw is mm; allowed are rad.*--units"),
+        ({"units": {"yaw": "mm"}}, "unit of yaw is mm; allowed: rad.*--units"),
         ({"time_offset": 0.1}, "a time offset needs times.*--frame-rate"),
         ({"robot": {"PSM1": "none.urdf"}}, "robot none.urdf of PSM1 is missing"),
     ],
