@@ -135,7 +135,10 @@ def test_painted_masks_are_fitted_and_frames_without_one_are_named_or_left_to_th
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("no_network")
-def test_ignored_pixels_of_the_project_and_of_a_label_are_left_out(masked: Path, tmp_path: Path) -> None:
+def test_ignored_pixels_of_the_project_and_of_a_label_are_left_out(
+    tiny_sequence: Callable[..., Path], tmp_path: Path
+) -> None:
+    masked = tiny_sequence(frames=1, **SIZE)
     mask = read_mask(masked.parent / "masks" / "left" / "001.png")
     rows, columns = np.nonzero(mask)
     wrong = np.zeros_like(mask)

@@ -66,12 +66,20 @@ class Lives:
             assert told.recv() == "ready" and victim.pid is not None
             client = Client(tab, ids, FRAMES, dice, self._unique, self._pixels)
             pid, delay = victim.pid, 0.05 + 2.0 * dice.random()
+            before = self._unfinished()
 
             def end() -> None:
                 patience = time.monotonic() + 60
                 while len(client.seen) < least and time.monotonic() < patience:
                     time.sleep(0.05)
-                time.sleep(delay)
+                if seed % 4 == 3:
+                    # This signal comes while an export is being written.
+                    patience = time.monotonic() + 20
+                    while self._unfinished() <= before and time.monotonic() < patience:
+                        time.sleep(0.001)
+                    time.sleep(0.02 * delay)
+                else:
+                    time.sleep(delay)
                 os.kill(pid, number)
 
             killer = threading.Thread(target=end)
@@ -86,6 +94,11 @@ class Lives:
         self.tally.runs += client.runs
         self.tally.strokes += client.strokes
         self.tally.acknowledged_exports += len(client.exported)
+
+    def _unfinished(self) -> set[str]:
+        """Names of exports that are being written or were interrupted."""
+        present = self._exports.iterdir() if self._exports.exists() else ()
+        return {path.name for path in present if path.name.startswith(".")}
 
     def _check_project(self, client: Client) -> None:
         """Open the project as the next server would, and check what this life's client has heard."""
