@@ -3,20 +3,18 @@
 import csv
 import signal
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
-from functools import cache, partial
+from functools import partial
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 import torch
-from tiny import TinyScene, tiny_scene
+from tiny import TinyImage, TinyScene, tiny_images, tiny_scene
 
 from carts_core.model.robot import Robot
 from carts_core.networks import FeatureExtractor
 from carts_core.process import tune_process
-from carts_core.rendering import Renderer
 from carts_core.resources import sample_sequence, shipped_robot
 
 pytest_plugins = ["small_network"]
@@ -110,36 +108,6 @@ def _write_table(path: Path, robot: Robot, positions: np.ndarray) -> None:
         writer.writerow(["frame", "time", *robot.joint_names])
         for row, values in enumerate(positions):
             writer.writerow([row + 1, f"{row / 10:.3f}", *(f"{value:.9f}" for value in values)])
-
-
-@dataclass(frozen=True)
-class TinyImage:
-    """One image of a tiny sequence."""
-
-    camera: str
-    row: int
-    image: np.ndarray
-    """[height, width, 3] in [0, 1]: the arm at its true joint positions, before a smooth background."""
-    mask: np.ndarray
-
-
-# Many tests ask for the same small pictures, so each is rendered once.
-@cache
-def tiny_images(robot: Robot, frames: int, cameras: tuple[str, ...], width: int, height: int) -> tuple[TinyImage, ...]:
-    """Every image of a tiny sequence."""
-    tiny = tiny_scene(robot, frames, cameras, width, height)
-    x, y = np.meshgrid(np.linspace(0, 1, width), np.linspace(0, 1, height))
-    background = np.stack([0.55 + 0.1 * x, 0.3 + 0.1 * y, 0.25 + 0.05 * x * y], -1)
-    images = []
-    for camera in cameras:
-        renderer = Renderer(tiny.scene, width=width, height=height, cameras=[camera])
-        for row, joint_positions in enumerate(tiny.truth):
-            with torch.no_grad():
-                rendering = renderer(tiny.scene.state({"PSM1": joint_positions}))
-            cover = rendering.silhouette[0].numpy()[..., None]
-            image = cover * rendering.image[0].permute(1, 2, 0).numpy() + (1 - cover) * background
-            images.append(TinyImage(camera, row, image.clip(0, 1), cover[..., 0] > 0.5))
-    return tuple(images)
 
 
 def _write_images(folder: Path, images: tuple[TinyImage, ...], domains: tuple[str, ...]) -> None:

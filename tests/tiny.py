@@ -9,6 +9,7 @@ import torch
 from carts_core.model.camera import Camera
 from carts_core.model.robot import Robot
 from carts_core.model.scene import Arm, Scene
+from carts_core.rendering import Renderer
 
 FOCAL_PER_WIDTH = 1.2
 BIAS = 0.01
@@ -58,3 +59,33 @@ def tiny_scene(robot: Robot, frames: int, cameras: tuple[str, ...], width: int, 
     signs = np.where(np.arange(len(robot.joint_names)) % 2, -1.0, 1.0)
     measured = truth + signs * np.where(prismatic, 0.1 * BIAS, BIAS)
     return TinyScene(Scene((Arm("PSM1", robot, np.eye(4)),), tuple(views)), truth, measured)
+
+
+@dataclass(frozen=True)
+class TinyImage:
+    """One image of a tiny sequence."""
+
+    camera: str
+    row: int
+    image: np.ndarray
+    """[height, width, 3] in [0, 1]: the arm at its true joint positions, before a smooth background."""
+    mask: np.ndarray
+
+
+# Many tests ask for the same small pictures, so each is rendered once.
+@cache
+def tiny_images(robot: Robot, frames: int, cameras: tuple[str, ...], width: int, height: int) -> tuple[TinyImage, ...]:
+    """Every image of a tiny sequence."""
+    tiny = tiny_scene(robot, frames, cameras, width, height)
+    x, y = np.meshgrid(np.linspace(0, 1, width), np.linspace(0, 1, height))
+    background = np.stack([0.55 + 0.1 * x, 0.3 + 0.1 * y, 0.25 + 0.05 * x * y], -1)
+    images = []
+    for camera in cameras:
+        renderer = Renderer(tiny.scene, width=width, height=height, cameras=[camera])
+        for row, joint_positions in enumerate(tiny.truth):
+            with torch.no_grad():
+                rendering = renderer(tiny.scene.state({"PSM1": joint_positions}))
+            cover = rendering.silhouette[0].numpy()[..., None]
+            image = cover * rendering.image[0].permute(1, 2, 0).numpy() + (1 - cover) * background
+            images.append(TinyImage(camera, row, image.clip(0, 1), cover[..., 0] > 0.5))
+    return tuple(images)

@@ -37,7 +37,7 @@ WRONG: list[tuple[list[str], str]] = [
     ),
     (["calibrate", "sequence.toml", "--settings", "loss=l1"], "has no setting 'loss'"),
     (["synthesize", "out", "--motion.frames", "0"], "MotionConfig.frames is 0"),
-    (["train", "--images.width", "17"], "give positive multiples of 16"),
+    (["train", "--images.width", "17"], "must be positive multiples of 16"),
     (["export", "sequence.toml", "out", "--format", "cocoo"], "Did you mean 'coco'?"),
     (["render", "sequence.toml", "--style", "ovrelay"], "Did you mean 'overlay'?"),
     (["evaluate", "sequence.toml", "--fraems", "1"], "Perhaps you meant: --frames"),

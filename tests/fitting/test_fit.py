@@ -12,8 +12,7 @@ import cv2
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
-from conftest import tiny_images
-from tiny import tiny_scene
+from tiny import tiny_images, tiny_scene
 
 import carts_core as carts
 from carts_core.errors import CartsError, RobotError, SequenceError, SettingsError

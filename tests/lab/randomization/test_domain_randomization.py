@@ -68,7 +68,7 @@ def test_with_a_perfect_model_the_hybrid_shows_what_is_observed(shipped_psm: Rob
         (AppearanceRanges, {"noise": (0.1, 0.0)}, "noise"),
         (AppearanceRanges, {"blur": (-1, 1)}, "blur"),
         (AppearanceRanges, {"jpeg_quality": (50, 120)}, "jpeg_quality"),
-        (ImageSettings, {"width": 100}, "give positive multiples of 16"),
+        (ImageSettings, {"width": 100}, "must be positive multiples of 16"),
         (ImageSettings, {"two_arms": 1.5}, "two_arms is 1.5; allowed: 0 to 1"),
         (ImageSettings, {"things": -0.1}, "things is -0.1; allowed: 0 to 1"),
         (ImageSettings, {"absent": 2}, "absent is 2; allowed: 0 to 1"),
