@@ -3,8 +3,10 @@
 import json
 import math
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +17,6 @@ from ..errors import CartsError
 from ..files import MARKER, OutputPath, output_stream, published, published_file, write_text
 from ..model.camera import T_DVRK_OPENCV
 from ..recording import Sequence as Recording
-from ..recording.importing.importer import detect
 from ..settings import FormatName
 from .annotation_formats import (
     write_bop,
@@ -29,10 +30,6 @@ from .annotation_formats import (
 )
 from .dataset import Dataset, ExportFrame, ExportProgress
 from .kinematics import JOINED, joint_columns, joint_units, kinematics_csv, position_values, std_values
-from .lerobot_format import write_lerobot
-from .recorded_csv_format import write_recorded_csv
-from .rosbag_format import write_rosbag2
-from .surgsync_format import write_surgsync
 from .video import write_video
 
 
@@ -154,6 +151,15 @@ class ExportFormat:
     that any sequence can be exported to."""
 
 
+def _imported(module: str, name: str) -> Callable[[Dataset, OutputPath, ExportProgress], None]:
+    """Writer that is imported at its first use, since it needs the importers of recordings and their libraries."""
+
+    def write(dataset: Dataset, output: OutputPath, progress: ExportProgress) -> None:
+        getattr(import_module(f".{module}", __package__), name)(dataset, output, progress)
+
+    return write
+
+
 FORMATS: dict[FormatName, ExportFormat] = {
     "masks": ExportFormat("PNG masks", write_masks, refines=True),
     "coco": ExportFormat("COCO", write_coco, images=True, refines=True),
@@ -170,20 +176,27 @@ FORMATS: dict[FormatName, ExportFormat] = {
     "dvrk-2.3": ExportFormat("Base frames for the dVRK up to 2.3", write_dvrk_2_3, ".json"),
     "dvrk-suj": ExportFormat("Fixed set-up joints for the dVRK", write_dvrk_suj, ".json"),
     "video": ExportFormat("Overlay video", write_video),
-    "rosbag2": ExportFormat("ROS 2 bag (MCAP)", write_rosbag2, refines=True),
-    "lerobot": ExportFormat("LeRobot data set", write_lerobot, refines=True, source="lerobot"),
-    "surgsync": ExportFormat("SurgSync recording", write_surgsync, refines=True, source="surgsync"),
-    "recorded-csv": ExportFormat("Recorded tables, CSV", write_recorded_csv, refines=True, source="folder"),
+    "rosbag2": ExportFormat("ROS 2 bag (MCAP)", _imported("rosbag_format", "write_rosbag2"), refines=True),
+    "lerobot": ExportFormat(
+        "LeRobot data set", _imported("lerobot_format", "write_lerobot"), refines=True, source="lerobot"
+    ),
+    "surgsync": ExportFormat(
+        "SurgSync recording", _imported("surgsync_format", "write_surgsync"), refines=True, source="surgsync"
+    ),
+    "recorded-csv": ExportFormat(
+        "Recorded tables, CSV", _imported("recorded_csv_format", "write_recorded_csv"), refines=True, source="folder"
+    ),
 }
 
 
 def formats_of(sequence: Recording) -> dict[FormatName, ExportFormat]:
     """Formats to which a sequence can be exported: those with a `source` only if it was imported from one."""
-    path = sequence.recording
-    try:
-        source = "" if path is None else detect(path).name
-    except CartsError:
-        source = ""
+    source = ""
+    if sequence.recording is not None:
+        from ..recording.importing.importer import detect  # noqa: PLC0415 -- most sequences need no importer
+
+        with suppress(CartsError):
+            source = detect(sequence.recording).name
     return {name: known for name, known in FORMATS.items() if known.source in ("", source)}
 
 
