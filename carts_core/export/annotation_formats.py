@@ -20,7 +20,7 @@ from trimesh.exchange.ply import export_ply
 
 from ..errors import CartsError
 from ..files import OutputPath, output_stream, write_bytes, write_text
-from ..model.camera import HALF_PIXEL
+from ..model.camera import opencv_matrix
 from ..model.keypoints import Keypoint, keypoints, project_keypoints
 from ..model.scene import Arm, SceneState
 from ..rendering.rasterizer import link_transforms, rasterize, vertices_in_camera
@@ -403,11 +403,10 @@ def _row(dataset: Dataset, view: View) -> int:
 
 def _bop_camera(dataset: Dataset, view: View) -> dict[str, Any]:
     state, row = dataset.state(view.frame), _row(dataset, view)
-    fx, fy, cx, cy = state.intrinsics[row].double().tolist()
     T_view_world = state.T_view_world[row].double().numpy()
     return {
         # BOP tools follow OpenCV's convention: the centre of the first pixel is at 0.
-        "cam_K": [fx, 0.0, cx - HALF_PIXEL, 0.0, fy, cy - HALF_PIXEL, 0.0, 0.0, 1.0],
+        "cam_K": opencv_matrix(state.intrinsics[row].double().tolist()).ravel().tolist(),
         "depth_scale": 1.0,
         "cam_R_w2c": T_view_world[:3, :3].ravel().tolist(),
         "cam_t_w2c": (_MM * T_view_world[:3, 3]).tolist(),

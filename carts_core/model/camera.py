@@ -1,5 +1,6 @@
 """Pinhole camera: pose, projection, and undistortion of images."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -219,7 +220,7 @@ class Camera:
     @property
     def K_opencv(self) -> Float[np.ndarray, "3 3"]:
         """Intrinsic matrix [px] in OpenCV's convention, with pixel centres at integers."""
-        return _opencv_matrix(self.intrinsics)
+        return opencv_matrix(self.intrinsics)
 
     def undistort(self, image: np.ndarray, interpolation: int = cv2.INTER_LINEAR) -> np.ndarray:
         """Undistort an image [height, width, ...]; unchanged if the camera has no distortion.
@@ -261,7 +262,7 @@ class Camera:
 def _undistortion_maps(
     width: int, height: int, intrinsics: tuple[float, ...], distortion: tuple[float, ...]
 ) -> tuple[np.ndarray, np.ndarray]:
-    K = _opencv_matrix(intrinsics)
+    K = opencv_matrix(intrinsics)
     return cv2.initUndistortRectifyMap(K, np.array(distortion), np.eye(3), K, (width, height), cv2.CV_32FC1)
 
 
@@ -270,13 +271,14 @@ def _distortion_maps(
     width: int, height: int, intrinsics: tuple[float, ...], distortion: tuple[float, ...]
 ) -> tuple[np.ndarray, np.ndarray]:
     """Column and row in the undistorted image of each pixel of a recorded image."""
-    K = _opencv_matrix(intrinsics)
+    K = opencv_matrix(intrinsics)
     rows, columns = np.mgrid[0:height, 0:width]
     pixels = np.stack([columns.ravel(), rows.ravel()], 1).astype(np.float64)
     found = cv2.undistortPoints(pixels[:, None], K, np.array(distortion), P=K).reshape(height, width, 2)
     return found[..., 0].astype(np.float32), found[..., 1].astype(np.float32)
 
 
-def _opencv_matrix(intrinsics: tuple[float, ...]) -> Float[np.ndarray, "3 3"]:
+def opencv_matrix(intrinsics: Iterable[float]) -> Float[np.ndarray, "3 3"]:
+    """Intrinsic matrix [px] in OpenCV's convention, from fx, fy, cx, cy [px] with pixel centres at +0.5."""
     fx, fy, cx, cy = intrinsics
     return np.array([[fx, 0.0, cx - HALF_PIXEL], [0.0, fy, cy - HALF_PIXEL], [0.0, 0.0, 1.0]])

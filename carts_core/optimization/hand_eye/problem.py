@@ -11,7 +11,7 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from ...errors import SettingsError
-from ...model.camera import HALF_PIXEL
+from ...model.camera import HALF_PIXEL, opencv_matrix
 from ...model.keypoints import Landmark, LandmarkKind, landmarks, link_transforms
 from ...model.scene import Scene
 from ...settings.ranges import Range, Ranged
@@ -197,8 +197,7 @@ def _subsets(view: View) -> Iterator[Bool[np.ndarray, " points"]]:
 def _perspective(view: View, rows: np.ndarray, intrinsics: np.ndarray) -> Iterator[np.ndarray]:
     if rows.sum() < MIN_POINTS:
         return
-    fx, fy, cx, cy = intrinsics
-    K = np.array([[fx, 0.0, cx - HALF_PIXEL], [0.0, fy, cy - HALF_PIXEL], [0.0, 0.0, 1.0]])
+    K = opencv_matrix(intrinsics)
     pixels = view.pixels[rows] - HALF_PIXEL
     for method in (cv2.SOLVEPNP_SQPNP, cv2.SOLVEPNP_EPNP):
         try:

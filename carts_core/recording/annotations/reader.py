@@ -173,8 +173,7 @@ def _check_size(name: str, size: tuple[int, ...], camera: Camera) -> None:
 def _undistorted(points: dict[str, tuple[float, float]], camera: Camera) -> dict[str, tuple[float, float]]:
     if not points or not any(camera.distortion):
         return points
-    K = camera.K
-    K[:2, 2] -= HALF_PIXEL
+    K = camera.K_opencv
     recorded = np.array(list(points.values()), np.float64) - HALF_PIXEL
     straight = cv2.undistortPoints(recorded[:, None], K, np.array(camera.distortion), P=K)[:, 0] + HALF_PIXEL
     return {name: (float(u), float(v)) for name, (u, v) in zip(points, straight, strict=True)}
