@@ -186,6 +186,9 @@ _THUMBNAIL = "/thumbnail/"
 _SCRIPTS = ("page", "paint", "marks", "loupe", "drag", "lanes", "timeline", "tour", "shell", "document")
 """Files of `static/`, in the order in which they run."""
 
+_STYLES = ("tokens", "page", "document")
+"""Style sheets of `static/`."""
+
 _POLICY = (
     "default-src 'none'; script-src 'self' 'nonce-{nonce}' 'wasm-unsafe-eval'; style-src 'self' 'unsafe-inline'; "
     "img-src 'self' data: blob:; font-src data:; worker-src blob:; connect-src 'self' ws://{host} data: blob:; "
@@ -350,11 +353,10 @@ class Page:
             "server": self._name,
         }
         configuration = html.escape(json.dumps(said), quote=True)
+        styles = "".join(f'<link rel="stylesheet" href="/static/{name}.css" />' for name in _STYLES)
         head = (
             f"<title>{html.escape(self._title)}</title>"
-            '<link rel="icon" href="/static/icon.svg" />'
-            '<link rel="stylesheet" href="/static/page.css" />'
-            '<link rel="stylesheet" href="/static/document.css" />'
+            f'<link rel="icon" href="/static/icon.svg" />{styles}'
             f'<script src="/static/boot.js" data-configuration="{configuration}"></script>'
         )
         scripts = "".join(f'<script src="/static/{name}.js" defer></script>' for name in _SCRIPTS)
