@@ -8,6 +8,7 @@ from typing import Any
 import cv2
 import numpy as np
 from playwright.sync_api import Browser, BrowserContext, FloatRect, Locator, Page, expect
+from playwright.sync_api import TimeoutError as PageTimeoutError
 from waiting import PATIENCE, eventually, wait_in
 
 from carts_viewer.actions import intents
@@ -102,13 +103,15 @@ def dismiss_warning(page: Page) -> None:
     page.locator(".mantine-Notification-closeButton").first.dispatch_event("click")
 
 
-def press(locator: Locator) -> None:
+def press(locator: Locator, timeout: float | None = None) -> None:
     """Click an element once it is at rest, also where it moves before the button of a mouse would be let go.
 
-    The trial takes longer than the 50 ms within which viser sends only the newest press of a panel.
+    The trial takes longer than the 50 ms within which viser sends only the newest press of a panel. An element that is
+    not there within `timeout` [ms] raises an error.
     """
-    locator.click(trial=True)
-    locator.evaluate("one => one.dispatchEvent(new MouseEvent('click', {bubbles: true, cancelable: true, detail: 1}))")
+    locator.click(trial=True, timeout=timeout)
+    click = "one => one.dispatchEvent(new MouseEvent('click', {bubbles: true, cancelable: true, detail: 1}))"
+    locator.evaluate(click, timeout=timeout)
 
 
 def box_of(locator: Locator) -> FloatRect:
@@ -189,16 +192,31 @@ class Tab:
         press(self.page.get_by_role("button", name=name, exact=True))
 
     def choose(self, label: str, option: str) -> None:
-        """Choose from a list."""
+        """Choose from a list; open it again if an update of the page closed it."""
         field = self.page.locator(self.element(self.find(label)))
-        field.focus()
-        press(field)
-        press(self.page.get_by_role("option", name=option, exact=True))
-        expect(field).to_have_value(option)
+        listed = self.page.get_by_role("option", name=option, exact=True)
 
-    def type_value(self, handle: object, value: float, leave: str = "Tab") -> None:
-        """Type into the number field beside a slider, and leave it with a key."""
+        def chosen() -> bool:
+            field.focus()
+            press(field)
+            try:
+                press(listed, timeout=5000)
+                expect(field).to_have_value(option, timeout=5000)
+            except (PageTimeoutError, AssertionError):
+                field.press("Escape")
+                field.blur()
+                return False
+            return True
+
+        eventually(chosen)
+
+    def type_value(self, handle: Any, value: float, leave: str = "Tab") -> None:
+        """Type into the number field beside a slider, and leave it with a key.
+
+        A value that the page has yet to receive would be written over what is typed.
+        """
         field = self.field(handle)
+        eventually(lambda: abs(float(field.input_value() or "nan") - handle.value) < 0.01)
         field.fill(f"{value:g}")
         field.press(leave)
 
