@@ -213,11 +213,20 @@ class Tab:
     def type_value(self, handle: Any, value: float, leave: str = "Tab") -> None:
         """Type into the number field beside a slider, and leave it with a key.
 
-        A value that the page has yet to receive would be written over what is typed.
+        An update of the page between the selection of the old text and the typing adds to the old text: type again.
         """
         field = self.field(handle)
-        eventually(lambda: abs(float(field.input_value() or "nan") - handle.value) < 0.01)
-        field.fill(f"{value:g}")
+
+        def shows(shown: float) -> bool:
+            return abs(float(field.input_value() or "nan") - shown) < 0.01
+
+        def typed() -> bool:
+            field.fill(f"{value:g}")
+            return shows(value)
+
+        self.app.wait_until_shown()
+        eventually(lambda: shows(handle.value))
+        eventually(typed)
         field.press(leave)
 
     def place(self, u: float, v: float, camera: int = 0) -> tuple[float, float]:
