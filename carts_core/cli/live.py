@@ -9,8 +9,10 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from ..console import Terminal
+from ..errors import SettingsError
 from ..settings.live import StreamAddress
 from ..settings.ranges import Count, Range
+from ..wording import counted
 from .options import FrameFreeParameters, Network, RangedOptions, Selection, SequencePath, check_writable
 
 if TYPE_CHECKING:
@@ -40,6 +42,8 @@ class Live(RangedOptions):
     """Do not print results on the standard output."""
     masks: bool = False
     """Include masks in the results."""
+    overlay: tuple[Path, ...] = ()
+    """Named pipes for outlines of the arms on green, one per camera, for a surgeon's console (docs/howto/live.md)."""
     record: Path | None = None
     """New folder in which the stream is recorded, as a sequence and a project with the corrections."""
     camera: tuple[str, ...] = Selection.camera
@@ -57,7 +61,7 @@ class Live(RangedOptions):
 
     def run(self) -> None:
         """Track until the end of the stream or Ctrl-C."""
-        from ..live import LiveStatistics, LiveTracker, Recorder, Results, follow, open_stream
+        from ..live import KeyedOverlay, LiveStatistics, LiveTracker, Recorder, Results, follow, open_stream
         from ..optimization import Backgrounds
         from ..project import Provenance
         from ..recording import Sequence
@@ -65,6 +69,11 @@ class Live(RangedOptions):
         console = Terminal(stderr=True)
         sequence = Sequence.open(self.sequence, progress=console.print)
         cameras = tuple(Selection(camera=self.camera).camera_names(sequence.scene))
+        if self.overlay and len(self.overlay) != len(cameras):
+            raise SettingsError(
+                f"--overlay gives {counted(len(self.overlay), 'pipe')} for {counted(len(cameras), 'camera')}. Give one "
+                "for each, in the order of --camera."
+            )
         domain = Selection(domain=(self.domain,) if self.domain else ()).domain_names(sequence)[0]
         extractor = self.network.load()
         address = StreamAddress.parse(self.source, self.joints_port)
@@ -91,6 +100,9 @@ class Live(RangedOptions):
                     send(message)
 
             sinks = [show, *([recorder] if recorder is not None else [])]
+            if self.overlay:
+                sinks.append(overlay := KeyedOverlay(sequence, dict(zip(cameras, self.overlay, strict=True))))
+                held.callback(overlay.close)
             statistics = LiveStatistics()
             try:
                 # Ctrl-C is the normal way to stop; a closed output pipe also stops tracking.

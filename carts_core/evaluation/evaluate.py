@@ -343,6 +343,14 @@ class Setup:
             pass
         return optimizer
 
+    def arm_masks(self, index: int) -> dict[str, Bool[np.ndarray, "h w"]]:
+        """Arm name -> mask of its visible pixels in the first camera, after optimization of a frame."""
+        best = self.solved(self.frame(index)).best
+        assert best is not None
+        renderer = Renderer(self.sequence.scene.with_cameras(self.cameras), cameras=self.cameras[:1])
+        arms = renderer.segment(best.state.to("cpu"))[0]
+        return {arm.name: arms == number for number, arm in enumerate(self.sequence.scene.arms)}
+
     def sequence_optimizer(self, frames: Names[int], **more: Any) -> SequenceOptimizer:
         """Joint optimizer of the given frames; `more` are further arguments of `SequenceOptimizer`."""
         stamps = self.sequence.timestamps

@@ -17,6 +17,7 @@ from .writing import csv_cell as csv_cell
 from .writing import holds_file as holds_file
 from .writing import locked_folder as locked_folder
 from .writing import output_stream as output_stream
+from .writing import pipe_stream as pipe_stream
 from .writing import published as published
 from .writing import published_file as published_file
 from .writing import remove_file as remove_file

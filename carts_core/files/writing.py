@@ -4,6 +4,7 @@ Outputs of several files are written in a hidden staging folder and renamed when
 """
 
 import ctypes
+import errno
 import fcntl
 import itertools
 import json
@@ -168,6 +169,25 @@ def append_line(path: OutputPath | Path, line: bytes, *, sync: bool = True) -> N
                 os.fsync(stream.fileno())
         if length == 0 and sync:
             os.fsync(folder)
+
+
+def pipe_stream(path: Path) -> BinaryIO:
+    """Open an existing named pipe for writing, unbuffered.
+
+    Raises:
+        OutputError: the path is missing or not a pipe, or no program has opened the pipe for reading.
+    """
+    try:
+        if not stat.S_ISFIFO(os.stat(path).st_mode):
+            raise OutputError(f"{path} is not a pipe. Create one with `mkfifo`, and give its path.")
+        descriptor = os.open(path, os.O_WRONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+    except FileNotFoundError as error:
+        raise OutputError(f"{path} is missing. Create it with `mkfifo {path}`, and start its reader.") from error
+    except OSError as error:
+        reason = "no program reads it" if error.errno == errno.ENXIO else error.strerror
+        raise OutputError(f"{path} cannot be written to: {reason}. Start its reader first.") from error
+    os.set_blocking(descriptor, True)
+    return os.fdopen(descriptor, "wb", buffering=0)
 
 
 def remove_file(path: OutputPath | Path) -> None:

@@ -12,6 +12,7 @@ from .messages import Source as Source
 from .messages import StreamError as StreamError
 from .messages import StreamFrame as StreamFrame
 from .messages import packed as packed
+from .overlay import KeyedOverlay as KeyedOverlay
 from .recorder import Recorder as Recorder
 from .sources import Camera as Camera
 from .sources import Folder as Folder

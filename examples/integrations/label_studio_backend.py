@@ -22,13 +22,13 @@ from pathlib import Path
 from typing import Any
 
 from carts_core.errors import CartsError
+from carts_core.evaluation import Setup
 from carts_core.files.reading import parse_json, parse_xml
 from carts_core.networks import FeatureExtractor
-from carts_core.optimization import Backgrounds, FrameOptimizer, SurfacePredictor
+from carts_core.optimization import FreeParameters, SurfacePredictor, SurfaceSolver
 from carts_core.process import tune_process
 from carts_core.recording import Sequence
 from carts_core.recording.annotations import brush_of_mask, find_frame
-from carts_core.rendering import Renderer
 from carts_core.resources import sample_sequence
 
 MODEL_VERSION = f"carts {version('carts')}"
@@ -62,23 +62,20 @@ class Backend:
         camera = self._sequence.recorded_camera(name)
         if any(camera.distortion):
             raise CartsError(f"Camera {name!r} has distortion, but masks refer to undistorted images. Undistort them.")
-        frame = self._sequence.frame(index, cameras=[name])
         with self._lock:
-            backgrounds = Backgrounds.of(self._sequence, [name], frame.domain)
-            given = self._sequence.scene, frame, backgrounds, self._predictor
-            optimizer = FrameOptimizer(*given, cameras=[name], live=False)
-            for _ in optimizer:
-                pass
-            assert optimizer.best is not None
-            arms = Renderer(self._sequence.scene, cameras=[name]).segment(optimizer.best.state)[0]
+            masks = self._setup(name).arm_masks(index)
         size = {"original_width": camera.width, "original_height": camera.height, "image_rotation": 0}
         regions = []
-        for number, arm in enumerate(self._sequence.scene.arms):
-            label = arm.name if arm.name in labels else labels[0] if len(labels) == 1 else None
-            if label is not None and (arms == number).any():
-                value = {"format": "rle", "rle": brush_of_mask(arms == number), "brushlabels": [label]}
-                regions.append(size | {"id": f"{index}-{arm.name}", "value": value})
+        for arm, mask in masks.items():
+            label = arm if arm in labels else labels[0] if len(labels) == 1 else None
+            if label is not None and mask.any():
+                value = {"format": "rle", "rle": brush_of_mask(mask), "brushlabels": [label]}
+                regions.append(size | {"id": f"{index}-{arm}", "value": value})
         return regions
+
+    def _setup(self, camera: str) -> Setup:
+        sequence = self._sequence
+        return Setup(sequence, sequence.domains[0], (camera,), self._predictor, SurfaceSolver(), FreeParameters())
 
 
 def serve(backend: Backend, host: str = "127.0.0.1", port: int = 9090) -> ThreadingHTTPServer:

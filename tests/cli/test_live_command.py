@@ -1,6 +1,7 @@
 """`carts live`: a replay on the command line, and what it leaves."""
 
 import json
+import os
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -60,6 +61,7 @@ def test_a_wrong_option_and_a_folder_that_holds_something_are_refused(
 ) -> None:
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "note.txt").write_text("mine")
+    os.mkfifo(tmp_path / "unread")
     for arguments, message in (
         (["--source", "replay:3"], "--source 'replay:3' is unknown"),
         (["--source", "socket:port"], "folder:PATH or socket:PORT"),
@@ -68,6 +70,10 @@ def test_a_wrong_option_and_a_folder_that_holds_something_are_refused(
         (["--rate", "0"], "--rate is 0.0; allowed: above 0"),
         (["--loops", "0"], "--loops is 0; allowed: 1 or more"),
         (["--quiet", "--record", tmp_path / "full"], "exists. Choose a new folder"),
+        (["--overlay", tmp_path / "a", tmp_path / "b"], "--overlay gives 2 pipes for 1 camera. Give one for each"),
+        (["--overlay", tmp_path / "a"], "is missing. Create it with `mkfifo"),
+        (["--overlay", tmp_path / "full"], "is not a pipe. Create one with `mkfifo`"),
+        (["--overlay", tmp_path / "unread"], "no program reads it. Start its reader first"),
     ):
         assert message in refused("live", sequence, *arguments)
     assert [path.name for path in (tmp_path / "full").iterdir()] == ["note.txt"]

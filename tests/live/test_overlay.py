@@ -1,0 +1,102 @@
+"""The overlay for a surgeon's console, in pipes that another thread reads."""
+
+import os
+import threading
+from collections.abc import Callable
+from pathlib import Path
+
+import av
+import cv2
+import numpy as np
+import pytest
+
+from carts_core.errors import OutputError
+from carts_core.live import KeyedOverlay, LiveVerdict, StreamFrame, Tracked
+from carts_core.live.overlay import COLOURS, KEY
+from carts_core.live.tracker import Effort, LiveEstimate
+from carts_core.recording import Sequence
+from carts_core.rendering import Renderer
+
+
+def tracked(sequence: Sequence, index: int, verdict: LiveVerdict) -> Tracked:
+    frame = sequence.frame(index)
+    state, std = sequence.scene.state(frame.measured), {arm: 0 * values for arm, values in frame.measured.items()}
+    what = frame.frame_id, 0.0, verdict, Effort.SMALL, 0.01, state, frame.measured, std, 0.0
+    return Tracked(StreamFrame(frame), LiveEstimate(*what), 0.0)
+
+
+@pytest.fixture
+def sequence(tiny_sequence: Callable[..., Path]) -> Sequence:
+    return Sequence.open(tiny_sequence(frames=2, width=160, height=128, cameras=("left", "right")))
+
+
+def read(pipe: Path, pictures: list[np.ndarray]) -> None:
+    """Read all pictures from a pipe until its writer ends, RGB."""
+    with av.open(str(pipe)) as container:
+        pictures.extend(frame.to_ndarray(format="rgb24") for frame in container.decode(video=0))
+
+
+def once_read(sequence: Sequence, pipes: dict[str, Path]) -> KeyedOverlay:
+    """The overlay, as soon as the threads that read the pipes have opened them."""
+    while True:
+        try:
+            return KeyedOverlay(sequence, pipes)
+        except OutputError as error:
+            assert "no program reads it" in str(error)
+
+
+def eroded(mask: np.ndarray, size: int) -> np.ndarray:
+    square = np.ones((size, size))
+    return cv2.erode(mask.astype(np.uint8), square, borderType=cv2.BORDER_CONSTANT, borderValue=0) > 0
+
+
+@pytest.mark.parametrize("verdict", list(LiveVerdict))
+def test_another_program_reads_outlines_on_green(sequence: Sequence, tmp_path: Path, verdict: LiveVerdict) -> None:
+    pipes = {name: tmp_path / name for name in ("left", "right")}
+    pictures: dict[str, list[np.ndarray]] = {name: [] for name in pipes}
+    threads = [threading.Thread(target=read, args=(pipes[name], pictures[name])) for name in pipes]
+    for pipe in pipes.values():
+        os.mkfifo(pipe)
+    for thread in threads:
+        thread.start()
+    overlay, result = once_read(sequence, pipes), tracked(sequence, 1, verdict)
+    overlay(result)
+    overlay.close()
+    for thread in threads:
+        thread.join(60.0)
+    for name in pipes:
+        (picture,) = pictures[name]
+        mask = Renderer(sequence.scene, cameras=[name]).segment(result.estimate.state)[0] >= 0
+        inner, smaller = (eroded(mask, size) for size in (7, 3))
+        outer = cv2.dilate(mask.astype(np.uint8), np.ones((7, 7))) > 0
+        # Colours come back from YUV to a few grey levels.
+        np.testing.assert_allclose(picture[inner | ~outer], np.broadcast_to(KEY, picture[inner | ~outer].shape), atol=3)
+        rim = mask & ~smaller
+        wanted = COLOURS.get(verdict, KEY)
+        np.testing.assert_allclose(picture[rim], np.broadcast_to(wanted, picture[rim].shape), atol=3)
+        assert rim.sum() > 50 and inner.any()
+
+
+def test_tracking_continues_if_the_reader_ends(
+    sequence: Sequence, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    os.mkfifo(tmp_path / "left")
+    reader = os.open(tmp_path / "left", os.O_RDONLY | os.O_NONBLOCK)
+    overlay = KeyedOverlay(sequence, {"left": tmp_path / "left"})
+    os.close(reader)
+    for index in (0, 1, 0):
+        overlay(tracked(sequence, index, LiveVerdict.GOOD))
+    overlay.close()
+    assert [record.message for record in caplog.records] == [
+        "The reader of the overlay has ended; tracking continues without an overlay."
+    ]
+
+
+def test_a_reader_that_does_not_read_delays_nothing(sequence: Sequence, tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "left")
+    reader = os.open(tmp_path / "left", os.O_RDONLY | os.O_NONBLOCK)
+    overlay = KeyedOverlay(sequence, {"left": tmp_path / "left"})
+    for index in (0, 1) * 20:
+        overlay(tracked(sequence, index, LiveVerdict.GOOD))
+    overlay.close()
+    os.close(reader)
