@@ -47,6 +47,7 @@ bench: setup-dev ## Print the measurements, then run the slow tests and the benc
 
 pictures: setup-dev ## Take the pictures of the README, the tutorial and the examples again
 	chromium=$$($(BIN)/python .ci/chromium.py) && CARTS_CHROMIUM=$$chromium $(BIN)/python docs/pictures.py
+	$(BIN)/python docs/run_pictures.py
 	$(BIN)/python docs/example_pictures.py
 
 wheel: setup-dev ## Build the sdist and the wheel into dist/

@@ -5,6 +5,8 @@
   let box = null;
   let held = false;
   let waiting = null;
+  let reported = 0; // time of the last report of a slider that is dragged
+  const LIVE = 120; // minimum time between such reports [ms]
 
   function element() {
     if (!box?.isConnected) {
@@ -12,12 +14,26 @@
       document.body.append(box, themeButton());
       box.addEventListener("click", (event) => {
         const chosen = event.target.closest("button[data-do]");
-        if (chosen && !chosen.disabled) say(chosen.dataset.do, chosen.dataset.value ?? "");
+        if (chosen && !chosen.disabled) choose(chosen);
       });
       box.addEventListener("change", (event) => {
         const field = event.target.closest("select[data-do], input[data-do]");
         if (!field) return;
         say(field.dataset.do, field.type === "checkbox" ? (field.checked ? "1" : "0") : field.value);
+      });
+      box.addEventListener("keydown", (event) => {
+        const field = event.target.closest("[data-enter]");
+        if (event.key === "Enter" && field) box.querySelector(`button[data-do="${field.dataset.enter}"]`)?.click();
+      });
+      window.addEventListener("keydown", (event) => {
+        if (event.key === "Escape" && !box.hidden) box.querySelector("button[data-escape]:enabled")?.click();
+      }, { capture: true });
+      // A slider reports while it is dragged; the last value follows by `change`.
+      box.addEventListener("input", (event) => {
+        const field = event.target.closest("input[data-live]");
+        if (!field || performance.now() - reported < LIVE) return;
+        reported = performance.now();
+        say(field.dataset.do, field.value);
       });
       // Keys typed in the document are not shortcuts of the page below.
       for (const kind of ["keydown", "keyup", "pointerdown", "wheel", "dblclick"]) {
@@ -32,19 +48,25 @@
     return box;
   }
 
+  /** Report a button: its own value, or that of a field. */
+  function choose(button) {
+    const { do: name, value, from } = button.dataset;
+    say(name, from ? document.getElementById(from).value : value ?? "");
+  }
+
   function themeButton() {
     const button = document.createElement("button");
-    Object.assign(button, { className: "carts-theme", title: "Light or dark", textContent: "◐" });
+    Object.assign(button, { className: "carts-theme", title: "Light or dark", textContent: "◐", type: "button" });
     button.setAttribute("aria-label", button.title);
     button.addEventListener("click", () => window.carts.toggleTheme());
     return button;
   }
 
   // Allowed elements of documents; others are removed.
-  const TAGS = new Set(("b br button code details div figcaption figure h1 h2 h3 img input label li ol option p polyline progress " +
-    "section select small span summary svg table tbody td th thead tr").split(" "));
-  const ATTRIBUTES = /^(alt|checked|class|colspan|disabled|fill|max|open|placeholder|points|preserveAspectRatio|role|selected|spellcheck|src|stroke|stroke-width|style|title|type|value|viewBox|data-[a-z]+|aria-[a-z]+)$/;
-  const PICTURES = /^\/media\/[0-9a-f]+\.jpg$/;
+  const TAGS = new Set(("article b br button caption circle code details div figcaption figure footer g h1 h2 h3 header hr i img input label li line " +
+    "ol option output p path polygon polyline progress section select small span summary svg table tbody td text th thead tr ul").split(" "));
+  const ATTRIBUTES = /^(alt|checked|class|colspan|cx|cy|d|disabled|fill|for|height|id|max|min|open|placeholder|points|preserveAspectRatio|r|role|scope|selected|spellcheck|src|step|stroke|stroke-[a-z]+|style|tabindex|title|type|value|viewBox|width|x|x1|x2|y|y1|y2|data-[a-z]+|aria-[a-z]+)$/;
+  const PICTURES = /^\/(media\/[0-9a-f]+\.jpg|static\/[a-z]+\.(svg|webp))$/;
 
   /** The nodes of a document's HTML. */
   function built(content) {
@@ -74,12 +96,14 @@
     const key = focused?.dataset?.do && [focused.dataset.do, focused.dataset.value ?? ""];
     const typed = focused?.type === "text" && focused.value !== focused.defaultValue
       ? [focused.value, focused.selectionStart, focused.selectionEnd] : null;
+    const opened = [...target.querySelectorAll("details[data-keep][open]")].map((part) => part.dataset.keep);
     const scrolled = [...target.querySelectorAll("[data-scroll]")].map((part) => [part.dataset.scroll, part.scrollTop]);
     target.className = content ? `carts-document carts-document-${place}` : "";
     target.hidden = !content;
     const top = target.scrollTop;
     target.replaceChildren(...built(content));
     target.scrollTop = top;
+    for (const part of target.querySelectorAll("details[data-keep]")) part.open ||= opened.includes(part.dataset.keep);
     for (const [name, position] of scrolled) {
       const part = [...target.querySelectorAll("[data-scroll]")].find((other) => other.dataset.scroll === name);
       if (part) part.scrollTop = position;
@@ -94,7 +118,10 @@
       }
     }
     document.documentElement.classList.toggle("carts-documented", Boolean(content));
-    document.documentElement.classList.toggle("carts-covered", Boolean(content) && place === "page");
+    const covered = Boolean(content) && place === "page";
+    document.documentElement.classList.toggle("carts-covered", covered);
+    const below = document.getElementById("root");
+    if (below) below.inert = covered; // the keyboard does not reach the covered view
   }
 
   // A click in the image is a press without motion.

@@ -95,7 +95,7 @@
   }
 
   // Elements over the lower part of a small screen.
-  const CONTROLS = "body.carts-small.carts-controls .mantine-Paper-root[style*='position: fixed'], body.carts-small .carts-document-side";
+  const CONTROLS = "body.carts-small.carts-controls .mantine-Paper-root[style*='position: fixed'], body.carts-small .carts-document-side, .carts-document .frames";
 
   /** Height of the elements over the lower end of the canvas [CSS px]. */
   function bottomBars() {

@@ -51,8 +51,8 @@ class Host(Protocol):
     def show_start(self, problem: str = "") -> None:
         """Show the start page."""
 
-    def show_recording(self, draft: str | None = None) -> None:
-        """Show the page *New recording* with a new or an existing draft."""
+    def show_recording(self, draft: str | None = None, source: Path | None = None) -> None:
+        """Show the page *New recording* with a new or an existing draft, or a draft of a checked path."""
 
     def show_batch(self, folder: Path) -> None:
         """Show a batch, or the start page with an error if the batch cannot be read."""

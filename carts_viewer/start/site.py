@@ -120,9 +120,9 @@ class Site:
         """Show the start page."""
         self._show(lambda: StartPage(self, problem))
 
-    def show_recording(self, draft: str | None = None) -> None:
-        """Show the page *New recording* with a new or an existing draft."""
-        self._show(lambda: RecordingWizard(self, draft))
+    def show_recording(self, draft: str | None = None, source: Path | None = None) -> None:
+        """See `Host.show_recording`."""
+        self._show(lambda: RecordingWizard(self, draft, source))
 
     def open_sample(self) -> None:
         """Open the shipped sequence."""

@@ -4,25 +4,25 @@ import json
 import time
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass, replace
-from functools import cache, lru_cache
+from functools import lru_cache
 from hashlib import sha256
 from pathlib import Path
 from typing import Annotated
 
 import msgspec
 
+from carts_core.batch.folder import is_batch
 from carts_core.errors import CartsError
 from carts_core.files import write_bytes, write_text
 from carts_core.files.reading import TABLE, is_regular, parse_json, read_bytes, read_text, typed
 from carts_core.project import ProjectState, ReviewState, read_state
 from carts_core.project.file import LOG, beside
 from carts_core.project.identity import data_dir
-from carts_core.recording import Sequence
-from carts_core.resources import sample_sequence
 from carts_viewer.app import ViewerApp
 from carts_viewer.jobs.companions import set_aside_damaged
 from carts_viewer.picture.layers import small_jpeg
 from carts_viewer.start.host import FileBrowser, Host, Wanted
+from carts_viewer.start.uploads import Uploads
 from carts_viewer.transport.document import render
 from carts_viewer.wizard.draft import delete_draft, drafts
 
@@ -171,19 +171,19 @@ class StartPage:
         self._site = site
         self._problem = problem or set_damaged_aside()
         self._browser: FileBrowser | None = None
+        self._uploads = Uploads(site.roots.folders[0])
+        site.page.receive_upload = self._uploads.serve
 
     def show(self) -> None:
         """Update the document."""
-        projects = recent_projects()
-        sample = sample_sequence()
-        known = next((thumbnail(project) for project in projects if project.sequence == str(sample)), None)
         content = render(
             "start.html",
             problem=self._problem,
             browser=self._browser,
             drafts=drafts(),
-            cards=[self._card(project) for project in projects],
-            sample=self._published(known if known is not None else _first_image(sample)),
+            cards=[self._card(project) for project in recent_projects()],
+            root=self._site.roots.folders[0],
+            uploads=self._uploads.root,
             ago=_ago,
         )
         self._site.document.show(content)
@@ -206,15 +206,26 @@ class StartPage:
                 return self._site.open_sequence(Path(value), project=own if is_regular(own) else None)
             case "forget":
                 forget(value)
+            case "open-path":
+                return self._open(self._site.roots.checked(Path(value.strip()).expanduser()))
             case "open":
                 self._toggle("Choose a sequence file (.toml).", lambda entry: entry.path.suffix.lower() == ".toml")
             case "open-batch":
                 self._toggle("Choose the output folder of carts batch.", lambda _: False, folders=True)
+            case "close-browser":
+                self._browser = None
             case "browse" if browser is not None:
                 browser.browse(value)
             case "pick" if browser is not None and (path := browser.picked(value)) is not None:
                 return self._site.show_batch(path) if path.is_dir() else self._site.open_sequence(path)
         self.show()
+
+    def _open(self, path: Path) -> None:
+        """Open a sequence file, a folder that contains one, a batch, or another path as a new recording."""
+        inside = path / "sequence.toml"
+        if is_regular(inside) or path.suffix.lower() == ".toml":
+            return self._site.open_sequence(inside if path.is_dir() else path)
+        return self._site.show_batch(path) if is_batch(path) else self._site.show_recording(source=path)
 
     def _toggle(self, purpose: str, wanted: Wanted, *, folders: bool = False) -> None:
         new = FileBrowser(self._site.roots, wanted=wanted, folders=folders, purpose=purpose)
@@ -229,7 +240,8 @@ class StartPage:
         self.show()
 
     def close(self) -> None:
-        """Do nothing."""
+        """Accept no more uploads."""
+        self._site.page.receive_upload = None
 
     def _card(self, project: RecentProject) -> tuple[RecentProject, str, str]:
         """Current entry of a project, the error if the project cannot be read, and the URL of the thumbnail."""
@@ -242,14 +254,6 @@ class StartPage:
     def _published(self, jpeg: bytes | None) -> str:
         """URL of a picture; empty if there is none."""
         return "" if jpeg is None else self._site.page.media.publish(jpeg)
-
-
-@cache
-def _first_image(path: Path) -> bytes:
-    """Thumbnail of a sequence's first image."""
-    sequence = Sequence.open(path)
-    frame = sequence.frame(0, cameras=[sequence.scene.cameras[0].name])
-    return small_jpeg(next(iter(frame.images.values())), width=_WIDTH)
 
 
 def _ago(seconds: float) -> str:

@@ -13,6 +13,7 @@ import viser
 
 from carts_core.console import visible
 from carts_viewer.transport.page import Page, call
+from carts_viewer.transport.viser_private import icon
 
 if TYPE_CHECKING:
     import jinja2
@@ -61,9 +62,10 @@ def render(template: str, **values: Any) -> str:
 def _templates() -> "jinja2.Environment":
     # Not needed by the viewer of one sequence.
     import jinja2  # noqa: PLC0415
+    from markupsafe import Markup  # noqa: PLC0415
 
     loader = jinja2.FileSystemLoader(Path(__file__).parent.parent / "templates")
-    return jinja2.Environment(
+    environment = jinja2.Environment(
         loader=loader,
         autoescape=True,
         trim_blocks=True,
@@ -71,3 +73,5 @@ def _templates() -> "jinja2.Environment":
         undefined=jinja2.StrictUndefined,
         finalize=lambda value: value if hasattr(value, "__html__") else visible(str(value)),
     )
+    environment.globals["icon"] = lambda name: Markup(icon(name).replace("<svg ", '<svg aria-hidden="true" ', 1))
+    return environment

@@ -253,13 +253,17 @@ _SERVER_CONSTRUCTION = threading.Lock()
 
 @contextlib.contextmanager
 def gated(
-    respond: Callable[[Request], Response | Awaitable[Response] | None], refuse: Callable[[object], str | None]
+    respond: Callable[[Request], Response | Awaitable[Response] | None],
+    refuse: Callable[[object], str | None],
+    handler_of: Callable[[str], Callable[[ServerConnection], Awaitable[None]] | None],
 ) -> Iterator[None]:
     """Context in which started websocket servers filter requests and messages.
 
     Args:
         respond: Returns the response to a request; None to let the server respond.
         refuse: Returns the reason to drop a message; None to accept it.
+        handler_of: Returns the handler of connections to a path, which checks its messages itself; None for the
+            server's handler.
     """
     original = websockets.asyncio.server.serve
 
@@ -270,14 +274,20 @@ def gated(
             """The next message that is not refused."""
             while True:
                 data = await super().recv(decode)
-                reason = refuse(data)
+                reason = None if _own_handler(self) else refuse(data)
                 if reason is None:
                     return data
                 if not getattr(self, "warned", False):
                     self.warned = True
                     _log.warning("Refused a message from a tab: %.200r", reason)
 
-    def serve(*arguments: Any, process_request: Any = None, **options: Any) -> Any:
+    def _own_handler(connection: ServerConnection) -> Callable[[ServerConnection], Awaitable[None]] | None:
+        return handler_of(connection.request.path.partition("?")[0]) if connection.request else None
+
+    def serve(handler: Any, *arguments: Any, process_request: Any = None, **options: Any) -> Any:
+        async def handled(connection: ServerConnection) -> None:
+            await (_own_handler(connection) or handler)(connection)
+
         def guarded(connection: Any, request: Request) -> Any:
             answer = respond(request)
             if answer is not None or process_request is None:
@@ -285,7 +295,7 @@ def gated(
             return process_request(connection, request)
 
         options = {**options, "max_size": MAX_MESSAGE_SIZE, "create_connection": Connection}
-        return original(*arguments, process_request=guarded, **options)
+        return original(handled, *arguments, process_request=guarded, **options)
 
     with _SERVER_CONSTRUCTION:
         websockets.asyncio.server.serve = serve  # type: ignore[assignment]

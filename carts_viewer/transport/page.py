@@ -23,6 +23,7 @@ from typing import Any
 
 import msgspec
 import viser
+from websockets.asyncio.server import ServerConnection
 from websockets.http11 import Request, Response
 
 from carts_core.errors import CartsError
@@ -182,8 +183,23 @@ class Media:
 OWN_KEYS = ("[", "]", "(", ")", "escape", "enter")
 """Keys that viser's shortcuts do not support, or that the page's script must handle first."""
 
+UPLOAD = "/upload"
+"""Path of the websocket of uploads."""
 _THUMBNAIL = "/thumbnail/"
-_SCRIPTS = ("page", "paint", "marks", "loupe", "drag", "lanes", "timeline", "tour", "shell", "document")
+_SCRIPTS = (
+    "page",
+    "paint",
+    "marks",
+    "loupe",
+    "drag",
+    "lanes",
+    "timeline",
+    "tour",
+    "shell",
+    "document",
+    "upload",
+    "clicks",
+)
 """Files of `static/`, in the order in which they run."""
 
 _STYLES = ("tokens", "page", "document")
@@ -222,11 +238,17 @@ class Page:
         self.media = Media()
         self.thumbnail: Callable[[str], Awaitable[Response]] | None = None
         """Answers requests below `/thumbnail/`; None if no recording is shown."""
+        self.receive_upload: Callable[[ServerConnection], Awaitable[None]] | None = None
+        """Receives the connections to `UPLOAD`; None if there are no uploads."""
         self._files = {path.name: path for path in static_dir().iterdir() if path.is_file()}
         queue_safely()
         list_icons_once()
         with (
-            gated(self._respond, lambda data: refusal(data, self._value_of)),
+            gated(
+                self._respond,
+                lambda data: refusal(data, self._value_of),
+                lambda path: self.receive_upload if path == UPLOAD else None,
+            ),
             contextlib.redirect_stdout(io.StringIO()),
         ):
             self.server = viser.ViserServer(host=host, port=port, verbose=False)

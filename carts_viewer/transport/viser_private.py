@@ -22,12 +22,12 @@ from viser.infra._async_message_buffer import AsyncMessageBuffer
 
 def list_icons_once() -> None:
     """Make viser list its archive of icons only once; listing it for every icon takes 0.5 s per tab."""
-    _gui_api.svg_from_icon = _gui_handles.svg_from_icon = _icon  # pyright: ignore[reportPrivateImportUsage]
+    _gui_api.svg_from_icon = _gui_handles.svg_from_icon = icon  # pyright: ignore[reportPrivateImportUsage]
 
 
 @functools.cache
-def _icon(name: str) -> str:
-    """The SVG of an icon."""
+def icon(name: str) -> str:
+    """The SVG of an icon of the Tabler set."""
     return _icons().read(f"{name}.svg").decode()
 
 

@@ -86,6 +86,30 @@ _WHOLE: tuple[Part, str] = ("recording", "")
 """Key of problems of the recording as a whole."""
 
 
+_ROLES = (*JOINT_NAMES, "jaw", "time", "frame")
+"""Meanings that a column can be given."""
+
+
+def _label(role: str) -> str:
+    """Meaning of a column, as text."""
+    return "image" if role == "frame" else role.replace("_", " ")
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column of the table in the form."""
+
+    name: str
+    samples: tuple[str, ...]
+    """First, middle and last value."""
+    chosen: str
+    """Meaning chosen by the user; empty if there is none."""
+    guess: str
+    """Label of the guessed meaning; empty if there is none, or another was chosen."""
+    role: str
+    """Meaning in use: a joint, time or frame; empty for all others."""
+
+
 @dataclass(frozen=True)
 class Guess:
     """Content of the files of a draft, and the problems of each part."""
@@ -107,12 +131,26 @@ class Guess:
         """Joint -> guessed column."""
         return {} if self.meanings is None else next(iter(self.meanings.arms.values()), {})
 
-    def unset_column(self, role: str, chosen: bool) -> str:
-        """Label of the choice that restores the guessed column."""
-        if chosen or self.meanings is None:
-            return "none"
-        column = getattr(self.meanings, role) if role in ("time", "frame") else self.columns.get(role)
-        return f"{column} ({'by name' if column in self.meanings.stated else 'guessed'})" if column else "none"
+    def described(self, options: ImportOptions) -> list["Column"]:
+        """The columns of the table, those with a meaning first."""
+        if self.table is None:
+            return []
+        chosen = {column: role for role, column in options.columns.items()}
+        found: dict[str, str] = {}
+        if self.meanings is not None:
+            several = len(self.meanings.arms) > 1
+            for arm, columns in self.meanings.arms.items():
+                found |= {column: f"{arm} {role}" if several and arm else role for role, column in columns.items()}
+            found |= {self.meanings.frame: "frame"} if self.meanings.frame else {}
+            found |= {self.meanings.time: "time"} if self.meanings.time else {}
+        rows = []
+        for name, values in self.table.columns.items():
+            origin = "by name" if self.meanings is not None and name in self.meanings.stated else "guessed"
+            guess = "" if name in chosen or name not in found else f"{_label(found[name])} ({origin})"
+            places = dict.fromkeys((0, len(values) // 2, len(values) - 1))
+            role = chosen.get(name) or (found.get(name) if found.get(name) in _ROLES else None) or ""
+            rows.append(Column(name, tuple(sample(values[row]) for row in places), chosen.get(name, ""), guess, role))
+        return sorted(rows, key=lambda row: not (row.chosen or row.guess))
 
     def notes(self, about: str, *kinds: NoteKind) -> list[Note]:
         """Notes of some kinds about a camera or arm, or about neither if `about` is empty."""
@@ -192,7 +230,6 @@ def check_form(
     draft: Draft, guess: Guess, pictures: dict[str, list[tuple[str, str]]], delay: TimeOffsetEstimate | None = None
 ) -> str:
     """HTML of the form: contents of the files by part, problems, and controls."""
-    table = {} if guess.table is None else guess.table.columns
     return render(
         "check.html",
         draft=draft,
@@ -201,7 +238,7 @@ def check_form(
         delay=delay,
         trials={str(trial): trial.stem for trial in guess.trials},
         curves=curves,
-        samples={column: f"{column} ({sample(values[0])})" for column, values in table.items()},
+        roles={role: _label(role) for role in _ROLES},
         joints=(*JOINT_NAMES, "jaw"),
         angles=get_args(AngleUnit),
         lengths=get_args(LengthUnit),

@@ -204,6 +204,9 @@ def changed(draft: Draft, name: str, value: str, guessed: Mapping[str, str]) -> 
         options |= {"kinematics": NO_TABLE, "columns": {}, "flip": (), "units": {}}
     elif kind == "column" and which in _MEANINGS:
         options["columns"] = _columns(draft, which, value, guessed)
+    elif kind == "meaning" and (not value or value in _MEANINGS):
+        chosen = {role: column for role, column in draft.options.columns.items() if column != which}
+        options["columns"] = _columns(draft.with_options(columns=chosen), value, which, guessed) if value else chosen
     elif name == "remove-camera":
         options["images"] = _with(draft.options.images, value, "")
     return draft.with_options(**options) if options else None

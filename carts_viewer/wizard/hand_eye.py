@@ -6,9 +6,6 @@ from collections.abc import Sequence as Rows
 from dataclasses import replace
 from pathlib import Path
 
-import cv2
-import numpy as np
-
 from carts_core.errors import SettingsError
 from carts_core.model.scene import Scene
 from carts_core.optimization import CalibrationResult, StopReason
@@ -18,7 +15,6 @@ from carts_core.recording.importing.found import FoundRecording
 from carts_core.recording.importing.writing import write_sequence
 from carts_core.wording import counted
 from carts_viewer.picture import layers
-from carts_viewer.picture.layers import Rgba
 from carts_viewer.picture.overlay import OverlayRenderer
 from carts_viewer.picture.scene_view import SceneView
 from carts_viewer.start.host import Host
@@ -37,14 +33,14 @@ from carts_viewer.wizard.calibration import (
 )
 from carts_viewer.wizard.check import open_recording
 from carts_viewer.wizard.draft import Draft
+from carts_viewer.wizard.drawing import Drawing, drawing_of
 from carts_viewer.wizard.points import Clicking, ClickPrompt, unknown_cameras
 
-_GOOD, _WRONG, _EDGE = (250, 204, 21, 255), (239, 68, 68, 255), (0, 0, 0, 255)
 _OPACITY = 0.9
 
 
 class FramePicture:
-    """Picture beside the document: image, overlay and clicked points."""
+    """Picture beside the document: image and overlay."""
 
     def __init__(self, page: Page, sequence: Sequence) -> None:
         self._page = page
@@ -55,16 +51,8 @@ class FramePicture:
         state = sequence.scene.state(frame.measured, mounts=frame.mounts)
         self._view = SceneView(page.server.scene, sequence.scene, state, sequence.scene.cameras[0].name)
 
-    def show(
-        self,
-        index: int,
-        camera: str,
-        scene: Scene | None,
-        points: Rows[ImagePoint],
-        wrong: frozenset[int],
-    ) -> None:
-        """Show a frame of a camera, with the contours of a calibrated scene and the clicked points; `wrong` are the
-        indices of contradicting points."""
+    def show(self, index: int, camera: str, scene: Scene | None) -> None:
+        """Show a frame of a camera, with the contours of a calibrated scene."""
         frame = self._sequence.frame(index, cameras=[camera])
         own = self._sequence.scene.camera(camera)
         if scene is None:
@@ -72,9 +60,6 @@ class FramePicture:
         else:
             ids = self._renderer.arm_ids(scene.state(frame.measured, mounts=frame.mounts), camera)
             picture = layers.contour(ids, _OPACITY)
-        for row, point in enumerate(points):
-            if point.frame == index and point.camera == camera:
-                _cross(picture, point, _WRONG if row in wrong else _GOOD)
         with self._page.server.atomic():
             if self._shown != (index, camera):
                 self._view.show_frame(frame.images[camera], own)
@@ -83,24 +68,22 @@ class FramePicture:
         self._shown = (index, camera)
 
 
-def _cross(picture: Rgba, point: ImagePoint, color: tuple[int, int, int, int]) -> None:
-    size = max(picture.shape[:2]) / 640
-    at = (int(np.floor(point.pixel[0])), int(np.floor(point.pixel[1])))
-    for shade, thickness in ((_EDGE, 3 * size), (color, size)):
-        cv2.drawMarker(picture, at, shade, cv2.MARKER_CROSS, round(11 * size), max(1, round(thickness)))
-
-
 def hand_eye_panel(
     draft: Draft,
     clicking: Clicking,
     prompt: ClickPrompt | None,
+    shown: ClickPrompt,
+    drawing: Drawing | None,
     progress: CalibrationProgress | None,
     problem: str,
     folder: str,
     undoable: bool,
 ) -> str:
-    """HTML of the panel of the Hand-eye step."""
+    """HTML of the panel of the Hand-eye step; `shown` has the frame and camera of the image."""
     report, result = draft.report, clicking.result
+    camera = clicking.sequence.scene.camera(shown.camera)
+    clicked = {point.frame for point in draft.points if point.camera == shown.camera}
+    planned = {entry.frame for entry in clicking.plan if entry.camera == shown.camera}
     deviations = {} if result is None else result.deviations
     if report is not None:
         deviations = {(pose.arm, pose.camera): pose.deviation for pose in report.poses}
@@ -116,23 +99,35 @@ def hand_eye_panel(
         undoable=undoable,
         calibration_frames=CALIBRATION_FRAMES,
         done=len({(p.camera, p.frame, p.arm, p.landmark) for p in draft.points}),
-        frames={str(index): name for index, name in enumerate(clicking.sequence.frame_ids[:2000])},
+        at=prompt or clicking.plan[-1],
+        shown=shown,
+        size=(camera.width, camera.height),
+        drawing=drawing,
+        dots={frame: frame in clicked for frame in sorted(clicked | planned)},
+        residuals=_residuals(draft, result),
+        wrong=frozenset(report.disagreeing if report else () if result is None else result.contradicting),
         deviations=deviations,
-        rms=None if result is None else _rms(draft, result),
+        rms=None if result is None else result.error if report is None else _rms(report.after, result),
+        rms_before=None if result is None or report is None else _rms(report.before, result),
         counted=counted,
     )
 
 
-def _rms(draft: Draft, result: HandEyeResult) -> float:
-    """RMS residual of the consistent points [px], after the calibration if there is one."""
-    if draft.report is None:
-        return result.error
-    agreeing = [row for row in range(len(draft.points)) if row not in result.contradicting]
-    values = [value for row in agreeing if (value := draft.report.after[row]) is not None]
+def _residuals(draft: Draft, result: HandEyeResult | None) -> list[tuple[float | None, float | None]]:
+    """Residual of each point before a calibration, and now [px]; None if not known."""
+    if draft.report is not None:
+        return list(zip(draft.report.before, draft.report.after, strict=True))
+    now = [None] * len(draft.points) if result is None else result.distances.tolist()
+    return [(None, None if value is None or math.isnan(value) else value) for value in now]
+
+
+def _rms(residuals: Rows[float | None], result: HandEyeResult) -> float:
+    """RMS residual of the consistent points [px]."""
+    values = [value for row, value in enumerate(residuals) if row not in result.contradicting and value is not None]
     return math.sqrt(sum(value**2 for value in values) / max(len(values), 1))
 
 
-_WIDTH = 340.0
+_WIDTH = 360.0
 """Width of the document at the side [px], as in `static/document.css`."""
 
 Calibrated = Callable[[Callable[[Draft], Draft]], None]
@@ -157,6 +152,7 @@ class HandEyeStep:
         self._wanted: ClickPrompt | None = None
         self._job: CalibrationJob | None = None
         self._progress: CalibrationProgress | None = None
+        self._drawings = {arm.name: drawing_of(arm) for arm in self._sequence.scene.arms}
         panel = host.page.server.gui.main_panel
         panel.dock_left()
         panel.set_width(_WIDTH)
@@ -175,10 +171,18 @@ class HandEyeStep:
         self._solve(draft)
         prompt = self.prompt(draft)
         at = prompt or (self._clicking.plan[0] if not draft.points else _prompt_of(draft.points[-1]))
-        wrong = frozenset(() if self._clicking.result is None else self._clicking.result.contradicting)
-        self._picture.show(at.frame, at.camera, self.shown_scene(draft), draft.points, wrong)
-        folder = self._target(draft)
-        content = hand_eye_panel(draft, self._clicking, prompt, self._progress, self.problem, folder, undoable)
+        self._picture.show(at.frame, at.camera, self.shown_scene(draft))
+        content = hand_eye_panel(
+            draft,
+            self._clicking,
+            prompt,
+            at,
+            self._drawings[at.arm],
+            self._progress,
+            self.problem,
+            self._target(draft),
+            undoable,
+        )
         self._host.document.show(content, "side")
 
     def clicked(self, draft: Draft, u: float, v: float) -> Draft:
@@ -214,6 +218,8 @@ class HandEyeStep:
             self._skip_frame(draft, prompt)
         elif kind == "look":
             self._look(prompt or self._clicking.plan[-1], which, value)
+        elif name == "show-point" and (row := _row(value, draft)) is not None:
+            self._wanted = _prompt_of(draft.points[row])
         elif name == "calibrate":
             self._calibrate()
         else:
@@ -222,6 +228,7 @@ class HandEyeStep:
 
     def _changed(self, draft: Draft, name: str, value: str) -> Draft:
         """The draft after a choice that may change it."""
+        kind, _, which = name.partition(" ")
         if name == "focal_length":
             draft = draft.uncalibrated(focal_length=value == "1")
         elif name == "name":
@@ -230,11 +237,26 @@ class HandEyeStep:
             draft = replace(draft, calibration=draft.offered, offered=None)
         elif name == "discard" and draft.offered is not None:
             draft = draft.uncalibrated()
-        elif name == "remove-point" and value.isdecimal() and int(value) < len(draft.points):
-            row = int(value)
+        elif kind == "move-point" and (row := _row(which, draft)) is not None:
+            draft = self._moved(draft, row, value)
+        elif name == "remove-point" and (row := _row(value, draft)) is not None:
             self._wanted = _prompt_of(draft.points[row])
             draft = draft.uncalibrated(points=(*draft.points[:row], *draft.points[row + 1 :]))
         return draft
+
+    def _moved(self, draft: Draft, row: int, value: str) -> Draft:
+        """The draft with a point at another position, "U V" relative to the image size."""
+        point = draft.points[row]
+        camera = self._sequence.scene.camera(point.camera)
+        try:
+            u, v = map(float, value.split())
+        except ValueError:
+            return draft
+        if not (0.0 <= u <= 1.0 and 0.0 <= v <= 1.0):
+            return draft
+        self._progress = None
+        moved = replace(point, pixel=(u * camera.width, v * camera.height))
+        return draft.uncalibrated(points=(*draft.points[:row], moved, *draft.points[row + 1 :]))
 
     def write(self, draft: Draft) -> Path:
         """Write the sequence and return its file; `CartsError` if this fails."""
@@ -341,6 +363,11 @@ class HandEyeStep:
             return str(target_folder(self._host.roots, Path(draft.source), draft.name))
         except SettingsError as error:
             return str(error)
+
+
+def _row(value: str, draft: Draft) -> int | None:
+    """Index of a clicked point in a choice; None if there is no such point."""
+    return int(value) if value.isdecimal() and len(value) < 9 and int(value) < len(draft.points) else None
 
 
 def _prompt_of(point: ImagePoint) -> ClickPrompt:

@@ -33,7 +33,7 @@ _MAX_UNDO = 200
 class RecordingWizard:
     """The page *New recording* with its draft."""
 
-    def __init__(self, host: Host, key: str | None = None) -> None:
+    def __init__(self, host: Host, key: str | None = None, source: Path | None = None) -> None:
         self._host = host
         self._problem = ""
         self._part = "source"
@@ -48,7 +48,9 @@ class RecordingWizard:
             self._draft = self._file.read()
         except CartsError as error:
             self._file, self._draft, self._problem = DraftFile(), Draft(), str(error)
-        if not self._draft.source:
+        if source is not None:
+            self._change(picked(self._draft, "source", source, {}))
+        elif not self._draft.source:
             self._browse("source")
 
     @property
