@@ -12,18 +12,10 @@
   const within = (value) => Math.min(Math.max(value, 0), 1);
   const move = (mark, u, v) => window.carts.report("Chosen", { name: `move-point ${mark.dataset.row}`, value: `${within(u)} ${within(v)}` });
 
-  /** Position of the image in the window [CSS px]; null if it is not shown. */
-  function imageBox() {
-    const image = window.carts.imageOnScreen?.();
-    const frame = window.__viserMutable?.canvas?.getBoundingClientRect();
-    if (!image || !frame) return null;
-    return { left: frame.left + image.left, top: frame.top + image.top, width: image.width, height: image.height, frame };
-  }
-
   function everyFrame() {
     requestAnimationFrame(everyFrame);
-    if (!marks().length || !window.carts) return;
-    const box = imageBox();
+    if (!marks().length) return;
+    const box = window.carts.imageBox();
     for (const mark of marks()) {
       const [u, v] = place(mark);
       const [x, y] = box ? [box.left + u * box.width, box.top + v * box.height] : [0, 0];
@@ -39,7 +31,7 @@
     mark.setPointerCapture(event.pointerId);
   }, { capture: true });
   window.addEventListener("pointermove", (event) => {
-    const box = drag && imageBox();
+    const box = drag && window.carts.imageBox();
     if (!box) return;
     const [x, y] = [event.clientX - drag.from[0], event.clientY - drag.from[1]];
     drag.moved ||= Math.hypot(x, y) > SLOP;

@@ -127,6 +127,15 @@
   // A click in the image is a press without motion.
   let pressed = null;
   const canvas = () => window.__viserMutable?.canvas;
+
+  /** Rectangle of the image in the window, and that of the canvas [CSS px]; null if no image is shown. */
+  function imageBox() {
+    const image = window.carts.imageOnScreen?.();
+    const frame = canvas()?.getBoundingClientRect();
+    if (!image || !frame) return null;
+    return { left: frame.left + image.left, top: frame.top + image.top, width: image.width, height: image.height, frame };
+  }
+
   window.addEventListener("pointerdown", (event) => {
     pressed = event.button === 0 && !event.shiftKey && event.target === canvas() ? [event.clientX, event.clientY] : null;
   }, { capture: true });
@@ -134,13 +143,12 @@
     const start = pressed;
     pressed = null;
     if (!start || Math.hypot(event.clientX - start[0], event.clientY - start[1]) > 3) return;
-    const image = window.carts.imageOnScreen();
-    if (!image) return;
-    const frame = canvas().getBoundingClientRect();
-    const u = (event.clientX - frame.left - image.left) / image.width;
-    const v = (event.clientY - frame.top - image.top) / image.height;
+    const box = imageBox();
+    if (!box) return;
+    const u = (event.clientX - box.left) / box.width;
+    const v = (event.clientY - box.top) / box.height;
     if (u >= 0 && u <= 1 && v >= 0 && v <= 1) window.carts.report("Clicked", { at: [u, v] });
   }, { capture: true });
 
-  window.carts.showDocument = showDocument;
+  Object.assign(window.carts, { showDocument, imageBox });
 })();
