@@ -25,7 +25,7 @@ extensions = [
 source_suffix = {".md": "markdown"}
 exclude_patterns = ["_build", "_ext", "requirements*"]
 
-myst_enable_extensions = ["colon_fence", "deflist", "dollarmath", "fieldlist"]
+myst_enable_extensions = ["attrs_block", "attrs_inline", "colon_fence", "deflist", "dollarmath", "fieldlist"]
 myst_heading_anchors = 3
 # Pages of the guide link to sources and to the README, which are not pages of the site.
 myst_url_schemes = ["http", "https", "mailto"]
@@ -45,8 +45,8 @@ copybutton_exclude = ".linenos, .gp, .go"
 html_math_renderer = "mathml"
 html_theme = "furo"
 html_title = f"CaRTS {release}"
-html_static_path = ["_static"]
-html_css_files = ["site.css"]
+html_static_path = ["_static", "../static/tokens.css"]
+html_css_files = ["tokens.css", "site.css"]
 html_favicon = "../static/icon.svg"
 html_logo = "../static/logo.svg"
 html_show_sourcelink = False

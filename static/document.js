@@ -93,7 +93,8 @@
     waiting = held ? [content, place] : null;
     if (held) return;
     const focused = target.contains(document.activeElement) ? document.activeElement : null;
-    const key = focused?.dataset?.do && [focused.dataset.do, focused.dataset.value ?? ""];
+    const keyOf = ({ do: name, row, value }) => name ? `${name} ${value ?? ""}` : row && `row ${row}`;
+    const key = focused?.dataset && keyOf(focused.dataset);
     const typed = focused?.type === "text" && focused.value !== focused.defaultValue
       ? [focused.value, focused.selectionStart, focused.selectionEnd] : null;
     const opened = [...target.querySelectorAll("details[data-keep][open]")].map((part) => part.dataset.keep);
@@ -109,8 +110,7 @@
       if (part) part.scrollTop = position;
     }
     if (key) {
-      const again = [...target.querySelectorAll("[data-do]")]
-        .find((other) => other.dataset.do === key[0] && (other.dataset.value ?? "") === key[1]);
+      const again = [...target.querySelectorAll("[data-do], [data-row]")].find((other) => keyOf(other.dataset) === key);
       again?.focus();
       if (typed && again?.type === "text") {
         again.value = typed[0];

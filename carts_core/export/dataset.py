@@ -254,8 +254,14 @@ class Dataset:
 
     @cached_property
     def steps(self) -> list[tuple[str, ExportFrame, Camera]]:
-        """Unique name, frame and camera of each view, ordered by frame."""
-        pairs = [(frame, camera) for frame in self.frames for camera in self.scene.cameras]
+        """Unique name, frame and camera of each view, ordered by frame; frames without an image have no view."""
+        recorded = {camera.name: set(self.sequence.frames_of(camera.name)) for camera in self.scene.cameras}
+        pairs = [
+            (frame, camera)
+            for frame in self.frames
+            for camera in self.scene.cameras
+            if frame.index in recorded[camera.name]
+        ]
         names = unique_file_names([f"{camera.name}_{frame.frame_id}" for frame, camera in pairs])
         return [(name, *pair) for name, pair in zip(names, pairs, strict=True)]
 

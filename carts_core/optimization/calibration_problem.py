@@ -177,7 +177,7 @@ class CalibrationProblem:
                 predictor.for_frame(frame, [camera.name for camera in scene.cameras]),
                 unknowns,
                 settings,
-                ignore[index] if ignore else None,
+                frame.ignoring(ignore[index] if ignore else None),
                 prior=Prior.around_start(precision),
                 backgrounds=backgrounds,
                 live=False,

@@ -153,6 +153,10 @@ class FrameOptimizer:
     ) -> None:
         self.settings = settings = settings or SurfaceSolver()
         self._scene = scene = scene.with_cameras(cameras)
+        lacking = [camera.name for camera in scene.cameras if camera.name in frame.missing]
+        if len(lacking) == len(scene.cameras) or (lacking and not isinstance(settings, SurfaceSolver)):
+            names = ", ".join(lacking)
+            raise SettingsError(f"frame {frame.frame_id} has no image of {names}. Choose other cameras or a frame.")
         self._arm_names = tuple(arm.name for arm in scene.arms)
         self._joint_names = tuple(arm.robot.joint_names for arm in scene.arms)
         source = predictor_of(networks) if isinstance(settings, SurfaceSolver) else networks
@@ -164,7 +168,7 @@ class FrameOptimizer:
         self._problem: FrameProblem | FeatureProblem
         if isinstance(settings, SurfaceSolver):
             predictor = predictor_of(networks).for_frame(frame, [camera.name for camera in scene.cameras])
-            given = scene, frame.images, predictor, self._variables, settings, ignore
+            given = scene, frame.images, predictor, self._variables, settings, frame.ignoring(ignore)
             self._problem = FrameProblem(*given, factors=further, backgrounds=known, live=live)
         elif further:
             raise SettingsError(

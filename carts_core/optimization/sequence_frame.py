@@ -223,7 +223,7 @@ class SequenceFrameSolver:
             self._predictor.for_frame(frame, [camera.name for camera in self._scene.cameras]),
             variables,
             self._settings,
-            self._ignore(frame.index),
+            frame.ignoring(self._ignore(frame.index)),
             prior=prior,
             backgrounds=self._backgrounds,
             live=False,

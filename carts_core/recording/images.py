@@ -139,10 +139,12 @@ class ImageFiles:
     Args:
         files: paths of the files.
         bits: bit depth of 16-bit files; by default measured in a sample of the files.
+        missing: frames without a file.
     """
 
-    def __init__(self, files: tuple[Path, ...], bits: int | None = None) -> None:
-        self.files = files
+    def __init__(self, files: tuple[Path, ...], bits: int | None = None, missing: frozenset[int] = frozenset()) -> None:
+        self.files, self.missing = files, missing
+        self._present = tuple(file for index, file in enumerate(files) if index not in missing)
         self._given, self._counted = bits, bits
 
     def name(self, index: int) -> str:
@@ -162,7 +164,7 @@ class ImageFiles:
     def bits(self) -> int:
         """Bit depth of the images; at least 8."""
         if self._counted is None:
-            self._counted = bits_of_files(self.files)
+            self._counted = bits_of_files(self._present)
         return self._counted
 
     def upright(self, index: int) -> bool:
@@ -172,8 +174,8 @@ class ImageFiles:
 
     def remarks(self) -> tuple[str, ...]:
         """Remarks on a sample of the images."""
-        bits = () if self._given is not None else bits_remark(self.files)
-        return (*image_remarks(spread_files(self.files)), *bits)
+        bits = () if self._given is not None else bits_remark(self._present)
+        return (*image_remarks(spread_files(self._present)), *bits)
 
 
 def read_image(path: Path, bits: Callable[[], int] | None = None) -> UInt8[np.ndarray, "height width 3"]:

@@ -47,6 +47,15 @@ class Frame:
     """Acquisition time [s]; None if not known."""
     mounts: dict[str, Float[np.ndarray, "4 4"]] = field(default_factory=dict)
     """Camera -> T_mount_world [m], for moving cameras."""
+    missing: tuple[str, ...] = ()
+    """Cameras without an image of this frame; their entries of `images` are black, and the solvers ignore them."""
+
+    def ignoring(
+        self, ignore: Mapping[str, Bool[np.ndarray, "height width"]] | None
+    ) -> dict[str, Bool[np.ndarray, "height width"]]:
+        """Camera -> ignored pixels: the given ones, and all pixels of missing images."""
+        blank = {name: np.ones(self.images[name].shape[:2], bool) for name in self.missing}
+        return {**(ignore or {}), **blank}
 
     __repr__ = short_repr
 
@@ -207,7 +216,13 @@ class Sequence:
             masks=masks or None,
             timestamp=None if self.timestamps is None else float(self.timestamps[index]),
             mounts=self.mounts(index),
+            missing=tuple(name for name in names if index in self._camera(name).missing),
         )
+
+    def frames_of(self, camera: str) -> list[int]:
+        """Indices of the frames with an image of a camera; `SequenceError` for an unknown camera."""
+        missing = self._camera(camera).missing
+        return [index for index in range(len(self)) if index not in missing]
 
     @property
     def moving_cameras(self) -> tuple[str, ...]:
@@ -253,12 +268,15 @@ class Sequence:
         from a video or a bag. Errors as `has_masks`."""
         entry = self._camera(camera)
         source = entry.images[self._domain(domain)]
-        if not isinstance(source, ImageFiles) or any(entry.camera.distortion) or not source.upright(index):
+        changed = any(entry.camera.distortion) or index in entry.missing
+        if not isinstance(source, ImageFiles) or changed or not source.upright(index):
             return None
         return source.files[index]
 
     def image_fingerprint(self, index: int, camera: str, domain: str | None = None) -> str:
         """Text that changes with the recorded image of a frame; the image is not decoded. Errors as `frame`."""
+        if index in self._camera(camera).missing:
+            return "missing"
         return self._camera(camera).images[self._domain(domain)].fingerprint(index)
 
     def mask_fingerprint(self, index: int, camera: str, domain: str | None = None) -> str | None:
@@ -302,7 +320,8 @@ class Sequence:
             image = read_image(path, getattr(entry.images[domain], "bits", None))
             self._check_size(image, camera.name, f"background {path}")
             return MeanBackground(camera.undistort(image), np.ones(image.shape[:2], bool))
-        indices = evenly_spaced(len(self))
+        present = self.frames_of(camera.name)
+        indices = [present[place] for place in evenly_spaced(len(present))]
         states = [
             self.scene.state({arm: rows[index] for arm, rows in self.measured.items()}, mounts=self.mounts(index))
             for index in indices
@@ -322,6 +341,8 @@ class Sequence:
         entry = self._camera(camera)
 
         def decode() -> np.ndarray:
+            if index in entry.missing:
+                return np.zeros((entry.camera.height, entry.camera.width, 3), np.uint8)
             image = (source := entry.images[domain]).read(index)
             self._check_size(image, camera, f"image {source.name(index)}")
             return entry.camera.undistort(image)

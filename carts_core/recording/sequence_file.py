@@ -140,6 +140,8 @@ class CameraInput:
     background: Mapping[str, Path]
     motion: Samples | None
     """Poses of the camera mount; None for a static camera."""
+    missing: frozenset[int] = frozenset()
+    """Frames without an image in some domain."""
 
     def remarks(self) -> tuple[str, ...]:
         """Remarks on changes to images and masks before they are used, and on unusual calibrations."""
@@ -161,6 +163,11 @@ def take_camera_input(table: TomlTable, rows: Rows, domains: tuple[str, ...]) ->
     motion = take_camera_motion(table, rows)
     patterns = _by_domain(table, "images", domains, required=True)
     images = {domain: _images(table, pattern, frames, domain, camera.name) for domain, pattern in patterns.items()}
+    missing = frozenset(
+        index for source in images.values() if isinstance(source, ImageFiles) for index in source.missing
+    )
+    if len(missing) == len(frames.frame_ids):
+        raise table.error("sparse_images", "is true, but no frame has an image in all domains. Correct `images`.")
     patterns, sparse = _by_domain(table, "masks", domains), table.take("sparse_masks", bool, False)
     masks = {name: _masks(table, pattern, frames, name, camera.name, sparse) for name, pattern in patterns.items()}
     background: dict[str, Path] = {}
@@ -172,7 +179,7 @@ def take_camera_input(table: TomlTable, rows: Rows, domains: tuple[str, ...]) ->
     if background and motion is not None:
         raise table.error("background", "cannot be combined with `motion`: backgrounds of a moving camera differ.")
     table.finish()
-    return CameraInput(camera, images, masks, background, motion)
+    return CameraInput(camera, images, masks, background, motion, missing)
 
 
 def _path(table: TomlTable, key: str, pattern: str, domain: str, camera: str) -> Path:
@@ -209,6 +216,8 @@ def _images(table: TomlTable, pattern: str, frames: FrameList, domain: str, came
     crop = table.take("crop", list, [])
     if not crop:
         return source
+    if isinstance(source, ImageFiles) and source.missing:
+        raise table.error("sparse_images", "cannot be combined with `crop`. Remove the frames without images.")
     if len(crop) != 4 or not all(isinstance(value, int) and value >= 0 for value in crop) or min(crop[2:]) < 1:
         raise table.error("crop", f"is {crop!r}. Give [left, top, width, height] in whole pixels.")
     return Cropped(source, (crop[0], crop[1], crop[2], crop[3]))
@@ -221,7 +230,7 @@ def _whole_images(table: TomlTable, pattern: str, frames: FrameList, domain: str
     bits = table.take("bits", int, None)
     if bits is not None and bits not in DEPTHS:
         raise table.error("bits", f"is {bits}. Give the bit depth of the images: {', '.join(map(str, DEPTHS))}.")
-    deinterlace = table.take("deinterlace", bool, True)
+    deinterlace, sparse = table.take("deinterlace", bool, True), table.take("sparse_images", bool, False)
     if topic:
         path = _path(table, "images", pattern, domain, camera)
         return BagImages(path, topic, _message_times(table, message_time, frames))
@@ -239,7 +248,9 @@ def _whole_images(table: TomlTable, pattern: str, frames: FrameList, domain: str
             )
         return Video(path, numbers, deinterlace=deinterlace)
     files = frame_files(table.file.parent, pattern, key, frames, domain=domain, camera=camera)
-    check_present(key, files, frames)
+    if sparse:
+        return ImageFiles(files, bits, frozenset(i for i, file in enumerate(files) if not is_regular(file)))
+    check_present(key, files, frames, " If a camera has no image of some frames, set sparse_images = true.")
     return ImageFiles(files, bits)
 
 

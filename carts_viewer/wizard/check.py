@@ -75,7 +75,8 @@ def open_recording(recording: FoundRecording) -> tuple[Sequence, TemporaryDirect
 def previews(sequence: Sequence, camera: str) -> list[tuple[str, bytes]]:
     """First, middle and last image of a camera: id of the frame and JPEG content."""
     found = []
-    for index in dict.fromkeys((0, len(sequence) // 2, len(sequence) - 1)):
+    present = sequence.frames_of(camera)
+    for index in dict.fromkeys((present[0], present[len(present) // 2], present[-1])):
         frame = sequence.frame(index, cameras=[camera])
         found.append((frame.frame_id, small_jpeg(frame.images[camera], width=_PREVIEW_WIDTH, quality=_JPEG_QUALITY)))
     return found
@@ -130,6 +131,16 @@ class Guess:
     def columns(self) -> dict[str, str]:
         """Joint -> guessed column."""
         return {} if self.meanings is None else next(iter(self.meanings.arms.values()), {})
+
+    @property
+    def in_order(self) -> dict[str, str]:
+        """Joint -> column, if the numeric columns may be the joints in order; empty for another number of columns."""
+        if self.table is None or self.meanings is None or self.meanings.arms:
+            return {}
+        taken = (self.meanings.time, self.meanings.frame)
+        numbers = [name for name, values in self.table.columns.items() if values.dtype.kind in "iuf"]
+        free = [name for name in numbers if name not in taken]
+        return dict(zip(_ROLES, free, strict=False)) if len(free) in (len(JOINT_NAMES), len(JOINT_NAMES) + 1) else {}
 
     def described(self, options: ImportOptions) -> list["Column"]:
         """The columns of the table, those with a meaning first."""

@@ -289,8 +289,7 @@ class HandEyeStep:
         """Move the prompts to the nearest unused frame."""
         used = {(entry.camera, entry.frame) for entry in self._clicking.plan}
         used |= {(point.camera, point.frame) for point in draft.points}
-        frames = range(len(self._sequence))
-        free = [frame for frame in frames if (prompt.camera, frame) not in used]
+        free = [frame for frame in self._sequence.frames_of(prompt.camera) if (prompt.camera, frame) not in used]
         if not free:
             raise SettingsError("all frames are in use. Use the list below, or skip landmarks that are not visible.")
         other = min(free, key=lambda frame: abs(frame - prompt.frame))

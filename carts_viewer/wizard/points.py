@@ -95,13 +95,14 @@ def _plan(sequence: Sequence) -> tuple[ClickPrompt, ...]:
     scene = sequence.scene
     arms = [arm for arm in scene.arms if len(sequence.measured[arm.name])]
     tips = np.concatenate([link_transforms(arm, sequence.measured[arm.name])[:, -1, :3, 3] for arm in arms], axis=-1)
-    frames = spread_out(tips, _FRAMES)
     unknown = unknown_cameras(scene)
     prompts = []
     for number, camera in enumerate(scene.cameras):
         if number and camera.name not in unknown:
             # The first camera suffices for a calibrated pair.
             continue
+        present = sequence.frames_of(camera.name)
+        frames = [present[row] for row in spread_out(tips[present], _FRAMES)]
         chosen = frames if number == 0 else [frames[row] for row in (0, -1)][:_FURTHER_FRAMES]
         for frame in dict.fromkeys(chosen):
             prompts += [

@@ -123,6 +123,8 @@ class RecordingWizard:
                 self._estimate_delay()
             case "accept-delay" if delay is not None and delay.proposed is not None:
                 self._set(changed(self._draft, "time_offset", str(delay.proposed), {}) or self._draft)
+            case "columns-in-order":
+                self._set(self._draft.with_options(columns={**self._draft.options.columns, **self._guessed().in_order}))
             case "trial":
                 if (trial := next((each for each in self._guessed().trials if str(each) == value), None)) is not None:
                     self._set(picked(self._draft, "source", self._host.roots.checked(trial), {}))

@@ -279,6 +279,15 @@ def common_ids(images: Mapping[str, Images], path: Path) -> tuple[str, ...]:
     return tuple(frame for frame in first.ids if frame in shared)
 
 
+def united_ids(images: Mapping[str, Images], path: Path) -> tuple[str, ...]:
+    """Ids of the frames with an image of any camera, in order; of videos, only those with an image of every camera."""
+    shared = common_ids(images, path)
+    if not all(each.pattern for each in images.values()):
+        return shared
+    every = {frame for each in images.values() for frame in each.ids}
+    return tuple(sorted(every, key=int)) if all(map(str.isdecimal, every)) else shared
+
+
 def cameras_of(
     images: Mapping[str, Images], job: Import, calibrations: Mapping[str, Path] | None = None
 ) -> tuple[FoundCamera, ...]:

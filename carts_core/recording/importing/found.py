@@ -170,6 +170,8 @@ class FoundCamera:
     masks: str = ""
     """File name pattern of the masks, relative to `images.parent` or absolute; empty without masks."""
     sparse_masks: bool = False
+    sparse_images: bool = False
+    """Whether some frames have no image."""
     bits: int | None = None
     """Number of significant bits of images stored with 16 bits; None for 8-bit images."""
     crop: tuple[int, int, int, int] | None = None

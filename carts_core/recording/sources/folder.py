@@ -12,12 +12,12 @@ from ...settings.interchange import NO_TABLE, ImportOptions
 from ..importing.cameras import (
     Images,
     cameras_of,
-    common_ids,
     files_with,
     find_images,
     image_files,
     side_of,
     subfolders,
+    united_ids,
 )
 from ..importing.columns import ColumnMeanings, arm_in, arm_log, guess_columns, samples
 from ..importing.foreign_tables import TABLE_SUFFIXES, ForeignTable, read_foreign_table
@@ -193,17 +193,25 @@ def _frames(path: Path, images: Images, ids: tuple[str, ...], kinematics: list[P
     return frame_times(images, ids, job)
 
 
+def _listing(frames: list[str]) -> str:
+    return ", ".join(frames[:5]) + (" ..." if len(frames) > 5 else "")
+
+
 def _read(path: Path, job: Import) -> FoundRecording:
     images = _images(path, job.options)
     cameras = cameras_of(images, job, _calibrations(path, list(images), job))
-    ids = common_ids(images, path)
-    shared = set(ids)
-    for name, each in images.items():
-        if lacking := [frame for frame in each.ids if frame not in shared]:
-            shown = ", ".join(lacking[:5]) + (" ..." if len(lacking) > 5 else "")
-            text = f"{len(lacking)} of {len(each.ids)} images left out, since another camera has no image of the frame"
+    ids = united_ids(images, path)
+    known = set(ids)
+    for place, (name, each) in enumerate(images.items()):
+        own = set(each.ids)
+        if lacking := [frame for frame in ids if frame not in own]:
+            cameras = (*cameras[:place], replace(cameras[place], sparse_images=True), *cameras[place + 1 :])
+            text = f"{len(lacking)} of {len(ids)} frames have no image of this camera, and are kept with the others"
+            job.warning(f"{text}: {_listing(lacking)}.", name)
+        if left_out := [frame for frame in each.ids if frame not in known]:
+            text = f"{len(left_out)} of {len(each.ids)} images left out, since another camera has no image of the frame"
             remedy = f"To keep them, import {name} alone: --images {name} {each.path.name}."
-            job.warning(f"{text}: {shown}.", name, remedy=remedy)
+            job.warning(f"{text}: {_listing(left_out)}.", name, remedy=remedy)
     found = _kinematics(path, job)
     if not found:
         _note_missing_kinematics(path, job)

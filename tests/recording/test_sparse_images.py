@@ -1,0 +1,72 @@
+"""Recordings in which a camera has no image of some frames."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from carts_core.errors import SequenceError, SettingsError
+from carts_core.networks import FeatureExtractor
+from carts_core.optimization import DescentSolver, FrameOptimizer, SurfaceSolver
+from carts_core.recording import Sequence
+from carts_core.recording.importing.importer import find
+from carts_core.settings.interchange import NO_TABLE, ImportOptions
+
+
+@pytest.fixture
+def sparse(tiny_sequence: Callable[..., Path]) -> Path:
+    """Three stereo frames; the second has no right image."""
+    path = tiny_sequence(frames=3, cameras=("left", "right"), width=320, height=240)
+    sorted((path.parent / "regular" / "right").iterdir())[1].unlink()
+    return path
+
+
+def marked(path: Path) -> Sequence:
+    text = path.read_text()
+    path.write_text(text.replace('name = "right"', 'name = "right"\nsparse_images = true'))
+    return Sequence.open(path)
+
+
+def test_a_missing_image_needs_the_key_that_the_error_names(sparse: Path) -> None:
+    with pytest.raises(SequenceError, match="sparse_images = true"):
+        Sequence.open(sparse)
+    sequence = marked(sparse)
+    assert sequence.frames_of("left") == [0, 1, 2] and sequence.frames_of("right") == [0, 2]
+    frame = sequence.frame(1)
+    assert frame.missing == ("right",) and not frame.images["right"].any() and frame.images["left"].any()
+    assert frame.ignoring(None)["right"].all() and sequence.frame(0).ignoring(None) == {}
+    assert sequence.image_file(1, "right") is None and sequence.image_fingerprint(1, "right") == "missing"
+    assert sequence.background("right").any()
+
+
+def test_a_camera_without_any_image_is_an_error(sparse: Path) -> None:
+    for file in (sparse.parent / "regular" / "right").iterdir():
+        file.unlink()
+    with pytest.raises(SequenceError, match="no frame has an image"):
+        marked(sparse)
+
+
+def test_a_frame_is_solved_with_the_cameras_that_have_an_image(sparse: Path) -> None:
+    sequence, extractor = marked(sparse), FeatureExtractor.load()
+    backgrounds = {name: sequence.background(name) for name in ("left", "right")}
+    frame, settings = sequence.frame(1), SurfaceSolver(iterations=8)
+
+    def solved(*cameras: str) -> np.ndarray:
+        given = sequence.scene, frame, backgrounds, extractor
+        return list(FrameOptimizer(*given, settings=settings, cameras=cameras))[-1].joint_positions()["PSM1"]
+
+    moved = np.abs(solved("left") - frame.measured["PSM1"]).max()
+    assert moved > 1e-3 and np.abs(solved("left", "right") - solved("left")).max() < 0.1 * moved
+    with pytest.raises(SettingsError, match="has no image of right"):
+        solved("right")
+    with pytest.raises(SettingsError, match="has no image of right"):
+        FrameOptimizer(sequence.scene, frame, backgrounds, extractor, settings=DescentSolver())
+
+
+def test_frames_with_one_camera_are_imported(sparse: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "raw"
+    (sparse.parent / "regular").rename(folder)
+    found = find(folder, ImportOptions(source="folder", kinematics=NO_TABLE))
+    assert len(found.frame_ids) == 3 and [camera.sparse_images for camera in found.cameras] == [False, True]
+    assert any("1 of 3 frames have no image of this camera" in note.text for note in found.notes)
