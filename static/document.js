@@ -150,5 +150,11 @@
     if (u >= 0 && u <= 1 && v >= 0 && v <= 1) window.carts.report("Clicked", { at: [u, v] });
   }, { capture: true });
 
+  // A document at the side ends where the canvas begins; viser changes the width of its panel.
+  setInterval(() => {
+    const left = canvas()?.getBoundingClientRect().left;
+    if (left > 200) document.documentElement.style.setProperty("--carts-side", `${left}px`);
+  }, 200);
+
   Object.assign(window.carts, { showDocument, imageBox });
 })();

@@ -127,8 +127,8 @@ def _rms(residuals: Rows[float | None], result: HandEyeResult) -> float:
     return math.sqrt(sum(value**2 for value in values) / max(len(values), 1))
 
 
-_WIDTH = 400.0
-"""Width of the panel below the document [viser's units of 0.9 px], which is 360 px wide (`static/document.css`)."""
+_WIDTH = 360.0
+"""Width of the panel below the document [px]; the document is as wide as the panel (`static/document.js`)."""
 
 Calibrated = Callable[[Callable[[Draft], Draft]], None]
 """Receives, on the site's thread, a function that changes the draft after a calibration."""

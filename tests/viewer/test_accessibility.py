@@ -64,9 +64,10 @@ def test_each_page_from_the_start_to_the_clicked_points(
         visitor.press("Continue to hand-eye")
         visitor.reads("Click the tip")
         dismiss_warning(page)
+        wizard = site.shown
+        assert isinstance(wizard, RecordingWizard)
         for count in range(1, 5):
-            assert isinstance(site.shown, RecordingWizard)
-            prompt = site.shown.prompt
+            prompt = wizard.prompt
             assert prompt is not None
             names, frames = (prompt.landmark,), [prompt.frame]
             (point,) = clicked(made.scene, {"PSM1": made.truth["PSM1"]}, frames, ["left"], noise=0.0, names=names)
@@ -77,12 +78,12 @@ def test_each_page_from_the_start_to_the_clicked_points(
         page.get_by_role("button", name="tip", exact=True).first.click()
         mark, row = page.locator(".mark[data-row='0']"), 0
         mark.wait_for()
-        before = site.shown.draft.points[row].pixel
+        before = wizard.draft.points[row].pixel
         mark.focus()
         page.keyboard.press("ArrowRight")
-        eventually(lambda: site.shown.draft.points[row].pixel[0] > before[0])  # type: ignore[union-attr]
+        eventually(lambda: wizard.draft.points[row].pixel[0] > before[0])
         page.keyboard.press("Delete")
-        eventually(lambda: len(site.shown.draft.points) == 3)  # type: ignore[union-attr]
+        eventually(lambda: len(wizard.draft.points) == 3)
         visitor.press("Check")
         visitor.press("Other table …")
         page.locator(".files").wait_for()
