@@ -11,6 +11,7 @@ All other packages are those of requirements.lock (--dev: requirements-dev.lock)
 """
 
 import hashlib
+import json
 import os
 import platform
 import shutil
@@ -108,12 +109,31 @@ def torch_index():
     return TORCH_CPU_INDEX
 
 
+def announce(pip, index):
+    """Say before any large download whether torch's build is for CPUs or for CUDA; pip reads the package's metadata."""
+    chosen = output(
+        *pip, "--dry-run", "--quiet", "--no-deps", "--ignore-installed", "--report", "-",
+        "-c", "constraints.txt", *(("--index-url", index) if index else ()), "torch",
+    )  # fmt: skip
+    try:
+        wheel = json.loads(chosen or "")["install"][0]["metadata"]
+    except (ValueError, LookupError):
+        say("the build of torch is unknown; the build for CUDA downloads 2.7 GB")
+        return
+    with_cuda = sys.platform == "linux" and any("nvidia" in needed for needed in wheel.get("requires_dist", ()))
+    build = "for CUDA, a download of 2.7 GB" if with_cuda else "for CPUs, a download of 0.2 GB"
+    say("torch {} is the build {}".format(wheel["version"], build))
+    if with_cuda:
+        say("for the build for CPUs, stop with Ctrl-C and set TORCH_INDEX={}".format(TORCH_CPU_INDEX))
+
+
 def install(extras):
     pip = (VENV_PYTHON, "-m", "pip", "install", "--disable-pip-version-check", "--no-input")
+    index = torch_index()
+    announce(pip, index)
     # Everything but torch, by its hashes; the lists are complete, so no dependency is looked for.
     run(*pip, "--no-deps", "--require-hashes", "-r", LOCKS[extras])
     pinned = (*pip, "-c", "constraints.txt")
-    index = torch_index()
     if index is not None or TORCH_INDEX:
         # Builds differ in what follows the + of their version only, so pip would be content with the one that is there.
         anew = ("--force-reinstall",) if TORCH_INDEX else ()

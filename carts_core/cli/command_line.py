@@ -26,7 +26,7 @@ from .batch import Batch
 from .calibrate import Calibrate, HandEye, TimeOffset
 from .export import Export, Render
 from .importing import Import, ImportMasks
-from .lab import Baseline, Bench, Synthesize, Train
+from .lab import Baseline, Bench, BenchDataSet, DataSet, Synthesize, Train
 from .live import Live
 from .optimize import Evaluate, Optimize
 from .robots import RobotCommand, Robots
@@ -137,7 +137,8 @@ def _parsed(arguments: list[str]) -> Any:
         with contextlib.redirect_stderr(said):
             if name in COMMANDS:
                 # For a misspelt option, suggest only options of the same command.
-                return tyro.cli(COMMANDS[name], prog=f"carts {name}", args=options)
+                data_set = name == "bench" and options[:1] and options[0] in get_args(DataSet)
+                return tyro.cli(BenchDataSet if data_set else COMMANDS[name], prog=f"carts {name}", args=options)
             return tyro.cli(Command, prog="carts", description=_DESCRIPTION, args=arguments)  # pyright: ignore
     except SystemExit:
         print(said.getvalue(), end="", file=sys.stderr)

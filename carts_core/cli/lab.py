@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 from rich.progress import TimeRemainingColumn
@@ -151,9 +151,59 @@ class Baseline:
         say(f"weights: {result.weights}\n{result.steps} steps, Dice {result.dice:.3f} on validation frames")
 
 
+DataSet = Literal["surgpose", "surgsync"]
+
+
+@dataclass(frozen=True)
+class BenchDataSet(RangedOptions):
+    """Evaluate the recordings of a published data set, and write a table of delays, corrections and keypoint errors."""
+
+    data_set: Annotated[DataSet, tyro.conf.Positional]
+    """Data set."""
+    folder: Annotated[Path, tyro.conf.Positional]
+    """Folder of a recording, or of several."""
+    output: Path | None = None
+    """Folder of the table; by default `runs/bench/surgpose` or `runs/bench/surgsync`."""
+    frames: Count = 50
+    """Number of evenly spaced frames per recording that are corrected and scored."""
+    frame_rate: float | None = None
+    """Frame rate of images without times [1/s], such as those of raw clips; otherwise, their delay is unknown."""
+    network: Annotated[Network, tyro.conf.arg(name="")] = field(default_factory=Network)
+
+    def run(self) -> None:
+        """Evaluate all recordings; the table is written after each."""
+        import json
+        from dataclasses import asdict
+
+        from ..files import write_text
+        from ..lab.benchmark.data_sets import bench_recording, recordings, table
+
+        paths = recordings(self.folder, self.data_set)
+        output, networks = output_folder(self.output, "bench", self.data_set), self.network.load()
+        results = []
+        with Bar() as bar, message_if_stopped(f"{output} holds the table of the finished recordings"):
+            task = bar.add_task(self.data_set, total=len(paths))
+            for number, path in enumerate(paths):
+
+                def say(step: str, name: str = path.name) -> None:
+                    bar.update(task, description=f"{name}: {step}")
+
+                own = output.path / f"{number:03d}_{path.name}"
+                results += bench_recording(path, self.data_set, own, networks, self.frames, self.frame_rate, say)
+                write_text(output / "results.json", json.dumps([asdict(result) for result in results], indent=1))
+                write_text(output / "table.md", "\n".join(table(results)) + "\n")
+                bar.update(task, advance=1)
+        for line in table(results):
+            bar.console.print(line, soft_wrap=True, markup=False)
+        bar.console.print(f"wrote {output}: table.md and results.json")
+
+
 @dataclass(frozen=True)
 class Bench:
-    """Measure accuracy and speed of all methods, and write a report; rerun the command to resume."""
+    """Measure accuracy and speed of all methods, and write a report; rerun the command to resume.
+
+    `carts bench surgpose FOLDER` and `carts bench surgsync FOLDER` evaluate recordings of these data sets.
+    """
 
     output: Annotated[Path | None, tyro.conf.Positional] = None
     """Folder of the report; by default `runs/bench/quick` or `runs/bench/full`."""
