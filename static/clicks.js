@@ -12,10 +12,8 @@
   const within = (value) => Math.min(Math.max(value, 0), 1);
   const move = (mark, u, v) => window.carts.report("Chosen", { name: `move-point ${mark.dataset.row}`, value: `${within(u)} ${within(v)}` });
 
-  function everyFrame() {
-    requestAnimationFrame(everyFrame);
-    if (!marks().length) return;
-    const box = window.carts.imageBox();
+  function placeMarks() {
+    const box = marks().length ? window.carts.imageBox() : null;
     for (const mark of marks()) {
       const [u, v] = place(mark);
       const [x, y] = box ? [box.left + u * box.width, box.top + v * box.height] : [0, 0];
@@ -59,5 +57,10 @@
     event.preventDefault();
     event.stopPropagation();
   }, { capture: true });
-  everyFrame();
+  (function everyFrame() {
+    requestAnimationFrame(everyFrame);
+    placeMarks();
+  })();
+
+  window.carts.placeMarks = placeMarks;
 })();

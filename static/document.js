@@ -103,6 +103,7 @@
     target.hidden = !content;
     const top = target.scrollTop;
     target.replaceChildren(...built(content));
+    window.carts.placeMarks?.();
     target.scrollTop = top;
     for (const part of target.querySelectorAll("details[data-keep]")) part.open ||= opened.includes(part.dataset.keep);
     for (const [name, position] of scrolled) {
