@@ -363,7 +363,7 @@ class Page:
         file = self._files.get(name)
         if file is None:
             return response(http.HTTPStatus.NOT_FOUND, "text/plain; charset=utf-8", b"No such file.")
-        kind = mimetypes.guess_type(name)[0] or "application/octet-stream"
+        kind = mimetypes.guess_type(name, strict=False)[0] or "application/octet-stream"
         return response(http.HTTPStatus.OK, kind, file.read_bytes())
 
     def _index(self, nonce: str) -> bytes:
