@@ -123,8 +123,8 @@ def evidence(
     images: FrameImages, start: SceneState, end: SceneState, predictor: FramePredictor, loss: float
 ) -> Evidence:
     """Compute image evidence for and against a fit; runs the predictor twice."""
-    before, maps = (images.renderer.surface_maps(state) for state in (start, end))
-    covered, was = (part[:, COVERAGE].sum(1, keepdim=True) for part in (maps, before))
+    maps = images.renderer.surface_maps(end)
+    covered = maps[:, COVERAGE].sum(1, keepdim=True)
     margin = max(images.size) if predictor.masked else round(_MARGIN * images.scale)
     window = Window.around(covered.sum(1), margin, predictor.stride, images.size)
     parts, parts_alone = (
@@ -154,7 +154,7 @@ def evidence(
     return Evidence(
         **asdict(worst),
         area=total(covered) / covered.numel(),
-        start_area=total(was) / was.numel(),
+        start_area=int((before_labels >= 0).sum()) / before_labels.size,
         loss=loss,
         predicted=_share(alone, rendered),
         changed=_share(change[1], rendered * change[0]) if change is not None and informative else None,
