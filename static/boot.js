@@ -17,6 +17,12 @@
     return made;
   };
 
+  /** An icon of the set that viser's widgets use, by its name. */
+  window.cartsIcon = (name) => {
+    const path = window.cartsConfiguration.icons?.[name] ?? "";
+    return `<svg class="carts-icon" viewBox="0 0 24 24" aria-hidden="true">${path}</svg>`;
+  };
+
   /** Call a function of `window.carts`; unknown names are ignored. */
   function call({ name, args }) {
     if (Object.hasOwn(window.carts ?? {}, name)) window.carts[name](...args);

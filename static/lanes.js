@@ -80,9 +80,9 @@
     return [low - room, high + room];
   }
 
-  function drawCurve(context, { view, xOf, top, height, ink, w }) {
+  function drawCurve(context, { view, xOf, top, height, ink, w, here }) {
     ask(view, Math.floor(w));
-    context.font = "10px system-ui, sans-serif";
+    context.font = "11px system-ui, sans-serif";
     const ends = curve?.name === chosen ? limits() : null;
     if (!ends) {
       context.fillStyle = ink;
@@ -109,16 +109,39 @@
     context.fillStyle = ink;
     context.fillText(String(Number(ends[1].toPrecision(4))), 4, top + 9);
     context.fillText(String(Number(ends[0].toPrecision(4))), 4, top + height - 2);
+    drawValue(context, here, { xOf, yOf, ink, w });
+  }
+
+  /** Lowest and highest value of the curve in the column of a frame; null if unknown. */
+  function rangeAt(frame) {
+    if (!curve || curve.name !== chosen) return null;
+    const column = curve.edges.findIndex((edge, place) => edge <= frame && frame < curve.edges[place + 1]);
+    const found = curve.curves.map((ends) => ends.map((values) => values[column])).findLast(([low]) => (low ?? null) !== null);
+    return column < 0 ? null : found ?? null;
+  }
+
+  const unit = () => /\[(.*)\]/.exec(chosen)?.[1] ?? "";
+  const worded = ([low, high]) => `${low === high ? low : `${low} to ${high}`} ${unit()}`.trimEnd();
+
+  /** A dot on the curve at a frame, with the value beside it. */
+  function drawValue(context, frame, { xOf, yOf, ink, w }) {
+    const found = rangeAt(frame);
+    if (!found) return;
+    const [x, y] = [xOf(frame + 0.5), yOf(found[1])];
+    context.fillStyle = ink;
+    context.beginPath();
+    context.arc(x, y, 3, 0, 2 * Math.PI);
+    context.fill();
+    context.font = "600 11px system-ui, sans-serif";
+    const text = worded(found);
+    const wide = context.measureText(text).width;
+    context.fillText(text, x + wide + 10 < w ? x + 7 : x - wide - 7, y + 4);
   }
 
   /** The curve's value at a frame as text; empty if unknown. */
   function valueAt(frame) {
-    if (!curve || curve.name !== chosen) return "";
-    const column = curve.edges.findIndex((edge, place) => edge <= frame && frame < curve.edges[place + 1]);
-    if (column < 0) return "";
-    const [lows, highs] = curve.curves.map((ends) => ends.map((values) => values[column])).findLast(([low]) => low !== null) ?? [];
-    if (lows === undefined) return "";
-    return ` · ${lows === highs ? lows : `${lows} to ${highs}`} ${/\[(.*)\]/.exec(chosen)?.[1].replace(/^1$/, "") ?? ""}`.trimEnd();
+    const found = rangeAt(frame);
+    return found ? ` · ${worded(found)}` : "";
   }
 
   Object.assign(window.carts, {

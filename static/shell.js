@@ -80,6 +80,34 @@
     setTimeout(() => note.remove(), 8000);
   }
 
+  // ---- The newest error, over the image -----------------------------------------------------------------------------------
+
+  let problem = null;
+
+  /** Show an error until it is dismissed; null hides it. */
+  function setError(text) {
+    if (!problem?.isConnected) {
+      const around = window.__viserMutable?.canvas?.parentElement ?? document.body;
+      problem = make("div", { class: "carts-error carts-problem", role: "alert" }, make("span", {}), make("button", { type: "button" }, "Dismiss"));
+      problem.lastChild.addEventListener("click", dismiss);
+      for (const kind of ["pointerdown", "pointermove", "pointerup", "wheel", "dblclick"]) {
+        problem.addEventListener(kind, (event) => event.stopPropagation());
+      }
+      around.append(problem);
+    }
+    problem.hidden = text === null;
+    problem.firstChild.textContent = text ?? "";
+  }
+
+  function dismiss() {
+    problem.hidden = true;
+    window.carts.report("Pressed", { key: "dismiss" });
+  }
+
+  window.addEventListener("keydown", (event) => {
+    if (event.key === "Escape" && problem && !problem.hidden && !document.querySelector("dialog[open]")) dismiss();
+  });
+
   async function copyLink() {
     if (!latest) return;
     const address = link(latest);
@@ -149,9 +177,13 @@
       const table = ([name, rows]) => make("section", {}, make("h3", {}, name), make("table", {}, ...rows.map(row)));
       sheet.append(
         make("header", {}, make("b", {}, "Keys"), make("span", {}, "Close with ? or Escape."),
-          make("button", { "data-do": "tour" }, "Take the tour"), make("button", { "aria-label": "Close" }, "×")),
+          make("button", { "data-do": "guide" }, "Guide"), make("button", { "data-do": "tour" }, "Take the tour"), make("button", { "aria-label": "Close" }, "×")),
         make("div", { class: "carts-columns" }, ...groups.map(table)));
       sheet.querySelector("[aria-label=Close]").addEventListener("click", () => showSheet(false));
+      sheet.querySelector("[data-do=guide]").addEventListener("click", () => {
+        showSheet(false);
+        window.carts.report("Pressed", { key: "guide" });
+      });
       sheet.querySelector("[data-do=tour]").addEventListener("click", () => { showSheet(false); window.carts.startTour(); });
       sheet.addEventListener("click", (event) => { if (event.target === sheet) showSheet(false); });
       document.body.append(sheet);
@@ -186,6 +218,37 @@
     hintsSetAt = performance.now();
     showHints();
   });
+
+  // ---- Names and keys of viser's widgets ---------------------------------------------------------------------------------
+
+  const HEADING = ".mantine-Paper-root[data-with-border] > .mantine-Paper-root:first-child";
+  const set = (one, name, value) => { if (one && one.getAttribute(name) !== value) one.setAttribute(name, value); };
+
+  /** Name the parts of sliders and the buttons of the header for screen readers, and let groups be opened by keys. */
+  function nameWidgets() {
+    for (const label of document.querySelectorAll("label[for]")) {
+      const control = document.getElementById(label.htmlFor);
+      const name = label.textContent.trim();
+      if (!control || !name) continue;
+      set(control.querySelector("[role=slider]"), "aria-label", name);
+      if (control.matches("input")) set(control, "aria-label", name);
+      else set(control.nextElementSibling?.querySelector("input"), "aria-label", name);
+    }
+    for (const heading of document.querySelectorAll(HEADING)) {
+      set(heading, "role", "button");
+      set(heading, "tabindex", "0");
+      set(heading, "aria-expanded", String(heading.nextElementSibling?.getAttribute("aria-hidden") !== "true"));
+    }
+    set(document.querySelector("[data-dock-header] button"), "aria-label", "Find an action (Ctrl+K)");
+  }
+  setInterval(() => (window.requestIdleCallback ?? setTimeout)(nameWidgets), 1000);
+  window.addEventListener("keydown", (event) => {
+    if (!["Enter", " "].includes(event.key) || !(event.target instanceof Element) || !event.target.matches(HEADING)) return;
+    event.target.click();
+    event.preventDefault();
+    event.stopPropagation();
+    setTimeout(nameWidgets, 50);
+  }, { capture: true });
 
   // ---- Show the compared pose while a key is held --------------------------------------------------------------------------
 
@@ -238,7 +301,7 @@
   }, 300);
 
   Object.assign(window.carts, {
-    copyLink, key,
+    copyLink, chooseTabs, key, setError,
     setHints(message) { hints = message; showHints(); },
     /** Reload if the server was restarted after this page was loaded, since the new server has other widgets. */
     reloadIfServerChanged(name) { if (name !== window.cartsConfiguration.server) location.reload(); },

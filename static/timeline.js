@@ -4,12 +4,11 @@
   "use strict";
 
   const make = window.cartsElement;
-  const REVIEW = ["#6b7280", "#60a5fa", "#fb923c", "#2dd4a7", "#ef4444", "#facc15", "#e879f9"];
   const NAMES = ["untouched", "optimized", "needs work", "accepted", "rejected", "moved by hand", "solved together"];
-  const FIT = [null, "#16a34a", "#eab308", "#ef4444"];
+  const FIT = ["#7d8a93", "#22a352", "#e0a106", "#ef5350"]; // unknown, good, doubtful, failed; 3:1 in either theme
+  const MARKS = { 2: "!", 3: "✓", 4: "✕" }; // of reviewed frames
   const VERDICTS = ["", "good", "doubtful", "failed"];
-  const SOURCE = [null, "#facc15", "#60a5fa", "#e879f9"];
-  const [TICKS, BARS, FITS, SOURCES, WHOLE] = [13, 24, 5, 4, 8]; // heights [px]
+  const [TICKS, BARS, REVIEWS, WHOLE] = [13, 20, 13, 8]; // heights [px]
   const [PICTURES, CURVE] = [38, 36]; // heights of the parts omitted in low windows [px]
   const TALL = 560; // minimum height of a window that shows them [px]
   const LEAST = 8; // minimum number of visible frames
@@ -45,21 +44,21 @@
     if (!below || strip?.isConnected) return;
     strip = document.createElement("div");
     strip.className = "carts-strip";
+    const icon = window.cartsIcon;
     strip.innerHTML = `<div class="carts-strip-head">
-        <button data-do="first" title="Start the range at this frame; the range limits playback, solving, optimizing and exporting. Key: (">(&nbsp;Start</button>
-        <button data-do="last" title="End the range at this frame. Key: )">End&nbsp;)</button>
-        <button data-do="whole" title="Remove the range">×</button>
+        <button data-do="first" aria-label="Start the range" title="Start the range at this frame; the range limits playback, solving, optimizing and exporting. Key: (">${icon("brackets-contain-start")}</button>
+        <button data-do="last" aria-label="End the range" title="End the range at this frame. Key: )">${icon("brackets-contain-end")}</button>
         <span class="carts-range"></span>
+        <button data-do="whole" title="Remove the range" aria-label="Remove the range">${icon("x")}</button>
         <select aria-label="Curve" title="Draw a curve over all frames: a joint, the loss, Dice or the probability of failure"></select>
-        <button data-do="lanes" title="Show or hide thumbnails and curve" aria-label="Thumbnails and curve">▾</button>
-        <button data-do="legend" title="Meaning of colours and marks" aria-expanded="false">Legend</button>
+        <button data-do="lanes" title="Show or hide thumbnails and curve" aria-label="Thumbnails and curve"></button>
         <output></output>
       </div>
-      <canvas role="slider" tabindex="-1" aria-label="Timeline: drag to scrub, wheel to zoom, Shift and drag for a range"></canvas>`;
+      <canvas role="slider" tabindex="0" aria-label="Timeline" aria-valuemin="1" aria-valuemax="1" aria-valuenow="1"></canvas>`;
     tip = document.createElement("div");
     tip.className = "carts-tip";
     tip.hidden = true;
-    strip.append(tip, legend());
+    strip.append(tip);
     [canvas, readout, picker] = ["canvas", "output", "select"].map((name) => strip.querySelector(name));
     for (const kind of ["pointerdown", "pointermove", "pointerup", "wheel", "dblclick"]) {
       strip.addEventListener(kind, (event) => event.stopPropagation());
@@ -69,15 +68,17 @@
     canvas.addEventListener("pointerup", () => { dragging = null; tellRange(); });
     canvas.addEventListener("pointerleave", () => { hover = null; dirty = true; });
     canvas.addEventListener("wheel", zoom, { passive: false });
+    canvas.addEventListener("keydown", (event) => {
+      const to = { ArrowLeft: here - 1, ArrowRight: here + 1, Home: 0, End: frames - 1 }[event.key];
+      if (to === undefined || event.ctrlKey || event.metaKey || event.altKey) return;
+      window.carts.report("ShowFrame", { index: clamped(to) });
+      event.preventDefault();
+      event.stopPropagation();
+    });
     canvas.addEventListener("dblclick", () => { view = [0, frames]; dirty = true; });
     const actions = {
       first: () => window.carts.report("Pressed", { key: "(" }), last: () => window.carts.report("Pressed", { key: ")" }),
       whole: () => window.carts.report("SetRange", { frames: null }),
-      legend: () => {
-        const card = strip.querySelector(".carts-strip-legend");
-        card.hidden = !card.hidden;
-        strip.querySelector("[data-do=legend]").setAttribute("aria-expanded", String(!card.hidden));
-      },
       lanes: () => { open = !open; localStorage.setItem("carts-lanes", open ? "open" : "closed"); dirty = true; },
     };
     strip.addEventListener("click", (event) => actions[event.target.closest("button")?.dataset.do]?.());
@@ -86,30 +87,6 @@
     fillPicker();
     below.parentElement.append(strip);
     dirty = true;
-  }
-
-  /** Meaning of the elements of a frame, from top to bottom, with their colours. */
-  function legend() {
-    const card = document.createElement("dl");
-    card.className = "carts-strip-legend";
-    card.hidden = true;
-    const key = (colour, text) => {
-      const swatch = make("span", { class: "carts-swatch" });
-      swatch.style.background = colour;
-      return make("span", { class: "carts-key" }, swatch, text);
-    };
-    const keys = (colours, names) => [...names.keys()].filter((number) => colours[number])
-      .flatMap((number) => [" ", key(colours[number], names[number])]);
-    const rows = [
-      ["White tick", "kept: an accepted frame, a keyframe, or a frame moved by hand; solving does not change it"],
-      ["Bar", "misfit, where higher is worse; low and faint if the fit of the current pose is unknown, absent if nothing is known. Its colour shows the review state or, without a review, the source of the joints:", ...keys(REVIEW, NAMES)],
-      ["Stripe below", "the verdict on the fit:", ...keys(FIT, VERDICTS)],
-      ["Stripe below that", "the source of the joints:", ...keys(SOURCE, ["", NAMES[5], NAMES[1], NAMES[6]])],
-      ["Line at the bottom", "the whole sequence, in the colour of each frame's verdict or, without a verdict, of its review; the box marks the part shown above"],
-      ["Bands", "teal: the shown frame; pink: frames being solved; amber: ends of the range; frames beyond them are dimmed"],
-    ];
-    card.append(...rows.flatMap(([name, ...about]) => [make("dt", {}, name), make("dd", {}, ...about)]));
-    return card;
   }
 
   function fillPicker() {
@@ -123,7 +100,7 @@
   const picturesHigh = () => (tall() ? PICTURES : 0);
   const curveHigh = () => (tall() && window.carts.lanes.chosen() ? CURVE : 0);
   const barsAt = () => TICKS + picturesHigh();
-  const curveAt = () => barsAt() + BARS + FITS + SOURCES + 2;
+  const curveAt = () => barsAt() + BARS + REVIEWS + 2;
   const wholeAt = () => curveAt() + curveHigh();
   const high = () => wholeAt() + 6 + WHOLE;
 
@@ -208,32 +185,21 @@
     show(frameAt(event.offsetX) - at * next + (event.deltaX / width()) * count, next);
   }
 
-  /** For every column of pixels: code of the worst frame, and whether any frame is kept. */
+  /** For every column of pixels: code of the worst frame, and review state of the first reviewed frame. */
   function columns(first, last, count) {
     const found = [];
     for (let column = 0; column < count; column += 1) {
       const from = Math.floor(first + ((last - first) * column) / count);
       const to = Math.max(Math.floor(first + ((last - first) * (column + 1)) / count), from + 1);
-      let [worst, any, kept] = [0, 0, false];
+      let [worst, review] = [0, 0];
       for (let frame = from; frame < to && frame < frames; frame += 1) {
         const code = codes[frame];
-        if (code >= worst) worst = code;
-        any = any || code;
-        kept ||= Boolean(code & 128);
+        if ((code & 0xffff00) >= (worst & 0xffff00)) worst = code || worst;
+        if (MARKS[code & 7]) review ||= code & 7;
       }
-      found.push([worst || any, kept]);
+      found.push([worst, review]);
     }
     return found;
-  }
-
-  function bar(context, x, wide, code, top, height) {
-    if (!code) return;
-    const bad = ((code >> 8) & 255) / 255;
-    const tallness = Math.max(3, bad * height);
-    context.globalAlpha = bad ? 1 : 0.4; // distinguishes unknown fits from good fits
-    context.fillStyle = REVIEW[code & 7];
-    context.fillRect(x, top + height - tallness, wide, tallness);
-    context.globalAlpha = 1;
   }
 
   function draw() {
@@ -246,19 +212,19 @@
     const context = canvas.getContext("2d");
     context.scale(ratio, ratio);
     const light = document.documentElement.dataset.mantineColorScheme === "light";
-    const ink = light ? "#374151" : "#aab4b4";
+    const ink = light ? "#374151" : "#b4c0c0";
     drawTicks(context, ink, w);
-    const lane = { view, frames, xOf, light, ink, w };
+    const lane = { view, frames, xOf, light, ink, w, here };
     if (picturesHigh()) {
       const domain = Math.max(known.domains.indexOf(shown.domain), 0);
       const camera = shown.active ?? 0;
       window.carts.lanes.drawThumbnails(
         context, { ...lane, top: TICKS, height: PICTURES - 2 }, { camera, domain, aspect: known.aspects[camera] ?? 4 / 3 });
     }
-    drawBars(context, light, w);
+    drawBars(context, ink, w);
     if (curveHigh()) window.carts.lanes.drawCurve(context, { ...lane, top: curveAt() + 1, height: CURVE - 3 });
     if (solving) {
-      context.fillStyle = "rgba(232, 121, 249, 0.2)";
+      context.fillStyle = light ? "rgba(15, 118, 110, 0.18)" : "rgba(45, 212, 167, 0.18)";
       context.fillRect(xOf(solving[0]), barsAt(), xOf(solving[0] + solving[1]) - xOf(solving[0]), BARS);
     }
     drawRange(context, light, w);
@@ -267,18 +233,27 @@
     say();
   }
 
-  function drawBars(context, light, w) {
+  /** Fits as bars, whose height is the misfit and whose colour is the verdict, above the marks of reviewed frames. */
+  function drawBars(context, ink, w) {
     const top = barsAt();
     const cells = Math.min(Math.ceil(view[1] - view[0]), Math.floor(w));
     const wide = w / cells;
-    columns(view[0], view[1], cells).forEach(([code, kept], number) => {
+    context.font = "600 10px system-ui, sans-serif";
+    context.textAlign = "center";
+    columns(view[0], view[1], cells).forEach(([code, review], number) => {
       const x = number * wide;
       const thick = Math.max(wide - (wide > 3 ? 1 : 0), 1);
-      bar(context, x, thick, code, top, BARS);
-      if (FIT[(code >> 3) & 3]) { context.fillStyle = FIT[(code >> 3) & 3]; context.fillRect(x, top + BARS + 1, thick, FITS - 1); }
-      if (SOURCE[(code >> 5) & 3]) { context.fillStyle = SOURCE[(code >> 5) & 3]; context.fillRect(x, top + BARS + FITS + 1, thick, SOURCES - 1); }
-      if (kept) { context.fillStyle = light ? "#111827" : "#f8fafc"; context.fillRect(x + wide / 2 - 1, top, 2, 6); }
+      if (code) {
+        const tallness = Math.max(3, (((code >> 8) & 255) / 255) * BARS);
+        context.fillStyle = FIT[(code >> 3) & 3];
+        context.fillRect(x, top + BARS - tallness, thick, tallness);
+      }
+      if (!review) return;
+      context.fillStyle = ink;
+      if (wide >= 9) context.fillText(MARKS[review], x + wide / 2, top + BARS + REVIEWS - 3);
+      else context.fillRect(x, top + BARS + 4, thick, review === 3 ? 2 : 5); // no room for a sign: low if accepted
     });
+    context.textAlign = "start";
   }
 
   /** Dim the frames outside of the range, and draw its ends, which can be dragged in the upper part. */
@@ -317,6 +292,8 @@
 
   function say() {
     readout.textContent = described(here, false);
+    const value = { "aria-valuemax": frames, "aria-valuenow": here + 1, "aria-valuetext": described(here) };
+    for (const [name, now] of Object.entries(value)) canvas.setAttribute(name, String(now));
     readout.title = described(here);
     tip.hidden = hover === null;
     if (hover !== null) {
@@ -325,7 +302,12 @@
     }
     strip.querySelector(".carts-range").textContent = range ? `${name(range[0])} – ${name(range[1])}` : "";
     strip.querySelector("[data-do=whole]").hidden = !range;
-    strip.querySelector("[data-do=lanes]").textContent = open ? "▾" : "▴";
+    const lanes = strip.querySelector("[data-do=lanes]");
+    if (lanes.dataset.open !== String(open)) {
+      lanes.dataset.open = String(open);
+      lanes.innerHTML = window.cartsIcon(open ? "chevron-down" : "chevron-up");
+      lanes.setAttribute("aria-expanded", String(open));
+    }
   }
 
   const name = (frame) => (ids && ids[frame] !== undefined ? ids[frame] : String(frame + 1));
@@ -335,13 +317,13 @@
     const least = (count / w) * 62;
     const step = [1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000, 10000, 20000, 50000].find((one) => one >= least) ?? 1e5;
     context.fillStyle = ink;
-    context.font = "10px system-ui, sans-serif";
+    context.font = "11px system-ui, sans-serif";
     for (let frame = Math.ceil(view[0] / step) * step; frame < view[1]; frame += step) {
       const x = xOf(frame);
       context.fillRect(x, 0, 1, TICKS - 4);
       const seconds = fps ? frame / fps : null;
       const time = seconds === null || seconds < 1 ? "" : ` ${Math.floor(seconds / 60)}:${String(Math.floor(seconds % 60)).padStart(2, "0")}`;
-      context.fillText(`${frame + 1}${time}`, x + 3, 8);
+      context.fillText(`${frame + 1}${time}`, x + 3, 9);
     }
   }
 
@@ -352,7 +334,7 @@
     const cells = Math.min(frames, Math.floor(w));
     columns(0, frames, cells).forEach(([code], number) => {
       if (!code) return;
-      context.fillStyle = FIT[(code >> 3) & 3] ?? REVIEW[code & 7];
+      context.fillStyle = FIT[(code >> 3) & 3];
       context.fillRect((number * w) / cells, top + 2, Math.max(w / cells, 1), WHOLE - 4);
     });
     if (range) {

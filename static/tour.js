@@ -12,8 +12,8 @@
       "images hardly determine."],
     ["Run", "Run", "The optimizer moves the joints until the rendered arm and the images agree (key R). The curves below show its progress."],
     ["Joints", "Joints", "Move joints by hand. Shift+click on the image places a keypoint of the arm."],
-    [".carts-strip", "The timeline", "All frames: high bars indicate bad fits, and frames without a bar have no fit yet. Drag to scrub, wheel to zoom, Shift+drag for a range. " +
-      "Legend explains colours and marks."],
+    [".carts-strip", "The timeline", "All frames: a high bar is a bad fit in the colour of its verdict; ✓, ! and ✕ are reviews. Drag to scrub, wheel to zoom, " +
+      "Shift+drag for a range."],
     ["Review", "Review", "Accept + next (G) shows the next unreviewed frame. The tab also has keyframes, Solve between, " +
       "search and history."],
     ["Jobs", "Jobs", "Long tasks run here while you continue: many frames, calibrations, exports."],

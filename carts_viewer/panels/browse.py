@@ -10,7 +10,7 @@ from carts_core.project import Key, Source
 from carts_core.wording import counted
 from carts_viewer.actions import intents
 from carts_viewer.actions.browsing import SPEEDS
-from carts_viewer.actions.frame_filter import SOLVED, is_copied
+from carts_viewer.actions.frame_filter import BY_HAND, SOLVED, is_copied
 from carts_viewer.panels.inputs import PanelPage, humanized, swatch, write
 from carts_viewer.picture.layers import ARM_COLORS, RENDERED_COLOR, TRUTH_COLORS, Layer, label_color
 from carts_viewer.picture.overlay import with_imported
@@ -19,10 +19,10 @@ from carts_viewer.state import Against, Scores, ViewState
 from carts_viewer.transport.document import escaped
 
 _SOURCES = {
-    Source.MEASURED: "joints as measured",
-    Source.HAND: "joints moved by hand",
-    Source.OPTIMIZER: "joints optimized",
-    Source.PROPAGATED: f"joints {SOLVED}",
+    Source.MEASURED: "measured",
+    Source.HAND: BY_HAND,
+    Source.OPTIMIZER: "optimized",
+    Source.PROPAGATED: SOLVED,
 }
 
 
@@ -42,10 +42,10 @@ class BrowsePanel:
         with gui.add_folder("Sequence"):
             # A slider needs two different ends even for a sequence of a single frame.
             self._frame = gui.add_slider("Frame", 1, max(self._count, 2), 1, 1, disabled=self._count == 1)
-            back = page.button("", intents.MoveFrame(-1), icon=viser.Icon.CHEVRON_LEFT, hint="Previous frame (B)")
+            back = page.button("Previous frame", intents.MoveFrame(-1), icon=viser.Icon.CHEVRON_LEFT)
             self._play = page.button("Play", intents.Play(), icon=viser.Icon.PLAYER_PLAY)
-            forward = page.button("", intents.MoveFrame(1), icon=viser.Icon.CHEVRON_RIGHT, hint="Next frame (N)")
-            page.row(back, self._play, forward, weights=(1, 2, 1))
+            forward = page.button("Next frame", intents.MoveFrame(1), icon=viser.Icon.CHEVRON_RIGHT)
+            page.row(back, self._play, forward, weights=(1, 2, 1), icons=(back, forward))
             self._speed = gui.add_number("Frames/s", 10.0, min=SPEEDS[0], max=SPEEDS[1], step=0.5)
             self._domains = {humanized(name): name for name in sequence.domains}
             self._domain = gui.add_dropdown("Domain", list(self._domains), visible=len(self._domains) > 1)
@@ -94,23 +94,22 @@ class BrowsePanel:
     @staticmethod
     def _source(state: ViewState) -> str:
         if state.pose.source is Source.PROPAGATED and is_copied(state.project, state.index):
-            return "joints copied from another frame"
+            return "copied from another frame"
         return _SOURCES[state.pose.source]
 
     def _describe(self, state: ViewState) -> str:
-        """Name of the frame, source of its joint positions, and scores, as HTML."""
-        shown = f"Frame <b>{escaped(state.frame.frame_id)}</b> ({state.index + 1} of {self._count})"
-        parts = [
-            f"Live frame <b>{escaped(state.frame.frame_id)}</b>" if state.streaming else shown,
-            self._source(state),
-        ]
+        """Name of a live frame, source of the joint positions, time and scores, as HTML."""
+        live = [f"Live frame <b>{escaped(state.frame.frame_id)}</b>"] if state.streaming else []
+        parts = [*live, self._source(state)]
         if state.frame.timestamp is not None:
             parts.append(_time(state.frame.timestamp, self._began))
         scores = self._scores = state.scores or self._scores
         if scores.dice is not None:
             parts.append(f"Dice <b>{scores.dice:.3f}</b>")
         if scores.joint_degrees is not None:
-            parts.append(f"joint error <b>{scores.joint_degrees:.2f}°</b>")
+            parts.append(
+                f'<span title="Mean error of the revolute joints">error <b>{scores.joint_degrees:.2f}°</b></span>'
+            )
         return " · ".join(parts)
 
 
@@ -120,11 +119,10 @@ _CALENDAR = 1e8
 
 def _time(stamp: float, began: float) -> str:
     """Time of a frame relative to the first frame, and its date if known, as HTML."""
-    since = f"{stamp - began:.3f} s after the first frame"
     if stamp < _CALENDAR:
-        return f"at {stamp:.3f} s"
+        return f"{stamp:.3f} s"
     date = f"{datetime.fromtimestamp(stamp, UTC):%Y-%m-%d %H:%M:%S} UTC"
-    return f'<span title="{stamp:.6f} s since 1970">{since}, {date}</span>'
+    return f'<span title="{stamp:.6f} s since 1970, {date}">{stamp - began:.3f} s</span>'
 
 
 _NOTHING = "Nothing"

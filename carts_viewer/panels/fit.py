@@ -106,6 +106,7 @@ class FitPanel:
             icon=viser.Icon.STETHOSCOPE,
             hint="Compare the arms at their current pose with the images of all cameras, without moving them",
         )
+        page.row(self._check, icons=(self._check,))
 
     def show(self, state: ViewState) -> None:
         """Update the verdict."""
@@ -153,20 +154,19 @@ def fit_text(
         said = f" {quality(cameras[name])}" if name in cameras else ""
         chips.append(f'<span class="carts-key">{mark}{escaped(name)}{said}{dice}</span>')
     line = f'<div class="carts-cameras">{"".join(chips)}</div>' if len(chips) > 1 or cameras else ""
-    if scores and line:
-        line += "<small>Dice: overlap of the rendered arms with the recording's mask, for comparison.</small>"
     if verdict is None:
         name = "running" if running else "not checked"
-        if busy is not None:
-            name += f' <span class="carts-spinner"></span>{escaped(busy)} …'
-        return f'<div class="carts-verdict unknown" role="status"><b>Fit {name}</b>{line}</div>'
-    remedy = f"<br><i>Try:</i> {escaped(verdict.remedy)}" if verdict.remedy else ""
-    name, joints = verdict.verdict, joint_words(undetermined)
+        waits = "" if busy is None else f'<small><span class="carts-spinner"></span>{escaped(busy)} …</small>'
+        return f'<div class="carts-verdict unknown" role="status"><b>Fit {name}</b>{waits}{line}</div>'
+    name, joints, reason = verdict.verdict, joint_words(undetermined), escaped(verdict.reason)
+    remedy = f"<p><i>Try:</i> {escaped(verdict.remedy)}</p>" if verdict.remedy else ""
     listed = ", ".join(undetermined or ()).replace("_", " ")
-    known = f', <b title="{escaped(listed)}">{joints}</b>' if joints else ""
+    known = f'<small title="{escaped(listed)}">{joints}</small>' if joints else ""
+    # The reason is shown on request, over the widgets below, which keep their place.
     return (
-        f'<div class="carts-verdict {name}" role="status" title="{_MEANING}"><b>Mask {name}</b>{known}<br>'
-        f"{escaped(verdict.reason)}{remedy}{line}</div>"
+        f'<div class="carts-verdict {name}" role="status"><details><summary title="{_MEANING}"><b>Mask {name}</b>'
+        f"{known or f'<small>{reason}</small>'}</summary>"
+        f'<div class="carts-why"><p>{reason}</p>{remedy}{line}</div></details></div>'
     )
 
 

@@ -286,8 +286,19 @@ def set_hints(page: PanelPage) -> list[str]:
     return missing
 
 
+_SCRIPTS = {
+    "Light or dark": ("toggleTheme",),
+    "Loupe": ("toggleLoupe",),
+    "Keys": ("showSheet",),
+    "Take the tour": ("startTour",),
+    "Copy link": ("copyLink",),
+    **{f"Tab: {name}": ("chooseTabs", [name]) for name in ("Optimize", "Review", "Values", "Jobs", "Live", "Export")},
+}
+"""Actions of the page's scripts by label, with the function and its arguments."""
+
+
 class HelpPanel:
-    """Registers the shortcuts and shows the help text."""
+    """Registers the shortcuts and all other actions as commands, and shows the guide in a window."""
 
     def __init__(self, page: PanelPage, perturb: Callable[[], intents.Intent]) -> None:
         gui = page.gui
@@ -301,8 +312,54 @@ class HelpPanel:
             if hotkey is None and isinstance(shortcut.action, intents.Intent):
                 own[shortcut.hotkey] = shortcut.action
         page.on_pressed(lambda key: page.emit(own[key]) if key in own else None)
-        text = (static_dir() / "help.md").read_text(encoding="utf-8")
-        gui.add_markdown(text.replace("{shortcuts}", key_table()))
+        _add_actions(page)
+        self._add_guide(page)
+
+    @staticmethod
+    def _add_guide(page: PanelPage) -> None:
+        window = page.gui.add_panel(visible=False)
+        with window.add_tab("Guide"):
+            close = page.gui.add_button("Close", icon=viser.Icon.X, color="gray")
+            text = (static_dir() / "help.md").read_text(encoding="utf-8")
+            page.gui.add_markdown(text.replace("{shortcuts}", key_table()))
+        window.float(x=40, y=60, width=480, height=620)
+
+        def show(on: bool) -> None:
+            window.visible = on
+
+        @close.on_click
+        async def _(_: viser.GuiEvent) -> None:
+            show(False)
+
+        @page.gui.add_command("Guide", description="Explains the page").on_trigger
+        async def _(_: viser.CommandEvent) -> None:
+            show(True)
+
+        page.on_pressed(lambda key: show(True) if key == "guide" else None)
+
+
+def _add_actions(page: PanelPage) -> None:
+    """Add a command for each button without a shortcut, and for each function of the page's scripts."""
+    known = [shortcut.action for shortcut in shortcuts()]
+    for handle, intent in page.buttons:
+        if intent in known:
+            continue
+        command = page.gui.add_command(handle.label, description=handle.hint or HINTS.get(handle.label))
+
+        @command.on_trigger
+        async def _(
+            event: viser.CommandEvent, intent: intents.Intent | Callable[[int], intents.Intent] = intent
+        ) -> None:
+            if isinstance(intent, intents.Intent):
+                page.emit(intent)
+            elif event.client_id is not None:
+                page.emit(intent(event.client_id))
+
+    for label, (name, *arguments) in _SCRIPTS.items():
+
+        @page.gui.add_command(label).on_trigger
+        async def _(_: viser.CommandEvent, name: str = name, arguments: list = arguments) -> None:
+            page.call(name, *arguments)
 
 
 def _listen(

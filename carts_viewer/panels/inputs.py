@@ -26,6 +26,7 @@ class PanelPage(TabPage):
     Attributes:
         emit: queues an intent for the worker; never blocks.
         waits: whether an intent with this key is pending, so that its widget is ahead of the state.
+        buttons: all buttons with their intents, for the list of actions.
     """
 
     def __init__(
@@ -33,6 +34,7 @@ class PanelPage(TabPage):
     ) -> None:
         super().__init__(client)
         self.emit, self.waits = emit, waits
+        self.buttons: list[tuple[viser.GuiButtonHandle, Intent | Callable[[int], Intent]]] = []
 
     def button(
         self, label: str, intent: Intent | Callable[[int], Intent], *, color: Any = "gray", **options: Any
@@ -42,6 +44,7 @@ class PanelPage(TabPage):
         When pressed, it emits the intent, or the result of `intent` for the client id.
         """
         handle = self.gui.add_button(label, color=color, **options)
+        self.buttons.append((handle, intent))
 
         @handle.on_click
         async def _(event: viser.GuiEvent) -> None:

@@ -4,13 +4,14 @@ import math
 
 import viser
 
+from carts_core.optimization import undetermined_joints
 from carts_core.settings import SurfaceSolver
 from carts_viewer.actions import intents
 from carts_viewer.actions.posing import MAX_PERTURBATION
 from carts_viewer.panels.inputs import PanelPage, humanized, valid, write
 from carts_viewer.picture.overlay import labelled_keypoints
 from carts_viewer.session import Session
-from carts_viewer.state import JointRange, Reach, ViewState
+from carts_viewer.state import JointRange, Phase, Reach, ViewState
 from carts_viewer.transport.document import escaped
 
 _STEP = 0.05
@@ -128,24 +129,24 @@ def _tidy(value: float) -> float:
     return round(value) if math.isfinite(value) else value
 
 
-_UNSURE = 1.0
-"""Standard deviation above which a joint counts as undetermined [deg, mm]; less than half of a typical error."""
 _EXPECTED = SurfaceSolver()
 _UNUSUAL = (
     2.0 * _EXPECTED.prior_deg,
     2e3 * math.radians(_EXPECTED.prior_deg) * _EXPECTED.length_scale,
 )
 """Threshold of unusually large corrections: two standard deviations of the solver's prior [deg], [mm]."""
-_EXPLAINED = (
-    f"± is one standard deviation. <span class='carts-unsure'>Amber ±</span> (above {_UNSURE:g}° or {_UNSURE:g} mm): "
-    "the images hardly determine this joint. Its value is a guess, but hardly affects the mask.<br>"
-    f"<span class='carts-unsure'>Amber change</span>: more than {_UNUSUAL[0]:.0f}° or {_UNUSUAL[1]:.0f} mm, which is "
-    "rare in real arms. Smaller changes are common."
-)
+_COLUMNS = {
+    "Change": f"Correction of the measured value. More than {_UNUSUAL[0]:.0f}° or {_UNUSUAL[1]:.0f} mm is rare.",
+    "Run": "Change by the last run",
+    "±": "One standard deviation",
+    "Image": "Whether the image determines the joint. The mask hardly depends on a joint that it does not determine.",
+    "Error": "Difference from the ground truth",
+}
+"""Columns of the table, with their hints."""
 
 
 class ValuesPanel:
-    """Table of the corrections of all joints of the shown frame."""
+    """Table of the joints of the shown frame: corrections, standard deviations, and observability."""
 
     def __init__(self, gui: viser.GuiApi, session: Session) -> None:
         self._session = session
@@ -153,43 +154,65 @@ class ValuesPanel:
 
     def show(self, state: ViewState) -> None:
         """Update the table."""
-        shown = self._session.joints(state.pose.scene)
-        truth = state.frame.truth or {}
-        known = {arm: value.standard_deviations for arm, value in state.project.joints(state.index).items()}
-        columns = ["", "Measured", "Now", "Change", "±", *(["Error"] if truth else [])]
-        rows = ["".join(f"<th>{name}</th>" for name in columns)]
-        for arm in self._session.scene.arms:
-            rows.append(f'<th colspan="{len(columns)}">{escaped(arm.name)}</th>')
-            for joint, limits in enumerate(self._session.ranges[arm.name]):
-                measured = limits.to_shown(float(state.frame.measured[arm.name][joint]))
-                now = limits.to_shown(float(shown[arm.name][joint]))
-                cells = [
-                    f"{measured:.2f}",
-                    f"{now:.2f}",
-                    _marked(_signed(now - measured), abs(now - measured) > _UNUSUAL[0 if limits.revolute else 1]),
-                    _standard_deviation(limits, known.get(arm.name), joint),
-                ]
-                if arm.name in truth:
-                    cells.append(_signed(now - limits.to_shown(float(truth[arm.name][joint]))))
-                unit = limits.unit
-                name = f"<td>{escaped(humanized(limits.joint))} <small>{unit}</small></td>"
-                rows.append(name + "".join(f"<td>{cell}</td>" for cell in cells))
-        body = "".join(f"<tr>{row}</tr>" for row in rows)
-        self._table.content = f'<table class="carts-values">{body}</table><p class="carts-caption">{_EXPLAINED}</p>'
+        self._table.content = f'<table class="carts-values">{"".join(value_rows(state, self._session))}</table>'
+
+
+def value_rows(state: ViewState, session: Session) -> list[str]:
+    """Rows of the table of joints, and of other unknowns of the last run that the images hardly determine, as HTML."""
+    shown, truth = session.joints(state.pose.scene), state.frame.truth or {}
+    known = {arm: value.standard_deviations or () for arm, value in state.project.joints(state.index).items()}
+    undetermined = undetermined_joints(session.scene, known)
+    # Changes by a run are those of the shown frame only until another frame is shown, which forgets the run.
+    before = None if state.run.start is None else session.joints(state.run.start)
+    absent = {"Run"} if before is None else set()
+    absent |= set() if truth else {"Error"}
+    absent |= {"±", "Image"} if undetermined is None else set()
+    columns = [name for name in _COLUMNS if name not in absent]
+    heads = "".join(f'<th scope="col" title="{_COLUMNS[name]}">{name}</th>' for name in columns)
+    rows = [f'<tr><th scope="col">Joint</th>{heads}</tr>']
+    for arm in session.scene.arms:
+        rows.append(f'<tr><th colspan="{1 + len(columns)}">{escaped(arm.name)}</th></tr>')
+        for joint, limits in enumerate(session.ranges[arm.name]):
+            measured = limits.to_shown(float(state.frame.measured[arm.name][joint]))
+            now = limits.to_shown(float(shown[arm.name][joint]))
+            std = dict(enumerate(known.get(arm.name, ()))).get(joint)
+            cells = {
+                "Change": _marked(_signed(now - measured), abs(now - measured) > _UNUSUAL[0 if limits.revolute else 1]),
+                "±": "" if std is None else f"{limits.to_shown(std):.2f}",
+                "Image": "" if std is None else _chip(f"{arm.name}.{limits.joint}" not in (undetermined or ())),
+            }
+            if before is not None:
+                cells["Run"] = _signed(now - limits.to_shown(float(before[arm.name][joint])))
+            if arm.name in truth:
+                cells["Error"] = _signed(now - limits.to_shown(float(truth[arm.name][joint])))
+            name = f"{escaped(humanized(limits.joint))} <small>{limits.unit}</small>"
+            title = f"measured {measured:.2f}, now {now:.2f} {limits.unit}"
+            values = "".join(f"<td>{cells.get(column, '')}</td>" for column in columns)
+            rows.append(f'<tr title="{title}"><td>{name}</td>{values}</tr>')
+    rows += [
+        f'<tr><td colspan="{len(columns)}">{escaped(name.replace("/", " ").replace("_", " "))}</td>'
+        f"<td>{_chip(False)}</td></tr>"
+        for name in _open_unknowns(state, session)
+    ]
+    return rows
+
+
+def _open_unknowns(state: ViewState, session: Session) -> list[str]:
+    """Unknowns of the last run besides joints, such as `psm1/base/x`, that the images do not determine."""
+    known = None if state.maps is None or not state.maps.of_run else state.maps.iterate.uncertainty
+    if known is None or state.run.phase is Phase.RUNNING:
+        return []
+    joints = {f"{limits.arm}/{limits.joint}" for ranges in session.ranges.values() for limits in ranges}
+    return [name for name in known.names if name not in joints and known.observability(name) != "determined"]
+
+
+def _chip(determined: bool) -> str:
+    return '<span class="carts-chip">yes</span>' if determined else '<span class="carts-chip doubtful">no</span>'
 
 
 def _signed(difference: float) -> str:
     """Difference as text with its sign, unless it rounds to zero."""
     return f"{difference:+.2f}" if abs(difference) >= 0.005 else "0.00"
-
-
-def _standard_deviation(limits: JointRange, known: tuple[float | None, ...] | None, joint: int) -> str:
-    """Standard deviation of a joint as text; empty if unknown."""
-    value = known[joint] if known else None
-    if value is None:
-        return ""
-    shown = limits.to_shown(value)
-    return _marked(f"{shown:.2f}", shown > _UNSURE)
 
 
 def _marked(text: str, on: bool) -> str:

@@ -9,7 +9,7 @@ from carts_viewer.panels.import_export import ExportPanel, ImportPanel
 from carts_viewer.panels.inputs import Panel, PanelPage
 from carts_viewer.panels.jobs import JobsPanel
 from carts_viewer.panels.joints import JointsPanel, KeypointsPanel, ValuesPanel
-from carts_viewer.panels.optimize import CurvesPanel, FreePanel, OptimizePanel, SettingsPanel
+from carts_viewer.panels.optimize import CurvesPanel, FreePanel, ObjectivePanel, OptimizePanel, SettingsPanel
 from carts_viewer.panels.paint import PaintPanel
 from carts_viewer.panels.project import HistoryPanel, MessagePanel, PeoplePanel, SavedPanel
 from carts_viewer.panels.review import FindPanel, ReviewPanel
@@ -55,9 +55,10 @@ class Layout:
         right = gui.add_panel()
         with right.add_tab("Optimize"):
             panels += [
-                OptimizePanel(page, session, state),
-                SettingsPanel(page, state),
+                OptimizePanel(page, session),
                 CurvesPanel(gui),
+                ObjectivePanel(page, session, state),
+                SettingsPanel(page, state),
                 FreePanel(page, session, state),
             ]
         with right.add_tab("Review"):
@@ -70,8 +71,7 @@ class Layout:
             panels.append(LivePanel(page))
         with right.add_tab("Export"):
             panels.append(ExportPanel(page, session, storage))
-        with right.add_tab("Help"):
-            HelpPanel(page, self.joints.perturb)
+        HelpPanel(page, self.joints.perturb)
         set_hints(page)
         right.dock_right()
         right.set_width(_WIDTH)

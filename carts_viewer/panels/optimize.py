@@ -35,14 +35,10 @@ OBSERVED = {"Network predictions": "network", "Masks": "masks", "Masks and netwo
 """Labels of the targets of a run."""
 MASKS = {"Recording": "recording", "Imported": "imported", "Painted": "painted"}
 """Labels of the masks that a run fits."""
-UNDETERMINED = "Not determined by this image"
-"""Label of unknowns that the images do not determine."""
-_CONSEQUENCE = "The mask hardly depends on these parameters, so it can be correct even if their values are guesses."
-_RUN = "Press Run to fit the arm to this frame."
 _BEFORE_RUN = {
-    ReviewState.ACCEPTED: "This frame is accepted. Run fits it again; if its pose changes, it must be accepted again.",
-    ReviewState.REJECTED: "This frame is rejected. Run still fits it.",
-    ReviewState.OPTIMIZED: "This frame has been fitted. Run continues from its pose.",
+    ReviewState.ACCEPTED: "Accepted. A run that moves the arms clears the review.",
+    ReviewState.REJECTED: "Rejected",
+    ReviewState.OPTIMIZED: "Optimized",
 }
 """Status text before a run, by review state."""
 
@@ -50,21 +46,41 @@ _BEFORE_RUN = {
 class OptimizePanel:
     """Buttons that control a run, and its status as text."""
 
-    def __init__(self, page: PanelPage, session: Session, state: ViewState) -> None:
+    def __init__(self, page: PanelPage, session: Session) -> None:
         gui = page.gui
-        self._session = session
         self._run = page.button("Run", intents.Run(), icon=viser.Icon.PLAYER_PLAY, color="teal")
         self._pause = page.button("Pause", intents.Pause(), icon=viser.Icon.PLAYER_PAUSE, disabled=True)
-        page.row(self._run, self._pause)
         self._step = page.button("Step", intents.Step(), icon=viser.Icon.PLAYER_SKIP_FORWARD)
         self._reset = page.button("Reset", intents.Reset(), icon=viser.Icon.PLAYER_TRACK_PREV)
-        page.row(self._step, self._reset)
+        icons = (self._pause, self._step, self._reset)
+        page.row(self._run, *icons, weights=(3, 1, 1, 1), icons=icons)
         self._status = gui.add_html("")
         self._calibration = CalibrationHint(page, session)
         self._unfamiliar = gui.add_html("", visible=False)
         self._adapt = page.button(
             "Adapt the network to this recording", intents.Adapt(), icon=viser.Icon.SCHOOL, visible=False, color=None
         )
+
+    def show(self, state: ViewState) -> None:
+        """Update the widgets."""
+        running = state.run.phase is Phase.RUNNING
+        self._run.label = "Continue" if state.run.phase is Phase.PAUSED else "Run"
+        self._run.disabled = self._step.disabled = running or state.busy is not None
+        self._pause.disabled = not running
+        self._reset.disabled = not state.run.curves.loss
+        self._unfamiliar.content = "".join(
+            f'<p class="carts-notice" role="status">{escaped(warning)}</p>' for warning in state.unfamiliar
+        )
+        self._unfamiliar.visible = self._adapt.visible = bool(state.unfamiliar)
+        self._status.content = f'<p class="carts-status">{status_line(state)}</p>'
+        self._calibration.show(state.run.base_frame_gain, state)
+
+
+class ObjectivePanel:
+    """Choice of the solver, and of what it fits."""
+
+    def __init__(self, page: PanelPage, session: Session, state: ViewState) -> None:
+        gui = page.gui
         self._solvers = {label: name for name, label in SOLVER_LABELS.items()}
         self._solver = gui.add_dropdown("Solver", list(self._solvers), initial_value=SOLVER_LABELS[state.solver])
         self._observed = gui.add_dropdown("Fit to", list(OBSERVED))
@@ -83,23 +99,11 @@ class OptimizePanel:
 
     def show(self, state: ViewState) -> None:
         """Update the widgets."""
-        running = state.run.phase is Phase.RUNNING
-        self._run.label = "Continue" if state.run.phase is Phase.PAUSED else "Run"
-        self._run.disabled = self._step.disabled = running or state.busy is not None
-        self._pause.disabled = not running
-        self._reset.disabled = not state.run.curves.loss
-        self._unfamiliar.content = "".join(
-            f'<p class="carts-notice" role="status">{escaped(warning)}</p>' for warning in state.unfamiliar
-        )
-        self._unfamiliar.visible = self._adapt.visible = bool(state.unfamiliar)
         write(self._solver, SOLVER_LABELS[state.solver])
         write(self._observed, next(label for label, what in OBSERVED.items() if what == state.observed.what))
         write(self._masks, next(label for label, masks in MASKS.items() if masks == state.observed.masks))
         self._masks.visible = state.observed.what != "network"
         write(self._cameras, "All cameras" if state.every_camera else "Shown camera")
-        lines = undetermined_lines(state, self._session)
-        self._status.content = f'<p class="carts-status">{status_line(state)}</p>{lines}'
-        self._calibration.show(state.run.base_frame_gain, state)
 
 
 def status_line(state: ViewState) -> str:
@@ -109,8 +113,8 @@ def status_line(state: ViewState) -> str:
         return f'<span class="carts-spinner"></span>{escaped(state.busy)} …'
     parts = []
     if curves.loss:
-        parts.append(f"Iteration <b>{len(curves.loss) - 1}</b> of {state.settings.iterations}")
-        parts.append(f"{1e3 * sum(curves.seconds) / len(curves.seconds):.0f} ms each")
+        mean = f"{1e3 * sum(curves.seconds) / len(curves.seconds):.0f} ms per iteration"
+        parts.append(f'<span title="{mean}">{len(curves.loss) - 1} of {state.settings.iterations} iterations</span>')
     if phase is Phase.RUNNING:
         parts.append("running")
     elif phase is Phase.PAUSED:
@@ -119,39 +123,7 @@ def status_line(state: ViewState) -> str:
         parts.append(escaped(state.run.reason))
     if state.run_outdated and phase is Phase.IDLE:
         parts.append("changed since the run")
-    return " · ".join(parts) or _BEFORE_RUN.get(state.review.state, _RUN)
-
-
-def undetermined_lines(state: ViewState, session: Session) -> str:
-    """Unknowns that the images of a run do not determine, with their changes, as HTML; empty during a run."""
-    known = None if state.maps is None or not state.maps.of_run else state.maps.iterate.uncertainty
-    if known is None or state.run.phase is Phase.RUNNING:
-        return ""
-    lines: list[str] = []
-    for how, meaning in (("weak", "Weakly determined by this image"), ("not visible", UNDETERMINED)):
-        these = [name for name in known.names if known.observability(name) == how]
-        names = [_spoken(name) + _moved(name, state, session) for name in these]
-        if names:
-            lines.append(f'<p class="carts-caption">{meaning}: {escaped(", ".join(names))}</p>')
-    return "".join([*lines, f'<p class="carts-caption">{_CONSEQUENCE}</p>' if lines else ""])
-
-
-def _moved(unknown: str, state: ViewState, session: Session) -> str:
-    """Change of a joint by a run, as text in brackets; empty for other unknowns."""
-    arm, _, joint = unknown.partition("/")
-    found = session.ranges.get(arm, ())
-    places = [number for number, limits in enumerate(found) if limits.joint == joint]
-    if not places or state.run.start is None:
-        return ""
-    before, now = (session.joints(scene)[arm][places[0]] for scene in (state.run.start, state.pose.scene))
-    limits = found[places[0]]
-    by, unit = limits.to_shown(now - before), "°" if limits.revolute else " mm"
-    return " (unchanged)" if abs(by) < 0.05 else f" (moved by {by:+.1f}{unit})"
-
-
-def _spoken(unknown: str) -> str:
-    owner, _, name = unknown.partition("/")
-    return f"{owner} {humanized(name).lower()}"
+    return " · ".join(parts) or _BEFORE_RUN.get(state.review.state, "")
 
 
 _GROUPS = {"base_frames": "Base frames", "extrinsics": "Camera pose", "intrinsics": "Camera intrinsics"}
@@ -282,12 +254,13 @@ def _widget(gui: Any, kind: type, name: str, value: Any) -> Any:
     return gui.add_number(label, value, step=step, hint=hint)
 
 
-_TEAL, _BLUE, _ORANGE, _GRAY = "#14b8a6", "#3b82f6", "#f97316", "#8a9696"
-_HEIGHT = 168
+_COLOR, _GRAY = "#0d9488", "#8a9696"
+_HEIGHT = 160
 _WHOLE = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000)
 _TICKS = uplot.Axis_Ticks(size=4, width=1)
-_TITLE = '<p class="carts-curve{}"><span style="color: {}">■</span> {} {}</p>'
-_QUANTITIES = (("Loss", "1", _TEAL), ("Dice", "1", _BLUE), ("Joint error", "°", _ORANGE))
+_GRID = uplot.Axis_Grid(stroke="#8a969633", width=1)
+_FONT = "11px system-ui, sans-serif"
+_QUANTITIES = ("Loss", "Dice", "Joint error [°]")
 
 
 class CurvesPanel:
@@ -295,8 +268,7 @@ class CurvesPanel:
 
     def __init__(self, gui: viser.GuiApi) -> None:
         self._shown: tuple[Curves | None, bool] = (None, False)
-        self._note = gui.add_html("", visible=False)
-        self._charts = [_Chart(gui, *quantity) for quantity in _QUANTITIES]
+        self._charts = [_Chart(gui, quantity) for quantity in _QUANTITIES]
 
     def show(self, state: ViewState) -> None:
         """Draw the curves of the state's run."""
@@ -304,8 +276,6 @@ class CurvesPanel:
         if (curves, outdated) == self._shown:
             return
         self._shown = curves, outdated
-        self._note.visible = bool(curves.loss)
-        self._note.content = f'<p class="carts-caption">{note(curves, outdated)}</p>'
         values = (
             curves.loss,
             tuple(score.dice for score in curves.scores),
@@ -316,17 +286,17 @@ class CurvesPanel:
 
 
 def note(curves: Curves, outdated: bool) -> str:
-    """Note about the curves."""
+    """Hint of the curves."""
     if outdated:
         return "Outdated: the pose, the image or a setting has changed since the run."
     if curves.comparable:
-        return "○ start of a stage · ● result. After a run, all losses are recomputed, so they are comparable."
-    return "○ start of a stage; during a run, losses are comparable only within a stage."
+        return "○ start of a stage, ● result. After a run, all losses are recomputed, so they are comparable."
+    return "○ start of a stage. During a run, losses are comparable only within a stage."
 
 
 class _Chart:
-    def __init__(self, gui: viser.GuiApi, name: str, unit: str, color: str) -> None:
-        self._name, self._unit, self._color = name, unit, color
+    def __init__(self, gui: viser.GuiApi, name: str) -> None:
+        self._name = name
         self._outdated = False
         self._title = gui.add_html("", visible=False)
         empty = np.zeros(1)
@@ -335,8 +305,17 @@ class _Chart:
             self._series(),
             scales={"x": uplot.Scale(time=False), "y": uplot.Scale(auto=True)},
             axes=(
-                uplot.Axis(size=30, incrs=_WHOLE, ticks=_TICKS, label="Iteration", labelSize=16, stroke=_GRAY),
-                uplot.Axis(size=46, space=24, ticks=_TICKS, label=f"{name} [{unit}]", labelSize=16, stroke=_GRAY),
+                uplot.Axis(
+                    size=30,
+                    incrs=_WHOLE,
+                    ticks=_TICKS,
+                    grid=_GRID,
+                    label="Iteration",
+                    labelSize=14,
+                    labelFont=_FONT,
+                    stroke=_GRAY,
+                ),
+                uplot.Axis(size=46, space=24, ticks=_TICKS, grid=_GRID, stroke=_GRAY),
             ),
             legend=uplot.Legend(show=True, live=True),
             cursor=uplot.Cursor(show=True, y=False, drag=uplot.Cursor_Drag(x=False, y=False)),
@@ -355,7 +334,11 @@ class _Chart:
             self._outdated = outdated
             self._plot.series = self._series()
         text = self._newest_and_result(values, curves.best)
-        self._title.content = _TITLE.format(" carts-outdated" if outdated else "", self._drawn, self._name, text)
+        style = "carts-curve carts-outdated" if outdated else "carts-curve"
+        mark = " · outdated" if outdated else ""
+        self._title.content = (
+            f'<p class="{style}" title="{note(curves, outdated)}"><b>{self._name}</b> {text}{mark}</p>'
+        )
         line = np.array([np.nan if value is None else value for value in values], float)
         numbers = np.arange(len(line))
         stages = np.array(curves.stages or [0] * len(line))[: len(line)]
@@ -366,7 +349,7 @@ class _Chart:
 
     @property
     def _drawn(self) -> str:
-        return _GRAY if self._outdated else self._color
+        return _GRAY if self._outdated else _COLOR
 
     def _series(self) -> tuple[uplot.Series, ...]:
         color = self._drawn
@@ -374,14 +357,14 @@ class _Chart:
         full = uplot.Series_Points(show=True, size=9, fill=color, stroke=color)
         return (
             uplot.Series(label="Iteration"),
-            uplot.Series(
-                label=f"{self._name} [{self._unit}]", stroke=color, width=2, points=uplot.Series_Points(show=False)
-            ),
+            uplot.Series(label=self._name, stroke=color, width=2, points=uplot.Series_Points(show=False)),
             uplot.Series(label="○", stroke=color, width=0, auto=False, points=hollow),
             uplot.Series(label="●", stroke=color, width=0, auto=False, points=full),
         )
 
     def _newest_and_result(self, series: Sequence[float | None], best: int) -> str:
         newest, kept = series[-1], series[best]
-        text = "" if newest is None else f"<b>{newest:.3g}</b>"
-        return text if kept is None else f"{text} · result <b>{kept:.3g}</b>, iteration {best}"
+        if kept is None:
+            return "" if newest is None else f"{newest:.3g}"
+        now = "" if newest is None or newest == kept else f"{newest:.3g} · "
+        return f"{now}result {kept:.3g}, iteration {best}"

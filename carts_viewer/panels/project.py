@@ -25,7 +25,7 @@ class SavedPanel:
         self._text = gui.add_html("")
         self._undo = page.button("Undo", intents.Undo(), icon=viser.Icon.ARROW_BACK_UP)
         self._redo = page.button("Redo", intents.Redo(), icon=viser.Icon.ARROW_FORWARD_UP)
-        page.row(self._undo, self._redo)
+        page.row(self._undo, self._redo, icons=(self._undo, self._redo))
 
     def show(self, state: ViewState) -> None:
         """Update the widgets."""
@@ -38,13 +38,13 @@ class SavedPanel:
             self._notice.visible = notice is not None
             self._notice.content = f'<p class="carts-notice" role="status">{escaped(notice or "")}</p>'
         if not self._storage.project.safe:
-            text = "<b>NOT SAVED</b>"
+            text = "<b class='carts-unsafe'>Not saved</b>"
         elif not self._storage.kept:
             text = "Not saved" if state.unsaved else escaped(path.name)
         elif state.unsaved:
-            text = "Not saved yet …"
+            text = "Saving …"
         else:
-            text = f"<b>Saved</b> in {escaped(path.name)}"
+            text = "Saved"
         self._text.content = (
             f'<p class="carts-caption carts-saved" title="{escaped(str(path))}"><span>{text}</span></p>'
         )
@@ -115,26 +115,15 @@ class PeoplePanel:
 
 
 class MessagePanel:
-    """The newest error, until it is dismissed or another action succeeds."""
+    """The newest error, over the image, until it is dismissed or another action succeeds."""
 
     def __init__(self, page: PanelPage) -> None:
         self._page = page
         self._shown: str | None = None
-        self._notes: list[viser.NotificationHandle] = []
-        self._text = page.gui.add_html("", visible=False)
-        self._dismiss = page.button("Dismiss", intents.DismissError(), icon=viser.Icon.X, color="red", visible=False)
+        page.on_pressed(lambda key: page.emit(intents.DismissError()) if key == "dismiss" else None)
 
     def show(self, state: ViewState) -> None:
         """Update the message."""
-        if state.error == self._shown:
-            return
-        self._shown = state.error
-        while self._notes:
-            self._notes.pop().remove()
-        self._text.visible = self._dismiss.visible = state.error is not None
-        self._text.content = f'<p class="carts-error" role="alert">{escaped(state.error or "")}</p>'
-        if state.error is not None:
-            note = self._page.client.add_notification(
-                "Action failed", state.error, color="red", auto_close_seconds=12.0
-            )
-            self._notes = [note]
+        if state.error != self._shown:
+            self._shown = state.error
+            self._page.call("setError", state.error)

@@ -31,7 +31,7 @@ from carts_viewer.transport.events import Trace
 from carts_viewer.transport.guard import response
 from carts_viewer.transport.page import TabPage
 
-_FIGURES = ("Loss [1]", "Dice [1]", "Probability of failure [1]")
+_FIGURES = ("Loss", "Dice", "Probability of failure [%]")
 _MAX_COLUMNS = 4000
 
 
@@ -70,7 +70,7 @@ class Traces:
             values = (
                 None if figures is None else figures.loss,
                 None if figures is None else figures.dice,
-                None if verdict is None else verdict.failure,
+                None if verdict is None else 100.0 * verdict.failure,
             )
             self._figures[:, frame] = [np.nan if value is None else value for value in values]
             corrections = project.joints(frame)

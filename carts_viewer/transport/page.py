@@ -30,7 +30,7 @@ from carts_core.errors import CartsError
 from carts_core.resources import static_dir
 
 from .guard import PAGES, Guard, check_address, gated, refusal, response
-from .viser_private import element_id, list_icons_once, queue_safely, run_script, value_of, widgets
+from .viser_private import element_id, icon_paths, list_icons_once, queue_safely, run_script, value_of, widgets
 
 
 class TabPage:
@@ -77,10 +77,25 @@ class TabPage:
         """The widget with this label (for tests and scripts)."""
         return next(handle for handle in widgets(self.gui) if getattr(handle, "label", None) == label)
 
-    def row(self, *handles: viser.GuiButtonHandle, weights: Sequence[float] | None = None) -> None:
-        """Lay out consecutive buttons of the current container side by side, with relative widths."""
+    def row(
+        self,
+        *handles: viser.GuiButtonHandle,
+        weights: Sequence[float] | None = None,
+        icons: Sequence[viser.GuiButtonHandle] = (),
+    ) -> None:
+        """Lay out consecutive buttons of the current container side by side, with relative widths.
+
+        Buttons in `icons` show only their icon; their label is their name for screen readers.
+        """
         shares = [1.0] * len(handles) if weights is None else list(weights)
         self._side_by_side([element_id(handle) for handle in handles], shares, "div:has(> [id='{}'])")
+        if icons:
+            labels = ", ".join(f"[id='{element_id(handle)}'] .mantine-Button-label" for handle in icons)
+            sections = labels.replace("-label", "-section")
+            self.gui.add_html(
+                f"<style>{labels} {{ position: absolute; width: 1px; height: 1px; overflow: hidden; "
+                f"clip-path: inset(50%) }} {sections} {{ margin: 0 }}</style>"
+            )
 
     def columns(self, handles: Sequence[Any], count: int = 2, *, narrow_labels: bool = False) -> None:
         """Lay out consecutive checkboxes or number fields of the current container in columns, in reading order.
@@ -185,6 +200,25 @@ OWN_KEYS = ("[", "]", "(", ")", "escape", "enter")
 
 UPLOAD = "/upload"
 """Path of the websocket of uploads."""
+
+_ICONS = (
+    "minus",
+    "plus",
+    "zoom-in-area",
+    "maximize",
+    "contrast",
+    "help",
+    "chevron-down",
+    "chevron-up",
+    "x",
+    "brackets-contain-start",
+    "brackets-contain-end",
+    "table",
+    "ruler-measure",
+    "grid-dots",
+)
+"""Icons that the page's scripts use."""
+
 _THUMBNAIL = "/thumbnail/"
 _SCRIPTS = (
     "page",
@@ -370,6 +404,7 @@ class Page:
         said = {
             "channel": element_id(self._channel),
             "keys": OWN_KEYS,
+            "icons": {name: icon_paths(name) for name in _ICONS},
             "keyGroups": self.key_groups,
             "project": self.project,
             "server": self._name,

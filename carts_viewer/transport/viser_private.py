@@ -31,6 +31,11 @@ def icon(name: str) -> str:
     return _icons().read(f"{name}.svg").decode()
 
 
+def icon_paths(name: str) -> str:
+    """The elements within the SVG of an icon, without the SVG itself."""
+    return icon(name).split(">", 1)[1].rsplit("</svg>", 1)[0]
+
+
 @functools.cache
 def _icons() -> ZipFile:
     return ZipFile(ICONS_DIR / "tabler-icons.zip")

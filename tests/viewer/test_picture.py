@@ -89,9 +89,9 @@ def test_the_next_picture_may_go_once_the_last_one_is_drawn_or_after_a_while() -
 
 def test_a_curve_is_the_lowest_and_highest_value_of_each_column_and_follows_what_is_corrected(desk: Desk) -> None:
     traces, project = Traces(desk.session), desk.session.editor.project
-    for asked in (("Nothing", 0, 3, 9), ("Loss [1]", 2, 2, 9), ("Loss [1]", 0, 3, 0), ("", -5, -3, 1)):
+    for asked in (("Nothing", 0, 3, 9), ("Loss", 2, 2, 9), ("Loss", 0, 3, 0), ("", -5, -3, 1)):
         assert traces.between(*asked) is None
-    assert traces.names[:2] == ["Loss [1]", "Dice [1]"] and traces.names[3].endswith("[°]")
+    assert traces.names[:2] == ["Loss", "Dice"] and traces.names[3].endswith("[°]")
     yaw = traces.names[3]
     measured = np.degrees(desk.session.sequence.measured["PSM1"][:, 0])
     found = traces.between(yaw, 0, 3, 100)
@@ -105,7 +105,7 @@ def test_a_curve_is_the_lowest_and_highest_value_of_each_column_and_follows_what
     assert whole["curves"][1] == [[pytest.approx(np.degrees(0.1), rel=1e-4)]] * 2
     project.record_figures({2: Figures(loss=0.25)}, project.state)
     traces.follow(project.state, [2])
-    loss = traces.between("Loss [1]", 0, 3, 100)
+    loss = traces.between("Loss", 0, 3, 100)
     assert loss is not None and loss["curves"] == [[[None, None, 0.25]] * 2]
 
 

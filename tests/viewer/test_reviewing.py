@@ -1,15 +1,13 @@
 """Reviews, verdicts, filters and warnings of frames."""
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from viewer_desk import Desk
 
 from carts_core.errors import CartsError
-from carts_core.optimization import BASE_FRAME_GAIN
-from carts_core.optimization.observability import Uncertainty
+from carts_core.optimization import BASE_FRAME_GAIN, undetermined_joints
 from carts_core.project import Figures, FitVerdict, Key, Review, ReviewState, Source
 from carts_viewer.actions import intents
 from carts_viewer.actions.frame_filter import (
@@ -25,11 +23,12 @@ from carts_viewer.actions.frame_filter import (
 from carts_viewer.actions.import_export import FRAME_CHOICES, export_warnings
 from carts_viewer.jobs.comparison import Fit
 from carts_viewer.panels.fit import fit_text
-from carts_viewer.panels.optimize import note, undetermined_lines
+from carts_viewer.panels.joints import value_rows
+from carts_viewer.panels.optimize import note
 from carts_viewer.panels.sequence import calibration_line
 from carts_viewer.picture.layers import Layer
 from carts_viewer.picture.strokes import Stroke, Target
-from carts_viewer.state import Against, Compare, Curves, JointRange, Maps, Phase, RunState, composed, other_pose
+from carts_viewer.state import Against, Compare, Curves, composed, other_pose
 
 CORNERS = np.array(((5.0, 5.0), (60.0, 5.0), (60.0, 40.0), (5.0, 40.0)))
 
@@ -205,7 +204,8 @@ def test_a_verdict_is_read_with_reason_remedy_and_cameras() -> None:
     verdict = FitVerdict("failed", "Camera right: <no>", "Run again.", 0.8, (("left", 0.01), ("right", 0.8)))
     text = fit_text(verdict, running=False, scores={"left": 0.98, "right": 0.663})
     for part in (
-        "<b>Mask failed</b><br>Camera right: &lt;no&gt;",
+        "<b>Mask failed</b><small>Camera right: &lt;no&gt;</small>",
+        "<p>Camera right: &lt;no&gt;</p>",
         "Run again.",
         "left good Dice 0.980",
         "right failed Dice 0.663",
@@ -213,7 +213,7 @@ def test_a_verdict_is_read_with_reason_remedy_and_cameras() -> None:
         assert part in text
     good = FitVerdict("good", "The image supports the fit.")
     text = fit_text(good, running=False, scores={}, undetermined=["PSM1.roll", "PSM1.wrist_yaw"])
-    assert '<b>Mask good</b>, <b title="PSM1.roll, PSM1.wrist yaw">2 joints not determined</b>' in text
+    assert '<b>Mask good</b><small title="PSM1.roll, PSM1.wrist yaw">2 joints not determined</small>' in text
     assert "all joints determined" in fit_text(good, running=False, scores={}, undetermined=[])
     assert "not checked" in fit_text(None, running=False, scores={})
 
@@ -245,31 +245,27 @@ def test_the_attention_map_of_a_pose_says_nothing_about_a_run(desk: Desk) -> Non
     desk.do(intents.SetSetting("solver", "surface"), intents.ShowLayer(Layer.ATTENTION))
     desk.controller.map()
     assert desk.state.maps is not None and desk.state.maps.iterate.uncertainty is not None
-    assert undetermined_lines(desk.state, desk.session) == ""
+    assert "no</span>" not in "".join(value_rows(desk.state, desk.session))
 
 
-def _state(uncertainty: Uncertainty | None, phase: Phase) -> SimpleNamespace:
-    iterate = SimpleNamespace(uncertainty=uncertainty)
-    start, end = (SimpleNamespace(jaw=value) for value in (0.1, 0.12))
-    run = replace(RunState(), phase=phase, start=start)
-    return SimpleNamespace(maps=Maps(iterate, ("left",)), run=run, pose=SimpleNamespace(scene=end))  # pyright: ignore
+def test_the_table_of_values_shows_what_a_run_moved_and_which_joints_the_image_determines(desk: Desk) -> None:
+    def table() -> str:
+        return "".join(value_rows(desk.state, desk.session))
 
-
-SESSION = SimpleNamespace(
-    ranges={"PSM1": [JointRange("PSM1", "jaw", True, -1.0, 1.0)]}, joints=lambda scene: {"PSM1": [scene.jaw]}
-)
-
-
-KNOWN = Uncertainty(("PSM1/outer_yaw", "PSM1/wrist_yaw", "PSM1/jaw"), (0.01, 0.03, 0.05), (0.05, 0.05, 0.05))
-
-
-def test_joints_that_the_image_leaves_open_are_named_by_how_much_once_the_run_has_ended() -> None:
-    lines = undetermined_lines(_state(KNOWN, Phase.IDLE), SESSION)  # pyright: ignore
-    assert "Weakly determined by this image: PSM1 wrist yaw<" in lines
-    assert "Not determined by this image: PSM1 jaw (moved by +1.1°)<" in lines
-    assert "outer" not in lines
-    assert undetermined_lines(_state(KNOWN, Phase.RUNNING), SESSION) == ""  # pyright: ignore
-    assert undetermined_lines(_state(None, Phase.IDLE), SESSION) == ""  # pyright: ignore
+    assert ">Change</th>" in table() and ">Run</th>" not in table() and ">Image</th>" not in table()
+    desk.do(intents.SetSetting("solver", "surface"), intents.Perturb(2.0, 0), intents.Run())
+    state = desk.finish()
+    assert state.run.start is not None
+    limits = desk.session.ranges["PSM1"][0]
+    before, now = (limits.to_shown(desk.session.joints(s)["PSM1"][0]) for s in (state.run.start, state.pose.scene))
+    known = {arm: value.standard_deviations or () for arm, value in state.project.joints(0).items()}
+    undetermined = undetermined_joints(desk.session.scene, known)
+    assert undetermined is not None
+    assert f"<td>{now - before:+.2f}</td>" in table() and table().count(">no</span>") == len(undetermined)
+    assert table().count(">yes</span>") + len(undetermined) == sum(map(len, desk.session.ranges.values()))
+    # The run is that of the shown frame alone.
+    desk.do(intents.ShowFrame(1))
+    assert ">Run</th>" not in table()
 
 
 def test_base_frames_are_named_only_above_the_threshold() -> None:

@@ -14,7 +14,7 @@ pytestmark = pytest.mark.browser
 def check_status(tab: Tab) -> None:
     """The status is of the shown frame, a label at the pointer of the frame there."""
     page, status, tip = tab.page, tab.page.locator(".carts-strip output"), tab.page.locator(".carts-tip")
-    box, legend = box_of(page.locator(".carts-strip canvas")), page.locator(".carts-strip-legend")
+    box = box_of(page.locator(".carts-strip canvas"))
     expect(status).to_contain_text("001 of 60 · untouched")
     expect(tip).to_be_hidden()
     x = box["x"] + box["width"] * 30.5 / 60
@@ -25,10 +25,11 @@ def check_status(tab: Tab) -> None:
     expect(status).to_contain_text("001 of 60 · untouched")
     page.mouse.move(x, box["y"] - 200)
     expect(tip).to_be_hidden()
-    expect(legend).to_be_hidden()
-    page.get_by_role("button", name="Legend").click()
-    expect(legend).to_contain_text("solving does not change it")
-    page.get_by_role("button", name="Legend").click()
+    timeline = page.get_by_role("slider", name="Timeline", exact=True)
+    for key, frame in (("End", "60"), ("ArrowLeft", "59"), ("Home", "1")):
+        timeline.press(key)
+        expect(timeline).to_have_attribute("aria-valuenow", frame)
+    timeline.blur()
 
 
 def check_range(tab: Tab) -> None:
