@@ -39,6 +39,7 @@ _EVENTS = (
     | intents.MoveFrame
     | intents.Peek
     | intents.Released
+    | intents.ReviewFrames
     | intents.SetRange
     | intents.SetReview
     | intents.ShowCamera

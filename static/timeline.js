@@ -51,6 +51,7 @@
         <span class="carts-range"></span>
         <button data-do="whole" title="Remove the range" aria-label="Remove the range">${icon("x")}</button>
         <select aria-label="Curve" title="Draw a curve over all frames: a joint, the loss, Dice or the probability of failure"></select>
+        <button data-do="frames" title="All frames as a table or a gallery" aria-label="Frames">${icon("table")}</button>
         <button data-do="lanes" title="Show or hide thumbnails and curve" aria-label="Thumbnails and curve"></button>
         <output></output>
       </div>
@@ -79,6 +80,7 @@
     const actions = {
       first: () => window.carts.report("Pressed", { key: "(" }), last: () => window.carts.report("Pressed", { key: ")" }),
       whole: () => window.carts.report("SetRange", { frames: null }),
+      frames: () => window.carts.openFrames(),
       lanes: () => { open = !open; localStorage.setItem("carts-lanes", open ? "open" : "closed"); dirty = true; },
     };
     strip.addEventListener("click", (event) => actions[event.target.closest("button")?.dataset.do]?.());
@@ -389,6 +391,9 @@
     },
     timeline: () => ({ view, frames, here, range, solving, code: (frame) => codes[frame], x: (frame) => xOf(frame + 0.5) }),
     showFrames: show,
+    reviewNames: NAMES,
+    nameOf: (frame) => name(frame),
+    thumbnailOf: (frame) => `/thumbnail/${shown.active ?? 0}/${Math.max(known.domains.indexOf(shown.domain), 0)}/${frame}.jpg`,
   });
   everyFrame();
 })();

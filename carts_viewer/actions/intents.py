@@ -581,6 +581,14 @@ class ReviewMatching(Intent):
     state: ReviewState
 
 
+class ReviewFrames(Intent):
+    """Set the review state of these frames, as one undo step; notes are kept."""
+
+    frames: list[int]
+    """Indices of frames; others are ignored."""
+    state: ReviewState
+
+
 class ClearFilter(Intent):
     """Clear all conditions of the filter."""
 

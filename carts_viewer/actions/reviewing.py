@@ -13,6 +13,7 @@ from carts_core.model.scene import SceneState
 from carts_core.optimization.keypoints import Pin, fit_keypoints
 from carts_core.project import Change, Key, Review, ReviewState, Source, next_unreviewed, worst_first
 from carts_core.project.values import MAX_NOTE_LENGTH
+from carts_core.wording import counted
 from carts_viewer.actions import intents
 from carts_viewer.actions.context import Context, Handler, clamped
 from carts_viewer.actions.frame_filter import FrameFilter, matching_frames
@@ -224,16 +225,27 @@ class FilterHandler(Handler):
         self._show(index=index)
 
     def _on_ReviewMatching(self, intent: intents.ReviewMatching) -> None:
-        frames, project = self._found(), self._context.session.editor.view
+        self._review_all(self._found(), intent.state)
+
+    def _on_ReviewFrames(self, intent: intents.ReviewFrames) -> None:
+        count = len(self._context.session.sequence)
+        frames = sorted({index for index in intent.frames if 0 <= index < count})
+        if not frames:
+            raise CartsError(f"None of the {len(intent.frames)} frames is in this recording of {count} frames.")
+        self._review_all(frames, intent.state)
+
+    def _review_all(self, frames: list[int], state: ReviewState) -> None:
+        """Set the review state of frames as one undo step."""
+        project = self._context.session.editor.view
         self._context.end_run("Stopped: many frames were reviewed")
         edits: dict[Key[Any], Any] = {}
         for index in frames:
-            review = Review(intent.state, project.review(index).note)
+            review = Review(state, project.review(index).note)
             edits[Key.review(index)] = None if review == Review() else review
         # Applied without the context, which would name every frame in the step.
         self._context.save()
-        of = " of" if intent.state is ReviewState.UNTOUCHED else ""
-        self._context.session.editor.apply(f"{_REVIEW_STEPS[intent.state]}{of} {len(frames)} frames", edits)
+        of = " of" if state is ReviewState.UNTOUCHED else ""
+        self._context.session.editor.apply(f"{_REVIEW_STEPS[state]}{of} {counted(len(frames), 'frame')}", edits)
         self._context.refresh()
 
     def _found(self) -> list[int]:

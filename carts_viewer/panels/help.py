@@ -289,6 +289,7 @@ def set_hints(page: PanelPage) -> list[str]:
 _SCRIPTS = {
     "Light or dark": ("toggleTheme",),
     "Loupe": ("toggleLoupe",),
+    "Frames": ("openFrames",),
     "Keys": ("showSheet",),
     "Take the tour": ("startTour",),
     "Copy link": ("copyLink",),

@@ -4,6 +4,7 @@ import viser
 
 from carts_viewer.panels.browse import BrowsePanel, OverlayPanel
 from carts_viewer.panels.fit import FitPanel, LivePanel
+from carts_viewer.panels.frames import FramesData
 from carts_viewer.panels.help import HelpPanel, set_hints
 from carts_viewer.panels.import_export import ExportPanel, ImportPanel
 from carts_viewer.panels.inputs import Panel, PanelPage
@@ -76,7 +77,7 @@ class Layout:
         right.dock_right()
         right.set_width(_WIDTH)
         self.timeline = TimelineData(page, session)
-        self.panels = [*panels, self.joints, ScriptState(page, session), self.timeline]
+        self.panels = [*panels, self.joints, ScriptState(page, session), self.timeline, FramesData(page)]
 
 
 def _review(page: PanelPage, session: Session, state: ViewState) -> list[Panel]:

@@ -214,8 +214,6 @@ _ICONS = (
     "brackets-contain-start",
     "brackets-contain-end",
     "table",
-    "ruler-measure",
-    "grid-dots",
 )
 """Icons that the page's scripts use."""
 
@@ -228,6 +226,7 @@ _SCRIPTS = (
     "drag",
     "lanes",
     "timeline",
+    "frames",
     "tour",
     "shell",
     "document",

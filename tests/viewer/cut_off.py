@@ -4,7 +4,10 @@ from playwright.sync_api import Page
 
 _FIND = """() => {
     const found = [];
-    const shown = (one) => one.getClientRects().length > 0 && getComputedStyle(one).visibility !== 'hidden';
+    // Labels of buttons that show an icon are for screen readers alone.
+    const unseen = (one) => getComputedStyle(one).clipPath !== 'none' && one.clientWidth <= 1;
+    const shown = (one) =>
+        one.getClientRects().length > 0 && getComputedStyle(one).visibility !== 'hidden' && !unseen(one);
     const clipped = (one) => {
         for (let box = one.parentElement; box; box = box.parentElement) {
             // A panel that scrolls shows everything sooner or later, but only up and down.
