@@ -30,7 +30,6 @@
         make("span", {}, button("view", "Gallery"), button("all", "Choose all"), ...Object.keys(REVIEWS).map((name) => button(name, name)))),
       make("div", { class: "carts-frames-list", tabindex: "0", role: "group", "aria-label": "List of frames" }));
     sheet.addEventListener("click", onClick);
-    sheet.addEventListener("dblclick", (event) => { const row = event.target.closest("[data-row]"); if (row) open(Number(row.dataset.row)); });
     sheet.addEventListener("input", draw);
     sheet.addEventListener("close", () => { window.carts.report("Pressed", { key: "frames-closed" }); });
     sheet.addEventListener("keydown", (event) => {
@@ -108,6 +107,7 @@
     else if (action === "view") { gallery = !gallery; localStorage.setItem("carts-frames", gallery ? "gallery" : "table"); }
     else if (action === "all") { const all = found(); chosen = new Set(chosen.size === all.length ? [] : all.map((one) => one.index)); }
     else if (action) window.carts.report("ReviewFrames", { frames: [...chosen], state: REVIEWS[action] });
+    else if (row && event.detail === 2) { open(Number(row.dataset.row)); return; } // the first click drew a new row
     else if (row) choose(Number(row.dataset.row), event);
     else return;
     draw();

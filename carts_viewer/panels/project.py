@@ -42,9 +42,9 @@ class SavedPanel:
         elif not self._storage.kept:
             text = "Not saved" if state.unsaved else escaped(path.name)
         elif state.unsaved:
-            text = "Saving …"
+            text = "Not saved yet …"
         else:
-            text = "Saved"
+            text = "<b>Saved</b>"
         self._text.content = (
             f'<p class="carts-caption carts-saved" title="{escaped(str(path))}"><span>{text}</span></p>'
         )

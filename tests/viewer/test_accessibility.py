@@ -11,13 +11,14 @@ from pathlib import Path
 
 import pytest
 from clicked_points import clicked
-from playwright.sync_api import Browser, Page
-from viewer_tab import dismiss_warning, new_context
+from playwright.sync_api import Browser, Page, expect
+from viewer_tab import OpenTab, dismiss_warning, new_context
 from visitor import Visitor, write_lab_files
-from waiting import eventually
+from waiting import eventually, wait_in
 
 from carts_core.model.camera import HALF_PIXEL
 from carts_core.recording import Sequence
+from carts_viewer.actions import intents
 from carts_viewer.start.site import Site
 from carts_viewer.wizard.wizard import RecordingWizard
 
@@ -89,3 +90,22 @@ def test_each_page_from_the_start_to_the_clicked_points(
         page.locator(".files").wait_for()
         page.keyboard.press("Escape")
         page.locator(".files").wait_for(state="detached")
+
+
+def test_the_viewer_with_each_tab_and_sheet(open_tab: OpenTab) -> None:
+    tab = open_tab(window=(1280, 800), width=160, height=120)
+    page = tab.page
+    tab.put(intents.Perturb(2.0, 0), intents.Assess(), intents.Download(1))
+    page.evaluate(Path(AXE or "").read_text(encoding="utf-8"))
+    for scheme in ("dark", "light"):
+        wait_in(page, f"document.documentElement.dataset.mantineColorScheme === '{scheme}'")
+        for name in ("Optimize", "Review", "Values", "Jobs", "Live", "Export"):
+            tab.open(name)
+            eventually(lambda: page.evaluate(_FOUND), lambda found: found == [])
+        for opened, sheet in (("Frames", "Frames"), ("Keys", "Keys")):
+            page.get_by_role("button", name=opened, exact=True).click()
+            expect(page.get_by_role("dialog", name=sheet)).to_be_visible()
+            assert page.evaluate(_FOUND) == [], f"{sheet}, {scheme} theme"
+            tab.press("Escape")
+            expect(page.get_by_role("dialog", name=sheet)).to_be_hidden()
+        page.get_by_role("button", name="Light or dark").click()
