@@ -168,6 +168,8 @@ HINTS = {
     "Redo": "Redo the last undone step (Ctrl+Shift+Z)",
     # Sequence
     "Frame": "Number of the shown frame, from 1; N and B show the next and the previous frame",
+    "Previous frame": "Previous frame (B)",
+    "Next frame": "Next frame (N)",
     "Play": "Play the sequence, or the range in the timeline, in a loop (space)",
     "Frames/s": "Playback rate [frames/s]",
     "Domain": "Variant of the images to show and optimize; all variants have the same joint positions",
