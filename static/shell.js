@@ -227,7 +227,8 @@
   /** Name the parts of sliders and the buttons of the header for screen readers, and let groups be opened by keys. */
   function nameWidgets() {
     for (const label of document.querySelectorAll("label[for]")) {
-      const control = document.getElementById(label.htmlFor);
+      // viser's labels do not refer to its fields of text.
+      const control = document.getElementById(label.htmlFor) ?? label.closest(".mantine-Flex-root")?.querySelector("input");
       const name = label.textContent.trim();
       if (!control || !name) continue;
       set(control.querySelector("[role=slider]"), "aria-label", name);
