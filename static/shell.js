@@ -240,7 +240,7 @@
       set(heading, "tabindex", "0");
       set(heading, "aria-expanded", String(heading.nextElementSibling?.getAttribute("aria-hidden") !== "true"));
     }
-    set(document.querySelector("[data-dock-header] button"), "aria-label", "Find an action (Ctrl+K)");
+    set(document.querySelector(".mantine-ActionIcon-root:has(+ .mantine-ActionIcon-root)"), "aria-label", "Find an action (Ctrl+K)");
   }
   setInterval(() => (window.requestIdleCallback ?? setTimeout)(nameWidgets), 1000);
   window.addEventListener("keydown", (event) => {
