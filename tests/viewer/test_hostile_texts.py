@@ -292,7 +292,7 @@ def test_names_of_files_columns_and_drafts_stay_texts_on_the_start_page_and_in_n
         site.wait()
         page = opened(site.url, WINDOWS[0])
         main = page.locator("main")
-        main.get_by_role("heading", name="CaRTS").wait_for()
+        main.get_by_role("heading", name="Correct a robot's kinematics from its image").wait_for()
         check(page, texts)
         main.get_by_role("button", name="Open a sequence file …").click()
         main.locator(".files button:enabled", has_text="toml").first.click()
