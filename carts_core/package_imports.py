@@ -1,12 +1,11 @@
-"""Imports of packages: optional dependencies, and deferred imports."""
+"""Imports of packages: optional dependencies, and imports on first use."""
 
 import gc
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from importlib import import_module
 from importlib.util import find_spec
-from types import ModuleType
 
 from .errors import CartsError
 
@@ -42,23 +41,20 @@ def gc_paused() -> Iterator[None]:
             gc.enable()
 
 
-class _Later(ModuleType):
-    """Placeholder for a module that is imported on first use."""
+def names_on_first_use(package: str, modules: Mapping[str, tuple[str, ...]]) -> Callable[[str], object]:
+    """`__getattr__` of a package that imports names from its modules on first use.
 
-    def __getattr__(self, name: str) -> object:
-        return getattr(import_module(self.__name__), name)
+    Args:
+        package: the package's `__name__`.
+        modules: module, relative to the package -> names.
+    """
+    module_of = {name: f"{package}.{module}" for module, names in modules.items() for name in names}
 
+    def getattr_(name: str) -> object:
+        if name not in module_of:
+            raise AttributeError(f"module {package!r} has no attribute {name!r}")
+        value = getattr(import_module(module_of[name]), name)
+        setattr(sys.modules[package], name, value)
+        return value
 
-@contextmanager
-def deferred_import(package: str, name: str) -> Iterator[None]:
-    """Make `from package import name` in the block import the module `name` on first use."""
-    whole = f"{package}.{name}"
-    if whole in sys.modules:
-        yield
-        return
-    parent = import_module(package)
-    setattr(parent, name, _Later(whole))
-    try:
-        yield
-    finally:
-        delattr(parent, name)
+    return getattr_

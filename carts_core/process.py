@@ -39,17 +39,17 @@ def tune_process() -> None:
 
     Freed memory is kept for the next image, which is faster; a server returns memory with `return_memory`.
     """
-    _leave_a_core_free()
-    _keep_memory()
+    leave_a_core_free()
+    keep_memory()
 
 
-def _leave_a_core_free() -> None:
+def leave_a_core_free() -> None:
     """Limit torch to one thread less than the number of cores, four at most, unless `OMP_NUM_THREADS` is set.
 
     Each parallel step waits for its slowest thread: with another process on one core, an iteration took 2.6 s instead
         of 0.1 s.
     """
-    if "OMP_NUM_THREADS" not in os.environ:
+    if "OMP_NUM_THREADS" not in os.environ and not _TUNED.core_left_free:
         import torch  # noqa: PLC0415  child processes without torch import this module, too
 
         torch.set_num_threads(max(1, min((os.cpu_count() or 2) - 1, MAX_THREADS)))
@@ -69,7 +69,7 @@ def inference_threads() -> int:
     return torch.get_num_threads()
 
 
-def _keep_memory() -> None:
+def keep_memory() -> None:
     """Make glibc keep the memory of images instead of returning it to the system.
 
     The system clears each new page on first access, which increased the time of a 640x480 px rendering from 16 ms to 29

@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
-import torch
 
 from .errors import OutputError, SettingsError
 from .files import OutputPath, append_line, holds_file, remove_file, write_text
@@ -61,14 +60,14 @@ def code_fingerprint(patterns: tuple[str, ...]) -> str:
 
 def robot_fingerprint(robot: Robot) -> str:
     """Fingerprint of a robot's joints, kinematics and meshes."""
-    probes = torch.tensor(_PROBES, dtype=torch.float64)[:, None].expand(-1, len(robot.joint_names))
+    probes = np.tile(np.array(_PROBES, np.float64)[:, None], len(robot.joint_names))
     meshes = [(mesh.link, mesh.vertices, mesh.normals, mesh.faces, mesh.color) for mesh in robot.meshes]
     return fingerprint(
         robot.joint_names,
         robot.joint_types,
-        robot.joint_limits.numpy(),
+        robot.joint_limits,
         robot.link_names,
-        robot.forward_kinematics(probes).numpy(),
+        robot.forward_kinematics(probes),
         meshes,
     )
 

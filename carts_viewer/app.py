@@ -1,8 +1,10 @@
 """The viewer of one sequence: page, tabs and worker, and the dispatch of browser events to tabs."""
 
 import logging
+import threading
 from collections.abc import Callable
 from contextlib import ExitStack
+from importlib import import_module
 from pathlib import Path
 from typing import Any, Unpack
 
@@ -166,7 +168,8 @@ class ViewerApp:
         self.page.thumbnail = self._thumbnails.answer
         self._worker = Worker(queue, self.tabs)
         EventDispatcher(self.page, self.tabs, self._worker, sequence)
-        self._worker.start(self._prepare)
+        self._imports = threading.Thread(target=self._import_solver, name="carts-imports", daemon=True)
+        self._worker.start(self._imports.start)
 
     @classmethod
     def open(
@@ -253,6 +256,9 @@ class ViewerApp:
             return
         self._closed = True
         self._worker.stop()
+        if self._imports.is_alive():
+            # An import cannot be interrupted, and the interpreter must not end during one.
+            self._imports.join()
         if self._own_page:
             self.page.close()
         self._thumbnails.close()
@@ -271,8 +277,13 @@ class ViewerApp:
             raise TimeoutError(f"The viewer was still busy after {timeout} s.")
         return self.state
 
+    def _import_solver(self) -> None:
+        """Import the solver after the first picture, in a thread of its own, so that the page stays responsive."""
+        import_module("carts_core.optimization.sequence")
+        self._worker.call(self._prepare)
+
     def _prepare(self) -> None:
-        """Load the networks on the worker, after the first picture."""
+        """Load the networks on the worker."""
         try:
             self._optimizers.prepare()
         finally:

@@ -7,9 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from jaxtyping import Bool, Float
-from torch import Tensor
 
 from carts_core.errors import CartsError, ProjectError, SequenceError
 from carts_core.model.perturbation import perturb
@@ -130,7 +128,7 @@ class Session:
 
     def measured(self, frame: Frame) -> SceneState:
         """The frame's measured state, with the project's calibration."""
-        return calibrated_scene(self.scene, self.editor.view).state(frame.measured, mounts=frame.mounts)
+        return calibrated_scene(self.scene, self.editor.view).state(frame.measured, None, frame.mounts)
 
     def edits(
         self,
@@ -150,23 +148,23 @@ class Session:
             joint_std: arm -> standard deviations [rad, m], NaN if unknown.
         """
         saved = self.editor.project.state
-        before, measured = self.pose(frame, saved).scene, self.scene.state(frame.measured, mounts=frame.mounts)
+        before, measured = self.pose(frame, saved).scene, self.scene.state(frame.measured, None, frame.mounts)
         edits: dict[Key[Any], Any] = {}
         for row, arm in enumerate(self.scene.arms):
             key, values = Key.joints(frame.index, arm.name), state.joint_positions[row]
-            if torch.equal(values, before.joint_positions[row]):
+            if np.array_equal(values, before.joint_positions[row]):
                 edits[key] = saved.get(key)
-            elif torch.equal(values, measured.joint_positions[row]):
+            elif np.array_equal(values, measured.joint_positions[row]):
                 edits[key] = None
             else:
-                edits[key] = joint_correction(values.numpy(), provenance, (joint_std or {}).get(arm.name))
-            if not torch.equal(state.T_world_base[row], before.T_world_base[row]):
+                edits[key] = joint_correction(values, provenance, (joint_std or {}).get(arm.name))
+            if not np.array_equal(state.T_world_base[row], before.T_world_base[row]):
                 edits[Key.base_frame(arm.name)] = _transform(state.T_world_base[row], provenance)
         for row, camera in enumerate(self.scene.cameras):
             transform, intrinsics = state.T_camera_world[row], state.intrinsics[row]
-            if not torch.equal(transform, before.T_camera_world[row]):
+            if not np.array_equal(transform, before.T_camera_world[row]):
                 edits[Key.extrinsics(camera.name)] = _transform(transform, provenance)
-            if not torch.equal(intrinsics, before.intrinsics[row]):
+            if not np.array_equal(intrinsics, before.intrinsics[row]):
                 edits[Key.intrinsics(camera.name)] = CorrectedIntrinsics(tuple(intrinsics.tolist()), provenance)
         return edits
 
@@ -191,7 +189,7 @@ class Session:
         values = {}
         for name, correction in corrections.items():
             here = np.asarray(frame.measured[name], np.float64)
-            low, high = self.scene.arm(name).robot.joint_limits.numpy().T
+            low, high = self.scene.arm(name).robot.joint_limits.T
             moved = here + np.array(correction.joint_positions) - source.measured[name]
             values[name] = np.clip(moved, np.minimum(low, here), np.maximum(high, here))
         return self.with_joints(self.measured(frame), values)
@@ -208,7 +206,7 @@ class Session:
         return replace(
             state,
             joint_positions=tuple(
-                torch.as_tensor(values[arm.name], dtype=torch.float32) if arm.name in values else old
+                np.asarray(values[arm.name], np.float32) if arm.name in values else old
                 for arm, old in zip(self.scene.arms, state.joint_positions, strict=True)
             ),
         )
@@ -224,7 +222,7 @@ class Session:
     def joints(self, state: SceneState) -> dict[str, Float[np.ndarray, " dofs"]]:
         """Joint positions [rad, m] by arm name."""
         return {
-            arm.name: values.numpy().astype(np.float64)
+            arm.name: values.astype(np.float64)
             for arm, values in zip(self.scene.arms, state.joint_positions, strict=True)
         }
 
@@ -247,7 +245,7 @@ def joint_correction(
     return JointCorrection(tuple(joint_positions.tolist()), provenance, std)
 
 
-def _transform(matrix: Float[Tensor, "4 4"], provenance: Provenance) -> CorrectedTransform:
+def _transform(matrix: Float[np.ndarray, "4 4"], provenance: Provenance) -> CorrectedTransform:
     return CorrectedTransform(tuple(tuple(row) for row in matrix.tolist()), provenance)
 
 

@@ -5,16 +5,15 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
-import torch
 from jaxtyping import Bool
 
 from carts_core.errors import SettingsError
+from carts_core.model.keypoints import Pin
 from carts_core.model.scene import Arm, SceneState
-from carts_core.optimization import FreeParameters, GivenMasks, Iterate, SolverSettings
-from carts_core.optimization.keypoints import Pin
+from carts_core.optimization import FreeParameters, GivenMasks, SolverSettings
 from carts_core.project import FitVerdict, IgnoreRegion, Key, MaskCorrection, PartLabels, ProjectState, Review, Source
 from carts_core.project.masks import project_masks
 from carts_core.project.values import WHOLE_PROJECT
@@ -27,6 +26,9 @@ from .actions.frame_filter import FrameFilter
 from .jobs.job_list import Job
 from .picture.layers import Layer, Rgba
 from .picture.strokes import Brush
+
+if TYPE_CHECKING:
+    from carts_core.optimization import Iterate
 
 
 class Against(StrEnum):
@@ -257,11 +259,11 @@ class Pose:
 
     def equals(self, other: "Pose") -> bool:
         """Whether all values and the source are equal."""
-        pairs = zip(_tensors(self.scene), _tensors(other.scene), strict=True)
-        return self.source is other.source and all(torch.equal(own, others) for own, others in pairs)
+        pairs = zip(_arrays(self.scene), _arrays(other.scene), strict=True)
+        return self.source is other.source and all(np.array_equal(own, others) for own, others in pairs)
 
 
-def _tensors(scene: SceneState) -> tuple[torch.Tensor, ...]:
+def _arrays(scene: SceneState) -> tuple[np.ndarray, ...]:
     return (*scene.joint_positions, scene.T_world_base, scene.T_camera_world, scene.intrinsics, scene.T_mount_world)
 
 
@@ -298,7 +300,7 @@ class Curves:
 class Maps:
     """Maps of the optimizer at the shown pose, at its working resolution."""
 
-    iterate: Iterate
+    iterate: "Iterate"
     cameras: tuple[str, ...]
     """Cameras of the iterate's maps, in the same order."""
     of_run: bool = True

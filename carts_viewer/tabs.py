@@ -10,7 +10,7 @@ from typing import Generic, TypeVar
 import viser
 
 from carts_core.errors import CartsError
-from carts_core.optimization import Backgrounds, FreeParameters, SurfaceSolver
+from carts_core.optimization import FreeParameters, SurfaceSolver
 from carts_core.recording import Sequence
 from carts_viewer.actions import intents
 from carts_viewer.actions.import_export import Deliver
@@ -294,7 +294,7 @@ class Tabs:
         """Drop cached images of the recording and values computed from them."""
         self._sequence.forget_images()
         for session in (self._session, *(tab.session for tab in self._tabs)):
-            Backgrounds.forget(session.sequence)
+            self._optimizers.forget_images(session.sequence)
 
     def close(self) -> None:
         """Save all unfinished work.

@@ -112,10 +112,11 @@ def main(arguments: list[str] | None = None) -> None:
             # The imports may take seconds on a busy machine.
             Terminal(stderr=True).print(f"carts {arguments[0]}: starting", style="dim")
         with gc_paused():
-            from ..process import tune_process
+            from ..process import keep_memory, tune_process
 
         log_to_stderr()
-        tune_process()
+        # The viewer imports PyTorch only to solve.
+        keep_memory() if isinstance(command, View) else tune_process()
         with stopped_by_signals():
             command.run()
     except CartsError as error:

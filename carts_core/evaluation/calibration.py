@@ -17,7 +17,7 @@ from ..optimization import CalibrationResult
 from ..recording import Frame, Sequence, calibrated_sequence_file
 from ..rendering import Renderer
 from ..wording import counted
-from .evaluate import dice
+from .metrics import dice
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

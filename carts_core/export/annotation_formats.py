@@ -10,7 +10,6 @@ from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
-import torch
 import trimesh
 from jaxtyping import Bool, Float, UInt8
 from numpy import ndarray
@@ -149,7 +148,7 @@ def _annotations(
 ) -> Iterable[Annotation]:
     """Annotation of an arm in a view; empty if neither pixels nor keypoints of the arm are in the image."""
     mask = dataset.label_image(view, "arms") == category.id
-    pixels = project_keypoints(dataset.scene, dataset.state(view.frame), points, view.camera.name).double().numpy()
+    pixels = project_keypoints(dataset.scene, dataset.state(view.frame), points, view.camera.name)
     values: list[float] = []
     for u, v in pixels:
         inside = bool(np.isfinite([u, v]).all()) and 0 <= u < view.camera.width and 0 <= v < view.camera.height
@@ -403,10 +402,10 @@ def _row(dataset: Dataset, view: View) -> int:
 
 def _bop_camera(dataset: Dataset, view: View) -> dict[str, Any]:
     state, row = dataset.state(view.frame), _row(dataset, view)
-    T_view_world = state.T_view_world[row].double().numpy()
+    T_view_world = state.T_view_world[row].astype(np.float64)
     return {
         # BOP tools follow OpenCV's convention: the centre of the first pixel is at 0.
-        "cam_K": opencv_matrix(state.intrinsics[row].double().tolist()).ravel().tolist(),
+        "cam_K": opencv_matrix(state.intrinsics[row].tolist()).ravel().tolist(),
         "depth_scale": 1.0,
         "cam_R_w2c": T_view_world[:3, :3].ravel().tolist(),
         "cam_t_w2c": (_MM * T_view_world[:3, 3]).tolist(),
@@ -429,7 +428,7 @@ def _bop_links(
         name = f"{view.frame.index:06d}_{len(poses):06d}.png"
         write_bytes(folder / "mask" / name, mask_png(whole))
         write_bytes(folder / "mask_visib" / name, mask_png(visible))
-        T = Ts[one.link].double().numpy()
+        T = Ts[one.link].astype(np.float64)
         pose = {"cam_R_m2c": T[:3, :3].ravel().tolist(), "cam_t_m2c": (_MM * T[:3, 3]).tolist(), "obj_id": one.id}
         poses.append(pose)
         seen.append(
@@ -445,15 +444,14 @@ def _bop_links(
     return poses, seen
 
 
-@torch.no_grad()
 def _silhouette(
-    dataset: Dataset, view: View, state: SceneState, Ts: Float[torch.Tensor, "links 4 4"], link: int
+    dataset: Dataset, view: View, state: SceneState, Ts: Float[ndarray, "links 4 4"], link: int
 ) -> Bool[np.ndarray, "height width"]:
     """Silhouette of a link without occlusion."""
     geometry = dataset.renderers[view.camera.name].geometry
     own = geometry.face_links == link
-    points = vertices_in_camera(geometry, Ts).mT.contiguous().numpy()
-    faces, surfaces = geometry.faces[own].numpy(), geometry.face_surfaces[own].numpy()
+    points = vertices_in_camera(geometry, Ts).T
+    faces, surfaces = geometry.faces[own], geometry.face_surfaces[own]
     intrinsics = state.intrinsics[_row(dataset, view)].tolist()
     face_ids, _ = rasterize(points, faces, intrinsics, view.camera.width, view.camera.height, surfaces)
     return face_ids >= 0

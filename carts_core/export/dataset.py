@@ -7,7 +7,7 @@ from collections.abc import Sequence as Items
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path, PurePath
-from typing import Literal, TypeVar
+from typing import TYPE_CHECKING, Literal, TypeVar
 
 import numpy as np
 from jaxtyping import Bool, Int, UInt, UInt8
@@ -20,17 +20,19 @@ from ..files.reading import IMAGE, read_bytes
 from ..model.camera import Camera
 from ..model.parts import link_classes, part_classes
 from ..model.scene import Scene, SceneState
-from ..networks import FeatureExtractor
-from ..optimization import Backgrounds, MaskRefiner, NetworkPredictor
 from ..project import Key, MaskCorrection, ProjectState, Source
 from ..project.state import corrected_state, source_of
 from ..recording import Sequence
-from ..rendering import Renderer
+from ..rendering import ImageRenderer
 from ..reprs import short_repr
 from ..settings import Images, Masks, Parts
 from ..wording import counted
 from .encodings import image_png, mask_png
 from .kinematics import KinematicsRow
+
+if TYPE_CHECKING:
+    from ..networks import FeatureExtractor
+    from ..optimization import NetworkPredictor
 
 
 @dataclass(frozen=True)
@@ -139,7 +141,7 @@ def project_frame(
         frame.frame_id,
         _SOURCES[source_of(project, index)],
         {
-            arm.name: values.numpy().astype(np.float64)
+            arm.name: values.astype(np.float64)
             for arm, values in zip(recording.scene.arms, pose.joint_positions, strict=True)
         },
         {arm: np.array(std, float) for arm, std in known.items() if std is not None} or None,
@@ -232,7 +234,7 @@ class Dataset:
     """Frame rate of a video [1/s]; None for the recorded rate."""
     masks: Masks = "rendered"
     """Masks that are refined; painted and given masks are not changed."""
-    load_networks: Callable[[], FeatureExtractor] | None = None
+    load_networks: "Callable[[], FeatureExtractor] | None" = None
     """Function that loads the networks when the first mask is refined; without it, masks are rendered."""
     rendered_folder: OutputPath | None = None
     """Folder for the rendered masks of refined views."""
@@ -294,16 +296,16 @@ class Dataset:
         return link_classes(self.scene.arms)
 
     @cached_property
-    def renderers(self) -> dict[str, Renderer]:
+    def renderers(self) -> dict[str, ImageRenderer]:
         """Camera -> renderer of that camera only, at full resolution."""
         return {
-            camera.name: Renderer(self.scene, width=camera.width, height=camera.height, cameras=[camera.name])
+            camera.name: ImageRenderer(self.scene, width=camera.width, height=camera.height, cameras=[camera.name])
             for camera in self.scene.cameras
         }
 
     def state(self, frame: ExportFrame) -> SceneState:
         """State of the scene in a frame, with its joint positions and camera poses."""
-        return self.scene.state(frame.joint_positions, mounts=self.sequence.mounts(frame.index))
+        return self.scene.state(frame.joint_positions, device=None, mounts=self.sequence.mounts(frame.index))
 
     def mask_source(self, frame: ExportFrame, camera: Camera) -> MaskSource:
         """Source of the mask of a view."""
@@ -334,13 +336,17 @@ class Dataset:
             yield View(number, frame, camera, name, link_ids, source)
 
     @cached_property
-    def _predictor(self) -> NetworkPredictor:
+    def _predictor(self) -> "NetworkPredictor":
+        from ..optimization import NetworkPredictor  # noqa: PLC0415
+
         assert self.load_networks is not None
         return NetworkPredictor(self.load_networks())
 
     def _refined(
         self, frame: ExportFrame, camera: Camera, rendered: Bool[ndarray, "height width"]
     ) -> Bool[ndarray, "height width"]:
+        from ..optimization import Backgrounds, MaskRefiner  # noqa: PLC0415
+
         refiner = MaskRefiner(self._predictor, Backgrounds.of(self.sequence, (camera.name,), self.domain))
         recorded = self.sequence.frame(frame.index, self.domain, [camera.name])
         masks = refiner.refine(self.scene, recorded, self.state(frame), {camera.name: rendered}, frame.ignored)

@@ -13,7 +13,6 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
-import torch
 from scipy.spatial.transform import Rotation
 
 from ..files import OutputPath, output_stream
@@ -156,7 +155,7 @@ def psm_geometry(robot: Robot) -> PsmGeometry | None:
     columns = [names.index(name) for name in JOINT_NAMES]
     joints = np.zeros((3, len(names)))
     joints[:, columns] = [[0.1, 0.2, 0.12, 0.3, 0.4, 0.5], [-0.3, 0.1, 0.15, -0.5, 0.2, -0.4], [0, 0, 0.1, 0, 0, 0]]
-    origins = robot.forward_kinematics(torch.from_numpy(joints)).numpy()[:, :, :3, 3]
+    origins = robot.forward_kinematics(joints)[:, :, :3, 3]
     best, distance = None, _SAME_LINK
     for geometry in CANDIDATES.values():
         tips = forward(joints[:, columns], geometry)[:, None, :3, 3]

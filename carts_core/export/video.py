@@ -6,25 +6,22 @@ from fractions import Fraction
 import av
 import cv2
 import numpy as np
-import torch
 from jaxtyping import Bool, UInt8
 
 from ..files import OutputPath, output_stream, unique_file_names
 from ..model.scene import SceneState
-from ..rendering import Renderer
+from ..rendering import ImageRenderer
 from .dataset import Dataset, ExportProgress, View
 
 _CONTOUR = (80, 255, 120)
 
 
 def image_and_mask(
-    renderer: Renderer, state: SceneState
+    renderer: ImageRenderer, state: SceneState
 ) -> tuple[UInt8[np.ndarray, "height width 3"], Bool[np.ndarray, "height width"]]:
     """RGB rendering of the first camera, and its mask."""
-    with torch.no_grad():
-        rendering = renderer(state)
-    image = (rendering.image[0].movedim(0, -1) * 255.0).to(torch.uint8).numpy()
-    return image, rendering.silhouette[0].numpy() > 0.5
+    images, arms = renderer.shaded(state)
+    return (np.moveaxis(images[0], 0, -1) * 255.0).astype(np.uint8), arms[0] >= 0
 
 
 def overlay(

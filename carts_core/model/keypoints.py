@@ -9,10 +9,9 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 import numpy as np
-import torch
 from jaxtyping import Float
-from torch import Tensor
 
+from ..arrays import Array, converted, library
 from .robot import Robot
 from .scene import Arm, Scene, SceneState
 
@@ -35,6 +34,16 @@ class Keypoint:
     """Position in the link's frame [m]."""
 
 
+@dataclass(frozen=True)
+class Pin:
+    """A keypoint with its manually set position in an image."""
+
+    keypoint: Keypoint
+    camera: str
+    pixel: tuple[float, float]
+    """Column and row in the camera's full-size image, pixel centres at 0.5 [px]."""
+
+
 def keypoints(arm: Arm) -> tuple[Keypoint, ...]:
     """Keypoints of an arm, from the tip backwards: the tips of its last links, then the links' joints.
 
@@ -53,8 +62,9 @@ def keypoints(arm: Arm) -> tuple[Keypoint, ...]:
 
 def project_keypoints(
     scene: Scene, state: SceneState, points: Sequence[Keypoint], camera: str
-) -> Float[Tensor, "points 2"]:
-    """Projections of points into a camera's image [px], differentiable; NaN behind the camera.
+) -> Float[Array, "points 2"]:
+    """Projections of points into a camera's image [px]; NaN behind the camera. A tensor, differentiable, for a state of
+    tensors; an array for a state of arrays.
 
     Raises:
         RobotError: the camera or an arm does not exist.
@@ -65,30 +75,29 @@ def project_keypoints(
         name: scene.arm(name).robot.forward_kinematics(state.joint_positions[arms[name]])
         for name in dict.fromkeys(point.arm for point in points)
     }
-    pixels = []
+    pixels, of = [], library(state.intrinsics)
+    fx_fy, cx_cy = state.intrinsics[view][:2], state.intrinsics[view][2:]
     for point in points:
         T_camera_base = state.T_view_world[view] @ state.T_world_base[arms[point.arm]]
         T_camera_link = T_camera_base @ links[point.arm][point.link]
-        p_camera = T_camera_link[:3, :3] @ T_camera_link.new_tensor(point.position) + T_camera_link[:3, 3]
-        fx_fy, cx_cy = state.intrinsics[view].split(2)
-        depth = torch.where(p_camera[2] > 0, p_camera[2], torch.nan)
+        p_camera = T_camera_link[:3, :3] @ converted(np.array(point.position), T_camera_link) + T_camera_link[:3, 3]
+        depth = of.where(p_camera[2:] > 0, p_camera[2:], np.nan)
         pixels.append(fx_fy * p_camera[:2] / depth + cx_cy)
-    return torch.stack(pixels) if pixels else state.intrinsics.new_zeros(0, 2)
+    return of.stack(pixels) if pixels else state.intrinsics[:0, :2]
 
 
 def _moved_by(robot: Robot) -> np.ndarray:
     """Whether each link is moved by each degree of freedom [links, dofs]."""
-    rest = torch.full((len(robot.joint_names),), 0.01, dtype=torch.float64)
+    rest = np.full(len(robot.joint_names), 0.01)
     before = robot.forward_kinematics(rest)
-    after = robot.forward_kinematics(rest + 0.01 * torch.eye(len(rest), dtype=torch.float64))
-    return ((after - before).abs().amax((-2, -1)) > 1e-9).T.numpy()
+    after = robot.forward_kinematics(rest + 0.01 * np.eye(len(rest)))
+    return (np.abs(after - before).max((-2, -1)) > 1e-9).T
 
 
 def _joints(robot: Robot, depth: np.ndarray) -> list[tuple[int, str]]:
     """Joint centres, starting at the base: the link to which each is fixed, and its name."""
     # Positions other than 0 are used, since at 0 distinct joints may coincide.
-    somewhere = torch.full((len(robot.joint_names),), 0.1, dtype=torch.float64)
-    origins = robot.forward_kinematics(somewhere)[:, :3, 3].numpy()
+    origins = robot.forward_kinematics(np.full(len(robot.joint_names), 0.1))[:, :3, 3]
     groups: list[list[int]] = []
     for link in sorted(np.flatnonzero(depth).tolist(), key=lambda index: depth[index]):
         together = (group for group in groups if np.linalg.norm(origins[group[0]] - origins[link]) < _SAME_POINT)
@@ -194,7 +203,7 @@ def link_transforms(
     arm: Arm, joint_positions: Float[np.ndarray, "frames dofs"]
 ) -> Float[np.ndarray, "frames links 4 4"]:
     """Transforms from the links to the base frame, in double precision [m]."""
-    return arm.robot.forward_kinematics(torch.as_tensor(np.asarray(joint_positions, np.float64))).numpy()
+    return arm.robot.forward_kinematics(np.asarray(joint_positions, np.float64))
 
 
 def _shaft(arm: Arm) -> tuple[int, tuple[float, float, float], tuple[float, float, float], float] | None:

@@ -9,7 +9,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 from jaxtyping import Int
 
 from .robot import SLENDER, Robot
@@ -60,9 +59,8 @@ def link_parts(robot: Robot) -> Int[np.ndarray, " links"]:
     links that move with the shaft (the longest mesh, if slender) are not part of the wrist.
     """
     dofs = len(robot.joint_names)
-    probes = torch.cat([torch.zeros(1, dofs), _PROBE * torch.eye(dofs)]).double()
-    Ts = robot.forward_kinematics(probes)
-    movers = ((Ts[1:] - Ts[:1]).abs().amax((-2, -1)) > 1e-9).sum(0).numpy()
+    Ts = robot.forward_kinematics(np.vstack([np.zeros(dofs), _PROBE * np.eye(dofs)]))
+    movers = (np.abs(Ts[1:] - Ts[:1]).max((-2, -1)) > 1e-9).sum(0)
     # All links of a robot without a wrist belong to the shaft.
     wrist = max(movers.max() - 2, _shaft_movers(robot, movers) + 1)
     return (movers >= wrist).astype(int) + (movers >= wrist + 1)

@@ -33,6 +33,6 @@ def perturb(
         if joints is not None:
             step = step * [name in joints.get(arm.name, ()) for name in robot.joint_names]
         start = np.asarray(joint_positions[arm.name], dtype=np.float64)
-        low, high = robot.joint_limits.numpy().T
+        low, high = robot.joint_limits.T
         moved[arm.name] = np.clip(start + step, np.minimum(low, start), np.maximum(high, start))
     return moved

@@ -1,6 +1,5 @@
 """Robot model: checked URDF, joints, differentiable forward kinematics and link meshes."""
 
-import copy
 import io
 import math
 from collections import Counter
@@ -10,28 +9,20 @@ from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
 
 import numpy as np
-import torch
 import trimesh
 import yourdfpy
 from jaxtyping import Float
-from torch import Tensor
 
+from ..arrays import Array, converted, library
 from ..errors import RobotError
 from ..files.reading import ROBOT, is_regular, read_text
-from ..package_imports import deferred_import
 from ..wording import listed, shown
 from . import mesh_cache
 from .instruments import robot_file
 from .meshes import CLUSTERING_RATIO, Decimation, LinkMesh, build_link_meshes, collada_asset, load_visual, mesh_path
 
-# The kinematics parser needs matplotlib only for plots, and the import takes 0.2 s.
-with deferred_import("matplotlib", "pyplot"):
-    import pytorch_kinematics
-
 NO_LIMIT = 1e3
 """Joint limit [rad], [m] above which a joint is considered unlimited."""
-_JOINT_PARTS = ("parent", "child", "origin", "axis", "mimic")
-"""Elements of a joint that define its motion; limits and dynamics have required attributes, which many URDFs omit."""
 ROUND_OFF = 1e-5
 """Distance [rad] below which angles are set to a multiple of 90 degrees: URDF exporters print 1.5708 for pi/2."""
 
@@ -49,69 +40,55 @@ def exact_right_angles(root: Element) -> None:
             origin.set("rpy", " ".join(repr(float(angle)) for angle in angles))
 
 
-def _skeleton(urdf_text: str) -> str:
-    """Links and joints of the URDF, without elements that the kinematics parser warns about."""
-    root = ElementTree.fromstring(urdf_text)
-    for child in list(root):
-        if child.tag not in ("link", "joint"):
-            root.remove(child)
-        elif child.tag == "link":
-            for part in list(child):
-                child.remove(part)
-        else:
-            for part in list(child):
-                if part.tag not in _JOINT_PARTS:
-                    child.remove(part)
-            if child.find("axis") is None:
-                ElementTree.SubElement(child, "axis", xyz="1 0 0")  # URDF's default axis; the parser's default is z
-    return ElementTree.tostring(root, encoding="unicode")
-
-
 class Kinematics:
     """Forward kinematics of a robot's links from its independent joint positions.
 
+    The transform of a link in its parent's frame is C + S sin(q) + G cos(q) + P q with constant matrices C, S, G and P,
+    where q is the position of the joint between them; see `_joint_matrices`.
+
     Args:
-        urdf_text: text of the URDF, with exact right angles.
-        base_link: reference frame of the transforms, which must not move with a joint.
+        base_link: reference frame of the transforms, which must not move with a joint; None for the root.
     """
 
-    def __init__(self, model: yourdfpy.URDF, urdf_text: str, base_link: str | None, source: Path) -> None:
+    def __init__(self, model: yourdfpy.URDF, base_link: str | None, source: Path) -> None:
         self.joint_names: tuple[str, ...] = tuple(model.actuated_joint_names)
         joints = model.joint_map
         self.joint_types: tuple[str, ...] = tuple(
             "prismatic" if joints[name].type == "prismatic" else "revolute" for name in self.joint_names
         )
-        self.joint_limits: Float[Tensor, "dofs 2"] = torch.tensor(
-            [_limits(joints[name]) for name in self.joint_names], dtype=torch.float64
+        self.joint_limits: Float[np.ndarray, "dofs 2"] = np.array(
+            [_limits(joints[name]) for name in self.joint_names], np.float64
         ).reshape(-1, 2)
-        links = list(model.link_map)
-        children = {joint.child for joint in joints.values()}
-        self.base_link = base_link or next(link for link in links if link not in children)
+        above = {joint.child: joint for joint in joints.values()}
+        links = _from_root(list(model.link_map), above)
+        self.base_link = base_link or links[0]
         if self.base_link not in links:
             raise RobotError(f"{source}: there is no link {self.base_link!r}. The links are: {', '.join(links)}.")
-        chain = pytorch_kinematics.build_chain_from_urdf(_skeleton(urdf_text)).to(dtype=torch.float64)
-        self._chains = {torch.device("cpu"): chain}
-        self._frame_index = {name: int(chain.get_frame_indices(name)[0]) for name in links}
-        self._expand, self._offset = _mimic_matrix(model, chain.get_joint_parameter_names())
-        self._T_base_root = self._base_transform(source)
-
-    def _base_transform(self, source: Path) -> Tensor:
-        probes = torch.stack([torch.zeros(len(self.joint_names)), torch.full((len(self.joint_names),), 0.1)]).double()
+        self._frame_index = {name: index for index, name in enumerate(links)}
+        self._parents = [self._frame_index[above[name].parent] for name in links[1:]]
+        moving = [above[name] for name in links[1:]]
+        matrices = np.array([_joint_matrices(joint) for joint in moving]).reshape(-1, 4, 4, 4)
+        self._constants = (*_mimic_matrix(model, moving), *matrices.swapaxes(0, 1))
+        probes = np.stack([np.zeros(len(self.joint_names)), np.full(len(self.joint_names), 0.1)])
         Ts_root_base = self._Ts_root(probes)[self._frame_index[self.base_link]]
-        if not torch.allclose(Ts_root_base[0], Ts_root_base[1]):
+        if not np.allclose(Ts_root_base[0], Ts_root_base[1]):
             raise RobotError(f"{source}: base link {self.base_link!r} moves with a joint. Choose a fixed link.")
-        return torch.linalg.inv(Ts_root_base[0])
+        self._T_base_root = np.linalg.inv(Ts_root_base[0])
 
-    def _Ts_root(self, joint_positions: Float[Tensor, "n dofs"]) -> Float[Tensor, "links n 4 4"]:
-        device = joint_positions.device
-        if device not in self._chains:
-            self._chains[device] = copy.deepcopy(self._chains[torch.device("cpu")]).to(device=device)
-        expand, offset = self._expand.to(device), self._offset.to(device)
-        return self._chains[device].forward_kinematics_tensor(joint_positions @ expand.T + offset)
+    def _Ts_root(self, joint_positions: Float[Array, "n dofs"]) -> list[Float[Array, "n 4 4"]]:
+        """Transforms of all links to the root, in the order of `_frame_index`."""
+        expand, offset, C, S, G, P = (converted(values, joint_positions) for values in self._constants)
+        q = (joint_positions @ expand.T + offset)[:, :, None, None]
+        of = library(q)
+        Ts_parent_link = C + S * of.sin(q) + G * of.cos(q) + P * q
+        Ts = [of.broadcast_to(converted(np.eye(4), q), (len(q), 4, 4))]
+        for index, parent in enumerate(self._parents):
+            Ts.append(Ts[parent] @ Ts_parent_link[:, index])
+        return Ts
 
     def __call__(
-        self, joint_positions: Float[Tensor, "*batch dofs"], link_names: tuple[str, ...]
-    ) -> Float[Tensor, "*batch links 4 4"]:
+        self, joint_positions: Float[Array, "*batch dofs"], link_names: tuple[str, ...]
+    ) -> Float[Array, "*batch links 4 4"]:
         """Ts_base_link [m] of the named links; computed in double precision, returned in the precision of the input.
 
         Raises:
@@ -126,11 +103,44 @@ class Kinematics:
         for name in link_names:
             if name not in self._frame_index:
                 raise RobotError(f"the robot has no link {shown(name)}. Its links: {listed(self._frame_index)}.")
-        batch = joint_positions.shape[:-1]
-        Ts_root = self._Ts_root(joint_positions.reshape(-1, dofs).double())
-        index = torch.tensor([self._frame_index[name] for name in link_names], device=joint_positions.device)
-        Ts_base = self._T_base_root.to(joint_positions.device) @ Ts_root[index]
-        return Ts_base.transpose(0, 1).reshape(*batch, len(link_names), 4, 4).to(joint_positions.dtype)
+        of, q = library(joint_positions), joint_positions.reshape(-1, dofs)
+        double = q.astype(np.float64) if of is np else q.double()
+        Ts_root = self._Ts_root(double)
+        Ts_root_link = of.stack([Ts_root[self._frame_index[name]] for name in link_names], 1)
+        Ts = (converted(self._T_base_root, double) @ Ts_root_link).reshape(*joint_positions.shape[:-1], -1, 4, 4)
+        return Ts.astype(joint_positions.dtype) if of is np else Ts.to(joint_positions.dtype)
+
+
+def _from_root(links: list[str], above: dict[str, yourdfpy.Joint]) -> list[str]:
+    """Links such that each follows its parent; `above` is the joint above each link but the root."""
+    ordered = [link for link in links if link not in above]
+    children: dict[str, list[str]] = {}
+    for link in links:
+        if link in above:
+            children.setdefault(above[link].parent, []).append(link)
+    for link in ordered:  # grows in the loop
+        ordered += children.get(link, [])
+    return ordered
+
+
+def _joint_matrices(joint: yourdfpy.Joint) -> Float[np.ndarray, "4 4 4"]:
+    """Constant matrices C, S, G, P with T_parent_child = C + S sin(q) + G cos(q) + P q.
+
+    For a revolute joint with the cross product matrix K of its unit axis, Rodrigues' formula is
+    R = I + K^2 + K sin(q) - K^2 cos(q).
+    """
+    origin = np.eye(4) if joint.origin is None else np.asarray(joint.origin, np.float64)
+    matrices = np.zeros((4, 4, 4))
+    matrices[0] = np.eye(4)
+    if joint.type != "fixed":
+        x, y, z = axis = np.asarray(joint.axis, np.float64) / np.linalg.norm(joint.axis)
+        if joint.type == "prismatic":
+            matrices[3, :3, 3] = axis
+        else:
+            K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+            matrices[0, :3, :3] += K @ K
+            matrices[1, :3, :3], matrices[2, :3, :3] = K, -K @ K
+    return origin @ matrices
 
 
 def _limits(joint: yourdfpy.Joint) -> tuple[float, float]:
@@ -145,18 +155,19 @@ def _limits(joint: yourdfpy.Joint) -> tuple[float, float]:
     return lower, upper
 
 
-def _mimic_matrix(model: yourdfpy.URDF, parameters: list[str]) -> tuple[Tensor, Tensor]:
-    """Matrix and offset that map independent joint positions to all joint positions of the chain."""
+def _mimic_matrix(model: yourdfpy.URDF, joints: list[yourdfpy.Joint]) -> tuple[np.ndarray, np.ndarray]:
+    """Matrix and offset that map independent joint positions to the positions of all joints; 0 for fixed joints."""
     independent = list(model.actuated_joint_names)
-    expand = torch.zeros(len(parameters), len(independent), dtype=torch.float64)
-    offset = torch.zeros(len(parameters), dtype=torch.float64)
-    for row, name in enumerate(parameters):
-        factor, shift, joint = 1.0, 0.0, model.joint_map[name]
-        while joint.mimic is not None:
-            shift += factor * (joint.mimic.offset or 0.0)
-            factor *= joint.mimic.multiplier if joint.mimic.multiplier is not None else 1.0
-            joint = model.joint_map[joint.mimic.joint]
-        expand[row, independent.index(joint.name)] = factor
+    expand, offset = np.zeros((len(joints), len(independent))), np.zeros(len(joints))
+    for row, joint in enumerate(joints):
+        if joint.type == "fixed":
+            continue
+        factor, shift, leader = 1.0, 0.0, joint
+        while (mimic := leader.mimic) is not None:
+            shift += factor * (mimic.offset or 0.0)
+            factor *= mimic.multiplier if mimic.multiplier is not None else 1.0
+            leader = model.joint_map[mimic.joint]
+        expand[row, independent.index(leader.name)] = factor
         offset[row] = shift
     return expand, offset
 
@@ -434,7 +445,7 @@ class Robot:
             model = yourdfpy.URDF.load(
                 io.BytesIO(text.encode()), load_meshes=False, build_scene_graph=False, mesh_dir=str(urdf.parent)
             )
-            kinematics = Kinematics(model, text, base_link, urdf)
+            kinematics = Kinematics(model, base_link, urdf)
         except FileNotFoundError as error:
             raise RobotError(f"robot {urdf} is missing. Give the path of a URDF file.") from error
         except RobotError:
@@ -458,8 +469,9 @@ class Robot:
             remarks = (*remarks, f"{decimation}.")
         return Robot(model.robot.name, urdf, kinematics, link_names, meshes, decimation, remarks)
 
-    def forward_kinematics(self, joint_positions: Float[Tensor, "*batch dofs"]) -> Float[Tensor, "*batch links 4 4"]:
-        """Ts_base_link [m] of the links in `link_names`, differentiable (f_FK of the paper).
+    def forward_kinematics(self, joint_positions: Float[Array, "*batch dofs"]) -> Float[Array, "*batch links 4 4"]:
+        """Ts_base_link [m] of the links in `link_names` (f_FK of the paper): an array for an array of joint positions,
+        a tensor for a tensor, differentiable.
 
         Raises:
             RobotError: the number of joint positions is wrong.
@@ -467,8 +479,8 @@ class Robot:
         return self._kinematics(joint_positions, self.link_names)
 
     def link_transform(
-        self, joint_positions: Float[Tensor, "*batch dofs"], link_name: str
-    ) -> Float[Tensor, "*batch 4 4"]:
+        self, joint_positions: Float[Array, "*batch dofs"], link_name: str
+    ) -> Float[Array, "*batch 4 4"]:
         """T_base_link [m] of any link of the URDF, with or without a mesh.
 
         Raises:
@@ -556,8 +568,7 @@ def _tolerance(
     longest = max((np.sort(mesh.extents) for _, mesh, _ in parts), key=lambda extents: extents[-1])
     if longest[-2] < SLENDER * longest[-1]:
         return INSTRUMENT_TOLERANCE
-    rest = torch.zeros(len(kinematics.joint_names), dtype=torch.float64)
-    Ts = kinematics(rest, link_names).numpy()
+    Ts = kinematics(np.zeros(len(kinematics.joint_names)), link_names)
     reach = max(
         np.linalg.norm(mesh.bounding_box.vertices @ Ts[link, :3, :3].T + Ts[link, :3, 3], axis=1).max()
         for link, mesh, _ in parts

@@ -2,13 +2,13 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
-import torch
 from jaxtyping import Float
 from numpy.typing import ArrayLike
-from torch import Tensor
 
+from ..arrays import Array, as_array
 from ..errors import RobotError
 from ..reprs import short_repr
 from ..wording import closest
@@ -48,29 +48,29 @@ class Light:
 class SceneState:
     """Optimizable values of a scene: a point, or a batch of points, in parameter space.
 
-    Fields are tensors that may carry gradients; `*batch` dimensions are hypotheses.
+    Fields are tensors, which may carry gradients, or NumPy arrays; `*batch` dimensions are hypotheses.
     """
 
-    joint_positions: tuple[Float[Tensor, "*batch dofs"], ...]
+    joint_positions: tuple[Float[Array, "*batch dofs"], ...]
     """Joint positions of each arm, in the scene's order [rad, m] (K of the paper)."""
-    T_world_base: Float[Tensor, "*batch arms 4 4"]
+    T_world_base: Float[Array, "*batch arms 4 4"]
     """Base frames (F_B of the paper)."""
-    T_camera_world: Float[Tensor, "*batch cameras 4 4"]
+    T_camera_world: Float[Array, "*batch cameras 4 4"]
     """Camera extrinsics (C of the paper); `T_camera_mount` for a moving camera."""
-    intrinsics: Float[Tensor, "*batch cameras 4"]
+    intrinsics: Float[Array, "*batch cameras 4"]
     """fx, fy, cx, cy of the full-size image [px]."""
-    T_mount_world: Float[Tensor, "*batch cameras 4 4"]
+    T_mount_world: Float[Array, "*batch cameras 4 4"]
     """Measured poses of the camera mounts in this frame; the identity for static cameras."""
 
     __repr__ = short_repr
 
     @property
-    def T_view_world(self) -> Float[Tensor, "*batch cameras 4 4"]:
+    def T_view_world(self) -> Float[Array, "*batch cameras 4 4"]:
         """Transforms from the world to each camera in this frame."""
         return self.T_camera_world @ self.T_mount_world
 
     def map(self, function) -> "SceneState":
-        """Apply a function to every tensor."""
+        """Apply a function to every field."""
         return SceneState(
             tuple(function(value) for value in self.joint_positions),
             function(self.T_world_base),
@@ -92,9 +92,15 @@ class SceneState:
         """Copy that shares neither memory nor gradients with this state."""
         return self.map(lambda value: value.detach().clone())
 
-    def to(self, device: str | torch.device) -> "SceneState":
-        """Copy of the state on another device."""
-        return self.map(lambda value: value.to(device))
+    def to(self, device: Any) -> "SceneState":
+        """The state as tensors on a PyTorch device."""
+        import torch  # noqa: PLC0415
+
+        return self.map(lambda value: torch.as_tensor(value, device=device))
+
+    def numpy(self) -> "SceneState":
+        """The state as NumPy arrays, without gradients; memory is shared if possible."""
+        return self.map(as_array)
 
 
 @dataclass(frozen=True)
@@ -144,26 +150,25 @@ class Scene:
 
     def distance(self, state: SceneState) -> float:
         """Median distance of the link centres from the cameras [m], at one state (no batch)."""
-        found = []
+        state, found = state.numpy(), []
         for arm, joints, T_world_base in zip(self.arms, state.joint_positions, state.T_world_base, strict=True):
             Ts = state.T_view_world[:, None] @ (T_world_base @ arm.robot.forward_kinematics(joints))
-            middles = [
-                Ts[:, mesh.link, :3, :3] @ torch.tensor(mesh.vertices.mean(0)).to(Ts) + Ts[:, mesh.link, :3, 3]
-                for mesh in arm.robot.meshes
-            ]
-            found += [middle.norm(dim=-1) for middle in middles]
-        return float(torch.cat(found).median())
+            for mesh in arm.robot.meshes:
+                T = Ts[:, mesh.link]
+                found.append(np.linalg.norm(T[:, :3, :3] @ mesh.vertices.mean(0) + T[:, :3, 3], axis=-1))
+        return float(np.median(np.concatenate(found)))
 
     def state(
         self,
         joint_positions: Mapping[str, ArrayLike],
-        device: str | torch.device = "cpu",
+        device: Any = "cpu",
         mounts: Mapping[str, Float[np.ndarray, "4 4"]] | None = None,
     ) -> SceneState:
         """State of the scene at given joint positions, with the scene's calibration.
 
         Args:
             joint_positions: arm name -> values `[*batch, dofs]` in the order of `Robot.joint_names`.
+            device: PyTorch device of the tensors; None for NumPy arrays.
             mounts: camera name -> T_mount_world [m], for moving cameras.
 
         Raises:
@@ -175,7 +180,7 @@ class Scene:
                 raise RobotError(
                     f"joint positions of arm {arm.name!r} are missing; given: {', '.join(joint_positions)}."
                 )
-            value = torch.as_tensor(np.asarray(joint_positions[arm.name]), dtype=torch.float32, device=device)
+            value = np.asarray(joint_positions[arm.name]).astype(np.float32)
             if value.shape[-1] != len(arm.robot.joint_names):
                 raise RobotError(
                     f"arm {arm.name!r} has {len(arm.robot.joint_names)} degrees of freedom "
@@ -184,14 +189,14 @@ class Scene:
             values.append(value)
         batch = values[0].shape[:-1]
 
-        def constant(array: np.ndarray) -> Tensor:
-            tensor = torch.tensor(array, dtype=torch.float32, device=device)
-            return tensor.expand(*batch, *tensor.shape)
+        def constant(array: np.ndarray) -> np.ndarray:
+            return np.broadcast_to(array.astype(np.float32), (*batch, *array.shape)).copy()
 
-        return SceneState(
+        state = SceneState(
             tuple(values),
             constant(np.stack([arm.T_world_base for arm in self.arms])),
             constant(np.stack([camera.T_camera_world for camera in self.cameras])),
             constant(np.array([camera.intrinsics for camera in self.cameras])),
             constant(np.stack([(mounts or {}).get(camera.name, np.eye(4)) for camera in self.cameras])),
         )
+        return state if device is None else state.to(device)

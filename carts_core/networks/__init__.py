@@ -1,4 +1,16 @@
 """Inference of the networks, and hybrid images."""
 
-from .extractor import FeatureExtractor as FeatureExtractor
-from .extractor import hybrid as hybrid
+from typing import TYPE_CHECKING
+
+from ..package_imports import names_on_first_use
+
+if TYPE_CHECKING:
+    from .extractor import FeatureExtractor as FeatureExtractor
+    from .extractor import hybrid as hybrid
+
+__getattr__ = names_on_first_use(
+    __name__,
+    {
+        "extractor": ("FeatureExtractor", "hybrid"),
+    },
+)

@@ -28,9 +28,6 @@ from .stages import Fit, Point, StopReason, run_stages
 from .variables import Variables
 from .verdict import Assessment
 
-BASE_FRAME_GAIN = 0.12
-"""Share of the residual explained by free base frames above which base frames are probably wrong [1]."""
-
 _BLUR = 3.0
 """Blur of the linear model, approximately its range of validity [px of the working image]."""
 

@@ -16,6 +16,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 from torch.nn import functional
 
+from ..arrays import as_array
 from ..compiled import compiled
 from ..imaging.working_image import (
     Window,
@@ -32,7 +33,6 @@ from ..imaging.working_image import (
 from ..model.parts import COVERAGE, NORMALS, SURFACE_CHANNELS
 from ..model.scene import Scene, SceneState
 from ..rendering import JacobianBlock, Outline, Renderer, SurfaceRendering
-from ..rendering.rasterizer import as_array
 from ..settings import SurfaceSolver
 from ..settings.stages import AlignEdges, Descend
 from ..threads import one_thread, total

@@ -2,33 +2,20 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
-import torch
 from jaxtyping import Float
 from scipy.optimize import least_squares
-from torch import Tensor
 
 from ..errors import SettingsError
-from ..model.keypoints import Keypoint, project_keypoints
+from ..model.keypoints import Pin, project_keypoints
 from ..model.scene import Scene, SceneState
-from ..settings import FreeParameters, SurfaceSolver
+from ..settings import SurfaceSolver
 from ..settings.ranges import Count, Positive, Ranged
-from .variables import Variables
 
 _ROOM = 1e-12
 """Minimum distance of the start from a joint limit [rad]."""
-
-
-@dataclass(frozen=True)
-class Pin:
-    """A keypoint with its manually set position in an image."""
-
-    keypoint: Keypoint
-    camera: str
-    pixel: tuple[float, float]
-    """Column and row in the camera's full-size image, pixel centres at 0.5 [px]."""
 
 
 @dataclass(frozen=True)
@@ -50,6 +37,7 @@ class KeypointFit:
     """Result of fitting the arms to pins."""
 
     state: SceneState
+    """State with NumPy arrays."""
     residuals: tuple[float, ...]
     """Distance of each pin from its keypoint [px]."""
     iterations: int
@@ -73,47 +61,48 @@ def fit_keypoints(
     if not pins:
         raise SettingsError("no keypoint is placed. Place at least one keypoint in the image.")
     settings = settings or KeypointSettings()
-    arms = tuple(dict.fromkeys(pin.keypoint.arm for pin in pins))
-    variables = Variables(scene, start.map(torch.Tensor.double), FreeParameters(arms=arms), settings.length_scale)
-    # Only joints are free, and the unknowns are in radian-like units.
-    weight = 1.0 / math.radians(settings.prior_deg)
+    names = [arm.name for arm in scene.arms]
+    free = [names.index(scene.arm(name).name) for name in dict.fromkeys(pin.keypoint.arm for pin in pins)]
+    start = start.numpy().map(lambda values: values.astype(np.float64))
+    joints = np.concatenate([start.joint_positions[arm] for arm in free])
+    robots = [scene.arms[arm].robot for arm in free]
+    kinds = [kind for robot in robots for kind in robot.joint_types]
+    # The unknowns are offsets in radian-like units.
+    scales = np.where([kind == "prismatic" for kind in kinds], settings.length_scale, 1.0)
+    limits = np.concatenate([robot.joint_limits for robot in robots])
+    ends = np.cumsum([len(robot.joint_names) for robot in robots])[:-1]
     by_camera: dict[str, list[int]] = {}
     for row, pin in enumerate(pins):
         by_camera.setdefault(pin.camera, []).append(row)
+    wanted = np.array([pin.pixel for pin in pins])
 
-    def distances(offsets: Float[Tensor, " n"]) -> Float[Tensor, "pins 2"]:
-        state, found = variables.state(offsets), offsets.new_zeros(len(pins), 2)
+    def state(offsets: Float[np.ndarray, " n"]) -> SceneState:
+        moved = dict(zip(free, np.split(joints + scales * offsets, ends), strict=True))
+        return replace(start, joint_positions=tuple(moved.get(i, q) for i, q in enumerate(start.joint_positions)))
+
+    def distances(offsets: Float[np.ndarray, " n"]) -> Float[np.ndarray, "pins 2"]:
+        found, at = np.empty_like(wanted), state(offsets)
         for camera, rows in by_camera.items():
-            points = [pins[row].keypoint for row in rows]
-            wanted = offsets.new_tensor([pins[row].pixel for row in rows])
-            found = found.index_put((torch.tensor(rows),), project_keypoints(scene, state, points, camera) - wanted)
-        return found
+            found[rows] = project_keypoints(scene, at, [pins[row].keypoint for row in rows], camera)
+        return found - wanted
 
-    def residuals(offsets: Float[Tensor, " n"]) -> Float[Tensor, " m"]:
-        return torch.cat([distances(offsets).flatten() / settings.pixel_error, weight * offsets])
+    def residuals(offsets: Float[np.ndarray, " n"]) -> Float[np.ndarray, " m"]:
+        prior = offsets / math.radians(settings.prior_deg)
+        return np.concatenate([distances(offsets).ravel() / settings.pixel_error, prior])
 
-    def jacobian(offsets: np.ndarray) -> np.ndarray:
-        found = torch.autograd.functional.jacobian(residuals, torch.from_numpy(offsets), vectorize=True)
-        assert isinstance(found, Tensor)
-        return found.numpy()
-
-    origin = torch.zeros(len(variables), dtype=torch.float64)
-    if not residuals(origin).isfinite().all():
+    origin = np.zeros(len(joints))
+    if not np.isfinite(residuals(origin)).all():
         raise SettingsError(
             "a keypoint is behind its camera. First move the arm in front of the camera with its sliders."
         )
+    lower, upper = (limits - joints[:, None]).T / scales
     fit = least_squares(
-        lambda offsets: residuals(torch.from_numpy(offsets)).numpy(),
-        origin.numpy(),
-        jac=jacobian,  # pyright: ignore[reportArgumentType]
+        residuals,
+        origin,
         # The method requires a start strictly inside the joint limits.
-        bounds=(
-            np.minimum(variables.lower.double().numpy(), -_ROOM),
-            np.maximum(variables.upper.double().numpy(), _ROOM),
-        ),
+        bounds=(np.minimum(lower, -_ROOM), np.maximum(upper, _ROOM)),
         x_scale="jac",
         max_nfev=settings.iterations,
     )
-    offsets = torch.from_numpy(fit.x)
-    errors = distances(offsets).norm(dim=-1)
-    return KeypointFit(variables.state(offsets).map(torch.Tensor.float), tuple(errors.tolist()), int(fit.nfev))
+    errors = np.linalg.norm(distances(fit.x), axis=-1)
+    return KeypointFit(state(fit.x).map(np.float32), tuple(errors.tolist()), int(fit.nfev))

@@ -1,9 +1,8 @@
 """Evaluations of an objective, their standard deviations, and the observability of joints."""
 
-import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 import torch
@@ -11,21 +10,13 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ..reprs import short_repr
-from ..settings import SurfaceSolver
-from ..wording import counted
 from .factors import Prior
+from .indications import DETERMINED
 from .variables import Variables
-
-if TYPE_CHECKING:
-    from ..model.scene import Scene
-
 
 Observability = Literal["determined", "weak", "not visible"]
 
-_DETERMINED, _VISIBLE = 1 / 3, 0.9
-_OPEN_ANGLE = _DETERMINED * math.radians(SurfaceSolver.prior_deg)
-_OPEN_LENGTH = _OPEN_ANGLE * SurfaceSolver.length_scale
-"""Standard deviation above which a joint is not determined [rad, m]."""
+_VISIBLE = 0.9
 
 
 @dataclass(frozen=True)
@@ -49,7 +40,7 @@ class Uncertainty:
         all."""
         index = self.names.index(name)
         share = self.std[index] / self.expected[index] if self.std_ratio is None else self.std_ratio[index]
-        return "determined" if share < _DETERMINED else "weak" if share < _VISIBLE else "not visible"
+        return "determined" if share < DETERMINED else "weak" if share < _VISIBLE else "not visible"
 
     def joint_std(self, arm: str, joints: Sequence[str]) -> Float[np.ndarray, " dofs"]:
         """Standard deviation of joint positions of an arm [rad, m]; NaN where a joint was not free."""
@@ -73,46 +64,6 @@ class Uncertainty:
     def rescaled(self, later: "Uncertainty") -> "Uncertainty":
         """Standard deviations under a rescaled prior; observability still refers to the original prior."""
         return replace(later, std_ratio=tuple(std / given for std, given in zip(self.std, self.expected, strict=True)))
-
-
-def undetermined_joints(
-    scene: "Scene", joint_std: Mapping[str, Sequence[float | None] | np.ndarray]
-) -> list[str] | None:
-    """`ARM.JOINT` of each joint whose standard deviation after a fit exceeds a third of the prior's.
-
-    Args:
-        joint_std: arm -> standard deviations [rad, m]; None and NaN (fixed joints) are ignored.
-
-    Returns:
-        The names; None if no standard deviation is known.
-    """
-    known, undetermined = False, []
-    for arm in scene.arms:
-        named = zip(arm.robot.joint_names, arm.robot.joint_types, joint_std.get(arm.name, ()), strict=False)
-        for joint, kind, std in named:
-            if std is None or math.isnan(std):
-                continue
-            known = True
-            if std > (_OPEN_LENGTH if kind == "prismatic" else _OPEN_ANGLE):
-                undetermined.append(f"{arm.name}.{joint}")
-    return undetermined if known else None
-
-
-def fit_words(verdict: str, undetermined: Sequence[str] | None) -> str:
-    """Verdict on the mask and number of undetermined joints as text: `mask good, 4 joints not determined`.
-
-    Args:
-        undetermined: result of `undetermined_joints`; None if no standard deviation is known.
-    """
-    joints = joint_words(undetermined)
-    return f"mask {verdict}, {joints}" if joints else f"mask {verdict}"
-
-
-def joint_words(undetermined: Sequence[str] | None) -> str:
-    """Number of undetermined joints as text; empty if no standard deviation is known."""
-    if undetermined is None:
-        return ""
-    return f"{counted(len(undetermined), 'joint')} not determined" if undetermined else "all joints determined"
 
 
 def uncertainty(

@@ -1,13 +1,13 @@
 """Predictors of surface maps: the network, and given masks."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Protocol, Self
 
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from ..errors import SettingsError
@@ -15,6 +15,7 @@ from ..imaging.working_image import Window
 from ..model.parts import COVERAGE, NORMALS, SURFACE_CHANNELS
 from ..networks.extractor import FeatureExtractor
 from ..recording import Frame
+from .given_masks import GivenMask
 
 
 class FramePredictor(Protocol):
@@ -113,31 +114,8 @@ def predictor_of(source: "FeatureExtractor | SurfacePredictor") -> SurfacePredic
     return NetworkPredictor(source) if isinstance(source, FeatureExtractor) else source
 
 
-GivenMask = Bool[np.ndarray, "h w"] | Float[np.ndarray, "h w"]
-"""Coverage of each pixel by all arms, in [0, 1]."""
-
 _STRIDE = 8
 """Stride without a network [px]."""
-
-
-@dataclass(frozen=True, eq=False)
-class GivenMasks:
-    """Masks that are not part of the recording, by frame."""
-
-    origin: str
-    """Name of such a mask in messages, such as "imported mask"."""
-    masks: Callable[[int], Mapping[str, GivenMask]]
-    """Frame index -> camera name -> mask at the camera's size, for the cameras with a mask."""
-    available: Callable[[int, str], bool]
-    """(frame index, camera name) -> whether a mask is available."""
-    ignored: Callable[[int], Mapping[str, Bool[np.ndarray, "h w"]]] = lambda _: {}
-    """Frame index -> camera name -> unlabelled pixels, which are not compared."""
-
-    def filled(self, frame: Frame) -> Frame:
-        """Copy of the frame with these masks for cameras without recorded masks."""
-        masks = {**self.masks(frame.index), **(frame.masks or {})}
-        whole = {name: np.asarray(mask) >= 0.5 for name, mask in masks.items()}
-        return replace(frame, masks=whole or None)
 
 
 class MaskPredictor:

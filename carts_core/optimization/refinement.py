@@ -84,7 +84,9 @@ class MaskRefiner:
                 backgrounds=self.backgrounds if self.backgrounds.covers(one) else None,
             )
             stage = Observe(scale=_SCALE, margin=round(2 * _BAND))
-            seen = observe(images, predictor, state.with_camera(index), stage).whole_coverage()[0].cpu().numpy()
+            seen = (
+                observe(images, predictor, state.to("cpu").with_camera(index), stage).whole_coverage()[0].cpu().numpy()
+            )
             refined[name] = _fused(mask, seen, images.size[0] / images.scale)
             if name in ignore:
                 refined[name] = np.where(ignore[name], mask, refined[name])

@@ -4,7 +4,6 @@ import math
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
-from enum import StrEnum
 
 import numpy as np
 import torch
@@ -19,6 +18,7 @@ from ..networks.extractor import FeatureExtractor
 from ..recording import Frame
 from ..settings import SurfaceSolver
 from ..threads import total
+from .indications import LIKELY, POSSIBLE, Verdict
 from .observability import Uncertainty
 from .observation import MIN_AREA_RATIO, FrameImages
 from .predictor import FramePredictor, SurfacePredictor, predictor_of
@@ -234,21 +234,6 @@ def _share(part: Float[Tensor, "cameras 1 h w"], whole: Float[Tensor, "cameras 1
     return total(part * whole) / max(total(whole), 1e-6)
 
 
-class Verdict(StrEnum):
-    """Reliability of a fit."""
-
-    GOOD = "good"
-    DOUBTFUL = "doubtful"
-    FAILED = "failed"
-
-    @classmethod
-    def of(cls, probability: float) -> "Verdict":
-        """Verdict from the probability of failure [1]."""
-        if probability >= _LIKELY:
-            return cls.FAILED
-        return cls.DOUBTFUL if probability >= _POSSIBLE else cls.GOOD
-
-
 @dataclass(frozen=True)
 class Assessment:
     """Verdict on a fit, with its reason."""
@@ -279,16 +264,15 @@ class Assessment:
         return known.doubted(1.0 if self.verdict is Verdict.FAILED else self.probability)
 
 
-_UNCERTAIN, _POSSIBLE, _LIKELY = 0.1, 0.13, 0.5
-"""Minimum probabilities of failure at which standard deviations account for a wrong fit, a fit is doubtful, and a fit
-has failed [1]; see docs/explanation/decisions.md."""
+_UNCERTAIN = 0.1
+"""Minimum probability of failure at which standard deviations account for a wrong fit [1]."""
 
 
 def assess(found: Evidence) -> Assessment:
     """Verdict on the fit of a frame."""
     what = "The given mask" if found.masked else "The image"
     # The overlap with given masks is the Dice itself, so no margin is needed.
-    doubtful_from = _UNCERTAIN if found.masked else _POSSIBLE
+    doubtful_from = _UNCERTAIN if found.masked else POSSIBLE
     return _assessed(found, doubtful_from, f"{what} contradicts", f"{what} supports", "fit")
 
 
@@ -316,8 +300,8 @@ def _assessed(found: Evidence, doubtful_from: float, contradicts: str, supports:
     probability = 1.0 / (1.0 + math.exp(-log_odds_of_failure(found.loss, found, found.masked)))
     for applies, reason, remedy in _NOTHING_THERE:
         if applies(found):
-            return Assessment(Verdict.FAILED, reason, remedy, max(probability, _LIKELY), found, True)
-    if probability >= _LIKELY:
+            return Assessment(Verdict.FAILED, reason, remedy, max(probability, LIKELY), found, True)
+    if probability >= LIKELY:
         reason = f"{contradicts} the {subject}: " + _weakest(found)
         return Assessment(Verdict.FAILED, reason, _REMEDY_FAILED, probability, found)
     if arm_is_elsewhere(found):
@@ -328,7 +312,7 @@ def _assessed(found: Evidence, doubtful_from: float, contradicts: str, supports:
         reason = "Only the shaft of an arm is predicted at its fitted pose, not its wrist or jaws."
     else:
         return Assessment(Verdict.GOOD, f"{supports} the {subject}.", "", probability, found)
-    return Assessment(Verdict.DOUBTFUL, reason, _REMEDY, max(probability, _POSSIBLE), found)
+    return Assessment(Verdict.DOUBTFUL, reason, _REMEDY, max(probability, POSSIBLE), found)
 
 
 def arm_is_elsewhere(found: Evidence) -> bool:

@@ -13,7 +13,7 @@ from ..errors import ProjectError
 from ..optimization import GivenMasks
 from ..recording import Sequence as Recording
 from ..recording.annotations import read_annotations
-from ..rendering import Renderer
+from ..rendering import ImageRenderer
 from ..wording import counted, listed
 from .layers import ImportedMask
 from .project import Project
@@ -46,9 +46,9 @@ def project_masks(layer: MaskLayer, state: ProjectState, recording: Recording) -
     scene, sequence = recording.scene, recording
 
     @cache
-    def renderer(name: str) -> Renderer:
+    def renderer(name: str) -> ImageRenderer:
         own = scene.camera(name)
-        return Renderer(scene, width=own.width, height=own.height, cameras=[name])
+        return ImageRenderer(scene, width=own.width, height=own.height, cameras=[name])
 
     def masks(index: int) -> Masks:
         corrections = {name: state.get(Key.mask_correction(index, name)) for name in cameras}

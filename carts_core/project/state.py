@@ -388,4 +388,4 @@ def corrected_state(scene: Scene, frame: Frame, project: ProjectState) -> SceneS
     joint positions."""
     measured = {name: frame.measured[name] for name in project.identity.arms}
     corrected = {name: found.joint_positions for name, found in project.joints(frame.index).items()}
-    return calibrated_scene(scene, project).state({**measured, **corrected}, mounts=frame.mounts)
+    return calibrated_scene(scene, project).state({**measured, **corrected}, device=None, mounts=frame.mounts)

@@ -77,9 +77,9 @@ def background_of_recording(
         image: index in `states` -> image of the frame.
     """
     # Imported here, so that reading and importing recordings require neither the renderer nor its compiler.
-    from ..rendering import Renderer  # noqa: PLC0415
+    from ..rendering import ImageRenderer  # noqa: PLC0415
 
-    renderer = Renderer(scene, cameras=[camera])
+    renderer = ImageRenderer(scene, cameras=[camera])
     arms = [renderer.segment(state)[0] >= 0 for state in states]
     covers = [dilate_silhouette(silhouette) for silhouette in arms]
     clear = len(arms) - np.sum([dilate_silhouette(silhouette, _MAX_ERROR) for silhouette in arms], axis=0)

@@ -162,12 +162,12 @@ class Sequence:
         return display(f"{self.name}: {counted(len(self), 'frame')}", picture, sentences, self._contents())
 
     def _measured_picture(self) -> Picture:
-        from ..rendering import Renderer  # noqa: PLC0415 - reading recordings requires no renderer
+        from ..rendering import ImageRenderer  # noqa: PLC0415 - reading recordings requires no renderer
 
         camera = self.scene.cameras[0].name
         frame = self.frame(0, cameras=[camera])
-        renderer = Renderer(self.scene, cameras=[camera])
-        state = self.scene.with_cameras([camera]).state(frame.measured, mounts=frame.mounts)
+        renderer = ImageRenderer(self.scene, cameras=[camera])
+        state = self.scene.with_cameras([camera]).state(frame.measured, None, frame.mounts)
         return Picture(frame.images[camera], [(renderer.segment(state)[0] >= 0, MEASURED_COLOUR)])
 
     def _contents(self) -> list[dict[str, str]]:
@@ -323,7 +323,7 @@ class Sequence:
         present = self.frames_of(camera.name)
         indices = [present[place] for place in evenly_spaced(len(present))]
         states = [
-            self.scene.state({arm: rows[index] for arm, rows in self.measured.items()}, mounts=self.mounts(index))
+            self.scene.state({arm: rows[index] for arm, rows in self.measured.items()}, None, self.mounts(index))
             for index in indices
         ]
         try:

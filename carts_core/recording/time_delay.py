@@ -13,7 +13,6 @@ from typing import Any
 
 import cv2
 import numpy as np
-import torch
 from jaxtyping import Float
 from scipy.optimize import minimize_scalar
 
@@ -289,7 +288,7 @@ def _basis(values: Float[np.ndarray, "rows columns"]) -> Float[np.ndarray, "colu
 
 def _points(robot: Robot, joints: Float[np.ndarray, "rows dofs"]) -> Float[np.ndarray, "rows coordinates"]:
     """Centres of the links in the arm's base frame [m]."""
-    Ts = robot.forward_kinematics(torch.from_numpy(np.nan_to_num(joints))).numpy()
+    Ts = robot.forward_kinematics(np.nan_to_num(joints))
     middles = [Ts[:, mesh.link, :3, :3] @ mesh.vertices.mean(0) + Ts[:, mesh.link, :3, 3] for mesh in robot.meshes]
     return np.where(np.isfinite(joints).all(1, keepdims=True), np.concatenate(middles, 1), np.nan)
 

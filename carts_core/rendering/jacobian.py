@@ -12,10 +12,11 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from ..arrays import as_array
 from ..compiled import compiled
 from ..model.parts import NORMALS
 from ..reprs import short_repr
-from .rasterizer import VisiblePoints, as_array
+from .rasterizer import VisiblePoints
 
 _HALF = np.float32(0.5)
 

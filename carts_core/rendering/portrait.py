@@ -1,14 +1,13 @@
 """Portrait of a single robot: a close-up of an instrument's tip, or a whole arm."""
 
 import numpy as np
-import torch
 from jaxtyping import Float, UInt8
 
 from ..model.camera import Camera
 from ..model.parts import link_parts
 from ..model.robot import Robot
 from ..model.scene import Arm, Light, Scene
-from .renderer import Renderer
+from .image_renderer import ImageRenderer
 
 _BACKDROP = 0.92
 _FOCAL_LENGTH = 2.4
@@ -47,33 +46,31 @@ def portrait(robot: Robot, width: int = 480, height: int = 320) -> UInt8[np.ndar
     focal = _FOCAL_LENGTH * width
     camera = Camera("portrait", width, height, (focal, focal, width / 2, height / 2), np.eye(4))
     scene = Scene((Arm("robot", robot, T_camera_base),), (camera,), Light(ambient=0.35, diffuse=0.75, specular=0.3))
-    renderer = Renderer(scene, width=width * _SUPERSAMPLING, height=height * _SUPERSAMPLING)
-    with torch.no_grad():
-        rendering = renderer(scene.state({"robot": joints.numpy()}))
-    silhouette = rendering.silhouette[0, ..., None].numpy()
-    image = rendering.image[0].permute(1, 2, 0).numpy() ** _GAMMA + _BACKDROP * (1 - silhouette)
+    renderer = ImageRenderer(scene, width=width * _SUPERSAMPLING, height=height * _SUPERSAMPLING)
+    images, arms = renderer.shaded(scene.state({"robot": joints}, None))
+    image = np.moveaxis(images[0], 0, -1) ** _GAMMA + _BACKDROP * (arms[0, ..., None] < 0)
     fine = np.clip(image, 0, 1).reshape(height, _SUPERSAMPLING, width, _SUPERSAMPLING, 3)
     return np.rint(fine.mean((1, 3)) * 255).astype(np.uint8)
 
 
-def _pose(robot: Robot) -> tuple[Float[torch.Tensor, " dofs"], Float[np.ndarray, "3"]]:
+def _pose(robot: Robot) -> tuple[Float[np.ndarray, " dofs"], Float[np.ndarray, "3"]]:
     """Straight joint positions with open jaws, and direction of motion of the links moved by the last joint."""
-    low, high = robot.joint_limits.double().clamp(-np.pi, np.pi).T
-    joints = torch.zeros(len(low), dtype=torch.float64).clamp(low, high)
-    moved = joints.clone()
+    low, high = robot.joint_limits.clip(-np.pi, np.pi).T
+    joints = np.zeros(len(low)).clip(low, high)
+    moved = joints.copy()
     moved[-1] += _STEP
     ways = [after - before for before, after in zip(_points(robot, joints), _points(robot, moved), strict=True)]
     means = np.array([way.mean(0) for way in ways])
     if (means @ means.T).min() < -1e-9:
         # Jaws move in opposite directions.
-        joints[-1] = (_OPEN * high[-1]).clamp(low[-1], high[-1])
+        joints[-1] = np.clip(_OPEN * high[-1], low[-1], high[-1])
     _, _, axes = np.linalg.svd(np.concatenate(ways), full_matrices=False)
     return joints, axes[0]
 
 
-def _points(robot: Robot, joints: torch.Tensor) -> list[Float[np.ndarray, "V 3"]]:
+def _points(robot: Robot, joints: Float[np.ndarray, " dofs"]) -> list[Float[np.ndarray, "V 3"]]:
     """Vertices of every mesh in the base frame [m]."""
-    Ts = robot.forward_kinematics(joints).numpy()
+    Ts = robot.forward_kinematics(joints)
     return [mesh.vertices @ Ts[mesh.link, :3, :3].T + Ts[mesh.link, :3, 3] for mesh in robot.meshes]
 
 

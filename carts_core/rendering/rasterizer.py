@@ -1,15 +1,18 @@
-"""Rasterization: triangles of a scene, their visibility, and visible surface points."""
+"""Rasterization: triangles of a scene, their visibility, and visible surface points.
+
+Functions of `Array`s accept NumPy arrays or tensors, and return the same.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import accumulate
+from typing import Any
 
 import numpy as np
-import torch
 from jaxtyping import Float, Int
-from torch import Tensor
 
+from ..arrays import Array, as_array, library
 from ..compiled import compiled
 from ..model.parts import link_parts
 from ..model.robot import Robot
@@ -203,32 +206,43 @@ class SceneGeometry:
     Vectors are columns (`3 V`, not `V 3`), because products along a short last dimension are slow.
     """
 
-    vertices: Float[Tensor, "3 V"]
+    vertices: Float[Array, "3 V"]
     """Vertex positions in link frames [m]."""
     vertex_counts: tuple[int, ...]
     """Number of vertices per link."""
-    vertex_links: Int[Tensor, " V"]
-    faces: Int[Tensor, "F 3"]
-    face_links: Int[Tensor, " F"]
-    face_arms: Int[Tensor, " F"]
-    face_parts: Int[Tensor, " F"]
+    vertex_links: Int[Array, " V"]
+    faces: Int[Array, "F 3"]
+    face_links: Int[Array, " F"]
+    face_arms: Int[Array, " F"]
+    face_parts: Int[Array, " F"]
     """Index of each face into `carts_core.model.parts.PARTS`."""
-    face_surfaces: Int[Tensor, " F"]
+    face_surfaces: Int[Array, " F"]
     """Index of the closed surface of each triangle, -1 for none; its back is not visible from outside."""
-    face_colors: Float[Tensor, "3 F"]
-    face_barycentric: Float[Tensor, "8 F"]
+    face_colors: Float[Array, "3 F"]
+    face_barycentric: Float[Array, "8 F"]
     """Affine maps from a point on a triangle to its second and third barycentric coordinates, concatenated."""
-    face_normals: Float[Tensor, "9 F"]
+    face_normals: Float[Array, "9 F"]
     """Unit vertex normals at each triangle's corners in its link's frame, concatenated."""
 
     @staticmethod
-    def of(scene: Scene, device: str | torch.device = "cpu") -> "SceneGeometry":
-        """Collect the link meshes of a scene; call once for all renderers of the same robots."""
-        return SceneGeometry._of(tuple(arm.robot for arm in scene.arms), torch.device(device))
+    def of(scene: Scene, device: Any = "cpu") -> "SceneGeometry":
+        """The link meshes of a scene as tensors on a PyTorch device, or as NumPy arrays for the device None."""
+        robots = tuple(arm.robot for arm in scene.arms)
+        return SceneGeometry._arrays(robots) if device is None else SceneGeometry._tensors(robots, device)
 
     @staticmethod
     @lru_cache(maxsize=4)
-    def _of(robots: tuple[Robot, ...], device: torch.device) -> "SceneGeometry":
+    def _tensors(robots: tuple[Robot, ...], device: Any) -> "SceneGeometry":
+        import torch  # noqa: PLC0415
+
+        arrays = SceneGeometry._arrays(robots)
+        fields = {name: value for name, value in vars(arrays).items() if name != "vertex_counts"}
+        tensors = {name: torch.as_tensor(value, device=device) for name, value in fields.items()}
+        return SceneGeometry(vertex_counts=arrays.vertex_counts, **tensors)
+
+    @staticmethod
+    @lru_cache(maxsize=4)
+    def _arrays(robots: tuple[Robot, ...]) -> "SceneGeometry":
         vertices, normals, faces, face_links, arms, face_parts, surfaces, colors, counts = ([] for _ in range(9))
         first_link, first_vertex = 0, 0
         for arm_index, robot in enumerate(robots):
@@ -249,21 +263,21 @@ class SceneGeometry:
             first_link += len(robot.link_names)
         vertex, face = np.concatenate(vertices).astype(np.float64), np.concatenate(faces)
 
-        def tensor(array: np.ndarray, dtype: torch.dtype = torch.float32) -> Tensor:
-            return torch.tensor(np.ascontiguousarray(array), dtype=dtype, device=device)
+        def array(values: np.ndarray, dtype: type = np.float32) -> np.ndarray:
+            return np.ascontiguousarray(values, dtype)
 
         return SceneGeometry(
-            tensor(vertex.T),
+            array(vertex.T),
             tuple(counts),
-            tensor(np.repeat(np.arange(len(counts)), counts), torch.int64),
-            tensor(face, torch.int32),
-            tensor(np.concatenate(face_links), torch.int64),
-            tensor(np.concatenate(arms), torch.int64),
-            tensor(np.concatenate(face_parts), torch.int64),
-            tensor(np.concatenate(surfaces), torch.int64),
-            tensor(np.concatenate(colors).T),
-            tensor(_barycentric_maps(vertex[face]).reshape(-1, 8).T),
-            tensor(np.concatenate(normals)[face].reshape(-1, 9).T),
+            array(np.repeat(np.arange(len(counts)), counts), np.int64),
+            array(face, np.int32),
+            array(np.concatenate(face_links), np.int64),
+            array(np.concatenate(arms), np.int64),
+            array(np.concatenate(face_parts), np.int64),
+            array(np.concatenate(surfaces), np.int64),
+            array(np.concatenate(colors).T),
+            array(_barycentric_maps(vertex[face]).reshape(-1, 8).T),
+            array(np.concatenate(normals)[face].reshape(-1, 9).T),
         )
 
 
@@ -278,41 +292,38 @@ def _barycentric_maps(corners: np.ndarray) -> np.ndarray:
     return np.concatenate([maps, offsets[..., None]], -1)
 
 
-def link_transforms(scene: Scene, state: SceneState) -> Float[Tensor, "*batch cameras links 4 4"]:
+def link_transforms(scene: Scene, state: SceneState) -> Float[Array, "*batch cameras links 4 4"]:
     """Ts_camera_link of every link in every camera, differentiable (f_FK of the paper, then F_B and C)."""
-    Ts_base_link: dict[int, Tensor] = {}
+    of, Ts_base_link = library(state.T_world_base), {}
     for robot in {id(arm.robot): arm.robot for arm in scene.arms}.values():
         # Forward kinematics of equal robots is batched, which takes as long as for a single robot.
         same = [index for index, arm in enumerate(scene.arms) if arm.robot is robot]
-        Ts = robot.forward_kinematics(torch.stack([state.joint_positions[index] for index in same]))
+        Ts = robot.forward_kinematics(of.stack([state.joint_positions[index] for index in same]))
         Ts_base_link.update(zip(same, Ts, strict=True))
-    bases = state.T_world_base.unbind(-3)
-    Ts_world_link = torch.cat([base[..., None, :, :] @ Ts_base_link[index] for index, base in enumerate(bases)], -3)
+    bases = of.moveaxis(state.T_world_base, -3, 0)
+    Ts_world_link = of.concatenate([T[..., None, :, :] @ Ts_base_link[arm] for arm, T in enumerate(bases)], -3)
     return state.T_view_world[..., :, None, :, :] @ Ts_world_link[..., None, :, :, :]
 
 
 def vertices_in_camera(
-    geometry: SceneGeometry, Ts_camera_link: Float[Tensor, "*batch links 4 4"]
-) -> Float[Tensor, "*batch 3 V"]:
+    geometry: SceneGeometry, Ts_camera_link: Float[Array, "*batch links 4 4"]
+) -> Float[Array, "*batch 3 V"]:
     """Positions of all vertices in the frame of a camera [m]."""
-    parts = geometry.vertices.split(geometry.vertex_counts, dim=1)
-    Ts = Ts_camera_link.unbind(-3)
-    return torch.cat([T[..., :3, :3] @ part + T[..., :3, 3:] for T, part in zip(Ts, parts, strict=True)], -1)
+    ends, Ts = accumulate(geometry.vertex_counts), Ts_camera_link
+    parts = [geometry.vertices[:, end - count : end] for count, end in zip(geometry.vertex_counts, ends, strict=True)]
+    moved = [Ts[..., link, :3, :3] @ part + Ts[..., link, :3, 3:] for link, part in enumerate(parts)]
+    return library(Ts).concatenate(moved, -1)
 
 
-def as_array(values: Tensor) -> np.ndarray:
-    """Convert a tensor to a C-ordered array on the CPU, copied only if necessary."""
-    return values.contiguous().cpu().numpy()
-
-
-def unit(vectors: Float[Tensor, "3 K"]) -> Float[Tensor, "3 K"]:
+def unit(vectors: Float[Array, "3 K"]) -> Float[Array, "3 K"]:
     """Normalize columns to unit length."""
-    return vectors * vectors.square().sum(0).clamp(min=1e-24).rsqrt()
+    of = library(vectors)
+    return vectors / of.sqrt(of.clip((vectors * vectors).sum(0), 1e-24, None))
 
 
 def phong(
-    color: Float[Tensor, "3 K"], points: Float[Tensor, "3 K"], normals: Float[Tensor, "3 K"], light: Light
-) -> Float[Tensor, "3 K"]:
+    color: Float[Array, "3 K"], points: Float[Array, "3 K"], normals: Float[Array, "3 K"], light: Light
+) -> Float[Array, "3 K"]:
     """Phong shading with one point light, two-sided.
 
     Args:
@@ -321,17 +332,18 @@ def phong(
     Returns:
         Linear RGB in [0, 1].
     """
-    to_light = unit(points.new_tensor(light.position)[:, None] - points)
+    of = library(points)
+    to_light = unit(of.stack([place - values for place, values in zip(light.position, points, strict=True)]))
     to_camera = -unit(points)
     towards_camera = (normals * to_camera).sum(0)
     # A surface seen from its back is also lit from its back.
-    side = torch.where(towards_camera.detach() < 0, -1.0, 1.0)
+    side = of.copysign(of.ones_like(towards_camera), towards_camera)
     cosine = (normals * to_light).sum(0) * side
     # The reflected light direction is 2 (n . l) n - l; only its cosine to the camera is needed.
     mirrored = 2.0 * cosine * towards_camera * side - (to_light * to_camera).sum(0)
-    highlight = light.specular * mirrored.clamp(min=1e-4) ** light.shininess * (cosine > 0)
-    lit = light.ambient + light.diffuse * cosine.clamp(min=0.0)
-    return (color * lit + highlight).clamp(max=1.0)
+    highlight = light.specular * of.clip(mirrored, 1e-4, None) ** light.shininess * (cosine > 0)
+    lit = light.ambient + light.diffuse * of.clip(cosine, 0.0, None)
+    return of.clip(color * lit + highlight, None, 1.0)
 
 
 @compiled
@@ -420,14 +432,14 @@ def gather_points(
 class VisiblePoints:
     """Surface points of visible pixels, without gradients. `K` is the number of visible pixels in all views."""
 
-    pixel: Int[Tensor, " K"]
+    pixel: Int[Array, " K"]
     """Index into the flattened `views x height x width`."""
-    face: Int[Tensor, " K"]
+    face: Int[Array, " K"]
     groups: tuple[tuple[int, int, int], ...]
     """View, link and number of points of each run of points on the same link in the same view."""
-    point_link: Float[Tensor, "3 K"]
+    point_link: Float[Array, "3 K"]
     """Surface point, in the frame of its link [m]."""
-    normal_link: Float[Tensor, "3 K"]
+    normal_link: Float[Array, "3 K"]
     """Interpolated normal at the point, in the frame of its link."""
 
     def runs(self) -> list[tuple[int, int, slice]]:
@@ -437,39 +449,40 @@ class VisiblePoints:
             (view, link, slice(end - count, end)) for (view, link, count), end in zip(self.groups, ends, strict=True)
         ]
 
-    def transformed(self, Ts_camera_link: Float[Tensor, "views links 4 4"]) -> tuple[Tensor, Tensor]:
+    def transformed(self, Ts_camera_link: Float[Array, "views links 4 4"]) -> tuple[Array, Array]:
         """Points and normals in the frames of their cameras, each [3, K], differentiable in the transforms."""
-        counts = [count for _, _, count in self.groups]
-        points, normals = self.point_link.split(counts, 1), self.normal_link.split(counts, 1)
         moved, turned = [], []
-        for (view, link, _), point, normal in zip(self.groups, points, normals, strict=True):
+        for view, link, run in self.runs():
             T = Ts_camera_link[view, link]
-            moved.append(T[:3, :3] @ point + T[:3, 3:])
-            turned.append(T[:3, :3] @ normal)
+            moved.append(T[:3, :3] @ self.point_link[:, run] + T[:3, 3:])
+            turned.append(T[:3, :3] @ self.normal_link[:, run])
         if not moved:
             return self.point_link, self.normal_link
-        return torch.cat(moved, 1), torch.cat(turned, 1)
+        of = library(Ts_camera_link)
+        return of.concatenate(moved, 1), of.concatenate(turned, 1)
 
-    def intrinsics(self, intrinsics: Float[Tensor, "views 4"]) -> Float[Tensor, "4 K"]:
+    def intrinsics(self, intrinsics: Float[Array, "views 4"]) -> Float[Array, "4 K"]:
         """fx, fy, cx, cy of each point's view."""
         if len(intrinsics) == 1:
             return intrinsics[0][:, None]
-        views = [intrinsics[view][:, None].expand(-1, count) for view, _, count in self.groups]
-        return torch.cat(views, 1) if views else intrinsics.new_zeros(4, 0)
+        of = library(intrinsics)
+        views = [of.broadcast_to(intrinsics[view][:, None], (4, count)) for view, _, count in self.groups]
+        return of.concatenate(views, 1) if views else intrinsics[:0].T
 
 
-@torch.no_grad()
 def visible_points(
     geometry: SceneGeometry,
-    face_ids: Int[Tensor, "views height width"],
-    inverse_depth: Float[Tensor, "views height width"],
-    Ts_camera_link: Float[Tensor, "views links 4 4"],
-    intrinsics: Float[Tensor, "views 4"],
+    face_ids: Int[Array, "views height width"],
+    inverse_depth: Float[Array, "views height width"],
+    Ts_camera_link: Float[Array, "views links 4 4"],
+    intrinsics: Float[Array, "views 4"],
 ) -> VisiblePoints:
     """Surface point and normal at each visible pixel."""
     faces = geometry.face_links, geometry.face_barycentric, geometry.face_normals
     *found, counts = gather_points(*map(as_array, (face_ids, inverse_depth, Ts_camera_link, intrinsics, *faces)))
     links = Ts_camera_link.shape[1]
     groups = tuple((index // links, index % links, count) for index, count in enumerate(counts) if count)
-    pixel, face, point, normal = (torch.from_numpy(values).to(face_ids.device) for values in found)
+    if library(face_ids) is not np:
+        found = [library(face_ids).from_numpy(values).to(face_ids.device) for values in found]
+    pixel, face, point, normal = found
     return VisiblePoints(pixel, face, groups, point, normal)

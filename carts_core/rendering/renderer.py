@@ -1,19 +1,18 @@
 """Differentiable renderer of a scene."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
-import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from ..model.keypoints import Keypoint
 from ..model.parts import NORMALS, SURFACE_CHANNELS
 from ..model.scene import Scene, SceneState
 from ..reprs import short_repr
+from .image_renderer import ImageRenderer
 from .jacobian import JacobianBlock, Outline, Tangents, map_jacobian, normal_motion, outline_faces, outline_position
-from .rasterizer import SceneGeometry, link_transforms, phong, rasterize, vertices_in_camera, visible_points
+from .rasterizer import phong, visible_points
 
 
 class _CarryMotion(torch.autograd.Function):
@@ -124,40 +123,18 @@ class Rendering:
         return torch.where(self.face_ids >= 0, 1.0 / self.inverse_depth, 0.0)
 
 
-class Renderer:
-    """Renderer of the arms in a scene's cameras.
+class Renderer(ImageRenderer):
+    """Differentiable renderer of the arms in a scene's cameras.
 
     Args:
-        width, height: size of the rendered images [px], by default the size of the first camera. The intrinsics of a
-            state refer to the size of the camera and are scaled.
-        cameras: names of the cameras to render, in this order; all by default. States contain all cameras of the scene,
-            or only these.
-        window: left, top, width and height [px] of the rendered part of these images; the whole image by default.
+        options: options of `ImageRenderer`.
         device: device of the images and of differentiable computations; visibility is always computed on the CPU.
     """
 
-    def __init__(
-        self,
-        scene: Scene,
-        *,
-        width: int | None = None,
-        height: int | None = None,
-        cameras: Sequence[str] | None = None,
-        window: tuple[int, int, int, int] | None = None,
-        device: str | torch.device = "cpu",
-    ) -> None:
-        self.scene = scene.with_cameras(cameras)
-        self.width = width or self.scene.cameras[0].width
-        self.height = height or self.scene.cameras[0].height
+    def __init__(self, scene: Scene, *, device: str | torch.device = "cpu", **options: Any) -> None:
         self.device = torch.device(device)
-        self.geometry = SceneGeometry.of(scene, device)
-        self._faces, self._surfaces = self.geometry.faces.cpu().numpy(), self.geometry.face_surfaces.cpu().numpy()
-        scale = [[self.width / camera.width, self.height / camera.height] * 2 for camera in self.scene.cameras]
-        self._scale = torch.tensor(scale, dtype=torch.float32, device=device)
-        left, top, self.width, self.height = window or (0, 0, self.width, self.height)
-        self._shift = torch.tensor([0, 0, left, top], dtype=torch.float32, device=device)
-        self._indices = [scene.cameras.index(camera) for camera in self.scene.cameras]
-        self._count = len(scene.cameras)
+        super().__init__(scene, **options)
+        self._scale, self._shift = (torch.from_numpy(values).to(device) for values in (self._scale, self._shift))
 
     def __call__(self, state: SceneState) -> Rendering:
         """Render a state, with gradients for every tensor of the state."""
@@ -184,33 +161,12 @@ class Renderer:
             self.geometry.face_arms,
         )
 
-    def segment(self, state: SceneState) -> Int[np.ndarray, "*batch cameras height width"]:
-        """Index of the visible arm per pixel, -1 for background; faster than rendering, since only visibility is
-        computed."""
-        return self._visible(state, self.geometry.face_arms)
-
-    def segment_links(self, state: SceneState) -> Int[np.ndarray, "*batch cameras height width"]:
-        """Index of the visible link per pixel, -1 for background.
-
-        Links are numbered across all arms, first `Robot.link_names` of the first arm, then those of the second arm.
-        """
-        return self._visible(state, self.geometry.face_links)
-
     @torch.no_grad()
     def visibility(
         self, state: SceneState
     ) -> tuple[Int[Tensor, "*batch cameras h w"], Float[Tensor, "*batch cameras h w"]]:
         """Compute only `face_ids` and `inverse_depth` of a `Rendering`."""
-        Ts, intrinsics = self._views(state)
-        shape = (*Ts.shape[:-3], self.height, self.width)
-        face_ids, inverse_depth = self._visibility(Ts.flatten(0, -4), intrinsics.flatten(0, -2))
-        return face_ids.view(shape), inverse_depth.view(shape)
-
-    def _visible(self, state: SceneState, face_labels: Int[Tensor, " F"]) -> np.ndarray:
-        """Label of the visible triangle per pixel, -1 for background."""
-        face_ids, _ = self.visibility(state)
-        # The background is face -1, which indexes the last label.
-        return np.append(face_labels.cpu().numpy(), -1)[face_ids.cpu().numpy()]
+        return super().visibility(state)
 
     @torch.no_grad()
     def surface_maps(self, state: SceneState) -> Float[Tensor, "*batch cameras 6 height width"]:
@@ -280,32 +236,12 @@ class Renderer:
         """
         return _tangents(*self._views(states), distance)
 
-    def _views(self, state: SceneState) -> tuple[Tensor, Tensor]:
-        """Ts_camera_link [*batch, cameras, links, 4, 4] and scaled intrinsics of the rendered cameras."""
-        if state.T_camera_world.shape[-3] == self._count and self._indices != list(range(self._count)):
-            # If the state contains all cameras of the scene, the rendered cameras are selected.
-            state = SceneState(
-                state.joint_positions,
-                state.T_world_base,
-                state.T_camera_world[..., self._indices, :, :],
-                state.intrinsics[..., self._indices, :],
-                state.T_mount_world[..., self._indices, :, :],
-            )
-        return link_transforms(self.scene, state), state.intrinsics * self._scale - self._shift
+    def _own(self, state: SceneState) -> SceneState:
+        return state.to(self.device)
 
     @torch.no_grad()
     def _visibility(self, views_T: Tensor, views_K: Tensor) -> tuple[Tensor, Tensor]:
-        """Visible triangle and inverse depth [views, height, width]."""
-        vertices = vertices_in_camera(self.geometry, views_T).mT.cpu()
-        size = (self.width, self.height)
-        seen = [
-            rasterize(points.numpy(), self._faces, intrinsics.tolist(), *size, self._surfaces)
-            for points, intrinsics in zip(vertices, views_K.cpu(), strict=True)
-        ]
-        if len(seen) == 1:  # the common case, without a copy
-            face_ids, inverse_depth = (array[None] for array in seen[0])
-        else:
-            face_ids, inverse_depth = (np.stack(arrays) for arrays in zip(*seen, strict=True))
+        face_ids, inverse_depth = super()._visibility(views_T, views_K.cpu())
         return torch.from_numpy(face_ids).to(self.device), torch.from_numpy(inverse_depth).to(self.device)
 
 
@@ -317,42 +253,3 @@ def _tangents(Ts: Float[Tensor, "states cameras links 4 4"], intrinsics: Tensor,
 def _side(position: Float[Tensor, "3 K"], normal: Float[Tensor, "3 K"]) -> Float[Tensor, " K"]:
     """1 where a normal points to the camera, -1 where it points away."""
     return torch.where((position * normal).sum(0) > 0, -1.0, 1.0)
-
-
-@torch.no_grad()
-def pick_point(
-    scene: Scene, renderer: Renderer, state: SceneState, pixel: tuple[float, float], radius: float = 0.0
-) -> Keypoint | None:
-    """Find the point of the rendered surface at a pixel, fixed to its link.
-
-    Args:
-        renderer: renderer of a single camera of the scene, at full size.
-        pixel: column and row, pixel centres at 0.5 [px].
-        radius: maximum distance to the centre of the nearest pixel with an arm [px]; 0 for the given pixel only.
-
-    Returns:
-        The point, named after its link; None if no arm is within the radius.
-    """
-    (camera,) = renderer.scene.cameras
-    faces, inverse_depth = renderer.visibility(state)
-    face_ids = faces[0].cpu().numpy()
-    rows, columns = np.nonzero(face_ids >= 0)
-    if not len(rows):
-        return None
-    centres = np.column_stack([columns, rows]) + 0.5
-    nearest = int(np.linalg.norm(centres - pixel, axis=-1).argmin())
-    row, column = int(rows[nearest]), int(columns[nearest])
-    inside = (column, row) == (int(np.floor(pixel[0])), int(np.floor(pixel[1])))
-    if not inside and np.linalg.norm(centres[nearest] - pixel) > radius:
-        return None
-    depth = 1.0 / float(inverse_depth[0, row, column])
-    view = scene.cameras.index(scene.camera(camera.name))
-    fx, fy, cx, cy = state.intrinsics[view].tolist()
-    u, v = centres[nearest]
-    p_camera = np.array([(u - cx) / fx * depth, (v - cy) / fy * depth, depth, 1.0])
-    link = int(renderer.geometry.face_links[face_ids[row, column]])
-    T_camera_link = link_transforms(scene, state)[view, link].double().cpu().numpy()
-    x, y, z, _ = np.linalg.solve(T_camera_link, p_camera).tolist()
-    links = [(arm, number) for arm in scene.arms for number in range(len(arm.robot.link_names))]
-    arm, number = links[link]
-    return Keypoint(arm.name, arm.robot.link_names[number], number, (x, y, z))

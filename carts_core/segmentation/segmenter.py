@@ -2,16 +2,17 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import cv2
 import numpy as np
-import torch
 from jaxtyping import Bool, Float, UInt8
 
 from ..errors import SettingsError
 from ..model.parts import COVERAGE, SURFACE_CHANNELS
-from ..networks import FeatureExtractor
+
+if TYPE_CHECKING:
+    from ..networks import FeatureExtractor
 
 MAX_POINTS = 100
 """Maximum number of points in a prompt."""
@@ -88,7 +89,7 @@ class NetworkSegmenter:
         self._last: tuple[np.ndarray, np.ndarray] | None = None
 
     @staticmethod
-    def of(extractor: FeatureExtractor) -> "NetworkSegmenter":
+    def of(extractor: "FeatureExtractor") -> "NetworkSegmenter":
         """Create a segmenter from the optimizer's networks."""
         return NetworkSegmenter(lambda image: instrument_probability(extractor, image))
 
@@ -115,11 +116,12 @@ class NetworkSegmenter:
         return self._last[1]
 
 
-@torch.no_grad()
 def instrument_probability(
-    extractor: FeatureExtractor, image: UInt8[np.ndarray, "height width 3"]
+    extractor: "FeatureExtractor", image: UInt8[np.ndarray, "height width 3"]
 ) -> Float[np.ndarray, "height width"]:
     """Probability of an instrument in each pixel: unconditioned coverage of the surface network."""
+    import torch  # noqa: PLC0415
+
     height, width = image.shape[:2]
     stride = extractor.stride
     scale = extractor.working_size[0] / width
@@ -128,7 +130,8 @@ def instrument_probability(
     images = torch.from_numpy(small).permute(2, 0, 1)[None].to(extractor.device)
     # With an empty prior surface map, the network uses only the image.
     nowhere = images.new_zeros(1, SURFACE_CHANNELS, *images.shape[2:])
-    coverage = extractor.surface(images, nowhere)[0, COVERAGE].sum(0).float().cpu().numpy()
+    with torch.no_grad():
+        coverage = extractor.surface(images, nowhere)[0, COVERAGE].sum(0).float().cpu().numpy()
     return cv2.resize(coverage, (width, height), interpolation=cv2.INTER_LINEAR)
 
 

@@ -4,18 +4,21 @@ import threading
 import time
 from dataclasses import replace
 from pathlib import Path
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
+from carts_core import live, optimization
 from carts_core.errors import CartsError
-from carts_core.live import LiveStatistics, LiveTracker, OpenStream, Recorder, Results, Tracked, follow, open_stream
+from carts_core.live import OpenStream, open_stream
 from carts_core.live.messages import mounts_of
-from carts_core.optimization import Backgrounds
 from carts_core.project import Provenance, Source
 from carts_core.settings.live import StreamAddress, StreamKind
 from carts_viewer.actions import intents
 from carts_viewer.actions.context import Context, Handler
 from carts_viewer.jobs.optimizers import OptimizerFactory, scene_at
 from carts_viewer.state import LiveState, Pose
+
+if TYPE_CHECKING:
+    from carts_core.live import LiveTracker, Recorder, Results, Tracked
 
 
 class LiveRun:
@@ -32,8 +35,10 @@ class LiveRun:
         error: the error that ended the stream; None while it runs, and after a normal end.
     """
 
-    def __init__(self, stream: OpenStream, tracker: LiveTracker, results: Results, recorder: Recorder | None) -> None:
-        self.statistics = LiveStatistics()
+    def __init__(
+        self, stream: OpenStream, tracker: "LiveTracker", results: "Results", recorder: "Recorder | None"
+    ) -> None:
+        self.statistics = live.LiveStatistics()
         self.error: Exception | None = None
         self.recorder = recorder
         self._stream, self._tracker, self._results = stream, tracker, results
@@ -52,7 +57,7 @@ class LiveRun:
         """Port that receives joints or frames; None if not used."""
         return None if self._stream.server is None else self._stream.server.port
 
-    def take(self) -> Tracked | None:
+    def take(self) -> "Tracked | None":
         """The newest result; None if it was already taken."""
         with self._changing:
             newest, self._newest = self._newest, None
@@ -66,14 +71,14 @@ class LiveRun:
     def _follow(self) -> None:
         sinks = [self._show, *([self.recorder] if self.recorder is not None else [])]
         try:
-            follow(self._stream.source, self._tracker, sinks, self.statistics)
+            live.follow(self._stream.source, self._tracker, sinks, self.statistics)
         except Exception as error:  # `LiveHandler.advance` raises it on the worker's thread.
             self.error = error
         finally:
             self._stream.close()
             self._tracker.close()
 
-    def _show(self, tracked: Tracked) -> None:
+    def _show(self, tracked: "Tracked") -> None:
         with self._changing:
             self._newest = tracked
         if self._stream.clients:
@@ -210,16 +215,16 @@ class LiveHandler(Handler):
         stream = open_stream(address, sequence, cameras, state.domain, rate=intent.rate, loops=loops)
         try:
             replayed = address.kind is StreamKind.REPLAY
-            known = Backgrounds.of(sequence, cameras, state.domain) if replayed else None
+            known = optimization.Backgrounds.of(sequence, cameras, state.domain) if replayed else None
             free = replace(state.free, base_frames=False, extrinsics=False, intrinsics=False)
             scene = scene_at(session.scene, session.measured(state.frame))
-            tracker = LiveTracker(scene, extractor, free=free, backgrounds=known, cameras=cameras, concurrent=True)
+            tracker = live.LiveTracker(scene, extractor, free=free, backgrounds=known, cameras=cameras, concurrent=True)
             made_by = Provenance.made_by_optimizer({"live": True}, extractor.sha256)
-            recorder = None if folder is None else Recorder(sequence, cameras, folder, made_by)
+            recorder = None if folder is None else live.Recorder(sequence, cameras, folder, made_by)
         except BaseException:
             stream.close()
             raise
-        self._live = LiveRun(stream, tracker, Results(scene.with_cameras(cameras)), recorder)
+        self._live = LiveRun(stream, tracker, live.Results(scene.with_cameras(cameras)), recorder)
         self._tell_at = 0.0
         port = self._live.port
         waits = f"Waiting for {'the first frame' if port is None else f'messages on port {port} of 127.0.0.1'}."
@@ -236,15 +241,15 @@ class LiveHandler(Handler):
             raise CartsError("This project is read-only, so the stream cannot be recorded beside it. Untick Record.")
         return project.path.with_name(f"{project.path.stem}_live_{time.strftime('%Y%m%d_%H%M%S')}")
 
-    def _show_result(self, run: LiveRun, tracked: Tracked) -> None:
-        context, estimate, live = self._context, tracked.estimate, self._context.state.live
-        assert live is not None
+    def _show_result(self, run: LiveRun, tracked: "Tracked") -> None:
+        context, estimate, shown = self._context, tracked.estimate, self._context.state.live
+        assert shown is not None
         mounts = mounts_of(self._session.scene, tracked.stream_frame.frame, tracked.stream_frame.camera_poses)
         frame = replace(tracked.stream_frame.frame, mounts=mounts)
         measured = self._session.measured(frame)
         scene = self._session.with_joints(measured, dict(estimate.joint_positions))
         camera = context.state.camera if context.state.camera in frame.images else next(iter(frame.images))
-        text = live.text
+        text = shown.text
         if time.monotonic() >= self._tell_at:
             self._tell_at = time.monotonic() + _STATISTICS_INTERVAL
             text = str(run.statistics)
@@ -252,7 +257,7 @@ class LiveHandler(Handler):
             frame=frame,
             camera=camera,
             pose=Pose(scene, Source.OPTIMIZER),
-            live=replace(live, verdict=estimate.verdict.value, age=tracked.age, text=text, busy=False),
+            live=replace(shown, verdict=estimate.verdict.value, age=tracked.age, text=text, busy=False),
             scores=None,
             maps=None,
         )

@@ -1,10 +1,10 @@
 """The optimizer: runs on the shown frame, solver settings, and free parameters."""
 
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+from carts_core import optimization
 from carts_core.errors import CartsError, SettingsError
-from carts_core.optimization import Backgrounds, Iterate, MaskRefiner, NetworkPredictor
 from carts_core.project import Edits, FitVerdict, Key
 from carts_core.settings import SolverName, SurfaceSolver
 from carts_core.settings import solver as named_solver
@@ -15,6 +15,9 @@ from carts_viewer.jobs.comparison import FitCheck
 from carts_viewer.jobs.optimizers import ActiveRun, FrameTask, OptimizerFactory, scene_at
 from carts_viewer.picture.layers import Layer
 from carts_viewer.state import NETWORK, PRESETS, Curves, Maps, Observed, Phase, RefinedMasks, RunState, Scores
+
+if TYPE_CHECKING:
+    from carts_core.optimization import Iterate
 
 _REASONS = {
     "iterations": "Done: the best iteration is the result",
@@ -104,7 +107,7 @@ class OptimizingHandler(Handler):
         if all(state.refined_mask(pose, camera) is not None for camera in cameras):
             return
         try:
-            predictor = NetworkPredictor(self._optimizers.prepare())
+            predictor = optimization.NetworkPredictor(self._optimizers.prepare())
         except CartsError:
             context.change(layer=Layer.MASK)
             raise
@@ -112,7 +115,8 @@ class OptimizingHandler(Handler):
         regions = {camera: region.region() for camera, region in ignored.items() if region is not None}
         masks = {}
         for camera in cameras:
-            refiner = MaskRefiner(predictor, Backgrounds.of(self._session.sequence, (camera,), state.domain))
+            backgrounds = optimization.Backgrounds.of(self._session.sequence, (camera,), state.domain)
+            refiner = optimization.MaskRefiner(predictor, backgrounds)
             rendered = {camera: context.renderer.mask(pose, camera)}
             masks |= refiner.refine(scene_at(self._session.scene, pose), frame, pose, rendered, regions)
         context.change(refined=RefinedMasks(frame, pose, ignored, masks), busy=None)
@@ -260,7 +264,7 @@ class OptimizingHandler(Handler):
             )
         )
 
-    def _verdict(self, run: ActiveRun, end: Iterate) -> FitVerdict | None:
+    def _verdict(self, run: ActiveRun, end: "Iterate") -> FitVerdict | None:
         """Verdict at the end of a run; with several cameras, each camera is assessed individually."""
         own = run.verdict()
         if own is not None and (len(self._session.scene.cameras) == 1 or own.verdict == "failed"):
@@ -288,7 +292,7 @@ class OptimizingHandler(Handler):
             self._context.edit("Check the fit", {Key.verdict(state.index): found.verdict})
         self._context.change(busy=None)
 
-    def _accept(self, run: ActiveRun, iterate: Iterate, verdict: FitVerdict | None = None) -> None:
+    def _accept(self, run: ActiveRun, iterate: "Iterate", verdict: FitVerdict | None = None) -> None:
         """Set the frame's pose to an iterate; all iterates of a run are one undo step."""
         state = self._context.state
         edits = self._session.edits(state.frame, run.pose(iterate).scene, run.provenance, iterate.joint_std())

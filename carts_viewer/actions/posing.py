@@ -3,9 +3,9 @@
 import math
 
 from carts_core.errors import CartsError
-from carts_core.model.keypoints import Keypoint, project_keypoints
+from carts_core.model.keypoints import Keypoint, Pin, project_keypoints
 from carts_core.model.scene import SceneState
-from carts_core.optimization.keypoints import Pin, fit_keypoints
+from carts_core.optimization.keypoints import fit_keypoints
 from carts_core.project import Key
 from carts_viewer.actions import intents
 from carts_viewer.actions.context import Context, Handler, clamped, finite

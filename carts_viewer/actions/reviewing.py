@@ -5,12 +5,12 @@ from collections.abc import Callable
 from dataclasses import fields, replace
 from typing import Any
 
-import torch
+import numpy as np
 
 from carts_core.errors import CartsError
-from carts_core.model.keypoints import project_keypoints
+from carts_core.model.keypoints import Pin, project_keypoints
 from carts_core.model.scene import SceneState
-from carts_core.optimization.keypoints import Pin, fit_keypoints
+from carts_core.optimization.keypoints import fit_keypoints
 from carts_core.project import Change, Key, Review, ReviewState, Source, next_unreviewed, worst_first
 from carts_core.project.values import MAX_NOTE_LENGTH
 from carts_core.wording import counted
@@ -184,13 +184,13 @@ class AnnotatingHandler(Handler):
         if self._fitted is None:
             return True
         pairs = zip(self._fitted.joint_positions, scene.joint_positions, strict=True)
-        return not all(torch.allclose(one, other, atol=1e-5) for one, other in pairs)
+        return not all(np.allclose(one, other, atol=1e-5) for one, other in pairs)
 
     def _nearest(self, pixel: tuple[float, float], camera: str) -> str:
         state = self._context.state
         points = list(self._keypoints.values())
         shown = project_keypoints(self._session.scene, state.pose.scene, points, camera)
-        distances = (shown - shown.new_tensor(pixel)).norm(dim=-1).nan_to_num(math.inf)
+        distances = np.nan_to_num(np.linalg.norm(shown - pixel, axis=-1), nan=math.inf)
         return list(self._keypoints)[int(distances.argmin())]
 
 

@@ -2,14 +2,15 @@
 
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from carts_core import optimization
 from carts_core.errors import CartsError, ProjectError
-from carts_core.optimization import Backgrounds, FrameEstimate, SequenceOptimizer, SequenceSettings
 from carts_core.project import Figures, Key, Keyframe, ProjectState, Source, between_kept
 from carts_core.project.values import WHOLE_PROJECT
+from carts_core.settings import SequenceSettings
 from carts_core.settings.serialization import to_plain
 from carts_core.wording import counted
 from carts_viewer.actions import intents
@@ -17,6 +18,9 @@ from carts_viewer.actions.context import Context, Handler
 from carts_viewer.jobs.comparison import Comparison, Outcome, unchecked
 from carts_viewer.jobs.optimizers import OptimizerFactory, SequenceRun, scene_at
 from carts_viewer.state import ListedFrame, SolveState
+
+if TYPE_CHECKING:
+    from carts_core.optimization import FrameEstimate
 
 
 class PropagatingHandler(Handler):
@@ -114,7 +118,7 @@ class PropagatingHandler(Handler):
         poses = {index: session.pose(sequence.frame(index, cameras=[]), self._before) for index in kept}
         free = replace(state.free, base_frames=False, extrinsics=False, intrinsics=False)
         model, stamps = SequenceSettings(direction=state.direction), sequence.timestamps
-        optimizer = SequenceOptimizer(
+        optimizer = optimization.SequenceOptimizer(
             scene_at(sequence.scene, state.pose.scene),
             lambda index: sequence.frame(index, state.domain, cameras),
             {index: None if stamps is None else float(stamps[index]) for index in frames},
@@ -125,7 +129,7 @@ class PropagatingHandler(Handler):
             keyframes={index: session.joints(pose.scene) for index, pose in poses.items()},
             keyframe_std={index: _standard_deviations(self._before, index) for index in kept},
             ignore=lambda index: session.ignored(index, cameras, target),
-            backgrounds=Backgrounds.of(sequence, cameras, state.domain),
+            backgrounds=optimization.Backgrounds.of(sequence, cameras, state.domain),
             cameras=cameras,
         )
         more = {"model": to_plain(model), "frames": [frames[0], frames[-1]], "keyframes": sorted(kept)}
@@ -161,7 +165,7 @@ class PropagatingHandler(Handler):
                 self._report(running=False, text="")
                 self._report(text=self._save(run, outcomes))
 
-    def _solved(self, estimate: FrameEstimate) -> bool:
+    def _solved(self, estimate: "FrameEstimate") -> bool:
         """Whether an estimate may be saved; edits of the frame since the start of the run take precedence."""
         now, index = self._session.editor.view, estimate.index
         kept = estimate.start == "keyframe" or index in now.kept_frames

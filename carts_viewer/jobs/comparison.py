@@ -3,11 +3,11 @@
 import json
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from carts_core.optimization import Assessment, FrameEstimate, FreeParameters, SolverSettings
+from carts_core.optimization import FreeParameters, SolverSettings
 from carts_core.project import Edits, Figures, FitVerdict, Key, ProjectState, Provenance, Source
 from carts_core.project.values import VERDICTS
 from carts_core.recording import Frame
@@ -15,6 +15,9 @@ from carts_viewer.jobs.optimizers import ActiveRun, FrameTask, OptimizerFactory,
 from carts_viewer.picture.overlay import OverlayRenderer
 from carts_viewer.session import Session, joint_correction
 from carts_viewer.state import Pose, Target, ViewState
+
+if TYPE_CHECKING:
+    from carts_core.optimization import Assessment, FrameEstimate
 
 _OUT_OF_VIEW = 5e-4
 """Share of an image that arms must cover to count as in view of the camera [1]."""
@@ -71,7 +74,7 @@ class FitCheck:
         return Fit(frame_verdict({name: assessment for name, (assessment, _) in seeing.items()}), loss)
 
 
-def frame_verdict(assessed: dict[str, Assessment]) -> FitVerdict:
+def frame_verdict(assessed: "dict[str, Assessment]") -> FitVerdict:
     """Verdict on a frame: the worst verdict of its cameras."""
     worst = max(assessed, key=lambda name: (VERDICTS.index(assessed[name].verdict.value), assessed[name].probability))
     found = assessed[worst]
@@ -104,7 +107,7 @@ class Comparison:
         self._optimizers = optimizers
         self._check = FitCheck(session, optimizers)
 
-    def outcome(self, estimate: FrameEstimate, run: SequenceRun, before: ProjectState, state: ViewState) -> Outcome:
+    def outcome(self, estimate: "FrameEstimate", run: SequenceRun, before: ProjectState, state: ViewState) -> Outcome:
         """The best of the solved pose, the result of an individual run on the frame, and the earlier pose.
 
         The individual run is made only if the solved pose is worse than the earlier pose, or its verdict is not good.
@@ -186,7 +189,7 @@ def _joints_alone(state: ViewState) -> FreeParameters:
     return replace(state.free, base_frames=False, extrinsics=False, intrinsics=False)
 
 
-def solved_edits(estimate: FrameEstimate, run: SequenceRun) -> Edits:
+def solved_edits(estimate: "FrameEstimate", run: SequenceRun) -> Edits:
     """Edits that apply the solved pose of a frame."""
     edits: dict[Key[Any], Any] = {}
     for arm, std in estimate.joint_std.items():
@@ -198,7 +201,7 @@ def solved_edits(estimate: FrameEstimate, run: SequenceRun) -> Edits:
     return edits
 
 
-def unchecked(estimate: FrameEstimate, run: SequenceRun) -> Outcome:
+def unchecked(estimate: "FrameEstimate", run: SequenceRun) -> Outcome:
     """The outcome of a frame that was not compared, because solving was stopped."""
     edits = {**solved_edits(estimate, run), Key.verdict(estimate.index): None}
     return Outcome(edits, Figures(estimate.loss), "not compared with the previous pose, because solving was stopped")

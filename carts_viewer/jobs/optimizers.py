@@ -1,34 +1,19 @@
 """Optimizers of the viewer: networks, runs on single frames, runs on many frames, and assessments of poses."""
 
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, Protocol, TypedDict, Unpack
+from typing import TYPE_CHECKING, Any, Protocol, TypedDict, Unpack
 
 import numpy as np
-import torch
 from jaxtyping import Bool
 
+from carts_core import networks, optimization
 from carts_core.errors import SettingsError, WeightsError
 from carts_core.model.scene import Scene, SceneState
-from carts_core.networks import FeatureExtractor
-from carts_core.networks.surface import SurfaceNetwork
-from carts_core.networks.weights import read_weights
-from carts_core.optimization import (
-    Assessment,
-    Backgrounds,
-    FrameOptimizer,
-    FreeParameters,
-    Iterate,
-    MaskPredictor,
-    NetworkPredictor,
-    Progress,
-    SequenceOptimizer,
-    SolverSettings,
-    StopReason,
-    SurfaceSolver,
-    check_domain,
-)
+from carts_core.optimization import FreeParameters, SolverSettings, SurfaceSolver
+from carts_core.process import leave_a_core_free
 from carts_core.project import FitVerdict, Provenance, Source
 from carts_core.recording import Sequence as Recording
 from carts_core.segmentation import NetworkSegmenter, Segmenter
@@ -38,12 +23,16 @@ from carts_core.settings.stages import NONE
 from carts_core.wording import duration_text
 from carts_viewer.state import NETWORK, Pose, Target
 
+if TYPE_CHECKING:
+    from carts_core.networks import FeatureExtractor
+    from carts_core.optimization import Assessment, FrameOptimizer, Iterate, MaskPredictor, Progress, SequenceOptimizer
+
 
 class Optimizer(Protocol):
     """Interface of an optimizer of one frame; the app uses `FrameOptimizer`."""
 
     @property
-    def best(self) -> Iterate | None:
+    def best(self) -> "Iterate | None":
         """During a run, the iterate with the lowest loss for the current observation; at the end, the last iterate."""
 
     @property
@@ -51,17 +40,17 @@ class Optimizer(Protocol):
         """Reason for the end of the run; None until then."""
 
     @property
-    def assessment(self) -> Assessment | None:
+    def assessment(self) -> "Assessment | None":
         """Assessment of the result; None during the run, and if the solver does not assess it."""
 
-    def step(self) -> Iterate | None:
+    def step(self) -> "Iterate | None":
         """The next iterate, first the initial state; None after the last iterate."""
 
     def base_frame_gain(self) -> float | None:
         """At the end, the share of the residual that free base frames would explain [1]; None if unknown."""
 
     @property
-    def history(self) -> list[Progress]:
+    def history(self) -> "list[Progress]":
         """Progress of every iterate."""
         ...
 
@@ -103,18 +92,18 @@ class ActiveRun:
             return None
         kept = (
             " The initial pose was kept."
-            if self.optimizer.stop_reason in (StopReason.FAILED, StopReason.START_KEPT)
+            if self.optimizer.stop_reason in (optimization.StopReason.FAILED, optimization.StopReason.START_KEPT)
             else ""
         )
         return FitVerdict(found.verdict.value, f"{found.reason}{kept}", found.remedy, found.probability)
 
-    def pose(self, iterate: Iterate) -> Pose:
+    def pose(self, iterate: "Iterate") -> Pose:
         """Convert an iterate's state, which has the run's cameras only, to a pose of the whole scene.
 
         Parameters that were not free are copied exactly: rounding must not count as a new calibration of all frames.
         """
-        state, start, free = iterate.state.to("cpu"), self.start.scene, self._free
-        extrinsics, intrinsics = start.T_camera_world.clone(), start.intrinsics.clone()
+        state, start, free = iterate.state.numpy(), self.start.scene, self._free
+        extrinsics, intrinsics = start.T_camera_world.copy(), start.intrinsics.copy()
         if free.extrinsics:
             extrinsics[self._rows] = state.T_camera_world
         if free.intrinsics:
@@ -128,7 +117,7 @@ class ActiveRun:
 class SequenceRun:
     """One run on many frames: the optimizer and its provenance."""
 
-    def __init__(self, optimizer: SequenceOptimizer, provenance: Provenance) -> None:
+    def __init__(self, optimizer: "SequenceOptimizer", provenance: Provenance) -> None:
         self.optimizer, self.provenance = optimizer, provenance
         self.cancelled = False
 
@@ -186,7 +175,7 @@ class OptimizerFactory:
         Raises:
             WeightsError: weights cannot be read.
         """
-        return any(read_weights(path).network.kind == SurfaceNetwork.kind for path in self._weights)
+        return any(_is_surface(path) for path in self._weights)
 
     def use(self, surface: Path | None) -> None:
         """Use another surface network from now on; None for the initial network.
@@ -194,24 +183,32 @@ class OptimizerFactory:
         Raises:
             WeightsError: the weights cannot be read, or are not those of a surface network.
         """
-        if surface is not None and read_weights(surface).network.kind != SurfaceNetwork.kind:
+        if surface is not None and not _is_surface(surface):
             raise WeightsError(f"{surface} contains no surface network. Adapt the network again.")
         self._surface, self._extractor = surface, None
 
-    def prepare(self) -> FeatureExtractor:
+    def prepare(self) -> "FeatureExtractor":
         """Load the networks, if they are not loaded yet.
 
         Raises:
             WeightsError: the networks cannot be loaded.
         """
+        leave_a_core_free()
         if self._extractor is None:
             self.report("Loading the networks")
             weights = list(self._weights)
             if self._surface is not None:
-                others = [path for path in weights if read_weights(path).network.kind != SurfaceNetwork.kind]
+                others = [path for path in weights if not _is_surface(path)]
                 weights = [self._surface, *others]
-            self._extractor = FeatureExtractor.load(*weights, device=self._device, inference=self._inference)
+            self._extractor = networks.FeatureExtractor.load(*weights, device=self._device, inference=self._inference)
         return self._extractor
+
+    @staticmethod
+    def forget_images(sequence: Recording) -> None:
+        """Drop values computed from the images of a recording."""
+        # Without this module, there are none.
+        if "carts_core.optimization.observation" in sys.modules:
+            optimization.Backgrounds.forget(sequence)
 
     def segmenter(self) -> Segmenter:
         """The segmenter of the *Prompt* tool.
@@ -238,22 +235,23 @@ class OptimizerFactory:
         known = extractor.sha256, domain, *cameras
         if known not in self._warnings:
             scene = scene.with_cameras(cameras)
-            found = check_domain(scene, sequence.frame(index, domain, list(cameras)), extractor)
-            background = Backgrounds.of(sequence, cameras, domain).covers(scene)
+            found = optimization.check_domain(scene, sequence.frame(index, domain, list(cameras)), extractor)
+            background = optimization.Backgrounds.of(sequence, cameras, domain).covers(scene)
             self._warnings[known] = tuple(found.warnings(", ".join(cameras), REMEDY, background=background))
         return self._warnings[known]
 
-    def predictor(self, target: Target) -> FeatureExtractor | MaskPredictor:
+    def predictor(self, target: Target) -> "FeatureExtractor | MaskPredictor":
         """Predictor of a target; if only masks are fitted, no network is loaded.
 
         Raises:
             WeightsError: the networks cannot be loaded.
         """
+        leave_a_core_free()
         if target.observed.what == "network":
             return self.prepare()
-        network = None if target.observed.what == "masks" else NetworkPredictor(self.prepare())
+        network = None if target.observed.what == "masks" else optimization.NetworkPredictor(self.prepare())
         masks, name = (None, "mask") if target.given is None else (target.given.masks, target.given.origin)
-        return MaskPredictor(network, masks, name)
+        return optimization.MaskPredictor(network, masks, name)
 
     def provenance(
         self,
@@ -291,7 +289,7 @@ class OptimizerFactory:
             )
         return self._frame_optimizer(task, predictor)
 
-    def assess(self, task: FrameTask) -> tuple[Assessment, float]:
+    def assess(self, task: FrameTask) -> "tuple[Assessment, float]":
         """Assessment and loss of a pose, which is not changed; errors are those of `make`."""
         surface = task.settings if isinstance(task.settings, SurfaceSolver) else SurfaceSolver()
         fixed = replace(task, settings=replace(surface, stages=NONE), free=FreeParameters())
@@ -302,31 +300,38 @@ class OptimizerFactory:
         return optimizer.assessment, float(optimizer.best.loss)
 
     @staticmethod
-    def _frame_optimizer(task: FrameTask, predictor: FeatureExtractor | MaskPredictor) -> FrameOptimizer:
+    def _frame_optimizer(task: FrameTask, predictor: "FeatureExtractor | MaskPredictor") -> "FrameOptimizer":
         sequence, joints, cameras = task.sequence, task.pose.scene.joint_positions, list(task.cameras)
         scene = scene_at(sequence.scene, task.pose.scene)
-        return FrameOptimizer(
+        return optimization.FrameOptimizer(
             scene,
             sequence.frame(task.index, task.domain, cameras),
-            Backgrounds.of(sequence, cameras, task.domain, required=task.settings.needs_background),
+            optimization.Backgrounds.of(sequence, cameras, task.domain, required=task.settings.needs_background),
             predictor,
             ignore=task.ignore,
-            start={arm.name: values.numpy() for arm, values in zip(scene.arms, joints, strict=True)},
+            start={arm.name: values for arm, values in zip(scene.arms, joints, strict=True)},
             settings=task.settings,
             free=task.free,
             cameras=cameras,
         )
 
 
+def _is_surface(weights: Path) -> bool:
+    """Whether a weights file contains a surface network; `WeightsError` if it cannot be read."""
+    from carts_core.networks.surface import SurfaceNetwork  # noqa: PLC0415
+    from carts_core.networks.weights import read_weights  # noqa: PLC0415
+
+    return read_weights(weights).network.kind == SurfaceNetwork.kind
+
+
 def scene_at(scene: Scene, state: SceneState) -> Scene:
     """The scene with base frames, extrinsics and intrinsics of a state."""
 
-    def array(value: torch.Tensor):
-        return value.numpy().astype("float64")
-
-    arms = [replace(arm, T_world_base=array(T)) for arm, T in zip(scene.arms, state.T_world_base, strict=True)]
+    arms = [
+        replace(arm, T_world_base=T.astype(np.float64)) for arm, T in zip(scene.arms, state.T_world_base, strict=True)
+    ]
     cameras = [
-        replace(camera, T_camera_world=array(T), intrinsics=tuple(k.tolist()))
+        replace(camera, T_camera_world=T.astype(np.float64), intrinsics=tuple(k.tolist()))
         for camera, T, k in zip(scene.cameras, state.T_camera_world, state.intrinsics, strict=True)
     ]
     return replace(scene, arms=tuple(arms), cameras=tuple(cameras))

@@ -12,12 +12,10 @@ from pathlib import Path
 from queue import Empty, SimpleQueue
 from typing import Any
 
+from carts_core import optimization
 from carts_core.errors import CartsError
-from carts_core.evaluation.calibration import moved_frames
 from carts_core.files.reading import VALUES, parse_json, read_text
 from carts_core.model.scene import Scene
-from carts_core.optimization.calibration import CalibrationOptimizer
-from carts_core.optimization.observation import Backgrounds
 from carts_core.project import (
     CorrectedIntrinsics,
     CorrectedTransform,
@@ -105,13 +103,13 @@ def calibrate(context: Context, optimizers: OptimizerFactory, count: int) -> Gen
     ignored = [session.ignored(index, cameras, target) for index in indices]
     before = session.editor.view
     scene = scene_at(session.scene, session.measured(state.frame))
-    optimizer = CalibrationOptimizer(
+    optimizer = optimization.CalibrationOptimizer(
         scene,
         frames,
         optimizers.predictor(target),
         free=replace(free, joints=False),
         ignore=ignored,
-        backgrounds=Backgrounds.of(sequence, cameras, state.domain),
+        backgrounds=optimization.Backgrounds.of(sequence, cameras, state.domain),
     )
     most = CALIBRATION_SETTINGS.iterations
     while (iterate := optimizer.step()) is not None:
@@ -143,6 +141,8 @@ def calibrate(context: Context, optimizers: OptimizerFactory, count: int) -> Gen
 
 def _moved(before: Scene, after: Scene) -> str:
     """Text with angles and distances of the poses that a calibration has moved; empty if there are none."""
+    from carts_core.evaluation.calibration import moved_frames  # noqa: PLC0415
+
     found = [f"{name} by {angle:.1f}° and {way:.1f} mm" for name, angle, way in moved_frames(before, after)]
     return f" Moved: {', '.join(found)}." if found else ""
 

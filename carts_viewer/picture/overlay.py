@@ -5,10 +5,9 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
-import torch
 from jaxtyping import Bool, Int
 
-from carts_core.evaluation.evaluate import dice, joint_mae_deg
+from carts_core.evaluation.metrics import dice, joint_mae_deg
 from carts_core.export.dataset import labelled
 from carts_core.model.keypoints import Keypoint, keypoints, project_keypoints
 from carts_core.model.parts import link_classes
@@ -16,7 +15,7 @@ from carts_core.model.scene import Scene, SceneState
 from carts_core.project import Key, MaskCorrection, PartLabels, ProjectState
 from carts_core.project.masks import ignored_labels
 from carts_core.recording import Frame, Sequence
-from carts_core.rendering import Renderer, pick_point
+from carts_core.rendering import ImageRenderer, pick_point
 from carts_viewer.picture import layers
 from carts_viewer.picture.layers import Layer
 from carts_viewer.state import Maps, Scores
@@ -28,14 +27,14 @@ class OverlayRenderer:
     def __init__(self, sequence: Sequence) -> None:
         self._scene = sequence.scene
         self._measured_joints = sequence.measured_joints
-        self._renderers: dict[str, Renderer] = {}
+        self._renderers: dict[str, ImageRenderer] = {}
         self._last: dict[str, tuple[SceneState, layers.ArmIds]] = {}
 
     def arm_ids(self, state: SceneState, camera: str) -> layers.ArmIds:
         """Index of the visible arm per pixel of the camera's own image, -1 for background."""
         # The result is cached, since overlay and scores of a pose are requested one after the other.
         if camera not in self._last or self._last[camera][0] is not state:
-            self._last[camera] = (state, self._renderer(camera).segment(state.to("cpu"))[0])
+            self._last[camera] = (state, self._renderer(camera).segment(state)[0])
         return self._last[camera][1]
 
     def classes(
@@ -45,7 +44,7 @@ class OverlayRenderer:
 
         Pixels added to the mask of an image without rendered arms have no class.
         """
-        rendered = self._renderer(camera).segment_links(state.to("cpu"))[0]
+        rendered = self._renderer(camera).segment_links(state)[0]
         classes = np.append(link_classes(self._scene.arms), 0)
         links = rendered
         if correction is not None and (rendered >= 0).any():
@@ -112,7 +111,7 @@ class OverlayRenderer:
 
     def pick(self, state: SceneState, camera: str, pixel: tuple[float, float], radius: float) -> Keypoint | None:
         """The visible point of an arm at a pixel, or the nearest within `radius` [px]; None if there is none."""
-        return pick_point(self._scene, self._renderer(camera), state.to("cpu"), pixel, radius)
+        return pick_point(self._scene, self._renderer(camera), state, pixel, radius)
 
     def scores(self, state: SceneState, frame: Frame, camera: str, correction: MaskCorrection | None = None) -> Scores:
         """Scores of the pose and its corrected mask against the frame's ground truth."""
@@ -122,21 +121,19 @@ class OverlayRenderer:
             name: dice(self.mask(state, name), mask) for name, mask in (frame.masks or {}).items() if name != camera
         }
         known = others if overlap is None else {camera: overlap, **others}
-        values = (joints.double().numpy() for joints in state.joint_positions)
+        values = (joints.astype(np.float64) for joints in state.joint_positions)
         estimate = {arm.name: joints for arm, joints in zip(self._scene.arms, values, strict=True)}
         return Scores(overlap, joint_mae_deg(self._scene, estimate, frame.truth or {}, self._measured_joints), known)
 
-    @torch.no_grad()
     def _shaded(self, state: SceneState, camera: str, opacity: float) -> layers.Rgba:
-        rendering = self._renderer(camera)(state.to("cpu"))
-        arm_ids = rendering.arm_ids[0].cpu().numpy()
-        self._last[camera] = (state, arm_ids)
-        return layers.shaded(rendering.image[0].cpu().numpy(), arm_ids, opacity)
+        images, arm_ids = self._renderer(camera).shaded(state)
+        self._last[camera] = (state, arm_ids[0])
+        return layers.shaded(images[0], arm_ids[0], opacity)
 
-    def _renderer(self, camera: str) -> Renderer:
+    def _renderer(self, camera: str) -> ImageRenderer:
         if camera not in self._renderers:
             own = self._scene.camera(camera)
-            self._renderers[camera] = Renderer(self._scene, width=own.width, height=own.height, cameras=[camera])
+            self._renderers[camera] = ImageRenderer(self._scene, width=own.width, height=own.height, cameras=[camera])
         return self._renderers[camera]
 
 

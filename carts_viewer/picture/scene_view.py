@@ -114,9 +114,7 @@ class SceneView:
 
     def show_pose(self, state: SceneState, camera: str) -> None:
         """Move arms and cameras to their poses in the frame of this camera."""
-        extrinsics = {
-            own.name: T.numpy().astype(float) for own, T in zip(self._scene.cameras, state.T_view_world, strict=True)
-        }
+        extrinsics = {own.name: T.astype(float) for own, T in zip(self._scene.cameras, state.T_view_world, strict=True)}
         if not self._unmoved(WORLD, camera.encode() + b"".join(T.tobytes() for T in extrinsics.values())):
             _place(self._world, extrinsics[camera])
             for name, outline in self._outlines.items():
@@ -129,11 +127,11 @@ class SceneView:
         self._place_arms(self._measured, state)
 
     def _place_arms(self, arms: list[list[viser.FrameHandle]], state: SceneState) -> None:
-        bases = state.T_world_base.numpy().astype(float)
+        bases = state.T_world_base.astype(float)
         for arm, nodes, T_world_base, joints in zip(self._scene.arms, arms, bases, state.joint_positions, strict=True):
-            if self._unmoved(nodes[0].name, T_world_base.tobytes() + joints.detach().numpy().tobytes()):
+            if self._unmoved(nodes[0].name, T_world_base.tobytes() + joints.tobytes()):
                 continue
-            Ts_base_link = arm.robot.forward_kinematics(joints).detach().numpy().astype(float)
+            Ts_base_link = arm.robot.forward_kinematics(joints).astype(float)
             for node, T_base_link in zip(nodes, Ts_base_link, strict=True):
                 _place(node, T_world_base @ T_base_link)
 

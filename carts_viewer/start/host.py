@@ -2,13 +2,15 @@
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 from carts_core.errors import SettingsError
-from carts_core.networks import FeatureExtractor
 from carts_viewer.start.roots import MAX_ENTRIES, Entry, Roots
 from carts_viewer.transport.document import Document
 from carts_viewer.transport.page import Page
+
+if TYPE_CHECKING:
+    from carts_core.networks import FeatureExtractor
 
 
 class SitePage(Protocol):
@@ -40,7 +42,7 @@ class Host(Protocol):
     def post(self, job: Callable[[], None]) -> None:
         """Queue a function for the site's thread. Thread-safe."""
 
-    def load_networks(self) -> FeatureExtractor:
+    def load_networks(self) -> "FeatureExtractor":
         """Load the networks. Thread-safe.
 
         Raises:

@@ -7,12 +7,11 @@ import threading
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Unpack
+from typing import TYPE_CHECKING, Unpack
 
 import viser
 
 from carts_core.errors import CartsError
-from carts_core.networks import FeatureExtractor
 from carts_core.process import return_memory
 from carts_core.resources import sample_sequence
 from carts_viewer.actions import intents
@@ -26,6 +25,9 @@ from carts_viewer.transport.document import Document, render
 from carts_viewer.transport.events import Chosen, Clicked
 from carts_viewer.transport.page import Page
 from carts_viewer.wizard.wizard import RecordingWizard
+
+if TYPE_CHECKING:
+    from carts_core.networks import FeatureExtractor
 
 _log = logging.getLogger(__name__)
 
@@ -111,7 +113,7 @@ class Site:
         finally:
             self.page.close()
 
-    def load_networks(self) -> FeatureExtractor:
+    def load_networks(self) -> "FeatureExtractor":
         """Load the networks; see `Host.load_networks`."""
         networks = {name: value for name, value in self._options.items() if name in NetworkOptions.__annotations__}
         return OptimizerFactory(report=self._report, **networks).prepare()  # pyright: ignore[reportArgumentType]

@@ -48,7 +48,7 @@ class FramePicture:
         self._renderer = OverlayRenderer(sequence)
         self._shown: tuple[int, str] | None = None
         frame = sequence.frame(0)
-        state = sequence.scene.state(frame.measured, mounts=frame.mounts)
+        state = sequence.scene.state(frame.measured, None, frame.mounts)
         self._view = SceneView(page.server.scene, sequence.scene, state, sequence.scene.cameras[0].name)
 
     def show(self, index: int, camera: str, scene: Scene | None) -> None:
@@ -58,7 +58,7 @@ class FramePicture:
         if scene is None:
             picture = layers.transparent(own.height, own.width)
         else:
-            ids = self._renderer.arm_ids(scene.state(frame.measured, mounts=frame.mounts), camera)
+            ids = self._renderer.arm_ids(scene.state(frame.measured, None, frame.mounts), camera)
             picture = layers.contour(ids, _OPACITY)
         with self._page.server.atomic():
             if self._shown != (index, camera):

@@ -92,7 +92,7 @@ def test_a_perturbation_moves_every_joint_by_its_size_and_the_seed_fixes_it(ship
 
 def test_a_perturbation_keeps_to_the_limits_and_the_chosen_joints(shipped_psm: Robot) -> None:
     tiny = tiny_scene(shipped_psm, 1, ("left",), 96, 72)
-    start = {"PSM1": shipped_psm.joint_limits[:, 1].numpy().copy()}
+    start = {"PSM1": shipped_psm.joint_limits[:, 1].copy()}
     moved = perturb(tiny.scene, start, 5.0, seed=0)["PSM1"]
     assert (moved <= start["PSM1"]).all()
     only = perturb(tiny.scene, {"PSM1": tiny.truth[0]}, 5.0, 0, {"PSM1": ("yaw",)})["PSM1"] != tiny.truth[0]

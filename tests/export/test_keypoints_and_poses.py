@@ -25,7 +25,7 @@ def test_coco_keypoints_lie_where_the_camera_sees_them(dataset: Dataset, tmp_pat
         points = keypoints(dataset.scene.arm(category["name"]))
         assert category["keypoints"] == [point.name for point in points]
         assert {index for edge in category["skeleton"] for index in edge} == set(range(1, len(points) + 1))
-        pixels = project_keypoints(dataset.scene, dataset.state(view.frame), points, view.camera.name).numpy()
+        pixels = project_keypoints(dataset.scene, dataset.state(view.frame), points, view.camera.name)
         values = np.array(annotation["keypoints"]).reshape(-1, 3)
         mask = coco.annToMask(annotation).astype(bool)
         assert annotation["num_keypoints"] == (values[:, 2] > 0).sum()

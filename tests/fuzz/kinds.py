@@ -155,7 +155,7 @@ def _open_robot(path: Path) -> None:
     _check_finite(robot.forward_kinematics(torch.full((2, dofs), 0.1)).numpy())
     for mesh in robot.meshes:
         _check_finite(mesh.vertices, mesh.normals, mesh.color)
-    if bool(robot.joint_limits.isnan().any()):
+    if bool(np.isnan(robot.joint_limits).any()):
         raise NotFiniteError
 
 

@@ -48,7 +48,7 @@ def test_an_instrument_has_the_joints_and_the_kinematics_of_its_arm(name: str) -
     robot = loaded(name)
     instrument, geometry = instrument_of(name)
     assert robot.joint_names == JOINTS[: 7 if instrument.has_jaws else 6]
-    low, high = robot.joint_limits.numpy().T
+    low, high = robot.joint_limits.T
     positions = np.random.default_rng(0).uniform(low, high, (50, len(low)))
     Ts = robot.link_transform(torch.from_numpy(positions), "wrist_yaw_link").numpy()
     expected = forward(positions[:, :6], geometry)

@@ -8,10 +8,10 @@ import torch
 from tiny import TinyScene, tiny_scene
 
 from carts_core.errors import RobotError, SettingsError
-from carts_core.model.keypoints import keypoints, project_keypoints
+from carts_core.model.keypoints import Pin, keypoints, project_keypoints
 from carts_core.model.perturbation import perturb
 from carts_core.model.robot import Robot
-from carts_core.optimization.keypoints import KeypointSettings, Pin, fit_keypoints
+from carts_core.optimization.keypoints import KeypointSettings, fit_keypoints
 
 TRUTH = np.array([0.1, -0.05, 0.16, 0.4, 0.3, -0.3, 0.4])
 """[rad, m]; no joint at a limit, and the wrist bent so that its joints can be told apart."""
@@ -37,7 +37,7 @@ def _perturbed(tiny: TinyScene, degrees: float, seed: int):
 def test_four_exact_keypoints_determine_the_joints(tiny: TinyScene, seed: int, cameras: tuple[str, ...]) -> None:
     pins = [pin for camera in cameras for pin in _pins(tiny, camera)]
     fit = fit_keypoints(tiny.scene, _perturbed(tiny, 2.0, seed), pins)
-    error = fit.state.joint_positions[0].numpy() - TRUTH
+    error = fit.state.joint_positions[0] - TRUTH
     assert np.abs(np.degrees(np.delete(error, 2))).max() < 0.1 and abs(error[2]) < 1e-4
     assert max(fit.residuals) < 0.05 and len(fit.residuals) == len(pins)
 
@@ -45,7 +45,7 @@ def test_four_exact_keypoints_determine_the_joints(tiny: TinyScene, seed: int, c
 def test_one_pin_is_met_and_joints_move_no_more_than_they_need(tiny: TinyScene) -> None:
     start = _perturbed(tiny, 2.0, 0)
     fit = fit_keypoints(tiny.scene, start, _pins(tiny, count=1))
-    moved = (fit.state.joint_positions[0] - start.joint_positions[0]).numpy()
+    moved = fit.state.joint_positions[0] - start.joint_positions[0].numpy()
     assert fit.residuals[0] < 0.05
     assert np.abs(np.degrees(np.delete(moved, 2))).max() < 4.0
 

@@ -10,7 +10,7 @@ from moving import let_camera_move, swing
 from perfect_predictor import NumberedTruths, PerfectPredictor, numbered
 
 from carts_core.errors import SettingsError
-from carts_core.evaluation.evaluate import dice
+from carts_core.evaluation.metrics import dice
 from carts_core.model.scene import SceneState
 from carts_core.optimization import CalibrationOptimizer, FrameOptimizer, FreeParameters, SequenceOptimizer
 from carts_core.optimization.calibration import with_fixed_gauge

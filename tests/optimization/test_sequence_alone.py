@@ -8,10 +8,16 @@ import numpy as np
 import pytest
 from short_sequence import ARM, FRAMES, Truths, optimizer
 
-from carts_core.optimization import FrameOptimizer, FreeParameters, SequenceOptimizer, SequenceSettings, SurfaceSolver
+from carts_core.optimization import (
+    FrameOptimizer,
+    FreeParameters,
+    SequenceOptimizer,
+    SequenceSettings,
+    SurfaceSolver,
+    Verdict,
+)
 from carts_core.optimization.sequence_frame import Origin, SequenceFrameSolver, SingleFrameFit
 from carts_core.optimization.variables import Variables
-from carts_core.optimization.verdict import Verdict
 from carts_core.recording import Frame, Sequence
 from carts_core.settings.stages import NONE
 

@@ -18,11 +18,11 @@ from carts_core.optimization import (
     SequenceOptimizer,
     SequenceSettings,
     SurfaceSolver,
+    Verdict,
 )
 from carts_core.optimization.sequence import initial_correction
 from carts_core.optimization.sequence_frame import FrameEstimate, Origin, SequenceFrameSolver
 from carts_core.optimization.variables import Variables
-from carts_core.optimization.verdict import Verdict
 from carts_core.recording import Frame
 from carts_core.rendering import Renderer
 

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from carts_core.errors import SettingsError, WeightsError
-from carts_core.evaluation.evaluate import dice
+from carts_core.evaluation.metrics import dice
 from carts_core.networks import FeatureExtractor
 from carts_core.recording import Sequence
 from carts_core.segmentation import NetworkSegmenter, Prompt, Segmenter

@@ -91,7 +91,7 @@ class AppModel:
 
 def _machine(path: Path, factory: OptimizerFactory) -> type[RuleBasedStateMachine]:
     sequence = Sequence.open(path)
-    low, high = sequence.scene.arm(ARM).robot.joint_limits.numpy().T
+    low, high = sequence.scene.arm(ARM).robot.joint_limits.T
     measured = [sequence.frame(index, cameras=[]).measured[ARM] for index in range(FRAMES)]
 
     class AppMachine(RuleBasedStateMachine):

@@ -160,7 +160,7 @@ def test_a_freed_camera_moves_in_the_pose_and_the_other_camera_stays(desk: Desk)
     desk.do(intents.SetCameras(False), intents.SetFreeGroup("extrinsics", True), intents.Run())
     state = desk.finish()
     calibrated = [camera.T_camera_world for camera in desk.session.scene.cameras]
-    left, right = state.pose.scene.T_camera_world.numpy()
+    left, right = state.pose.scene.T_camera_world
     assert np.abs(left - calibrated[0]).max() > 1e-5
     assert np.allclose(right, calibrated[1], atol=1e-6)
 

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from viewer_desk import Desk
 
 from carts_core.errors import CartsError
@@ -221,7 +220,7 @@ def test_the_point_that_was_taken_follows_the_pointer_and_a_gesture_is_one_step(
     assert desk.saved.position == 1 and desk.saved.steps[0].name.startswith("Drag PSM1 ")
     desk.do(intents.Undo())
     for one, other in zip(desk.state.pose.scene.joint_positions, start.joint_positions, strict=True):
-        assert torch.equal(one, other)
+        assert np.array_equal(one, other)
 
 
 def test_a_link_that_is_dragged_beyond_its_limits_and_back_brings_the_joints_back(desk: Desk) -> None:
@@ -231,7 +230,7 @@ def test_a_link_that_is_dragged_beyond_its_limits_and_back_brings_the_joints_bac
     away = desk.session.joints(desk.state.pose.scene)
     assert max(np.abs(away[arm] - start[arm]).max() for arm in start) > 0.005
     for arm in desk.session.scene.arms:
-        low, high = arm.robot.joint_limits.double().numpy().T
+        low, high = arm.robot.joint_limits.T
         assert (away[arm.name] >= low - 1e-6).all() and (away[arm.name] <= high + 1e-6).all()
     desk.do(intents.DragLink(1.0, "left", place, place))
     back = desk.session.joints(desk.state.pose.scene)
@@ -294,7 +293,7 @@ def test_a_pose_as_measured_needs_no_correction_and_one_as_saved_keeps_its_prove
 def test_a_corrected_calibration_holds_in_every_frame(session: Session) -> None:
     frame = session.frame(1, "regular", "left")
     state = session.pose(frame).scene
-    extrinsics, intrinsics, bases = state.T_camera_world.clone(), state.intrinsics.clone(), state.T_world_base.clone()
+    extrinsics, intrinsics, bases = state.T_camera_world.copy(), state.intrinsics.copy(), state.T_world_base.copy()
     extrinsics[1, 0, 3] += 0.01
     intrinsics[0, 0] += 5.0
     bases[0, 1, 3] += 0.02
@@ -303,9 +302,9 @@ def test_a_corrected_calibration_holds_in_every_frame(session: Session) -> None:
     assert {key.name for key in edits if key.kind in (Kind.EXTRINSICS, Kind.INTRINSICS)} == {"right", "left"}
     session.editor.project.apply("Calibrate", edits)
     other = _pose(session, 0).scene
-    torch.testing.assert_close(other.T_camera_world, extrinsics, rtol=0.0, atol=1e-7)
-    torch.testing.assert_close(other.T_world_base, bases, rtol=0.0, atol=1e-7)
-    assert torch.equal(other.intrinsics, intrinsics)
+    np.testing.assert_allclose(other.T_camera_world, extrinsics, rtol=0.0, atol=1e-7)
+    np.testing.assert_allclose(other.T_world_base, bases, rtol=0.0, atol=1e-7)
+    assert np.array_equal(other.intrinsics, intrinsics)
 
 
 # ---- People at the same time ----------------------------------------------------------------------------------------

@@ -14,7 +14,7 @@ from viewer_tab import READY, dismiss_warning, new_context
 from visitor import Visitor, write_lab_files
 from waiting import eventually, wait_in
 
-from carts_core.evaluation.evaluate import dice
+from carts_core.evaluation.metrics import dice
 from carts_core.model.camera import HALF_PIXEL
 from carts_core.model.psm_kinematics import JOINT_NAMES
 from carts_core.model.scene import Scene

@@ -13,7 +13,7 @@ from viewer_desk import Desk
 from viewer_tab import decoded
 
 from carts_core.errors import CartsError, SettingsError
-from carts_core.evaluation.evaluate import dice
+from carts_core.evaluation.metrics import dice
 from carts_core.model.camera import Camera
 from carts_core.model.parts import part_classes
 from carts_core.project import IgnoreRegion, Key, MaskCorrection

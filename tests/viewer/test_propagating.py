@@ -10,7 +10,7 @@ import pytest
 from viewer_desk import Desk
 
 from carts_core.errors import CartsError, ProjectError
-from carts_core.evaluation.evaluate import dice
+from carts_core.evaluation.metrics import dice
 from carts_core.optimization import SequenceOptimizer, SurfaceSolver
 from carts_core.project import (
     CorrectedIntrinsics,

@@ -70,7 +70,7 @@ def test_a_frame_that_changes_after_it_was_accepted_must_be_accepted_again(desk:
 def test_the_calibration_is_part_of_what_was_accepted_in_every_frame(desk: Desk) -> None:
     desk.do(ACCEPT, intents.ShowFrame(1), intents.SetReview(ReviewState.REJECTED), intents.ShowFrame(2))
     scene = desk.state.pose.scene
-    moved = scene.T_world_base.clone()
+    moved = scene.T_world_base.copy()
     moved[0, 0, 3] += 0.001
     desk.controller._context.set_pose("Move the base", replace(scene, T_world_base=moved))
     assert [desk.saved.review(i).state for i in range(3)] == ["untouched", "rejected", "untouched"]

@@ -173,7 +173,7 @@ def _crossing_joints(scene: Scene, around: dict[str, np.ndarray], rng: np.random
     for _ in range(_DRAWS):
         drawn = {}
         for arm in scene.arms:
-            low, high = arm.robot.joint_limits[:3].numpy().T
+            low, high = arm.robot.joint_limits[:3].T
             step = rng.normal(0.0, [_TURN, _TURN, _REACH])
             drawn[arm.name] = around[arm.name].copy()
             drawn[arm.name][:3] = np.clip(around[arm.name][:3] + step, low, high)

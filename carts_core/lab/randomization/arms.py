@@ -296,7 +296,7 @@ def perturbed(rng: np.random.Generator, geometry: RobotGeometry, placement: Plac
 
 
 def _random_joints(rng: np.random.Generator, geometry: RobotGeometry) -> np.ndarray:
-    limits = geometry.robot.joint_limits.numpy()
+    limits = geometry.robot.joint_limits
     low = np.where(np.isfinite(limits[:, 0]), limits[:, 0], -np.pi)
     high = np.where(np.isfinite(limits[:, 1]), limits[:, 1], np.pi)
     anywhere = rng.uniform(low, high)
@@ -392,7 +392,7 @@ class RecordedPlacements:
         rows = self._joints[name]
         least = np.where(np.array(geometry.robot.joint_types) == "revolute", _LEAST, 0.1 * _LEAST)
         spread = np.maximum(_JOINTS * np.ptp(rows, axis=0), least)
-        low, high = geometry.robot.joint_limits.numpy().T
+        low, high = geometry.robot.joint_limits.T
         joints = np.clip(rows[int(rng.integers(len(rows)))] + rng.normal(0, 1, rows.shape[1]) * spread, low, high)
         T_camera_base = T_camera_world @ self._arms[name].T_world_base
         placement = Placement(joints, T_camera_base)

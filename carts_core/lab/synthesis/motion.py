@@ -168,7 +168,7 @@ def _draw(
     low, high = motion.jaw_range
     joints[:, 6:] = np.clip((low + high) / 2 + _spline(config, rng, np.array([0.75 * (high - low)])), low, high)
     joints = reach_tip(arm, config.tip_link, targets, joints)
-    lowest, highest = arm.robot.joint_limits.numpy()[:6].T
+    lowest, highest = arm.robot.joint_limits[:6].T
     margin = _LIMIT_MARGIN * (highest - lowest)
     if (joints[:, :6] < lowest + margin).any() or (joints[:, :6] > highest - margin).any():
         raise Rejected("a joint is too close to its limit")
@@ -313,7 +313,7 @@ def plan_arm(
 
 def _draw_arm(robot: Robot, config: SynthesisConfig, rng: np.random.Generator) -> Float[np.ndarray, "frames dofs"]:
     """Random motion about a random configuration, within the joint limits."""
-    low, high = robot.joint_limits.numpy().T
+    low, high = robot.joint_limits.T
     low, high = np.where(np.isfinite(low), low, -_FREE), np.where(np.isfinite(high), high, _FREE)
     reach = np.minimum(config.motion.wrist_range, 0.25 * (high - low))
     middle = rng.uniform(low + 1.2 * reach, high - 1.2 * reach)

@@ -8,7 +8,6 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
-import torch
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
@@ -48,7 +47,7 @@ def tips_of(arm: FoundArm) -> Float[np.ndarray, "rows 3"]:
     joints = np.zeros((len(arm.values), len(robot.joint_names)))
     for column, name in enumerate(arm.columns):
         joints[:, robot.joint_names.index(name)] = arm.values[:, column]
-    return robot.forward_kinematics(torch.from_numpy(joints)).numpy()[:, -1, :3, 3]
+    return robot.forward_kinematics(joints)[:, -1, :3, 3]
 
 
 def check_in_view(arm: FoundArm, camera: FoundCamera, job: Import) -> None:

@@ -113,7 +113,7 @@ def test_a_plan_keeps_within_limits_touches_nothing_and_stays_in_view(
 ) -> None:
     renderer = Renderer(Scene(arms, (camera,)), width=160, height=120)
     for arm, positions in zip(arms, joints, strict=True):
-        low, high = arm.robot.joint_limits.numpy().T
+        low, high = arm.robot.joint_limits.T
         assert (positions > low + 0.02).all() and (positions < high - 0.02).all()
     for frame in range(len(joints[0])):
         left, right = (_vertices(arm, positions[frame]) for arm, positions in zip(arms, joints, strict=True))

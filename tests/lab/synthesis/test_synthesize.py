@@ -132,7 +132,7 @@ def test_one_arm_is_seen_from_so_far_and_its_masks_are_those_of_the_true_joints(
         )
         assert true > 0.97 and measured < true
         assert (np.abs(frame.truth["arm"] - frame.measured["arm"]) > 0.005).all()
-        low, high = arm.robot.joint_limits.numpy().T
+        low, high = arm.robot.joint_limits.T
         assert (frame.truth["arm"] > low).all() and (frame.truth["arm"] < high).all()
         T_camera_base = sequence.scene.cameras[0].T_camera_world @ arm.T_world_base
         tip = arm.robot.forward_kinematics(torch.from_numpy(frame.truth["arm"]))[-1].numpy()

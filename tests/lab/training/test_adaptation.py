@@ -75,7 +75,7 @@ def test_arms_are_placed_at_the_distance_of_the_recording_and_in_the_image(far_a
         distances.append(np.median(z))
         u, v = fx * x / z + cx, fy * y / z + cy
         inside += bool(((u > 0) & (u < 48) & (v > 0) & (v < 32)).any())
-        low, high = robot.joint_limits.numpy().T
+        low, high = robot.joint_limits.T
         assert ((placement.joint_positions >= low) & (placement.joint_positions <= high)).all()
     assert 1.2 < np.median(distances) < 1.9
     assert inside == 40
