@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from PIL import Image
 
-from carts_core.evaluation.evaluate import dice
+from carts_core.evaluation.metrics import dice
 from carts_core.model.scene import SceneState
 from carts_core.networks import FeatureExtractor
 from carts_core.optimization import FrameOptimizer

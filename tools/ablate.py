@@ -22,7 +22,7 @@ from unittest.mock import patch
 import numpy as np
 import torch
 
-from carts_core.evaluation.evaluate import Estimate, frame_score, start_positions
+from carts_core.evaluation.scores import Estimate, frame_score, start_positions
 from carts_core.networks.extractor import FeatureExtractor
 from carts_core.optimization import Backgrounds, FrameOptimizer
 from carts_core.recording import Sequence

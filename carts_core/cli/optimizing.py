@@ -71,7 +71,7 @@ _CODE = (
     "imaging/**/*.py",
     "model/**/*.py",
     "recording/*.py",
-    "evaluation/evaluate.py",
+    "evaluation/scores.py",
     "export/kinematics.py",
     "export/encodings.py",
     "networks/**/*.py",

@@ -15,13 +15,13 @@ if TYPE_CHECKING:
     from .calibration import frame_residuals as frame_residuals
     from .calibration import mean_dice as mean_dice
     from .calibration import write_calibration as write_calibration
-    from .evaluate import FrameScore as FrameScore
-    from .evaluate import Setup as Setup
-    from .evaluate import camera_groups as camera_groups
-    from .evaluate import evaluate as evaluate
-    from .evaluate import mean_score as mean_score
-    from .evaluate import start_positions as start_positions
-    from .evaluate import to_json as to_json
+    from .scores import FrameScore as FrameScore
+    from .scores import Setup as Setup
+    from .scores import camera_groups as camera_groups
+    from .scores import evaluate as evaluate
+    from .scores import mean_score as mean_score
+    from .scores import start_positions as start_positions
+    from .scores import to_json as to_json
 
 __getattr__ = names_on_first_use(
     __name__,
@@ -34,6 +34,6 @@ __getattr__ = names_on_first_use(
             "mean_dice",
             "write_calibration",
         ),
-        "evaluate": ("FrameScore", "Setup", "camera_groups", "evaluate", "mean_score", "start_positions", "to_json"),
+        "scores": ("FrameScore", "Setup", "camera_groups", "evaluate", "mean_score", "start_positions", "to_json"),
     },
 )

@@ -3,8 +3,6 @@
 import cv2
 import numpy as np
 from jaxtyping import Bool, Int, UInt, UInt8
-from pycocotools import mask as coco_mask
-from scipy.spatial.distance import cdist
 
 from ..errors import CartsError
 
@@ -31,6 +29,8 @@ def image_png(image: UInt8[np.ndarray, "height width channels"]) -> bytes:
 def coco_rle(mask: Bool[np.ndarray, "height width"]) -> dict[str, object]:
     """Encode a mask as COCO's compressed run-length encoding (column-major): `size` as [height, width], and `counts` as
     text."""
+    from pycocotools import mask as coco_mask  # noqa: PLC0415
+
     counts = coco_mask.encode(np.asfortranarray(mask, dtype=np.uint8))["counts"]
     assert isinstance(counts, bytes)
     return {"size": list(mask.shape), "counts": counts.decode("ascii")}
@@ -108,6 +108,8 @@ def _links(line: np.ndarray, points: np.ndarray, first: np.ndarray) -> tuple[np.
     Args:
         points: points of all holes; those of hole n are `first[n]` to `first[n + 1]`.
     """
+    from scipy.spatial.distance import cdist  # noqa: PLC0415
+
     length, at = np.full(len(points), np.inf), np.zeros(len(points), np.int64)
     for row in range(0, len(line), _ROWS):
         distances = cdist(line[row : row + _ROWS], points, "sqeuclidean")

@@ -18,19 +18,8 @@ from ..files import MARKER, OutputPath, output_stream, published, published_file
 from ..model.camera import T_DVRK_OPENCV
 from ..recording import Sequence as Recording
 from ..settings import FormatName
-from .annotation_formats import (
-    write_bop,
-    write_coco,
-    write_coco_keypoints,
-    write_cvat,
-    write_datumaro,
-    write_masks,
-    write_voc,
-    write_yolo,
-)
 from .dataset import Dataset, ExportFrame, ExportProgress
 from .kinematics import JOINED, joint_columns, joint_units, kinematics_csv, position_values, std_values
-from .video import write_video
 
 
 def _camera_poses(dataset: Dataset, frames: Sequence[ExportFrame]) -> dict[str, Float[np.ndarray, "frames 4 4"]]:
@@ -151,8 +140,8 @@ class ExportFormat:
     that any sequence can be exported to."""
 
 
-def _imported(module: str, name: str) -> Callable[[Dataset, OutputPath, ExportProgress], None]:
-    """Writer that is imported at its first use, since it needs the importers of recordings and their libraries."""
+def _imported(name: str, module: str = "annotation_formats") -> Callable[[Dataset, OutputPath, ExportProgress], None]:
+    """Writer that is imported at its first use, since it needs further libraries."""
 
     def write(dataset: Dataset, output: OutputPath, progress: ExportProgress) -> None:
         getattr(import_module(f".{module}", __package__), name)(dataset, output, progress)
@@ -161,30 +150,30 @@ def _imported(module: str, name: str) -> Callable[[Dataset, OutputPath, ExportPr
 
 
 FORMATS: dict[FormatName, ExportFormat] = {
-    "masks": ExportFormat("PNG masks", write_masks, refines=True),
-    "coco": ExportFormat("COCO", write_coco, images=True, refines=True),
-    "coco-keypoints": ExportFormat("COCO keypoints", write_coco_keypoints, images=True),
-    "bop": ExportFormat("BOP poses", write_bop, images=True),
-    "yolo": ExportFormat("YOLO segmentation", write_yolo, images=True, refines=True),
-    "voc": ExportFormat("Pascal VOC", write_voc, images=True, refines=True),
-    "cvat": ExportFormat("CVAT for images", write_cvat, images=True, refines=True),
-    "datumaro": ExportFormat("Datumaro", write_datumaro, images=True, refines=True),
+    "masks": ExportFormat("PNG masks", _imported("write_masks"), refines=True),
+    "coco": ExportFormat("COCO", _imported("write_coco"), images=True, refines=True),
+    "coco-keypoints": ExportFormat("COCO keypoints", _imported("write_coco_keypoints"), images=True),
+    "bop": ExportFormat("BOP poses", _imported("write_bop"), images=True),
+    "yolo": ExportFormat("YOLO segmentation", _imported("write_yolo"), images=True, refines=True),
+    "voc": ExportFormat("Pascal VOC", _imported("write_voc"), images=True, refines=True),
+    "cvat": ExportFormat("CVAT for images", _imported("write_cvat"), images=True, refines=True),
+    "datumaro": ExportFormat("Datumaro", _imported("write_datumaro"), images=True, refines=True),
     "csv": ExportFormat("Kinematics, CSV", write_kinematics_csv, ".csv"),
     "npz": ExportFormat("Kinematics, NumPy", write_kinematics_npz, ".npz"),
     "json": ExportFormat("Kinematics, JSON", write_kinematics_json, ".json"),
     "dvrk": ExportFormat("Base frames for the dVRK", write_dvrk, ".json"),
     "dvrk-2.3": ExportFormat("Base frames for the dVRK up to 2.3", write_dvrk_2_3, ".json"),
     "dvrk-suj": ExportFormat("Fixed set-up joints for the dVRK", write_dvrk_suj, ".json"),
-    "video": ExportFormat("Overlay video", write_video),
-    "rosbag2": ExportFormat("ROS 2 bag (MCAP)", _imported("rosbag_format", "write_rosbag2"), refines=True),
+    "video": ExportFormat("Overlay video", _imported("write_video", "video")),
+    "rosbag2": ExportFormat("ROS 2 bag (MCAP)", _imported("write_rosbag2", "rosbag_format"), refines=True),
     "lerobot": ExportFormat(
-        "LeRobot data set", _imported("lerobot_format", "write_lerobot"), refines=True, source="lerobot"
+        "LeRobot data set", _imported("write_lerobot", "lerobot_format"), refines=True, source="lerobot"
     ),
     "surgsync": ExportFormat(
-        "SurgSync recording", _imported("surgsync_format", "write_surgsync"), refines=True, source="surgsync"
+        "SurgSync recording", _imported("write_surgsync", "surgsync_format"), refines=True, source="surgsync"
     ),
     "recorded-csv": ExportFormat(
-        "Recorded tables, CSV", _imported("recorded_csv_format", "write_recorded_csv"), refines=True, source="folder"
+        "Recorded tables, CSV", _imported("write_recorded_csv", "recorded_csv_format"), refines=True, source="folder"
     ),
 }
 

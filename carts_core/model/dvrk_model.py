@@ -17,7 +17,7 @@ from ..files.decoding import decoded
 from ..files.reading import CALIBRATION, MESH, LfsPointerError, open_regular, parse_yaml, read_text
 from ..package_imports import require_package
 from ..wording import counted
-from .meshes import mesh_path
+from .link_mesh import mesh_path
 from .psm_kinematics import CLASSIC, SI
 from .psm_urdf import remote_center_chain
 from .xacro_guard import expanded

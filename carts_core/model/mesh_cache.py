@@ -14,7 +14,7 @@ from ..errors import OutputError
 from ..files import locked_folder, output_path, output_stream
 from ..files.paths import home
 from ..files.reading import CACHED, MESH, open_regular, read_bytes
-from .meshes import Decimation, LinkMesh
+from .link_mesh import Decimation, LinkMesh
 
 _VERSION = 3
 

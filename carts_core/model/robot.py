@@ -3,14 +3,14 @@
 import io
 import math
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
 
 import numpy as np
-import trimesh
-import yourdfpy
 from jaxtyping import Float
 
 from ..arrays import Array, converted, library
@@ -19,7 +19,10 @@ from ..files.reading import ROBOT, is_regular, read_text
 from ..wording import listed, shown
 from . import mesh_cache
 from .instruments import robot_file
-from .meshes import CLUSTERING_RATIO, Decimation, LinkMesh, build_link_meshes, collada_asset, load_visual, mesh_path
+from .link_mesh import CLUSTERING_RATIO, Decimation, LinkMesh, collada_asset, mesh_path
+
+if TYPE_CHECKING:
+    import trimesh
 
 NO_LIMIT = 1e3
 """Joint limit [rad], [m] above which a joint is considered unlimited."""
@@ -40,35 +43,120 @@ def exact_right_angles(root: Element) -> None:
             origin.set("rpy", " ".join(repr(float(angle)) for angle in angles))
 
 
+@dataclass(frozen=True, eq=False)
+class _Joint:
+    """A joint of a checked URDF."""
+
+    name: str
+    type: str
+    parent: str
+    child: str
+    origin: Float[np.ndarray, "4 4"]
+    """T_parent_child at position 0 [m]."""
+    axis: Float[np.ndarray, "3"]
+    mimic: tuple[str, float, float] | None
+    """Mimicked joint, multiplier and offset."""
+    limits: tuple[float, float]
+    """Lower and upper limit [rad, m]; infinite without a limit."""
+
+    @property
+    def independent(self) -> bool:
+        """Whether the joint is a degree of freedom."""
+        return self.type != "fixed" and self.mimic is None
+
+    @staticmethod
+    def of(element: Element) -> "_Joint":
+        """Joint of an element that `parsed_urdf` has checked."""
+        kind = element.get("type", "")
+        parent, child = (_attributes(element, role).get("link", "") for role in ("parent", "child"))
+        origin, mimic, limit = (_attributes(element, part) for part in ("origin", "mimic", "limit"))
+        T_parent_child = np.eye(4)
+        T_parent_child[:3, :3] = _rotation(*_numbers(origin.get("rpy", "0 0 0")))
+        T_parent_child[:3, 3] = _numbers(origin.get("xyz", "0 0 0"))
+        follows = None
+        if element.find("mimic") is not None:
+            follows = mimic.get("joint", ""), float(mimic.get("multiplier", 1.0)), float(mimic.get("offset", 0.0))
+        lower, upper = -math.inf, math.inf
+        if kind != "continuous" and "lower" in limit and "upper" in limit:
+            # Some URDFs have a huge limit for an unlimited joint.
+            lower, upper = (
+                math.copysign(math.inf, value) if abs(value) > NO_LIMIT else value
+                for value in (float(limit["lower"]), float(limit["upper"]))
+            )
+        axis = np.array(_numbers(_attributes(element, "axis").get("xyz", "1 0 0")))
+        return _Joint(element.get("name", ""), kind, parent, child, T_parent_child, axis, follows, (lower, upper))
+
+    def matrices(self) -> Float[np.ndarray, "4 4 4"]:
+        """Constant matrices C, S, G, P with T_parent_child = C + S sin(q) + G cos(q) + P q.
+
+        For a revolute joint with the cross product matrix K of its unit axis, Rodrigues' formula is
+        R = I + K^2 + K sin(q) - K^2 cos(q).
+        """
+        matrices = np.zeros((4, 4, 4))
+        matrices[0] = np.eye(4)
+        if self.type != "fixed":
+            x, y, z = axis = self.axis / np.linalg.norm(self.axis)
+            if self.type == "prismatic":
+                matrices[3, :3, 3] = axis
+            else:
+                K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+                matrices[0, :3, :3] += K @ K
+                matrices[1, :3, :3], matrices[2, :3, :3] = K, -K @ K
+        return self.origin @ matrices
+
+
+def _attributes(element: Element, part: str) -> Mapping[str, str]:
+    """Attributes of a child element; empty without it."""
+    found = element.find(part)
+    return {} if found is None else found.attrib
+
+
+def _numbers(text: str) -> list[float]:
+    return [float(word) for word in text.replace(",", " ").split()]
+
+
+def _rotation(roll: float, pitch: float, yaw: float) -> Float[np.ndarray, "3 3"]:
+    """Rotation about the fixed axes x, y and z in this order, as in a URDF."""
+    (sr, sp, sy), (cr, cp, cy) = np.sin([roll, pitch, yaw]), np.cos([roll, pitch, yaw])
+    return np.array(
+        [
+            [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
+            [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
+            [-sp, cp * sr, cp * cr],
+        ]
+    )
+
+
 class Kinematics:
     """Forward kinematics of a robot's links from its independent joint positions.
 
     The transform of a link in its parent's frame is C + S sin(q) + G cos(q) + P q with constant matrices C, S, G and P,
-    where q is the position of the joint between them; see `_joint_matrices`.
+    where q is the position of the joint between them; see `_Joint.matrices`.
 
     Args:
+        root: the checked URDF.
         base_link: reference frame of the transforms, which must not move with a joint; None for the root.
     """
 
-    def __init__(self, model: yourdfpy.URDF, base_link: str | None, source: Path) -> None:
-        self.joint_names: tuple[str, ...] = tuple(model.actuated_joint_names)
-        joints = model.joint_map
+    def __init__(self, root: Element, base_link: str | None, source: Path) -> None:
+        joints = {joint.name: joint for joint in map(_Joint.of, root.findall("joint"))}
+        self.joint_names: tuple[str, ...] = tuple(name for name, joint in joints.items() if joint.independent)
         self.joint_types: tuple[str, ...] = tuple(
             "prismatic" if joints[name].type == "prismatic" else "revolute" for name in self.joint_names
         )
         self.joint_limits: Float[np.ndarray, "dofs 2"] = np.array(
-            [_limits(joints[name]) for name in self.joint_names], np.float64
+            [joints[name].limits for name in self.joint_names], np.float64
         ).reshape(-1, 2)
         above = {joint.child: joint for joint in joints.values()}
-        links = _from_root(list(model.link_map), above)
+        links = _from_root([link.get("name", "") for link in root.findall("link")], above)
         self.base_link = base_link or links[0]
         if self.base_link not in links:
             raise RobotError(f"{source}: there is no link {self.base_link!r}. The links are: {', '.join(links)}.")
         self._frame_index = {name: index for index, name in enumerate(links)}
         self._parents = [self._frame_index[above[name].parent] for name in links[1:]]
         moving = [above[name] for name in links[1:]]
-        matrices = np.array([_joint_matrices(joint) for joint in moving]).reshape(-1, 4, 4, 4)
-        self._constants = (*_mimic_matrix(model, moving), *matrices.swapaxes(0, 1))
+        matrices = np.array([joint.matrices() for joint in moving]).reshape(-1, 4, 4, 4)
+        self._constants = (*_mimic_matrix(joints, moving, self.joint_names), *matrices.swapaxes(0, 1))
         probes = np.stack([np.zeros(len(self.joint_names)), np.full(len(self.joint_names), 0.1)])
         Ts_root_base = self._Ts_root(probes)[self._frame_index[self.base_link]]
         if not np.allclose(Ts_root_base[0], Ts_root_base[1]):
@@ -111,7 +199,7 @@ class Kinematics:
         return Ts.astype(joint_positions.dtype) if of is np else Ts.to(joint_positions.dtype)
 
 
-def _from_root(links: list[str], above: dict[str, yourdfpy.Joint]) -> list[str]:
+def _from_root(links: list[str], above: Mapping[str, _Joint]) -> list[str]:
     """Links such that each follows its parent; `above` is the joint above each link but the root."""
     ordered = [link for link in links if link not in above]
     children: dict[str, list[str]] = {}
@@ -123,52 +211,21 @@ def _from_root(links: list[str], above: dict[str, yourdfpy.Joint]) -> list[str]:
     return ordered
 
 
-def _joint_matrices(joint: yourdfpy.Joint) -> Float[np.ndarray, "4 4 4"]:
-    """Constant matrices C, S, G, P with T_parent_child = C + S sin(q) + G cos(q) + P q.
-
-    For a revolute joint with the cross product matrix K of its unit axis, Rodrigues' formula is
-    R = I + K^2 + K sin(q) - K^2 cos(q).
-    """
-    origin = np.eye(4) if joint.origin is None else np.asarray(joint.origin, np.float64)
-    matrices = np.zeros((4, 4, 4))
-    matrices[0] = np.eye(4)
-    if joint.type != "fixed":
-        x, y, z = axis = np.asarray(joint.axis, np.float64) / np.linalg.norm(joint.axis)
-        if joint.type == "prismatic":
-            matrices[3, :3, 3] = axis
-        else:
-            K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-            matrices[0, :3, :3] += K @ K
-            matrices[1, :3, :3], matrices[2, :3, :3] = K, -K @ K
-    return origin @ matrices
-
-
-def _limits(joint: yourdfpy.Joint) -> tuple[float, float]:
-    limit = joint.limit
-    if joint.type == "continuous" or limit is None or limit.lower is None or limit.upper is None:
-        return -np.inf, np.inf
-    # Some URDFs have a huge limit for an unlimited joint.
-    lower, upper = (
-        math.copysign(math.inf, value) if abs(value) > NO_LIMIT else float(value)
-        for value in (limit.lower, limit.upper)
-    )
-    return lower, upper
-
-
-def _mimic_matrix(model: yourdfpy.URDF, joints: list[yourdfpy.Joint]) -> tuple[np.ndarray, np.ndarray]:
+def _mimic_matrix(
+    joints: Mapping[str, _Joint], moving: Sequence[_Joint], independent: Sequence[str]
+) -> tuple[Float[np.ndarray, "joints dofs"], Float[np.ndarray, " joints"]]:
     """Matrix and offset that map independent joint positions to the positions of all joints; 0 for fixed joints."""
-    independent = list(model.actuated_joint_names)
-    expand, offset = np.zeros((len(joints), len(independent))), np.zeros(len(joints))
-    for row, joint in enumerate(joints):
+    expand, offset = np.zeros((len(moving), len(independent))), np.zeros(len(moving))
+    for row, joint in enumerate(moving):
         if joint.type == "fixed":
             continue
-        factor, shift, leader = 1.0, 0.0, joint
-        while (mimic := leader.mimic) is not None:
-            shift += factor * (mimic.offset or 0.0)
-            factor *= mimic.multiplier if mimic.multiplier is not None else 1.0
-            leader = model.joint_map[mimic.joint]
+        factor, leader = 1.0, joint
+        while leader.mimic is not None:
+            name, multiplier, shift = leader.mimic
+            offset[row] += factor * shift
+            factor *= multiplier
+            leader = joints[name]
         expand[row, independent.index(leader.name)] = factor
-        offset[row] = shift
     return expand, offset
 
 
@@ -441,11 +498,7 @@ class Robot:
         try:
             root = parsed_urdf(read_text(urdf, ROBOT), urdf)
             exact_right_angles(root)
-            text = ElementTree.tostring(root, encoding="unicode")
-            model = yourdfpy.URDF.load(
-                io.BytesIO(text.encode()), load_meshes=False, build_scene_graph=False, mesh_dir=str(urdf.parent)
-            )
-            kinematics = Kinematics(model, base_link, urdf)
+            kinematics = Kinematics(root, base_link, urdf)
         except FileNotFoundError as error:
             raise RobotError(f"robot {urdf} is missing. Give the path of a URDF file.") from error
         except RobotError:
@@ -454,20 +507,21 @@ class Robot:
             raise RobotError(f"robot {urdf} is not a readable URDF ({error}). Check it with a URDF viewer.") from error
         if not kinematics.joint_names:
             raise RobotError(
-                f"robot {model.robot.name} ({urdf}) has no movable joint. Use a robot with movable joints."
+                f"robot {root.get('name')} ({urdf}) has no movable joint. Use a robot with movable joints."
             )
-        link_names = tuple(link.name for link in model.robot.links if link.visuals)
+        name, files = root.get("name", ""), _mesh_files(root, urdf)
+        link_names = tuple(link.get("name", "") for link in root.findall("link") if link.find("visual") is not None)
         limits = max_faces, tolerance
         meshes, decimation = mesh_cache.cached_meshes(
-            _cache_key(model, kinematics, urdf, limits),
-            lambda: _prepared_meshes(model, kinematics, urdf, link_names, limits, report),
+            _cache_key(files, kinematics, urdf, limits),
+            lambda: _prepared_meshes(root, kinematics, urdf, link_names, limits, report),
         )
         if not meshes:
             raise RobotError(f"robot {urdf} has no visual mesh to render. Add <visual> elements.")
-        remarks = _remarks(_mesh_files(model, urdf))
+        remarks = _remarks(files)
         if decimation.before > CLUSTERING_RATIO * max_faces:
             remarks = (*remarks, f"{decimation}.")
-        return Robot(model.robot.name, urdf, kinematics, link_names, meshes, decimation, remarks)
+        return Robot(name, urdf, kinematics, link_names, meshes, decimation, remarks)
 
     def forward_kinematics(self, joint_positions: Float[Array, "*batch dofs"]) -> Float[Array, "*batch links 4 4"]:
         """Ts_base_link [m] of the links in `link_names` (f_FK of the paper): an array for an array of joint positions,
@@ -502,16 +556,14 @@ class Robot:
         return self.joint_names.index(joint_name)
 
 
-def _mesh_files(model: yourdfpy.URDF, urdf: Path) -> list[Path]:
+def _mesh_files(root: Element, urdf: Path) -> list[Path]:
     """Existing mesh files of a URDF."""
-    geometries = [visual.geometry for link in model.robot.links for visual in link.visuals]
-    names = [each.mesh.filename for each in geometries if each is not None and each.mesh is not None]
-    return [path for name in names if is_regular(path := mesh_path(urdf.parent, name))]
+    meshes = [mesh for visual in root.iterfind("link/visual") for mesh in visual.iterfind("geometry/mesh")]
+    return [path for mesh in meshes if is_regular(path := mesh_path(urdf.parent, mesh.get("filename", "")))]
 
 
-def _cache_key(model: yourdfpy.URDF, kinematics: Kinematics, urdf: Path, limits: tuple[int, float | None]) -> str:
+def _cache_key(files: list[Path], kinematics: Kinematics, urdf: Path, limits: tuple[int, float | None]) -> str:
     """Cache key of link meshes; `limits` are `max_faces` and `tolerance` of `Robot.load`."""
-    files = _mesh_files(model, urdf)
     # Units other than metres are part of the key, since older cache entries are not scaled.
     units = tuple(metres for file in files if (metres := collada_asset(file)[0]) != 1.0)
     settings = (kinematics.base_link, *limits, units) if units else (kinematics.base_link, *limits)
@@ -533,14 +585,32 @@ def _remarks(files: Iterable[Path]) -> tuple[str, ...]:
 
 
 def _prepared_meshes(
-    model: yourdfpy.URDF,
+    root: Element,
     kinematics: Kinematics,
     urdf: Path,
     link_names: tuple[str, ...],
     limits: tuple[int, float | None],
     report: Callable[[str], None],
 ) -> mesh_cache.PreparedMeshes:
-    """Read and decimate the meshes of links."""
+    """Read and decimate the meshes of links.
+
+    Raises:
+        RobotError: a mesh is missing or invalid, or a visual is not readable.
+    """
+    # Imported for meshes that are not in the cache.
+    import yourdfpy  # noqa: PLC0415
+
+    from .meshes import build_link_meshes, load_visual  # noqa: PLC0415
+
+    try:
+        model = yourdfpy.URDF.load(
+            io.BytesIO(ElementTree.tostring(root)),
+            load_meshes=False,
+            build_scene_graph=False,
+            mesh_dir=str(urdf.parent),
+        )
+    except Exception as error:  # the parser raises many types of exceptions
+        raise RobotError(f"robot {urdf} is not a readable URDF ({error}). Check it with a URDF viewer.") from error
     report(f"{model.robot.name}: preparing meshes (once)")
     materials = {material.name: material for material in model.robot.materials}
     links = {link.name: link for link in model.robot.links}
@@ -560,7 +630,7 @@ def _prepared_meshes(
 
 
 def _tolerance(
-    kinematics: Kinematics, link_names: tuple[str, ...], parts: list[tuple[int, trimesh.Trimesh, np.ndarray]]
+    kinematics: Kinematics, link_names: tuple[str, ...], parts: "list[tuple[int, trimesh.Trimesh, np.ndarray]]"
 ) -> float:
     """Maximum surface deviation [m]: `INSTRUMENT_TOLERANCE` for an instrument, else a share of the robot's reach."""
     if not parts:

@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float
-from scipy.optimize import least_squares
 
 from ..errors import SettingsError
 from ..model.keypoints import Pin, project_keypoints
@@ -58,6 +57,8 @@ def fit_keypoints(
         SettingsError: there is no pin, or a keypoint starts behind its camera.
         RobotError: a pin names an arm or a camera that does not exist.
     """
+    from scipy.optimize import least_squares  # noqa: PLC0415  takes 0.3 s
+
     if not pins:
         raise SettingsError("no keypoint is placed. Place at least one keypoint in the image.")
     settings = settings or KeypointSettings()

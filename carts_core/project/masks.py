@@ -12,7 +12,6 @@ from jaxtyping import Bool
 from ..errors import ProjectError
 from ..optimization import GivenMasks
 from ..recording import Sequence as Recording
-from ..recording.annotations import read_annotations
 from ..rendering import ImageRenderer
 from ..wording import counted, listed
 from .layers import ImportedMask
@@ -66,6 +65,8 @@ def project_masks(layer: MaskLayer, state: ProjectState, recording: Recording) -
 
 def file_masks(source: Path, recording: Recording) -> GivenMasks:
     """Masks from a file or folder, read by `read_annotations`; `ProjectError` if no mask matches a frame."""
+    from ..recording.annotations import read_annotations  # noqa: PLC0415  imports all importers
+
     found = read_annotations(source, recording)
     layers = {
         (frame.frame, frame.camera): ImportedMask.of(frame.labels) for frame in found.frames if frame.labels is not None

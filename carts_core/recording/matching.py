@@ -5,7 +5,6 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.spatial.transform import Rotation, Slerp
 
 from ..errors import SequenceError
 from ..model.ecm_kinematics import JOINT_NAMES, forward
@@ -104,6 +103,8 @@ class Samples:
             return np.tile(self.values, (len(places), 1, 1))
         rows = np.arange(len(self.values))
         Ts = np.tile(np.eye(4), (len(places), 1, 1))
+        from scipy.spatial.transform import Rotation, Slerp  # noqa: PLC0415  takes 0.2 s
+
         Ts[:, :3, :3] = Slerp(rows, Rotation.from_matrix(self.values[:, :3, :3]))(places).as_matrix()
         Ts[:, :3, 3] = np.stack([np.interp(places, rows, one) for one in self.values[:, :3, 3].T], 1)
         return Ts
@@ -269,6 +270,8 @@ def _poses(section: TomlTable, table: Table) -> Float[np.ndarray, "rows 4 4"]:
             far[0],
         )
     Ts = np.tile(np.eye(4), (len(table), 1, 1))
+    from scipy.spatial.transform import Rotation  # noqa: PLC0415  takes 0.2 s
+
     Ts[:, :3, :3], Ts[:, :3, 3] = Rotation.from_quat(rotations).as_matrix(), positions
     return Ts if kind == POSES[0] else np.linalg.inv(Ts)
 

@@ -14,7 +14,6 @@ from typing import Any
 import cv2
 import numpy as np
 from jaxtyping import Float
-from scipy.optimize import minimize_scalar
 
 from ..model.robot import Robot
 from .sequence import Sequence
@@ -224,6 +223,8 @@ class _Delays:
             return 1.0 - float((XY * _fitted(XX, XY)).sum() / max(float(YY), 1e-12))
 
         bounds = around - 1.5 * _GRID, around + 1.5 * _GRID
+        from scipy.optimize import minimize_scalar  # noqa: PLC0415  takes 0.3 s
+
         found: Any = minimize_scalar(unexplained, bounds=bounds, method="bounded", options={"xatol": 2e-4})
         return float(found.x)
 

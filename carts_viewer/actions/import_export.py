@@ -18,7 +18,6 @@ from carts_core.files import OutputPath, file_name, output_path
 from carts_core.project import ProjectState, ReviewState, frames_in, import_annotations
 from carts_core.project.state import calibrated_scene
 from carts_core.project.values import UNREVIEWED
-from carts_core.recording.annotations import read_annotations
 from carts_core.settings import Masks
 from carts_core.wording import shown
 from carts_viewer.actions import intents
@@ -355,6 +354,8 @@ class ImportingHandler(Handler):
             raise CartsError("Enter the path of the masks: an annotation file, or a folder of masks or labels.")
         # The folder is resolved, since it may be reached through a link.
         path = session.roots.checked(session.sequence.path.parent.resolve() / Path(given))
+        from carts_core.recording.annotations import read_annotations  # noqa: PLC0415  imports all importers
+
         found = read_annotations(path, session.sequence, intent.camera, format=intent.format, confined=True)
         self._context.end_run("Stopped: masks were imported")
         self._context.save()

@@ -47,7 +47,7 @@ def drawing_of(arm: Arm) -> Drawing | None:
     points = {name: mark for name, mark in known.items() if mark.kind is LandmarkKind.POINT}
     if not points:
         return None
-    low, high = robot.joint_limits.double().numpy().T
+    low, high = robot.joint_limits.T
     low, high = np.clip(low, -np.pi, np.pi), np.clip(high, -np.pi, np.pi)
     Ts = link_transforms(arm, (low + _BEND * (high - low))[None])[0]
     centres = np.stack([mark.positions(Ts)[0] for mark in points.values()])

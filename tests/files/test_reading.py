@@ -16,7 +16,8 @@ import pytest
 
 from carts_core.errors import CartsError, RobotError, SequenceError, WeightsError
 from carts_core.files.reading import Kind, RefusedFileError, parse_json, parse_toml, read_bytes
-from carts_core.model.meshes import mesh_path, read_mesh
+from carts_core.model.link_mesh import mesh_path
+from carts_core.model.meshes import read_mesh
 from carts_core.model.robot import Robot
 from carts_core.networks.weights import read_weights
 from carts_core.recording.annotations.recognition import recognized

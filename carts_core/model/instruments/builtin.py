@@ -10,9 +10,6 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from xml.etree import ElementTree
 
-import trimesh
-from trimesh.exchange.ply import export_ply
-
 from ...errors import OutputError, RobotError
 from ...files import output_path, write_bytes
 from ...files.reading import MESH, is_regular, read_bytes
@@ -129,6 +126,9 @@ def _parts(instrument: Instrument) -> Iterator[tuple[str, str, str, str | Solid]
 
 
 def _meshes(instrument: Instrument) -> dict[str, bytes]:
+    import trimesh  # noqa: PLC0415
+    from trimesh.exchange.ply import export_ply  # noqa: PLC0415
+
     made = {}
     for name, _, _, shape in _parts(instrument):
         if isinstance(shape, str):

@@ -8,6 +8,7 @@ from itertools import product
 from typing import Any
 
 import numpy as np
+from jaxtyping import Bool
 
 from ..model.perturbation import perturb
 from ..model.scene import SceneState
