@@ -41,8 +41,12 @@ def gc_paused() -> Iterator[None]:
             gc.enable()
 
 
-def names_on_first_use(package: str, modules: Mapping[str, tuple[str, ...]]) -> Callable[[str], object]:
-    """`__getattr__` of a package that imports names from its modules on first use.
+def names_on_first_use(
+    package: str, modules: Mapping[str, tuple[str, ...]]
+) -> tuple[Callable[[str], object], Callable[[], list[str]]]:
+    """`__getattr__` and `__dir__` of a package that imports names from its modules on first use.
+
+    A name must not be the name of one of the package's modules.
 
     Args:
         package: the package's `__name__`.
@@ -57,4 +61,4 @@ def names_on_first_use(package: str, modules: Mapping[str, tuple[str, ...]]) -> 
         setattr(sys.modules[package], name, value)
         return value
 
-    return getattr_
+    return getattr_, lambda: sorted({*vars(sys.modules[package]), *module_of})

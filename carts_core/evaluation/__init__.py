@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from .scores import start_positions as start_positions
     from .scores import to_json as to_json
 
-__getattr__ = names_on_first_use(
+__getattr__, __dir__ = names_on_first_use(
     __name__,
     {
         "calibration": (

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from .tracker import LiveTracker as LiveTracker
     from .tracker import LiveVerdict as LiveVerdict
 
-__getattr__ = names_on_first_use(
+__getattr__, __dir__ = names_on_first_use(
     __name__,
     {
         "loop": ("LiveStatistics", "Results", "Tracked", "follow"),

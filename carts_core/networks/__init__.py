@@ -8,7 +8,7 @@ if TYPE_CHECKING:
     from .extractor import FeatureExtractor as FeatureExtractor
     from .extractor import hybrid as hybrid
 
-__getattr__ = names_on_first_use(
+__getattr__, __dir__ = names_on_first_use(
     __name__,
     {
         "extractor": ("FeatureExtractor", "hybrid"),

@@ -46,7 +46,7 @@ if TYPE_CHECKING:
     from .verdict import SequenceAssessment as SequenceAssessment
     from .verdict import check_domain as check_domain
 
-__getattr__ = names_on_first_use(
+__getattr__, __dir__ = names_on_first_use(
     __name__,
     {
         "calibration": ("CalibrationIterate", "CalibrationOptimizer", "CalibrationResult", "UnknownChange"),

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from .renderer import Rendering as Rendering
     from .renderer import SurfaceRendering as SurfaceRendering
 
-__getattr__ = names_on_first_use(
+__getattr__, __dir__ = names_on_first_use(
     __name__,
     {
         "jacobian": ("JacobianBlock", "Outline", "Tangents"),

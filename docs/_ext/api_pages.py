@@ -41,7 +41,7 @@ def api_pages() -> dict[str, str]:
 
 def _public_names(module: ModuleType, package: bool) -> Iterator[str]:
     """Public classes and functions defined in a module, or exported by a package, in their order."""
-    declared = getattr(module, "__all__", None) or vars(module)
+    declared = getattr(module, "__all__", None) or dict.fromkeys([*vars(module), *dir(module)])
     for name in declared:
         value = getattr(module, name)
         if name.startswith("_") or not (inspect.isclass(value) or inspect.isfunction(value)):
