@@ -30,7 +30,8 @@ def shows_its_own(tab: Tab) -> None:
         (tab.find("Opacity %"), round(100 * state.opacity)),
     ):
         expect(tab.field(handle)).to_have_value(f"{value:g}")
-    expect(tab.page.get_by_text(f"({state.index + 1} of {len(tab.app.sequence)})")).to_be_visible()
+    place = f"{state.frame.frame_id} of {len(tab.app.sequence)}"
+    expect(tab.page.locator(".carts-strip output")).to_contain_text(place)
     tab.open("Review")
     expect(tab.page.locator(".mantine-TextInput-input:visible").first).to_have_value(state.review.note)
     expect(tab.page.locator(tab.element(tab.find("Go to")))).to_have_value(tab.find("Go to").value)
