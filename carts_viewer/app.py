@@ -23,7 +23,7 @@ from carts_viewer.session import Storage, open_storage
 from carts_viewer.state import ViewState
 from carts_viewer.tabs import IntentQueue, Tab, Tabs, View
 from carts_viewer.transport import events
-from carts_viewer.transport.guard import check_address
+from carts_viewer.transport.guard import Proxy, check_address
 from carts_viewer.transport.page import Page
 from carts_viewer.worker import Worker
 
@@ -119,6 +119,8 @@ class ServerOptions(NetworkOptions, total=False):
     """Address to listen on, 127.0.0.1 by default. The URL contains a token if other computers can reach the address."""
     port: int
     """Port to listen on, 8080 by default; 0 for any free port. If the port is busy, the next free port is used."""
+    proxy: Proxy | None
+    """Reverse proxy in front of the server; None without one."""
 
 
 class ViewerApp:
@@ -140,6 +142,7 @@ class ViewerApp:
         *,
         host: str = "127.0.0.1",
         port: int = 8080,
+        proxy: Proxy | None = None,
         report: Callable[[str], None] = lambda line: None,
         page: Page | None = None,
         folders: tuple[Path, ...] = (),
@@ -160,7 +163,7 @@ class ViewerApp:
         # The first rendering compiles the visibility kernel, which takes seconds the very first time.
         report("Preparing the renderer (takes a few seconds the first time)")
         renderer.arm_ids(self.state.pose.scene, self.state.camera)
-        self.page = page or Page(host=host, port=port, title=f"{sequence.name} · CaRTS")
+        self.page = page or Page(host=host, port=port, title=f"{sequence.name} · CaRTS", proxy=proxy)
         self.url = self.page.url
         self.page.key_groups = key_groups()
         self.page.project = sequence.name

@@ -7,7 +7,25 @@
   // The token is no longer needed, and would be copied with the address.
   const address = new URL(location.href);
   address.searchParams.delete("token");
+  // viser connects to this address without a slash at its end, which proxies in front of a folder redirect.
+  if (address.pathname !== "/" && address.pathname.endsWith("/")) address.pathname += "index.html";
   history.replaceState(null, "", address);
+
+  // In a frame of another site, such as a notebook, a browser may deny storage; values then last as long as the page.
+  for (const name of ["localStorage", "sessionStorage"]) {
+    try {
+      void window[name];
+    } catch {
+      const kept = new Map();
+      Object.defineProperty(window, name, {
+        value: {
+          getItem: (key) => kept.get(key) ?? null,
+          setItem: (key, value) => void kept.set(key, String(value)),
+          removeItem: (key) => void kept.delete(key),
+        },
+      });
+    }
+  }
 
   /** An element with attributes and children; strings are inserted as text, never as HTML. */
   window.cartsElement = (tag, attributes = {}, ...children) => {

@@ -66,7 +66,7 @@
   const TAGS = new Set(("article b br button caption circle code details div figcaption figure footer g h1 h2 h3 header hr i img input label li line " +
     "ol option output p path polygon polyline progress section select small span summary svg table tbody td text th thead tr ul").split(" "));
   const ATTRIBUTES = /^(alt|checked|class|colspan|cx|cy|d|disabled|fill|for|height|id|max|min|open|placeholder|points|preserveAspectRatio|r|role|scope|selected|spellcheck|src|step|stroke|stroke-[a-z]+|style|tabindex|title|type|value|viewBox|width|x|x1|x2|y|y1|y2|data-[a-z]+|aria-[a-z]+)$/;
-  const PICTURES = /^\/(media\/[0-9a-f]+\.jpg|static\/[a-z]+\.(svg|webp))$/;
+  const PICTURES = /^(media\/[0-9a-f]+\.jpg|static\/[a-z]+\.(svg|webp))$/;
 
   /** The nodes of a document's HTML. */
   function built(content) {

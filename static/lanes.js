@@ -40,7 +40,7 @@
     const step = one >= wide ? 1 : 2 ** Math.ceil(Math.log2(wide / one));
     const missing = [];
     for (let frame = Math.floor(view[0] / step) * step; frame < Math.min(view[1], frames); frame += step) {
-      const address = `/thumbnail/${camera}/${domain}/${frame}.jpg`;
+      const address = `thumbnail/${camera}/${domain}/${frame}.jpg`;
       const x = xOf(frame);
       const picture = pictures.get(address);
       if (picture) context.drawImage(picture, x, top, wide - 1, height);

@@ -54,7 +54,7 @@
     if (running) return;
     if (!files.length) { show("Nothing to upload: there are no visible files.", null, true); return; }
     running = true;
-    const socket = new WebSocket(`${location.origin.replace(/^http/, "ws")}/upload`);
+    const socket = new WebSocket(new URL("upload", location.href.replace(/^http/, "ws")));
     try {
       show(` ${files.length} files`, 0);
       const folder = await transfer(socket, files);

@@ -25,15 +25,16 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class HandEye:
-    """Estimate base frames from landmarks clicked in 3 to 6 images, without an initial pose.
+    """Estimate base frames without an initial pose, from landmarks clicked in 3 to 6 images, or from masks of an arm.
 
     The points are read from a table (docs/howto/own_recording.md). To click points, use *New recording* in `carts
-    view`.
+    view`. Masks must contain the whole visible arm and nothing else; `carts calibrate --observe masks` refines the
+    result.
     """
 
     sequence: SequencePath
     """Sequence file. Its base frames are ignored."""
-    points: Path
+    points: Path | None = None
     """CSV file with the columns frame (its id), camera, arm, landmark (tip, wrist yaw joint, wrist pitch joint,
     shaft edge, shaft middle), u and v [px of the undistorted image, from its upper left corner]."""
     output: Path | None = None
@@ -46,9 +47,63 @@ class HandEye:
     """Cameras whose pose relative to the other cameras is unknown."""
     pixel_error: float = 2.0
     """Expected error of a point [px]."""
+    masks: str | None = None
+    """Masks instead of points: `recording` or a source of masks as in `carts calibrate --masks`."""
+    camera: str | None = None
+    """With masks: camera whose images are masked; by default the first one."""
+
+    def __post_init__(self) -> None:
+        if (self.points is None) == (self.masks is None):
+            raise SettingsError("give either --points FILE (clicked landmarks) or --masks (masks of the arm).")
 
     def run(self) -> None:
         """Solve and write the result; no files are left after an error."""
+        if self.masks is None:
+            self._from_points()
+        else:
+            self._from_masks(self.masks)
+
+    def _from_masks(self, masks: str) -> None:
+        from ..files import MARKER, published, write_text
+        from ..optimization.hand_eye import placed, pose_from_masks
+        from ..recording import Sequence, calibrated_sequence_file, evenly_spaced
+
+        console = Terminal()
+        sequence = Sequence.open(self.sequence, progress=console.print)
+        (camera,) = Selection(camera=(self.camera or sequence.scene.cameras[0].name,)).camera_names(sequence.scene)
+        arm = sequence.scene.arms[0].name
+        if len(sequence.scene.arms) > 1 or camera in sequence.moving_cameras:
+            raise SettingsError(
+                "a hand-eye calibration from masks needs one arm and a camera that does not move. Click points: "
+                "--points, or import one arm: carts import --arms."
+            )
+        observer = ObservationOptions(observe="masks", masks=masks).observer(CalibrationOptions().chosen, sequence)
+        known = [n for n in range(len(sequence)) if observer.has_mask(sequence, n, camera)]
+        if not known:
+            raise SettingsError(
+                f"no frame has a mask for camera {camera!r}. Give other masks, or click points: --points."
+            )
+        chosen = [known[n] for n in evenly_spaced(len(known), _MASKED_FRAMES)]
+        frames = [observer.completed(sequence.frame(n, cameras=[camera])) for n in chosen]
+        found = pose_from_masks(
+            sequence.scene,
+            arm,
+            camera,
+            sequence.measured[arm][chosen],
+            [frame.masks[camera] for frame in frames if frame.masks is not None],
+        )
+        scene = placed(sequence.scene, arm, camera, found.T_camera_base)
+        output = output_folder(self.output, sequence.name, "hand_eye")
+        with published(output, overwrite=self.overwrite) as folder:
+            text = calibrated_sequence_file(sequence.path, output.path, sequence.scene, scene, "hand-eye")
+            write_text(folder / "sequence.toml", text)
+            write_text(folder / MARKER, json.dumps({"format": "hand-eye", "sequence": str(self.sequence)}, indent=1))
+        console.print(f"{arm} in {camera}: mean IoU {found.iou:.2f} with the masks of {len(chosen)} frames")
+        console.print(
+            f"wrote {output}. To refine it: carts calibrate {output}/sequence.toml --observe masks --masks {masks}"
+        )
+
+    def _from_points(self) -> None:
         from ..files import MARKER, published, write_text
         from ..optimization.hand_eye import (
             RESULT_FILE,
@@ -64,6 +119,7 @@ class HandEye:
         console = Terminal()
         settings = HandEyeSettings(self.pixel_error, self.focal_length, self.free_cameras)
         sequence = Sequence.open(self.sequence, progress=console.print)
+        assert self.points is not None
         points = read_points(self.points, sequence)
         mounts = mounts_of_points(sequence, points)
         result = solve_hand_eye(moved_cameras(sequence.scene, mounts), sequence.measured, points, settings)
@@ -100,7 +156,8 @@ def _print(console: Console, sequence: "Sequence", points: "Points[ImagePoint]",
 
 @dataclass(frozen=True)
 class TimeOffset:
-    """Estimate the delay between images and joint positions from the motion of the arms, and propose a time_offset.
+    """Estimate the delay between images and joint positions from the motion of the arms, and propose a time_offset, or
+    one for each arm if they differ.
 
     This requires neither a hand-eye calibration nor a network. The sequence file is not changed.
     """
@@ -115,42 +172,45 @@ class TimeOffset:
     """Camera whose images are used; by default the first camera."""
     domain: str | None = None
     """Domain of the images; by default the first domain."""
-    largest: float = 0.5
-    """Half-width of the search range around the current time_offset [s], extended to at most 3 s if no delay in this
-    range explains the motion."""
+    largest: float = 3.0
+    """Half-width of the search range around the current time_offset [s]."""
 
     def run(self) -> None:
         """Print the estimate, and write a sequence file if a folder is given."""
         from ..files import MARKER, published, write_text
-        from ..recording import Sequence, calibrated_sequence_file, estimate_time_offset
+        from ..recording import Sequence, calibrated_sequence_file, estimate_time_offsets, offsets_to_write
 
         console = Terminal()
         sequence = Sequence.open(self.sequence, progress=console.print)
         with Bar(console=console) as bar:
             task = bar.add_task("motion in the images", total=None)
-            found = estimate_time_offset(
+            found = estimate_time_offsets(
                 sequence,
                 self.camera,
                 domain=self.domain,
                 largest=self.largest,
                 progress=lambda done, total: bar.update(task, completed=done, total=total),
             )
-        console.print(found.sentence())
-        if found.proposed is None:
+        for each in found:
+            console.print(each.sentence())
+        if not (offsets := offsets_to_write(found, sequence)):
             return
         if self.output is None:
-            console.print(f"Set it under [frames] in {self.sequence}, or give an output folder with -o.")
+            where = ", ".join(f"{value:g} in [[arms]] of {arm}" for arm, value in offsets.items() if arm)
+            text = f"Set time_offset in {self.sequence}: {offsets['']:g} in [frames]{', ' if where else ''}{where}"
+            console.print(f"{text}; or give an output folder with -o.")
             return
         with published(self.output, overwrite=self.overwrite) as folder:
-            text = calibrated_sequence_file(
-                sequence.path, self.output, sequence.scene, sequence.scene, "time-offset", found.proposed
-            )
+            scene = sequence.scene
+            text = calibrated_sequence_file(sequence.path, self.output, scene, scene, "time-offset", offsets)
             write_text(folder / "sequence.toml", text)
             write_text(folder / MARKER, json.dumps({"format": "time-offset", "sequence": str(self.sequence)}, indent=1))
         console.print(f"wrote {self.output}/sequence.toml")
 
 
 _SPREAD = "spread:"
+_MASKED_FRAMES = 12
+"""Maximum number of frames of a hand-eye calibration from masks."""
 
 
 @dataclass(frozen=True)

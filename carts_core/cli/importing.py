@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 from rich.console import Console
 
-from ..console import Terminal
+from ..console import Bar, Terminal
 from ..settings.interchange import AnnotationFormat, ImportOptions
 from .options import SequencePath
 
@@ -47,11 +47,19 @@ class Import:
             console.print(f"carts import SOURCE reads:\n{known_kinds()}", markup=False, highlight=False, soft_wrap=True)
             return
         folder = self.output or Path(f"{recording_name(self.source)}_sequence")
-        path, recording = import_recording(self.source, folder, self.options, overwrite=self.overwrite)
+        with Bar(console=console) as bar:
+
+            def show(done: int, total: int) -> None:
+                task = bar.task_ids[0] if bar.task_ids else bar.add_task("motion in the images")
+                bar.update(task, completed=done, total=total)
+
+            path, recording = import_recording(
+                self.source, folder, self.options, overwrite=self.overwrite, progress=show
+            )
         print_report(console, recording)
         console.print(f"wrote {path}. To view it: carts view {path}", markup=False, soft_wrap=True)
         if any(arm.times is not None for arm in recording.arms):
-            text = f"To estimate a delay between images and log: carts time-offset {path}"
+            text = f"To estimate a delay between images and log again: carts time-offset {path}"
             console.print(text, markup=False, soft_wrap=True)
 
 

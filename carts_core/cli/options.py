@@ -431,7 +431,7 @@ class Observer:
             return
         frames = list(frames)
         for camera, domain in product(cameras, domains):
-            without = [index for index in frames if not self._has_mask(sequence, index, camera, domain)]
+            without = [index for index in frames if not self.has_mask(sequence, index, camera, domain)]
             # If the network is also used, recorded masks may be missing, but external masks must belong to this
             # recording.
             if without and (self.every or (self.given is not None and len(without) == len(frames))):
@@ -445,7 +445,8 @@ class Observer:
     def _origin(self) -> str:
         return "mask" if self.given is None else self.given.origin
 
-    def _has_mask(self, sequence: "Sequence", index: int, camera: str, domain: str | None) -> bool:
+    def has_mask(self, sequence: "Sequence", index: int, camera: str, domain: str | None = None) -> bool:
+        """Whether a frame has a mask to be fitted."""
         if self.given is None:
             return sequence.has_masks(camera, domain, index)
         return self.given.available(index, camera)
@@ -460,7 +461,7 @@ class Observer:
             background: whether the solver uses the empty background.
         """
         if self.masked:
-            without = [camera for camera in cameras if not self._has_mask(sequence, index, camera, domain)]
+            without = [camera for camera in cameras if not self.has_mask(sequence, index, camera, domain)]
             if not without or len(without) == len(cameras):
                 return []
             return [

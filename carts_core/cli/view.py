@@ -30,6 +30,10 @@ class View:
     """
     port: int = 8080
     """Port to listen on; if it is in use, the next free port."""
+    base_path: str = ""
+    """Path of the page behind a reverse proxy, such as /x/y."""
+    trusted_origin: tuple[str, ...] = ()
+    """Origins at which browsers see the page through a proxy, such as https://host. Other origins are refused."""
     open_browser: bool = False
     """Open the page in the default browser."""
     segmenter: tuple[Path, Path] | None = None
@@ -40,6 +44,7 @@ class View:
         """Serve until Ctrl-C."""
         with gc_paused():
             from carts_viewer.serving import serve, serve_site
+            from carts_viewer.transport.guard import Proxy
 
             from ..batch.folder import is_batch
         # Otherwise each garbage collection would scan all modules, which blocks the page for 0.2 s.
@@ -52,6 +57,7 @@ class View:
         options: dict[str, Any] = {
             "host": self.host,
             "port": self.port,
+            "proxy": Proxy(self.base_path, self.trusted_origin),
             "device": self.network.processor,
             "inference": self.network.inference,
             "weights": self.network.weights,

@@ -62,7 +62,7 @@ def source_of(recording: Path | None, sequence: Recording) -> Path:
 def as_imported(sequence: Recording) -> Recording:
     """The sequence with the joint positions of its file at a time offset of 0, which are those of the recorded rows."""
     opened = Recording.open(sequence.path)
-    return opened if opened.matching is None else opened.with_time_offset(0.0)
+    return opened if opened.matching is None else opened.with_time_offset(0.0, of_arms=False)
 
 
 def rows_of_frames(

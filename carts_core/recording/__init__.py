@@ -8,4 +8,5 @@ from .sequence import FrameReader as FrameReader
 from .sequence import Sequence as Sequence
 from .sequence_file import calibrated_sequence_file as calibrated_sequence_file
 from .time_delay import TimeOffsetEstimate as TimeOffsetEstimate
-from .time_delay import estimate_time_offset as estimate_time_offset
+from .time_delay import estimate_time_offsets as estimate_time_offsets
+from .time_delay import offsets_to_write as offsets_to_write

@@ -1,6 +1,6 @@
 """Joint positions and camera poses at the times of the frames, from the rows of kinematics tables."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -65,13 +65,15 @@ class Samples:
     """Table, for error messages."""
     times: Float[np.ndarray, " rows"] | None
     """Time of each row in the table's clock, increasing [s]; None if row n belongs to frame n."""
+    time_offset: float = 0.0
+    """Time in the table's clock minus time in the clock of `[kinematics]` [s]."""
 
     def at_frames(self, frames: FrameList, matching: TimeMatching | None) -> Float[np.ndarray, "frames ..."]:
         """Values of the frames; joints and positions are interpolated linearly, rotations spherically."""
         if matching is None:
             return self.values
         assert self.times is not None and frames.timestamps is not None
-        wanted = frames.timestamps + matching.time_offset
+        wanted = frames.timestamps + matching.time_offset + self.time_offset
         before, after = neighbours(self.times, wanted)
         to_before, to_after = np.abs(wanted - self.times[before]), np.abs(self.times[after] - wanted)
         if matching.interpolation == "nearest":
@@ -88,8 +90,9 @@ class Samples:
         return (1.0 - share[:, None]) * self.values[before] + share[:, None] * self.values[after]
 
     def logged_at(self, times: Float[np.ndarray, " times"]) -> Float[np.ndarray, "times ..."]:
-        """Values at times of the table's clock; NaN outside the table's range."""
+        """Values at times of the clock of `[kinematics]` [s]; NaN outside the table's range."""
         assert self.times is not None
+        times = times + self.time_offset
         if self.values.ndim == 2:
             return at_times(times, self.times, self.values)
         places = np.interp(times, self.times, np.arange(len(self.times), dtype=float), left=np.nan, right=np.nan)
@@ -112,7 +115,8 @@ class Samples:
     def _too_far(self, frames: FrameList, matching: TimeMatching, far: np.ndarray) -> SequenceError:
         assert self.times is not None and frames.timestamps is not None
         row, what = far[0], "joint positions" if self.values.ndim == 2 else "camera poses"
-        wanted = frames.timestamps + matching.time_offset
+        offset = matching.time_offset + self.time_offset
+        wanted = frames.timestamps + offset
         after = int(np.searchsorted(self.times, wanted[row]))
         near = " and ".join(
             f"line {self.table.lines[index]} at {self.times[index]:.6g} s"
@@ -122,7 +126,7 @@ class Samples:
         return self.table.error(
             f" has no {what} for {len(far)} of {counted(len(wanted), 'frame')}. The first is frame "
             f"{frames.frame_ids[row]!r} at {wanted[row]:.6g} s of the table's clock (image time plus time_offset = "
-            f"{matching.time_offset:g} s), next to {near}; at most {matching.max_gap:g} s are allowed. "
+            f"{offset:g} s), next to {near}; at most {matching.max_gap:g} s are allowed. "
             f"The frames are from {wanted.min():.6g} to {wanted.max():.6g} s, the rows from {self.times[0]:.6g} to "
             f"{self.times[-1]:.6g} s. Correct `time_offset` in [frames] (both clocks are in seconds), leave out these "
             "frames with a table of the other frames, or allow a larger `max_gap`."
@@ -150,7 +154,16 @@ class Rows:
         """Measured joint positions of an arm, from its own `table` or the table of the sequence; raises as `read`."""
         own = arm.take("table", str, "")
         table = self.read(arm.path(own)) if own else self.table
-        return self.samples(table, columns.read(table))
+        return replace(self.samples(table, columns.read(table)), time_offset=self.offset_of(arm))
+
+    def offset_of(self, arm: TomlTable) -> float:
+        """Key `time_offset` of an arm [s]; `SequenceError` if rows are not matched by time."""
+        offset = float(arm.take("time_offset", float, 0.0))
+        if offset and self.matching is None:
+            raise arm.error(
+                "time_offset", "needs [frames], so that rows are matched by time. Add it, or remove the key."
+            )
+        return offset
 
     def truth_of(self, arm: TomlTable, columns: JointColumns) -> Samples | None:
         """True joint positions of an arm, from its own `truth` or the table of the sequence; raises as `read`."""
@@ -158,7 +171,7 @@ class Rows:
         if (path := arm.path(own) if own else self.truth) is None:
             return None
         table = self.read(path)
-        return self.samples(table, columns.read(table))
+        return replace(self.samples(table, columns.read(table)), time_offset=self.offset_of(arm))
 
     def read(self, path: Path) -> Table:
         """Read another table, which must have the same frames or the same clock."""

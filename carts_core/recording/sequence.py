@@ -127,11 +127,19 @@ class Sequence:
         # An absolute path stays valid if the working directory changes.
         return Sequence(read_description(Path(path).absolute(), progress))
 
-    def with_time_offset(self, time_offset: float) -> "Sequence":
-        """Sequence with the same images and joint positions at another time offset (kinematics minus image) [s];
-        `SequenceError` if rows are not matched by time, or the rows of a frame are too distant in time."""
-        matching = replace(self.checked_matching(), time_offset=time_offset)
-        moved = Sequence(replace(self._description, matching=matching))
+    @property
+    def arm_time_offsets(self) -> dict[str, float]:
+        """Arm -> time offset in addition to that of `matching` [s]."""
+        return {name: arm.measured.time_offset for name, arm in self._description.arms.items()}
+
+    def with_time_offset(self, time_offset: float, *, of_arms: bool = True) -> "Sequence":
+        """Sequence with the same images and joint positions at another time offset (kinematics minus image) [s], and
+        without additional offsets of arms if not `of_arms`; `SequenceError` if rows are not matched by time, or the
+        rows of a frame are too distant in time."""
+        matching, arms = replace(self.checked_matching(), time_offset=time_offset), self._description.arms
+        if not of_arms:
+            arms = {name: arm.without_time_offset() for name, arm in arms.items()}
+        moved = Sequence(replace(self._description, matching=matching, arms=arms))
         # Images and masks do not depend on the time offset.
         moved._cache = self._cache
         return moved
@@ -234,16 +242,17 @@ class Sequence:
         return {camera: Ts[index].copy() for camera, Ts in self._mounts.items()}
 
     def logged_at(self, times: Float[np.ndarray, " times"]) -> Logged:
-        """Logged values at times of the tables' clock [s]; `SequenceError` if rows are not matched by time."""
+        """Logged values at times in the clock of `[kinematics]` [s]; `SequenceError` if rows have no times."""
         self.checked_matching()
         arms = {name: arm.measured.logged_at(times) for name, arm in self._description.arms.items()}
         cameras = {name: camera.motion for name, camera in self._cameras.items() if camera.motion is not None}
         return Logged(arms, {name: motion.logged_at(times) for name, motion in cameras.items()})
 
     def logged_rows(self, arm: str) -> tuple[Float[np.ndarray, " rows"] | None, Float[np.ndarray, "rows dofs"]]:
-        """Rows of an arm's table: times [s], None if row n belongs to frame n, and joint positions [rad, m]."""
+        """Rows of an arm's table: times in the clock of `[kinematics]` [s], None if row n belongs to frame n, and joint
+        positions [rad, m]."""
         rows = self._description.arms[arm].measured
-        return rows.times, rows.values
+        return None if rows.times is None else rows.times - rows.time_offset, rows.values
 
     def checked_matching(self) -> TimeMatching:
         """Matching of frames and rows by time; `SequenceError` if rows are not matched by time."""

@@ -3,7 +3,7 @@
 import os
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -293,6 +293,11 @@ class ArmInput:
     measured: Samples
     truth: Samples | None
 
+    def without_time_offset(self) -> "ArmInput":
+        """The arm with all rows in the clock of `[kinematics]`."""
+        truth = None if self.truth is None else replace(self.truth, time_offset=0.0)
+        return replace(self, measured=replace(self.measured, time_offset=0.0), truth=truth)
+
 
 @dataclass(frozen=True)
 class Description:
@@ -389,7 +394,12 @@ def _take_arm(
 
 
 def calibrated_sequence_file(
-    path: Path, folder: Path, before: Scene, after: Scene, command: str = "calibrate", time_offset: float | None = None
+    path: Path,
+    folder: Path,
+    before: Scene,
+    after: Scene,
+    command: str = "calibrate",
+    time_offsets: Mapping[str, float] | None = None,
 ) -> str:
     """Content of a copy of a sequence file for another folder, with another calibration.
 
@@ -400,7 +410,7 @@ def calibrated_sequence_file(
         before: the scene that `path` describes.
         after: the same scene with other base frames, extrinsics or intrinsics.
         command: the `carts` command that estimated them, for the heading.
-        time_offset: new `time_offset` in `[frames]` [s]; None keeps it.
+        time_offsets: new values of `time_offset` [s]: of `[frames]` under the empty name, and of arms.
     """
     document: dict[str, Any] = tomlkit.parse(read_text(path, SEQUENCE))
     source, target = path.parent.resolve(), folder.resolve()
@@ -421,12 +431,15 @@ def calibrated_sequence_file(
     move(document, "recording")
     move(document["kinematics"], "table", "truth")
     move(document.get("frames", {}), "table", "video")
-    if time_offset is not None:
-        document["frames"]["time_offset"] = time_offset
+    offsets = time_offsets or {}
+    if "" in offsets:
+        document["frames"]["time_offset"] = offsets[""]
     for table, old, new in zip(document["arms"], before.arms, after.arms, strict=True):
         move(table, "table", "truth", "T_world_base")
         if not table["robot"].startswith(SCHEME):
             move(table, "robot")
+        if table["name"] in offsets:
+            table["time_offset"] = offsets[table["name"]]
         if not np.array_equal(old.T_world_base, new.T_world_base):
             table["T_world_base"] = _matrix(new.T_world_base)
     for table, old, new in zip(document["cameras"], before.cameras, after.cameras, strict=True):

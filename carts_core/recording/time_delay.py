@@ -3,23 +3,25 @@
 Optical flow between two frames is nearly a linear function of the motion of points of the arms between the same times,
 for any hand-eye calibration. Flow is regressed on motion at many delays, without camera poses or a network. The
 estimate is the delay with the largest explained share; its standard deviation is computed by the jackknife over parts
-of the recording.
+of the recording. Arms whose delays differ are estimated by coordinate ascent, each given the motion of the others.
 """
 
-from collections.abc import Callable
-from dataclasses import dataclass
-from itertools import pairwise
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from itertools import combinations, pairwise
 from typing import Any
 
 import cv2
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
-from ..model.robot import Robot
+from .matching import at_times, neighbours
 from .sequence import Sequence
 
 WIDTH = 192
 """Width at which images are compared [px]."""
+LARGEST = 3.0
+"""Default half-width of the search range [s]."""
 _CELLS = 6, 5
 """Columns and rows of the grid over which flow is averaged."""
 _MAX_FRAMES, _STRETCHES = 600, 4
@@ -32,17 +34,22 @@ _BLOCKS = 10
 """Number of blocks of the jackknife."""
 _GRID = 0.02
 """Spacing of the initial grid of delays [s]."""
-_WIDEST = 3.0
-"""Maximum delay to which the search extends when the optimum is at the end of its range [s]."""
-_PLAIN = 0.6
-"""Explained share below which delays up to `_WIDEST` are also tried."""
-_EQUAL, _APART = 0.05, 0.15
-"""Maximum difference in explained share [1], and minimum distance [s], of equally good delays."""
+_NEAR = 0.05
+"""Range of the refinement around a delay of the grid [s]."""
+_EQUAL, _APART = 0.1, 0.15
+"""Maximum relative difference in unexplained share, and minimum distance [s], of equally good delays."""
+_SIGNIFICANT = 2.0
+"""Minimum gain by separate clocks, in standard errors of the mean over blocks."""
+_ROUNDS = 4
+"""Maximum number of rounds of the coordinate ascent."""
 _KEPT = 1e-4
 """Share of the maximum variance below which a direction of motion is ignored."""
 _POSTURES = 3
 """Number of principal directions of link positions that modulate the flow."""
-_RIDGE = 1e-3
+_RIDGE = 1e-2
+"""Weight of the prior that flow per motion is equal in all directions."""
+_SPARE = 2.0
+"""Time before and after the search range for which rows are used [s]."""
 _LEVER = 0.1
 """Lever arm by which rotations of a camera are converted to lengths [m]."""
 _MIN_KNOWN_FRACTION = 0.5
@@ -50,7 +57,8 @@ _MIN_KNOWN_FRACTION = 0.5
 _STILL = 0.02
 """Minimum flow that counts as motion [px]."""
 _MIN_EXPLAINED, _MIN_GAIN = 0.15, 0.1
-"""Minimum share of flow explained by the best delay, and its smallest margin over other delays."""
+"""Minimum share of flow explained by the best delay, and its minimum relative reduction of the unexplained share
+compared with the median over the delays."""
 _MAX_DEVIATION = 0.04
 """Maximum standard deviation of a reliable estimate [s]."""
 _MIN_DEVIATION = 0.001
@@ -61,24 +69,27 @@ _WORTH_A_CHANGE = 3.0, 0.008
 
 @dataclass(frozen=True)
 class TimeOffsetEstimate:
-    """Estimated `time_offset`."""
+    """Estimated time offset of all tables, or of one arm."""
 
     present: float
-    """Current `time_offset` of the sequence [s]."""
+    """Current offset [s]."""
     seconds: float
     """Estimated offset [s]."""
     deviation: float
     """Standard deviation of the estimate [s]."""
     explained: float
-    """Share of the flow in held-out blocks explained by the estimate [1]."""
+    """Share of the flow in held-out blocks explained by the estimate [1]; for one arm, of the flow that the motion of
+    the others does not explain."""
     explained_now: float
     """Share explained by the current offset; negative if worse than no prediction [1]."""
     problem: str | None
     """Reason why the estimate is unreliable, as a sentence; None for a reliable estimate."""
     others: tuple[float, ...] = ()
-    """Other delays with nearly the same explained share [s]."""
-    at_end: bool = False
-    """Whether the estimate is at the end of the searched range."""
+    """Other delays with nearly the same explained share [s], the best first."""
+    arm: str = ""
+    """Arm with an offset of its own; empty for all tables."""
+    alone: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
+    """Arm -> offsets that fit as well if the arm has a clock of its own [s], for an estimate of all tables."""
 
     @property
     def proposed(self) -> float | None:
@@ -87,36 +98,49 @@ class TimeOffsetEstimate:
         off = abs(self.seconds - self.present)
         return None if self.problem or off < max(deviations * self.deviation, least) else round(self.seconds, 4)
 
+    @property
+    def choices(self) -> dict[str, tuple[float, ...]]:
+        """Equally good offsets [s] of all tables, under the empty name, and of arms; empty without ambiguity."""
+        return {**({self.arm: (self.seconds, *self.others)} if self.others else {}), **self.alone}
+
     def sentence(self) -> str:
         """Result as a sentence."""
+        of, about = (f" of {self.arm}", f"{self.arm}: ") if self.arm else ("", "")
+        alone = "; ".join(f"{arm} {_listed(offsets)}" for arm, offsets in self.alone.items())
+        alone = f" With a clock of its own, an arm could also have another offset: {alone}." if alone else ""
         if self.problem:
-            return f"The delay between images and kinematics is unknown: {self.problem}"
+            return f"The delay between images and kinematics{of} is unknown: {self.problem}{alone}"
         found = f"{self.seconds:.3f} s ± {self.deviation:.3f} s"
         if self.proposed is None:
-            return f"The time offset of {self.present:.3f} s agrees with the motion, which gives {found}."
+            text = f"The time offset{of} of {self.present:.3f} s agrees with the motion, which gives {found}."
+            return f"{text}{alone}"
         return (
-            f"Proposed: time_offset = {self.proposed:.3f} ({found}) instead of {self.present:.3f} s. It explains "
-            f"{100 * self.explained:.0f} % of the motion in the images instead of "
-            f"{max(100 * self.explained_now, 0.0):.0f} %."
+            f"{about}Proposed: time_offset = {self.proposed:.3f} ({found}) instead of {self.present:.3f} s. It "
+            f"explains {100 * self.explained:.0f} % of the motion in the images instead of "
+            f"{max(100 * self.explained_now, 0.0):.0f} %.{alone}"
         )
 
 
-def estimate_time_offset(
+def estimate_time_offsets(
     sequence: Sequence,
     camera: str | None = None,
     *,
     domain: str | None = None,
-    largest: float = 0.5,
+    largest: float = LARGEST,
     progress: Callable[[int, int], None] | None = None,
-) -> TimeOffsetEstimate:
-    """Estimate the `time_offset` of a sequence from the motion in its images; the sequence is not changed.
+) -> tuple[TimeOffsetEstimate, ...]:
+    """Estimate the time offsets of a sequence from the motion in its images; the sequence is not changed.
 
     Args:
         sequence: sequence whose rows are matched with frames by time.
         camera: camera of the images; the first one by default.
         domain: domain of the images; the first one by default.
-        largest: search range around the current offset [s]; widened to 3 s if the best offset is at its end.
+        largest: half-width of the search range around the current offset [s].
         progress: called with the number of frames read, and the total.
+
+    Returns:
+        One estimate for all tables, or one for each arm that moves if their offsets differ; then, an estimate without
+        an arm is that of the motion of the cameras.
     """
     present = sequence.checked_matching().time_offset
     assert sequence.timestamps is not None
@@ -126,16 +150,20 @@ def estimate_time_offset(
     flows = _flows(sequence, camera or sequence.scene.cameras[0].name, domain, frames, steps, progress)
     if np.sqrt((flows**2).mean()) < _STILL:
         return _unknown(present, "nothing moves in the images.")
-    delays = _Delays(sequence, sequence.timestamps, steps, flows)
-    found = delays.estimate(present, largest)
-    if largest < _WIDEST and (found.at_end or found.explained < _PLAIN):
-        # Nearly periodic motion has several maxima.
-        return delays.estimate(present, _WIDEST)
-    return found
+    return _Delays(sequence, steps, flows, largest).estimate()
 
 
-def _unknown(present: float, problem: str) -> TimeOffsetEstimate:
-    return TimeOffsetEstimate(present, present, float("inf"), 0.0, 0.0, problem)
+def offsets_to_write(found: tuple[TimeOffsetEstimate, ...], sequence: Sequence) -> dict[str, float]:
+    """Proposed values of `time_offset` [s]: of `[frames]` under the empty name, and of arms; empty to keep all."""
+    if all(each.proposed is None for each in found):
+        return {}
+    new = {each.arm: each.present if each.proposed is None else each.proposed for each in found}
+    shared = new.pop("", sequence.checked_matching().time_offset)
+    return {"": shared, **{arm: round(seconds - shared, 4) for arm, seconds in new.items()}}
+
+
+def _unknown(present: float, problem: str) -> tuple[TimeOffsetEstimate, ...]:
+    return (TimeOffsetEstimate(present, present, float("inf"), 0.0, 0.0, problem),)
 
 
 def _chosen(times: Float[np.ndarray, " frames"]) -> tuple[list[int], Float[np.ndarray, "steps 2"]]:
@@ -175,66 +203,36 @@ def _flows(
     return np.array(flows, np.float64)
 
 
-class _Delays:
-    """Regression of flow on motion as a function of the delay."""
+class _Clock:
+    """Motion of the arms and cameras whose logs share a clock, as predictors of flow."""
 
-    def __init__(self, sequence: Sequence, times: np.ndarray, steps: np.ndarray, flows: np.ndarray) -> None:
-        self._sequence, self._begin, self._end = sequence, times[steps[:, 0]], times[steps[:, 1]]
-        largest = np.quantile(np.abs(flows), 0.995, axis=0)
-        self._flows = np.clip(flows, -largest, largest)
-        self._blocks = np.arange(len(steps)) * _BLOCKS // len(steps)
+    def __init__(
+        self, sequence: Sequence, arms: tuple[str, ...], cameras: tuple[str, ...], steps: np.ndarray, largest: float
+    ) -> None:
+        assert sequence.timestamps is not None
+        self.name = "" if cameras or not arms else arms[0]
+        self.present = sequence.checked_matching().time_offset + sum(sequence.arm_time_offsets[arm] for arm in arms)
+        """Current time offset [s]."""
+        self._sequence, self._cameras = sequence, cameras
+        self._steps = [sequence.timestamps[steps[:, side]] + sequence.checked_matching().time_offset for side in (0, 1)]
+        self._tables = [_link_points(sequence, arm, self._steps[0], largest + _SPARE) for arm in arms]
         self._bases: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
+        self._predictors: dict[float, tuple[list[np.ndarray], np.ndarray]] = {}
 
-    def estimate(self, present: float, largest: float) -> TimeOffsetEstimate:
-        """Estimate the offset within `largest` of the current offset [s]."""
-        steps = round(largest / _GRID)
-        grid = [present + step * _GRID for step in range(-steps, steps + 1)]
-        tried = {offset: parts for offset in grid if (parts := self._parts(offset)) is not None}
-        if not tried:
-            return _unknown(present, "the table has no rows at the times of the frames.")
-        if not next(iter(tried.values()))[0].size:
-            return _unknown(present, "no joint moves in the table.")
-        curve = {offset: _predicted(parts) for offset, parts in tried.items()}
-        best = max(curve, key=lambda offset: curve[offset])
-        seconds = self._refined(best, np.ones(_BLOCKS, bool))
-        without = np.array([self._refined(seconds, np.arange(_BLOCKS) != left) for left in range(_BLOCKS)])
-        deviation = float(np.sqrt((_BLOCKS - 1) / _BLOCKS * np.square(without - np.mean(without)).sum()))
-        others = _as_good(curve, best)
-        at_end = best - 1.5 * _GRID < min(curve) or best + 1.5 * _GRID > max(curve)
-        return TimeOffsetEstimate(
-            present,
-            seconds,
-            max(deviation, _MIN_DEVIATION),
-            curve[best],
-            curve.get(present, 0.0),
-            _problem(curve[best], list(curve.values()), abs(best - present) > largest - 1.5 * _GRID, deviation, others),
-            others,
-            at_end,
-        )
+    def at(self, shift: float) -> tuple[list[Float[np.ndarray, "steps inputs"]], Bool[np.ndarray, " steps"]]:
+        """Predictors of the flow at a shift from the current offset [s], and whether rows are logged then.
 
-    def _refined(self, around: float, blocks: np.ndarray) -> float:
-        """Refine an offset [s], using a subset of the blocks."""
+        The first predictors are those of a constant posture.
+        """
+        if shift not in self._predictors:
+            self._predictors[shift] = self._computed(shift)
+        return self._predictors[shift]
 
-        def unexplained(offset: float) -> float:
-            parts = self._parts(offset)
-            if parts is None:
-                return 1.0
-            XX, XY, YY = (part[blocks].sum(0) for part in parts)
-            return 1.0 - float((XY * _fitted(XX, XY)).sum() / max(float(YY), 1e-12))
-
-        bounds = around - 1.5 * _GRID, around + 1.5 * _GRID
-        from scipy.optimize import minimize_scalar  # noqa: PLC0415  takes 0.3 s
-
-        found: Any = minimize_scalar(unexplained, bounds=bounds, method="bounded", options={"xatol": 2e-4})
-        return float(found.x)
-
-    def _parts(self, offset: float) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
-        """Normal equations of motion X and flow Y at an offset, by block: X^T X, X^T Y, |Y|^2; None if rows are
-        missing."""
-        places, motion = self._motion(offset)
+    def _computed(self, shift: float) -> tuple[list[np.ndarray], np.ndarray]:
+        places, motion = self._motion(shift)
         there = np.asarray(np.isfinite(motion).all(1))
         if there.mean() < _MIN_KNOWN_FRACTION:
-            return None
+            return [np.empty((len(there), 0))], np.zeros_like(there)
         if self._bases is None:
             # The normalization is the same for all offsets, so that they are comparable.
             middle = places[there].mean(0)
@@ -243,82 +241,243 @@ class _Delays:
         moves, middle, postures = self._bases
         X, around = np.nan_to_num(motion) @ moves, np.nan_to_num(places - middle) @ postures
         # The flow caused by a motion depends on the posture of the arms; a linear dependence is modelled.
-        X = np.concatenate([X, *(X * posture[:, None] for posture in around.T)], 1)
-        Y = np.where(there[:, None], self._flows, 0.0)
-        inside = [self._blocks == block for block in range(_BLOCKS)]
-        return (
-            np.stack([X[rows].T @ X[rows] for rows in inside]),
-            np.stack([X[rows].T @ Y[rows] for rows in inside]),
-            np.array([np.square(Y[rows]).sum() for rows in inside]),
-        )
+        return [X, *(X * posture[:, None] for posture in around.T)], there
 
-    def _motion(self, offset: float) -> tuple[Float[np.ndarray, "steps inputs"], Float[np.ndarray, "steps inputs"]]:
+    def _motion(self, shift: float) -> tuple[Float[np.ndarray, "steps inputs"], Float[np.ndarray, "steps inputs"]]:
         """Positions of link points, and motion of link points and camera mounts in each step [m]; NaN if not logged."""
-        begin, end = (self._sequence.logged_at(times + offset) for times in (self._begin, self._end))
-        places, moved = [], []
-        for arm in self._sequence.scene.arms:
-            first, last = (_points(arm.robot, at.joints[arm.name]) for at in (begin, end))
+        places, moved = [np.empty((len(self._steps[0]), 0))], []
+        for times, points in self._tables:
+            first, last = (at_times(at + shift, times, points) for at in self._steps)
             places.append(0.5 * (first + last))
             moved.append(last - first)
-        for camera in begin.mounts:
-            Ts = np.linalg.inv(begin.mounts[camera]) @ end.mounts[camera]
-            rotations = np.stack([Ts[:, 2, 1], Ts[:, 0, 2], Ts[:, 1, 0]], 1)
-            moved.append(np.concatenate([Ts[:, :3, 3], _LEVER * rotations], 1))
+        if self._cameras:
+            begin, end = (self._sequence.logged_at(at + shift).mounts for at in self._steps)
+            for camera in self._cameras:
+                Ts = np.linalg.inv(begin[camera]) @ end[camera]
+                rotations = np.stack([Ts[:, 2, 1], Ts[:, 0, 2], Ts[:, 1, 0]], 1)
+                moved.append(np.concatenate([Ts[:, :3, 3], _LEVER * rotations], 1))
         return np.concatenate(places, 1), np.concatenate(moved, 1)
 
 
+class _Delays:
+    """Regression of flow on motion, as a function of the shift of each clock from its current offset [s]."""
+
+    def __init__(self, sequence: Sequence, steps: np.ndarray, flows: np.ndarray, largest: float) -> None:
+        extreme = np.quantile(np.abs(flows), 0.995, axis=0)
+        self._flows = np.clip(flows, -extreme, extreme)
+        self._inside = [np.flatnonzero(np.arange(len(steps)) * _BLOCKS // len(steps) == n) for n in range(_BLOCKS)]
+        count = round(largest / _GRID)
+        self._grid, self._largest = [step * _GRID for step in range(-count, count + 1)], largest
+        self._shared = sequence.checked_matching().time_offset
+        arms, cameras = tuple(arm.name for arm in sequence.scene.arms), sequence.moving_cameras
+        groups = [(arms, cameras)] if len(arms) == 1 else [*(((arm,), ()) for arm in arms), ((), cameras)]
+        self._clocks = [_Clock(sequence, *group, steps, largest) for group in groups if any(group)]
+
+    def estimate(self) -> tuple[TimeOffsetEstimate, ...]:
+        """One estimate for all clocks, or one for each that moves if their shifts differ."""
+        every = [*range(len(self._clocks))]
+        together = self._curve([0.0 for _ in every], every)
+        if not together:
+            return _unknown(self._shared, "the table has no rows at the times of the frames.")
+        moving = [n for n in every if self._clocks[n].at(next(iter(together)))[0][0].size]
+        if not moving:
+            return _unknown(self._shared, "no joint moves in the table.")
+        common = self._estimate([0.0 for _ in every], every, together)
+        if len(moving) == 1:
+            return (common,)
+        same = _best(together)
+        starts = (
+            [same if n in moving else None for n in every],
+            [self._alone(n) if n in moving else None for n in every],
+        )
+        shifts, _ = max((self._ascended(start, moving) for start in starts), key=lambda found: found[1])
+        for n in moving * _ROUNDS:
+            shifts[n] = None if shifts[n] is None else self._refined(shifts, [n], shifts[n] or 0.0)
+        found = tuple(self._estimate(shifts, [n]) for n in moving)
+        if _differ(found) and self._is_better(shifts, starts[0]):
+            return found
+        apart = [each for each in found if each.others or _differ((each, replace(common, explained=1.0)))]
+        return (replace(common, alone={each.arm: (each.seconds, *each.others) for each in apart}),)
+
+    def _is_better(self, shifts: list[float | None], others: list[float | None]) -> bool:
+        """Whether shifts explain significantly more of the flow than others, in a paired test over held-out blocks."""
+        parts = [self._parts(each, constant=True) for each in (shifts, others)]
+        if parts[0] is None or parts[1] is None:
+            return parts[0] is not None
+        gain = _unexplained(*parts[1]) - _unexplained(*parts[0])
+        return float(gain.mean()) > _SIGNIFICANT * float(gain.std(ddof=1)) / np.sqrt(_BLOCKS)
+
+    def _alone(self, clock: int) -> float | None:
+        """Best shift of a clock without the motion of the others."""
+        curve = self._curve([None] * len(self._clocks), [clock])
+        return _best(curve) if curve else None
+
+    def _ascended(self, shifts: list[float | None], moving: list[int]) -> tuple[list[float | None], float]:
+        """Coordinate ascent from shifts: the result, and its explained share."""
+        shifts = list(shifts)
+        for _ in range(_ROUNDS):
+            before = list(shifts)
+            for clock in moving:
+                if curve := self._curve(shifts, [clock]):
+                    shifts[clock] = _best(curve)
+            if shifts == before:
+                break
+        return shifts, self._share(shifts, constant=True)
+
+    def _curve(self, shifts: list[float | None], moved: list[int]) -> dict[float, float]:
+        """Share explained at each common shift of the clocks `moved`; without shifts at which rows are missing.
+
+        Predictors are those of a constant posture: they are less accurate and less ambiguous in periodic motion.
+        """
+        shares = {shift: self._share(_with(shifts, moved, shift), constant=True) for shift in self._grid}
+        return {shift: share for shift, share in shares.items() if np.isfinite(share)}
+
+    def _share(self, shifts: list[float | None], *, constant: bool = False) -> float:
+        """Share of the flow explained in held-out blocks; minus infinity if rows are missing."""
+        parts = self._parts(shifts, constant=constant)
+        return -np.inf if parts is None else 1.0 - float(_unexplained(*parts).sum()) / max(float(parts[2].sum()), 1e-12)
+
+    def _estimate(
+        self, shifts: list[float | None], moved: list[int], curve: dict[float, float] | None = None
+    ) -> TimeOffsetEstimate:
+        """Estimate of the common shift of the clocks `moved`, given the shifts of the others."""
+        curve = curve or self._curve(shifts, moved)
+        best = _best(curve)
+        shift = self._refined(shifts, moved, best)
+        base = max(self._share(_with(shifts, moved, None)), 0.0)
+        explained, now = ((self._share(_with(shifts, moved, at)) - base) / (1.0 - base) for at in (shift, 0.0))
+        parts = np.array([self._refined(shifts, moved, shift, left) for left in range(_BLOCKS)])
+        deviation = float(np.sqrt((_BLOCKS - 1) / _BLOCKS * np.square(parts - np.mean(parts)).sum()))
+        clock = self._clocks[moved[0]] if len(moved) == 1 < len(self._clocks) else None
+        present, arm = (self._shared, "") if clock is None else (clock.present, clock.name)
+        others = tuple(present + self._refined(shifts, moved, other) for other in _as_good(curve, best))
+        gain = 1.0 - (1.0 - curve[best]) / (1.0 - float(np.median([*curve.values()])))
+        at_end = abs(best) > self._largest - 1.5 * _GRID
+        problem = _problem(explained, gain, at_end, deviation, present + shift, others)
+        deviation = max(deviation, _MIN_DEVIATION)
+        return TimeOffsetEstimate(present, present + shift, deviation, explained, now, problem, others, arm)
+
+    def _refined(self, shifts: list[float | None], moved: list[int], around: float, left: int | None = None) -> float:
+        """Refine a common shift [s]; without one block of steps if given."""
+        blocks = np.arange(_BLOCKS) != (-1 if left is None else left)
+
+        def unexplained(shift: float) -> float:
+            parts = self._parts(_with(shifts, moved, shift))
+            if parts is None:
+                return 1.0
+            XX, XY, YY = (part[blocks].sum(0) for part in parts)
+            return 1.0 - float((XY * _fitted(XX, XY)).sum() / max(float(YY), 1e-12))
+
+        bounds = around - _NEAR, around + _NEAR
+        from scipy.optimize import minimize_scalar  # noqa: PLC0415  takes 0.3 s
+
+        found: Any = minimize_scalar(unexplained, bounds=bounds, method="bounded", options={"xatol": 2e-4})
+        return float(found.x)
+
+    def _parts(
+        self, shifts: list[float | None], *, constant: bool = False
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+        """Normal equations of motion X and flow Y, by block: X^T X, X^T Y, |Y|^2; None if rows are missing.
+
+        Args:
+            constant: use only the predictors of a constant posture.
+        """
+        found = [clock.at(shift) for clock, shift in zip(self._clocks, shifts, strict=True) if shift is not None]
+        there = np.all([known for _, known in found], axis=0) if found else np.zeros(1, bool)
+        if there.mean() < _MIN_KNOWN_FRACTION:
+            return None
+        X = np.where(
+            there[:, None], np.concatenate([X for all_X, _ in found for X in all_X[: 1 if constant else None]], 1), 0.0
+        )
+        Y = np.where(there[:, None], self._flows, 0.0)
+        return (
+            np.stack([X[rows].T @ X[rows] for rows in self._inside]),
+            np.stack([X[rows].T @ Y[rows] for rows in self._inside]),
+            np.array([np.square(Y[rows]).sum() for rows in self._inside]),
+        )
+
+
+def _with(shifts: list[float | None], moved: list[int], shift: float | None) -> list[float | None]:
+    return [shift if clock in moved else own for clock, own in enumerate(shifts)]
+
+
+def _best(curve: dict[float, float]) -> float:
+    return max(curve, key=lambda shift: curve[shift])
+
+
+def _differ(found: tuple[TimeOffsetEstimate, ...]) -> bool:
+    """Whether shifts that the motion explains differ by more than a change that is worth proposing."""
+    deviations, least = _WORTH_A_CHANGE
+    known = [each for each in found if each.explained >= _MIN_EXPLAINED]
+    return any(
+        abs((a.seconds - a.present) - (b.seconds - b.present))
+        > max(deviations * np.hypot(a.deviation, b.deviation), least)
+        for a, b in combinations(known, 2)
+    )
+
+
 def _as_good(curve: dict[float, float], best: float) -> tuple[float, ...]:
-    """Other local maxima of the explained share that are nearly as high, as for periodic motion."""
-    offsets = sorted(curve)
-    shares = [curve[offset] for offset in offsets]
+    """Other local maxima of the explained share that are nearly as high, as for periodic motion, the best first."""
+    shifts = sorted(curve)
+    shares = [curve[shift] for shift in shifts]
     peaks = [
-        offset
-        for index, offset in enumerate(offsets[1:-1], start=1)
+        shift
+        for index, shift in enumerate(shifts[1:-1], start=1)
         if shares[index] >= max(shares[index - 1], shares[index + 1])
     ]
-    enough = curve[best] - _EQUAL * abs(curve[best])
-    return tuple(offset for offset in peaks if abs(offset - best) > _APART and curve[offset] >= enough)
+    enough = 1.0 - (1.0 + _EQUAL) * (1.0 - curve[best])
+    good = [shift for shift in peaks if abs(shift - best) > _APART and curve[shift] >= enough]
+    return tuple(sorted(good, key=lambda shift: -curve[shift]))
 
 
 def _basis(values: Float[np.ndarray, "rows columns"]) -> Float[np.ndarray, "columns directions"]:
-    """Whitened principal directions of the rows."""
+    """Principal directions of the rows, in units of the largest standard deviation."""
     _, sizes, directions = np.linalg.svd(values, full_matrices=False)
     kept = sizes**2 > _KEPT * sizes[0] ** 2
-    return directions[kept].T / (sizes[kept] / np.sqrt(len(values)))
+    return directions[kept].T / (sizes[0] / np.sqrt(len(values)))
 
 
-def _points(robot: Robot, joints: Float[np.ndarray, "rows dofs"]) -> Float[np.ndarray, "rows coordinates"]:
-    """Centres of the links in the arm's base frame [m]."""
-    Ts = robot.forward_kinematics(np.nan_to_num(joints))
+def _link_points(
+    sequence: Sequence, arm: str, wanted: Float[np.ndarray, " steps"], reach: float
+) -> tuple[Float[np.ndarray, " rows"], Float[np.ndarray, "rows coordinates"]]:
+    """Centres of the links of an arm in its base frame [m], and their times [s], within `reach` of wanted times [s]."""
+    times, joints = sequence.logged_rows(arm)
+    assert times is not None
+    robot = sequence.scene.arm(arm).robot
+    before, after = neighbours(wanted, times)
+    near = np.minimum(np.abs(times - wanted[before]), np.abs(wanted[after] - times)) <= reach
+    times, joints = times[near], joints[near]
+    Ts = robot.forward_kinematics(joints)
     middles = [Ts[:, mesh.link, :3, :3] @ mesh.vertices.mean(0) + Ts[:, mesh.link, :3, 3] for mesh in robot.meshes]
-    return np.where(np.isfinite(joints).all(1, keepdims=True), np.concatenate(middles, 1), np.nan)
+    return times, np.concatenate(middles, 1)
 
 
-def _predicted(parts: tuple[np.ndarray, np.ndarray, np.ndarray]) -> float:
-    """Share of the flow explained in cross-validation over blocks; negative if worse than no prediction [1]."""
-    XX, XY, YY = parts
-    unexplained = 0.0
-    for left in range(_BLOCKS):
-        others = np.arange(_BLOCKS) != left
-        B = _fitted(XX[others].sum(0), XY[others].sum(0))
-        unexplained += float(YY[left] - 2 * (XY[left] * B).sum() + (B * (XX[left] @ B)).sum())
-    return 1.0 - unexplained / max(float(YY.sum()), 1e-12)
+def _unexplained(XX: np.ndarray, XY: np.ndarray, YY: np.ndarray) -> Float[np.ndarray, " blocks"]:
+    """Squared flow [px^2] of each block that the fit to the other blocks does not explain."""
+    B = _fitted(XX.sum(0) - XX, XY.sum(0) - XY)
+    return YY - 2 * (XY * B).sum((1, 2)) + (B * (XX @ B)).sum((1, 2))
 
 
 def _fitted(XX: np.ndarray, XY: np.ndarray) -> np.ndarray:
-    return np.linalg.solve(XX + _RIDGE * np.trace(XX) / len(XX) * np.eye(len(XX)), XY)
+    size = XX.shape[-1]
+    ridge = _RIDGE * np.trace(XX, axis1=-2, axis2=-1) / max(size, 1)
+    return np.linalg.solve(XX + ridge[..., None, None] * np.eye(size), XY)
+
+
+def _listed(offsets: tuple[float, ...]) -> str:
+    return ", ".join(f"{offset:.3f} s" for offset in offsets)
 
 
 def _problem(
-    explained: float, curve: list[float], at_end: bool, deviation: float, others: tuple[float, ...]
+    explained: float, gain: float, at_end: bool, deviation: float, seconds: float, others: tuple[float, ...]
 ) -> str | None:
-    if explained < _MIN_EXPLAINED or explained - float(np.median(curve)) < _MIN_GAIN:
+    if explained < _MIN_EXPLAINED or gain < _MIN_GAIN:
         return "the motion of the arms does not explain the motion in the images. Check columns, signs and units."
     if at_end:
         return "the best delay is at the end of the search range. Give a larger range, or check the clocks."
     if others:
-        listed = ", ".join(f"{offset:.2f} s" for offset in others[:3])
-        return f"other delays are as good ({listed}), as for periodic motion. Use a part with other motion."
+        listed = _listed((seconds, *others))
+        return f"several delays are equally good ({listed}), as for periodic motion. Choose one of them."
     if deviation > _MAX_DEVIATION:
         return f"the delays of parts of the recording differ (± {deviation:.2f} s). Check the clocks."
     return None

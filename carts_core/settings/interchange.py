@@ -51,7 +51,9 @@ class ImportOptions:
     clock: Clock | None = None
     """Unit of the table's times."""
     time_offset: float | None = None
-    """Kinematics time minus image time [s]."""
+    """Kinematics time minus image time [s]; by default estimated from the motion in the images where possible."""
+    arm_time_offset: Mapping[str, float] = field(default_factory=dict)
+    """Arm -> time offset in addition to that of all tables [s]."""
     frame_rate: float | None = None
     """Frame rate of images without times, or replacement of a video's constant rate [1/s]."""
     arms: Mapping[str, str] = field(default_factory=dict)
@@ -75,7 +77,8 @@ class ImportOptions:
                 raise SettingsError(
                     f"calibration_size of {camera} is {size!r}; give width and height, such as 640x480."
                 )
-        for name, value in (("time_offset", self.time_offset), ("frame_rate", self.frame_rate)):
+        offsets = [(f"arm_time_offset of {arm}", seconds) for arm, seconds in self.arm_time_offset.items()]
+        for name, value in (("time_offset", self.time_offset), ("frame_rate", self.frame_rate), *offsets):
             if value is not None and not math.isfinite(value):
                 raise SettingsError(f"{name} is {value}; give a finite number.")
         if self.frame_rate is not None and not 0.01 <= self.frame_rate <= 1000:

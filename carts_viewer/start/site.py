@@ -66,7 +66,12 @@ class Site:
             SettingsError: a folder does not exist, or the address is not usable.
         """
         self.roots = Roots(folders)
-        self.page = Page(host=options.get("host", "127.0.0.1"), port=options.get("port", 8080), title="CaRTS")
+        self.page = Page(
+            host=options.get("host", "127.0.0.1"),
+            port=options.get("port", 8080),
+            title="CaRTS",
+            proxy=options.get("proxy"),
+        )
         self.document = Document(self.page)
         self._report, self._options = report, options
         self.url = self.page.url

@@ -5,10 +5,12 @@ import http
 import ipaddress
 import logging
 import math
+import re
 import secrets
 import socket
 import threading
 from collections.abc import Awaitable, Callable, Iterable, Iterator
+from dataclasses import dataclass
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
@@ -43,15 +45,49 @@ def check_address(host: str, port: int) -> None:
         ) from error
 
 
+@dataclass(frozen=True)
+class Proxy:
+    """Reverse proxy in front of the viewer."""
+
+    base_path: str = ""
+    """Path of the page at the proxy, such as /x/y; accepted in requests, whether or not the proxy removes it."""
+    trusted_origins: tuple[str, ...] = ()
+    """Origins at which browsers see the page or the notebook that embeds it, such as https://host."""
+
+    def __post_init__(self) -> None:
+        if not re.fullmatch(r"(/[A-Za-z0-9._~@-]+)*", self.base_path):
+            raise SettingsError(
+                f"The base path is {self.base_path!r}. Give a path such as /x/y: names with a slash before each, and "
+                "none at the end."
+            )
+        for origin in self.trusted_origins:
+            if not re.fullmatch(r"https?://([a-z0-9.-]+|\[[0-9a-f:]+\])(:[1-9]\d{0,4})?", origin):
+                raise SettingsError(
+                    f"The trusted origin is {origin!r}. Give https://host or https://host:port, as a browser sends "
+                    "it: in lower case and without a path."
+                )
+
+    def inside(self, target: str) -> str | None:
+        """A requested target without the base path; None for the base path without a slash, which is redirected."""
+        path, mark, query = target.partition("?")
+        if not self.base_path or not f"{path}/".startswith(f"{self.base_path}/"):
+            return target
+        rest = path.removeprefix(self.base_path)
+        return f"{rest}{mark}{query}" if rest else None
+
+
 class Guard:
     """Decides which requests a server answers.
 
     Attributes:
         token: Token required in a first request; None if only this computer can reach the server.
+        proxy: The reverse proxy.
     """
 
-    def __init__(self, host: str) -> None:
+    def __init__(self, host: str, proxy: Proxy | None = None) -> None:
         self._host = host
+        self.proxy = proxy or Proxy()
+        self._proxy_hosts = {urlsplit(origin).netloc for origin in self.proxy.trusted_origins}
         self.token = None if _is_loopback(host) else secrets.token_urlsafe(32)
         # Differs from the token, which may remain in a browser's history or a terminal.
         self._session = secrets.token_urlsafe(32)
@@ -71,12 +107,17 @@ class Guard:
             headers: Headers of the request.
         """
         hosts = headers.get_all("Host")
-        if len(hosts) != 1 or not self._is_ours(_hostname(hosts[0])):
-            return f"Requests for {', '.join(hosts)!r} are refused. Use the viewer's own address."
+        own = len(hosts) == 1 and self._is_ours(_hostname(hosts[0]))
+        if not own and (len(hosts) != 1 or hosts[0] not in self._proxy_hosts):
+            return (
+                f"Requests for {', '.join(hosts)!r} are refused. Use the viewer's own address, or give the "
+                "proxy's: --trusted-origin."
+            )
+        trusted = {*self.proxy.trusted_origins, *([f"http://{hosts[0]}"] if own else [])}
         for origin in headers.get_all("Origin"):
-            if origin != f"http://{hosts[0]}":
+            if origin not in trusted:
                 return f"Requests from {origin!r} are refused. Only the viewer's own page is allowed."
-        if _from_another_page(target, headers):
+        if _from_another_page(target, headers, framed=bool(self.proxy.trusted_origins)):
             return "The viewer's files are available to its own page only. Open the page instead."
         if self.token is not None and not (self._has_token(target) or self._has_cookie(headers)):
             return "A token is required. Open the address that the viewer printed, with the token at its end."
@@ -89,7 +130,7 @@ class Guard:
         """
         if self.token is None or not self._has_token(target):
             return None
-        return f"{_cookie_name(headers)}={self._session}; Path=/; HttpOnly; SameSite=Strict"
+        return f"{_cookie_name(headers)}={self._session}; Path={self.proxy.base_path}/; HttpOnly; SameSite=Strict"
 
     def _is_ours(self, name: str | None) -> bool:
         """Whether a host name may refer to this server."""
@@ -117,15 +158,17 @@ def _any_equal(given: Iterable[str], secret: str) -> bool:
     return any([secrets.compare_digest(value.encode("utf-8", "replace"), secret.encode()) for value in given])
 
 
-def _from_another_page(target: str, headers: Headers) -> bool:
+def _from_another_page(target: str, headers: Headers, *, framed: bool) -> bool:
     """Whether a request comes from a page of another origin, which may only link to our pages.
 
-    Websockets are checked by their `Origin`, which every browser sends.
+    Websockets are checked by their `Origin`, which every browser sends. Frames are allowed if `framed`; the page's
+    policy then names the origins that may embed it.
     """
     if headers.get("Upgrade") == "websocket" or set(headers.get_all("Sec-Fetch-Site")) <= {"same-origin", "none"}:
         return False
-    to_a_tab = headers.get_all("Sec-Fetch-Mode") == ["navigate"] and headers.get_all("Sec-Fetch-Dest") == ["document"]
-    return not (to_a_tab and target.partition("?")[0] in PAGES)
+    places = (["document"], ["iframe"]) if framed else (["document"],)
+    opened = headers.get_all("Sec-Fetch-Mode") == ["navigate"] and headers.get_all("Sec-Fetch-Dest") in places
+    return not (opened and target.partition("?")[0] in PAGES)
 
 
 def _cookie_name(headers: Headers) -> str:
@@ -306,7 +349,10 @@ def gated(
 
 
 def response(status: http.HTTPStatus, kind: str, body: bytes, **more: str) -> Response:
-    """A response with headers against MIME sniffing, caching and framing; `more`: headers with `_` instead of `-`."""
+    """A response with headers against MIME sniffing, caching and framing; `more`: headers with `_` instead of `-`.
+
+    `frame-ancestors` in a `Content-Security-Policy` takes precedence over `X-Frame-Options`.
+    """
     headers = Headers()
     headers["Content-Type"] = kind
     headers["Content-Length"] = str(len(body))

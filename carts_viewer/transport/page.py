@@ -29,7 +29,7 @@ from websockets.http11 import Request, Response
 from carts_core.errors import CartsError
 from carts_core.resources import static_dir
 
-from .guard import PAGES, Guard, check_address, gated, refusal, response
+from .guard import PAGES, Guard, Proxy, check_address, gated, refusal, response
 from .viser_private import element_id, icon_paths, list_icons_once, queue_safely, run_script, value_of, widgets
 
 
@@ -164,7 +164,8 @@ def _parts() -> tuple[str, str]:
     return before, after
 
 
-MEDIA = "/media/"
+MEDIA = "media/"
+"""Start of the addresses of pictures, relative to the page."""
 _MAX_PICTURES = 256
 """Maximum number of kept pictures; the oldest are removed first."""
 
@@ -240,8 +241,8 @@ _STYLES = ("tokens", "page", "document")
 
 _POLICY = (
     "default-src 'none'; script-src 'self' 'nonce-{nonce}' 'wasm-unsafe-eval'; style-src 'self' 'unsafe-inline'; "
-    "img-src 'self' data: blob:; font-src data:; worker-src blob:; connect-src 'self' ws://{host} data: blob:; "
-    "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+    "img-src 'self' data: blob:; font-src data:; worker-src blob:; connect-src 'self' {sockets} data: blob:; "
+    "base-uri 'none'; form-action 'none'; frame-ancestors {ancestors}"
 )
 """`Content-Security-Policy` of the page. viser's client is an inline script (hence the nonce) that unpacks itself with
 WebAssembly, writes style sheets, and makes its workers and textures from blobs."""
@@ -250,19 +251,22 @@ WebAssembly, writes style sheets, and makes its workers and textures from blobs.
 class Page:
     """A viser server that answers only requests from its own page, and the scripts of this page."""
 
-    def __init__(self, *, host: str = "127.0.0.1", port: int = 8080, title: str = "CaRTS") -> None:
+    def __init__(
+        self, *, host: str = "127.0.0.1", port: int = 8080, title: str = "CaRTS", proxy: Proxy | None = None
+    ) -> None:
         """Start serving.
 
         Args:
             host: The address to listen on. The URL contains a token if other computers can reach the address.
             port: The port to listen on; 0 for any free port. If the port is busy, the next free port is used.
             title: The browser tab's title.
+            proxy: The reverse proxy in front of the server; None without one.
 
         Raises:
             SettingsError: `host` is not an address of this computer.
         """
         check_address(host, port)
-        self._guard = Guard(host)
+        self._guard = Guard(host, proxy)
         self._title = title
         self.key_groups: list[Any] = []
         """Content of the key sheet: groups with pairs of key and description."""
@@ -280,7 +284,7 @@ class Page:
             gated(
                 self._respond,
                 lambda data: refusal(data, self._value_of),
-                lambda path: self.receive_upload if path == UPLOAD else None,
+                lambda path: self.receive_upload if self._guard.proxy.inside(path) == UPLOAD else None,
             ),
             contextlib.redirect_stdout(io.StringIO()),
         ):
@@ -364,17 +368,22 @@ class Page:
 
     def _respond(self, request: Request) -> Response | Awaitable[Response] | None:
         """The viewer's response to a request; None to let viser respond."""
-        reason = self._guard.refusal(request.path, request.headers)
+        target = self._guard.proxy.inside(request.path)
+        reason = self._guard.refusal(target or "/", request.headers)
         if reason is not None:
             return response(http.HTTPStatus.FORBIDDEN, "text/plain; charset=utf-8", reason.encode())
         if request.headers.get("Upgrade") == "websocket":
             return None
-        path = request.path.partition("?")[0]
+        if target is None:
+            # Addresses in the page are relative to a folder.
+            slash = f"{self._guard.proxy.base_path}/"
+            return response(http.HTTPStatus.PERMANENT_REDIRECT, "text/plain; charset=utf-8", b"", Location=slash)
+        path = target.partition("?")[0]
         return self._page(request) if path in PAGES else self._file(path)
 
     def _file(self, path: str) -> Response | Awaitable[Response]:
-        if path.startswith(MEDIA):
-            return self.media.answer(path.removeprefix(MEDIA))
+        if path.startswith(f"/{MEDIA}"):
+            return self.media.answer(path.removeprefix(f"/{MEDIA}"))
         if path.startswith(_THUMBNAIL) and self.thumbnail is not None:
             return self.thumbnail(path.removeprefix(_THUMBNAIL))
         return self._static(path.removeprefix("/static/") if path.startswith("/static/") else "")
@@ -382,7 +391,11 @@ class Page:
     def _page(self, request: Request) -> Response:
         nonce = secrets.token_urlsafe(16)
         # Without a policy, viser's client would connect to any server in `?websocket=` and execute its messages.
-        policy = _POLICY.format(nonce=nonce, host=request.headers["Host"])
+        trusted = self._guard.proxy.trusted_origins
+        sockets = " ".join(
+            [f"ws://{request.headers['Host']}", *(origin.replace("http", "ws", 1) for origin in trusted)]
+        )
+        policy = _POLICY.format(nonce=nonce, sockets=sockets, ancestors=" ".join(trusted) or "'none'")
         cookie = self._guard.cookie(request.path, request.headers)
         more = {"Content_Security_Policy": policy} | ({} if cookie is None else {"Set_Cookie": cookie})
         return response(http.HTTPStatus.OK, "text/html; charset=utf-8", self._index(nonce), **more)
@@ -409,11 +422,11 @@ class Page:
             "server": self._name,
         }
         configuration = html.escape(json.dumps(said), quote=True)
-        styles = "".join(f'<link rel="stylesheet" href="/static/{name}.css" />' for name in _STYLES)
+        styles = "".join(f'<link rel="stylesheet" href="static/{name}.css" />' for name in _STYLES)
         head = (
             f"<title>{html.escape(self._title)}</title>"
-            f'<link rel="icon" href="/static/icon.svg" />{styles}'
-            f'<script src="/static/boot.js" data-configuration="{configuration}"></script>'
+            f'<link rel="icon" href="static/icon.svg" />{styles}'
+            f'<script src="static/boot.js" data-configuration="{configuration}"></script>'
         )
-        scripts = "".join(f'<script src="/static/{name}.js" defer></script>' for name in _SCRIPTS)
+        scripts = "".join(f'<script src="static/{name}.js" defer></script>' for name in _SCRIPTS)
         return viser_index(head + scripts, nonce).encode()

@@ -4,20 +4,19 @@ from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import get_args
 
 import numpy as np
 
-from carts_core.errors import CartsError
+from carts_core.errors import CartsError, SettingsError
 from carts_core.model.psm_kinematics import JOINT_NAMES
-from carts_core.recording import Sequence, TimeOffsetEstimate, estimate_time_offset
+from carts_core.recording import Sequence, TimeOffsetEstimate
 from carts_core.recording.importing.cameras import find_images
 from carts_core.recording.importing.columns import ColumnMeanings, guess_columns, sample
+from carts_core.recording.importing.delays import estimated_delays, is_timed, with_delays, with_times
 from carts_core.recording.importing.foreign_tables import ForeignTable
 from carts_core.recording.importing.found import FoundArm, FoundRecording, Note, NoteKind, Part, PartError
 from carts_core.recording.importing.importer import detect, find
-from carts_core.recording.importing.writing import write_sequence
 from carts_core.recording.sources.datasets import JIGSAWS, jigsaws_trials
 from carts_core.recording.sources.folder import kinematics_table
 from carts_core.settings.interchange import NO_TABLE, AngleUnit, ImportOptions, LengthUnit
@@ -60,16 +59,6 @@ def curves(arm: FoundArm) -> list[Curve]:
         label = f"{name.replace('_', ' ')} {scale * low:.0f} to {scale * high:.0f} {unit}"
         found.append(Curve(points, color, label))
     return found
-
-
-def open_recording(recording: FoundRecording) -> tuple[Sequence, TemporaryDirectory[str]]:
-    """The recording as a sequence, with the temporary folder of its tables; `CartsError` if it is invalid."""
-    folder = TemporaryDirectory(prefix="carts-import-")
-    try:
-        return Sequence.open(write_sequence(recording, Path(folder.name) / "sequence")), folder
-    except BaseException:
-        folder.cleanup()
-        raise
 
 
 def previews(sequence: Sequence, camera: str) -> list[tuple[str, bytes]]:
@@ -230,15 +219,51 @@ def _problems_of_images(source: Path, options: ImportOptions) -> dict[tuple[Part
     return found
 
 
-def estimated_delay(recording: FoundRecording) -> TimeOffsetEstimate:
-    """Time offset estimated from the motion in images and table; `CartsError` if rows have no times."""
-    sequence, folder = open_recording(recording)
-    with folder:
-        return estimate_time_offset(sequence)
+@dataclass(frozen=True)
+class Delays:
+    """Time offsets estimated from the motion in images and table."""
+
+    found: tuple[TimeOffsetEstimate, ...]
+    options: ImportOptions
+    """Options of the import with which they were estimated."""
+    shared: float
+    """Time offset of all tables with which they were estimated [s]."""
+    offsets: dict[str, float]
+    """Proposed offsets as in `offsets_to_write`; empty to keep all."""
+
+    def accepted(self) -> ImportOptions:
+        """Options with the proposed offsets."""
+        return with_delays(self.options, self.offsets) if self.offsets else self.options
+
+    def chosen(self, arm: str, value: str) -> ImportOptions:
+        """Options with one of the equally good offsets, of an arm or, if empty, of all tables; `SettingsError` for
+        another value."""
+        listed = [seconds for each in self.found for seconds in each.choices.get(arm, ()) if f"{seconds:.4f}" == value]
+        if listed:
+            seconds = round(listed[0], 4)
+            chosen = {arm: round(seconds - self.shared, 4), "": self.shared} if arm else {"": seconds}
+            return with_delays(self.options, {**self.options.arm_time_offset, **chosen})
+        raise SettingsError(f"{value!r} is not one of the estimated offsets. Estimate them again.")
+
+
+def delays_of(draft: Draft, guess: Guess) -> Delays | None:
+    """Estimate time offsets; None without a recording or times of rows, `CartsError` if an image cannot be read."""
+    if guess.recording is None:
+        return None
+    source = Path(draft.source)
+
+    def again(options: ImportOptions) -> FoundRecording:
+        return find(source, replace(options, source=guess.kind))
+
+    recording, options = with_times(guess.recording, draft.options, again)
+    if not is_timed(recording):
+        return None
+    found, offsets = estimated_delays(recording)
+    return Delays(found, options, recording.time_offset, offsets)
 
 
 def check_form(
-    draft: Draft, guess: Guess, pictures: dict[str, list[tuple[str, str]]], delay: TimeOffsetEstimate | None = None
+    draft: Draft, guess: Guess, pictures: dict[str, list[tuple[str, str]]], delay: Delays | None = None
 ) -> str:
     """HTML of the form: contents of the files by part, problems, and controls."""
     return render(

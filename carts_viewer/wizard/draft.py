@@ -193,6 +193,10 @@ def changed(draft: Draft, name: str, value: str, guessed: Mapping[str, str]) -> 
         options[name] = value or None
     elif name in _NUMBERS:
         options[name] = _number(value)
+    elif kind == "arm_time_offset" and which:
+        own = {arm: seconds for arm, seconds in draft.options.arm_time_offset.items() if arm != which}
+        seconds = _number(value)
+        options[kind] = own if seconds is None else {**own, which: seconds}
     elif kind == "calibration_size" and which:
         options[kind] = _with(draft.options.calibration_size, which, value.replace(" ", "").replace("×", "x"))
     elif kind == "flip" and which in JOINT_NAMES:

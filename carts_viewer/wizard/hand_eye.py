@@ -11,6 +11,7 @@ from carts_core.model.scene import Scene
 from carts_core.optimization import CalibrationResult, StopReason
 from carts_core.optimization.hand_eye import HandEyePrior, HandEyeResult, ImagePoint
 from carts_core.recording import Sequence
+from carts_core.recording.importing.delays import open_recording
 from carts_core.recording.importing.found import FoundRecording
 from carts_core.recording.importing.writing import write_sequence
 from carts_core.wording import counted
@@ -31,7 +32,6 @@ from carts_viewer.wizard.calibration import (
     report_of,
     target_folder,
 )
-from carts_viewer.wizard.check import open_recording
 from carts_viewer.wizard.draft import Draft
 from carts_viewer.wizard.drawing import Drawing, drawing_of
 from carts_viewer.wizard.points import Clicking, ClickPrompt, unknown_cameras

@@ -7,12 +7,12 @@ from pathlib import Path
 
 from carts_core.errors import CartsError, SettingsError
 from carts_core.model.scene import Scene
-from carts_core.recording import TimeOffsetEstimate
+from carts_core.recording.importing.delays import open_recording
 from carts_core.recording.video import SUFFIXES
 from carts_viewer.start.host import FileBrowser, Host
 from carts_viewer.start.roots import Entry
 from carts_viewer.transport.document import render
-from carts_viewer.wizard.check import Guess, check_form, estimated_delay, guess, open_recording, previews, problem_of
+from carts_viewer.wizard.check import Delays, Guess, check_form, delays_of, guess, previews, problem_of
 from carts_viewer.wizard.draft import Draft, DraftFile, Step, changed, picked
 from carts_viewer.wizard.hand_eye import HandEyeStep
 from carts_viewer.wizard.points import ClickPrompt
@@ -40,7 +40,9 @@ class RecordingWizard:
         self._browser: FileBrowser | None = None
         self._undo: list[Draft] = []
         self._guess: Guess | None = None
-        self._delay: TimeOffsetEstimate | None = None
+        self._delay: Delays | None = None
+        self._estimated = ""
+        """Source of which the delay has been estimated."""
         self._pictures: dict[str, list[tuple[str, str]]] = {}
         self._step: HandEyeStep | None = None
         try:
@@ -121,8 +123,10 @@ class RecordingWizard:
         match name:
             case "estimate-delay":
                 self._estimate_delay()
-            case "accept-delay" if delay is not None and delay.proposed is not None:
-                self._set(changed(self._draft, "time_offset", str(delay.proposed), {}) or self._draft)
+            case "accept-delay" if delay is not None:
+                self._set(self._draft.uncalibrated(options=delay.accepted()))
+            case _ if name.startswith("choose-delay ") and delay is not None:
+                self._set(self._draft.uncalibrated(options=delay.chosen(name.partition(" ")[2], value)))
             case "columns-in-order":
                 self._set(self._draft.with_options(columns={**self._draft.options.columns, **self._guessed().in_order}))
             case "trial":
@@ -221,6 +225,8 @@ class RecordingWizard:
             if self._guess.recording is not None:
                 with suppress(CartsError):
                     self._add_pictures(self._guess)
+                    if self._draft.options.time_offset is None and self._draft.source != self._estimated:
+                        self._estimate_delay()
         return self._guess
 
     def _show_message(self, title: str, text: str, place: str = "page") -> None:
@@ -228,10 +234,9 @@ class RecordingWizard:
 
     def _estimate_delay(self) -> None:
         """Estimate the delay from the motion in images and table."""
-        recording = self._guessed().recording
-        if recording is not None:
-            self._show_message("Time", "Comparing the motion in the images with the table …")
-            self._delay = estimated_delay(recording)
+        self._estimated, found = self._draft.source, self._guessed()
+        self._show_message("Time", "Comparing the motion in the images with the table …")
+        self._delay = delays_of(self._draft, found)
 
     def _add_pictures(self, found: Guess) -> None:
         assert found.recording is not None

@@ -193,7 +193,7 @@ def test_weights_that_are_missing_are_an_error_in_the_page_for_a_run_and_once_fo
 def test_the_page_carries_our_script_style_and_title(shared_viewer: ViewerApp) -> None:
     response = get(shared_viewer.url, "/")
     page = response.read().decode()
-    assert "<title>tiny · CaRTS</title>" in page and "/static/page.js" in page and "/static/page.css" in page
+    assert "<title>tiny · CaRTS</title>" in page and "static/page.js" in page and "static/page.css" in page
     assert response.headers["X-Frame-Options"] == "DENY"
     for name, kind in (("page.js", "javascript"), ("page.css", "text/css"), ("icon.svg", "svg")):
         found = get(shared_viewer.url, f"/static/{name}")

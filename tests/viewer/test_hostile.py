@@ -181,7 +181,7 @@ def test_where_others_can_reach_it_pages_files_and_websockets_need_the_token(sha
         assert get(url, "/" + query).status == _connect(shared_page, "/" + query) == 403
         assert get(url, "/static/page.js" + query).status == 403
     answer = get(url, "/?" + token)
-    assert answer.status == 200 and "/static/boot.js" in answer.read().decode()
+    assert answer.status == 200 and "static/boot.js" in answer.read().decode()
     cookie = answer.headers["Set-Cookie"].partition(";")[0]
     for path in ("/", "/static/page.js", "/index.html"):
         assert get(url, path, Cookie=cookie).status == 200

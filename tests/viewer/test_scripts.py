@@ -132,13 +132,13 @@ def test_of_a_document_only_what_documents_are_made_of_is_shown(tab: Tab, page: 
     document = Document(page)
     document.show(
         "<h1 onclick='ran.push(1)' class='kept'>Title</h1><script>ran.push(1)</script><iframe srcdoc='<b>'></iframe>"
-        f"<img src='{other_site.address}/i.png' onerror='ran.push(1)'><img src='/media/0a.jpg'>"
+        f"<img src='{other_site.address}/i.png' onerror='ran.push(1)'><img src='media/0a.jpg'>"
         "<a href='javascript:1'>x</a>"
         "<svg><polyline points='0,0 1,1'/><animate onbegin='ran.push(1)'/><foreignObject><b>x</b></foreignObject></svg>"
     )
     tab.get_by_role("heading", name="Title").wait_for()
     assert tab.locator("main").inner_html() == (
-        '<h1 class="kept">Title</h1><img><img src="/media/0a.jpg"><svg><polyline points="0,0 1,1"></polyline></svg>'
+        '<h1 class="kept">Title</h1><img><img src="media/0a.jpg"><svg><polyline points="0,0 1,1"></polyline></svg>'
     )
     assert tab.evaluate("ran") == [] and other_site.asked == []
     document.show("")

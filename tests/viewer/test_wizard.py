@@ -135,7 +135,8 @@ def test_a_delay_between_video_and_log_is_proposed_taken_and_undone(tmp_path: Pa
             site.wait()
             return place.draft.options.time_offset
 
-        assert chosen("estimate-delay") is None and "Proposed." in site.document.content
+        site.wait()
+        assert "Proposed: time_offset" in site.document.content and place.draft.options.time_offset is None
         assert chosen("accept-delay") == pytest.approx(0.12, abs=0.01)
         chosen("estimate-delay")
         assert "agrees with the motion" in site.document.content

@@ -1,4 +1,4 @@
-"""Hand-eye calibration from points clicked in a few images, without an initial pose."""
+"""Hand-eye calibration from points clicked in a few images, or from masks, without an initial pose."""
 
 from .files import RESULT_FILE as RESULT_FILE
 from .files import HandEyePrior as HandEyePrior
@@ -14,3 +14,6 @@ from .result import PointAgreement as PointAgreement
 from .result import PoseDeviation as PoseDeviation
 from .result import agreement_with_points as agreement_with_points
 from .result import solve_hand_eye as solve_hand_eye
+from .silhouettes import SilhouettePose as SilhouettePose
+from .silhouettes import placed as placed
+from .silhouettes import pose_from_masks as pose_from_masks

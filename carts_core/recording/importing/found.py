@@ -198,6 +198,8 @@ class FoundArm:
     """Base frame [m]; None if unknown."""
     base_from: str = ""
     """Source of the base frame, for the report."""
+    time_offset: float = 0.0
+    """Time offset in addition to that of the recording [s]."""
     beyond_limits: bool = False
     """Whether positions exceed the robot's limits, so that the sequence file must state their units."""
 

@@ -1,6 +1,7 @@
 """Import of a recording of any known format as a sequence file."""
 
 import os
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -8,6 +9,7 @@ from ...errors import SequenceError
 from ...settings.interchange import ImportOptions
 from ...wording import closest, shown
 from ..sources import SOURCES, Source
+from .delays import compensated, is_timed
 from .found import FoundRecording, Import, Part, PartError
 from .writing import completed, write_sequence
 
@@ -61,6 +63,8 @@ def find(path: Path, options: ImportOptions | None = None) -> FoundRecording:
     try:
         recording = replace(source.read(path, Import(options)), path=path)
         _check_names(recording, options)
+        arms = (replace(arm, time_offset=options.arm_time_offset.get(arm.name, 0.0)) for arm in recording.arms)
+        recording = replace(recording, arms=tuple(arms))
         return completed(recording, options)
     except OSError as error:
         named = "" if error.filename is None else f" {shown(str(error.filename))}"
@@ -95,6 +99,7 @@ def _check_names(recording: FoundRecording, options: ImportOptions) -> None:
         ("arms", options.arms, arms),
         ("robot", options.robot, arms or ["PSM1"]),
         ("base", options.base, arms),
+        ("arm_time_offset", options.arm_time_offset, arms),
         ("calibration", options.calibration, cameras),
         ("calibration_size", options.calibration_size, cameras),
     ):
@@ -118,10 +123,23 @@ def _is_given(options: ImportOptions, name: str) -> bool:
 
 
 def import_recording(
-    path: Path, folder: Path, options: ImportOptions | None = None, *, overwrite: bool = False
+    path: Path,
+    folder: Path,
+    options: ImportOptions | None = None,
+    *,
+    overwrite: bool = False,
+    progress: Callable[[int, int], None] | None = None,
 ) -> tuple[Path, FoundRecording]:
     """Write the sequence file and tables of a recording into a folder, without copying images; returns the file and the
-    content. `CartsError` for an unknown format or damaged or contradictory content, in which case nothing is
-    written."""
+    content. `CartsError` for an unknown format or damaged or contradictory content, in which case nothing is written.
+
+    Time offsets that are not given are estimated from the motion in the images; `progress` is called with the number of
+    frames read for this, and the total.
+    """
+    options = options or ImportOptions()
     recording = find(path, options)
+    if options.time_offset is None and not options.arm_time_offset:
+        uses = detect(path, options.source).uses
+        if "time_offset" in uses and (is_timed(recording) or "frame_rate" in uses):
+            recording = compensated(recording, options, lambda changed: find(path, changed), progress)
     return write_sequence(recording, folder, overwrite=overwrite), recording

@@ -153,7 +153,8 @@ def _frames_with_kinematics(recording: FoundRecording, job: Import) -> FoundReco
         return recording
     wanted = recording.frame_times + recording.time_offset
     keep = np.ones(len(wanted), bool)
-    logs = [(arm.name, arm.times) for arm in recording.arms if arm.times is not None]
+    # Times in the clock that the time offset of the recording refers to.
+    logs = [(arm.name, arm.times - arm.time_offset) for arm in recording.arms if arm.times is not None]
     if recording.motion is not None and logs:
         logs.append((_ENDOSCOPE, recording.motion.times))
     for name, times in logs:
