@@ -63,6 +63,7 @@ def view(
     """
     hub = os.environ.get("JUPYTERHUB_SERVICE_PREFIX")
     path = f"{hub.rstrip('/')}/proxy" if proxy_path is None and hub else proxy_path
-    app = ViewerApp.open(Path(sequence), **{"port": 0, "proxy": Proxy("", origins), **options})
+    chosen: dict[str, Any] = {"port": 0, "proxy": Proxy("", origins), **options}
+    app = ViewerApp.open(Path(sequence), **chosen)
     url = app.url if path is None else f"{path}/{app.page.server.get_port()}/"
     return NotebookView(app, url, height)

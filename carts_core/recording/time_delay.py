@@ -271,7 +271,7 @@ class _Delays:
         self._shared = sequence.checked_matching().time_offset
         arms, cameras = tuple(arm.name for arm in sequence.scene.arms), sequence.moving_cameras
         groups = [(arms, cameras)] if len(arms) == 1 else [*(((arm,), ()) for arm in arms), ((), cameras)]
-        self._clocks = [_Clock(sequence, *group, steps, largest) for group in groups if any(group)]
+        self._clocks = [_Clock(sequence, own, moving, steps, largest) for own, moving in groups if own or moving]
 
     def estimate(self) -> tuple[TimeOffsetEstimate, ...]:
         """One estimate for all clocks, or one for each that moves if their shifts differ."""

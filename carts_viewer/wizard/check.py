@@ -248,9 +248,9 @@ class Delays:
 
 def delays_of(draft: Draft, guess: Guess) -> Delays | None:
     """Estimate time offsets; None without a recording or times of rows, `CartsError` if an image cannot be read."""
-    if guess.recording is None:
-        return None
     source = Path(draft.source)
+    if guess.recording is None or "time_offset" not in detect(source, guess.kind).uses:
+        return None
 
     def again(options: ImportOptions) -> FoundRecording:
         return find(source, replace(options, source=guess.kind))

@@ -17,7 +17,7 @@ from waiting import eventually, wait_in
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
-import carts_core
+import carts_viewer
 from carts_core.errors import SettingsError
 from carts_viewer.app import ViewerApp
 from carts_viewer.transport.guard import Guard, Proxy
@@ -169,7 +169,7 @@ def test_a_notebook_embeds_the_page_and_no_other_site_can(
 ) -> None:
     port, other = _free_port(), _free_port()
     command = [sys.executable, "-m", "http.server", "--bind", "127.0.0.1", "--directory", str(tmp_path)]
-    with carts_core.view(
+    with carts_viewer.view(
         tiny_sequence(), origins=(f"http://localhost:{port}",), height=400, weights=(untrained_weights,)
     ) as shown:
         (tmp_path / "cell.html").write_text(shown._repr_html_())
@@ -179,7 +179,7 @@ def test_a_notebook_embeds_the_page_and_no_other_site_can(
                 page.goto(f"http://localhost:{port}/cell.html")
                 frame = eventually(lambda: page.frame(url=re.compile(re.escape(shown.url))))
                 assert frame is not None
-                eventually(lambda: frame.evaluate(f"Boolean({READY})"))
+                eventually(lambda: page.frames[-1].evaluate(f"Boolean({READY})"))
                 page.goto(f"http://localhost:{other}/cell.html")
                 frame = page.frames[-1]
                 assert not frame.evaluate("Boolean(window.carts)") and frame.url.startswith("chrome-error:")

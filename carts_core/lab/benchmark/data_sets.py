@@ -24,8 +24,16 @@ from ...model.keypoints import link_transforms
 from ...model.scene import Arm, Scene
 from ...networks import FeatureExtractor
 from ...optimization import FreeParameters, SurfacePredictor, SurfaceSolver
-from ...recording import Sequence, calibrated_sequence_file, estimate_time_offset, evenly_spaced
+from ...recording import (
+    Sequence,
+    TimeOffsetEstimate,
+    calibrated_sequence_file,
+    estimate_time_offsets,
+    evenly_spaced,
+    offsets_to_write,
+)
 from ...recording.annotations import read_annotations
+from ...recording.importing.delays import with_delays
 from ...recording.importing.importer import import_recording
 from ...recording.sources.datasets import SURGPOSE, SURGSYNC
 from ...settings.interchange import ImportOptions
@@ -136,21 +144,20 @@ def bench_recording(
     """
     progress("importing")
     options = ImportOptions(source=data_set, frame_rate=frame_rate)
-    file, _ = import_recording(path, folder / "imported", options, overwrite=True)
+    file, _ = import_recording(path, folder / "imported", options, overwrite=True, estimate_delays=False)
     sequence = Sequence.open(file)
     progress("delay")
-    delay, problem = None, None
+    delays: dict[str, TimeOffsetEstimate] = {}
+    no_delay = ""
     try:
-        delay = estimate_time_offset(sequence)
-        problem = delay.problem
+        estimates = estimate_time_offsets(sequence)
+        delays = {each.arm: each for each in estimates}
+        if offsets := offsets_to_write(estimates, sequence):
+            # Frames without rows at the new offset are left out by the import.
+            file, _ = import_recording(path, folder / "imported", with_delays(options, offsets), overwrite=True)
+            sequence = Sequence.open(file)
     except SequenceError as error:
-        problem = str(error)
-    if delay is not None and delay.proposed is not None:
-        # Frames without rows at the new offset are left out by the import.
-        file, _ = import_recording(
-            path, folder / "imported", replace(options, time_offset=delay.proposed), overwrite=True
-        )
-        sequence = Sequence.open(file)
+        no_delay = str(error)
     keypoints, scored = _keypoints(path, sequence), evenly_spaced(len(sequence), min(frames, len(sequence)))
     progress("hand-eye")
     others = {arm: [point for point in points if point.frame not in scored] for arm, points in keypoints.items()}
@@ -173,6 +180,7 @@ def bench_recording(
     dot_joints = _corrected(setup, dot_frames if usable else [], progress)
     results = []
     for arm in sequence.scene.arms:
+        delay = delays.get(arm.name) or delays.get("")
         points, (rotation, insertion) = keypoints.get(arm.name, []), _correction(sequence, arm, *joints)
         errors = [
             _error(sequence, arm, _dots(sequence, arm, points, other), points, each)
@@ -182,9 +190,9 @@ def bench_recording(
             ArmResult(
                 recording=path.name,
                 arm=arm.name,
-                delay=None if delay is None or problem else round(delay.seconds, 4),
-                delay_std=None if delay is None or problem else round(delay.deviation, 4),
-                delay_problem=problem,
+                delay=None if delay is None or delay.problem else round(delay.seconds, 4),
+                delay_std=None if delay is None or delay.problem else round(delay.deviation, 4),
+                delay_problem=no_delay if delay is None else delay.problem,
                 hand_eye="keypoints" if arm.name in bases else "published" if given else "none",
                 hand_eye_px=bases[arm.name][1] if arm.name in bases else None,
                 frames=len(joints[0]),

@@ -81,7 +81,7 @@ def pose_from_masks(
     joints, small = joint_positions[used], [small[index] for index in used]
     points = _surface_points(robot, joints, rng)
     problem = _Chamfer.of(points, small, view, rng)
-    rotations = torch.tensor(Rotation.random(_ROTATIONS, random_state=seed).as_matrix(), dtype=torch.float32)
+    rotations = torch.tensor(Rotation.from_quat(rng.normal(size=(_ROTATIONS, 4))).as_matrix(), dtype=torch.float32)
     shifts = problem.translations(rotations)
     losses = torch.cat(
         [problem.losses(*part, _COARSE) for part in zip(rotations.split(256), shifts.split(256), strict=True)]

@@ -128,17 +128,18 @@ def import_recording(
     options: ImportOptions | None = None,
     *,
     overwrite: bool = False,
+    estimate_delays: bool = True,
     progress: Callable[[int, int], None] | None = None,
 ) -> tuple[Path, FoundRecording]:
     """Write the sequence file and tables of a recording into a folder, without copying images; returns the file and the
     content. `CartsError` for an unknown format or damaged or contradictory content, in which case nothing is written.
 
-    Time offsets that are not given are estimated from the motion in the images; `progress` is called with the number of
-    frames read for this, and the total.
+    Time offsets that are not given are estimated from the motion in the images if `estimate_delays`; `progress` is
+    called with the number of frames read for this, and the total.
     """
     options = options or ImportOptions()
     recording = find(path, options)
-    if options.time_offset is None and not options.arm_time_offset:
+    if estimate_delays and options.time_offset is None and not options.arm_time_offset:
         uses = detect(path, options.source).uses
         if "time_offset" in uses and (is_timed(recording) or "frame_rate" in uses):
             recording = compensated(recording, options, lambda changed: find(path, changed), progress)
