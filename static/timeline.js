@@ -393,7 +393,7 @@
     showFrames: show,
     reviewNames: NAMES,
     nameOf: (frame) => name(frame),
-    thumbnailOf: (frame) => `/thumbnail/${shown.active ?? 0}/${Math.max(known.domains.indexOf(shown.domain), 0)}/${frame}.jpg`,
+    thumbnailOf: (frame) => `thumbnail/${shown.active ?? 0}/${Math.max(known.domains.indexOf(shown.domain), 0)}/${frame}.jpg`,
   });
   everyFrame();
 })();
