@@ -65,7 +65,7 @@ class HandEye:
 
     def _from_masks(self, masks: str) -> None:
         from ..files import MARKER, published, write_text
-        from ..optimization.hand_eye import placed, pose_from_masks
+        from ..optimization.hand_eye.silhouettes import placed, pose_from_masks
         from ..recording import Sequence, calibrated_sequence_file, evenly_spaced
 
         console = Terminal()

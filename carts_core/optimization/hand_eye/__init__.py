@@ -14,6 +14,3 @@ from .result import PointAgreement as PointAgreement
 from .result import PoseDeviation as PoseDeviation
 from .result import agreement_with_points as agreement_with_points
 from .result import solve_hand_eye as solve_hand_eye
-from .silhouettes import SilhouettePose as SilhouettePose
-from .silhouettes import placed as placed
-from .silhouettes import pose_from_masks as pose_from_masks

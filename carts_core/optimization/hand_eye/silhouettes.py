@@ -122,7 +122,7 @@ def _surface_points(
     faces = rng.choice(len(weights), _POINTS, p=weights / weights.sum())
     shares = rng.dirichlet(np.ones(3), _POINTS)
     points = np.einsum("pc,pcd->pd", shares, np.concatenate(corners)[faces])
-    Ts = robot.forward_kinematics(torch.from_numpy(joints)).numpy()[:, links[faces]]
+    Ts = robot.forward_kinematics(joints)[:, links[faces]]
     return torch.tensor(np.einsum("fpij,pj->fpi", Ts[..., :3, :3], points) + Ts[..., :3, 3], dtype=torch.float32)
 
 
