@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 from xml.etree import ElementTree
-from xml.etree.ElementTree import Element
+from xml.etree.ElementTree import Element, SubElement
 
 import numpy as np
 from jaxtyping import Float
@@ -127,11 +127,30 @@ def _rotation(roll: float, pitch: float, yaw: float) -> Float[np.ndarray, "3 3"]
     )
 
 
+_JOINT_PARTS = ("parent", "child", "origin", "axis", "mimic")
+"""Elements of a joint that define its motion; limits and dynamics have required attributes, which many URDFs omit."""
+
+
+def _links_and_joints(root: Element) -> str:
+    """Text of a URDF with what pytorch-kinematics needs, without elements that it warns about."""
+    robot = Element("robot", root.attrib)
+    for child in root:
+        if child.tag == "link":
+            SubElement(robot, "link", child.attrib)
+        elif child.tag == "joint":
+            joint = SubElement(robot, "joint", child.attrib)
+            joint.extend(part for part in child if part.tag in _JOINT_PARTS)
+            if child.find("axis") is None:
+                SubElement(joint, "axis", xyz="1 0 0")  # URDF's default axis; that of pytorch-kinematics is z
+    return ElementTree.tostring(robot, encoding="unicode")
+
+
 class Kinematics:
     """Forward kinematics of a robot's links from its independent joint positions.
 
     The transform of a link in its parent's frame is C + S sin(q) + G cos(q) + P q with constant matrices C, S, G and P,
-    where q is the position of the joint between them; see `_Joint.matrices`.
+    where q is the position of the joint between them; see `_Joint.matrices`. The transforms of tensors are computed by
+    pytorch-kinematics, with gradients.
 
     Args:
         root: the checked URDF.
@@ -155,6 +174,8 @@ class Kinematics:
         self._frame_index = {name: index for index, name in enumerate(links)}
         self._parents = [self._frame_index[above[name].parent] for name in links[1:]]
         moving = [above[name] for name in links[1:]]
+        self._joints, self._links = [joint.name for joint in moving], links
+        self._urdf, self._chains = _links_and_joints(root), {}
         matrices = np.array([joint.matrices() for joint in moving]).reshape(-1, 4, 4, 4)
         self._constants = (*_mimic_matrix(joints, moving, self.joint_names), *matrices.swapaxes(0, 1))
         probes = np.stack([np.zeros(len(self.joint_names)), np.full(len(self.joint_names), 0.1)])
@@ -163,16 +184,33 @@ class Kinematics:
             raise RobotError(f"{source}: base link {self.base_link!r} moves with a joint. Choose a fixed link.")
         self._T_base_root = np.linalg.inv(Ts_root_base[0])
 
-    def _Ts_root(self, joint_positions: Float[Array, "n dofs"]) -> list[Float[Array, "n 4 4"]]:
+    def _Ts_root(self, joint_positions: Float[Array, "n dofs"]) -> Sequence[Float[Array, "n 4 4"]]:
         """Transforms of all links to the root, in the order of `_frame_index`."""
-        expand, offset, C, S, G, P = (converted(values, joint_positions) for values in self._constants)
+        constants = (converted(values, joint_positions) for values in self._constants)
+        if library(joint_positions) is not np:
+            expand, offset, *_ = constants
+            return self._Ts_root_of_tensor(joint_positions @ expand.T + offset)
+        expand, offset, C, S, G, P = constants
         q = (joint_positions @ expand.T + offset)[:, :, None, None]
-        of = library(q)
-        Ts_parent_link = C + S * of.sin(q) + G * of.cos(q) + P * q
-        Ts = [of.broadcast_to(converted(np.eye(4), q), (len(q), 4, 4))]
+        Ts_parent_link = C + S * np.sin(q) + G * np.cos(q) + P * q
+        Ts = [np.broadcast_to(np.eye(4), (len(q), 4, 4))]
         for index, parent in enumerate(self._parents):
             Ts.append(Ts[parent] @ Ts_parent_link[:, index])
         return Ts
+
+    def _Ts_root_of_tensor(self, joint_positions: Float[Array, "n joints"]) -> Float[Array, "links n 4 4"]:
+        """The same by pytorch-kinematics, from the positions of all joints in the order of `_joints`."""
+        device = joint_positions.device
+        if device not in self._chains:
+            import pytorch_kinematics  # noqa: PLC0415
+
+            chain = pytorch_kinematics.build_chain_from_urdf(self._urdf)
+            chain = chain.to(dtype=joint_positions.dtype, device=device)
+            joints = [self._joints.index(name) for name in chain.get_joint_parameter_names()]
+            links = [int(chain.get_frame_indices(name)[0]) for name in self._links]
+            self._chains[device] = chain, joints, links
+        chain, joints, links = self._chains[device]
+        return chain.forward_kinematics_tensor(joint_positions[:, joints])[links]
 
     def __call__(
         self, joint_positions: Float[Array, "*batch dofs"], link_names: tuple[str, ...]

@@ -222,8 +222,9 @@ def test_links_are_where_another_library_has_them_and_an_axis_that_is_not_given_
     for positions in np.random.default_rng(0).uniform(-1, 1, (20, 3)):
         other.update_cfg(positions)
         for link in ("tip", "arm", "slide", "finger", "plate"):
-            T = robot.link_transform(torch.from_numpy(positions), link).numpy()
+            T, of_tensor = (robot.link_transform(q, link) for q in (positions, torch.from_numpy(positions)))
             np.testing.assert_allclose(T, other.get_transform(link, "base"), rtol=0, atol=1e-6)
+            np.testing.assert_allclose(T, of_tensor, rtol=0, atol=1e-6)
 
 
 def test_derivatives_of_transforms_are_those_of_finite_differences(tmp_path: Path) -> None:
