@@ -38,7 +38,13 @@
   /** An icon of the set that viser's widgets use, by its name. */
   window.cartsIcon = (name) => {
     const path = window.cartsConfiguration.icons?.[name] ?? "";
-    return `<svg class="carts-icon" viewBox="0 0 24 24" aria-hidden="true">${path}</svg>`;
+    const svg = `<svg xmlns="http://www.w3.org/2000/svg" class="carts-icon" viewBox="0 0 24 24" aria-hidden="true">${path}</svg>`;
+    return document.importNode(new DOMParser().parseFromString(svg, "image/svg+xml").documentElement, true);
+  };
+
+  /** Insert the icons that elements name in `data-icon`. */
+  window.cartsIcons = (parent) => {
+    for (const element of parent.querySelectorAll("[data-icon]")) element.append(window.cartsIcon(element.dataset.icon));
   };
 
   /** Call a function of `window.carts`; unknown names are ignored. */

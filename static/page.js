@@ -248,24 +248,24 @@
   function buildBar(canvas) {
     bar = document.createElement("div");
     bar.className = "carts-bar";
-    const icon = window.cartsIcon;
     bar.setAttribute("role", "toolbar");
     bar.setAttribute("aria-label", "View");
     bar.innerHTML = `
       <button data-do="endoscope" title="Look through the endoscope (V)" aria-label="Endoscope view">Endoscope</button>
       <button data-do="scene" title="Orbit around the arms and the cameras (V)" aria-label="3D view">3D</button>
       <span class="carts-zoom">
-        <button data-do="out" title="Zoom out" aria-label="Zoom out">${icon("minus")}</button><output aria-label="Zoom"></output>
-        <button data-do="in" title="Zoom in (wheel over the image)" aria-label="Zoom in">${icon("plus")}</button>
+        <button data-do="out" title="Zoom out" aria-label="Zoom out" data-icon="minus"></button><output aria-label="Zoom"></output>
+        <button data-do="in" title="Zoom in (wheel over the image)" aria-label="Zoom in" data-icon="plus"></button>
       </span>
-      <button data-do="fit" title="Show the whole image (double click)" aria-label="Fit">${icon("maximize")}</button>
-      <button data-do="loupe" title="Loupe: pixels, coordinates and colour (,)" aria-label="Loupe">${icon("zoom-in-area")}</button>
+      <button data-do="fit" title="Show the whole image (double click)" aria-label="Fit" data-icon="maximize"></button>
+      <button data-do="loupe" title="Loupe: pixels, coordinates and colour (,)" aria-label="Loupe" data-icon="zoom-in-area"></button>
       <span class="carts-layers">
         <button data-do="ghost" title="Show the measured arms, semi-transparent">Measured</button>
         <button data-do="grid" title="Show the grid: 1 cm, with strong lines every 5 cm">Grid</button>
       </span>
-      <button data-do="theme" title="Light or dark" aria-label="Light or dark">${icon("contrast")}</button>
-      <button data-do="help" title="Help and keys (?)" aria-label="Keys">${icon("help")}</button>`;
+      <button data-do="theme" title="Light or dark" aria-label="Light or dark" data-icon="contrast"></button>
+      <button data-do="help" title="Help and keys (?)" aria-label="Keys" data-icon="help"></button>`;
+    window.cartsIcons(bar);
     const actions = {
       endoscope: showEndoscope, scene: showScene, fit: () => (view.endoscope ? showEndoscope() : showScene()),
       grid: () => toggle("grid"), ghost: () => toggle("ghost"),

@@ -44,18 +44,18 @@
     if (!below || strip?.isConnected) return;
     strip = document.createElement("div");
     strip.className = "carts-strip";
-    const icon = window.cartsIcon;
     strip.innerHTML = `<div class="carts-strip-head">
-        <button data-do="first" aria-label="Start the range" title="Start the range at this frame; the range limits playback, solving, optimizing and exporting. Key: (">${icon("brackets-contain-start")}</button>
-        <button data-do="last" aria-label="End the range" title="End the range at this frame. Key: )">${icon("brackets-contain-end")}</button>
+        <button data-do="first" aria-label="Start the range" title="Start the range at this frame; the range limits playback, solving, optimizing and exporting. Key: (" data-icon="brackets-contain-start"></button>
+        <button data-do="last" aria-label="End the range" title="End the range at this frame. Key: )" data-icon="brackets-contain-end"></button>
         <span class="carts-range"></span>
-        <button data-do="whole" title="Remove the range" aria-label="Remove the range">${icon("x")}</button>
+        <button data-do="whole" title="Remove the range" aria-label="Remove the range" data-icon="x"></button>
         <select aria-label="Curve" title="Draw a curve over all frames: a joint, the loss, Dice or the probability of failure"></select>
-        <button data-do="frames" title="All frames as a table or a gallery" aria-label="Frames">${icon("table")}</button>
+        <button data-do="frames" title="All frames as a table or a gallery" aria-label="Frames" data-icon="table"></button>
         <button data-do="lanes" title="Show or hide thumbnails and curve" aria-label="Thumbnails and curve"></button>
         <output></output>
       </div>
       <canvas role="slider" tabindex="0" aria-label="Timeline" aria-valuemin="1" aria-valuemax="1" aria-valuenow="1"></canvas>`;
+    window.cartsIcons(strip);
     tip = document.createElement("div");
     tip.className = "carts-tip";
     tip.hidden = true;
@@ -307,7 +307,7 @@
     const lanes = strip.querySelector("[data-do=lanes]");
     if (lanes.dataset.open !== String(open)) {
       lanes.dataset.open = String(open);
-      lanes.innerHTML = window.cartsIcon(open ? "chevron-down" : "chevron-up");
+      lanes.replaceChildren(window.cartsIcon(open ? "chevron-down" : "chevron-up"));
       lanes.setAttribute("aria-expanded", String(open));
     }
   }

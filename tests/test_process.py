@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from carts_core import process
 from carts_core.model.mesh_cache import cache_dir, read
 from carts_core.process import tune_process
 from carts_core.project.identity import data_dir
@@ -18,6 +19,7 @@ def test_a_core_is_left_to_others(given: str | None, expected: int, monkeypatch:
     monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
     if given:
         monkeypatch.setenv("OMP_NUM_THREADS", given)
+    monkeypatch.setattr(process._TUNED, "core_left_free", False)
     torch.set_num_threads(2)
     tune_process()
     assert torch.get_num_threads() == expected

@@ -99,7 +99,7 @@ def frame_latency(app: ViewerApp, *, moves: int = 120, frames: int = 8, pause: f
     times: list[float] = []
     with RawTab(app.url, draws=True, key=_KEY) as tab:
         app.wait_until_shown()
-        keys = {1: tab.find("Next frame"), -1: tab.find("Previous frame (back)")}
+        keys = {1: tab.command("Next frame"), -1: tab.command("Previous frame (back)")}
         lap = [1] * count + [-1] * count
         for number in range(len(lap) + moves):
             by, pressed = lap[number % len(lap)], time.perf_counter()

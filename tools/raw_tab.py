@@ -109,6 +109,12 @@ class RawTab:
         """Id of the widget or command with this label."""
         return next(element for element, widget in self.widgets.items() if widget.get("label") == label)
 
+    def command(self, label: str) -> str:
+        """Id of the command with this label."""
+        return next(
+            element for element, props in self.widgets.items() if props.get("label") == label and "hotkey" in props
+        )
+
     def press(self, command: str) -> None:
         """Trigger the command of a key; errors as `set`."""
         self.send({"type": "CommandTriggerMessage", "uuid": command})

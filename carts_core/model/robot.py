@@ -16,6 +16,7 @@ from jaxtyping import Float
 from ..arrays import Array, converted, library
 from ..errors import RobotError
 from ..files.reading import ROBOT, is_regular, read_text
+from ..reprs import short_repr
 from ..wording import listed, shown
 from . import mesh_cache
 from .instruments import robot_file
@@ -58,6 +59,8 @@ class _Joint:
     """Mimicked joint, multiplier and offset."""
     limits: tuple[float, float]
     """Lower and upper limit [rad, m]; infinite without a limit."""
+
+    __repr__ = short_repr
 
     @property
     def independent(self) -> bool:

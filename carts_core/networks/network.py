@@ -1,6 +1,7 @@
 """Feature network: a small U-Net; ACS compares the features of its last layer before the 1x1 head."""
 
 import copy
+from contextlib import AbstractContextManager, nullcontext
 from itertools import pairwise
 from typing import Any, ClassVar, Self, TypeVar
 
@@ -53,6 +54,11 @@ class ImageNetwork(nn.Module):
         return channels_last(folded).requires_grad_(False)
 
 
+def _one_thread(level: int) -> AbstractContextManager[None]:
+    """Single thread for the coarse levels: for few pixels, oneDNN selects kernels by the number of threads."""
+    return one_thread() if level >= 3 else nullcontext()
+
+
 class UNet(ImageNetwork):
     """U-Net of convolution, batch norm and ReLU; skip connections are added, at half the cost of concatenation."""
 
@@ -79,13 +85,15 @@ class UNet(ImageNetwork):
         self.check_input(x, self.inputs)
         skips: list[Tensor] = []
         for level, encode in enumerate(self.encoder):
-            x = encode(functional.max_pool2d(x, 2) if level else x)
+            with _one_thread(level):
+                x = encode(functional.max_pool2d(x, 2) if level else x)
             skips.append(x)
         coarse = skips.pop()
-        for reduce, decode in zip(reversed(self.reduce), reversed(self.decoder), strict=True):
+        for level, (reduce, decode) in reversed([*enumerate(zip(self.reduce, self.decoder, strict=True))]):
             coarse = x
-            x = functional.interpolate(reduce(x), scale_factor=2, mode="bilinear", align_corners=False)
-            x = decode(x + skips.pop())
+            with _one_thread(level):
+                x = functional.interpolate(reduce(x), scale_factor=2, mode="bilinear", align_corners=False)
+                x = decode(x + skips.pop())
         return x, coarse
 
     def standardized(self, images: Float[Tensor, "batch 3 h w"]) -> Float[Tensor, "batch 3 h w"]:

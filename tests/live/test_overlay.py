@@ -4,13 +4,13 @@ import os
 import threading
 from collections.abc import Callable
 from pathlib import Path
+from typing import BinaryIO
 
 import av
 import cv2
 import numpy as np
 import pytest
 
-from carts_core.errors import OutputError
 from carts_core.live import KeyedOverlay, LiveVerdict, StreamFrame, Tracked
 from carts_core.live.overlay import COLOURS, KEY
 from carts_core.live.tracker import Effort, LiveEstimate
@@ -30,19 +30,11 @@ def sequence(tiny_sequence: Callable[..., Path]) -> Sequence:
     return Sequence.open(tiny_sequence(frames=2, width=160, height=128, cameras=("left", "right")))
 
 
-def read(pipe: Path, pictures: list[np.ndarray]) -> None:
+def read(pipe: BinaryIO, pictures: list[np.ndarray]) -> None:
     """Read all pictures from a pipe until its writer ends, RGB."""
-    with av.open(str(pipe)) as container:
+    os.set_blocking(pipe.fileno(), True)
+    with pipe, av.open(pipe, format="yuv4mpegpipe") as container:
         pictures.extend(frame.to_ndarray(format="rgb24") for frame in container.decode(video=0))
-
-
-def once_read(sequence: Sequence, pipes: dict[str, Path]) -> KeyedOverlay:
-    """The overlay, as soon as the threads that read the pipes have opened them."""
-    while True:
-        try:
-            return KeyedOverlay(sequence, pipes)
-        except OutputError as error:
-            assert "no program reads it" in str(error)
 
 
 def eroded(mask: np.ndarray, size: int) -> np.ndarray:
@@ -54,12 +46,13 @@ def eroded(mask: np.ndarray, size: int) -> np.ndarray:
 def test_another_program_reads_outlines_on_green(sequence: Sequence, tmp_path: Path, verdict: LiveVerdict) -> None:
     pipes = {name: tmp_path / name for name in ("left", "right")}
     pictures: dict[str, list[np.ndarray]] = {name: [] for name in pipes}
-    threads = [threading.Thread(target=read, args=(pipes[name], pictures[name])) for name in pipes]
     for pipe in pipes.values():
         os.mkfifo(pipe)
+    ends = {name: os.fdopen(os.open(pipe, os.O_RDONLY | os.O_NONBLOCK), "rb") for name, pipe in pipes.items()}
+    overlay, result = KeyedOverlay(sequence, pipes), tracked(sequence, 1, verdict)
+    threads = [threading.Thread(target=read, args=(ends[name], pictures[name])) for name in pipes]
     for thread in threads:
         thread.start()
-    overlay, result = once_read(sequence, pipes), tracked(sequence, 1, verdict)
     overlay(result)
     overlay.close()
     for thread in threads:

@@ -157,7 +157,7 @@ def test_captions_have_times_remarks_and_the_offset_between_clocks(open_viewer: 
     app = open_viewer(edit=describe, prepare=add_times)
     with RawTab(app.url) as tab:
         app.queue.put(intents.ShowFrame(1))
-        assert "at 0.150 s" in caption(app)
+        assert "· 0.150 s ·" in caption(app)
         offset = app.view.page.find("Time offset [s]")
         assert offset.visible and offset.value == -0.035
         app.queue.put(intents.SetTimeOffset(-0.02))
@@ -170,7 +170,8 @@ def test_captions_have_times_remarks_and_the_offset_between_clocks(open_viewer: 
     other = open_viewer(prepare=as_ros)
     with RawTab(other.url):
         other.queue.put(intents.ShowFrame(1))
-        assert "0.100 s after the first frame, 2016-06-28 00:00:00 UTC" in caption(other)
+        since = "1467072000.350000 s since 1970, 2016-06-28 00:00:00 UTC"
+        assert f'· <span title="{since}">0.100 s</span> ·' in caption(other)
         assert not other.view.page.find("Time offset [s]").visible
 
 

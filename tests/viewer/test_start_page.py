@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shutil
 from collections.abc import Callable
 from contextlib import closing
@@ -331,7 +332,7 @@ def test_another_recording_in_the_same_tab_is_not_taken_for_a_wrong_link(
         page.goto(site.url)  # and at once, before it is connected:
         for path, name in ((first, "tiny"), (second, "other")):
             site.post(lambda path=path: site.open_sequence(path))
-            expect(page.get_by_text(f"in {path.stem}.carts")).to_be_visible()
+            expect(page.locator(".carts-saved")).to_have_attribute("title", re.compile(rf"{path.stem}\.carts$"))
             wait_in(page, f"location.href.includes('project={name}')")
         assert page.evaluate("localStorage.getItem('noted')") is None
         page.close()
