@@ -33,7 +33,7 @@ def sequence(tiny_sequence: Callable[..., Path]) -> Sequence:
 def read(pipe: BinaryIO, pictures: list[np.ndarray]) -> None:
     """Read all pictures from a pipe until its writer ends, RGB."""
     os.set_blocking(pipe.fileno(), True)
-    with pipe, av.open(pipe, format="yuv4mpegpipe") as container:
+    with pipe, av.open(pipe, "r", format="yuv4mpegpipe") as container:
         pictures.extend(frame.to_ndarray(format="rgb24") for frame in container.decode(video=0))
 
 
