@@ -158,6 +158,7 @@ class SurfaceFactor:
         blurred[..., COVERAGE.start, :, :] = blurred[..., COVERAGE, :, :].sum(-3)
         return blurred
 
+    @one_thread()
     def _normal_equations(
         self, jacobian: tuple[JacobianBlock, ...], residual: Tensor, grown: Tensor, weight: Tensor, unknowns: int
     ) -> tuple[Tensor, Tensor, Tensor]:
