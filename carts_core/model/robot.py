@@ -177,10 +177,10 @@ class Kinematics:
         self._frame_index = {name: index for index, name in enumerate(links)}
         self._parents = [self._frame_index[above[name].parent] for name in links[1:]]
         moving = [above[name] for name in links[1:]]
-        self._joints, self._links = [joint.name for joint in moving], links
+        self._joints = [joint.name for joint in moving]
         self._urdf, self._chains = _links_and_joints(root), {}
         matrices = np.array([joint.matrices() for joint in moving]).reshape(-1, 4, 4, 4)
-        self._constants = (*_mimic_matrix(joints, moving, self.joint_names), *matrices.swapaxes(0, 1))
+        self._mimics, self._matrices = _mimic_matrix(joints, moving, self.joint_names), matrices.swapaxes(0, 1)
         probes = np.stack([np.zeros(len(self.joint_names)), np.full(len(self.joint_names), 0.1)])
         Ts_root_base = self._Ts_root(probes)[self._frame_index[self.base_link]]
         if not np.allclose(Ts_root_base[0], Ts_root_base[1]):
@@ -189,12 +189,11 @@ class Kinematics:
 
     def _Ts_root(self, joint_positions: Float[Array, "n dofs"]) -> Sequence[Float[Array, "n 4 4"]]:
         """Transforms of all links to the root, in the order of `_frame_index`."""
-        constants = (converted(values, joint_positions) for values in self._constants)
-        if library(joint_positions) is not np:
-            expand, offset, *_ = constants
-            return self._Ts_root_of_tensor(joint_positions @ expand.T + offset)
-        expand, offset, C, S, G, P = constants
-        q = (joint_positions @ expand.T + offset)[:, :, None, None]
+        expand, offset = (converted(values, joint_positions) for values in self._mimics)
+        positions = joint_positions @ expand.T + offset
+        if library(positions) is not np:
+            return self._Ts_root_of_tensor(positions)
+        (C, S, G, P), q = self._matrices, positions[:, :, None, None]
         Ts_parent_link = C + S * np.sin(q) + G * np.cos(q) + P * q
         Ts = [np.broadcast_to(np.eye(4), (len(q), 4, 4))]
         for index, parent in enumerate(self._parents):
@@ -210,7 +209,7 @@ class Kinematics:
             chain = pytorch_kinematics.build_chain_from_urdf(self._urdf)
             chain = chain.to(dtype=joint_positions.dtype, device=device)
             joints = [self._joints.index(name) for name in chain.get_joint_parameter_names()]
-            links = [int(chain.get_frame_indices(name)[0]) for name in self._links]
+            links = [int(chain.get_frame_indices(name)[0]) for name in self._frame_index]
             self._chains[device] = chain, joints, links
         chain, joints, links = self._chains[device]
         return chain.forward_kinematics_tensor(joint_positions[:, joints])[links]
