@@ -377,7 +377,7 @@ _REMEDY = (
 )
 _REMEDY_FAILED = (
     "Run the optimizer. If it has run, place the arm roughly in the viewer and run again, check the calibration, or "
-    "add an image of the empty scene to the sequence file (`background`)."
+    "add an image of the empty scene to the sequence file (key background)."
 )
 
 _CALIBRATION_REMEDY = (
