@@ -154,7 +154,6 @@ def test_without_a_trusted_origin_a_proxy_is_refused(open_behind: Callable, tmp_
 
 @pytest.mark.browser
 def test_the_page_works_through_jupyter_server_proxy(browser: Browser, open_behind: Callable, tmp_path: Path) -> None:
-    pytest.importorskip("jupyter_server_proxy", reason="jupyter-server-proxy is not installed: pip install it")
     port = _free_port()
     _, viewer = open_behind(Proxy("", (f"http://127.0.0.1:{port}",)))
     command = [sys.executable, "-m", "jupyter_server", f"--ServerApp.port={port}", "--ServerApp.ip=127.0.0.1"]
