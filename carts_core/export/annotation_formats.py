@@ -310,20 +310,33 @@ pixel.
 
 
 def write_yolo(dataset: Dataset, folder: OutputPath, progress: ExportProgress) -> None:
-    """Write the dataset in YOLO format; each connected visible region of an arm is an object."""
+    """Write the dataset in YOLO format; each connected visible region of an arm is an object.
+
+    Datumaro reads YOLO boxes, but no polygons: `obj.names` and `annotations/` hold a box per category for it. Only
+    visible categories get a file, since Datumaro reads empty files of `labels/` too.
+    """
     for view in dataset.views(progress):
         stem = dataset.stems[view.id - 1]
         dataset.write_image_as(view, folder / "images", stem)
         size = (view.camera.width, view.camera.height)
-        lines = []
+        lines, boxes = [], []
         for category, mask in dataset.instances(view):
-            for polygon in polygons(mask):
-                numbers = " ".join(f"{value:.6f}" for value in ((polygon + _INTO_PIXEL) / size).ravel())
-                lines.append(f"{category.id - 1} {numbers}\n")
+            left, top, width, height = bounding_box(mask)
+            centre_and_size = np.array([[left + 0.5 * width, top + 0.5 * height], [width, height]])
+            boxes.append(_yolo_line(category, centre_and_size / size))
+            lines += [_yolo_line(category, (polygon + _INTO_PIXEL) / size) for polygon in polygons(mask)]
         write_text(folder / "labels" / f"{stem}.txt", "".join(lines))
-    names = json.dumps([category.name for category in dataset.categories], ensure_ascii=False)  # JSON is valid YAML
+        if boxes:
+            write_text(folder / "annotations" / f"{stem}.txt", "".join(boxes))
+    categories = [category.name for category in dataset.categories]
+    write_text(folder / "obj.names", "".join(f"{name}\n" for name in categories))
+    names = json.dumps(categories, ensure_ascii=False)  # JSON is valid YAML
     text = f"# Not split: both contain all images.\ntrain: images\nval: images\nnames: {names}\n"
     write_text(folder / "data.yaml", text)
+
+
+def _yolo_line(category: Category, numbers: Float[np.ndarray, "pairs 2"]) -> str:
+    return f"{category.id - 1} {' '.join(f'{number:.6f}' for number in numbers.ravel())}\n"
 
 
 _MM = 1000.0

@@ -20,7 +20,7 @@ from pycocotools.coco import COCO
 from scipy.ndimage import gaussian_filter
 
 from carts_core.export import Dataset, FormatName, Images, export
-from carts_core.export.encodings import MIN_POINTS, polygons, row_runs
+from carts_core.export.encodings import MIN_POINTS, bounding_box, polygons, row_runs
 from carts_core.recording import Sequence
 from carts_core.recording.images import read_image
 
@@ -311,6 +311,32 @@ def test_datumaro_reads_the_masks(dataset: Dataset, tmp_path: Path, datumaro_pyt
         assert read["images"] == 3
         masks = {tuple(key.split("|")): mask for key, mask in zip(read["keys"].tolist(), read["masks"], strict=True)}
     assert_same_masks(masks, expected_masks(dataset))
+
+
+_BOX_READER = """
+import json, sys
+import datumaro
+
+folder = sys.argv[1]
+dataset = datumaro.Dataset.import_from(folder)
+names = [label.name for label in dataset.categories()[datumaro.AnnotationType.label]]
+boxes = [[item.id, names[box.label], *map(round, box.get_bbox())] for item in dataset for box in item.annotations]
+shapes = {item.id: item.media.data.shape[:2] for item in dataset}
+print(json.dumps([datumaro.Environment().detect_dataset(folder), shapes, sorted(boxes)]))
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+def test_datumaro_recognizes_yolo_and_reads_the_boxes(dataset: Dataset, tmp_path: Path, datumaro_python: Path) -> None:
+    """Of images without arms too; Datumaro has no reader of YOLO polygons."""
+    folder = export(dataset, "yolo", tmp_path / "out")
+    finished = subprocess.run([datumaro_python, "-c", _BOX_READER, folder], capture_output=True, text=True, check=False)
+    assert finished.returncode == 0, finished.stderr
+    formats, shapes, boxes = json.loads(finished.stdout)
+    expected = {key: bounding_box(mask) for key, mask in expected_masks(dataset).items()}
+    assert formats == ["yolo"] and len(shapes) == 3
+    assert boxes == [[*key, *box] for key, box in sorted(expected.items())]
 
 
 def _filled(mask: np.ndarray) -> np.ndarray:
