@@ -9,10 +9,11 @@ import tyro
 from rich.console import Console
 
 from ..console import Bar, Terminal
-from ..errors import SettingsError
+from ..errors import SequenceError, SettingsError
 from ..settings import CALIBRATION, FreeParameters
 from ..settings.serialization import to_plain
 from ..stopping import message_if_stopped
+from ..wording import counted
 from .options import CalibrationOptions, ObservationOptions, Selection, SequencePath, output_folder
 
 if TYPE_CHECKING:
@@ -195,14 +196,24 @@ class TimeOffset:
             console.print(each.sentence())
         if not (offsets := offsets_to_write(found, sequence)):
             return
+        if missing := sequence.missing_rows(offsets):
+            if len(missing) == len(sequence):
+                raise SequenceError("No frame has rows at the proposed offset. Check the clocks.")
+            console.print(
+                f"{len(missing)} of {counted(len(sequence), 'frame')} have no rows at the proposed offset and are left "
+                'out (missing_rows = "omit").'
+            )
         if self.output is None:
             where = ", ".join(f"{value:g} in [[arms]] of {arm}" for arm, value in offsets.items() if arm)
             text = f"Set time_offset in {self.sequence}: {offsets['']:g} in [frames]{', ' if where else ''}{where}"
+            text += ', and missing_rows = "omit" in [frames]' if missing else ""
             console.print(f"{text}; or give an output folder with -o.")
             return
         with published(self.output, overwrite=self.overwrite) as folder:
             scene = sequence.scene
-            text = calibrated_sequence_file(sequence.path, self.output, scene, scene, "time-offset", offsets)
+            text = calibrated_sequence_file(
+                sequence.path, self.output, scene, scene, "time-offset", offsets, omit=bool(missing)
+            )
             write_text(folder / "sequence.toml", text)
             write_text(folder / MARKER, json.dumps({"format": "time-offset", "sequence": str(self.sequence)}, indent=1))
         console.print(f"wrote {self.output}/sequence.toml")

@@ -3,6 +3,7 @@
 """
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -102,6 +103,12 @@ class FrameList:
             raise SequenceError(
                 f"{self.counted}; a sequence may have at most {MAX_FRAMES:,} frames. Divide the recording."
             )
+
+    def select(self, kept: Sequence[int]) -> "FrameList":
+        """Frames of these indices, without their table."""
+        times = None if self.timestamps is None else self.timestamps[list(kept)]
+        ids, numbers = [self.frame_ids[index] for index in kept], [self.video_frames[index] for index in kept]
+        return FrameList(tuple(ids), times, tuple(numbers), self.counted)
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ Missing or damaged bags and topics raise `SequenceError`.
 import hashlib
 import threading
 import weakref
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
@@ -70,6 +70,10 @@ class Cropped:
     def remarks(self) -> tuple[str, ...]:
         """Remarks on the uncropped images."""
         return self.source.remarks()
+
+    def select(self, kept: Sequence[int]) -> "Cropped":
+        """Cropped images of these frames."""
+        return Cropped(self.source.select(kept), self.crop)
 
 
 class Bag:
@@ -176,6 +180,10 @@ class BagImages:
     def remarks(self) -> tuple[str, ...]:
         """No remarks: images are used unchanged."""
         return ()
+
+    def select(self, kept: Sequence[int]) -> "BagImages":
+        """Messages of these frames."""
+        return BagImages(self.path, self.topic, tuple(self._times[index] for index in kept))
 
 
 def decode_message(message: Any, what: str) -> UInt8[np.ndarray, "height width 3"]:

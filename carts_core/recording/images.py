@@ -132,6 +132,10 @@ class ImageSource(Protocol):
         """Sentences on changes to stored images before they are used: rotation, scaling, deinterlacing."""
         ...
 
+    def select(self, kept: Sequence[int]) -> "ImageSource":
+        """Source of the images of these frames."""
+        ...
+
 
 class ImageFiles:
     """Image source with one file per frame.
@@ -176,6 +180,11 @@ class ImageFiles:
         """Remarks on a sample of the images."""
         bits = () if self._given is not None else bits_remark(self._present)
         return (*image_remarks(spread_files(self._present)), *bits)
+
+    def select(self, kept: Sequence[int]) -> "ImageFiles":
+        """Files of these frames."""
+        missing = frozenset(place for place, index in enumerate(kept) if index in self.missing)
+        return ImageFiles(tuple(self.files[index] for index in kept), self._given, missing)
 
 
 def read_image(path: Path, bits: Callable[[], int] | None = None) -> UInt8[np.ndarray, "height width 3"]:

@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from ..errors import SequenceError
 from ..model.ecm_kinematics import JOINT_NAMES, forward
@@ -30,6 +30,7 @@ def at_times(
 
 
 INTERPOLATIONS = ("linear", "nearest")
+MISSING_ROWS = ("error", "omit")
 _ROUNDING = 1e-6
 """Minimum distinguishable time difference [s]."""
 
@@ -44,16 +45,23 @@ class TimeMatching:
     """`linear` between neighbouring rows, or the `nearest` row."""
     max_gap: float = 0.1
     """Maximum time difference between a frame and the rows used for it [s]."""
+    missing_rows: str = "error"
+    """`omit` to leave out frames without such rows, or `error`."""
 
 
 def take_matching(section: TomlTable) -> TimeMatching:
-    """Read the keys `time_offset`, `interpolation` and `max_gap` of `[frames]`."""
+    """Read the keys `time_offset`, `interpolation`, `max_gap` and `missing_rows` of `[frames]`."""
     time_offset = float(section.take("time_offset", float, 0.0))
     interpolation = section.take_choice("interpolation", INTERPOLATIONS, "linear")
     max_gap = float(section.take("max_gap", float, TimeMatching.max_gap))
     if not 0.0 < max_gap < np.inf:
         raise section.error("max_gap", f"is {max_gap}, but must be a positive number [s].")
-    return TimeMatching(time_offset, interpolation, max_gap)
+    return TimeMatching(
+        time_offset,
+        interpolation,
+        max_gap,
+        section.take_choice("missing_rows", MISSING_ROWS, TimeMatching.missing_rows),
+    )
 
 
 @dataclass(frozen=True)
@@ -72,6 +80,19 @@ class Samples:
         """Values of the frames; joints and positions are interpolated linearly, rotations spherically."""
         if matching is None:
             return self.values
+        before, after, share, far = self._rows_at(frames, matching)
+        if far.any():
+            raise self._too_far(frames, matching, np.flatnonzero(far))
+        if self.values.ndim == 3:
+            return self._poses_at(before + share * (after - before))
+        return (1.0 - share[:, None]) * self.values[before] + share[:, None] * self.values[after]
+
+    def is_missing(self, frames: FrameList, matching: TimeMatching) -> Bool[np.ndarray, " frames"]:
+        """Whether a frame has no rows within `max_gap`."""
+        return self._rows_at(frames, matching)[-1]
+
+    def _rows_at(self, frames: FrameList, matching: TimeMatching) -> tuple[np.ndarray, ...]:
+        """Rows before and after each frame, share of the latter, and whether a row is too distant in time."""
         assert self.times is not None and frames.timestamps is not None
         wanted = frames.timestamps + matching.time_offset + self.time_offset
         before, after = neighbours(self.times, wanted)
@@ -83,11 +104,7 @@ class Samples:
         else:
             distance = np.maximum(to_before, to_after)
             share = np.where(before == after, 0.0, to_before / np.maximum(to_before + to_after, _ROUNDING))
-        if (far := np.flatnonzero(distance > matching.max_gap + _ROUNDING)).size:
-            raise self._too_far(frames, matching, far)
-        if self.values.ndim == 3:
-            return self._poses_at(before + share * (after - before))
-        return (1.0 - share[:, None]) * self.values[before] + share[:, None] * self.values[after]
+        return before, after, share, distance > matching.max_gap + _ROUNDING
 
     def logged_at(self, times: Float[np.ndarray, " times"]) -> Float[np.ndarray, "times ..."]:
         """Values at times of the clock of `[kinematics]` [s]; NaN outside the table's range."""
@@ -129,7 +146,7 @@ class Samples:
             f"{offset:g} s), next to {near}; at most {matching.max_gap:g} s are allowed. "
             f"The frames are from {wanted.min():.6g} to {wanted.max():.6g} s, the rows from {self.times[0]:.6g} to "
             f"{self.times[-1]:.6g} s. Correct `time_offset` in [frames] (both clocks are in seconds), leave out these "
-            "frames with a table of the other frames, or allow a larger `max_gap`."
+            'frames with missing_rows = "omit", or allow a larger `max_gap`.'
         )
 
 

@@ -152,6 +152,12 @@ class Sequence:
         corrected._backgrounds, corrected._background_lock = {}, threading.Lock()
         return corrected
 
+    def missing_rows(self, offsets: Mapping[str, float]) -> list[int]:
+        """Frames without rows at other time offsets [s], of `[frames]` under the empty name and of arms, as returned by
+        `offsets_to_write`; `SequenceError` if rows are not matched by time."""
+        matching = replace(self.checked_matching(), time_offset=offsets[""])
+        return np.flatnonzero(self._description.has_missing_rows(matching, offsets)).tolist()
+
     def __len__(self) -> int:
         return len(self.frame_ids)
 

@@ -1,7 +1,7 @@
 """Sequence files: reading and validation, and writing of a copy with another calibration."""
 
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -24,7 +24,7 @@ from ..model.camera import (
 from ..model.instruments import SCHEME, robot_file
 from ..model.robot import Robot
 from ..model.scene import Arm, Light, Scene
-from ..wording import closest, listed, shown
+from ..wording import closest, counted, listed, shown
 from .frame_list import FrameList, check_present, expand, frame_files, is_glob, is_per_frame, numbers_of_frames
 from .image_sources import BagImages, Cropped
 from .images import DEPTHS, ImageFiles, ImageSource, mask_remarks
@@ -142,6 +142,15 @@ class CameraInput:
     """Poses of the camera mount; None for a static camera."""
     missing: frozenset[int] = frozenset()
     """Frames without an image in some domain."""
+
+    def select(self, kept: Sequence[int]) -> "CameraInput":
+        """The camera with the images and masks of these frames."""
+        return replace(
+            self,
+            images={domain: source.select(kept) for domain, source in self.images.items()},
+            masks={domain: tuple(files[index] for index in kept) for domain, files in self.masks.items()},
+            missing=frozenset(place for place, index in enumerate(kept) if index in self.missing),
+        )
 
     def remarks(self) -> tuple[str, ...]:
         """Remarks on changes to images and masks before they are used, and on unusual calibrations."""
@@ -317,6 +326,19 @@ class Description:
     recording: Path | None = None
     """File or folder of the foreign recording that was imported; None if not stated. It need not exist."""
 
+    def has_missing_rows(self, matching: TimeMatching, arm_offsets: Mapping[str, float] | None = None) -> np.ndarray:
+        """Whether a frame lacks rows of an arm or a moving camera; [frames].
+
+        Args:
+            matching: matching by time.
+            arm_offsets: arm -> time offset [s], instead of its own.
+        """
+        samples = [camera.motion for camera in self.cameras.values()]
+        for name, arm in self.arms.items():
+            offset = (arm_offsets or {}).get(name, arm.measured.time_offset)
+            samples += [one and replace(one, time_offset=offset) for one in (arm.measured, arm.truth)]
+        return np.any([one.is_missing(self.frames, matching) for one in samples if one is not None], axis=0)
+
 
 def read_description(path: Path, progress: Callable[[str], None] | None = None) -> Description:
     """Read a sequence file and the files it refers to, except images."""
@@ -342,7 +364,29 @@ def read_description(path: Path, progress: Callable[[str], None] | None = None) 
         for remark in remarks:
             progress(f"note: {remark}")
     by_name = {entry.camera.name: entry for entry in cameras}, {entry.arm.name: entry for entry in arms}
-    return Description(path, name, scene, domains, rows.frames, rows.matching, *by_name, remarks, recording)
+    found = Description(path, name, scene, domains, rows.frames, rows.matching, *by_name, remarks, recording)
+    return _without_missing_rows(found)
+
+
+def _without_missing_rows(found: Description) -> Description:
+    """Description without the frames that lack rows, if they are to be left out."""
+    if found.matching is None or found.matching.missing_rows == "error":
+        return found
+    missing = found.has_missing_rows(found.matching)
+    if not missing.any():
+        return found
+    if missing.all():
+        raise SequenceError(
+            f"{found.path}: no frame has rows within {found.matching.max_gap:g} s. Correct `time_offset` in [frames]."
+        )
+    kept = np.flatnonzero(~missing).tolist()
+    text = f"{int(missing.sum())} of {counted(len(missing), 'frame')} are left out: no rows at their times."
+    return replace(
+        found,
+        frames=found.frames.select(kept),
+        cameras={name: camera.select(kept) for name, camera in found.cameras.items()},
+        remarks=(*found.remarks, text),
+    )
 
 
 def _take_domains(root: TomlTable) -> tuple[str, ...]:
@@ -400,6 +444,8 @@ def calibrated_sequence_file(
     after: Scene,
     command: str = "calibrate",
     time_offsets: Mapping[str, float] | None = None,
+    *,
+    omit: bool = False,
 ) -> str:
     """Content of a copy of a sequence file for another folder, with another calibration.
 
@@ -411,6 +457,7 @@ def calibrated_sequence_file(
         after: the same scene with other base frames, extrinsics or intrinsics.
         command: the `carts` command that estimated them, for the heading.
         time_offsets: new values of `time_offset` [s]: of `[frames]` under the empty name, and of arms.
+        omit: leave out frames without rows at these offsets.
     """
     document: dict[str, Any] = tomlkit.parse(read_text(path, SEQUENCE))
     source, target = path.parent.resolve(), folder.resolve()
@@ -434,6 +481,8 @@ def calibrated_sequence_file(
     offsets = time_offsets or {}
     if "" in offsets:
         document["frames"]["time_offset"] = offsets[""]
+    if omit:
+        document["frames"]["missing_rows"] = "omit"
     for table, old, new in zip(document["arms"], before.arms, after.arms, strict=True):
         move(table, "table", "truth", "T_world_base")
         if not table["robot"].startswith(SCHEME):

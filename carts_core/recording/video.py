@@ -287,6 +287,10 @@ class Video:
             raise SequenceError(f"video {self.path} cannot be read: {error}.") from error
         return f"{content} {self._numbers[index]} {self._deinterlace}"
 
+    def select(self, kept: Sequence[int]) -> "Video":
+        """Video with these frames."""
+        return Video(self.path, tuple(self._numbers[index] for index in kept), deinterlace=self._deinterlace)
+
     def remarks(self) -> tuple[str, ...]:
         """Remarks on rotation, deinterlacing and non-square pixels, from the first frame."""
         with self._lock:

@@ -9,6 +9,7 @@ import pytest
 from swaying import LOGS, swaying_joints, write_log, write_swaying
 
 from carts_core.cli.command_line import main
+from carts_core.errors import SequenceError
 from carts_core.model.robot import Robot
 from carts_core.recording import Sequence, estimate_time_offsets
 from carts_core.recording.time_delay import TimeOffsetEstimate
@@ -108,6 +109,33 @@ def test_the_command_proposes_and_writes(late: Path, tmp_path: Path, capsys: pyt
     main(["time-offset", str(tmp_path / "shifted" / "sequence.toml"), "-o", str(tmp_path / "again")])
     assert "agrees with the motion" in capsys.readouterr().out and not (tmp_path / "again").exists()
     assert np.isfinite(shifted.measured["PSM1"]).all()
+
+
+def test_frames_without_rows_at_the_proposed_offset_are_left_out(
+    late: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A log that ends with the video: the last images would have rows 120 ms later."""
+    log = late.with_name("log.csv")
+    header, *rows = log.read_text().splitlines()
+    log.write_text("\n".join([header, *(row for row in rows if float(row.split(",")[0]) < SECONDS - 0.03)]) + "\n")
+    whole = Sequence.open(late)
+    main(["time-offset", str(late), "-o", str(tmp_path / "shifted"), "--largest", "1"])
+    shifted = Sequence.open(tmp_path / "shifted" / "sequence.toml")
+    assert shifted.matching is not None and abs(shifted.matching.time_offset - DELAY) < 0.010
+    missing = len(whole) - len(shifted)
+    assert 0 < missing < 5 and f"{missing} of 150 frames have no rows" in capsys.readouterr().out
+    assert any(f"{missing} of 150 frames are left out" in remark for remark in shifted.remarks)
+    assert shifted.frame_ids == whole.frame_ids[:-missing]
+    last = len(shifted) - 1
+    np.testing.assert_array_equal(shifted.frame(last).images["left"], whole.frame(last).images["left"])
+    with pytest.raises(SequenceError, match=r'missing_rows = "omit"'):
+        Sequence.open(_without_key(tmp_path / "shifted" / "sequence.toml", "missing_rows"))
+
+
+def _without_key(path: Path, key: str) -> Path:
+    lines = path.read_text().splitlines(keepends=True)
+    path.write_text("".join(line for line in lines if not line.startswith(key)))
+    return path
 
 
 def test_an_import_estimates_the_delay(late: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
