@@ -342,6 +342,7 @@ class EdgeFactor:
         near = functional.interpolate(coverage[:, None], self._shown.shape[2:], mode="bilinear").clamp(0.0, 1.0)
         return LocalEdgeFactor(self, offsets, attention(near, _NEAR) * self._shown, weight)
 
+    @one_thread()
     def equations(self, outline: Outline, counts: Float[Tensor, "cameras 1 h w"], edge_weight: float) -> Linearization:
         """Quadratic model for given outlines and pixel weights."""
         distance, weight = self._nearest(outline)
