@@ -157,5 +157,11 @@
     if (left > 200) document.documentElement.style.setProperty("--carts-side", `${left}px`);
   }, 200);
 
-  Object.assign(window.carts, { showDocument, imageBox });
+  /** Set the progress bar of the document to a share of 1; replacing the document would close opened lists. */
+  function setProgress(share) {
+    const bar = box?.querySelector("progress");
+    if (bar) bar.value = share;
+  }
+
+  Object.assign(window.carts, { showDocument, setProgress, imageBox });
 })();

@@ -39,6 +39,11 @@ class Document:
         for client in self.page.server.get_clients().values():
             self._send(client)
 
+    def set_progress(self, share: float) -> None:
+        """Set the progress bar of the document in all tabs to a share in [0, 1]."""
+        for client in self.page.server.get_clients().values():
+            call(client, "setProgress", share)
+
     @property
     def content(self) -> str:
         """The shown HTML; empty if there is none."""

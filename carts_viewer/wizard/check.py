@@ -1,6 +1,7 @@
 """The Check step of New recording: content of the files, previews, problems, and corrections of guesses."""
 
-from collections.abc import Mapping
+import threading
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -29,6 +30,8 @@ _WIDTH, _HEIGHT = 600, 150
 _MAX_POINTS = 400
 _PREVIEW_WIDTH = 360
 _JPEG_QUALITY = 75
+_SHARE_STEP = 0.02
+"""Minimum increase of a reported share [1]."""
 
 
 @dataclass(frozen=True)
@@ -246,7 +249,7 @@ class Delays:
         raise SettingsError(f"{value!r} is not one of the estimated offsets. Estimate them again.")
 
 
-def delays_of(draft: Draft, guess: Guess) -> Delays | None:
+def delays_of(draft: Draft, guess: Guess, progress: Callable[[int, int], None] | None = None) -> Delays | None:
     """Estimate time offsets; None without a recording or times of rows, `CartsError` if an image cannot be read."""
     source = Path(draft.source)
     if guess.recording is None or "time_offset" not in detect(source, guess.kind).uses:
@@ -258,12 +261,65 @@ def delays_of(draft: Draft, guess: Guess) -> Delays | None:
     recording, options = with_times(guess.recording, draft.options, again)
     if not is_timed(recording):
         return None
-    found, offsets = estimated_delays(recording)
+    found, offsets = estimated_delays(recording, progress)
     return Delays(found, options, recording.time_offset, offsets)
 
 
+class _CancelledError(Exception):
+    pass
+
+
+class DelayJob:
+    """Estimation of time offsets on a separate thread.
+
+    Attributes:
+        share: share of the images that have been read, in [0, 1].
+    """
+
+    def __init__(
+        self, draft: Draft, guess: Guess, advanced: Callable[[], None], ended: Callable[[Delays | str | None], None]
+    ) -> None:
+        """Start the estimation.
+
+        Args:
+            advanced: called on the thread when `share` has grown.
+            ended: called on the thread with the result of `delays_of`, or the text of an error; not called after
+                `cancel`.
+        """
+        self.share = 0.0
+        self._draft, self._guess, self._advanced, self._ended = draft, guess, advanced, ended
+        self._cancelled = threading.Event()
+        threading.Thread(target=self._run, name="carts-delay", daemon=True).start()
+
+    def cancel(self) -> None:
+        """Stop without a result; the thread ends soon after."""
+        self._cancelled.set()
+
+    def _run(self) -> None:
+        found: Delays | str | None
+        try:
+            found = delays_of(self._draft, self._guess, self._progress)
+        except _CancelledError:
+            return
+        except Exception as error:
+            found = problem_of(error) if isinstance(error, CartsError) else f"The estimation failed: {error!r}"
+        if not self._cancelled.is_set():
+            self._ended(found)
+
+    def _progress(self, done: int, total: int) -> None:
+        if self._cancelled.is_set():
+            raise _CancelledError
+        if done / total >= self.share + _SHARE_STEP or done == total:
+            self.share = done / total
+            self._advanced()
+
+
 def check_form(
-    draft: Draft, guess: Guess, pictures: dict[str, list[tuple[str, str]]], delay: Delays | None = None
+    draft: Draft,
+    guess: Guess,
+    pictures: dict[str, list[tuple[str, str]]],
+    delay: Delays | None = None,
+    estimating: DelayJob | None = None,
 ) -> str:
     """HTML of the form: contents of the files by part, problems, and controls."""
     return render(
@@ -272,6 +328,7 @@ def check_form(
         guess=guess,
         pictures=pictures,
         delay=delay,
+        estimating=estimating,
         trials={str(trial): trial.stem for trial in guess.trials},
         curves=curves,
         roles={role: _label(role) for role in _ROLES},

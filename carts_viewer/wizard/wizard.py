@@ -12,7 +12,7 @@ from carts_core.recording.video import SUFFIXES
 from carts_viewer.start.host import FileBrowser, Host
 from carts_viewer.start.roots import Entry
 from carts_viewer.transport.document import render
-from carts_viewer.wizard.check import Delays, Guess, check_form, delays_of, guess, previews, problem_of
+from carts_viewer.wizard.check import DelayJob, Delays, Guess, check_form, guess, previews, problem_of
 from carts_viewer.wizard.draft import Draft, DraftFile, Step, changed, picked
 from carts_viewer.wizard.hand_eye import HandEyeStep
 from carts_viewer.wizard.points import ClickPrompt
@@ -41,6 +41,7 @@ class RecordingWizard:
         self._undo: list[Draft] = []
         self._guess: Guess | None = None
         self._delay: Delays | None = None
+        self._estimating: DelayJob | None = None
         self._estimated = ""
         """Source of which the delay has been estimated."""
         self._pictures: dict[str, list[tuple[str, str]]] = {}
@@ -123,6 +124,8 @@ class RecordingWizard:
         match name:
             case "estimate-delay":
                 self._estimate_delay()
+            case "cancel-delay":
+                self._cancel_estimate()
             case "accept-delay" if delay is not None:
                 self._set(self._draft.uncalibrated(options=delay.accepted()))
             case _ if name.startswith("choose-delay ") and delay is not None:
@@ -152,6 +155,7 @@ class RecordingWizard:
 
     def close(self) -> None:
         """Stop running work; the draft is already saved."""
+        self._cancel_estimate()
         self._leave_hand_eye()
 
     def _set(self, draft: Draft) -> None:
@@ -165,6 +169,8 @@ class RecordingWizard:
         anew = (draft.source, draft.options) != (self._draft.source, self._draft.options)
         self._draft = draft
         if anew:
+            if self._cancel_estimate():
+                self._estimated = ""
             self._guess = self._delay = None
         if anew or draft.step is not Step.HAND_EYE:
             self._leave_hand_eye()
@@ -213,7 +219,7 @@ class RecordingWizard:
         if self._browser is not None:
             return render("recording.html", step=Step.FILES, **values)
         found = self._guessed()
-        form = check_form(self._draft, found, self._pictures, self._delay)
+        form = check_form(self._draft, found, self._pictures, self._delay, self._estimating)
         return render("recording.html", step=Step.CHECK, guess=found, form=form, undoable=bool(self._undo), **values)
 
     def _guessed(self) -> Guess:
@@ -226,17 +232,45 @@ class RecordingWizard:
                 with suppress(CartsError):
                     self._add_pictures(self._guess)
                     if self._draft.options.time_offset is None and self._draft.source != self._estimated:
-                        self._estimate_delay()
+                        self._estimate_delay(asked=False)
         return self._guess
 
     def _show_message(self, title: str, text: str, place: str = "page") -> None:
         self._host.document.show(render("message.html", title=title, text=text), place)
 
-    def _estimate_delay(self) -> None:
-        """Estimate the delay from the motion in images and table."""
-        self._estimated, found = self._draft.source, self._guessed()
-        self._show_message("Time", "Comparing the motion in the images with the table …")
-        self._delay = delays_of(self._draft, found)
+    def _estimate_delay(self, *, asked: bool = True) -> None:
+        """Start the estimation of the delay from the motion in images and table; errors are shown if `asked`."""
+        self._cancel_estimate()
+        self._estimated = self._draft.source
+
+        def ended(found: Delays | str | None) -> None:
+            self._host.post(lambda: self._delay_ended(job, found, asked=asked))
+
+        job = DelayJob(self._draft, self._guessed(), lambda: self._host.post(self._show_delay_progress), ended)
+        self._estimating = job
+
+    def _show_delay_progress(self) -> None:
+        if self._estimating is not None and self._draft.step is not Step.HAND_EYE:
+            self._host.document.set_progress(self._estimating.share)
+
+    def _cancel_estimate(self) -> bool:
+        """Cancel the estimation of the delay; returns whether it was running."""
+        job, self._estimating = self._estimating, None
+        if job is not None:
+            job.cancel()
+        return job is not None
+
+    def _delay_ended(self, job: DelayJob, found: Delays | str | None, *, asked: bool) -> None:
+        """Apply the result of the estimation; called on the site's thread."""
+        if job is not self._estimating:
+            return
+        self._estimating = None
+        if isinstance(found, str):
+            self._problem = found if asked else self._problem
+        else:
+            self._delay = found
+        if self._draft.step is not Step.HAND_EYE:
+            self.show()
 
     def _add_pictures(self, found: Guess) -> None:
         assert found.recording is not None

@@ -130,16 +130,26 @@ def test_a_delay_between_video_and_log_is_proposed_taken_and_undone(tmp_path: Pa
         site.post(lambda: site.show_recording(file.key))
         place = place_of(site)
 
-        def chosen(name: str) -> float | None:
-            site.post(lambda: place.choose(name, ""))
+        def chosen(name: str, value: str = "") -> float | None:
+            site.post(lambda: place.choose(name, value))
             site.wait()
             return place.draft.options.time_offset
 
+        def shows(text: str) -> None:
+            eventually(lambda: text in site.document.content)
+
         site.wait()
-        assert "Proposed: time_offset" in site.document.content and place.draft.options.time_offset is None
+        shows("Estimating the delay")
+        assert "Columns of log.csv" in site.document.content
+        chosen("clock", "s")  # another choice, which starts it again
+        shows("Proposed: time_offset")
+        assert place.draft.options.time_offset is None
         assert chosen("accept-delay") == pytest.approx(0.12, abs=0.01)
         chosen("estimate-delay")
-        assert "agrees with the motion" in site.document.content
+        chosen("cancel-delay")
+        assert "Estimating" not in site.document.content and "Estimate from the motion" in site.document.content
+        chosen("estimate-delay")
+        shows("agrees with the motion")
         assert chosen("undo") is None
 
 
