@@ -56,6 +56,8 @@ class ImportOptions:
     """Arm -> time offset in addition to that of all tables [s]."""
     frame_rate: float | None = None
     """Frame rate of images without times, or replacement of a video's constant rate [1/s]."""
+    row_rate: float | None = None
+    """Rate of table rows without times [1/s]; the first row is assigned to the first image, up to the time offset."""
     arms: Mapping[str, str] = field(default_factory=dict)
     """Arm -> name in the recording; other arms are not imported."""
     robot: Mapping[str, str] = field(default_factory=dict)
@@ -78,11 +80,12 @@ class ImportOptions:
                     f"calibration_size of {camera} is {size!r}; give width and height, such as 640x480."
                 )
         offsets = [(f"arm_time_offset of {arm}", seconds) for arm, seconds in self.arm_time_offset.items()]
-        for name, value in (("time_offset", self.time_offset), ("frame_rate", self.frame_rate), *offsets):
+        for name, value in (("time_offset", self.time_offset), *offsets):
             if value is not None and not math.isfinite(value):
                 raise SettingsError(f"{name} is {value}; give a finite number.")
-        if self.frame_rate is not None and not 0.01 <= self.frame_rate <= 1000:
-            raise SettingsError(f"frame_rate is {self.frame_rate:g}; allowed: 0.01 to 1000 frames per second.")
+        for name, rate, largest in (("frame_rate", self.frame_rate, 1e3), ("row_rate", self.row_rate, 1e4)):
+            if rate is not None and not 0.01 <= rate <= largest:
+                raise SettingsError(f"{name} is {rate:g}; allowed: 0.01 to {largest:g} per second.")
         for joint, unit in self.units.items():
             if unit not in (*get_args(AngleUnit), *get_args(LengthUnit)):
                 allowed = ", ".join((*get_args(AngleUnit), *get_args(LengthUnit)))

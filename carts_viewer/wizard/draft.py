@@ -174,7 +174,7 @@ _CHOICES = {
     "length_unit": get_args(LengthUnit),
     "clock": ("s", "ms", "us", "ns"),
 }
-_NUMBERS = ("time_offset", "frame_rate", "tool_point")
+_NUMBERS = ("time_offset", "frame_rate", "row_rate", "tool_point")
 _MEANINGS = (*JOINT_NAMES, "jaw", "time", "frame")
 
 

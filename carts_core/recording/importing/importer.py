@@ -52,7 +52,7 @@ def find(path: Path, options: ImportOptions | None = None) -> FoundRecording:
     options = _with_places(path, options or ImportOptions())
     source = detect(path, options.source)
     parts: dict[str, Part] = {"images": "images", "kinematics": "kinematics"}
-    for name in ("images", "kinematics", "columns", "clock", "time_offset", "frame_rate"):
+    for name in ("images", "kinematics", "columns", "clock", "time_offset", "frame_rate", "row_rate"):
         if name not in source.uses and _is_given(options, name):
             what = name.replace("_", " ")
             problem = (

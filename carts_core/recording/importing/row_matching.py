@@ -1,8 +1,8 @@
 """Matching of log rows with images: by times, frame rate, file names, numbers or order.
 
-The methods are, in order of precedence: times, a given frame rate, a column with the images' file names or numbers, and
-    the order of rows if the numbers of rows and images are equal. The times of a video only reflect its nominal rate,
-    so one row per image takes precedence over them. A note reports the method and omissions.
+The methods are, in order of precedence: times, given rates of images and rows, a column with the images' file names or
+    numbers, and the order of rows if the numbers of rows and images are equal. The times of a video only reflect its
+    nominal rate, so one row per image takes precedence over them. A note reports the method and omissions.
 """
 
 import re
@@ -184,7 +184,11 @@ def match_rows(frames: FrameTimes, table: ForeignTable, meanings: ColumnMeanings
             "Use --columns frame COLUMN.",
         )
     span = None if frames.times is None or len(frames.times) < 2 else float(frames.times[-1] - frames.times[0])
-    times = row_seconds(table, meanings.time, options.clock, job, span)
+    times, source = row_seconds(table, meanings.time, options.clock, job, span), f"column {meanings.time!r}"
+    if options.row_rate is not None and times is None:
+        times, source = np.arange(len(table)) / options.row_rate, f"{options.row_rate:g} rows/s"
+    elif options.row_rate is not None:
+        job.warning(f"{table.path.name}: the given rate of rows is not used, since the rows have times ({source}).")
     one_each = None
     if named is not None and (named < 0).mean() <= _FEW:
         known = named[named >= 0]
@@ -194,9 +198,10 @@ def match_rows(frames: FrameTimes, table: ForeignTable, meanings: ColumnMeanings
         one_each = np.arange(len(table))
     if times is not None and frames.times is not None and not explicit:
         apart = bool(frames.times[0] > times[-1] or frames.times[-1] < times[0])
-        own_clock = options.time_offset is None and not frames.given and (apart or frames.nominal)
+        stated = frames.given or options.row_rate is not None
+        own_clock = options.time_offset is None and not stated and (apart or frames.nominal)
         if not (own_clock and one_each is not None):
-            return _by_time(frames, meanings, times, apart, named is not None, job)
+            return _by_time(frames, meanings, times, source, apart, named is not None, job)
     if explicit or named is not None:
         assert named is not None and column is not None
         general = column.strip().lower().replace("_", " ").replace(":", "") in _INDEX
@@ -212,22 +217,27 @@ def match_rows(frames: FrameTimes, table: ForeignTable, meanings: ColumnMeanings
         return _by_image(frames, table, named, times, f"column {column!r}", job, stated=explicit)
     if in_order:
         return _by_image(frames, table, np.arange(len(table)), times, "the order of rows and images", job, stated=False)
-    lacking = "the images have no times" if times is not None else "the table has no times"
+    lacking = {
+        "the table has no times": ("the rate of the rows", "--row-rate", times),
+        "the images have no times": ("the frame rate of the images", "--frame-rate", frames.times),
+    }
+    unknown = {text: remedy for text, (*remedy, known) in lacking.items() if known is None}
+    rates, flags = (" and ".join(parts) for parts in zip(*unknown.values(), strict=True))
     raise PartError(
         "columns",
         f"the recording has {counted(len(frames.ids), 'image')} and {table.path.name} has "
-        f"{counted(len(table), 'row')}, and {lacking}. Make the numbers equal, choose the column of times or of "
-        "image names, or give the frame rate of the images.",
-        "Use --columns time COLUMN, --columns frame COLUMN or --frame-rate.",
+        f"{counted(len(table), 'row')}, and {' and '.join(unknown)}. Make the numbers equal, choose the column of "
+        f"times or of image names, or give {rates}.",
+        f"Use --columns time COLUMN, --columns frame COLUMN or {flags}.",
     )
 
 
 def _by_time(
-    frames: FrameTimes, meanings: ColumnMeanings, times: np.ndarray, apart: bool, named: bool, job: Import
+    frames: FrameTimes, meanings: ColumnMeanings, times: np.ndarray, source: str, apart: bool, named: bool, job: Import
 ) -> RowMatch:
     assert frames.times is not None
     dropped = f"; column {meanings.frame!r} is not used" if named else ""
-    text = f"rows are matched with images by time: column {meanings.time!r} and {frames.source}{dropped}."
+    text = f"rows are matched with images by time: {source} and {frames.source}{dropped}."
     option = "--columns frame COLUMN" if named else ""
     job.found(text, option=option, given="time" in job.options.columns)
     offset = job.options.time_offset

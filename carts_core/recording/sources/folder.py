@@ -290,6 +290,6 @@ SOURCE = Source(
     "images or videos with a table of kinematics",
     "a folder with images or videos and a .csv, .parquet, .npy or .npz file, two levels deep",
     lambda path: path.is_dir() and bool(_image_places(path)) and bool(tables_of(path)),
-    ("images", "kinematics", "columns", "clock", "time_offset", "frame_rate"),
+    ("images", "kinematics", "columns", "clock", "time_offset", "frame_rate", "row_rate"),
     _read,
 )

@@ -154,6 +154,13 @@ def more_rows_without_times(folder: Path) -> dict:
     return {}
 
 
+def rows_of_known_rate(folder: Path) -> dict:
+    """Images and rows without times, at rates of 4/s and 100/s."""
+    frames(folder / "images")
+    table(folder / "log.csv", joints(np.arange(0, FRAMES / RATE, 0.01)))
+    return {"frame_rate": RATE, "row_rate": 100.0}
+
+
 def fewer_rows_with_names(folder: Path) -> dict:
     times = frames(folder / "images")
     table(folder / "log.csv", {"frame": np.arange(FRAMES - 2) + 1, **joints(times[:-2])})
@@ -297,6 +304,7 @@ ROWS: dict[str, tuple[Callable[[Path], dict], Check | str]] = {
     "a video of another rate than its rows": (video_of_another_rate, of_each_row("by the order of rows and images")),
     "two rows for each image": (two_rows_for_each, of_each_row("8 rows of an image that already has a row")),
     "twice as many rows": (more_rows_without_times, "8 images and log.csv has 16 rows, and the table has no times"),
+    "rows of a known rate": (rows_of_known_rate, of_the_log()),
     "fewer rows": (fewer_rows_with_names, lambda found: is_motion(found, np.arange(FRAMES - 2) / RATE)),
     "seconds": (timed(), of_the_log()),
     "milliseconds": (timed(1e3), of_the_log()),
