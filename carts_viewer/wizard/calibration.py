@@ -167,6 +167,8 @@ class CalibrationReport:
     """Indices of points whose residual has grown beyond the noise of clicks."""
     objection: str
     """Description of the contradiction between points and calibration; empty if they agree."""
+    rms_limit: float | None = None
+    """Maximum RMS residual of the points that errors of clicks and measured joints explain [px]."""
 
 
 def report_of(result: CalibrationResult, clicking: Clicking, points: Rows[ImagePoint]) -> CalibrationReport:
@@ -189,6 +191,7 @@ def report_of(result: CalibrationResult, clicking: Clicking, points: Rows[ImageP
         after=after,
         disagreeing=compared.disagreeing,
         objection=_objection(result, compared, clicking, points),
+        rms_limit=compared.rms_limit if np.isfinite(compared.rms_limit) else None,
     )
 
 

@@ -304,6 +304,28 @@ def test_a_calibration_that_points_agree_with_is_kept_with_its_figures(site: Sit
     assert place_of(site).draft.calibration is None and "± 8.2 mm" not in site.document.content
 
 
+def test_a_calibration_that_moves_within_the_errors_of_points_and_joints_says_what_it_follows(
+    site: Site, jobs: list[CalibrationJob], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Moved(OneStep):
+        """An optimizer that shifts the base frame by 0.3 mm."""
+
+        def __init__(self, scene: Scene, *_: object, **__: object) -> None:
+            shift = np.eye(4)
+            shift[0, 3] = 3e-4
+            arms = tuple(replace(arm, T_world_base=shift @ arm.T_world_base) for arm in scene.arms)
+            super().__init__(replace(scene, arms=arms))
+
+    monkeypatch.setattr(calibration, "CalibrationOptimizer", Moved)
+    place = place_of(site)
+    site.post(lambda: place.choose(*CALIBRATE))
+    report = ended(site, "The result follows the images").report
+    assert report is not None and not report.objection and report.rms_limit is not None
+    assert f"within the {report.rms_limit:.1f} px RMS" in site.document.content
+    (before, after) = (np.sqrt(np.mean(np.square(each))) for each in (report.before, report.after))
+    assert before + 0.1 < after < report.rms_limit
+
+
 def test_a_calibration_that_moves_off_the_points_is_offered_and_not_kept(
     site: Site, jobs: list[CalibrationJob], monkeypatch: pytest.MonkeyPatch
 ) -> None:
