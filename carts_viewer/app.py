@@ -1,10 +1,8 @@
 """The viewer of one sequence: page, tabs and worker, and the dispatch of browser events to tabs."""
 
 import logging
-import threading
 from collections.abc import Callable
 from contextlib import ExitStack
-from importlib import import_module
 from pathlib import Path
 from typing import Any, Unpack
 
@@ -14,6 +12,7 @@ from carts_core.model.parts import part_classes
 from carts_core.recording import Sequence
 from carts_viewer.actions import intents
 from carts_viewer.jobs.optimizers import NetworkOptions, OptimizerFactory
+from carts_viewer.jobs.solver_process import Requests, SolverProcess, SolverStopped
 from carts_viewer.panels.help import key_groups
 from carts_viewer.panels.layout import choose_theme
 from carts_viewer.panels.timeline import Thumbnails
@@ -123,6 +122,25 @@ class ServerOptions(NetworkOptions, total=False):
     """Reverse proxy in front of the server; None without one."""
 
 
+class _SolverListener:
+    """Passes events of the solver process to the worker."""
+
+    def __init__(self, worker: Worker, say: Callable[[str], None]) -> None:
+        self._worker, self._say = worker, say
+
+    def solver_replied(self) -> None:
+        """See `Listener`."""
+        self._worker.wake()
+
+    def solver_reports(self, text: str) -> None:
+        """See `Listener`."""
+        self._worker.call(lambda: self._say(text))
+
+    def solver_stopped(self, error: SolverStopped) -> None:
+        """See `Listener`."""
+        self._worker.call(lambda: self._worker.fail(error))
+
+
 class ViewerApp:
     """Serves the viewer of one sequence until it is closed.
 
@@ -146,9 +164,13 @@ class ViewerApp:
         report: Callable[[str], None] = lambda line: None,
         page: Page | None = None,
         folders: tuple[Path, ...] = (),
+        solver: Requests | None = None,
         **networks: Unpack[NetworkOptions],
     ) -> None:
-        """Start serving an open sequence with its project, which is closed with the viewer; see `open`."""
+        """Start serving an open sequence with its project, which is closed with the viewer; see `open`.
+
+        `solver`: the solver, which remains; None for a process that is closed with the viewer.
+        """
         self._report = report
         self._own_page = page is None
         self._closed = False
@@ -158,7 +180,9 @@ class ViewerApp:
         self._storage = storage
         renderer = OverlayRenderer(sequence)
         queue: IntentQueue[Tab] = IntentQueue()
-        self._optimizers = OptimizerFactory(report=self._say, **networks)
+        self._own_solver = solver is None
+        self._solver: Requests = solver or SolverProcess()
+        self._optimizers = OptimizerFactory(report=self._say, requests=self._solver, **networks)
         self.tabs = Tabs(sequence, storage, renderer, self._optimizers, self._deliver, queue, folders)
         # The first rendering compiles the visibility kernel, which takes seconds the very first time.
         report("Preparing the renderer (takes a few seconds the first time)")
@@ -169,10 +193,11 @@ class ViewerApp:
         self.page.project = sequence.name
         self._thumbnails = Thumbnails(sequence)
         self.page.thumbnail = self._thumbnails.answer
-        self._worker = Worker(queue, self.tabs)
+        self._worker = Worker(queue, self.tabs, lambda: self._solver.busy)
+        self._listener = _SolverListener(self._worker, self._say)
+        self._solver.listeners.append(self._listener)
         EventDispatcher(self.page, self.tabs, self._worker, sequence)
-        self._imports = threading.Thread(target=self._import_solver, name="carts-imports", daemon=True)
-        self._worker.start(self._imports.start)
+        self._worker.start(self._prepare)
 
     @classmethod
     def open(
@@ -183,6 +208,7 @@ class ViewerApp:
         report: Callable[[str], None] = lambda line: None,
         page: Page | None = None,
         folders: tuple[Path, ...] = (),
+        solver: Requests | None = None,
         **options: Unpack[ServerOptions],
     ) -> "ViewerApp":
         """Open a sequence file and serve its viewer.
@@ -193,6 +219,7 @@ class ViewerApp:
             report: Called with a line for the user about long operations.
             page: An empty page that is already served and remains after the viewer is closed; None to serve a new page.
             folders: Folders that masks may be imported from, besides the sequence's own folder.
+            solver: The solver, which remains after the viewer is closed; None for a process of its own.
             options: See `ServerOptions`.
 
         Raises:
@@ -207,7 +234,7 @@ class ViewerApp:
         if storage.notice is not None:
             report(storage.notice)
         try:
-            return cls(sequence, storage, report=report, page=page, folders=folders, **options)
+            return cls(sequence, storage, report=report, page=page, folders=folders, solver=solver, **options)
         except BaseException:
             storage.close()
             raise
@@ -259,15 +286,15 @@ class ViewerApp:
             return
         self._closed = True
         self._worker.stop()
-        if self._imports.is_alive():
-            # An import cannot be interrupted, and the interpreter must not end during one.
-            self._imports.join()
+        self._solver.listeners.remove(self._listener)
         if self._own_page:
             self.page.close()
         self._thumbnails.close()
         with ExitStack() as stack:
             # The callbacks run in reverse order, even if one of them fails.
             stack.callback(self._storage.close)
+            if self._own_solver:
+                stack.callback(self._solver.close)
             stack.callback(self.tabs.close)
 
     def wait_until_shown(self, timeout: float = 120.0) -> ViewState:
@@ -280,17 +307,12 @@ class ViewerApp:
             raise TimeoutError(f"The viewer was still busy after {timeout} s.")
         return self.state
 
-    def _import_solver(self) -> None:
-        """Import the solver after the first picture, in a thread of its own, so that the page stays responsive."""
-        import_module("carts_core.optimization.sequence")
-        self._worker.call(self._prepare)
-
     def _prepare(self) -> None:
-        """Load the networks on the worker."""
-        try:
-            self._optimizers.prepare()
-        finally:
-            self._worker.report(None)
+        """Start the solver and load the networks after the first picture."""
+        self._solver.start(*self._optimizers.warm_up)
+        reply = self._optimizers.prepare()
+        # Errors are shown in all tabs.
+        reply.on_done(lambda: self._worker.call(reply.check))
 
     def _say(self, text: str) -> None:
         self._report(text)

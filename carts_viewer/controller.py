@@ -139,6 +139,7 @@ class Controller(Handler):
         self._storage_failure: str | None = None
         self._browsing = BrowsingHandler(context)
         self._live = LiveHandler(context, optimizers, self._browsing.show)
+        self._painting = PaintingHandler(context, optimizers.segment)
         self._annotating = AnnotatingHandler(context, self._browsing.show)
         self._handlers = (
             self._browsing,
@@ -148,7 +149,7 @@ class Controller(Handler):
             DraggingHandler(context),
             PosingHandler(context),
             KeyframeHandler(context),
-            PaintingHandler(context, optimizers.segmenter),
+            self._painting,
             ImportingHandler(context),
             FilterHandler(context, self._browsing.show),
         )
@@ -222,7 +223,7 @@ class Controller(Handler):
 
     def wait_time(self) -> float | None:
         """Time until work is due without a request [s]; None if no work is due."""
-        handlers = (self._optimizing, self._browsing, self._live)
+        handlers = (self._optimizing, self._painting, self._browsing, self._live)
         return min((wait for handler in handlers if (wait := handler.wait_time()) is not None), default=None)
 
     def overdue_in(self) -> float | None:
@@ -236,6 +237,7 @@ class Controller(Handler):
     def advance(self) -> None:
         """Do one step of the running work: an iteration, or the next frame of playback."""
         self._optimizing.advance()
+        self._painting.advance()
         self._browsing.advance()
         self._live.advance()
         if self._editor.overdue_in() == 0.0:

@@ -17,6 +17,7 @@ from carts_core.project import (
     CorrectedTransform,
     DamagedProject,
     Edits,
+    IgnoreRegion,
     JointCorrection,
     Key,
     Project,
@@ -114,13 +115,12 @@ class Session:
     ) -> dict[str, Bool[np.ndarray, "height width"]]:
         """Camera -> pixels of the frame that a fit ignores, for cameras with such pixels."""
         cameras = list(cameras)
+        return target.ignored(self.ignore_regions(index, cameras), index, cameras)
+
+    def ignore_regions(self, index: int, cameras: Iterable[str]) -> dict[str, IgnoreRegion]:
+        """Camera -> ignore region of the frame, for cameras with such a region."""
         regions = {camera: self.editor.view.get(Key.ignore_region(index, camera)) for camera in cameras}
-        ignored = {camera: region.region() for camera, region in regions.items() if region is not None}
-        of_masks = {} if target.given is None else target.given.ignored(index)
-        return {
-            **ignored,
-            **{name: mask | ignored.get(name, False) for name, mask in of_masks.items() if name in cameras},
-        }
+        return {camera: region for camera, region in regions.items() if region is not None}
 
     def target(self, observed: Observed, project: ProjectState | None = None) -> Target:
         """The chosen target of a run, with the masks of a state of the project, by default the current state."""

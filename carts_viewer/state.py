@@ -2,10 +2,11 @@
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
+from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 from jaxtyping import Bool
@@ -13,7 +14,7 @@ from jaxtyping import Bool
 from carts_core.errors import SettingsError
 from carts_core.model.keypoints import Pin
 from carts_core.model.scene import Arm, SceneState
-from carts_core.optimization import FreeParameters, GivenMasks, SolverSettings
+from carts_core.optimization import FreeParameters, GivenMasks, Iterate, SolverSettings
 from carts_core.project import FitVerdict, IgnoreRegion, Key, MaskCorrection, PartLabels, ProjectState, Review, Source
 from carts_core.project.masks import project_masks
 from carts_core.project.values import WHOLE_PROJECT
@@ -26,9 +27,6 @@ from .actions.frame_filter import FrameFilter
 from .jobs.job_list import Job
 from .picture.layers import Layer, Rgba
 from .picture.strokes import Brush
-
-if TYPE_CHECKING:
-    from carts_core.optimization import Iterate
 
 
 class Against(StrEnum):
@@ -150,15 +148,42 @@ class Target:
     """Target of a run: network predictions or masks. Masks of the project are those at the start of the run."""
 
     observed: Observed = Observed()
-    given: GivenMasks | None = None
-    """The masks, if they are not those of the recording."""
+    project: ProjectState | None = None
+    """Project with the masks, if they are not those of the recording."""
+    recording: Recording | None = None
 
     @staticmethod
     def of(observed: Observed, project: ProjectState, recording: Recording) -> "Target":
         """The chosen target, with the current masks of a project."""
         if observed.what == "network" or observed.masks == "recording":
             return Target(observed)
-        return Target(observed, project_masks(observed.masks, project, recording))
+        return Target(observed, project, recording)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Target, (self.observed, self.project, self.recording)
+
+    @cached_property
+    def given(self) -> GivenMasks | None:
+        """The masks, if they are not those of the recording."""
+        if self.observed.masks == "recording" or self.project is None or self.recording is None:
+            return None
+        return project_masks(self.observed.masks, self.project, self.recording)
+
+    def of_frame(self, index: int) -> "Target":
+        """The target of one frame, with the values of this frame only."""
+        if self.project is None:
+            return self
+        records = {place: self.project.records.get(place) for place in (index, WHOLE_PROJECT)}
+        known = {place: record for place, record in records.items() if record is not None}
+        return replace(self, project=replace(self.project, records=known, steps=(), exports=()))
+
+    def ignored(
+        self, regions: Mapping[str, IgnoreRegion], index: int, cameras: Sequence[str]
+    ) -> dict[str, Bool[np.ndarray, "height width"]]:
+        """Camera -> pixels of a frame that a fit ignores: ignore regions, and unlabelled pixels of given masks."""
+        found = {name: region.region() for name, region in regions.items() if name in cameras}
+        of_masks = {} if self.given is None else self.given.ignored(index)
+        return {**found, **{name: mask | found.get(name, False) for name, mask in of_masks.items() if name in cameras}}
 
     def seen(self, recording: Recording, index: int, domain: str, cameras: Sequence[str]) -> list[str]:
         """Cameras that can be compared in a frame; if only masks are fitted, those with a mask."""
@@ -300,7 +325,7 @@ class Curves:
 class Maps:
     """Maps of the optimizer at the shown pose, at its working resolution."""
 
-    iterate: "Iterate"
+    iterate: Iterate
     cameras: tuple[str, ...]
     """Cameras of the iterate's maps, in the same order."""
     of_run: bool = True

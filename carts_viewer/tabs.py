@@ -292,8 +292,8 @@ class Tabs:
 
     def forget_images(self) -> None:
         """Drop cached images of the recording and values computed from them."""
-        self._sequence.forget_images()
         for session in (self._session, *(tab.session for tab in self._tabs)):
+            session.sequence.forget_images()
             self._optimizers.forget_images(session.sequence)
 
     def close(self) -> None:

@@ -28,8 +28,9 @@ class Worker:
     Tabs take turns: work of one tab delays the others by a single step.
     """
 
-    def __init__(self, queue: IntentQueue[Tab], tabs: Tabs) -> None:
-        self._queue = queue
+    def __init__(self, queue: IntentQueue[Tab], tabs: Tabs, computing: Callable[[], bool] = lambda: False) -> None:
+        """`computing`: returns whether the solver is at work, so that texts about its preparation stay."""
+        self._queue, self._computing = queue, computing
         self._tabs = tabs
         self._calls: SimpleQueue[Callable[[], None]] = SimpleQueue()
         self._stop = threading.Event()
@@ -52,6 +53,14 @@ class Worker:
         self._stop.set()
         self._queue.wake()
         self._thread.join(timeout=30.0)
+
+    def wake(self) -> None:
+        """Continue with work that waits for a reply of the solver. Thread-safe."""
+        self._queue.wake()
+
+    def fail(self, error: CartsError) -> None:
+        """Show an error in all tabs; called on the worker's thread."""
+        self._fail(error, *self._tabs)
 
     def call(self, work: Callable[[], None]) -> None:
         """Call a function on the worker's thread, before pending intents. Thread-safe."""
@@ -107,7 +116,7 @@ class Worker:
         self._advance_background()
         for tab in self._tabs:
             self._attempt(tab.controller.follow, tab)
-            if tab.controller.state.busy is not None:
+            if tab.controller.state.busy is not None and not self._computing():
                 tab.controller.say(None)
         self._publish()
 

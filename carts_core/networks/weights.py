@@ -17,9 +17,10 @@ from torch import Tensor
 
 from ..errors import SettingsError, WeightsError
 from ..files import write_bytes
-from ..files.reading import WEIGHTS, check_regular, parse_json, read_bytes
+from ..files.reading import WEIGHTS, parse_json, read_bytes
 from ..settings import Architecture, SurfaceArchitecture
 from ..wording import shortened
+from .header import REMEDY, read_header, unreadable
 from .network import FeatureNetwork, ImageNetwork
 from .surface import SurfaceNetwork, UNetSurface
 
@@ -50,7 +51,6 @@ _NETWORKS: dict[tuple[str, str], tuple[type[Architecture | SurfaceArchitecture],
 """Format and version -> architecture and network."""
 _TYPES = (torch.float32, torch.float64, torch.float16, torch.bfloat16, torch.int64)
 _MAX_SIDE = 4096
-_REMEDY = "Train weights with `carts train`, or reinstall carts to restore the shipped weights."
 
 
 @dataclass(frozen=True)
@@ -93,36 +93,16 @@ def read_weights(path: Path) -> Weights:
         WeightsError: the file is missing, is not safetensors, was not written by `carts train`, or its tensors do not
             fit its architecture.
     """
-    metadata, shapes = _header(path)
+    metadata, shapes = read_header(path)
     kind, make_network = _NETWORKS[metadata["format"], metadata["version"]]
     architecture, working_size, training = _described(path, metadata, kind)
     network = _filled(path, make_network, architecture, shapes)
     if len(working_size) != 2 or any(not 0 < n <= _MAX_SIDE or n % architecture.stride for n in working_size):
         raise WeightsError(
             f"weights file {path} has the working size {working_size}; allowed: two positive multiples of "
-            f"{architecture.stride}. {_REMEDY}"
+            f"{architecture.stride}. {REMEDY}"
         )
     return Weights(network.eval(), working_size, training, hashlib.sha256(read_bytes(path, WEIGHTS)).hexdigest())
-
-
-def _header(path: Path) -> tuple[dict[str, str], dict[str, tuple[int, ...]]]:
-    """Read the metadata, of a supported version, and the shape of every tensor."""
-    try:
-        check_regular(path, WEIGHTS)
-        with safe_open(path, framework="pt") as file:
-            metadata = file.metadata() or {}
-            shapes = {name: tuple(file.get_slice(name).get_shape()) for name in file.keys()}
-    except (FileNotFoundError, IsADirectoryError) as error:
-        raise WeightsError(f"weights file {path} is missing. {_REMEDY}") from error
-    except (SafetensorError, OSError, ValueError) as error:
-        raise _unreadable(path, error) from error
-    if (metadata.get("format"), metadata.get("version")) not in _NETWORKS:
-        allowed = " or ".join(f"{name!r}, version {version!r}" for name, version in _NETWORKS)
-        raise WeightsError(
-            f"weights file {path} has format {metadata.get('format')!r}, version {metadata.get('version')!r}; allowed: "
-            f"{allowed}. {_REMEDY}"
-        )
-    return metadata, shapes
 
 
 def _described(
@@ -138,7 +118,7 @@ def _described(
     except (KeyError, ValueError, TypeError, AttributeError, OverflowError, SettingsError) as error:
         raise WeightsError(
             f"weights file {path} has unreadable metadata ({shortened(str(error))}). Required: an architecture "
-            f"(widths and numbers of convolutions), a working size and the training settings. {_REMEDY}"
+            f"(widths and numbers of convolutions), a working size and the training settings. {REMEDY}"
         ) from error
     return architecture, working_size, training
 
@@ -159,7 +139,7 @@ def _filled(
         first = differing[0]
         raise WeightsError(
             f"weights file {path} does not fit its architecture {architecture}: {shortened(first)} is "
-            f"{shapes.get(first, 'missing')}, but should be {wanted.get(first, 'absent')}. {_REMEDY}"
+            f"{shapes.get(first, 'missing')}, but should be {wanted.get(first, 'absent')}. {REMEDY}"
         )
     try:
         with safe_open(path, framework="pt") as file:
@@ -167,15 +147,9 @@ def _filled(
         network = make_network(architecture)
         network.load_state_dict(state)
     except (SafetensorError, OSError, RuntimeError, ValueError) as error:
-        raise _unreadable(path, error) from error
+        raise unreadable(path, error) from error
     if any(value.dtype not in _TYPES for value in state.values()):
-        raise WeightsError(f"weights file {path} holds tensors of an unknown type. {_REMEDY}")
+        raise WeightsError(f"weights file {path} holds tensors of an unknown type. {REMEDY}")
     if not all(bool(value.isfinite().all()) for value in state.values()):
-        raise WeightsError(f"weights file {path} holds values that are not finite. {_REMEDY}")
+        raise WeightsError(f"weights file {path} holds values that are not finite. {REMEDY}")
     return network
-
-
-def _unreadable(path: Path, error: Exception) -> WeightsError:
-    return WeightsError(
-        f"weights file {path} is not a readable safetensors file of `carts train` ({shortened(str(error))}). {_REMEDY}"
-    )

@@ -16,6 +16,9 @@ from .indications import Verdict as Verdict
 from .indications import fit_words as fit_words
 from .indications import joint_words as joint_words
 from .indications import undetermined_joints as undetermined_joints
+from .iterate import Iterate as Iterate
+from .iterate import Progress as Progress
+from .iterate import StopReason as StopReason
 
 if TYPE_CHECKING:
     from .calibration import CalibrationIterate as CalibrationIterate
@@ -25,8 +28,6 @@ if TYPE_CHECKING:
     from .factors import Factor as Factor
     from .factors import Linearization as Linearization
     from .frame import FrameOptimizer as FrameOptimizer
-    from .frame import Iterate as Iterate
-    from .frame import Progress as Progress
     from .frame_problem import propose_ignore as propose_ignore
     from .observation import Backgrounds as Backgrounds
     from .predictor import FramePredictor as FramePredictor
@@ -39,7 +40,6 @@ if TYPE_CHECKING:
     from .sequence_frame import FrameEstimate as FrameEstimate
     from .sequence_frame import Origin as Origin
     from .sequence_frame import sequence_checkpoint as sequence_checkpoint
-    from .stages import StopReason as StopReason
     from .verdict import Assessment as Assessment
     from .verdict import DomainCheck as DomainCheck
     from .verdict import Evidence as Evidence
@@ -51,14 +51,13 @@ __getattr__, __dir__ = names_on_first_use(
     {
         "calibration": ("CalibrationIterate", "CalibrationOptimizer", "CalibrationResult", "UnknownChange"),
         "factors": ("Factor", "Linearization"),
-        "frame": ("FrameOptimizer", "Iterate", "Progress"),
+        "frame": ("FrameOptimizer",),
         "frame_problem": ("propose_ignore",),
         "observation": ("Backgrounds",),
         "predictor": ("FramePredictor", "ImagePredictor", "MaskPredictor", "NetworkPredictor", "SurfacePredictor"),
         "refinement": ("MaskRefiner",),
         "sequence": ("SequenceOptimizer",),
         "sequence_frame": ("FrameEstimate", "Origin", "sequence_checkpoint"),
-        "stages": ("StopReason",),
         "verdict": ("Assessment", "DomainCheck", "Evidence", "SequenceAssessment", "check_domain"),
     },
 )

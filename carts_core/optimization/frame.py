@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -11,20 +11,20 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 
 from ..errors import SettingsError
-from ..model.scene import Scene, SceneState
+from ..model.scene import Scene
 from ..networks.extractor import FeatureExtractor
 from ..recording import Frame
-from ..reprs import short_repr
 from ..settings import FreeParameters, SolverSettings, SurfaceSolver
 from ..settings.stages import FINEST, Descend
 from .factors import Factor, bounded_step
 from .feature_problem import FeatureProblem
 from .frame_problem import FrameProblem
 from .image_factors import SurfaceFactor
-from .observability import Evaluation, Uncertainty
+from .iterate import Iterate, Progress, StopReason
+from .observability import Evaluation
 from .observation import Backgrounds
 from .predictor import SurfacePredictor, predictor_of
-from .stages import Fit, Point, StopReason, run_stages
+from .stages import Fit, Point, run_stages
 from .variables import Variables
 from .verdict import Assessment
 
@@ -59,56 +59,6 @@ def base_frame_gain(problem: FrameProblem, offsets: Float[Tensor, " n"], free: F
         )
         explained.append(-float(gradient @ step + 0.5 * step @ hessian @ step))
     return (explained[0] - explained[1]) / max(surface.cost, 1e-12)
-
-
-@dataclass(frozen=True)
-class Iterate:
-    """One iterate of an optimization with its rendering; an immutable copy."""
-
-    index: int
-    """Iteration number; 0 for the start."""
-    state: SceneState
-    loss: float
-    """Loss without the prior; comparable within one observation and, if not `live`, one blur."""
-    gradient_norms: dict[str, float]
-    """Gradient norm per unknown, in radian-like units."""
-    seconds: float
-    """Duration of this iteration [s]."""
-    arm_names: tuple[str, ...]
-    joint_names: tuple[tuple[str, ...], ...]
-    """Joint names per arm."""
-    silhouette: Float[np.ndarray, "cameras h w"]
-    """Rendered silhouette; all maps are at the resolution of comparison."""
-    image: UInt8[np.ndarray, "cameras h w 3"]
-    """Rendered arms, RGB."""
-    uncertainty: Uncertainty | None
-    """Standard deviations; None for losses without curvature."""
-    attention: Float[np.ndarray, "cameras h w"]
-    similarity: Float[np.ndarray, "cameras h w"]
-    """Cosine similarity of features, or 1 minus the squared difference of surface maps; at most 1."""
-
-    __repr__ = short_repr
-
-    def joint_positions(self) -> dict[str, np.ndarray]:
-        """Arm name -> joint positions [dofs], [rad, m]."""
-        values = (value.cpu().double().numpy() for value in self.state.joint_positions)
-        return dict(zip(self.arm_names, values, strict=True))
-
-    def joint_std(self) -> dict[str, np.ndarray]:
-        """Arm name -> standard deviation of the joint positions [dofs], [rad, m]; NaN if unknown."""
-        known = self.uncertainty or Uncertainty((), (), ())
-        return {arm: known.joint_std(arm, joints) for arm, joints in zip(self.arm_names, self.joint_names, strict=True)}
-
-
-@dataclass(frozen=True)
-class Progress:
-    """Loss, time and stage of an iterate, stored in the history."""
-
-    index: int
-    loss: float
-    seconds: float
-    stage: int = 0
-    """Stage index, from 0; losses are comparable within one stage, see `FrameOptimizer.comparable_losses`."""
 
 
 class FrameOptimizer:

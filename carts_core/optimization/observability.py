@@ -1,69 +1,14 @@
 """Evaluations of an objective, their standard deviations, and the observability of joints."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
-from typing import Literal
+from dataclasses import dataclass, field
 
-import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ..reprs import short_repr
 from .factors import Prior
-from .indications import DETERMINED
+from .indications import Uncertainty
 from .variables import Variables
-
-Observability = Literal["determined", "weak", "not visible"]
-
-_VISIBLE = 0.9
-
-
-@dataclass(frozen=True)
-class Uncertainty:
-    """Standard deviations of the unknowns after an optimization."""
-
-    names: tuple[str, ...]
-    """Names of the unknowns as in `Variables.names`, such as `PSM1/yaw`."""
-    std: tuple[float, ...]
-    """Standard deviation [rad]; [m] for prismatic joints and translations."""
-    expected: tuple[float, ...]
-    """Prior standard deviation; at the end of a fit, rescaled by the size of the corrections."""
-    std_ratio: tuple[float, ...] | None = None
-    """Ratio of posterior to prior standard deviation for the prior of the settings [1]; None if `expected` is that
-    prior."""
-
-    __repr__ = short_repr
-
-    def observability(self, name: str) -> Observability:
-        """Observability of an unknown: whether its standard deviation decreases to a third, slightly, or hardly at
-        all."""
-        index = self.names.index(name)
-        share = self.std[index] / self.expected[index] if self.std_ratio is None else self.std_ratio[index]
-        return "determined" if share < DETERMINED else "weak" if share < _VISIBLE else "not visible"
-
-    def joint_std(self, arm: str, joints: Sequence[str]) -> Float[np.ndarray, " dofs"]:
-        """Standard deviation of joint positions of an arm [rad, m]; NaN where a joint was not free."""
-        known = dict(zip(self.names, self.std, strict=True))
-        return np.array([known.get(f"{arm}/{joint}", np.nan) for joint in joints])
-
-    def doubted(self, probability: float) -> "Uncertainty":
-        """Standard deviations that account for the probability that the fit is wrong [1], in which case the prior
-        applies.
-
-        The two cases are combined by the law of total variance.
-        """
-
-        def mixed(right: Sequence[float], wrong: Sequence[float]) -> tuple[float, ...]:
-            variances = (np.square(values) for values in (right, wrong))
-            return tuple(np.sqrt(np.dot((1.0 - probability, probability), list(variances))).tolist())
-
-        ratio = None if self.std_ratio is None else mixed(self.std_ratio, [1.0] * len(self.std_ratio))
-        return replace(self, std=mixed(self.std, self.expected), std_ratio=ratio)
-
-    def rescaled(self, later: "Uncertainty") -> "Uncertainty":
-        """Standard deviations under a rescaled prior; observability still refers to the original prior."""
-        return replace(later, std_ratio=tuple(std / given for std, given in zip(self.std, self.expected, strict=True)))
 
 
 def uncertainty(

@@ -3,7 +3,6 @@
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from enum import StrEnum
 from functools import singledispatch
 from typing import Any, Protocol
 
@@ -33,22 +32,11 @@ from .calibration_problem import CalibrationProblem
 from .factors import REJECTIONS, FirstOrderDescent, LevenbergMarquardt, Linearization
 from .feature_problem import FeatureProblem
 from .frame_problem import FrameProblem
+from .iterate import StopReason
 from .observability import Evaluation
 from .observation import MIN_AREA_RATIO
 from .variables import Variables
 from .verdict import Assessment, Verdict, assess
-
-
-class StopReason(StrEnum):
-    """Reason for the end of an optimization."""
-
-    CONVERGED = "converged"
-    ITERATIONS = "iterations"
-    START_KEPT = "start kept"
-    FAILED = "failed"
-    """The image contradicts the estimate; the start is kept."""
-    NOT_OPTIMIZED = "not optimized"
-    CANCELLED = "cancelled"
 
 
 class Problem(Protocol):

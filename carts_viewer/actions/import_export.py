@@ -154,7 +154,7 @@ class ExportingHandler(Handler):
                 parts=intent.parts,
                 images=images,
                 masks=intent.masks,
-                load_networks=self._optimizers.prepare,
+                load_networks=self._optimizers.extractor,
             )
 
         return make, len(chosen)

@@ -17,7 +17,7 @@ from carts_viewer.actions.import_export import ExportingHandler
 from carts_viewer.actions.sequence import PropagatingHandler
 from carts_viewer.editing import Person
 from carts_viewer.jobs.companions import Decisions
-from carts_viewer.jobs.comparison import Comparison
+from carts_viewer.jobs.comparison import Comparison, Waiting
 from carts_viewer.jobs.job_list import (
     AdaptOptions,
     CalibrateOptions,
@@ -30,10 +30,12 @@ from carts_viewer.jobs.job_list import (
     SolveOptions,
 )
 from carts_viewer.jobs.networks import Networks
-from carts_viewer.jobs.optimizers import OptimizerFactory
+from carts_viewer.jobs.optimizers import OptimizerFactory, wait_for
 from carts_viewer.jobs.work import Progress, adapt, calibrate, optimize_frames
 from carts_viewer.state import ViewState
 
+_END = Progress(0, 0, "")
+"""End of a job's steps."""
 _SAVE_INTERVAL = 5.0
 """Interval between saves of a job's progress [s]."""
 _CHOICES = "index frame domain camera pose settings free solver observed every_camera direction filter".split()
@@ -80,7 +82,9 @@ class JobsHandler(Handler):
         """User whose request is being carried out."""
         self._asked: dict[int, JobRequester] = {}
         """Requesters by job number; jobs from before the viewer started have none."""
-        self._work: Generator[Progress] | None = None
+        self._work: Generator[Progress | Waiting] | None = None
+        self._reply: Waiting = None
+        """Reply that the job waits for."""
         self._wait = 0.0
         self._saved_at = 0.0
         self._networks = Networks(project.path, kept=project.writable, optimizers=optimizers, decisions=decisions)
@@ -94,7 +98,7 @@ class JobsHandler(Handler):
     def wait_time(self) -> float | None:
         """Time until the next step is due [s]; None if no job is active."""
         active = any(job.state in (JobState.WAITING, JobState.RUNNING) for job in self._list.jobs)
-        return self._wait if active else None
+        return max(self._wait, wait_for(self._reply)) if active else None
 
     # ---- Intents ---------------------------------------------------------------------------------------------------
 
@@ -224,7 +228,7 @@ class JobsHandler(Handler):
             raise
         self._publish()
 
-    def _own(self, options: OptimizeOptions | CalibrateOptions | AdaptOptions) -> Generator[Progress]:
+    def _own(self, options: OptimizeOptions | CalibrateOptions | AdaptOptions) -> Generator[Progress | Waiting]:
         match options:
             case OptimizeOptions():
                 return optimize_frames(self._context, self._comparison, options.frames, options.first)
@@ -254,17 +258,22 @@ class JobsHandler(Handler):
             self._step(job)
 
     def _step(self, job: Job) -> None:
+        if wait_for(self._reply) > 0.0:
+            return
+        self._reply = None
         try:
-            progress = None if self._work is None else next(self._work, None)
+            step = _END if self._work is None else next(self._work, _END)
         except Exception as error:
             self._work = None
             self._end(job, JobState.FAILED, str(error))
             raise
-        if progress is None:
+        if step is _END:
             self._work = None
             self._end(job, JobState.DONE, self._list.find(job.number).text)
+        elif isinstance(step, Progress):
+            self._report(job, step)
         else:
-            self._report(job, progress)
+            self._reply = step
 
     def _report(self, job: Job, progress: Progress) -> None:
         now, self._wait = self._list.find(job.number), progress.wait
@@ -283,7 +292,7 @@ class JobsHandler(Handler):
             self._exporting.cancel()
         if self._work is not None:
             self._work.close()
-        self._work = None
+        self._work = self._reply = None
 
     def _end(self, job: Job, state: JobState, text: str) -> None:
         self._wait = 0.0

@@ -14,7 +14,8 @@ from carts_core.project import Provenance, Source
 from carts_core.settings.live import StreamAddress, StreamKind
 from carts_viewer.actions import intents
 from carts_viewer.actions.context import Context, Handler
-from carts_viewer.jobs.optimizers import OptimizerFactory, scene_at
+from carts_viewer.jobs.optimizers import OptimizerFactory
+from carts_viewer.jobs.solver import scene_at
 from carts_viewer.state import LiveState, Pose
 
 if TYPE_CHECKING:
@@ -208,7 +209,7 @@ class LiveHandler(Handler):
         self._context.end_run("Stopped: a live stream was started")
         context.save()
         context.change(playing=False, error=None)
-        extractor = self._optimizers.prepare()
+        extractor = self._optimizers.extractor()
         state, sequence, cameras = context.state, session.sequence, context.cameras
         folder = self._folder() if intent.record else None
         loops = _ENDLESS_LOOPS if intent.repeat else 1

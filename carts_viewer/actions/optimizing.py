@@ -1,23 +1,24 @@
 """The optimizer: runs on the shown frame, solver settings, and free parameters."""
 
-from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
 
-from carts_core import optimization
 from carts_core.errors import CartsError, SettingsError
+from carts_core.model.scene import SceneState
+from carts_core.optimization import Iterate
 from carts_core.project import Edits, FitVerdict, Key
+from carts_core.recording import Frame
 from carts_core.settings import SolverName, SurfaceSolver
 from carts_core.settings import solver as named_solver
 from carts_core.settings.serialization import changed
 from carts_viewer.actions import intents
 from carts_viewer.actions.context import Context, Handler
-from carts_viewer.jobs.comparison import FitCheck
-from carts_viewer.jobs.optimizers import ActiveRun, FrameTask, OptimizerFactory, scene_at
+from carts_viewer.jobs.optimizers import ActiveRun, OptimizerFactory, provenance, wait_for
+from carts_viewer.jobs.solver import Advanced, Ended, Fit, FrameTask, RefineTask, Started
+from carts_viewer.jobs.solver_process import Reply, SolverStopped
 from carts_viewer.picture.layers import Layer
-from carts_viewer.state import NETWORK, PRESETS, Curves, Maps, Observed, Phase, RefinedMasks, RunState, Scores
-
-if TYPE_CHECKING:
-    from carts_core.optimization import Iterate
+from carts_viewer.state import PRESETS, Curves, Maps, Observed, Phase, Pose, RefinedMasks, RunState, Scores
 
 _REASONS = {
     "iterations": "Done: the best iteration is the result",
@@ -29,17 +30,35 @@ _REASONS = {
 }
 
 
+@dataclass(frozen=True)
+class _Request:
+    """Request of maps or refined masks."""
+
+    inputs: tuple[object, ...]
+    """Values of the state that the result depends on."""
+    reply: Reply[Any]
+    show: Callable[[Any], None]
+
+
+@dataclass(frozen=True)
+class _Check:
+    """Request of a verdict on a pose."""
+
+    frame: Frame
+    pose: Pose
+    reply: Reply[Fit]
+
+
 class OptimizingHandler(Handler):
-    """Handler that runs the optimizer, one iteration at a time."""
+    """Handler that runs the optimizer, one iteration at a time, and shows what the solver replies."""
 
     def __init__(self, context: Context, optimizers: OptimizerFactory) -> None:
         super().__init__(context)
         context.run = self
         self._optimizers = optimizers
-        self._check = FitCheck(context.session, optimizers)
         self._run: ActiveRun | None = None
-        self._target = NETWORK
-        """Target of the last run."""
+        self._mapping: _Request | None = None
+        self._check: _Check | None = None
         self._before: Edits | None = None
         """Edits that restore the frame to the start of the last run."""
 
@@ -49,13 +68,22 @@ class OptimizingHandler(Handler):
         return self._run is not None
 
     def wait_time(self) -> float | None:
-        """Time until the next iteration is due [s]: 0 during a run, otherwise None."""
-        return 0.0 if self._context.state.run.phase is Phase.RUNNING else None
+        """Time until the next iteration or reply is due [s]; None if there is none."""
+        run, waits = self._run, []
+        if run is not None and self._due(run):
+            waits.append(wait_for(run.reply))
+        waits += [wait_for(asked.reply) for asked in (self._mapping, self._check) if asked is not None]
+        return min(waits, default=None)
 
     def advance(self) -> None:
-        """Perform an iteration, if one is due."""
-        if self._context.state.run.phase is Phase.RUNNING:
-            self._iterate()
+        """Perform an iteration, if one is due, and show what the solver has replied.
+
+        Raises:
+            CartsError: the solver has failed.
+        """
+        self._iterate()
+        self._take_check()
+        self._take_maps()
 
     def end(self, reason: str | None, *, save: bool = True) -> None:
         """End the run and save its pose; its curves are kept until the next run.
@@ -66,6 +94,7 @@ class OptimizingHandler(Handler):
         if self._context.state.run.base_frame_gain is not None:
             self._set(base_frame_gain=None)
         if self._run is not None:
+            self._run.steps.close()
             self._run = None
             self._set(phase=Phase.IDLE, reason=reason)
             if save:
@@ -76,7 +105,7 @@ class OptimizingHandler(Handler):
         self._before = None
 
     def map(self) -> None:
-        """Compute the maps or refined masks of the chosen layer, if they are missing.
+        """Request the maps or refined masks of the chosen layer, if they are missing.
 
         Raises:
             CartsError: the maps cannot be computed.
@@ -86,40 +115,68 @@ class OptimizingHandler(Handler):
             self._refine()
         if state.layer not in (Layer.ATTENTION, Layer.SIMILARITY):
             return
+        if self._run is not None and state.camera in self._run.cameras:
+            return
         if state.maps is not None and state.camera in state.maps.cameras:
             return
-        try:
-            run = self._make((state.camera,))
-            iterate = run.optimizer.step()
-        except CartsError:
-            # For example, the weights are missing. The layer is changed to avoid an attempt for every picture.
-            self._context.change(layer=Layer.MASK)
-            raise
-        self._context.change(maps=None if iterate is None else Maps(iterate, run.cameras, of_run=False), busy=None)
+        cameras = (state.camera,)
+
+        def show(iterate: Iterate | None) -> None:
+            assert iterate is not None, "the first iterate is the start"
+            self._context.change(maps=Maps(iterate, cameras, of_run=False))
+
+        inputs = state.frame, state.pose, cameras, state.settings, state.free, state.observed
+        self._request(inputs, lambda: self._optimizers.compare(self._task(cameras)), show)
 
     def _refine(self) -> None:
         """Refine the rendered masks of the shown cameras; during a gesture or a run, masks are shown as rendered."""
-        state, context = self._context.state, self._context
+        state, context, session = self._context.state, self._context, self._session
         if state.unsaved or state.run.phase is Phase.RUNNING:
             return
         pose, frame = state.pose.scene, state.frame
         cameras = [state.camera] if not state.beside else [*frame.images]
         if all(state.refined_mask(pose, camera) is not None for camera in cameras):
             return
-        try:
-            predictor = optimization.NetworkPredictor(self._optimizers.prepare())
-        except CartsError:
-            context.change(layer=Layer.MASK)
-            raise
         ignored = {camera: state.ignore_region_of(camera) for camera in cameras}
-        regions = {camera: region.region() for camera, region in ignored.items() if region is not None}
-        masks = {}
-        for camera in cameras:
-            backgrounds = optimization.Backgrounds.of(self._session.sequence, (camera,), state.domain)
-            refiner = optimization.MaskRefiner(predictor, backgrounds)
-            rendered = {camera: context.renderer.mask(pose, camera)}
-            masks |= refiner.refine(scene_at(self._session.scene, pose), frame, pose, rendered, regions)
-        context.change(refined=RefinedMasks(frame, pose, ignored, masks), busy=None)
+
+        def task() -> RefineTask:
+            regions = {camera: region.region() for camera, region in ignored.items() if region is not None}
+            rendered = {camera: context.renderer.mask(pose, camera) for camera in cameras}
+            return RefineTask(session.sequence, state.index, state.domain, pose, rendered, regions)
+
+        self._request(
+            (frame, pose, *ignored.items()),
+            lambda: self._optimizers.refine(task()),
+            lambda masks: context.change(refined=RefinedMasks(frame, pose, ignored, masks)),
+        )
+
+    def _request(self, inputs: tuple[object, ...], ask: Callable[[], Reply[Any]], show: Callable[[Any], None]) -> None:
+        """Ask for what the layer shows, unless this was asked already; one request is made at a time."""
+        if self._mapping is None:
+            self._mapping = _Request(inputs, ask(), show)
+        elif self._mapping.reply.done and not _same(self._mapping.inputs, inputs):
+            self._mapping = _Request(inputs, ask(), show)
+        self._take_maps(inputs)
+
+    def _take_maps(self, inputs: tuple[object, ...] | None = None) -> None:
+        """Show the maps that have arrived; those for other `inputs` are dropped."""
+        asked = self._mapping
+        if asked is None or not asked.reply.done:
+            return
+        if inputs is None:
+            # It is called again with the current inputs, if the layer still shows maps.
+            self.map()
+            self._mapping = None if self._mapping is asked else self._mapping
+            return
+        self._mapping = None
+        if _same(asked.inputs, inputs):
+            try:
+                asked.show(asked.reply.result())
+            except CartsError:
+                # For example, the weights are missing. The layer is changed to avoid an attempt for every picture.
+                self._context.change(layer=Layer.MASK)
+                raise
+            self._context.change(busy=None)
 
     # ---- Intents ---------------------------------------------------------------------------------------------------
 
@@ -127,6 +184,8 @@ class OptimizingHandler(Handler):
         if self._run is None:
             self._start()
         self._set(phase=Phase.RUNNING, reason=None)
+        if self._run is not None and self._run.provenance is None:
+            self._iterate()
 
     def _on_Pause(self, intent: intents.Pause) -> None:
         if self._context.state.run.phase is Phase.RUNNING:
@@ -137,10 +196,13 @@ class OptimizingHandler(Handler):
 
     def _on_Step(self, intent: intents.Step) -> None:
         if self._run is None:
-            self._start()
-            self._iterate()
+            # The first iterate is the start.
+            self._start().due = 1
+        assert self._run is not None
+        self._run.due += 1
         self._set(phase=Phase.PAUSED, reason=None)
-        self._iterate()
+        while self._run is not None and self._due(self._run) and self._run.request().done:
+            self._iterate()
 
     def _on_Reset(self, intent: intents.Reset) -> None:
         if self._run is not None:
@@ -198,10 +260,10 @@ class OptimizingHandler(Handler):
 
     # ---- The run ---------------------------------------------------------------------------------------------------
 
-    def _make(self, cameras: tuple[str, ...]) -> ActiveRun:
-        state, target = self._context.state, self._session.target(self._context.state.observed)
-        self._target, ignore = target, self._session.ignored(state.index, cameras, target)
-        task = FrameTask(
+    def _task(self, cameras: tuple[str, ...]) -> FrameTask:
+        state, every = self._context.state, [camera.name for camera in self._session.scene.cameras]
+        target = self._session.target(state.observed)
+        return FrameTask(
             self._session.sequence,
             state.index,
             state.domain,
@@ -209,92 +271,102 @@ class OptimizingHandler(Handler):
             state.pose,
             state.settings,
             state.free,
-            target,
-            ignore,
+            target.of_frame(state.index),
+            self._session.ignored(state.index, every, target),
         )
-        provenance = self._optimizers.provenance(cameras, state.settings, state.free, target)
-        return ActiveRun(self._optimizers.make(task), task, provenance)
 
-    def _start(self) -> None:
+    def _start(self) -> ActiveRun:
         if self._context.state.settings_error is not None:
             raise SettingsError(self._context.state.settings_error)
         if self._context.state.solving:
             raise CartsError("Many frames are being solved. Wait, or stop solving first.")
-        self._run = self._make(self._context.cameras)
         self._context.save()
         self._before = self._session.saved(self._context.state.index)
-        run = RunState(Phase.RUNNING, start=self._context.state.pose.scene)
-        self._context.change(run=run, playing=False, error=None, busy=None, unfamiliar=self._network_warnings())
+        self._run = self._optimizers.run(replace(self._task(self._context.cameras), shown=True))
+        return self._run
 
-    def _network_warnings(self) -> tuple[str, ...]:
-        """Warnings about the network of the run."""
-        state = self._context.state
-        if self._target.observed.what != "network" or not isinstance(state.settings, SurfaceSolver):
-            return ()
-        scene = scene_at(self._session.scene, state.pose.scene)
-        return self._optimizers.domain_warnings(
-            self._session.sequence, scene, state.index, state.domain, self._context.cameras
-        )
+    def _due(self, run: ActiveRun) -> bool:
+        """Whether the next result of the run is due."""
+        return self._context.state.run.phase is Phase.RUNNING or run.due > 0
 
     def _iterate(self) -> None:
+        """Take the next result of the run, if it is due and has arrived; otherwise request it."""
         run = self._run
-        if run is None:
+        if run is None or not self._due(run) or not run.request().done:
             return
-        iterate = run.optimizer.step()
-        if iterate is None:
-            best, reason = run.optimizer.best, run.optimizer.stop_reason
-            if best is not None:
-                self._accept(run, best, self._verdict(run, best))
-                curves = self._context.state.run.curves
-                self._set(curves=replace(curves, loss=tuple(run.optimizer.comparable_losses()), comparable=True))
-            self.end(_REASONS.get(reason or "", reason))
-            self._set(base_frame_gain=run.optimizer.base_frame_gain())
-            return
+        reply, run.reply = run.request(), None
+        try:
+            found = reply.result()
+        except SolverStopped:
+            self.end("Stopped: the solver process has ended")
+            raise
+        except Exception:
+            self._run = None
+            self._set(phase=Phase.IDLE)
+            raise
+        match found:
+            case Started():
+                task = run.task
+                run.provenance = provenance(found, task.cameras, task.settings, task.free, task.target)
+                state = RunState(self._context.state.run.phase, start=task.pose.scene)
+                warnings = found.warnings
+                self._context.change(run=state, playing=False, error=None, busy=None, unfamiliar=warnings)
+            case Advanced():
+                self._show(run, found)
+            case Ended():
+                self._finish(run, found)
+
+    def _show(self, run: ActiveRun, found: Advanced) -> None:
+        iterate, run.due = found.iterate, max(run.due - 1, 0)
         self._accept(run, iterate)
         self._context.score()
-        curves, best = self._context.state.run.curves, run.optimizer.best
+        curves = self._context.state.run.curves
         self._set(
             curves=Curves(
                 (*curves.loss, float(iterate.loss)),
-                tuple(progress.stage for progress in run.optimizer.history),
+                (*curves.stages, found.stage),
                 False,
                 (*curves.scores, self._context.state.scores or Scores()),
                 (*curves.seconds, float(iterate.seconds)),
-                best.index if best else 0,
+                found.best,
             )
         )
 
-    def _verdict(self, run: ActiveRun, end: "Iterate") -> FitVerdict | None:
-        """Verdict at the end of a run; with several cameras, each camera is assessed individually."""
-        own = run.verdict()
-        if own is not None and (len(self._session.scene.cameras) == 1 or own.verdict == "failed"):
-            return own
-        state = self._context.state
-        try:
-            found = self._check.fit(state.index, state.domain, run.pose(end), state.settings, self._target).verdict
-        except CartsError:
-            # There is no surface network, and the solver does not need one.
-            return own
-        return found
+    def _finish(self, run: ActiveRun, found: Ended) -> None:
+        if found.best is not None:
+            self._accept(run, found.best, found.verdict)
+            self._set(curves=replace(self._context.state.run.curves, loss=found.losses, comparable=True))
+        self.end(_REASONS.get(found.stop_reason or "", found.stop_reason))
+        self._set(base_frame_gain=found.base_frame_gain)
 
     def _on_Assess(self, intent: intents.Assess) -> None:
         self.end("Stopped: a check of the fit was started")
         self._optimizers.report("Comparing the pose with the images")
-        state = self._context.state
-        target = self._session.target(state.observed)
-        found = self._check.fit(state.index, state.domain, state.pose, state.settings, target)
-        if self._session.editor.project.writable:
+        state, cameras = self._context.state, tuple(camera.name for camera in self._session.scene.cameras)
+        self._check = _Check(state.frame, state.pose, self._optimizers.fit(self._task(cameras)))
+        self._take_check()
+
+    def _take_check(self) -> None:
+        """Store the verdict that has arrived, unless the pose was changed since."""
+        check, editor = self._check, self._session.editor
+        if check is None or not check.reply.done:
+            return
+        self._check, index, verdict = None, check.frame.index, check.reply.result().verdict
+        if not self._session.pose(check.frame).equals(check.pose):
+            return
+        if editor.project.writable:
             # A verdict changes no value, so it is not an undo step.
             self._context.save()
-            self._session.editor.project.record_verdict(state.index, found.verdict)
+            editor.project.record_verdict(index, verdict)
             self._context.refresh()
-        else:
-            self._context.edit("Check the fit", {Key.verdict(state.index): found.verdict})
+        elif index == self._context.state.index:
+            self._context.edit("Check the fit", {Key.verdict(index): verdict})
         self._context.change(busy=None)
 
-    def _accept(self, run: ActiveRun, iterate: "Iterate", verdict: FitVerdict | None = None) -> None:
+    def _accept(self, run: ActiveRun, iterate: Iterate, verdict: FitVerdict | None = None) -> None:
         """Set the frame's pose to an iterate; all iterates of a run are one undo step."""
         state = self._context.state
+        assert run.provenance is not None
         edits = self._session.edits(state.frame, run.pose(iterate).scene, run.provenance, iterate.joint_std())
         # An earlier verdict refers to another pose.
         edits[Key.verdict(state.index)] = verdict
@@ -307,3 +379,12 @@ class OptimizingHandler(Handler):
 
     def _set(self, **changes: Any) -> None:
         self._context.change(run=replace(self._context.state.run, **changes))
+
+
+def _same(one: tuple[object, ...], other: tuple[object, ...]) -> bool:
+    """Whether inputs are the same objects, or equal settings; arrays are not compared."""
+    return len(one) == len(other) and all(a is b or _equal(a, b) for a, b in zip(one, other, strict=True))
+
+
+def _equal(one: object, other: object) -> bool:
+    return type(one) is type(other) and not isinstance(one, Frame | SceneState | Pose) and one == other

@@ -1,5 +1,6 @@
 """Painting on masks and ignore regions, by strokes or by prompts to the segmenter."""
 
+from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
@@ -9,10 +10,12 @@ from jaxtyping import UInt8
 
 from carts_core.errors import CartsError
 from carts_core.model.parts import part_classes
-from carts_core.project import Edits, Key, Kind, ProjectState
-from carts_core.segmentation import Prompt, Segmenter
+from carts_core.project import Edits, Key, Kind
+from carts_core.segmentation import Prompt
 from carts_viewer.actions import intents
 from carts_viewer.actions.context import Context, Handler, clamped
+from carts_viewer.jobs.optimizers import wait_for
+from carts_viewer.jobs.solver_process import Reply
 from carts_viewer.picture.layers import Layer
 from carts_viewer.picture.strokes import DIAMETERS, Mask, Stroke, Target, Tool, corrected, ignored, relabelled
 
@@ -25,12 +28,45 @@ _STEPS = {
 _CLEARED = {Target.MASK: "Clear the mask correction", Target.IGNORE: "Clear the ignore region"}
 
 
+Layers = Mapping[Key[Any], Any]
+Segment = Callable[[UInt8[np.ndarray, "height width 3"], Prompt], Reply[Mask]]
+"""Function that segments the object of a prompt."""
+
+
 class PaintingHandler(Handler):
     """Handler of painting tools, strokes and prompts."""
 
-    def __init__(self, context: Context, segmenter: Callable[[], Segmenter]) -> None:
+    def __init__(self, context: Context, segment: Segment) -> None:
         super().__init__(context)
-        self._prompting = Prompting(segmenter)
+        self._segment, self._prompting = segment, Prompting()
+        self._prompts: deque[intents.Paint] = deque()
+        """Prompts that are not segmented yet, oldest first."""
+        self._reply: Reply[Mask] | None = None
+        """Mask of the first prompt, if it was requested."""
+
+    def wait_time(self) -> float | None:
+        """Time until the reply to a prompt is due [s]; None without a prompt."""
+        return wait_for(self._reply) if self._prompts else None
+
+    def advance(self) -> None:
+        """Apply the masks of prompts that have arrived.
+
+        Raises:
+            CartsError: segmentation failed or found nothing.
+        """
+        while self._prompts and wait_for(self._reply) == 0.0:
+            stroke, reply, self._reply = self._prompts[0].stroke, self._reply, None
+            try:
+                if reply is None:
+                    self._reply = self._segment(
+                        self._image(stroke), self._prompting.begin(stroke, self._layers(stroke))
+                    )
+                else:
+                    edits = self._prompting.edits(reply.result(), self._layers(stroke), self._changed(stroke))
+                    self._change(self._step(stroke), edits)
+            finally:
+                if self._reply is None:
+                    self._painted(self._prompts.popleft())
 
     def _on_NextObject(self, intent: intents.NextObject) -> None:
         self._prompting.finish()
@@ -65,11 +101,19 @@ class PaintingHandler(Handler):
 
     def _on_Paint(self, intent: intents.Paint) -> None:
         stroke = intent.stroke
-        painted = {**self._context.state.brush.painted, intent.client_id: stroke.number}
+        if stroke.prompt:
+            self._prompts.append(intent)
+            self.advance()
+            return
         try:
-            self._change(self._step(stroke), self._edits(stroke))
+            covered = stroke.covers(self._session.scene.camera(stroke.camera))
+            self._change(self._step(stroke), self._changed(stroke)(self._layers(stroke), covered, stroke.erase))
         finally:
-            self._set_brush(painted=painted)
+            self._painted(intent)
+
+    def _painted(self, intent: intents.Paint) -> None:
+        """Report to the page that a stroke is applied."""
+        self._set_brush(painted={**self._context.state.brush.painted, intent.client_id: intent.stroke.number})
 
     def _on_ClearLayer(self, intent: intents.ClearLayer) -> None:
         state = self._context.state
@@ -77,24 +121,25 @@ class PaintingHandler(Handler):
         painted = (Key.mask_correction, Key.part_labels) if target is Target.MASK else (Key.ignore_region,)
         self._change(_CLEARED[target], {make(state.index, state.camera): None for make in painted})
 
-    def _edits(self, stroke: Stroke) -> Edits:
-        """Edits of a stroke or a prompt to the ignore region, or to the mask and the part labels."""
-        project, place = self._session.editor.view, (stroke.frame, stroke.camera)
-        mask, labels, region = Key.mask_correction(*place), Key.part_labels(*place), Key.ignore_region(*place)
+    def _layers(self, stroke: Stroke) -> Layers:
+        """The layers that a stroke may change: the ignore region, or the mask and the part labels."""
+        make = (Key.ignore_region,) if stroke.target is Target.IGNORE else (Key.mask_correction, Key.part_labels)
+        keys: list[Key[Any]] = [one(stroke.frame, stroke.camera) for one in make]
+        return {key: self._session.editor.view.get(key) for key in keys}
 
-        def changed(layers: Mapping[Key[Any], Any], covered: Mask, erase: bool) -> Edits:
+    def _changed(self, stroke: Stroke) -> Callable[[Layers, Mask, bool], Edits]:
+        """Function of layers, pixels, and whether these are erased, that returns the changed layers."""
+
+        def changed(layers: Layers, covered: Mask, erase: bool) -> Edits:
             if stroke.target is Target.IGNORE:
-                return {region: ignored(layers[region], covered, erase=erase)}
+                return {key: ignored(layer, covered, erase=erase) for key, layer in layers.items()}
+            (mask, correction), (labels, painted) = layers.items()
             return {
-                mask: corrected(layers[mask], covered, self._rendered(stroke), erase=erase),
-                labels: relabelled(layers[labels], covered, stroke.label, erase=erase),
+                mask: corrected(correction, covered, self._rendered(stroke), erase=erase),
+                labels: relabelled(painted, covered, stroke.label, erase=erase),
             }
 
-        keys: tuple[Key[Any], ...] = (region,) if stroke.target is Target.IGNORE else (mask, labels)
-        if stroke.prompt:
-            return self._prompting.edits(stroke, self._image(stroke), project, keys, changed)
-        covered = stroke.covers(self._session.scene.camera(stroke.camera))
-        return changed({key: project.get(key) for key in keys}, covered, stroke.erase)
+        return changed
 
     def _image(self, stroke: Stroke) -> UInt8[np.ndarray, "height width 3"]:
         """The image on which a stroke was drawn."""
@@ -140,9 +185,6 @@ class PaintingHandler(Handler):
         self._context.change(brush=replace(self._context.state.brush, **changes))
 
 
-Layers = Mapping[Key[Any], Any]
-
-
 @dataclass(frozen=True)
 class _PromptedObject:
     """A segmented object that further clicks refine."""
@@ -153,7 +195,7 @@ class _PromptedObject:
     before: Layers
     """The layers before the object was added."""
     after: Layers
-    """The layers after the object was added."""
+    """The layers after the object was added; before that, those at the prompt."""
 
 
 class Prompting:
@@ -164,52 +206,52 @@ class Prompting:
     replaces the content of the layer inside the box by the segmentation.
     """
 
-    def __init__(self, segmenter: Callable[[], Segmenter]) -> None:
-        self._segmenter = segmenter
+    def __init__(self) -> None:
         self._begun: _PromptedObject | None = None
+        """The object that the next click may refine."""
+        self._asked: tuple[_PromptedObject, bool] | None = None
+        """The object of the prompt that is being segmented, and whether it is erased."""
 
     def finish(self) -> None:
         """Let the next click start a new object."""
         self._begun = None
 
-    def edits(
-        self,
-        stroke: Stroke,
-        image: UInt8[np.ndarray, "height width 3"],
-        project: ProjectState,
-        keys: tuple[Key[Any], ...],
-        changed: Callable[[Layers, Mask, bool], Edits],
-    ) -> Edits:
-        """Edits of a click or a box.
+    def begin(self, stroke: Stroke, layers: Layers) -> Prompt:
+        """The prompt of a click or a box.
 
         Args:
             stroke: one point, or two corners of a box.
-            image: RGB image of the stroke's frame and camera.
-            project: current state of the project.
-            keys: the layers that the stroke may change.
-            changed: function of layers, pixels, and whether these are erased, that returns the changed layers.
-
-        Raises:
-            CartsError: segmentation failed or found nothing.
+            layers: the layers that the stroke may change.
         """
-        now = {key: project.get(key) for key in keys}
         place = (stroke.frame, stroke.camera, stroke.target, stroke.label)
         begun, prompt = self._begun, prompt_of(stroke)
         self._begun = None
-        goes_on = begun is not None and (begun.place, begun.after) == (place, now) and prompt.box is None
-        if begun is not None and goes_on:
+        before, erase = layers, stroke.erase
+        if begun is not None and (begun.place, begun.after) == (place, layers) and prompt.box is None:
             point = prompt.inside
             inside, outside = begun.prompt.inside, begun.prompt.outside
             prompt = Prompt(
                 *((inside, outside + point) if stroke.erase else (inside + point, outside)), begun.prompt.box
             )
-        before = begun.before if begun is not None and goes_on else now
-        erase = stroke.erase and not goes_on
-        found = self._segmenter().segment(image, prompt)
-        cleared = before if prompt.box is None or erase else changed(before, _boxed(prompt.box, found), True)
+            before, erase = begun.before, False
+        self._asked = _PromptedObject(place, prompt, before, layers), erase
+        return prompt
+
+    def edits(self, found: Mask, layers: Layers, changed: Callable[[Layers, Mask, bool], Edits]) -> Edits:
+        """Edits of the prompt that was begun last.
+
+        Args:
+            found: the segmented pixels.
+            layers: the layers that the prompt may change; changes since `begin` are kept.
+            changed: function of layers, pixels, and whether these are erased, that returns the changed layers.
+        """
+        assert self._asked is not None
+        (asked, erase), self._asked = self._asked, None
+        before, box = asked.before if layers == asked.after else layers, asked.prompt.box
+        cleared = before if box is None or erase else changed(before, _boxed(box, found), True)
         edits = changed(cleared, found, erase)
         if not erase:
-            self._begun = _PromptedObject(place, prompt, before, dict(edits))
+            self._begun = replace(asked, before=before, after=dict(edits))
         return edits
 
 

@@ -2,11 +2,10 @@
 
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from carts_core import optimization
 from carts_core.errors import CartsError, ProjectError
 from carts_core.project import Figures, Key, Keyframe, ProjectState, Source, between_kept
 from carts_core.project.values import WHOLE_PROJECT
@@ -15,12 +14,10 @@ from carts_core.settings.serialization import to_plain
 from carts_core.wording import counted
 from carts_viewer.actions import intents
 from carts_viewer.actions.context import Context, Handler
-from carts_viewer.jobs.comparison import Comparison, Outcome, unchecked
-from carts_viewer.jobs.optimizers import OptimizerFactory, SequenceRun, scene_at
+from carts_viewer.jobs.comparison import Comparison, Outcome, Waiting, unchecked
+from carts_viewer.jobs.optimizers import OptimizerFactory, SequenceRun, provenance, wait_for
+from carts_viewer.jobs.solver import Estimate, SequenceStep, SequenceTask, Smoothed, Started
 from carts_viewer.state import ListedFrame, SolveState
-
-if TYPE_CHECKING:
-    from carts_core.optimization import FrameEstimate
 
 
 class PropagatingHandler(Handler):
@@ -33,35 +30,39 @@ class PropagatingHandler(Handler):
         self._held: dict[int, Outcome] = {}
         """Frame -> result that fits worse than the previous pose and is not applied."""
         self._run: SequenceRun | None = None
-        self._work: Iterator[None] = iter(())
+        self._work: Iterator[Waiting] = iter(())
+        self._reply: Waiting = None
+        """Reply that the run waits for."""
         self._before: ProjectState = context.session.editor.view
         """The project at the start of the run."""
 
     def wait_time(self) -> float | None:
-        """Time until the next step is due [s]: 0 while frames are being solved, otherwise None."""
-        return None if self._run is None else 0.0
+        """Time until the next step or reply is due [s]; None if no frames are being solved."""
+        return None if self._run is None else wait_for(self._reply)
 
     def advance(self) -> None:
-        """Solve the next frame, if any.
+        """Continue with a reply of the solver, if frames are being solved and it has arrived.
 
         Raises:
             CartsError: a frame is not usable, or the frames could not be saved. Solved frames are saved if possible.
         """
-        if self._run is not None:
-            next(self._work, None)
+        if self.wait_time() == 0.0:
+            self._reply = next(self._work, None)
 
     def drop(self, reason: str) -> None:
         """Abort the run without saving."""
         if self._run is not None:
+            self._run.steps.close()
             self._run = None
             self._report(running=False, text=reason)
 
     def finish(self) -> None:
         """Stop, and save the solved frames. Errors as in `advance`."""
         if self._run is not None:
-            self._run.cancel()
-            for _ in self._work:
-                pass
+            self._run.cancelled = True
+            for reply in self._work:
+                if reply is not None:
+                    reply.wait()
 
     # ---- Intents ---------------------------------------------------------------------------------------------------
 
@@ -103,7 +104,7 @@ class PropagatingHandler(Handler):
         except Exception:
             self._context.change(solve=former)
             raise
-        self._work = self._steps(self._run)
+        self._work, self._reply = self._steps(self._run), None
         self._context.change(busy=None, solve=SolveState(frames, text="Estimating the first frame"))
 
     def _on_StopSolving(self, intent: intents.StopSolving) -> None:
@@ -113,62 +114,79 @@ class PropagatingHandler(Handler):
 
     def _make(self, frames: range, kept: list[int]) -> SequenceRun:
         """A run on these frames. The free joints are those of a run on one frame; the calibration is fixed."""
-        state, session, cameras = self._context.state, self._session, list(self._context.cameras)
-        sequence, target = session.sequence, session.target(state.observed, self._before)
-        poses = {index: session.pose(sequence.frame(index, cameras=[]), self._before) for index in kept}
-        free = replace(state.free, base_frames=False, extrinsics=False, intrinsics=False)
-        model, stamps = SequenceSettings(direction=state.direction), sequence.timestamps
-        optimizer = optimization.SequenceOptimizer(
-            scene_at(sequence.scene, state.pose.scene),
-            lambda index: sequence.frame(index, state.domain, cameras),
-            {index: None if stamps is None else float(stamps[index]) for index in frames},
-            self._optimizers.predictor(target),
-            settings=state.settings,
-            model=model,
-            free=free,
-            keyframes={index: session.joints(pose.scene) for index, pose in poses.items()},
-            keyframe_std={index: _standard_deviations(self._before, index) for index in kept},
-            ignore=lambda index: session.ignored(index, cameras, target),
-            backgrounds=optimization.Backgrounds.of(sequence, cameras, state.domain),
-            cameras=cameras,
+        state, session, cameras = self._context.state, self._session, self._context.cameras
+        sequence, before = session.sequence, self._before
+        poses = {index: session.pose(sequence.frame(index, cameras=[]), before) for index in kept}
+        regions = {index: session.ignore_regions(index, cameras) for index in frames}
+        self._task = SequenceTask(
+            sequence,
+            frames,
+            state.domain,
+            cameras,
+            state.pose.scene,
+            state.settings,
+            SequenceSettings(direction=state.direction),
+            replace(state.free, base_frames=False, extrinsics=False, intrinsics=False),
+            session.target(state.observed, before),
+            {index: session.joints(pose.scene) for index, pose in poses.items()},
+            {index: _standard_deviations(before, index) for index in kept},
+            {index: found for index, found in regions.items() if found},
         )
-        more = {"model": to_plain(model), "frames": [frames[0], frames[-1]], "keyframes": sorted(kept)}
-        provenance = self._optimizers.provenance(cameras, state.settings, free, target, Source.PROPAGATED, **more)
-        return SequenceRun(optimizer, provenance)
+        return self._optimizers.sequence(self._task)
 
-    def _steps(self, run: SequenceRun) -> Iterator[None]:
+    def _steps(self, run: SequenceRun) -> Iterator[Waiting]:
         outcomes: dict[int, Outcome] = {}
         try:
-            while run.optimizer.step() is not None:
-                self._check_calibration()
-                self._report(done=run.optimizer.progress[0], text=run.status())
-                yield
-            visited = run.optimizer.progress[0]
-            for number, (index, estimate) in enumerate(run.optimizer.estimates.items(), start=1):
+            while not isinstance(found := (yield from run.steps.next(run.cancelled or None)), Smoothed):
+                self._take(run, found)
+                yield None
+            run.estimates = dict(found.estimates)
+            for number, (index, estimate) in enumerate(run.estimates.items(), start=1):
                 if run.cancelled:
                     break
                 if self._solved(estimate):
-                    outcomes[index] = self._comparison.outcome(estimate, run, self._before, self._context.state)
+                    before, state = self._before, self._context.state
+                    outcomes[index] = yield from self._comparison.outcome(estimate, run, before, state)
                     self._context.change(busy=None)
                     self._check_calibration()
-                self._report(compared=number, text=f"Comparing with the previous pose, frame {number} of {visited}")
-                yield
+                self._report(compared=number, text=f"Comparing with the previous pose, frame {number} of {run.done}")
+                yield None
             if outcomes and not run.cancelled:
                 self._report(text="Checking the calibration")
-                yield
-                gain = run.optimizer.base_frame_gain()
+                gain = yield from run.steps.next()
                 self._report(base_frame_gain=gain, calibration=self._before.records.get(WHOLE_PROJECT))
         finally:
+            run.steps.close()
             # Frames that were solved before an error, such as a missing image, are saved.
             if self._run is run:
                 self._run = None
                 self._report(running=False, text="")
                 self._report(text=self._save(run, outcomes))
 
-    def _solved(self, estimate: "FrameEstimate") -> bool:
+    def _take(self, run: SequenceRun, found: object) -> None:
+        """Use the start or a step of the run."""
+        if isinstance(found, Started):
+            task = self._task
+            more = {
+                "model": to_plain(task.model),
+                "frames": [task.frames[0], task.frames[-1]],
+                "keyframes": sorted(task.keyframes),
+            }
+            chosen = task.cameras, task.settings, task.free, task.target
+            run.provenance = provenance(found, *chosen, Source.PROPAGATED, **more)
+            self._context.change(busy=None)
+            self._report(text="Estimating the first frame")
+        elif isinstance(found, SequenceStep):
+            self._check_calibration()
+            run.done = found.done
+            if found.estimate is not None:
+                run.estimates[found.estimate.index] = found.estimate
+            self._report(done=found.done, text=found.text)
+
+    def _solved(self, estimate: Estimate) -> bool:
         """Whether an estimate may be saved; edits of the frame since the start of the run take precedence."""
         now, index = self._session.editor.view, estimate.index
-        kept = estimate.start == "keyframe" or index in now.kept_frames
+        kept = estimate.keyframe or index in now.kept_frames
         return not kept and now.joints(index) == self._before.joints(index)
 
     def _check_calibration(self) -> None:
@@ -186,7 +204,7 @@ class PropagatingHandler(Handler):
         figures: dict[int, Figures] = {}
         listed: list[ListedFrame] = []
         self._held = {}
-        for index, estimate in run.optimizer.estimates.items():
+        for index, estimate in run.estimates.items():
             if not self._solved(estimate):
                 continue
             outcome = outcomes.get(index) or unchecked(estimate, run)

@@ -1,145 +1,96 @@
-"""Optimizers of the viewer: networks, runs on single frames, runs on many frames, and assessments of poses."""
+"""Optimizers of the viewer: requests to the solver, and runs on single frames and on many frames."""
 
-import sys
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol, TypedDict, Unpack
+from typing import TYPE_CHECKING, Any, TypedDict, Unpack
 
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import UInt8
 
-from carts_core import networks, optimization
-from carts_core.errors import SettingsError, WeightsError
-from carts_core.model.scene import Scene, SceneState
-from carts_core.optimization import FreeParameters, SolverSettings, SurfaceSolver
-from carts_core.process import leave_a_core_free
-from carts_core.project import FitVerdict, Provenance, Source
+from carts_core.errors import WeightsError
+from carts_core.networks.header import is_surface
+from carts_core.optimization import FreeParameters, Iterate, SolverSettings
+from carts_core.project import Provenance, Source
 from carts_core.recording import Sequence as Recording
-from carts_core.segmentation import NetworkSegmenter, Segmenter
+from carts_core.segmentation import Prompt, Segmenter
 from carts_core.settings.optimization import Inference
 from carts_core.settings.serialization import to_plain
-from carts_core.settings.stages import NONE
-from carts_core.wording import duration_text
+from carts_viewer.jobs.solver import (
+    Advanced,
+    Calibrated,
+    CalibrationStep,
+    CalibrationTask,
+    Ended,
+    Estimate,
+    Fit,
+    FrameTask,
+    Masks,
+    NetworkChoice,
+    RefineTask,
+    SequenceStep,
+    SequenceTask,
+    Smoothed,
+    Solver,
+    Started,
+    result_state,
+)
+from carts_viewer.jobs.solver_process import Reply, Requests, Run, SolverInProcess
+from carts_viewer.picture.strokes import Mask
 from carts_viewer.state import NETWORK, Pose, Target
 
 if TYPE_CHECKING:
     from carts_core.networks import FeatureExtractor
-    from carts_core.optimization import Assessment, FrameOptimizer, Iterate, MaskPredictor, Progress, SequenceOptimizer
+
+REPLY_WAIT = 1.0
+"""Maximum time between checks for a reply, which wakes the worker [s]."""
 
 
-class Optimizer(Protocol):
-    """Interface of an optimizer of one frame; the app uses `FrameOptimizer`."""
-
-    @property
-    def best(self) -> "Iterate | None":
-        """During a run, the iterate with the lowest loss for the current observation; at the end, the last iterate."""
-
-    @property
-    def stop_reason(self) -> str | None:
-        """Reason for the end of the run; None until then."""
-
-    @property
-    def assessment(self) -> "Assessment | None":
-        """Assessment of the result; None during the run, and if the solver does not assess it."""
-
-    def step(self) -> "Iterate | None":
-        """The next iterate, first the initial state; None after the last iterate."""
-
-    def base_frame_gain(self) -> float | None:
-        """At the end, the share of the residual that free base frames would explain [1]; None if unknown."""
-
-    @property
-    def history(self) -> "list[Progress]":
-        """Progress of every iterate."""
-        ...
-
-    def comparable_losses(self) -> list[float]:
-        """Losses of all iterates, computed with the last observation so that they are comparable."""
-        ...
-
-
-@dataclass(frozen=True, eq=False)
-class FrameTask:
-    """A frame to optimize or assess."""
-
-    sequence: Recording
-    index: int
-    domain: str
-    cameras: tuple[str, ...]
-    pose: Pose
-    """Initial state."""
-    settings: SolverSettings
-    free: FreeParameters
-    target: Target
-    ignore: Mapping[str, Bool[np.ndarray, "height width"]]
-    """Camera -> pixels that show an occluder."""
+def wait_for(reply: Reply[Any] | None) -> float:
+    """Time until work that waits for a reply is due [s]."""
+    return 0.0 if reply is None or reply.done else REPLY_WAIT
 
 
 class ActiveRun:
-    """One run on one frame."""
+    """One run on one frame.
 
-    def __init__(self, optimizer: Optimizer, task: FrameTask, provenance: Provenance) -> None:
-        self.optimizer, self.provenance = optimizer, provenance
-        self.start, self.cameras, self._free = task.pose, task.cameras, task.free
-        names = [camera.name for camera in task.sequence.scene.cameras]
-        self._rows = [names.index(name) for name in task.cameras]
+    Attributes:
+        provenance: provenance of its results; known after `Started`.
+        due: number of iterations to perform while the run is paused.
+        reply: the next result, if it was requested.
+    """
 
-    def verdict(self) -> FitVerdict | None:
-        """Verdict on the result of an ended run; None if the solver does not assess it."""
-        found = self.optimizer.assessment
-        if found is None:
-            return None
-        kept = (
-            " The initial pose was kept."
-            if self.optimizer.stop_reason in (optimization.StopReason.FAILED, optimization.StopReason.START_KEPT)
-            else ""
-        )
-        return FitVerdict(found.verdict.value, f"{found.reason}{kept}", found.remedy, found.probability)
+    def __init__(self, steps: "Run[Started | Advanced | Ended]", task: FrameTask) -> None:
+        self.steps, self.task, self.cameras = steps, task, task.cameras
+        self.provenance: Provenance | None = None
+        self.reply: Reply[Started | Advanced | Ended | None] | None = None
+        self.due = 0
 
-    def pose(self, iterate: "Iterate") -> Pose:
-        """Convert an iterate's state, which has the run's cameras only, to a pose of the whole scene.
+    def request(self) -> "Reply[Started | Advanced | Ended | None]":
+        """The requested result; the next one is requested if there is none."""
+        self.reply = self.reply or self.steps.next()
+        return self.reply
 
-        Parameters that were not free are copied exactly: rounding must not count as a new calibration of all frames.
-        """
-        state, start, free = iterate.state.numpy(), self.start.scene, self._free
-        extrinsics, intrinsics = start.T_camera_world.copy(), start.intrinsics.copy()
-        if free.extrinsics:
-            extrinsics[self._rows] = state.T_camera_world
-        if free.intrinsics:
-            intrinsics[self._rows] = state.intrinsics
-        bases = state.T_world_base if free.base_frames else start.T_world_base
-        moved = {"T_camera_world": extrinsics, "T_mount_world": start.T_mount_world}
-        scene = replace(state, T_world_base=bases, intrinsics=intrinsics, **moved)
-        return Pose(scene, Source.OPTIMIZER)
+    def pose(self, iterate: Iterate) -> Pose:
+        """Pose of the whole scene at an iterate."""
+        return Pose(result_state(self.task, iterate), Source.OPTIMIZER)
 
 
 class SequenceRun:
-    """One run on many frames: the optimizer and its provenance."""
+    """One run on many frames.
 
-    def __init__(self, optimizer: "SequenceOptimizer", provenance: Provenance) -> None:
-        self.optimizer, self.provenance = optimizer, provenance
-        self.cancelled = False
+    Attributes:
+        provenance: provenance of its results; known after `Started`.
+        estimates: frame -> newest estimate of each visited frame.
+        done: number of visited frames.
+        cancelled: whether the run was stopped; its results are kept.
+    """
 
-    def cancel(self) -> None:
-        """Stop the run; the results so far remain in the optimizer's `estimates`."""
-        self.cancelled = True
-        self.optimizer.cancel()
-
-    def status(self) -> str:
-        """Progress, as text for the user."""
-        done, total = self.optimizer.progress
-        if done == 0:
-            return "Solving single frames for an initial estimate of the kinematic error"
-        if done == total:
-            return f"All {total} frames estimated; revising inconsistent ones and assessing the fit"
-        if done < 2 < total:
-            return f"Frame {done} of {total}"  # The first frame takes longer, so it does not predict the time left.
-        return f"Frame {done} of {total}, about {duration_text(self.optimizer.seconds_left)} left"
-
-
-REMEDY = "Fit masks (Fit to), or adapt the network to this recording."
-"""Remedy for images outside the domain of the network."""
+    def __init__(self, steps: "Run[Started | SequenceStep | Smoothed | float]") -> None:
+        self.steps = steps
+        self.provenance = Provenance(Source.PROPAGATED)
+        self.estimates: dict[int, Estimate] = {}
+        self.done, self.cancelled = 0, False
 
 
 class NetworkOptions(TypedDict, total=False):
@@ -156,18 +107,19 @@ class NetworkOptions(TypedDict, total=False):
 
 
 class OptimizerFactory:
-    """Makes optimizers; loads the networks once, when they are first needed."""
+    """Sends tasks to the solver, with the chosen networks. Errors are raised by the replies."""
 
-    def __init__(self, *, report: Callable[[str], None], **options: Unpack[NetworkOptions]) -> None:
+    def __init__(
+        self, *, report: Callable[[str], None], requests: Requests | None = None, **options: Unpack[NetworkOptions]
+    ) -> None:
+        """`requests`: the solver; None for the solver in this process."""
         self._segmenter = options.get("segmenter")
-        self._own_segmenter: tuple[FeatureExtractor, Segmenter] | None = None
-        self._weights = options.get("weights", ())
-        self._device = options.get("device", "cpu")
-        self._inference: Inference = options.get("inference", "auto")
+        self._choice = NetworkChoice(
+            options.get("weights", ()), None, options.get("device", "cpu"), options.get("inference", "auto")
+        )
+        self._requests: Requests = requests or SolverInProcess()
+        self._here: tuple[NetworkChoice, Solver] | None = None
         self.report = report
-        self._surface: Path | None = None
-        self._extractor: FeatureExtractor | None = None
-        self._warnings: dict[tuple[object, ...], tuple[str, ...]] = {}
 
     def given_surface(self) -> bool:
         """Whether the weights options include a surface network.
@@ -175,7 +127,7 @@ class OptimizerFactory:
         Raises:
             WeightsError: weights cannot be read.
         """
-        return any(_is_surface(path) for path in self._weights)
+        return any(is_surface(path) for path in self._choice.weights)
 
     def use(self, surface: Path | None) -> None:
         """Use another surface network from now on; None for the initial network.
@@ -183,155 +135,79 @@ class OptimizerFactory:
         Raises:
             WeightsError: the weights cannot be read, or are not those of a surface network.
         """
-        if surface is not None and not _is_surface(surface):
+        if surface is not None and not is_surface(surface):
             raise WeightsError(f"{surface} contains no surface network. Adapt the network again.")
-        self._surface, self._extractor = surface, None
+        self._choice = replace(self._choice, surface=surface)
 
-    def prepare(self) -> "FeatureExtractor":
-        """Load the networks, if they are not loaded yet.
+    def extractor(self) -> "FeatureExtractor":
+        """The networks in this process, for live streams.
 
         Raises:
             WeightsError: the networks cannot be loaded.
         """
-        leave_a_core_free()
-        if self._extractor is None:
-            self.report("Loading the networks")
-            weights = list(self._weights)
-            if self._surface is not None:
-                others = [path for path in weights if not _is_surface(path)]
-                weights = [self._surface, *others]
-            self._extractor = networks.FeatureExtractor.load(*weights, device=self._device, inference=self._inference)
-        return self._extractor
+        if self._here is None or self._here[0] != self._choice:
+            self._here = self._choice, Solver(self._choice, self.report)
+        return self._here[1].extractor()
 
-    @staticmethod
-    def forget_images(sequence: Recording) -> None:
+    @property
+    def warm_up(self) -> tuple[Any, ...]:
+        """The request that loads the networks."""
+        return "call", self._choice, "prepare"
+
+    def prepare(self) -> Reply[str]:
+        """Load the networks; the result is their fingerprint."""
+        return self._requests.ask(*self.warm_up)
+
+    def forget_images(self, sequence: Recording) -> None:
         """Drop values computed from the images of a recording."""
-        # Without this module, there are none.
-        if "carts_core.optimization.observation" in sys.modules:
-            optimization.Backgrounds.forget(sequence)
+        self._call("forget_images", sequence)
 
-    def segmenter(self) -> Segmenter:
-        """The segmenter of the *Prompt* tool.
+    def segment(self, image: UInt8[np.ndarray, "height width 3"], prompt: Prompt) -> Reply[Mask]:
+        """Mask of the object of a prompt."""
+        own = self._segmenter
+        if own is not None:
+            return Reply.of(lambda: own.segment(image, prompt))
+        return self._call("segment", image, prompt)
 
-        Raises:
-            WeightsError: the networks cannot be loaded.
-        """
-        if self._segmenter is not None:
-            return self._segmenter
-        extractor = self.prepare()
-        if self._own_segmenter is None or self._own_segmenter[0] is not extractor:
-            self._own_segmenter = extractor, NetworkSegmenter.of(extractor)
-        return self._own_segmenter[1]
+    def run(self, task: FrameTask) -> ActiveRun:
+        """A run on a frame."""
+        return ActiveRun(Run(self._requests, self._choice, "run", task), task)
 
-    def domain_warnings(
-        self, sequence: Recording, scene: Scene, index: int, domain: str, cameras: Sequence[str]
-    ) -> tuple[str, ...]:
-        """Warnings that arms or images are outside the domain of the network, based on one frame; cached.
+    def compare(self, task: FrameTask) -> Reply[Iterate | None]:
+        """The iterate at the pose of a task, with its maps."""
+        return self._call("compare", task)
 
-        Raises:
-            CartsError: weights or an image is not usable.
-        """
-        extractor = self.prepare()
-        known = extractor.sha256, domain, *cameras
-        if known not in self._warnings:
-            scene = scene.with_cameras(cameras)
-            found = optimization.check_domain(scene, sequence.frame(index, domain, list(cameras)), extractor)
-            background = optimization.Backgrounds.of(sequence, cameras, domain).covers(scene)
-            self._warnings[known] = tuple(found.warnings(", ".join(cameras), REMEDY, background=background))
-        return self._warnings[known]
+    def fit(self, task: FrameTask) -> Reply[Fit]:
+        """The fit of the pose of a task."""
+        return self._call("fit", task)
 
-    def predictor(self, target: Target) -> "FeatureExtractor | MaskPredictor":
-        """Predictor of a target; if only masks are fitted, no network is loaded.
+    def refine(self, task: RefineTask) -> Reply[Masks]:
+        """Refined masks."""
+        return self._call("refine", task)
 
-        Raises:
-            WeightsError: the networks cannot be loaded.
-        """
-        leave_a_core_free()
-        if target.observed.what == "network":
-            return self.prepare()
-        network = None if target.observed.what == "masks" else optimization.NetworkPredictor(self.prepare())
-        masks, name = (None, "mask") if target.given is None else (target.given.masks, target.given.origin)
-        return optimization.MaskPredictor(network, masks, name)
+    def sequence(self, task: SequenceTask) -> SequenceRun:
+        """A run on many frames."""
+        return SequenceRun(Run(self._requests, self._choice, "sequence", task))
 
-    def provenance(
-        self,
-        cameras: Sequence[str],
-        settings: SolverSettings,
-        free: FreeParameters,
-        target: Target = NETWORK,
-        source: Source = Source.OPTIMIZER,
-        **more: Any,
-    ) -> Provenance:
-        """Provenance of a run with these settings, and with `more` settings.
+    def calibration(self, task: CalibrationTask) -> Run[Started | CalibrationStep | Calibrated]:
+        """A calibration on many frames."""
+        return Run(self._requests, self._choice, "calibration", task)
 
-        Raises:
-            WeightsError: the networks cannot be loaded.
-        """
-        used = {**to_plain(settings), "free": asdict(free), "cameras": list(cameras), **more}
-        observed = target.observed
-        if observed.what != "network":
-            used |= {"observe": observed.what, "masks": observed.masks}
-        weights = None if observed.what == "masks" else self.prepare().sha256
-        return Provenance.made_by_optimizer(used, weights, source)
-
-    def make(self, task: FrameTask) -> Optimizer:
-        """Make an optimizer of a frame.
-
-        Raises:
-            CartsError: weights, an image, a mask or a setting is not usable.
-        """
-        predictor = self.predictor(task.target)
-        self.report("Preparing the frame")
-        if task.target.observed.what != "network" and not isinstance(task.settings, SurfaceSolver):
-            raise SettingsError(
-                "The chosen solver compares image features and cannot fit masks. Choose the solver Surface "
-                "maps, or fit the network's predictions."
-            )
-        return self._frame_optimizer(task, predictor)
-
-    def assess(self, task: FrameTask) -> "tuple[Assessment, float]":
-        """Assessment and loss of a pose, which is not changed; errors are those of `make`."""
-        surface = task.settings if isinstance(task.settings, SurfaceSolver) else SurfaceSolver()
-        fixed = replace(task, settings=replace(surface, stages=NONE), free=FreeParameters())
-        optimizer = self._frame_optimizer(fixed, self.predictor(task.target))
-        for _ in optimizer:
-            pass
-        assert optimizer.assessment is not None and optimizer.best is not None
-        return optimizer.assessment, float(optimizer.best.loss)
-
-    @staticmethod
-    def _frame_optimizer(task: FrameTask, predictor: "FeatureExtractor | MaskPredictor") -> "FrameOptimizer":
-        sequence, joints, cameras = task.sequence, task.pose.scene.joint_positions, list(task.cameras)
-        scene = scene_at(sequence.scene, task.pose.scene)
-        return optimization.FrameOptimizer(
-            scene,
-            sequence.frame(task.index, task.domain, cameras),
-            optimization.Backgrounds.of(sequence, cameras, task.domain, required=task.settings.needs_background),
-            predictor,
-            ignore=task.ignore,
-            start={arm.name: values for arm, values in zip(scene.arms, joints, strict=True)},
-            settings=task.settings,
-            free=task.free,
-            cameras=cameras,
-        )
+    def _call(self, method: str, *arguments: Any) -> Reply[Any]:
+        return self._requests.ask("call", self._choice, method, *arguments)
 
 
-def _is_surface(weights: Path) -> bool:
-    """Whether a weights file contains a surface network; `WeightsError` if it cannot be read."""
-    from carts_core.networks.surface import SurfaceNetwork  # noqa: PLC0415
-    from carts_core.networks.weights import read_weights  # noqa: PLC0415
-
-    return read_weights(weights).network.kind == SurfaceNetwork.kind
-
-
-def scene_at(scene: Scene, state: SceneState) -> Scene:
-    """The scene with base frames, extrinsics and intrinsics of a state."""
-
-    arms = [
-        replace(arm, T_world_base=T.astype(np.float64)) for arm, T in zip(scene.arms, state.T_world_base, strict=True)
-    ]
-    cameras = [
-        replace(camera, T_camera_world=T.astype(np.float64), intrinsics=tuple(k.tolist()))
-        for camera, T, k in zip(scene.cameras, state.T_camera_world, state.intrinsics, strict=True)
-    ]
-    return replace(scene, arms=tuple(arms), cameras=tuple(cameras))
+def provenance(
+    started: Started,
+    cameras: Sequence[str],
+    settings: SolverSettings,
+    free: FreeParameters,
+    target: Target = NETWORK,
+    source: Source = Source.OPTIMIZER,
+    **more: Any,
+) -> Provenance:
+    """Provenance of a run with these settings, and with `more` settings."""
+    used = {**to_plain(settings), "free": asdict(free), "cameras": list(cameras), **more}
+    if target.observed.what != "network":
+        used |= {"observe": target.observed.what, "masks": target.observed.masks}
+    return Provenance.made_by_optimizer(used, started.weights_sha256, source)

@@ -6,13 +6,12 @@ import sys
 import threading
 import time
 from collections.abc import Container, Generator, Sequence
-from contextlib import suppress
+from contextlib import closing, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from queue import Empty, SimpleQueue
 from typing import Any
 
-from carts_core import optimization
 from carts_core.errors import CartsError
 from carts_core.files.reading import VALUES, parse_json, read_text
 from carts_core.model.scene import Scene
@@ -24,15 +23,15 @@ from carts_core.project import (
     ProjectState,
     Provenance,
     ReviewState,
-    Source,
 )
 from carts_core.project.values import WHOLE_PROJECT
 from carts_core.recording import evenly_spaced
 from carts_core.settings import CALIBRATION_SETTINGS
 from carts_core.stopping import PARENT
 from carts_viewer.actions.context import Context
-from carts_viewer.jobs.comparison import Comparison
-from carts_viewer.jobs.optimizers import OptimizerFactory, scene_at
+from carts_viewer.jobs.comparison import Comparison, Waiting
+from carts_viewer.jobs.optimizers import OptimizerFactory, provenance
+from carts_viewer.jobs.solver import Calibrated, CalibrationStep, CalibrationTask, Started, scene_at
 
 _ACCEPTED, _OPTIMIZED = ReviewState.ACCEPTED, ReviewState.OPTIMIZED
 
@@ -50,7 +49,9 @@ class Progress:
     """Time until the next step is due [s]."""
 
 
-def optimize_frames(context: Context, comparison: Comparison, frames: Sequence[int], first: int) -> Generator[Progress]:
+def optimize_frames(
+    context: Context, comparison: Comparison, frames: Sequence[int], first: int
+) -> Generator[Progress | Waiting]:
     """Run the optimizer on frames individually, starting at index `first` of `frames`; worse results are discarded.
 
     Every frame is a separate undo step, and is saved before the next frame is started.
@@ -70,10 +71,7 @@ def optimize_frames(context: Context, comparison: Comparison, frames: Sequence[i
         if not target.seen(session.sequence, index, context.state.domain, cameras):
             yield Progress(place + 1, len(frames), f"Frame {name} has no mask", f"{name}: no mask to fit, not changed")
             continue
-        steps = comparison.own_run(index, context.state)
-        while (outcome := next(steps)) is None:
-            yield Progress(place, len(frames), f"Frame {name}")
-        fit, edits, remark = outcome
+        fit, edits, remark = yield from comparison.own_run(index, context.state)
         if remark is not None:
             worse += 1
             yield Progress(place + 1, len(frames), f"Frame {name}", f"{name}: discarded, worse than before ({remark})")
@@ -88,7 +86,7 @@ def optimize_frames(context: Context, comparison: Comparison, frames: Sequence[i
     yield Progress(len(frames), len(frames), text)
 
 
-def calibrate(context: Context, optimizers: OptimizerFactory, count: int) -> Generator[Progress]:
+def calibrate(context: Context, optimizers: OptimizerFactory, count: int) -> Generator[Progress | Waiting]:
     """Fit base frames, and cameras if they are free, to frames spread over the sequence; one undo step."""
     session, state = context.session, context.state
     sequence = session.sequence
@@ -98,32 +96,25 @@ def calibrate(context: Context, optimizers: OptimizerFactory, count: int) -> Gen
         state.free, base_frames=state.free.base_frames or not (state.free.extrinsics or state.free.intrinsics)
     )
     yield Progress(0, 0, f"Reading {len(indices)} frames")
-    frames = [sequence.frame(index, state.domain, cameras) for index in indices]
-    target = session.target(state.observed)
-    ignored = [session.ignored(index, cameras, target) for index in indices]
-    before = session.editor.view
-    scene = scene_at(session.scene, session.measured(state.frame))
-    optimizer = optimization.CalibrationOptimizer(
-        scene,
-        frames,
-        optimizers.predictor(target),
-        free=replace(free, joints=False),
-        ignore=ignored,
-        backgrounds=optimization.Backgrounds.of(sequence, cameras, state.domain),
-    )
-    most = CALIBRATION_SETTINGS.iterations
-    while (iterate := optimizer.step()) is not None:
-        text = f"Stage {iterate.stage + 1} of {iterate.stages}, loss {iterate.loss:.4f}; at most {most} iterations"
-        yield Progress(iterate.index, most, text, text)
-    result = optimizer.result()
-    for change in result.unknowns:
-        unit = "°" if change.unit == "deg" else f" {change.unit}"
-        line = f"{change.name}: {change.change:+.3f} ± {change.standard_deviation:.3f}{unit}"
+    target, before = session.target(state.observed), session.editor.view
+    measured = session.measured(state.frame)
+    ignored = tuple(session.ignored(index, cameras, target) for index in indices)
+    task = CalibrationTask(sequence, tuple(indices), state.domain, measured, free, target, ignored)
+    most, made_by, result = CALIBRATION_SETTINGS.iterations, None, None
+    with closing(optimizers.calibration(task)) as steps:
+        while (found := (yield from steps.next())) is not None:
+            match found:
+                case Started():
+                    made_by = provenance(found, cameras, CALIBRATION_SETTINGS, free, target)
+                case CalibrationStep():
+                    yield Progress(found.index, most, found.text, found.text)
+                case Calibrated():
+                    result = found
+    assert made_by is not None and result is not None
+    for line in result.changes:
         yield Progress(most, most, "Comparing", line)
-    found = result.assessment
-    verdict = "" if found is None else f"{found.verdict.value.capitalize()}: {found.reason} {found.remedy}".strip()
-    provenance = optimizers.provenance(cameras, CALIBRATION_SETTINGS, free, target)
-    edits = _calibration_edits(scene, result.scene, replace(provenance, source=Source.OPTIMIZER))
+    verdict, scene = result.verdict, scene_at(session.scene, measured)
+    edits = _calibration_edits(scene, result.applied_to(scene), made_by)
     if not edits:
         yield Progress(most, most, f"Nothing was changed. {verdict}")
         return
@@ -135,16 +126,8 @@ def calibrate(context: Context, optimizers: OptimizerFactory, count: int) -> Gen
     context.refresh()
     again = " All masks have changed: run or solve fitted frames again." if solved else ""
     again += f" Accepted frames that became unreviewed: {accepted}." if accepted else ""
-    done = f"Calibrated on {len(indices)} frames, one undo step.{_moved(scene, result.scene)}"
+    done = f"Calibrated on {len(indices)} frames, one undo step.{result.moved}"
     yield Progress(most, most, f"{done} {verdict}{again}")
-
-
-def _moved(before: Scene, after: Scene) -> str:
-    """Text with angles and distances of the poses that a calibration has moved; empty if there are none."""
-    from carts_core.evaluation.calibration import moved_frames  # noqa: PLC0415
-
-    found = [f"{name} by {angle:.1f}° and {way:.1f} mm" for name, angle, way in moved_frames(before, after)]
-    return f" Moved: {', '.join(found)}." if found else ""
 
 
 def _count(project: ProjectState, states: Container[ReviewState]) -> int:

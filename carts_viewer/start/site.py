@@ -121,7 +121,7 @@ class Site:
     def load_networks(self) -> "FeatureExtractor":
         """Load the networks; see `Host.load_networks`."""
         networks = {name: value for name, value in self._options.items() if name in NetworkOptions.__annotations__}
-        return OptimizerFactory(report=self._report, **networks).prepare()  # pyright: ignore[reportArgumentType]
+        return OptimizerFactory(report=self._report, **networks).extractor()  # pyright: ignore[reportArgumentType]
 
     def show_start(self, problem: str = "") -> None:
         """Show the start page."""

@@ -30,7 +30,7 @@ from carts_core.optimization import (
     Verdict,
     check_domain,
 )
-from carts_core.optimization.observability import Uncertainty
+from carts_core.optimization.indications import Uncertainty
 from carts_core.optimization.observation import FrameImages
 from carts_core.optimization.verdict import (
     _SHOWN,

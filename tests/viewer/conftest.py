@@ -21,6 +21,7 @@ from carts_viewer import editing
 from carts_viewer.actions import intents
 from carts_viewer.app import ViewerApp
 from carts_viewer.jobs.optimizers import NetworkOptions
+from carts_viewer.jobs.solver_process import Requests, SolverProcess
 
 FLAGS = (
     "--no-sandbox --disable-quic --no-first-run --disable-background-networking --disable-component-update "
@@ -41,8 +42,17 @@ def untrained_weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
+@pytest.fixture(scope="session")
+def solver() -> Iterator[SolverProcess]:
+    """The process of the solver, which the viewers share."""
+    with closing(SolverProcess()) as process:
+        yield process
+
+
 @pytest.fixture
-def open_viewer(tiny_sequence: Callable[..., Path], untrained_weights: Path) -> Iterator[OpenViewer]:
+def open_viewer(
+    tiny_sequence: Callable[..., Path], untrained_weights: Path, solver: SolverProcess
+) -> Iterator[OpenViewer]:
     """Opens the viewer of a tiny sequence; further options are those of `tiny_sequence`.
 
     `prepare` gets the sequence's folder before it is opened, `networks` the options of the networks. A `marked` one
@@ -59,6 +69,7 @@ def open_viewer(tiny_sequence: Callable[..., Path], untrained_weights: Path) -> 
             *,
             marked: bool = False,
             networks: NetworkOptions | None = None,
+            solver: Requests = solver,
             **options,
         ) -> ViewerApp:
             if marked:
@@ -66,7 +77,7 @@ def open_viewer(tiny_sequence: Callable[..., Path], untrained_weights: Path) -> 
             path = tiny_sequence(**options)
             (mark_frames if marked else prepare)(path.parent)
             chosen: NetworkOptions = {"weights": (untrained_weights,), **(networks or {})}
-            app = stack.enter_context(ViewerApp.open(path, port=0, **chosen))
+            app = stack.enter_context(ViewerApp.open(path, port=0, solver=solver, **chosen))
             if marked:
                 app.queue.put(intents.SetOpacity(1.0))
             app.wait_until_shown()
@@ -76,9 +87,11 @@ def open_viewer(tiny_sequence: Callable[..., Path], untrained_weights: Path) -> 
 
 
 @pytest.fixture(scope="module")
-def shared_viewer(shared_sequence: Callable[..., Path], untrained_weights: Path) -> Iterator[ViewerApp]:
+def shared_viewer(
+    shared_sequence: Callable[..., Path], untrained_weights: Path, solver: SolverProcess
+) -> Iterator[ViewerApp]:
     """The viewer of a tiny sequence, for tests that leave it as it is."""
-    with ViewerApp.open(shared_sequence(), port=0, weights=(untrained_weights,)) as app:
+    with ViewerApp.open(shared_sequence(), port=0, solver=solver, weights=(untrained_weights,)) as app:
         app.wait_until_shown()
         yield app
 

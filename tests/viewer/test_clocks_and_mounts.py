@@ -13,7 +13,8 @@ from carts_core.evaluation.metrics import dice
 from carts_core.project import CorrectedTransform, Key, Project, Provenance, Source, TimeOffset
 from carts_core.recording import Sequence
 from carts_viewer.actions import intents
-from carts_viewer.jobs.optimizers import OptimizerFactory, scene_at
+from carts_viewer.jobs.optimizers import OptimizerFactory
+from carts_viewer.jobs.solver import scene_at
 
 FRAMES = 4
 

@@ -16,10 +16,10 @@ from carts_core.errors import CartsError, SettingsError
 from carts_core.evaluation.metrics import dice
 from carts_core.model.camera import Camera
 from carts_core.model.parts import part_classes
+from carts_core.optimization import FrameOptimizer
 from carts_core.project import IgnoreRegion, Key, MaskCorrection
 from carts_core.segmentation import Prompt
 from carts_viewer.actions import intents
-from carts_viewer.jobs.optimizers import OptimizerFactory
 from carts_viewer.picture.layers import (
     ADDED_COLOR,
     IGNORED_COLOR,
@@ -206,13 +206,13 @@ def test_a_corrected_mask_keeps_the_optimizers_loss_and_an_ignore_region_does_no
 
 def test_the_optimizer_is_given_the_ignore_region_of_its_cameras(desk: Desk, monkeypatch: pytest.MonkeyPatch) -> None:
     given = []
-    make = OptimizerFactory.make
+    make = FrameOptimizer.__init__
 
-    def watched(self: OptimizerFactory, *arguments: Any) -> Any:
-        given.append(arguments[-1].ignore)
-        return make(self, *arguments)
+    def watched(self: FrameOptimizer, *arguments: Any, **options: Any) -> None:
+        given.append(options["ignore"])
+        make(self, *arguments, **options)
 
-    monkeypatch.setattr(OptimizerFactory, "make", watched)
+    monkeypatch.setattr(FrameOptimizer, "__init__", watched)
     desk.do(intents.SetCameras(False))
     desk.do(_polygon(Target.IGNORE), _polygon(Target.IGNORE, frame=1, number=2), intents.Step())
     assert list(given[-1]) == ["left"] and np.array_equal(given[-1]["left"], _pixels(desk))
