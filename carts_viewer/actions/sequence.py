@@ -101,11 +101,11 @@ class PropagatingHandler(Handler):
         self._optimizers.report("Preparing to solve")
         try:
             self._run = self._make(frames, kept)
+            self._work, self._reply = self._steps(self._run), None
+            self.advance()
         except Exception:
             self._context.change(solve=former)
             raise
-        self._work, self._reply = self._steps(self._run), None
-        self._context.change(busy=None, solve=SolveState(frames, text="Estimating the first frame"))
 
     def _on_StopSolving(self, intent: intents.StopSolving) -> None:
         self.finish()

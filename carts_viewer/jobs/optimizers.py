@@ -1,5 +1,6 @@
 """Optimizers of the viewer: requests to the solver, and runs on single frames and on many frames."""
 
+import sys
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -8,6 +9,7 @@ from typing import TYPE_CHECKING, Any, TypedDict, Unpack
 import numpy as np
 from jaxtyping import UInt8
 
+from carts_core import optimization
 from carts_core.errors import WeightsError
 from carts_core.networks.header import is_surface
 from carts_core.optimization import FreeParameters, Iterate, SolverSettings
@@ -160,6 +162,9 @@ class OptimizerFactory:
 
     def forget_images(self, sequence: Recording) -> None:
         """Drop values computed from the images of a recording."""
+        # Without this module, there are none in this process.
+        if "carts_core.optimization.observation" in sys.modules:
+            optimization.Backgrounds.forget(sequence)
         self._call("forget_images", sequence)
 
     def segment(self, image: UInt8[np.ndarray, "height width 3"], prompt: Prompt) -> Reply[Mask]:

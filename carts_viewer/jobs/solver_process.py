@@ -294,15 +294,12 @@ class SolverProcess:
         while True:
             self._wanted.wait()
             here, there = Pipe()
-            with self._changing:
-                if self._closed:
-                    return
-                process = self._process = _started(there)
-                there.close()
-                self._pipe, self.pid = here, process.pid
-                self._send()
-            failures = 0 if self._receive(here) else failures + 1
-            status = process.wait()
+            with there, self._changing:
+                process = self._process = None if self._closed else _started(there)
+                self.pid = None if process is None else process.pid
+            ready = process is not None and self._receive(here)
+            status = 0 if process is None else process.wait()
+            failures = 0 if ready else failures + 1
             with self._changing:
                 self._process = self._pipe = self.pid = None
                 lost, self._waiting = list(self._waiting.values()), {}
@@ -321,7 +318,7 @@ class SolverProcess:
                 listener.solver_stopped(error)
 
     def _send(self) -> None:
-        """Send the unsent requests; the lock is held. The child always reads, so that sending does not block."""
+        """Send the unsent requests to a process that is ready, which always reads; the lock is held."""
         while self._pipe is not None and self._unsent:
             try:
                 self._pipe.send_bytes(self._unsent.pop(0))
@@ -337,11 +334,15 @@ class SolverProcess:
                 number, value, error = pipe.recv()
             except (EOFError, OSError):
                 return ready
-            if number is None:
+            if number is None and value is None:
                 ready = True
-                if value:
-                    for listener in tuple(self.listeners):
-                        listener.solver_reports(value)
+                with self._changing:
+                    self._pipe = pipe
+                    self._send()
+                continue
+            if number is None:
+                for listener in tuple(self.listeners):
+                    listener.solver_reports(value)
                 continue
             with self._changing:
                 reply = self._waiting.pop(number, None)
@@ -351,14 +352,19 @@ class SolverProcess:
                 listener.solver_replied()
 
 
-def _started(pipe: Connection) -> "subprocess.Popen[bytes]":
+def _started(pipe: Connection) -> "subprocess.Popen[bytes] | None":
+    """The process; None if the system cannot start it."""
     paths = [os.path.abspath(path) for path in sys.path]
     start = "import sys; sys.path[:] = sys.argv[3:]; from carts_viewer.jobs.solver_process import serve; serve()"
-    return subprocess.Popen(
-        [sys.executable, "-P", "-c", start, str(os.getpid()), str(pipe.fileno()), *paths],
-        stdin=subprocess.DEVNULL,
-        pass_fds=[pipe.fileno()],
-    )
+    try:
+        return subprocess.Popen(
+            [sys.executable, "-P", "-c", start, str(os.getpid()), str(pipe.fileno()), *paths],
+            stdin=subprocess.DEVNULL,
+            pass_fds=[pipe.fileno()],
+        )
+    except OSError as error:
+        _log.error("The solver process cannot be started: %s", error)
+        return None
 
 
 def _packed(number: int, request: tuple[Any, ...]) -> bytes:
@@ -368,7 +374,7 @@ def _packed(number: int, request: tuple[Any, ...]) -> bytes:
 
 def _description(status: int, failures: int) -> str:
     """Message about the unexpected end of the process with an exit status."""
-    reason = f"exit status {status}"
+    reason = f"exit status {status}" if status else "see the log"
     if status < 0:
         reason = signal.Signals(-status).name
         if -status == signal.SIGKILL:
@@ -436,7 +442,7 @@ def serve() -> None:
     threading.Thread(target=_read, args=(pipe, requests), daemon=True).start()
     tune_process()
     desk = _Desk(lambda text: pipe.send((None, text, None)))
-    pipe.send((None, "", None))
+    pipe.send((None, None, None))
     idle = False
     while True:
         try:

@@ -19,6 +19,7 @@ from carts_viewer.actions import intents
 from carts_viewer.actions.sequence import PropagatingHandler
 from carts_viewer.app import ViewerApp
 from carts_viewer.jobs.job_list import JobState
+from carts_viewer.jobs.solver_process import SolverInProcess
 from carts_viewer.picture.overlay import OverlayRenderer
 from carts_viewer.state import Phase
 
@@ -134,7 +135,7 @@ def test_exports_are_downloaded_and_written_beside_the_project(open_tab: OpenTab
 def test_frames_are_solved_while_the_page_stays_live_and_a_suspected_calibration_is_corrected(
     open_tab: OpenTab, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    tab = open_tab(frames=4, width=160, height=120)
+    tab = open_tab(frames=4, width=160, height=120, solver=SolverInProcess())
     app = tab.app
     stop, solve = (tab.page.get_by_role("button", name=name, exact=True) for name in ("Stop and keep", "Solve all"))
     go_on, make = threading.Event(), PropagatingHandler._make

@@ -21,7 +21,8 @@ from carts_viewer.actions.frame_filter import (
     review_name,
 )
 from carts_viewer.actions.import_export import FRAME_CHOICES, export_warnings
-from carts_viewer.jobs.comparison import Fit
+from carts_viewer.jobs.comparison import worse_than
+from carts_viewer.jobs.solver import Fit
 from carts_viewer.panels.fit import fit_text
 from carts_viewer.panels.joints import value_rows
 from carts_viewer.panels.optimize import note
@@ -197,7 +198,7 @@ def test_a_fit_is_worse_by_what_the_images_say_and_by_the_truth_where_it_is_know
         (Fit(GOOD, 0.02, 0.564), Fit(DOUBTFUL, 0.06, 0.701), "Dice 0.564, before 0.701"),
         (Fit(DOUBTFUL, 0.09, 0.95), Fit(GOOD, 0.02, 0.90), None),
     ):
-        assert after.worse_than(before) == worse
+        assert worse_than(after, before) == worse
 
 
 def test_a_verdict_is_read_with_reason_remedy_and_cameras() -> None:
