@@ -231,7 +231,7 @@ class Controller(Handler):
         if not self._editor.project.writable:
             return None
         watch = max(0.0, self._watch_at - time.monotonic())
-        draft = self._editor.overdue_in()
+        draft = None if self._optimizing.computing else self._editor.overdue_in()
         return watch if draft is None else min(draft, watch)
 
     def advance(self) -> None:
@@ -240,7 +240,7 @@ class Controller(Handler):
         self._painting.advance()
         self._browsing.advance()
         self._live.advance()
-        if self._editor.overdue_in() == 0.0:
+        if not self._optimizing.computing and self._editor.overdue_in() == 0.0:
             self._context.save()
         self._watch()
 

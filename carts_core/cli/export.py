@@ -106,7 +106,7 @@ class Export:
 
     def run(self) -> None:
         """Write the export; no files are left after Ctrl-C or an error."""
-        from ..export import FORMATS, Dataset, ExportProgress, export
+        from ..export import FORMATS, Dataset, ExportProgress, export, network_refiner
         from ..recording import Sequence
 
         if self.recording is not None and not FORMATS[self.format].source:
@@ -127,7 +127,7 @@ class Export:
             images=self.images,
             frame_rate=self.frame_rate,
             masks=self.masks,
-            load_networks=self.network.load,
+            refine=network_refiner(self.network.load),
             recording=self.recording,
         )
         with Bar(console=console) as bar:

@@ -9,6 +9,7 @@ from .dataset import ExportFrame as ExportFrame
 from .dataset import ExportProgress as ExportProgress
 from .dataset import corrected_frames as corrected_frames
 from .dataset import measured_frames as measured_frames
+from .dataset import network_refiner as network_refiner
 from .dataset import project_frame as project_frame
 from .encodings import image_png as image_png
 from .encodings import mask_png as mask_png

@@ -5,7 +5,7 @@ import os
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from collections.abc import Sequence as Items
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cache, cached_property
 from pathlib import Path, PurePath
 from typing import TYPE_CHECKING, Literal, TypeVar
 
@@ -31,7 +31,6 @@ from .kinematics import KinematicsRow
 
 if TYPE_CHECKING:
     from ..networks import FeatureExtractor
-    from ..optimization import NetworkPredictor
 
 
 @dataclass(frozen=True)
@@ -173,13 +172,14 @@ class ExportProgress:
     def track(self, steps: Items[T]) -> Iterator[T]:
         """Yield the steps and report progress; raises `ExportCancelled` if cancelled."""
         for done, step in enumerate(steps):
-            self._check()
+            self.pause()
             yield step
             if self.progress is not None:
                 self.progress(done + 1, len(steps))
-        self._check()
+        self.pause()
 
-    def _check(self) -> None:
+    def pause(self) -> None:
+        """Call `cancelled`; raises `ExportCancelled` if it returns True."""
         if self.cancelled is not None and self.cancelled():
             raise ExportCancelled("the export was cancelled. Nothing was written.")
 
@@ -233,8 +233,8 @@ class Dataset:
     """Frame rate of a video [1/s]; None for the recorded rate."""
     masks: Masks = "rendered"
     """Masks that are refined; painted and given masks are not changed."""
-    load_networks: "Callable[[], FeatureExtractor] | None" = None
-    """Function that loads the networks when the first mask is refined; without it, masks are rendered."""
+    refine: "Refine | None" = None
+    """Function that refines a rendered mask, such as `network_refiner`; without it, masks are rendered."""
     rendered_folder: OutputPath | None = None
     """Folder for the rendered masks of refined views."""
     recording: Path | None = None
@@ -311,7 +311,7 @@ class Dataset:
         if camera.name in frame.masks or camera.name in frame.part_labels:
             return "painted"
         wanted = self.masks == "refined" or (self.masks == "auto" and frame.verdict == "good")
-        return "refined" if wanted and self.load_networks is not None else "rendered"
+        return "refined" if wanted and self.refine is not None else "rendered"
 
     def views(self, progress: ExportProgress) -> Iterator[View]:
         """Yield the labelled views of all frames and cameras, one `progress` step each.
@@ -329,27 +329,11 @@ class Dataset:
                 link_ids = painted_links(painted, link_ids, rendered, self.link_classes, where)
             source = self.mask_source(frame, camera)
             if source == "refined":
-                link_ids = labelled(self._refined(frame, camera, rendered >= 0), rendered, where)
+                assert self.refine is not None
+                link_ids = labelled(self.refine(self, frame, camera, rendered >= 0), rendered, where)
                 if self.rendered_folder is not None:
                     write_bytes(self.rendered_folder / f"{name}.png", mask_png(rendered >= 0))
             yield View(number, frame, camera, name, link_ids, source)
-
-    @cached_property
-    def _predictor(self) -> "NetworkPredictor":
-        from ..optimization import NetworkPredictor  # noqa: PLC0415
-
-        assert self.load_networks is not None
-        return NetworkPredictor(self.load_networks())
-
-    def _refined(
-        self, frame: ExportFrame, camera: Camera, rendered: Bool[ndarray, "height width"]
-    ) -> Bool[ndarray, "height width"]:
-        from ..optimization import Backgrounds, MaskRefiner  # noqa: PLC0415
-
-        refiner = MaskRefiner(self._predictor, Backgrounds.of(self.sequence, (camera.name,), self.domain))
-        recorded = self.sequence.frame(frame.index, self.domain, [camera.name])
-        masks = refiner.refine(self.scene, recorded, self.state(frame), {camera.name: rendered}, frame.ignored)
-        return masks[camera.name]
 
     def label_image(self, view: View, parts: Parts | None = None) -> UInt[np.ndarray, "height width"]:
         """Label image: category id per pixel, 0 for background; 8 bits if sufficient for all categories, else 16."""
@@ -531,3 +515,25 @@ def painted_links(
         else:
             found[pixels] = np.flatnonzero(classes == number)[0]
     return found
+
+
+Refine = Callable[[Dataset, ExportFrame, Camera, Bool[np.ndarray, "height width"]], Bool[np.ndarray, "height width"]]
+"""Function that refines the rendered mask of a view."""
+
+
+def network_refiner(load: "Callable[[], FeatureExtractor]") -> Refine:
+    """Refinement by the networks, which are loaded when the first mask is refined."""
+    loaded = cache(load)
+
+    def refine(
+        dataset: Dataset, frame: ExportFrame, camera: Camera, rendered: Bool[np.ndarray, "height width"]
+    ) -> Bool[np.ndarray, "height width"]:
+        from ..optimization import Backgrounds, MaskRefiner, NetworkPredictor  # noqa: PLC0415
+
+        backgrounds = Backgrounds.of(dataset.sequence, (camera.name,), dataset.domain)
+        recorded = dataset.sequence.frame(frame.index, dataset.domain, [camera.name])
+        refiner = MaskRefiner(NetworkPredictor(loaded()), backgrounds)
+        masks = refiner.refine(dataset.scene, recorded, dataset.state(frame), {camera.name: rendered}, frame.ignored)
+        return masks[camera.name]
+
+    return refine

@@ -221,9 +221,7 @@ def export(
             chosen.write(dataset, path, progress or ExportProgress())
         return Path(output)
     with published(output, overwrite=overwrite) as path:
-        dataset = replace(
-            dataset, load_networks=dataset.load_networks if chosen.refines else None, rendered_folder=path / "rendered"
-        )
+        dataset = replace(dataset, refine=dataset.refine if chosen.refines else None, rendered_folder=path / "rendered")
         chosen.write(dataset, path, progress or ExportProgress())
         write_text(path / MARKER, _summary(dataset, name))
     return Path(output)

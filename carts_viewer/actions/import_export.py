@@ -13,8 +13,9 @@ from pathlib import Path
 from typing import Generic, TypeVar
 
 from carts_core.errors import CartsError, SettingsError
-from carts_core.export import FORMATS, Dataset, ExportProgress, Parts, export, mask_png, project_frame
+from carts_core.export import FORMATS, Dataset, ExportFrame, ExportProgress, Parts, export, mask_png, project_frame
 from carts_core.files import OutputPath, file_name, output_path
+from carts_core.model.camera import Camera
 from carts_core.project import ProjectState, ReviewState, frames_in, import_annotations
 from carts_core.project.state import calibrated_scene
 from carts_core.project.values import UNREVIEWED
@@ -23,7 +24,9 @@ from carts_core.wording import shown
 from carts_viewer.actions import intents
 from carts_viewer.actions.context import Context, Handler
 from carts_viewer.jobs.optimizers import OptimizerFactory
+from carts_viewer.jobs.solver import RefineTask
 from carts_viewer.picture.layers import Layer
+from carts_viewer.picture.strokes import Mask
 from carts_viewer.state import ExportState
 
 FRAME_CHOICES = {
@@ -48,6 +51,8 @@ _STEMS = {
     "dvrk-suj": "suj",
 }
 """File names for formats whose name is not descriptive."""
+_REPLY_INTERVAL = 0.005
+"""Interval between checks for a reply of the solver [s]."""
 _TIME_SLICE = 0.05
 """Time slice of an export [s]; longer steps are completed."""
 
@@ -144,6 +149,15 @@ class ExportingHandler(Handler):
         renderer, sequence, images = self._context.renderer, session.sequence, "copied" if intent.images else "named"
 
         def make(progress: ExportProgress) -> Dataset:
+            def refine(dataset: Dataset, frame: ExportFrame, camera: Camera, rendered: Mask) -> Mask:
+                masks, scene = {camera.name: rendered}, tuple(one.name for one in dataset.scene.cameras)
+                place = dataset.sequence, frame.index, dataset.domain, scene, dataset.state(frame)
+                reply = self._optimizers.refine(RefineTask(*place, masks, frame.ignored))
+                while not reply.done:
+                    reply.wait(_REPLY_INTERVAL)
+                    progress.pause()
+                return reply.result()[camera.name]
+
             indices = ExportProgress(cancelled=progress.cancelled).track(chosen)
             frames = tuple(project_frame(sequence, view, index, cameras, renderer.mask) for index in indices)
             return Dataset(
@@ -154,7 +168,7 @@ class ExportingHandler(Handler):
                 parts=intent.parts,
                 images=images,
                 masks=intent.masks,
-                load_networks=self._optimizers.extractor,
+                refine=refine,
             )
 
         return make, len(chosen)

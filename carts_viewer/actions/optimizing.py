@@ -67,6 +67,11 @@ class OptimizingHandler(Handler):
         """Whether a run is in progress or paused."""
         return self._run is not None
 
+    @property
+    def computing(self) -> bool:
+        """Whether the next iterate of the run is due, so that its draft is unfinished."""
+        return self._run is not None and self._due(self._run)
+
     def wait_time(self) -> float | None:
         """Time until the next iteration or reply is due [s]; None if there is none."""
         run, waits = self._run, []
@@ -142,7 +147,8 @@ class OptimizingHandler(Handler):
         def task() -> RefineTask:
             regions = {camera: region.region() for camera, region in ignored.items() if region is not None}
             rendered = {camera: context.renderer.mask(pose, camera) for camera in cameras}
-            return RefineTask(session.sequence, state.index, state.domain, pose, rendered, regions)
+            every = tuple(camera.name for camera in session.scene.cameras)
+            return RefineTask(session.sequence, state.index, state.domain, every, pose, rendered, regions)
 
         self._request(
             (frame, pose, *ignored.items()),
@@ -351,7 +357,8 @@ class OptimizingHandler(Handler):
         check, editor = self._check, self._session.editor
         if check is None or not check.reply.done:
             return
-        self._check, index, verdict = None, check.frame.index, check.reply.result().verdict
+        self._check = None
+        index, verdict = check.frame.index, check.reply.result().verdict
         if not self._session.pose(check.frame).equals(check.pose):
             return
         if editor.project.writable:

@@ -75,6 +75,8 @@ class RefineTask:
     sequence: Recording
     index: int
     domain: str
+    cameras: tuple[str, ...]
+    """Cameras of the state."""
     state: SceneState
     rendered: Masks
     ignore: Masks
@@ -312,7 +314,7 @@ class Solver:
     def refine(self, task: RefineTask) -> Masks:
         """Refined masks of the cameras in `rendered`."""
         predictor = optimization.NetworkPredictor(self.extractor())
-        scene, masks = scene_at(task.sequence.scene, task.state), {}
+        scene, masks = scene_at(task.sequence.scene.with_cameras(task.cameras), task.state), {}
         frame = task.sequence.frame(task.index, task.domain, list(task.rendered))
         for camera, rendered in task.rendered.items():
             backgrounds = optimization.Backgrounds.of(task.sequence, (camera,), task.domain)

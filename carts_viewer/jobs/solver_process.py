@@ -74,9 +74,9 @@ class Reply(Generic[T]):
         if self.done:
             self._call_back()
 
-    def wait(self) -> None:
-        """Wait until the result or an error is known."""
-        self._done.wait()
+    def wait(self, timeout: float | None = None) -> None:
+        """Wait until the result or an error is known, at most `timeout` [s]."""
+        self._done.wait(timeout)
 
     def result(self) -> T:
         """Wait for the result.

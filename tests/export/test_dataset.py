@@ -22,6 +22,7 @@ from carts_core.export import (
     corrected_frames,
     export,
     measured_frames,
+    network_refiner,
 )
 from carts_core.export.dataset import labelled
 from carts_core.files import file_name, unique_file_names
@@ -156,7 +157,7 @@ def test_masks_of_good_frames_are_refined_with_the_rendered_ones_beside_them(
     frames = (replace(first, verdict="good"), replace(second, verdict="doubtful"), replace(third, verdict="good"))
     frames = (*frames[:2], replace(frames[2], masks=given))
     rendered = Dataset(sequence, frames, scene, "regular")
-    dataset = replace(rendered, masks="auto", load_networks=FeatureExtractor.load)
+    dataset = replace(rendered, masks="auto", refine=network_refiner(FeatureExtractor.load))
     folders = [export(each, "masks", tmp_path / str(number)) for number, each in enumerate((rendered, dataset))]
     sources = [view["mask"] for view in json.loads((folders[1] / "export.json").read_text())["views"]]
     assert sources == ["refined", "rendered", "painted"]

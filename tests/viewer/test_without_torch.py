@@ -1,4 +1,4 @@
-"""Overlay, edits, review and exports of the viewer require no PyTorch."""
+"""The page requires no PyTorch: overlay, edits, review, exports, and results of the solver process."""
 
 import json
 import subprocess
@@ -32,18 +32,23 @@ with ViewerApp.open(Path(sys.argv[1]), project=Path(sys.argv[2]), port=0) as app
         app.wait_until_shown()
     for name in ("masks", "coco-keypoints", "bop", "video"):
         app.queue.put(intents.Export(name, "Accepted", masks="rendered"))
+    app.wait_until_shown()
+    app.queue.put(intents.Run())
+    state = app.wait_until_shown()
+    assert state.verdict is not None and state.run.curves.comparable
+    app.queue.put(intents.SetReview(ReviewState.ACCEPTED))
+    app.queue.put(intents.ShowLayer(Layer.REFINED))
+    app.queue.put(intents.Export("masks", "Accepted", masks="refined"))
     state = app.wait_until_shown()
     steps = [step.name for step in state.project.steps]
     print(json.dumps([state.error, steps, [[job.state.value, job.text] for job in state.jobs]]))
 """
 
 
-def test_the_viewer_shows_edits_reviews_and_exports_without_torch(
-    tiny_sequence: Callable[..., Path], tmp_path: Path
-) -> None:
+def test_the_page_needs_no_torch(tiny_sequence: Callable[..., Path], tmp_path: Path) -> None:
     arguments = [str(tiny_sequence()), str(tmp_path / "page.carts")]
     said = subprocess.check_output([sys.executable, "-c", _USE, *arguments], text=True, timeout=120)
     error, steps, jobs = json.loads(said.splitlines()[-1])
     assert error is None
-    assert len(steps) == 3
-    assert [state for state, _ in jobs] == ["done"] * 4
+    assert len(steps) == 5
+    assert [state for state, _ in jobs] == ["done"] * 5
