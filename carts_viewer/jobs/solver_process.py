@@ -290,16 +290,16 @@ class SolverProcess:
 
     def _serve(self) -> None:
         """Start the process whenever it is wanted, and receive its results."""
-        failures = 0
+        failures, urgent = 0, False
         while True:
             self._wanted.wait()
             here, there = Pipe()
             with there, self._changing:
-                process = self._process = None if self._closed else _started(there)
+                process = self._process = None if self._closed else _started(there, urgent)
                 self.pid = None if process is None else process.pid
             ready = process is not None and self._receive(here)
             status = 0 if process is None else process.wait()
-            failures = 0 if ready else failures + 1
+            failures, urgent = 0 if ready else failures + 1, True
             with self._changing:
                 self._process = self._pipe = self.pid = None
                 lost, self._waiting = list(self._waiting.values()), {}
@@ -352,13 +352,13 @@ class SolverProcess:
                 listener.solver_replied()
 
 
-def _started(pipe: Connection) -> "subprocess.Popen[bytes] | None":
-    """The process; None if the system cannot start it."""
+def _started(pipe: Connection, urgent: bool) -> "subprocess.Popen[bytes] | None":
+    """The process, with low priority after the first request if `urgent`; None if the system cannot start it."""
     paths = [os.path.abspath(path) for path in sys.path]
-    start = "import sys; sys.path[:] = sys.argv[3:]; from carts_viewer.jobs.solver_process import serve; serve()"
+    start = "import sys; sys.path[:] = sys.argv[4:]; from carts_viewer.jobs.solver_process import serve; serve()"
     try:
         return subprocess.Popen(
-            [sys.executable, "-P", "-c", start, str(os.getpid()), str(pipe.fileno()), *paths],
+            [sys.executable, "-P", "-c", start, str(os.getpid()), str(pipe.fileno()), str(int(urgent)), *paths],
             stdin=subprocess.DEVNULL,
             pass_fds=[pipe.fileno()],
         )
@@ -432,11 +432,12 @@ ForkingPickler.register(Sequence, _by_path)
 
 
 def serve() -> None:
-    """Entry point of the process; its arguments are the id of the page's process, and a pipe."""
-    parent, descriptor = (int(text) for text in sys.argv[1:3])
+    """Entry point of the process; its arguments are the id of the page's process, a pipe, and whether it is urgent."""
+    parent, descriptor, urgent = (int(text) for text in sys.argv[1:4])
     end_with_parent(parent, signal.SIGKILL)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is handled by the page's process.
-    os.nice(_NICENESS)
+    if not urgent:
+        os.nice(_NICENESS)
     pipe = Connection(descriptor)
     requests = SimpleQueue[bytes]()
     threading.Thread(target=_read, args=(pipe, requests), daemon=True).start()
@@ -457,6 +458,9 @@ def serve() -> None:
         except Exception as failed:
             error = _described(failed)
         pipe.send((int.from_bytes(packed[:_LENGTH], "little"), value, error))
+        if urgent:
+            os.nice(_NICENESS)
+            urgent = 0
 
 
 def _read(pipe: Connection, requests: SimpleQueue[bytes]) -> None:
