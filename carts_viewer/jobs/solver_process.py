@@ -30,7 +30,7 @@ from carts_viewer.jobs.solver import NetworkChoice, Solver
 
 T = TypeVar("T")
 _log = logging.getLogger(__name__)
-_NICENESS = 10
+_NICENESS = 5
 """Increment of the niceness of the process, so that the page takes precedence."""
 _LENGTH = 8
 """Length of the number before each request [bytes]."""
