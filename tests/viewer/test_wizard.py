@@ -322,7 +322,7 @@ def test_a_calibration_that_moves_within_the_errors_of_points_and_joints_says_wh
     report = ended(site, "The result follows the images").report
     assert report is not None and not report.objection and report.rms_limit is not None
     assert f"within the {report.rms_limit:.1f} px RMS" in site.document.content
-    (before, after) = (np.sqrt(np.mean(np.square(each))) for each in (report.before, report.after))
+    before, after = (np.sqrt(np.mean(np.square(np.array(each, float)))) for each in (report.before, report.after))
     assert before + 0.1 < after < report.rms_limit
 
 
