@@ -11,9 +11,9 @@ from carts_core.model.camera import Camera
 from carts_core.model.parts import part_classes
 from carts_core.recording import Sequence
 from carts_viewer.actions import intents
+from carts_viewer.actions.shortcuts import key_sheet
 from carts_viewer.jobs.optimizers import NetworkOptions, OptimizerFactory
 from carts_viewer.jobs.solver_process import Requests, SolverProcess, SolverStopped
-from carts_viewer.panels.help import key_groups
 from carts_viewer.panels.layout import choose_theme
 from carts_viewer.panels.timeline import Thumbnails
 from carts_viewer.picture.overlay import OverlayRenderer
@@ -36,15 +36,26 @@ _EVENTS = (
     | events.Dragged
     | Painted
     | intents.AcceptAndNext
+    | intents.ChooseKeypoint
+    | intents.ClearLayer
     | intents.Drawn
     | intents.MoveFrame
+    | intents.NextObject
     | intents.Peek
     | intents.Released
+    | intents.RemovePins
     | intents.ReviewFrames
+    | intents.SetDiameter
+    | intents.SetKeys
+    | intents.SetPaintClass
     | intents.SetRange
     | intents.SetReview
+    | intents.SetTarget
+    | intents.SetTool
     | intents.ShowCamera
     | intents.ShowFrame
+    | intents.ShowKeypoints
+    | intents.ShowLoupe
 )
 """Events that the page's scripts send; handlers check the values of intents."""
 
@@ -189,7 +200,7 @@ class ViewerApp:
         renderer.arm_ids(self.state.pose.scene, self.state.camera)
         self.page = page or Page(host=host, port=port, title=f"{sequence.name} · CaRTS", proxy=proxy)
         self.url = self.page.url
-        self.page.key_groups = key_groups()
+        self.page.keys = key_sheet()
         self.page.project = sequence.name
         self._thumbnails = Thumbnails(sequence)
         self.page.thumbnail = self._thumbnails.answer

@@ -18,6 +18,7 @@ from carts_viewer.actions.painting import PaintingHandler
 from carts_viewer.actions.posing import DraggingHandler, PosingHandler
 from carts_viewer.actions.reviewing import AnnotatingHandler, FilterHandler
 from carts_viewer.actions.sequence import KeyframeHandler, PropagatingHandler
+from carts_viewer.actions.shortcuts import checked_keys
 from carts_viewer.editing import MAX_NAME_LENGTH, Person
 from carts_viewer.jobs.optimizers import OptimizerFactory
 from carts_viewer.picture.overlay import OverlayRenderer
@@ -208,6 +209,9 @@ class Controller(Handler):
         chosen = " ".join(intent.name.split())[:MAX_NAME_LENGTH]
         self._editor.person.chosen = chosen
         self._context.change(name=chosen)
+
+    def _on_SetKeys(self, intent: intents.SetKeys) -> None:
+        self._context.change(keys=checked_keys(intent.keys))
 
     def _on_Refresh(self, intent: intents.Refresh) -> None:
         self._context.change()

@@ -454,6 +454,10 @@ class ViewState:
     """The joint that keys move, as arm and index of the joint; None for the first."""
     keypoints: KeypointState = field(default_factory=KeypointState)
     brush: Brush = field(default_factory=Brush)
+    loupe: bool = False
+    """Whether the loupe is shown."""
+    keys: Mapping[str, str] = field(default_factory=dict)
+    """Keys that the user has changed, by action (`carts_viewer.actions.shortcuts`)."""
     maps: Maps | None = None
     """Maps of the shown pose, frame and domain; None until needed."""
     refined: RefinedMasks | None = None

@@ -22,7 +22,7 @@ from carts_core.resources import sample_sequence
 from carts_viewer.actions import intents
 from carts_viewer.app import ViewerApp
 from carts_viewer.picture.overlay import labelled_keypoints
-from carts_viewer.picture.strokes import Stroke, Target
+from carts_viewer.picture.strokes import Stroke, Target, Tool
 from carts_viewer.state import Phase
 
 IMAGES = Path(__file__).parent / "images"
@@ -100,18 +100,18 @@ def take(work: Photographer) -> None:
     work.run()
     work.picture("run")
     work.do(intents.ShowFrame(1), intents.Perturb(5.0, 0))
-    work.tab("Review")
+    work.do(intents.SetTool(Tool.KEYPOINT))
     work.click_keypoints("psm1 jaw 1 tip", "psm1 wrist pitch joint")
     work.picture("keypoints")
     work.click_keypoints("psm2 jaw 1 tip", "psm2 wrist pitch joint")
     work.run()
     work.do(intents.ShowKeypoints(False))
-    work.tab("Paint")
+    work.do(intents.SetTool(Tool.BRUSH))
     work.paint(Target.MASK, (150, 90), (200, 100), (260, 96))
     work.paint(Target.IGNORE, (430, 330), (520, 320), (560, 400), (450, 430), polygon=True)
     work.picture("paint")
-    work.tab("Paint")
     work.do(
+        intents.SetTool(Tool.SELECT),
         intents.Undo(),
         intents.Undo(),
         intents.ShowFrame(0),

@@ -1,4 +1,4 @@
-// Dragging a link of an arm with Ctrl (or Cmd). Every message contains the start and the current position of the pointer, so
+// Dragging a link of an arm with the tool Drag link, or with Ctrl (or Cmd). Every message contains the start and the current position of the pointer, so
 // that lost messages do not matter. Needs page.js.
 (() => {
   "use strict";
@@ -16,13 +16,11 @@
 
   setInterval(send, 2000); // keep the gesture alive while the pointer rests with its button down
 
-  function cursor(name) {
-    const canvas = window.__viserMutable?.canvas;
-    if (canvas) canvas.style.cursor = name;
-  }
+  const cursor = (name) => window.carts.setCursor(name);
+  const wanted = (event) => event.ctrlKey || event.metaKey || (window.carts?.brush().tool === "drag link" && !event.shiftKey);
 
   window.addEventListener("pointerdown", (event) => {
-    if (event.button !== 0 || !(event.ctrlKey || event.metaKey) || !isPicture(event)) return;
+    if (event.button !== 0 || !wanted(event) || !isPicture(event)) return;
     const at = window.carts.imageAt(event);
     if (!at) return;
     held = { gesture: Date.now(), camera: at[0], start: [at[1], at[2]], end: [at[1], at[2]], waiting: false };

@@ -1,5 +1,5 @@
 // The loupe: magnified pixels around the pointer with coordinates and colour. It reads the page's textures and sends no
-// requests to the server. Needs page.js.
+// requests to the server. Needs page.js and keys.js.
 (() => {
   "use strict";
 
@@ -9,7 +9,7 @@
   const HELD = 350; // a key pressed for longer is held, and its release hides the loupe [ms]
   const sources = new Map(); // name of a node -> { uuid, context } of its texture
   let box = null;
-  let pinned = false; // stays until the key or the button is pressed again
+  let pinned = false; // selected in the palette
   let pressedAt = null;
   let pointer = null;
 
@@ -82,31 +82,19 @@
     box.style.transform = `translate(${Math.round(x)}px, ${Math.round(y)}px)`;
   }
 
-  function toggle(on = !pinned) {
-    pinned = on;
-    document.querySelector(".carts-bar [data-do=loupe]")?.setAttribute("aria-pressed", String(pinned));
-    draw();
-  }
-
   window.addEventListener("pointermove", (event) => {
     // A pointer over a panel or a bar is not in an image.
     const over = event.target instanceof Element && event.target.matches("canvas");
     pointer = over ? { clientX: event.clientX, clientY: event.clientY } : null;
   }, { capture: true });
-  window.addEventListener("keydown", (event) => {
-    const typing = event.target instanceof Element && event.target.closest("input:not([readonly]), textarea");
-    if (event.key !== "," || typing || event.ctrlKey || event.metaKey) return;
-    event.preventDefault();
-    if (!event.repeat) pressedAt = performance.now();
-  }, { capture: true });
-  window.addEventListener("keyup", (event) => {
-    if (event.key !== "," || pressedAt === null) return;
-    const held = performance.now() - pressedAt > HELD;
-    pressedAt = null;
-    toggle(held ? false : !pinned);
-  }, { capture: true });
-  window.addEventListener("blur", () => { pressedAt = null; });
-  Object.assign(window.carts, { toggleLoupe: () => toggle() });
+  window.carts.onKey("loupe",
+    () => { pressedAt = performance.now(); },
+    () => {
+      const on = performance.now() - pressedAt > HELD ? false : !pinned;
+      pressedAt = null;
+      if (on !== pinned) window.carts.report("ShowLoupe", { on });
+    });
+  Object.assign(window.carts, { setLoupe(on) { pinned = on; draw(); } });
   (function everyFrame() {
     requestAnimationFrame(everyFrame);
     if (window.carts) draw();

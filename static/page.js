@@ -42,8 +42,8 @@
     if (!active || !others.length || !mutable.canvas) return;
     const count = shown.cameras.length;
     const places = shown.cameras.map((camera) => camera.index).sort((one, other) => one - other);
-    const [above, below] = covered();
-    const room = [mutable.canvas.clientWidth, mutable.canvas.clientHeight * (1 - above - below)];
+    const [above, below, beside] = covered();
+    const room = [mutable.canvas.clientWidth * (1 - beside), mutable.canvas.clientHeight * (1 - above - below)];
     const scale = (columns) =>
       Math.min(room[0] / (columns * active.width), room[1] / (Math.ceil(count / columns) * active.height));
     const counts = Array.from({ length: count }, (_, number) => number + 1);
@@ -102,23 +102,30 @@
     const controls = document.querySelector(CONTROLS);
     if (controls) return innerHeight - controls.getBoundingClientRect().top;
     const strip = document.querySelector(".carts-strip");
-    return strip ? strip.offsetHeight + (parseFloat(getComputedStyle(strip).bottom) || 0) : 0;
+    const tools = palette();
+    const height = tools && !isColumn(tools) ? tools.offsetHeight + 8 : 0;
+    return strip ? strip.offsetHeight + height + (parseFloat(getComputedStyle(strip).bottom) || 0) : 0;
   }
 
-  /** Shares of the canvas that this page's bars cover at its upper and lower end. */
+  const palette = () => document.querySelector(".carts-tools");
+  const isColumn = (tools) => tools.offsetHeight > tools.offsetWidth;
+
+  /** Shares of the canvas that this page's bars and tools cover at its upper, lower and left end. */
   function covered() {
-    const height = viser()?.canvas?.clientHeight || 1;
-    return [46 / height, bottomBars() / height];
+    const { clientHeight: height, clientWidth: width } = viser()?.canvas ?? {};
+    const tools = palette();
+    const beside = tools && isColumn(tools) ? tools.offsetLeft + tools.offsetWidth + 4 : 0;
+    return [46 / (height || 1), bottomBars() / (height || 1), beside / (width || 1)];
   }
 
   /** The part of the plane at distance 1 that the canvas shows in the endoscope view. */
   function visibleRectangle(image, aspect) {
-    const [above, below] = covered();
+    const [above, below, beside] = covered();
     const free = Math.max(1 - above - below, 0.2);
-    const height = (Math.max(image.height / free, image.width / aspect) * MARGIN) / view.zoom;
+    const height = (Math.max(image.height / free, image.width / aspect / (1 - beside)) * MARGIN) / view.zoom;
     const width = height * aspect;
     return {
-      left: image.left + view.x * image.width - width / 2,
+      left: image.left + view.x * image.width - (width * (1 + beside)) / 2,
       top: image.top + view.y * image.height - height * (above + free / 2),
       width, height,
     };
@@ -154,10 +161,10 @@
   /** Keep the image in view: centred along an axis on which it fits, without a gap along the other. */
   function clampPan(image, aspect) {
     const part = visibleRectangle(image, aspect);
-    const [above, below] = covered();
+    const [above, below, beside] = covered();
     const clamp = (centre, share) =>
       share >= 1 ? 0.5 : Math.min(Math.max(centre, share / 2 - 0.01), 1.01 - share / 2);
-    view.x = clamp(view.x, part.width / image.width);
+    view.x = clamp(view.x, (part.width * (1 - beside)) / image.width);
     view.y = clamp(view.y, (part.height * (1 - above - below)) / image.height);
   }
 
@@ -251,25 +258,25 @@
     bar.setAttribute("role", "toolbar");
     bar.setAttribute("aria-label", "View");
     bar.innerHTML = `
-      <button data-do="endoscope" title="Look through the endoscope (V)" aria-label="Endoscope view">Endoscope</button>
-      <button data-do="scene" title="Orbit around the arms and the cameras (V)" aria-label="3D view">3D</button>
+      <button data-do="endoscope" data-key="view" title="Look through the endoscope" aria-label="Endoscope view">Endoscope</button>
+      <button data-do="scene" data-key="view" title="Orbit around the arms and the cameras" aria-label="3D view">3D</button>
       <span class="carts-zoom">
         <button data-do="out" title="Zoom out" aria-label="Zoom out" data-icon="minus"></button><output aria-label="Zoom"></output>
         <button data-do="in" title="Zoom in (wheel over the image)" aria-label="Zoom in" data-icon="plus"></button>
       </span>
       <button data-do="fit" title="Show the whole image (double click)" aria-label="Fit" data-icon="maximize"></button>
-      <button data-do="loupe" title="Loupe: pixels, coordinates and colour (,)" aria-label="Loupe" data-icon="zoom-in-area"></button>
       <span class="carts-layers">
         <button data-do="ghost" title="Show the measured arms, semi-transparent">Measured</button>
         <button data-do="grid" title="Show the grid: 1 cm, with strong lines every 5 cm">Grid</button>
       </span>
       <button data-do="theme" title="Light or dark" aria-label="Light or dark" data-icon="contrast"></button>
-      <button data-do="help" title="Help and keys (?)" aria-label="Keys" data-icon="help"></button>`;
+      <button data-do="help" data-key="sheet" title="Help and keys" aria-label="Keys" data-icon="help"></button>`;
     window.cartsIcons(bar);
+    window.carts.nameKeys(bar);
     const actions = {
       endoscope: showEndoscope, scene: showScene, fit: () => (view.endoscope ? showEndoscope() : showScene()),
       grid: () => toggle("grid"), ghost: () => toggle("ghost"),
-      loupe: () => window.carts.toggleLoupe(), theme: () => window.carts.toggleTheme(), help: () => window.carts.showSheet(),
+      theme: () => window.carts.toggleTheme(), help: () => window.carts.showSheet(),
       in: () => zoomAt(1.25, 0.5, 0.5), out: () => zoomAt(0.8, 0.5, 0.5),
     };
     for (const button of bar.querySelectorAll("button")) {
@@ -313,11 +320,11 @@
     const image = imageRectangle();
     const camera = viser()?.camera;
     if (!image || !camera || !view.endoscope) return;
-    const [above, below] = covered();
+    const [above, below, beside] = covered();
     const before = visibleRectangle(image, camera.aspect);
     view.zoom = Math.min(Math.max(view.zoom * factor, 1), 40);
     const after = visibleRectangle(image, camera.aspect);
-    view.x += ((u - 0.5) * (before.width - after.width)) / image.width;
+    view.x += ((u - (1 + beside) / 2) * (before.width - after.width)) / image.width;
     view.y += ((v - above - (1 - above - below) / 2) * (before.height - after.height)) / image.height;
     refresh();
   }
@@ -354,9 +361,10 @@
     }, { capture: true, passive: false });
     window.addEventListener("pointerdown", (event) => {
       if (!inPicture(event) || (painting(event) && event.button === 0)) return;
-      if (event.button === 0 && (event.ctrlKey || event.metaKey)) return; // drag.js drags a link
+      const { tool } = window.carts.brush();
+      if (event.button === 0 && (event.ctrlKey || event.metaKey || (tool === "drag link" && !event.shiftKey))) return; // drag.js drags a link
       const at = imageAt(event);
-      pointing = event.shiftKey && event.button === 0 ? (at?.[0] ?? shown.active) : null;
+      pointing = (event.shiftKey || tool === "keypoint") && event.button === 0 ? (at?.[0] ?? shown.active) : null;
       pressed = pointing === null && event.button === 0 && at ? [at[0], event.clientX, event.clientY] : null;
       if (pointing !== null) point(event);
       else last = share(event);
@@ -457,7 +465,7 @@
   window.addEventListener("pointerdown", () => { presses += 1; }, { capture: true });
   window.addEventListener("click", (event) => {
     const used = event.target instanceof Element && event.target.closest("[role=option], button, input[type=checkbox]");
-    if (!used || event.detail === 0 || used.closest("[role=dialog]")) return;
+    if (!used || event.detail === 0 || used.closest("dialog, [role=dialog]")) return;
     const list = used.matches("[role=option]"); // its field keeps the focus, though typing has ended
     const end = performance.now() + (list ? 500 : 60); // a list takes the focus back when it closes, possibly late
     const press = presses;

@@ -10,7 +10,7 @@
   const SHOWN_BY_NOW = 250; // [ms] after the server's acknowledgement, if no new overlay is detected
   const FORGOTTEN = 60000; // [ms] after which an unacknowledged stroke is dropped
 
-  let brush = { tool: "off" }; // state of the tool from the server
+  let brush = { tool: "select" }; // state of the tool from the server
   let canvas = null;
   let drawing = null; // the current stroke, or the open polygon
   let pending = []; // sent strokes that no overlay shows yet
@@ -20,7 +20,7 @@
   let drawn = "";
   let dirty = true;
 
-  const active = () => brush.tool !== "off" && window.carts?.view.endoscope;
+  const active = () => ["brush", "polygon", "eraser", "prompt"].includes(brush.tool) && window.carts?.view.endoscope;
   const place = () => window.carts?.imageOnScreen();
 
   function inImage(event) {
@@ -134,21 +134,13 @@
     const typing = event.target instanceof Element && event.target.closest("input, textarea, [role=dialog]");
     if (event.key === "Shift") { shift = event.type === "keydown"; dirty = true; }
     if (event.type !== "keydown" || typing || event.ctrlKey || event.metaKey) return;
-    const key = event.key.toLowerCase();
-    if (drawing && ["escape", "enter", "backspace"].includes(key)) {
-      if (key === "escape") drop();
-      else if (key === "enter" && drawing.polygon) finish();
-      else if (key === "backspace" && drawing.polygon && drawing.points.pop() && !drawing.points.length) drop();
-      dirty = true;
-    } else if (!window.cartsConfiguration.keys.includes(key) || (key === "escape" && !active())) {
-      return;
-    } else if (key === "enter" && !(active() && brush.tool === "prompt")) {
-      return; // Enter presses the focused button
-    } else {
-      window.carts.report("Pressed", { key });
-    }
+    if (!drawing || !["Escape", "Enter", "Backspace"].includes(event.key)) return;
+    if (event.key === "Escape") drop();
+    else if (event.key === "Enter" && drawing.polygon) finish();
+    else if (event.key === "Backspace" && drawing.polygon && drawing.points.pop() && !drawing.points.length) drop();
+    dirty = true;
     event.preventDefault();
-    event.stopPropagation();
+    event.stopImmediatePropagation(); // keys.js does not see these keys
   }
 
   // ---- Drawing -----------------------------------------------------------------------------------------------------
@@ -264,7 +256,6 @@
   /** The canvas receives pointer events if a tool is selected; otherwise the pointer pans the image. */
   function takePointer(on) {
     canvas.style.pointerEvents = on ? "auto" : "none";
-    canvas.style.cursor = ["polygon", "prompt"].includes(brush.tool) ? "crosshair" : "none";
   }
 
   function everyFrame() {
@@ -302,6 +293,7 @@
       brush = message;
       dirty = true;
       if (canvas) takePointer(active());
+      document.dispatchEvent(new CustomEvent("carts-brush"));
     },
     /** The server has applied all strokes up to this one, and sent an overlay that shows them. */
     painted(number) {

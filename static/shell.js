@@ -1,5 +1,5 @@
-// State and controls of one browser tab: theme, address and link, the key sheet, and the review buttons of a small
-// screen. Needs page.js.
+// State and controls of one browser tab: theme, address and link, and the review buttons of a small screen. Needs page.js
+// and keys.js.
 (() => {
   "use strict";
 
@@ -104,9 +104,12 @@
     window.carts.report("Pressed", { key: "dismiss" });
   }
 
-  window.addEventListener("keydown", (event) => {
-    if (event.key === "Escape" && problem && !problem.hidden && !document.querySelector("dialog[open]")) dismiss();
-  });
+  /** Dismiss the shown error; returns whether there was one. */
+  function closeError() {
+    if (!problem || problem.hidden) return false;
+    dismiss();
+    return true;
+  }
 
   async function copyLink() {
     if (!latest) return;
@@ -163,43 +166,6 @@
     away = !on;
   }, 300);
 
-  // ---- The key sheet ---------------------------------------------------------------------------------------------------
-
-  let sheet = null;
-
-  function showSheet(open) {
-    if (!sheet) {
-      sheet = document.createElement("dialog");
-      sheet.className = "carts-sheet";
-      sheet.setAttribute("aria-label", "Keys");
-      const groups = window.cartsConfiguration.keyGroups ?? [];
-      const row = ([key, text]) => make("tr", {}, make("td", {}, make("kbd", {}, key)), make("td", {}, text));
-      const table = ([name, rows]) => make("section", {}, make("h3", {}, name), make("table", {}, ...rows.map(row)));
-      sheet.append(
-        make("header", {}, make("b", {}, "Keys"), make("span", {}, "Close with ? or Escape."),
-          make("button", { "data-do": "guide" }, "Guide"), make("button", { "data-do": "tour" }, "Take the tour"), make("button", { "aria-label": "Close" }, "×")),
-        make("div", { class: "carts-columns" }, ...groups.map(table)));
-      sheet.querySelector("[aria-label=Close]").addEventListener("click", () => showSheet(false));
-      sheet.querySelector("[data-do=guide]").addEventListener("click", () => {
-        showSheet(false);
-        window.carts.report("Pressed", { key: "guide" });
-      });
-      sheet.querySelector("[data-do=tour]").addEventListener("click", () => { showSheet(false); window.carts.startTour(); });
-      sheet.addEventListener("click", (event) => { if (event.target === sheet) showSheet(false); });
-      document.body.append(sheet);
-    }
-    if (open && !sheet.open) sheet.showModal();
-    if (!open && sheet.open) sheet.close();
-  }
-
-  window.addEventListener("keydown", (event) => {
-    const typing = event.target instanceof Element && event.target.closest("input:not([readonly]), textarea");
-    if (event.key !== "?" || typing) return;
-    showSheet(!sheet?.open);
-    event.preventDefault();
-    event.stopPropagation();
-  }, { capture: true });
-
   // ---- Hints of buttons and labels; viser shows those of fields ------------------------------------------------------------
 
   let hints = {};
@@ -255,12 +221,7 @@
 
   let peeking = false;
   const peek = (on) => { if (on !== peeking) { peeking = on; window.carts.report("Peek", { on }); } };
-  window.addEventListener("keydown", (event) => {
-    const typing = event.target instanceof Element && event.target.closest("input:not([readonly]), textarea");
-    if (event.key === "." && !typing) { peek(true); event.preventDefault(); }
-  }, { capture: true });
-  window.addEventListener("keyup", (event) => { if (event.key === ".") peek(false); }, { capture: true });
-  window.addEventListener("blur", () => peek(false));
+  window.carts.onKey("peek", () => peek(true), () => peek(false));
 
   // ---- A small screen ---------------------------------------------------------------------------------------------------
 
@@ -302,7 +263,7 @@
   }, 300);
 
   Object.assign(window.carts, {
-    copyLink, chooseTabs, key, setError,
+    copyLink, chooseTabs, closeError, key, setError,
     setHints(message) { hints = message; showHints(); },
     /** Reload if the server was restarted after this page was loaded, since the new server has other widgets. */
     reloadIfServerChanged(name) { if (name !== window.cartsConfiguration.server) location.reload(); },
@@ -313,7 +274,6 @@
       history.replaceState(null, "", address);
       location.reload();
     },
-    showSheet: () => showSheet(true),
     toggleTheme,
   });
 })();

@@ -45,8 +45,8 @@
     strip = document.createElement("div");
     strip.className = "carts-strip";
     strip.innerHTML = `<div class="carts-strip-head">
-        <button data-do="first" aria-label="Start the range" title="Start the range at this frame; the range limits playback, solving, optimizing and exporting. Key: (" data-icon="brackets-contain-start"></button>
-        <button data-do="last" aria-label="End the range" title="End the range at this frame. Key: )" data-icon="brackets-contain-end"></button>
+        <button data-do="first" aria-label="Start the range" data-key="MarkRange False" title="Start the range at this frame; the range limits playback, solving, optimizing and exporting" data-icon="brackets-contain-start"></button>
+        <button data-do="last" aria-label="End the range" data-key="MarkRange True" title="End the range at this frame" data-icon="brackets-contain-end"></button>
         <span class="carts-range"></span>
         <button data-do="whole" title="Remove the range" aria-label="Remove the range" data-icon="x"></button>
         <select aria-label="Curve" title="Draw a curve over all frames: a joint, the loss, Dice or the probability of failure"></select>
@@ -56,6 +56,7 @@
       </div>
       <canvas role="slider" tabindex="0" aria-label="Timeline" aria-valuemin="1" aria-valuemax="1" aria-valuenow="1"></canvas>`;
     window.cartsIcons(strip);
+    window.carts.nameKeys(strip);
     tip = document.createElement("div");
     tip.className = "carts-tip";
     tip.hidden = true;
@@ -78,7 +79,7 @@
     });
     canvas.addEventListener("dblclick", () => { view = [0, frames]; dirty = true; });
     const actions = {
-      first: () => window.carts.report("Pressed", { key: "(" }), last: () => window.carts.report("Pressed", { key: ")" }),
+      first: () => window.carts.report("Pressed", { key: "MarkRange False" }), last: () => window.carts.report("Pressed", { key: "MarkRange True" }),
       whole: () => window.carts.report("SetRange", { frames: null }),
       frames: () => window.carts.openFrames(),
       lanes: () => { open = !open; localStorage.setItem("carts-lanes", open ? "open" : "closed"); dirty = true; },

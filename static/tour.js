@@ -10,17 +10,18 @@
     [".carts-verdict", "The verdict", "The reliability of the fit: good, doubtful or failed, with a reason and a remedy. " +
       "The verdict refers to the mask, and is derived from the images, not from the solver. The tab Values marks joints that the " +
       "images hardly determine."],
-    ["Run", "Run", "The optimizer moves the joints until the rendered arm and the images agree (key R). The curves below show its progress."],
-    ["Joints", "Joints", "Move joints by hand. Shift+click on the image places a keypoint of the arm."],
+    ["Run", "Run", "The optimizer moves the joints until the rendered arm and the images agree. The curves below show its progress."],
+    [".carts-tools", "Tools", "Drag links, place keypoints, paint masks and regions to ignore. Escape returns to Select."],
+    ["Joints", "Joints", "Move joints by hand, or drag links and place keypoints with the tools beside the image."],
     [".carts-strip", "The timeline", "All frames: a high bar is a bad fit in the colour of its verdict; ✓, ! and ✕ are reviews. Drag to scrub, wheel to zoom, " +
       "Shift+drag for a range."],
-    ["Review", "Review", "Accept + next (G) shows the next unreviewed frame. The tab also has keyframes, Solve between, " +
+    ["Review", "Review", "Accept + next shows the next unreviewed frame. The tab also has keyframes, Solve between, " +
       "search and history."],
     ["Jobs", "Jobs", "Long tasks run here while you continue: many frames, calibrations, exports."],
     ["Export", "Export", "Masks, keypoints and kinematics for other tools. Every edit is saved at once and can be undone."],
     [".carts-review-bar", "Review", "The verdict, and your review of the frame; accepting shows the next unreviewed frame."],
     [".carts-review-bar [data-do=controls]", "All controls", "This button shows all other controls, in tabs: fit, review, values, jobs, export, help."],
-    [".carts-bar [data-do=help]", "More", "This button, or the key ?, opens the key sheet. Every control has a hint, shown when the pointer " +
+    [".carts-bar [data-do=help]", "More", "This button lists all keys, and changes them. Every control has a hint, shown when the pointer " +
       "rests on it."],
   ];
   let steps = []; // steps whose element is visible, fewer on a small screen

@@ -105,6 +105,9 @@ class BrowsingHandler(Handler):
     def _on_ShowBeside(self, intent: intents.ShowBeside) -> None:
         self._context.change(beside=not self._context.state.beside if intent.on is None else intent.on)
 
+    def _on_ShowLoupe(self, intent: intents.ShowLoupe) -> None:
+        self._context.change(loupe=not self._context.state.loupe if intent.on is None else intent.on)
+
     def _on_SetReach(self, intent: intents.SetReach) -> None:
         self._context.change(reach=Reach(intent.reach))
 

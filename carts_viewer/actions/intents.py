@@ -54,6 +54,13 @@ class SetName(Latest):
     name: str
 
 
+class SetKeys(Latest):
+    """Set the keys that the user has changed (`carts_viewer.actions.shortcuts`)."""
+
+    keys: dict[str, str]
+    """Name of an action -> its key."""
+
+
 class DismissError(Latest):
     """Remove the error message from the page."""
 
@@ -290,8 +297,14 @@ class ToggleTool(Intent):
     tool: Tool
 
 
+class ShowLoupe(Intent):
+    """Show or hide the loupe; None toggles it."""
+
+    on: bool | None = None
+
+
 class SetTarget(Latest):
-    """Choose the painted layer; None toggles it."""
+    """Choose the painted layer; None toggles it. With a tool that does not paint, the brush is selected, too."""
 
     target: Target | None = None
 

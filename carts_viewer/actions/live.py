@@ -106,6 +106,8 @@ ALLOWED_WHILE_LIVE = (
     intents.Drawn,
     intents.Released,
     intents.SetName,
+    intents.SetKeys,
+    intents.ShowLoupe,
     intents.DismissError,
     intents.CancelJob,
 )

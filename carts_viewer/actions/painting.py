@@ -76,11 +76,13 @@ class PaintingHandler(Handler):
         self._set_brush(tool=intent.tool)
 
     def _on_ToggleTool(self, intent: intents.ToggleTool) -> None:
-        self._set_brush(tool=Tool.OFF if self._context.state.brush.tool is intent.tool else intent.tool)
+        self._set_brush(tool=Tool.SELECT if self._context.state.brush.tool is intent.tool else intent.tool)
 
     def _on_SetTarget(self, intent: intents.SetTarget) -> None:
-        other = Target.IGNORE if self._context.state.brush.target is Target.MASK else Target.MASK
-        self._set_brush(target=intent.target or other)
+        brush = self._context.state.brush
+        target = intent.target or (Target.IGNORE if brush.target is Target.MASK else Target.MASK)
+        needs_brush = target is Target.IGNORE and not brush.tool.paints
+        self._set_brush(target=target, tool=Tool.BRUSH if needs_brush else brush.tool)
 
     def _on_SetPaintClass(self, intent: intents.SetPaintClass) -> None:
         known = {0, *(one.number for one in part_classes(self._session.scene.arms))}

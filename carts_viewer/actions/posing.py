@@ -115,7 +115,7 @@ class DraggingHandler(Handler):
         self._gesture, self._frame, self._start, self._point = intent.gesture, state.index, state.pose.scene, None
         self._point = self._context.renderer.pick(state.pose.scene, intent.camera, intent.start, _GRAB_DISTANCE)
         if self._point is None:
-            raise CartsError("There is no arm under the pointer. Hold Ctrl, and drag a link in the overlay.")
+            raise CartsError("There is no arm under the pointer. Drag a link in the overlay.")
 
 
 def _within(value: float, size: int) -> float:

@@ -145,7 +145,7 @@ class OverlayPanel:
             self._opacity = gui.add_slider("Opacity %", 0, 100, 5, round(100 * state.opacity))
             self._legend = gui.add_html("")
             self._against = gui.add_dropdown(
-                "Compare with", [_NOTHING, *map(str, Against)], hint="Hold . to see only the other pose"
+                "Compare with", [_NOTHING, *map(str, Against)], hint="Hold {peek} to see only the other pose"
             )
             self._swipe = gui.add_slider("Swipe %", 0, 100, 1, 50, visible=False)
         page.on_input(self._layer, lambda value: intents.ShowLayer(Layer(value)))

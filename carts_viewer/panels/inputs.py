@@ -27,6 +27,7 @@ class PanelPage(TabPage):
         emit: queues an intent for the worker; never blocks.
         waits: whether an intent with this key is pending, so that its widget is ahead of the state.
         buttons: all buttons with their intents, for the list of actions.
+        hints: hints of controls by element id, with names of actions in place of keys.
     """
 
     def __init__(
@@ -35,6 +36,24 @@ class PanelPage(TabPage):
         super().__init__(client)
         self.emit, self.waits = emit, waits
         self.buttons: list[tuple[viser.GuiButtonHandle, Intent | Callable[[int], Intent]]] = []
+        self.hints: dict[str, str] = {}
+        self._windows: list[viser.PanelHandle] = []
+
+    def open_window(self, window: viser.PanelHandle) -> None:
+        """Show a floating panel, which `close_window` closes before those that were opened earlier."""
+        self._windows = [*(other for other in self._windows if other is not window), window]
+        window.visible = True
+
+    def close_window(self) -> bool:
+        """Close the floating panel that was opened last; returns whether there was one."""
+        shown = [window for window in self._windows if window.visible]
+        if shown:
+            shown[-1].visible = False
+        return bool(shown)
+
+    def emit_from(self, intent: Intent | Callable[[int], Intent], client_id: int) -> None:
+        """Emit an intent, or the result of `intent` for the client id."""
+        self.emit(intent if isinstance(intent, Intent) else intent(client_id))
 
     def button(
         self, label: str, intent: Intent | Callable[[int], Intent], *, color: Any = "gray", **options: Any
@@ -50,7 +69,7 @@ class PanelPage(TabPage):
         async def _(event: viser.GuiEvent) -> None:
             # A tab can send a click on a disabled button, so the controller checks every click.
             if event.client_id is not None:
-                self.emit(intent if isinstance(intent, Intent) else intent(event.client_id))
+                self.emit_from(intent, event.client_id)
 
         return handle
 

@@ -1,4 +1,4 @@
-"""Panels of joint positions: sliders, a table of values, and keypoints."""
+"""Panels of joint positions: sliders, and a table of values."""
 
 import math
 
@@ -9,7 +9,6 @@ from carts_core.settings import SurfaceSolver
 from carts_viewer.actions import intents
 from carts_viewer.actions.posing import MAX_PERTURBATION
 from carts_viewer.panels.inputs import PanelPage, humanized, valid, write
-from carts_viewer.picture.overlay import labelled_keypoints
 from carts_viewer.session import Session
 from carts_viewer.state import JointRange, Phase, Reach, ViewState
 from carts_viewer.transport.document import escaped
@@ -53,7 +52,9 @@ class JointsPanel:
             for arm in session.scene.arms
             for number, limits in enumerate(session.ranges[arm.name])
         }
-        self._nudged = gui.add_dropdown("Nudge (I, O)", list(self._names), hint="Joint that the keys I and O move")
+        self._nudged = gui.add_dropdown(
+            "Nudged joint", list(self._names), hint="Joint that the keys {Nudge 0.1} and {Nudge -0.1} move"
+        )
         page.on_input(self._reach, lambda name: intents.SetReach(Reach(name)))
         page.on_input(self._nudged, lambda name: intents.ChooseJoint(self._names[name]))
 
@@ -217,40 +218,3 @@ def _signed(difference: float) -> str:
 
 def _marked(text: str, on: bool) -> str:
     return f'<span class="carts-unsure">{text}</span>' if on else text
-
-
-_NEAREST = "Nearest to the pointer"
-
-
-class KeypointsPanel:
-    """Choice of the keypoint to place, and residuals of placed keypoints."""
-
-    def __init__(self, page: PanelPage, session: Session) -> None:
-        gui = page.gui
-        self._labels = {point: label for label, point in labelled_keypoints(session.scene).items()}
-        with gui.add_folder("Keypoints"):
-            gui.add_html(
-                '<p class="carts-caption"><b>Shift+click</b> places the chosen keypoint in the image; <b>Shift+'
-                "drag</b> moves it. The arm follows immediately. A run starts from this pose; keypoints do not "
-                "constrain it.</p>"
-            )
-            options = [_NEAREST, *self._labels.values()]
-            self._chosen = gui.add_dropdown("Keypoint", options)
-            self._shown = gui.add_checkbox("Show keypoints", False)
-            self._residuals = gui.add_html("")
-            self._forget = page.button("Clear clicks", intents.RemovePins(), icon=viser.Icon.X, visible=False)
-        page.on_input(self._chosen, lambda label: intents.ChooseKeypoint(None if label == _NEAREST else label))
-        page.on_input(self._shown, lambda on: intents.ShowKeypoints(bool(on)))
-
-    def show(self, state: ViewState) -> None:
-        """Update the widgets."""
-        keypoints = state.keypoints
-        write(self._chosen, keypoints.chosen or _NEAREST)
-        write(self._shown, keypoints.shown)
-        self._forget.visible = bool(keypoints.pins)
-        rows = [
-            f"<tr><td>{escaped(self._labels[pin.keypoint])} <small>({escaped(pin.camera)})</small></td>"
-            f"<td>{residual:.1f} px off</td></tr>"
-            for pin, residual in zip(keypoints.pins, keypoints.residuals, strict=True)
-        ]
-        self._residuals.content = f'<table class="carts-values">{"".join(rows)}</table>'

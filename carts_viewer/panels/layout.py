@@ -5,18 +5,18 @@ import viser
 from carts_viewer.panels.browse import BrowsePanel, OverlayPanel
 from carts_viewer.panels.fit import FitPanel, LivePanel
 from carts_viewer.panels.frames import FramesData
-from carts_viewer.panels.help import HelpPanel, set_hints
+from carts_viewer.panels.help import HelpPanel
 from carts_viewer.panels.import_export import ExportPanel, ImportPanel
 from carts_viewer.panels.inputs import Panel, PanelPage
 from carts_viewer.panels.jobs import JobsPanel
-from carts_viewer.panels.joints import JointsPanel, KeypointsPanel, ValuesPanel
+from carts_viewer.panels.joints import JointsPanel, ValuesPanel
 from carts_viewer.panels.optimize import CurvesPanel, FreePanel, ObjectivePanel, OptimizePanel, SettingsPanel
-from carts_viewer.panels.paint import PaintPanel
 from carts_viewer.panels.project import HistoryPanel, MessagePanel, PeoplePanel, SavedPanel
 from carts_viewer.panels.review import FindPanel, ReviewPanel
 from carts_viewer.panels.script_state import ScriptState
 from carts_viewer.panels.sequence import KeyframesPanel
 from carts_viewer.panels.timeline import TimelineData
+from carts_viewer.panels.tools import ToolPalette
 from carts_viewer.session import Session, Storage
 from carts_viewer.state import ViewState
 
@@ -49,7 +49,6 @@ class Layout:
             FitPanel(page, session),
             BrowsePanel(page, session),
             OverlayPanel(page, session, state),
-            PaintPanel(page, session, state),
         ]
         with gui.add_folder("Joints"):
             self.joints = JointsPanel(page, session, state)
@@ -72,12 +71,18 @@ class Layout:
             panels.append(LivePanel(page))
         with right.add_tab("Export"):
             panels.append(ExportPanel(page, session, storage))
-        HelpPanel(page, self.joints.perturb)
-        set_hints(page)
+        panels.append(HelpPanel(page, self.joints.perturb))
         right.dock_right()
         right.set_width(_WIDTH)
         self.timeline = TimelineData(page, session)
-        self.panels = [*panels, self.joints, ScriptState(page, session), self.timeline, FramesData(page)]
+        self.panels = [
+            *panels,
+            self.joints,
+            ScriptState(page, session),
+            ToolPalette(page, session),
+            self.timeline,
+            FramesData(page),
+        ]
 
 
 def _review(page: PanelPage, session: Session, state: ViewState) -> list[Panel]:
@@ -85,7 +90,6 @@ def _review(page: PanelPage, session: Session, state: ViewState) -> list[Panel]:
     return [
         ReviewPanel(page),
         KeyframesPanel(page, session),
-        KeypointsPanel(page, session),
         ImportPanel(page, session),
         FindPanel(page, session),
         HistoryPanel(page),

@@ -160,7 +160,7 @@ class SettingsPanel:
 
         @advanced.on_click
         async def _(_: viser.GuiEvent) -> None:
-            self._window.visible = not self._window.visible
+            page.open_window(self._window)
 
         @close.on_click
         async def _(_: viser.GuiEvent) -> None:

@@ -83,6 +83,7 @@ def stored_choices(state: ViewState) -> dict[str, Any]:
         "reach": str(state.reach),
         "beside": state.beside,
         "fps": state.fps,
+        "keys": dict(state.keys),
     }
 
 
@@ -97,6 +98,9 @@ def restored_choices(settings: Mapping[str, Any], state: ViewState) -> list[inte
         found.append(intents.SetReach(Reach(reach)))
     if isinstance(beside, bool) and beside is not state.beside:
         found.append(intents.ShowBeside(beside))
+    keys = settings.get("keys")
+    if isinstance(keys, dict) and all(isinstance(one, str) for one in (*keys, *keys.values())):
+        found.append(intents.SetKeys(keys))
     for name, make in (("opacity", intents.SetOpacity), ("fps", intents.SetSpeed)):
         value = settings.get(name)
         if isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value):

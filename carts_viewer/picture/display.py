@@ -12,7 +12,6 @@ from carts_viewer.panels.inputs import Panel
 from carts_viewer.picture.layers import Layer, Rgba, imported, paint_over, parts
 from carts_viewer.picture.overlay import OverlayRenderer, with_imported
 from carts_viewer.picture.scene_view import SceneView
-from carts_viewer.picture.strokes import Tool
 from carts_viewer.session import Session
 from carts_viewer.state import Maps, ViewState, composed, other_pose
 from carts_viewer.transport.page import TabPage
@@ -145,7 +144,7 @@ def _picture(state: ViewState) -> tuple:
     keys = *painted_kinds, Kind.IMPORTED_MASK, Kind.IMPORTED_KEYPOINTS
     entries = state.project.records.get(state.index)
     layers = [] if entries is None else [e for key, e in entries.entries.items() if key.kind in keys]
-    painted = layers, brush.tool is Tool.OFF, brush.target, brush.painted
+    painted = layers, brush.tool.paints, brush.target, brush.painted
     return state.layer, state.opacity, id(state.maps), id(state.refined), state.beside, state.compare, painted
 
 
@@ -153,7 +152,7 @@ def _draw_paint(
     overlay: Rgba, state: ViewState, corrected: MaskCorrection | None, ignored: IgnoreRegion | None
 ) -> None:
     """Draw painted layers, unless only the frame is shown."""
-    at_work = state.brush.tool is not Tool.OFF
+    at_work = state.brush.tool.paints
     if at_work or state.layer is not Layer.NONE:
         # The layers of ground truth and parts show the corrected mask itself.
         correction = None if state.layer in (Layer.TRUTH, Layer.PARTS) else corrected

@@ -29,11 +29,18 @@ _Count = Annotated[int, msgspec.Meta(ge=0, lt=2**53)]
 class Tool(StrEnum):
     """Tool of the pointer; the value is its label."""
 
-    OFF = "Off"
+    SELECT = "Select"
+    DRAG = "Drag link"
+    KEYPOINT = "Keypoint"
     BRUSH = "Brush"
-    ERASER = "Eraser"
     POLYGON = "Polygon"
+    ERASER = "Eraser"
     PROMPT = "Prompt"
+
+    @property
+    def paints(self) -> bool:
+        """Whether the tool changes a painted layer."""
+        return self in (Tool.BRUSH, Tool.POLYGON, Tool.ERASER, Tool.PROMPT)
 
 
 class Target(StrEnum):
@@ -45,9 +52,9 @@ class Target(StrEnum):
 
 @dataclass(frozen=True)
 class Brush:
-    """Painting tool of a tab."""
+    """Tool of a tab, and what it paints."""
 
-    tool: Tool = Tool.OFF
+    tool: Tool = Tool.SELECT
     target: Target = Target.MASK
     label: int = 0
     """Number of the class that is painted on the mask (`carts_core.model.parts.PartClass`); 0 for any arm."""

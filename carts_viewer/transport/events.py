@@ -46,7 +46,7 @@ class Trace(Event):
 
 
 class Pressed(Event):
-    """A key of `page.OWN_KEYS` was pressed."""
+    """The key of an action, or a button of a script, was pressed."""
 
     key: _Key
 

@@ -53,11 +53,11 @@ class TabPage:
         call(self.client, name, *arguments)
 
     def on_pressed(self, callback: Callable[[str], None]) -> None:
-        """Call `callback(key)` when a key of `OWN_KEYS` is pressed in this tab; the key may be an arbitrary string."""
+        """Call `callback(name)` when the key of an action is pressed in this tab; the name may be any string."""
         self._pressed.append(callback)
 
     def press(self, key: str) -> None:
-        """Call the callbacks for a key that was pressed in this tab."""
+        """Call the callbacks for an action whose key was pressed in this tab."""
         for callback in self._pressed:
             callback(key)
 
@@ -196,9 +196,6 @@ class Media:
         return response(http.HTTPStatus.OK, "image/jpeg", content)
 
 
-OWN_KEYS = ("[", "]", "(", ")", "escape", "enter")
-"""Keys that viser's shortcuts do not support, or that the page's script must handle first."""
-
 UPLOAD = "/upload"
 """Path of the websocket of uploads."""
 
@@ -215,6 +212,15 @@ _ICONS = (
     "brackets-contain-start",
     "brackets-contain-end",
     "table",
+    "pointer",
+    "hand-grab",
+    "target",
+    "brush",
+    "polygon",
+    "eraser",
+    "wand",
+    "ban",
+    "trash",
 )
 """Icons that the page's scripts use."""
 
@@ -222,6 +228,8 @@ _THUMBNAIL = "/thumbnail/"
 _SCRIPTS = (
     "page",
     "paint",
+    "keys",
+    "tools",
     "marks",
     "loupe",
     "drag",
@@ -268,8 +276,8 @@ class Page:
         check_address(host, port)
         self._guard = Guard(host, proxy)
         self._title = title
-        self.key_groups: list[Any] = []
-        """Content of the key sheet: groups with pairs of key and description."""
+        self.keys: dict[str, Any] = {}
+        """Keys of the page (`actions.shortcuts.key_sheet`)."""
         self.project = ""
         """Name of the shown recording; empty if there is none."""
         self.media = Media()
@@ -314,7 +322,7 @@ class Page:
         """Remove all widgets, commands, nodes and callbacks; tabs must be reloaded once new widgets exist."""
         self._title = title
         self._disconnect_callbacks.clear()
-        self.key_groups = []
+        self.keys = {}
         self.project = ""
         self.thumbnail = None
         self.server.gui.reset()
@@ -415,9 +423,8 @@ class Page:
     def _index(self, nonce: str) -> bytes:
         said = {
             "channel": element_id(self._channel),
-            "keys": OWN_KEYS,
+            "keys": self.keys,
             "icons": {name: icon_paths(name) for name in _ICONS},
-            "keyGroups": self.key_groups,
             "project": self.project,
             "server": self._name,
         }

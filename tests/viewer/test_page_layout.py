@@ -8,7 +8,8 @@ from waiting import eventually, wait_in
 
 from carts_core.project import ReviewState
 from carts_viewer.actions import intents
-from carts_viewer.panels.help import HINTS, set_hints
+from carts_viewer.actions.shortcuts import keys_of
+from carts_viewer.panels.help import HINTS, hint_with_keys, set_hints
 
 pytestmark = pytest.mark.browser
 
@@ -66,13 +67,11 @@ def check_tour(tab: Tab) -> None:
     expect(offer).to_have_count(0)
     assert page.evaluate(stored) == "declined"
     page.evaluate("localStorage.removeItem('carts-tour'); carts.offerTour()")
-    tab.open("Paint")
-    expect(page.get_by_role("button", name="Polygon", exact=True)).to_be_visible()
     scrolled = "[...document.querySelectorAll('.mantine-ScrollArea-viewport')].map((one) => one.scrollTop)"
     before = page.evaluate(scrolled)
     page.get_by_role("button", name="Take the tour").click()
     titles = go_through_the_tour(page, (1280, 800))
-    assert len(set(titles)) == 9 and titles[0] == "The picture" and page.evaluate(stored) == "begun"
+    assert len(set(titles)) == 10 and titles[0] == "The picture" and page.evaluate(stored) == "begun"
     assert page.evaluate(scrolled) == before
     tab.press("?")
     page.get_by_role("button", name="Take the tour").click()
@@ -100,17 +99,19 @@ def test_every_text_of_a_desktop_page_is_whole_legible_and_explained(open_tab: O
     redo = box_of(page.get_by_role("button", name="Redo", exact=True))
     assert bar["x"] > redo["x"] + redo["width"]
     # Every control has an explanation: over buttons, also greyed out, labels and fields; of a joint with unit, limits.
-    assert len(tab.view.page.widgets()) > 120 and set_hints(tab.view.page) == []
+    assert len(tab.view.page.widgets()) > 120 and set_hints(tab.view.page, {}) == []
     joint = tab.slider("PSM1", 0)
     assert joint.hint is not None and "[°], limits" in joint.hint
     page.get_by_role("button", name="Pause", exact=True).hover(force=True)
-    expect(page.get_by_role("button", name="Pause", exact=True)).to_have_attribute("title", HINTS["Pause"])
+    expect(page.get_by_role("button", name="Pause", exact=True)).to_have_attribute(
+        "title", hint_with_keys(HINTS["Pause"], keys_of({}))
+    )
     expect(page.locator(f"label[for='{tab.app.page.element_id(joint)}']")).to_have_attribute("title", joint.hint)
     page.locator(tab.element(joint)).first.hover(force=True)
     expect(page.get_by_role("tooltip").filter(has_text=joint.hint)).to_be_visible()
     page.mouse.move(640, 5)
     bare = "button:not([title]):not([aria-label]), select:not([title])"
-    for bar in (".carts-bar", ".carts-strip"):
+    for bar in (".carts-bar", ".carts-tools", ".carts-strip"):
         assert page.locator(bar).locator(bare).count() == 0
     # A picture that is zoomed keeps its name and fit in view, below the tool bar.
     page.evaluate("carts.zoomAt(4, 0.5, 0.25)")
@@ -144,7 +145,7 @@ def test_a_phone_shows_what_reading_and_reviewing_needs_and_the_rest_in_a_sheet(
     page, app = tab.page, tab.app
     check_note(tab)
     page.evaluate("carts.startTour()")
-    assert len(go_through_the_tour(page, PHONE)) == 4
+    assert len(go_through_the_tour(page, PHONE)) == 5
     place = page.evaluate("carts.imageOnScreen()")
     assert place["left"] >= 0 and place["left"] + place["width"] <= 391
     for button in page.locator(".carts-review-bar button").all():
@@ -172,7 +173,6 @@ def test_a_phone_shows_what_reading_and_reviewing_needs_and_the_rest_in_a_sheet(
 
     eventually(image_above_sheet)
     tab.put(intents.Perturb(2.0, 0), intents.SetRange((0, 1)), intents.Export("csv", "All"))
-    tab.open("Paint")
     look_into_tabs(tab, folders=True)
     # The curves of a run leave the panel as wide as it is.
     tab.open("Optimize")

@@ -51,7 +51,7 @@ def _loupe(tab: Tab) -> dict[str, Any] | None:
 
 
 def check_loupe(tab: Tab) -> None:
-    """The loupe shows position and colour of the pixel under the pointer, and asks the server for nothing."""
+    """The loupe shows position and colour of the pixel under the pointer, and asks the server for no picture."""
     tab.page.evaluate(_COUNT)
     u, v = MARKERS[1][0] * 320, MARKERS[1][1] * 240
     tab.page.mouse.move(*tab.place(u, v))
@@ -74,8 +74,9 @@ def check_loupe(tab: Tab) -> None:
     assert loupe is not None and max(map(float, loupe["rgb"].split())) < 30
     tab.button("Loupe")
     eventually(lambda: _loupe(tab), lambda loupe: loupe is None)
-    # But that a picture was drawn may be reported at any time.
-    assert not [text for text in tab.page.evaluate("window.sent") if "GuiUpdateMessage" in text and "Drawn" not in text]
+    # The server knows whether it is shown. That a picture was drawn may be reported at any time.
+    sent = [text for text in tab.page.evaluate("window.sent") if "GuiUpdateMessage" in text and "Drawn" not in text]
+    assert len(sent) == 2 and all("ShowLoupe" in text for text in sent)
 
 
 def check_slider(tab: Tab) -> None:

@@ -53,11 +53,9 @@ def _coloured(tab: Tab, color: tuple[int, int, int]) -> int:
 def test_strokes_are_exact_at_any_zoom_seen_in_every_tab_and_taken_back(open_tab: OpenTab) -> None:
     tab = open_tab(marked=True, networks={"segmenter": Discs()})
     app = tab.app
-    tab.open("Paint")
-    tab.button("Ignore region")
+    tab.button("Ignore")
     eventually(lambda: tab.state.brush.target, lambda target: target is Target.IGNORE)
-    tab.button("Brush")
-    # Another tab has its own tool in hand, and shows what was painted.
+    # The region to ignore needs a brush. Another tab has its own tool in hand, and shows what was painted.
     other = open_tab(app, (900, 640))
     expect(other.page.locator("canvas.carts-paint")).to_have_css("pointer-events", "none")
     other.put(intents.SetOpacity(1.0))
@@ -101,7 +99,7 @@ def test_strokes_are_exact_at_any_zoom_seen_in_every_tab_and_taken_back(open_tab
     hand.steps(9)
     assert _ignored(app)[148, 145]
     # With the tool put away, the left button moves the picture again. What was painted may hide the discs.
-    hand.take("Escape", Tool.OFF)
+    hand.take("Escape", Tool.SELECT)
     left = tab.page.evaluate("carts.imageOnScreen().left")
     hand.draw((160.0, 120.0), (156.0, 124.0))
     eventually(
@@ -147,8 +145,7 @@ def test_polygon_eraser_shift_and_classes_change_the_mask_as_exported(open_tab: 
     assert np.array_equal(decoded(started.value.path().read_bytes()) > 0, _mask(app))
     # A class shows the layer of parts with its legend, and is painted in its colour.
     wrist = next(one for one in part_classes(app.scene.arms) if one.part == "wrist")
-    tab.open("Paint")
-    tab.choose("Class", wrist.name)
+    tab.page.get_by_label("Class").select_option(wrist.name)
     eventually(lambda: tab.state.layer, lambda layer: layer is Layer.PARTS)
     for one in part_classes(app.scene.arms):
         expect(tab.page.locator(".carts-legend").get_by_text(one.name, exact=True)).to_be_visible()

@@ -244,7 +244,7 @@ def test_clearing_is_one_step_and_touches_one_layer_of_one_frame(desk: Desk) -> 
 
 def test_the_brush_grows_and_shrinks_within_its_limits(desk: Desk) -> None:
     assert desk.do(intents.ToggleTool(Tool.BRUSH)).brush.tool is Tool.BRUSH
-    assert desk.do(intents.ToggleTool(Tool.BRUSH)).brush.tool is Tool.OFF
+    assert desk.do(intents.ToggleTool(Tool.BRUSH)).brush.tool is Tool.SELECT
     assert desk.do(intents.SetDiameter(1e9)).brush.diameter == 300
     assert desk.do(intents.SetDiameter(-5.0)).brush.diameter == 1
     sizes = [desk.do(intents.ScaleBrush(1.25)).brush.diameter for _ in range(40)]

@@ -1,5 +1,6 @@
 """Pictures over the frame, when they are sent, the timeline's curves and thumbnails, and the table of keys."""
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -8,10 +9,11 @@ from viewer_desk import Desk
 from viewer_tab import decoded
 from waiting import get
 
+from carts_core.errors import CartsError
 from carts_core.project import Figures, Key, Review, ReviewState
 from carts_viewer.actions import intents
+from carts_viewer.actions.shortcuts import checked_keys, key_table, shortcuts, with_keys
 from carts_viewer.app import ViewerApp
-from carts_viewer.panels.help import key_table, shortcuts, with_keys
 from carts_viewer.panels.timeline import THUMBNAIL_HEIGHT, Traces, frame_code
 from carts_viewer.picture import layers
 from carts_viewer.picture.display import MAX_WAIT, RateLimit
@@ -143,9 +145,26 @@ PAGE = Path(__file__).resolve().parents[2] / "docs" / "reference" / "keys.md"
 
 
 def test_no_two_shortcuts_share_a_key_and_none_flies_the_camera() -> None:
-    keys = [(shortcut.hotkey, shortcut.modifier) for shortcut in shortcuts()]
-    assert len(set(keys)) == len(keys)
-    assert not {hotkey for hotkey, _ in keys} & set("WASDQE")
+    keys = [shortcut.key for shortcut in shortcuts().values()]
+    assert len(set(keys)) == len(keys) >= 60
+    assert not set(keys) & set("WASDQE")
+    assert checked_keys({name: shortcut.key for name, shortcut in shortcuts().items()}) == {}
+
+
+@pytest.mark.parametrize(
+    ("changed", "reason"),
+    [
+        ({"MoveFrame 1": "G"}, "G is the key of 'Next frame'. Press another key."),
+        ({"MoveFrame 1": "W"}, "W moves the camera of the 3D view. Press another key."),
+        ({"MoveFrame 1": "Ctrl+T"}, "Ctrl+T belongs to the browser. Press another key."),
+        ({"MoveFrame 1": ""}, "No key is not a key. Press another key."),
+        ({"MoveFrame 1": "x" * 1000}, f"{'x' * 24} is not a key. Press another key."),
+        ({"Format the disk": "F1"}, "'Format the disk' is not an action with a key."),
+    ],
+)
+def test_a_key_that_has_another_function_is_refused(changed: dict[str, str], reason: str) -> None:
+    with pytest.raises(CartsError, match=re.escape(reason)):
+        checked_keys(changed)
 
 
 def test_the_page_of_keys_lists_them_as_they_are() -> None:
