@@ -50,6 +50,7 @@ _EVENTS = (
     | intents.SetPaintClass
     | intents.SetRange
     | intents.SetReview
+    | intents.SetSwipe
     | intents.SetTarget
     | intents.SetTool
     | intents.ShowCamera

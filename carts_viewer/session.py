@@ -23,6 +23,7 @@ from carts_core.project import (
     Project,
     ProjectState,
     Provenance,
+    ReviewState,
     default_path,
     rescued_copies,
 )
@@ -58,6 +59,8 @@ class Session:
             for arm in self.scene.arms
         }
         self._reader = FrameReader(sequence)
+        self._accepted: tuple[ProjectState, Frame, SceneState | None] | None = None
+        """State of the project, frame, and its accepted state."""
         self.roots = Roots([sequence.path.parent, *folders])
 
     @property
@@ -129,6 +132,15 @@ class Session:
     def measured(self, frame: Frame) -> SceneState:
         """The frame's measured state, with the project's calibration."""
         return calibrated_scene(self.scene, self.editor.view).state(frame.measured, None, frame.mounts)
+
+    def accepted(self, frame: Frame) -> SceneState | None:
+        """The frame's state at its last acceptance; None if it was never accepted, or in a read-only project."""
+        view = self.editor.view
+        if self._accepted is None or self._accepted[:2] != (view, frame):
+            past = view if view.review(frame.index).state is ReviewState.ACCEPTED else None
+            past = past or self.editor.project.accepted(frame.index)
+            self._accepted = view, frame, None if past is None else corrected_state(self.scene, frame, past)
+        return self._accepted[2]
 
     def edits(
         self,

@@ -25,46 +25,44 @@ from carts_core.settings.stages import reduced
 
 from .actions.frame_filter import FrameFilter
 from .jobs.job_list import Job
-from .picture.layers import Layer, Rgba
+from .picture.layers import Layer
 from .picture.strokes import Brush
 
 
-class Against(StrEnum):
-    """Reference pose of a comparison; the value is the label in the page."""
+class ComparedPose(StrEnum):
+    """Pose of a comparison; the value is the label in the page."""
 
     MEASURED = "Measured"
     BEFORE_RUN = "Before the run"
+    CURRENT = "Current"
+    ACCEPTED = "Accepted"
+
+
+class CompareMode(StrEnum):
+    """Kind of a comparison; the value is the label in the page."""
+
+    OUTLINES = "Outlines"
+    SWIPE = "Swipe"
+    PAINTED = "Painted mask"
 
 
 @dataclass(frozen=True)
 class Compare:
-    """The compared pose, and the share of the picture that shows it."""
+    """The comparison in the picture, and the share of the picture that shows its left side."""
 
-    against: Against | None = None
+    mode: CompareMode | None = None
     """None for no comparison, except while the key is pressed."""
+    left: ComparedPose = ComparedPose.MEASURED
+    right: ComparedPose = ComparedPose.CURRENT
     swipe: float = 0.5
-    """Share of the picture's width, from the left, that shows the other pose, 0..1."""
+    """Share of the picture's width, from the left, that shows the left side, 0..1."""
     peek: bool = False
-    """Whether the key is pressed, so that the whole picture shows the other pose."""
+    """Whether the key is pressed, so that the whole picture shows the left side."""
 
     @property
     def share(self) -> float:
-        """Share of the picture's width that shows the other pose, 0..1."""
-        return 1.0 if self.peek else self.swipe if self.against is not None else 0.0
-
-
-def other_pose(compare: Compare, measured: SceneState, before_run: SceneState | None) -> SceneState:
-    """The reference pose; the measured pose if there was no run."""
-    return before_run if compare.against is Against.BEFORE_RUN and before_run is not None else measured
-
-
-def composed(own: Rgba, other: Rgba, share: float) -> Rgba:
-    """Overlay of the other pose on the left, of the current pose on the right, and of a line between them."""
-    column = round(share * own.shape[1])
-    both = np.concatenate([other[:, :column], own[:, column:]], axis=1)
-    if 0 < column < own.shape[1]:
-        both[:, max(column - 1, 0) : column + 1] = 255
-    return both
+        """Share of the picture's width that shows the left side, 0..1."""
+        return 1.0 if self.peek else self.swipe if self.mode in (CompareMode.SWIPE, CompareMode.PAINTED) else 0.0
 
 
 class Reach(StrEnum):
@@ -434,7 +432,7 @@ class ViewState:
     every_camera: bool = True
     """Whether a run uses all cameras or only the shown camera."""
     compare: Compare = field(default_factory=Compare)
-    """The other pose that the picture shows, if any."""
+    """The comparison in the picture, if any."""
     filter: FrameFilter = field(default_factory=FrameFilter)
     """Filter of *Find*."""
     reach: Reach = Reach.NEAR

@@ -41,7 +41,7 @@ _PACE = 0.2
 KINDS = {
     "frames": ("Frame", "Domain", "Play", "Next frame", "Previous worst", "Next worst", "Next unreviewed"),
     "joints": ("Yaw [°]", "Insertion [mm]", "Jaw [°]", "Perturb all joints", "All back to measured", "Copy previous"),
-    "overlay": ("Layer", "Opacity %", "Compare with", "Swipe %"),
+    "overlay": ("Layer", "Opacity %", "Compare"),
     "run": ("Run", "Pause", "Step", "Reset", "Check the fit"),
     "settings": (
         "Solver",

@@ -11,7 +11,7 @@ from typing import Any
 from .database import TABLES, DamagedProject, Seal, as_number, check_seal, checked_rows, row_digest
 from .identity import SequenceIdentity
 from .state import Entry, ExportRecord, ProjectState, Step
-from .values import Edits, Figures, Key, Kind, check_edit, decode
+from .values import Edits, Figures, Key, Kind, ReviewState, check_edit, decode
 
 
 @dataclass
@@ -138,6 +138,16 @@ def before(memory: sqlite3.Connection, step: int, position: int) -> tuple[dict[K
         if value != _newest(memory, about, step)[1]:
             later.append(number)
     return edits, min(later, default=None)
+
+
+def acceptance(memory: sqlite3.Connection, frame: int, position: int) -> int | None:
+    """Last step up to a position that accepted a frame, or changed the note of an accepted frame; None without one."""
+    changed = "SELECT step, value FROM changes WHERE kind = ? AND frame = ? AND step <= ? ORDER BY step DESC"
+    for step, value in memory.execute(changed, (Kind.REVIEW.value, frame, position)):
+        review = decode(Kind.REVIEW, value)
+        if review is not None and review.state is ReviewState.ACCEPTED:
+            return step
+    return None
 
 
 def add_figures(

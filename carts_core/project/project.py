@@ -16,7 +16,7 @@ from . import database, journal
 from .identity import SequenceIdentity, default_path
 from .state import ExportRecord, ProjectState, Step, by_revision, step_at
 from .store import Store, open_or_begin, read_project
-from .values import WHOLE_PROJECT, Edits, Figures, FitVerdict, Key, check_edit
+from .values import WHOLE_PROJECT, Edits, Figures, FitVerdict, Key, ReviewState, check_edit
 
 if TYPE_CHECKING:
     from ..recording import Sequence
@@ -203,6 +203,20 @@ class Project:
             _, entries = journal.move(memory, state.position, number - 1)
             verdicts, figures = state.regained(state.with_entries(entries), edits)
             return {**edits, **verdicts}, figures
+
+    def accepted(self, frame: int) -> ProjectState | None:
+        """State of a frame and of the calibration at the last acceptance of the frame.
+
+        None if the frame was never accepted, or if the project is read-only and the frame is not accepted.
+        """
+        with self._edit:
+            state = self.state
+            if state.review(frame).state is ReviewState.ACCEPTED:
+                return state
+            step = None if self._store is None else journal.acceptance(self._store.memory, frame, state.position)
+            if self._store is None or step is None:
+                return None
+            return state.with_entries(journal.move(self._store.memory, state.position, step)[1])
 
     def history(self) -> tuple[Step, ...]:
         """All steps, oldest first; those with a number above `state.position` are undone."""

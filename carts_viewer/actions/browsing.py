@@ -9,7 +9,7 @@ from carts_core.errors import SequenceError
 from carts_core.project import Key, TimeOffset
 from carts_viewer.actions import intents
 from carts_viewer.actions.context import Context, Handler, clamped, finite, one_of
-from carts_viewer.state import Against, Reach, RunState
+from carts_viewer.state import Reach, RunState
 
 _log = logging.getLogger(__name__)
 SPEEDS = (0.5, 60.0)
@@ -126,7 +126,7 @@ class BrowsingHandler(Handler):
             self.handle(intents.SetRange((index, last if last >= index else end)))
 
     def _on_CompareWith(self, intent: intents.CompareWith) -> None:
-        self._compare(against=None if intent.against is None else Against(intent.against))
+        self._compare(mode=intent.mode, left=intent.left, right=intent.right)
 
     def _on_SetSwipe(self, intent: intents.SetSwipe) -> None:
         self._compare(swipe=clamped(intent.share, 0.0, 1.0))

@@ -12,7 +12,7 @@ from carts_core.project import ReviewState
 from carts_core.settings import AnnotationFormat, Direction, Masks
 from carts_viewer.picture.layers import Layer
 from carts_viewer.picture.strokes import Stroke, Target, Tool
-from carts_viewer.state import Against, Reach
+from carts_viewer.state import ComparedPose, CompareMode, Reach
 from carts_viewer.transport.events import Event
 
 
@@ -132,13 +132,16 @@ class MarkRange(Intent):
 
 
 class CompareWith(Latest):
-    """Choose the pose to compare with; None for no comparison."""
+    """Choose the comparison in the picture; the poses are those of a swipe."""
 
-    against: Against | None
+    mode: CompareMode | None
+    """None for no comparison."""
+    left: ComparedPose = ComparedPose.MEASURED
+    right: ComparedPose = ComparedPose.CURRENT
 
 
 class SetSwipe(Latest):
-    """Set the share of the picture's width that shows the other pose, 0..1."""
+    """Set the share of the picture's width that shows the left side of a comparison, 0..1."""
 
     share: float
 

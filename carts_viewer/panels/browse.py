@@ -15,7 +15,7 @@ from carts_viewer.panels.inputs import PanelPage, humanized, swatch, write
 from carts_viewer.picture.layers import ARM_COLORS, RENDERED_COLOR, TRUTH_COLORS, Layer, label_color
 from carts_viewer.picture.overlay import with_imported
 from carts_viewer.session import Session
-from carts_viewer.state import Against, Scores, ViewState
+from carts_viewer.state import ComparedPose, CompareMode, Scores, ViewState
 from carts_viewer.transport.document import escaped
 
 _SOURCES = {
@@ -144,13 +144,21 @@ class OverlayPanel:
             self._layer = gui.add_dropdown("Layer", [str(layer) for layer in Layer], initial_value=str(state.layer))
             self._opacity = gui.add_slider("Opacity %", 0, 100, 5, round(100 * state.opacity))
             self._legend = gui.add_html("")
-            self._against = gui.add_dropdown(
-                "Compare with", [_NOTHING, *map(str, Against)], hint="Hold {peek} to see only the other pose"
+            self._mode = gui.add_dropdown(
+                "Compare",
+                [_NOTHING, *map(str, CompareMode)],
+                hint="Hold {peek} to see only the left or the measured pose",
             )
-            self._swipe = gui.add_slider("Swipe %", 0, 100, 1, 50, visible=False)
+            self._sides = [
+                gui.add_dropdown(
+                    side, list(map(str, ComparedPose)), visible=False, hint=f"Pose on the {side.lower()} of the line"
+                )
+                for side in ("Left", "Right")
+            ]
         page.on_input(self._layer, lambda value: intents.ShowLayer(Layer(value)))
-        page.on_input(self._against, lambda name: intents.CompareWith(None if name == _NOTHING else Against(name)))
-        page.on_input(self._swipe, lambda value: intents.SetSwipe(value / 100))
+        page.on_input(self._mode, lambda mode: self._compared(mode=mode))
+        for side, handle in zip(("left", "right"), self._sides, strict=True):
+            page.on_input(handle, lambda pose, side=side: self._compared(**{side: pose}))
         page.on_input(self._opacity, lambda value: intents.SetOpacity(value / 100))
 
     def show(self, state: ViewState) -> None:
@@ -158,11 +166,22 @@ class OverlayPanel:
         write(self._layer, str(state.layer))
         if not self._waits(intents.SetOpacity):
             write(self._opacity, round(100 * state.opacity))
-        write(self._against, str(state.compare.against or _NOTHING))
-        self._swipe.visible = state.compare.against is not None
-        if not self._waits(intents.SetSwipe):
-            write(self._swipe, round(100 * state.compare.swipe))
-        self._legend.content = f'<div class="carts-legend">{self._describe(state)}</div>'
+        compare = state.compare
+        if not self._waits(intents.CompareWith):
+            write(self._mode, str(compare.mode or _NOTHING))
+            for handle, pose in zip(self._sides, (compare.left, compare.right), strict=True):
+                write(handle, str(pose))
+                handle.visible = compare.mode is CompareMode.SWIPE
+        # The legend of these comparisons is over the image.
+        over_image = compare.mode in (CompareMode.OUTLINES, CompareMode.PAINTED)
+        self._legend.content = f'<div class="carts-legend">{"" if over_image else self._describe(state)}</div>'
+
+    def _compared(self, mode: str = "", left: str = "", right: str = "") -> intents.CompareWith:
+        """The comparison that the lists show, with one new choice."""
+        mode = mode or self._mode.value
+        left, right = left or self._sides[0].value, right or self._sides[1].value
+        chosen = None if mode == _NOTHING else CompareMode(mode)
+        return intents.CompareWith(chosen, ComparedPose(left), ComparedPose(right))
 
     def _describe(self, state: ViewState) -> str:
         if state.layer in (Layer.MASK, Layer.CONTOUR, Layer.REFINED):

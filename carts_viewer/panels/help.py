@@ -29,7 +29,6 @@ HINTS = {
     # Overlay
     "Layer": "Layer over the image (number keys)",
     "Opacity %": "Opacity of the overlay: 0 is invisible, 100 hides the image below [%]",
-    "Swipe %": "Left part of the image, which shows the other pose [% of the width]",
     "Adapt the network to this recording": "Queue a job that trains the network on synthetic images for this recording",
     "Use newest network": "Use the network that was adapted last",
     # Joints

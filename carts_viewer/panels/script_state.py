@@ -7,6 +7,7 @@ from typing import Any
 from carts_viewer.actions import intents
 from carts_viewer.actions.frame_filter import review_name
 from carts_viewer.panels.fit import quality
+from carts_viewer.picture.comparison import compared_poses, legend, side_names
 from carts_viewer.picture.layers import Layer
 from carts_viewer.picture.overlay import keypoints_in_image, labelled_keypoints
 from carts_viewer.session import Session
@@ -57,6 +58,7 @@ class ScriptState:
                     ],
                 }
             )
+        poses = {} if state.compare.mode is None else compared_poses(state, self._session)
         return {
             "cameras": cameras,
             "active": names.index(state.camera),
@@ -71,6 +73,11 @@ class ScriptState:
             "range": state.range,
             "playing": state.playing,
             "notice": state.notice,
+            "compare": {
+                "sides": side_names(state, poses),
+                "share": state.compare.swipe,
+                "legend": legend(state, poses),
+            },
             "settings": stored_choices(state),
         }
 

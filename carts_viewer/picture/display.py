@@ -9,11 +9,12 @@ from carts_core.model.scene import SceneState
 from carts_core.project import IgnoreRegion, Key, Kind, MaskCorrection
 from carts_core.project.values import WHOLE_PROJECT
 from carts_viewer.panels.inputs import Panel
-from carts_viewer.picture.layers import Layer, Rgba, imported, paint_over, parts
+from carts_viewer.picture.comparison import compared_poses, composed, outlines, painted
+from carts_viewer.picture.layers import Layer, Rgba, imported, paint_over, parts, transparent
 from carts_viewer.picture.overlay import OverlayRenderer, with_imported
 from carts_viewer.picture.scene_view import SceneView
 from carts_viewer.session import Session
-from carts_viewer.state import Maps, ViewState, composed, other_pose
+from carts_viewer.state import ComparedPose, CompareMode, ViewState
 from carts_viewer.transport.page import TabPage
 
 
@@ -21,6 +22,10 @@ from carts_viewer.transport.page import TabPage
 def _threads() -> ThreadPoolExecutor:
     """Threads for the cameras shown side by side; the renderer is thread-safe."""
     return ThreadPoolExecutor(4, thread_name_prefix="overlay")
+
+
+Poses = Mapping[ComparedPose, SceneState | None]
+"""The compared poses; None for a pose that does not exist."""
 
 
 class PageDisplay:
@@ -81,31 +86,51 @@ class PageDisplay:
 
     def _overlays(self, state: ViewState, cameras: list[str]) -> dict[str, Rgba]:
         """Overlays by camera, rendered in parallel."""
+        # The project is read on the worker's thread.
+        poses = compared_poses(state, self._session) if state.compare.mode or state.compare.peek else {}
         if len(cameras) == 1:
-            return {cameras[0]: self._overlay(state, cameras[0])}
-        return dict(zip(cameras, _threads().map(lambda camera: self._overlay(state, camera), cameras), strict=True))
+            return {cameras[0]: self._overlay(state, cameras[0], poses)}
+        overlays = _threads().map(lambda camera: self._overlay(state, camera, poses), cameras)
+        return dict(zip(cameras, overlays, strict=True))
 
-    def _overlay(self, state: ViewState, camera: str) -> Rgba:
+    def _overlay(self, state: ViewState, camera: str, poses: Poses) -> Rgba:
+        compare, correction = state.compare, state.mask_correction_of(camera)
+        if compare.mode is CompareMode.OUTLINES and not compare.peek:
+            masks = {which: self._renderer.arm_ids(pose, camera) for which, pose in poses.items() if pose is not None}
+            own = self._scene.camera(camera)
+            overlay = outlines(masks, (own.height, own.width))
+        elif compare.mode is CompareMode.PAINTED:
+            rendered = self._renderer.arm_ids(state.pose.scene, camera)
+            before, after = painted(rendered, correction, camera, state.opacity)
+            overlay = composed(after, before, compare.share)
+        else:
+            overlay = self._layer(state, camera, poses.get(compare.right) if compare.mode else state.pose.scene)
+            if compare.share > 0.0:
+                overlay = composed(overlay, self._layer(state, camera, poses[compare.left]), compare.share)
+        if compare.mode is not CompareMode.PAINTED:
+            # An outline is not the layer of a corrected mask.
+            shown = correction if compare.mode is None or state.brush.tool.paints else None
+            _draw_paint(overlay, state, shown, state.ignore_region_of(camera))
+        return overlay
+
+    def _layer(self, state: ViewState, camera: str, scene: SceneState | None) -> Rgba:
+        """The chosen layer of a pose; transparent without a pose."""
+        if scene is None:
+            own = self._scene.camera(camera)
+            return transparent(own.height, own.width)
         correction = state.mask_correction_of(camera)
         truth = state.layer is Layer.TRUTH and not state.streaming
         frame = with_imported(state.frame, self._scene, state.project) if truth else state.frame
 
-        def at(scene: SceneState, maps: Maps | None) -> Rgba:
-            if state.layer is Layer.IMPORTED and not state.streaming:
-                return self._imported(state, camera)
-            if state.layer is Layer.REFINED:
-                return self._renderer.refined(scene, camera, state.refined_mask(scene, camera), state.opacity)
-            if state.layer is Layer.PARTS:
-                painted = state.part_labels_of(camera)
-                return parts(self._renderer.classes(scene, camera, correction, painted), state.opacity)
-            return self._renderer.overlay(scene, frame, camera, state.layer, state.opacity, maps, correction)
-
-        overlay, share = at(state.pose.scene, state.maps), state.compare.share
-        if share > 0.0:
-            other = other_pose(state.compare, self._session.measured(state.frame), state.run.start)
-            overlay = composed(overlay, at(other, None), share)
-        _draw_paint(overlay, state, correction, state.ignore_region_of(camera))
-        return overlay
+        if state.layer is Layer.IMPORTED and not state.streaming:
+            return self._imported(state, camera)
+        if state.layer is Layer.REFINED:
+            return self._renderer.refined(scene, camera, state.refined_mask(scene, camera), state.opacity)
+        if state.layer is Layer.PARTS:
+            labels = state.part_labels_of(camera)
+            return parts(self._renderer.classes(scene, camera, correction, labels), state.opacity)
+        maps = state.maps if scene is state.pose.scene else None
+        return self._renderer.overlay(scene, frame, camera, state.layer, state.opacity, maps, correction)
 
     def _imported(self, state: ViewState, camera: str) -> Rgba:
         """Picture of imported masks and keypoints."""
@@ -144,8 +169,9 @@ def _picture(state: ViewState) -> tuple:
     keys = *painted_kinds, Kind.IMPORTED_MASK, Kind.IMPORTED_KEYPOINTS
     entries = state.project.records.get(state.index)
     layers = [] if entries is None else [e for key, e in entries.entries.items() if key.kind in keys]
+    compared = (state.project, state.run.start) if state.compare.mode else None
     painted = layers, brush.tool.paints, brush.target, brush.painted
-    return state.layer, state.opacity, id(state.maps), id(state.refined), state.beside, state.compare, painted
+    return state.layer, state.opacity, id(state.maps), id(state.refined), state.beside, state.compare, compared, painted
 
 
 def _draw_paint(

@@ -230,6 +230,7 @@ _SCRIPTS = (
     "paint",
     "keys",
     "tools",
+    "compare",
     "marks",
     "loupe",
     "drag",

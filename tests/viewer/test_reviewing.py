@@ -27,9 +27,10 @@ from carts_viewer.panels.fit import fit_text
 from carts_viewer.panels.joints import value_rows
 from carts_viewer.panels.optimize import note
 from carts_viewer.panels.sequence import calibration_line
+from carts_viewer.picture.comparison import compared_pose, composed
 from carts_viewer.picture.layers import Layer
 from carts_viewer.picture.strokes import Stroke, Target
-from carts_viewer.state import Against, Compare, Curves, composed, other_pose
+from carts_viewer.state import Compare, ComparedPose, CompareMode, Curves
 
 CORNERS = np.array(((5.0, 5.0), (60.0, 5.0), (60.0, 40.0), (5.0, 40.0)))
 
@@ -176,11 +177,10 @@ def test_the_other_pose_is_seen_up_to_the_swipe_or_all_over_while_a_key_is_held(
     assert composed(own, other, 0.4)[0, :, 0].tolist() == [2, 2, 2, 255, 255, 1, 1, 1, 1, 1]
     assert (composed(own, other, 1.0) == 2).all()
     assert Compare().share == 0.0 and Compare(peek=True).share == 1.0
-    state = known.do(intents.ShowFrame(0), intents.CompareWith(Against.MEASURED), intents.SetSwipe(7.0))
+    state = known.do(intents.ShowFrame(0), intents.CompareWith(CompareMode.SWIPE), intents.SetSwipe(7.0))
     assert state.compare.share == 1.0
-    measured = known.session.measured(state.frame)
-    assert other_pose(state.compare, measured, None) is measured
-    assert other_pose(Compare(Against.BEFORE_RUN), measured, state.pose.scene) is state.pose.scene
+    assert compared_pose(ComparedPose.CURRENT, state, known.session) is state.pose.scene
+    assert compared_pose(ComparedPose.BEFORE_RUN, state, known.session) is None
 
 
 # ---- Verdicts -------------------------------------------------------------------------------------------------------

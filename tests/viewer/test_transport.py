@@ -310,7 +310,7 @@ USED = set(
     "viser.infra._async_message_buffer _impl _gui_input_handle_from_uuid _data _websock_connection".split()
 )
 """Every private name of theirs, all in one module. Check each when viser is updated."""
-SCRIPTS = {f"{name}.js" for name in "page paint tools marks loupe timeline shell drag document".split()}
+SCRIPTS = {f"{name}.js" for name in "page paint tools compare marks loupe timeline shell drag document".split()}
 
 
 def private_names(path: Path) -> set[str]:
