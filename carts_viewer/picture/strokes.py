@@ -19,6 +19,8 @@ DIAMETERS = (1, 300)
 """Minimum and maximum diameter of the brush [px]."""
 MAX_STROKE_POINTS = 20_000
 """Maximum number of points of a stroke; the page splits longer strokes."""
+_SUBPIXELS = 3
+"""Subpixels per pixel and axis at which strokes are drawn; odd, so that one is in the middle."""
 _FRACTION_BITS = 4
 """Fractional bits of pixel coordinates passed to OpenCV."""
 
@@ -87,17 +89,28 @@ class Stroke:
 
     def covers(self, camera: Camera) -> Mask:
         """The pixels of the camera's image that the stroke covers."""
-        canvas = np.zeros((camera.height, camera.width), np.uint8)
+        covered = np.zeros((camera.height, camera.width), bool)
+        margin = self.diameter / 2 + 1
+        limits = (camera.width, camera.height)
+        left, top = np.clip(np.floor(self.points.min(0) - margin), 0, limits).astype(int)
+        right, bottom = np.clip(np.ceil(self.points.max(0) + margin), 0, limits).astype(int)
+        if right <= left or bottom <= top:
+            return covered
+        # Thin lines on subpixels and their distances, since OpenCV rounds thick lines to whole pixels.
+        canvas = np.ones((_SUBPIXELS * (bottom - top), _SUBPIXELS * (right - left)), np.uint8)
         # OpenCV places integer coordinates at pixel centres, this package at pixel corners.
-        line = np.rint((self.points - 0.5) * 2**_FRACTION_BITS).astype(np.int32)
+        points = _SUBPIXELS * (self.points - (left, top)) - 0.5
+        line = np.rint(points * 2**_FRACTION_BITS).astype(np.int32)
         if self.polygon:
-            cv2.fillPoly(canvas, [line], 1, cv2.LINE_8, _FRACTION_BITS)
-        elif len(line) == 1:
-            radius = round(self.diameter / 2 * 2**_FRACTION_BITS)
-            cv2.circle(canvas, line[0].tolist(), radius, 1, cv2.FILLED, cv2.LINE_8, _FRACTION_BITS)
+            cv2.fillPoly(canvas, [line], 0, cv2.LINE_8, _FRACTION_BITS)
+            inside = canvas == 0
         else:
-            cv2.polylines(canvas, [line], False, 1, self.diameter, cv2.LINE_8, _FRACTION_BITS)
-        return canvas.astype(bool)
+            cv2.polylines(canvas, [np.append(line, line[-1:], axis=0)], False, 0, 1, cv2.LINE_8, _FRACTION_BITS)
+            distance = cv2.distanceTransform(canvas, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+            inside = distance <= _SUBPIXELS * self.diameter / 2
+        middle = slice(_SUBPIXELS // 2, None, _SUBPIXELS)
+        covered[top:bottom, left:right] = inside[middle, middle]
+        return covered
 
 
 class Painted(Event):
