@@ -22,7 +22,7 @@
     return [...held.filter(([on]) => on).map(([, name]) => name), key].join("+");
   }
 
-  const FIELDS = "input:not([readonly]), textarea, select, [contenteditable], dialog, [role=dialog]";
+  const FIELDS = "input:not([readonly]), textarea, select, [contenteditable], dialog[open], [role=dialog]";
   const WIDGETS = "button, a, summary, input, [role], [tabindex]"; // which have functions for some keys themselves
   const OF_WIDGETS = /^(Space|Enter|Home|End|Arrow.*)$/;
 
@@ -32,7 +32,7 @@
     const name = [...defaults.keys()].find((one) => keyOf(one) === key);
     const target = event.target instanceof Element ? event.target : document.body;
     if (!name || target.closest(FIELDS) || document.querySelector("dialog[open], body.carts-touring")) return null;
-    if (OF_WIDGETS.test(key) && target.closest(WIDGETS)) return null;
+    if (OF_WIDGETS.test(key) && target.checkVisibility() && target.closest(WIDGETS)) return null;
     if (key.startsWith("Arrow") && !window.carts.view.endoscope) return null; // moves the camera of the 3D view
     if (name === "NextObject" && window.carts.brush().tool !== "prompt") return null;
     return name;
@@ -168,7 +168,9 @@
       else if (button) { stopAsking(); actions[button.dataset.do](); }
     });
     sheet.addEventListener("keydown", (event) => {
-      if (nameOf(event) === keyOf("sheet")) { event.preventDefault(); showSheet(false); }
+      if (![keyOf("sheet"), "Escape"].includes(nameOf(event))) return;
+      event.preventDefault();
+      showSheet(false);
     }, { capture: true });
     sheet.addEventListener("cancel", (event) => { if (asked) event.preventDefault(); });
     sheet.addEventListener("close", stopAsking);

@@ -56,7 +56,7 @@ def test_strokes_are_exact_at_any_zoom_seen_in_every_tab_and_taken_back(open_tab
     tab.button("Ignore")
     eventually(lambda: tab.state.brush.target, lambda target: target is Target.IGNORE)
     # The region to ignore needs a brush. Another tab has its own tool in hand, and shows what was painted.
-    other = open_tab(app, (900, 640))
+    other = open_tab(app, (960, 640))
     expect(other.page.locator("canvas.carts-paint")).to_have_css("pointer-events", "none")
     other.put(intents.SetOpacity(1.0))
     hand = Hand(tab)
