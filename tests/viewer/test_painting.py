@@ -5,7 +5,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import cv2
 import msgspec
 import numpy as np
 import pytest
@@ -59,13 +58,16 @@ def _read(**changes: Any) -> Stroke:
     return read_stroke(painted, 3, {"left": CAMERA})
 
 
-def test_a_stroke_covers_a_dot_the_line_of_opencv_or_a_filled_polygon() -> None:
+def test_a_stroke_covers_the_pixels_within_its_radius_or_a_filled_polygon() -> None:
     covered = _read(points=[[20.5, 20.5]], diameter=9).covers(CAMERA)
     y, x = np.mgrid[:48, :64] + 0.5
     distance = np.hypot(x - 20.5, y - 20.5)
-    assert covered[distance < 4].all() and not covered[distance > 5.5].any()
-    line = cv2.line(np.zeros((48, 64), np.uint8), (10, 12), (40, 30), 1, 7)
-    assert np.array_equal(_read(points=[[10.5, 12.5], [40.5, 30.5]]).covers(CAMERA), line.astype(bool))
+    assert covered[distance < 4.25].all() and not covered[distance > 4.75].any()
+    for start, end in (((10.5, 12.5), (40.5, 30.5)), ((10.0, 12.0), (40.2, 12.0)), ((20.7, 40.0), (20.7, 9.3))):
+        covered, along = _read(points=[start, end]).covers(CAMERA), np.subtract(end, start)
+        share = np.clip(((x - start[0]) * along[0] + (y - start[1]) * along[1]) / (along @ along), 0, 1)
+        distance = np.hypot(x - start[0] - share * along[0], y - start[1] - share * along[1])
+        assert covered[distance < 3.25].all() and not covered[distance > 3.75].any()
     covered = _read(polygon=True, points=[[10, 10], [50, 10], [50, 40], [10, 40]], diameter=200).covers(CAMERA)
     assert covered[11:39, 11:49].all() and covered.sum() <= 41 * 31
 

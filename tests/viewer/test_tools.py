@@ -145,7 +145,8 @@ def test_keys_are_changed_refused_listed_and_remembered(open_tab: OpenTab) -> No
     expect(page.get_by_role("dialog")).to_have_count(0)
     tab.press("?")
     page.locator(".carts-keys [data-do=reset]").click()
-    eventually(lambda: tab.state.keys, lambda keys: not keys)
+    wait_in(page, "carts.keyOf('MoveFrame 1') === 'N'")
+    assert not tab.state.keys
     tab.press("Escape")
     tab.press("n")
     eventually(lambda: tab.state.index, lambda index: index == 2)
