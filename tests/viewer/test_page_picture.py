@@ -172,7 +172,7 @@ def test_the_overlay_stays_on_the_frame_in_any_window_zoom_and_view(open_tab: Op
 
 
 def test_sliders_keypoints_and_links_are_dragged_and_each_drag_is_one_step(open_tab: OpenTab) -> None:
-    tab = open_tab(marked=True)
+    tab = open_tab(window=(1150, 720), marked=True)
     app, mouse, keyboard = tab.app, tab.page.mouse, tab.page.keyboard
     check_slider(tab)
     tab.put(intents.Undo(), intents.Undo())
