@@ -21,6 +21,7 @@ from carts_core.process import tune_process
 from carts_core.resources import sample_sequence
 from carts_viewer.actions import intents
 from carts_viewer.app import ViewerApp
+from carts_viewer.jobs.job_list import JobState
 from carts_viewer.picture.scene_view import OVERLAY
 from tools.bench_start import print_starts
 from tools.memory import resident_megabytes
@@ -46,7 +47,9 @@ _KEY = "bench"
 """What the measuring tab calls itself, so that the next one takes its place."""
 
 
-def slider_latency(app: ViewerApp, *, drags: int = 4, seconds: float = 4.0, draws: bool = True) -> Latency:
+def slider_latency(
+    app: ViewerApp, *, drags: int = 4, seconds: float = 4.0, draws: bool = True, job: bool = False
+) -> Latency:
     """Drag the first joint's slider and wait for overlays.
 
     Args:
@@ -54,6 +57,7 @@ def slider_latency(app: ViewerApp, *, drags: int = 4, seconds: float = 4.0, draw
         drags: How many drags.
         seconds: Duration of each [s].
         draws: Whether the tab says when it has drawn; one that does not is as slow as the viewer ever waits for.
+        job: Whether all frames are optimized meanwhile.
     """
     arm = app.state.frame.measured
     name = next(iter(arm))
@@ -63,6 +67,9 @@ def slider_latency(app: ViewerApp, *, drags: int = 4, seconds: float = 4.0, draw
         slider = app.page.element_id(app.view.layout.joints.slider(name, 0))
         shown = _record_pictures(app, name)
         app.wait_until_shown()
+        if job:
+            app.queue.put(intents.OptimizeFrames("all"))
+            _until(lambda: any(one.state is JobState.RUNNING for one in app.state.jobs))
         for _ in range(drags):
             start = float(np.degrees(arm[name][0]))
             moves: list[tuple[float, float]] = []
@@ -71,15 +78,22 @@ def slider_latency(app: ViewerApp, *, drags: int = 4, seconds: float = 4.0, draw
                 moves.append((time.perf_counter(), value))
                 tab.set(slider, value)
                 time.sleep(1.0 / _MOVES_PER_SECOND)
-            app.wait_until_shown()
+            last = moves[-1][1]
+            _until(lambda last=last: bool(shown) and abs(np.degrees(shown[-1][1]) - last) < 1e-3)
             time.sleep(_SETTLE)
             pictures = [(at, np.degrees(value)) for at, value in shown if at >= moves[0][0]]
             arrivals = [at for at, _ in tab.overlays if at >= moves[0][0]]
             stale |= not pictures or abs(pictures[-1][1] - moves[-1][1]) > 1e-3
             times += [_wait_for(at, value, pictures, arrivals) for at, value in moves]
             app.queue.put(intents.BackToMeasured())
-            app.wait_until_shown()
+            _until(lambda start=start: abs(np.degrees(shown[-1][1]) - start) < 1e-3)
             shown.clear()
+        if job:
+            running = app.state.jobs[-1]
+            if running.state is not JobState.RUNNING:
+                raise RuntimeError(f"The job ended early: {running.text}")
+            app.queue.put(intents.CancelJob(running.number))
+        app.wait_until_shown()
     return _latency(times, stale)
 
 
@@ -202,6 +216,7 @@ def main() -> None:
         print(f"{arguments.sequence}: {camera.width} x {camera.height}, {len(app.scene.arms)} arm(s)")
         for draws, name in ((True, "tab that draws at once"), (False, "tab that never answers")):
             print(f"slider to overlay, {name}: {_figures(slider_latency(app, draws=draws))}")
+        print(f"slider to overlay, while all frames are optimized: {_figures(slider_latency(app, job=True))}")
         print(f"key to next frame with overlay, read before: {_figures(frame_latency(app))}")
         for iterations, megabytes in memory_while_optimizing(app, arguments.iterations):
             print(f"memory after {iterations} iterations: {megabytes:.0f} MB")
