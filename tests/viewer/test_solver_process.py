@@ -176,6 +176,7 @@ def _runs(pid: int) -> bool:
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(1800)
 def test_nothing_is_lost_when_the_process_is_killed_while_the_page_is_used(
     tiny_sequence: Callable[..., Path], tmp_path: Path
 ) -> None:
