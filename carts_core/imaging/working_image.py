@@ -84,10 +84,10 @@ class Window:
         return whole
 
 
-def stacked_images(
+def resized_images(
     scene: Scene, images: Mapping[str, UInt8[np.ndarray, "h w 3"]], size: tuple[int, int], what: str
-) -> Float[Tensor, "cameras 3 height width"]:
-    """Images of the scene's cameras, downscaled to a size (width, height) [px], RGB in [0, 1].
+) -> UInt8[np.ndarray, "cameras height width 3"]:
+    """Images of the scene's cameras, downscaled to a size (width, height) [px].
 
     Raises:
         SettingsError: an image is missing, or its size differs from that of its camera.
@@ -99,7 +99,14 @@ def stacked_images(
         image = images[camera.name]
         _check_shape(image, (camera.height, camera.width, 3), f"{what} of camera {camera.name!r}")
         resized.append(cv2.resize(image, size, interpolation=cv2.INTER_AREA))
-    return torch.from_numpy(np.stack(resized)).permute(0, 3, 1, 2).float() / 255.0
+    return np.stack(resized)
+
+
+def stacked_images(
+    scene: Scene, images: Mapping[str, UInt8[np.ndarray, "h w 3"]], size: tuple[int, int], what: str
+) -> Float[Tensor, "cameras 3 height width"]:
+    """Like `resized_images`, as a tensor of RGB in [0, 1]."""
+    return torch.from_numpy(resized_images(scene, images, size, what)).permute(0, 3, 1, 2).float() / 255.0
 
 
 def _check_shape(image: np.ndarray, shape: tuple[int, ...], what: str) -> None:

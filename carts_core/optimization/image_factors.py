@@ -287,7 +287,7 @@ _ROBUST = 1.5
 _BLUR = 1.0
 """Standard deviation of the blur for edge detection [px]."""
 
-_SHARE = (0.3, 1.0, 1.0)
+EDGE_SHARE = np.array((0.3, 1.0, 1.0), np.float32)
 """Weight of an outline pixel per part [1]; errors along a straight shaft are correlated over many pixels."""
 
 _RENDERED_ANEW = 1.0
@@ -327,7 +327,7 @@ class EdgeFactor:
         self.renderer = Renderer(scene, width=size[0], height=size[1], device=device)
         self._samples = torch.arange(-_REACH, _REACH + 0.5 * _SAMPLING, _SAMPLING, device=device)
         self._expected = torch.exp(-0.5 * (self._samples / _LIKELY).square())
-        self._share = torch.tensor(_SHARE, device=device)
+        self._share = torch.from_numpy(EDGE_SHARE).to(device)
 
     def near(
         self, offsets: Float[Tensor, " n"], coverage: Float[Tensor, "cameras rows columns"], weight: float
@@ -402,7 +402,7 @@ class LocalEdgeFactor:
         return self._outline.moved_by(step)
 
 
-_STILL = 0.03
+STILL = 0.03
 """Outline motion below which the alignment has converged [px]."""
 
 
@@ -433,6 +433,6 @@ def align_edges(
         step = bounded_step(before, gradient, hessian, variables.lower, variables.upper).to(offsets)
         offsets = variables.clamp(before + step)
         step = offsets - before
-        if factor.moved_by(step) < _STILL:
+        if factor.moved_by(step) < STILL:
             break
     return offsets, Linearization(found.cost, found.gradient + found.hessian @ step, found.hessian)

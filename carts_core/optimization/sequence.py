@@ -3,6 +3,7 @@
 import math
 import statistics
 import time
+from bisect import bisect
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import pairwise
@@ -21,9 +22,9 @@ from ..settings import FreeParameters, SequenceSettings, SolverSettings, surface
 from .kalman import ErrorModel, Gaussian, Information, Smoother, combined, remove_measurement
 from .observation import Backgrounds
 from .predictor import SurfacePredictor, predictor_of
-from .sequence_frame import FrameEstimate, Ignore, Measurement, Origin, SequenceFrameSolver, Visit
+from .sequence_frame import ColourTracker, FrameEstimate, Ignore, Measurement, Origin, SequenceFrameSolver, Visit
 from .variables import Variables
-from .verdict import SequenceAssessment, Verdict, assess, assess_sequence
+from .verdict import Assessment, SequenceAssessment, Verdict, assess, assess_sequence
 
 
 def visiting_gaps(times: Mapping[int, float | None], model: SequenceSettings) -> dict[int, float]:
@@ -202,6 +203,7 @@ class SequenceOptimizer:
         self._solver = SequenceFrameSolver(
             self._scene, self._predictor, self.settings, self.model, ignore or (lambda _: {}), backgrounds, checkpoint
         )
+        self._tracker = ColourTracker(self.model)
         self._queue, self._frames = list(gaps), len(gaps)
         initial = {self._queue[place] for place in evenly_spaced(len(self._queue), self.model.initial_frames)}
         initial.update([index for index in self._queue if index in self._keyframes][:1])
@@ -302,10 +304,16 @@ class SequenceOptimizer:
         """Assess all estimates, then solve failed frames individually if only joints are free; yield each new
         estimate."""
         failed, corrections = [], self._smoother.smoothed()
-        for index, estimate in self.estimates.items():
-            began = time.perf_counter()
-            frame, variables = self._open(index)
-            found = assess(self._solver.evidence(frame, variables, corrections[index].mean, estimate.loss))
+        looked = [index for index, visit in self._visits.items() if not visit.measurement.by_colours]
+        known: dict[int, Assessment] = {}
+        # Frames without the network come last, since the looks before and after them decide.
+        for index in sorted(self._visits, key=lambda index: self._visits[index].measurement.by_colours):
+            began, estimate = time.perf_counter(), self.estimates[index]
+            found = self._between_good_looks(index, sorted(looked), known)
+            if found is None:
+                frame, variables = self._open(index)
+                found = assess(self._solver.evidence(frame, variables, corrections[index].mean, estimate.loss))
+            known[index] = found
             seconds = estimate.seconds + time.perf_counter() - began
             judged = replace(estimate.judged(found, self._scene), seconds=seconds)
             yield judged
@@ -326,6 +334,19 @@ class SequenceOptimizer:
                 yield estimate.with_single_frame_fit(self._scene, variables, alone, seconds)
             if in_vain == _IN_VAIN:
                 return
+
+    def _between_good_looks(
+        self, index: int, looked: Sequence[int], known: Mapping[int, Assessment]
+    ) -> Assessment | None:
+        """Verdict on a frame whose colours agree with the fit: the less certain one of the looks before and after it,
+        if both are good; None for other frames."""
+        if not self._visits[index].measurement.by_colours:
+            return None
+        place = bisect(looked, index)
+        beside = [known[other] for other in looked[max(place - 1, 0) : place + 1]]
+        if not beside or any(one.verdict is not Verdict.GOOD for one in beside):
+            return None
+        return max(beside, key=lambda one: one.probability)
 
     def _assess_whole(self) -> None:
         """Assess the sequence; if it failed and there are no keyframes, failed frames return to their measured
@@ -365,9 +386,14 @@ class SequenceOptimizer:
         expected = self._smoother.expected(index)
         if index in self._keyframes:
             start, measurement = Origin.KEYFRAME, self._keyframe(frame, variables, expected)
+        elif self._visits and (found := self._tracker.measured(self._solver, frame, variables, expected)) is not None:
+            start, measurement = Origin.WARM, found
         else:
             start, measurement, lost = self._measure(frame, variables, expected)
-            if self._visits and measurement.information.contradicts(expected):
+            contradicts = bool(self._visits) and measurement.information.contradicts(expected)
+            usual = not (lost or contradicts) and measurement.loss <= self._unusual_loss()
+            self._tracker.looked(self._solver, frame, variables, measurement, usual)
+            if contradicts:
                 # If the image fits badly, it is ignored; otherwise the prediction is wrong, and the filter restarts.
                 if lost:
                     start, measurement = Origin.CARRIED, measurement.left_out()
@@ -389,8 +415,7 @@ class SequenceOptimizer:
             if self._initial_correction is None:
                 return Origin.COLD, self._solver.cold(frame, variables, self._prior), False
             return Origin.COLD, self._solver.warm(frame, variables, self._prior, self._initial_correction), False
-        losses = [visit.measurement.loss for visit in self._visits.values() if visit.start is not Origin.CARRIED]
-        usual = self.model.cold_factor * statistics.median(losses or [math.inf])
+        usual = self._unusual_loss()
         warm = self._solver.warm(frame, variables, expected, expected.mean)
         if warm.loss > usual:
             wide = self._solver.warm(frame, variables, expected, expected.mean, wide=True)
@@ -402,6 +427,11 @@ class SequenceOptimizer:
         best = replace(best, iterations=warm.iterations + cold.iterations)
         lost = best.loss > usual and best.loss * self.model.cold_factor > warm.loss
         return Origin.WARM if best.loss == warm.loss else Origin.COLD, best, lost
+
+    def _unusual_loss(self) -> float:
+        """Loss above which a frame gets a cold start."""
+        losses = [visit.measurement.loss for visit in self._visits.values() if visit.start is not Origin.CARRIED]
+        return self.model.cold_factor * statistics.median(losses or [math.inf])
 
     def _keyframe(self, frame: Frame, variables: Variables, expected: Gaussian) -> Measurement:
         correction, known = self._keyframes.correction(frame.index, variables)

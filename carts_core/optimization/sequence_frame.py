@@ -1,5 +1,6 @@
 """Measurements and estimates of single frames in a sequence, with checkpoints and verdicts."""
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import CancelledError
 from dataclasses import astuple, dataclass, replace
@@ -20,7 +21,7 @@ from ..recording import Frame
 from ..rendering import Renderer
 from ..reprs import short_repr
 from ..settings import FreeParameters, SequenceSettings, SurfaceSolver
-from ..settings.stages import COMPARE, FINEST, Observe, Stage, first_observe, reduced
+from ..settings.stages import COMPARE, FINEST, AlignRegions, Observe, Stage, first_observe, reduced
 from .factors import Prior
 from .frame import base_frame_gain
 from .frame_problem import FrameProblem
@@ -28,6 +29,7 @@ from .kalman import Gaussian, Information
 from .observability import Evaluation, Uncertainty
 from .observation import Backgrounds
 from .predictor import SurfacePredictor
+from .regions import ColourModel, RegionFactor, RegionImages, align_regions
 from .stages import Fit, run_stages
 from .variables import Variables
 from .verdict import Assessment, Evidence
@@ -50,7 +52,10 @@ class Measurement:
     information: Information
     """Information of the image alone, linearized at the correction and scaled for correlated pixels."""
     loss: float
+    """Loss of the surface factor; that of the last look of the network if the network did not look at the frame."""
     iterations: int
+    by_colours: bool = False
+    """Whether the outlines were aligned with colours and edges, without the network."""
 
     def left_out(self) -> "Measurement":
         """Copy without the information of its image."""
@@ -174,6 +179,32 @@ class SequenceFrameSolver:
         found, used = fit.best.evaluation, fit.used
         return SingleFrameFit(_double(fit.best.offsets), found.uncertainty, found.loss, used, fit.assessment)
 
+    def between(
+        self, frame: Frame, variables: Variables, expected: Gaussian, colours: ColourModel, stage: AlignRegions
+    ) -> tuple[Measurement, Float[np.ndarray, " arms"]]:
+        """Find the correction near its prediction without the network; returns it and the likelihood of each arm (see
+        `Alignment`)."""
+        images, prior = self._region_images(frame), _prior(expected, variables)
+        start = _offsets(expected.mean, variables)
+        factor = RegionFactor(images, variables, colours, stage)
+        found = align_regions(factor, prior.linearize(start), stage, start, variables)
+        precision, correction = _double(found.model.hessian), _double(found.offsets)
+        seen = Information(precision, precision @ correction - _double(found.model.gradient))
+        measurement = Measurement(correction, seen.scaled(self._share), math.nan, stage.steps, True)
+        return measurement, found.likelihood
+
+    def colours(self, frame: Frame, variables: Variables, correction: np.ndarray) -> ColourModel:
+        """Colours at the outlines of a correction [n]."""
+        state = variables.state(_offsets(correction, variables))
+        return self._region_images(frame).learnt(state)
+
+    def masked(self, frame: Frame) -> bool:
+        """Whether given masks are the target in a frame."""
+        return self._predictor.for_frame(frame, [camera.name for camera in self._scene.cameras]).masked
+
+    def _region_images(self, frame: Frame) -> RegionImages:
+        return RegionImages(self._scene, frame.images, self._ignore(frame.index), self._settings)
+
     @_checkpointed
     def at(self, frame: Frame, variables: Variables, expected: Gaussian, correction: np.ndarray) -> Measurement:
         """Evaluate a given correction [n]."""
@@ -245,6 +276,71 @@ class SequenceFrameSolver:
             if cancelled():
                 raise CancelledError
         return fit
+
+
+class ColourTracker:
+    """Measures frames between two looks of the network by the colours of earlier frames.
+
+    If the colours do not identify the arms (such as in smoke), the network looks at the next frames: at first at one,
+    then twice as many each time.
+
+    Args:
+        model: settings `between`, `look_every` and `min_likelihood`.
+    """
+
+    def __init__(self, model: SequenceSettings) -> None:
+        self._model = model
+        self._colours: ColourModel | None = None
+        self._usual: np.ndarray | None = None
+        """Usual likelihood of each arm [1]."""
+        self._loss = math.nan
+        self._since = 0
+        """Number of frames since the last look."""
+        self._pause, self._pauses = 0, 0
+        """Number of further frames at which the network looks anyway, and of pauses since the last good frame."""
+
+    def measured(
+        self, solver: SequenceFrameSolver, frame: Frame, variables: Variables, expected: Gaussian
+    ) -> Measurement | None:
+        """Measurement of a frame without the network; None if the network must look at it."""
+        if self._colours is None or self._pause > 0 or self._since + 1 >= self._model.look_every:
+            return None
+        (stage,) = self._model.between
+        assert isinstance(stage, AlignRegions)
+        found, likelihood = solver.between(frame, variables, expected, self._colours, stage)
+        usual = likelihood if self._usual is None else self._usual
+        least = np.maximum(self._model.min_likelihood, _USUAL_SHARE * np.nan_to_num(usual))
+        if np.isnan(likelihood).all() or (likelihood < least).any() or found.information.contradicts(expected):
+            self._pause, self._pauses = _SHORTEST << min(self._pauses, _MOST_PAUSES), self._pauses + 1
+            return None
+        mean = (1.0 - _NEWEST) * usual + _NEWEST * likelihood
+        self._usual = np.where(np.isnan(mean), likelihood, mean)
+        self._since, self._pauses = self._since + 1, 0
+        return replace(found, loss=self._loss)
+
+    def looked(
+        self, solver: SequenceFrameSolver, frame: Frame, variables: Variables, found: Measurement, good: bool
+    ) -> None:
+        """Learn the colours of a frame at which the network has looked, if the fit is good."""
+        self._since, self._loss = 0, found.loss
+        if not good:
+            self._colours = self._usual = None
+        if self._pause > 1:
+            self._pause -= 1
+        elif good and self._model.between and self._model.look_every > 1 and not solver.masked(frame):
+            self._pause = 0
+            new = solver.colours(frame, variables, found.correction)
+            self._colours = new if self._colours is None else self._colours.updated(new, _NEWEST)
+
+
+_NEWEST = 0.3
+"""Weight of the newest frame in averages of colours and likelihoods [1]."""
+_SHORTEST = 1
+"""Number of frames at which the network looks after an alignment was rejected."""
+_USUAL_SHARE = 0.5
+"""Share of the usual likelihood below which the network looks at a frame [1]."""
+_MOST_PAUSES = 5
+"""Number of times a pause is doubled."""
 
 
 def _prior(expected: Gaussian, variables: Variables) -> Prior:

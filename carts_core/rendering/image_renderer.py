@@ -51,6 +51,10 @@ class ImageRenderer:
         computed."""
         return self._labels(self.visibility(state)[0], self.geometry.face_arms)
 
+    def segment_parts(self, state: SceneState) -> Int[np.ndarray, "*batch cameras height width"]:
+        """Index into `carts_core.model.parts.PARTS` of the visible part per pixel, -1 for background."""
+        return self._labels(self.visibility(state)[0], self.geometry.face_parts)
+
     def segment_links(self, state: SceneState) -> Int[np.ndarray, "*batch cameras height width"]:
         """Index of the visible link per pixel, -1 for background.
 

@@ -235,14 +235,16 @@ def jacobian_of_box(
 
 
 @compiled
-def keep_outline(face_ids, inverse_depth, nearness, border):
+def keep_outline(face_ids, inverse_depth, nearness, border, share):
     """Keep `face_ids` of pixels with a much farther surface to their left, right, above or below; set all others to -1.
 
     Args:
         face_ids, inverse_depth [cameras, height, width]: visible triangle, and 1 / depth [1/m].
         nearness: share of a pixel's inverse depth below which a neighbour counts as much farther away [1].
         border: width of the image border that is omitted [px].
+        share: share of these pixels to keep, selected by a hash of their position [1].
     """
+    limit = np.uint32(min(share * 65536.0, 65536.0))
     cameras, height, width = face_ids.shape
     kept = np.full(face_ids.shape, -1, face_ids.dtype)
     for camera in range(cameras):
@@ -256,6 +258,11 @@ def keep_outline(face_ids, inverse_depth, nearness, border):
                     or near[row, column - 1] < least
                     or near[row, column + 1] < least
                 ):
+                    mixed = np.uint32(np.uint32(row) * np.uint32(2654435761)) ^ np.uint32(
+                        np.uint32(column) * np.uint32(2246822519)
+                    )
+                    if np.uint32(np.uint32(mixed * np.uint32(3266489917)) >> np.uint32(16)) >= limit:
+                        continue
                     kept[camera, row, column] = face_ids[camera, row, column]
     return kept
 
@@ -346,6 +353,8 @@ class Outline:
     """Outward unit normals."""
     parts: Int[Tensor, " K"]
     """Index into `carts_core.model.parts.PARTS`."""
+    arms: Int[Tensor, " K"]
+    """Index of the arm."""
     motion: Float[Tensor, "unknowns K"]
     """Motion along the normal [px per unit of each unknown]."""
 
@@ -362,7 +371,9 @@ class Outline:
 
 
 def outline_faces(
-    face_ids: Int[Tensor, "cameras height width"], inverse_depth: Float[Tensor, "cameras height width"]
+    face_ids: Int[Tensor, "cameras height width"],
+    inverse_depth: Float[Tensor, "cameras height width"],
+    share: float = 1.0,
 ) -> Int[Tensor, "cameras height width"]:
     """Visible faces at pixels with a much farther surface to their left, right, above or below; -1 elsewhere.
 
@@ -370,8 +381,9 @@ def outline_faces(
 
     Args:
         inverse_depth: 1 / depth [1/m], 0 for background.
+        share: share of these pixels to keep, scattered evenly [1].
     """
-    kept = keep_outline(as_array(face_ids), as_array(inverse_depth), 1.0 - BEHIND, BORDER)
+    kept = keep_outline(as_array(face_ids), as_array(inverse_depth), 1.0 - BEHIND, BORDER, share)
     return torch.from_numpy(kept).to(face_ids.device)
 
 

@@ -211,11 +211,15 @@ class Renderer(ImageRenderer):
         return SurfaceRendering(maps, image, jacobian)
 
     @torch.no_grad()
-    def outline(self, state: SceneState, tangents: Tangents) -> Outline:
-        """Outlines of one state (no batch), and their motion with the unknowns."""
+    def outline(self, state: SceneState, tangents: Tangents, *, share: float = 1.0) -> Outline:
+        """Outlines of one state (no batch), and their motion with the unknowns.
+
+        Args:
+            share: share of the outline pixels, scattered evenly [1].
+        """
         Ts, intrinsics = self._views(state)
         face_ids, inverse_depth = self._visibility(Ts, intrinsics)
-        rim = outline_faces(face_ids, inverse_depth)
+        rim = outline_faces(face_ids, inverse_depth, share)
         points = visible_points(self.geometry, rim, inverse_depth, Ts, intrinsics)
         position, normal = outline_position(inverse_depth, points.pixel)
         return Outline(
@@ -223,6 +227,7 @@ class Renderer(ImageRenderer):
             position,
             normal,
             self.geometry.face_parts[points.face],
+            self.geometry.face_arms[points.face],
             normal_motion(points, normal, Ts, intrinsics, tangents),
         )
 

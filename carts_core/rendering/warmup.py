@@ -9,7 +9,11 @@ from ..model.camera import Camera
 from ..model.robot import Robot
 from ..model.scene import Arm, Scene
 from ..optimization.image_factors import nearest_edges
+from ..optimization.regions import RegionFactor, RegionImages
+from ..optimization.variables import Variables
 from ..resources import shipped_robot
+from ..settings import FreeParameters, SurfaceSolver
+from ..settings.stages import AlignRegions
 from .renderer import Renderer
 
 
@@ -29,6 +33,12 @@ def main() -> None:
     renderer.outline(around.map(lambda values: values[0]), renderer.tangents(around, 2 * step))
     image, pixel, samples = (np.zeros(shape, np.float32) for shape in ((1, 2, 2, 6), (2, 1), 3))
     nearest_edges(image, np.zeros(1, np.int64), pixel, pixel, samples, samples)
+    settings, state = SurfaceSolver(), around.map(lambda values: values[0])
+    images = RegionImages(scene, {"camera": np.zeros((48, 64, 3), np.uint8)}, {}, settings)
+    variables = Variables(scene, state, FreeParameters(), settings.length_scale)
+    factor = RegionFactor(images, variables, images.learnt(state), AlignRegions())
+    factor.render(0.0 * variables.lower)
+    factor.linearize(0.0 * variables.lower)
 
 
 if __name__ == "__main__":

@@ -7,6 +7,7 @@ from typing import Annotated, Literal, get_args
 from ..errors import SettingsError
 from .ranges import Range, Ranged, Share, require
 from .stages import (
+    BETWEEN,
     CALIBRATION_STAGES,
     COLD,
     FEATURES,
@@ -16,6 +17,7 @@ from .stages import (
     PAPER,
     WARM,
     WARM_WIDE,
+    AlignRegions,
     FirstOrder,
     Stage,
 )
@@ -66,10 +68,18 @@ class SequenceSettings(Ranged):
     """Stages from the correction predicted by the other frames."""
     wide: tuple[Stage, ...] = WARM_WIDE
     """Stages after `warm` ends with an unusual loss, before a cold start."""
+    between: tuple[Stage, ...] = BETWEEN
+    """`AlignRegions`, for frames between two looks of the network; empty to let the network look at every frame."""
+    look_every: Annotated[int, Range(1, 1000)] = 8
+    """Number of frames from one look of the network to the next while `between` fits well [1]."""
+    min_likelihood: Annotated[float, Range(-2, 2)] = 0.4
+    """Mean log odds of the colours at the outlines of an arm below which the network looks at a frame [1]."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
         require(self.direction in get_args(Direction), "direction", self.direction, " or ".join(get_args(Direction)))
+        regions = len(self.between) <= 1 and all(isinstance(stage, AlignRegions) for stage in self.between)
+        require(regions, "between", self.between, "one AlignRegions, or nothing")
 
 
 class Loss(StrEnum):
@@ -153,8 +163,8 @@ class SurfaceSolver(Ranged):
     def __post_init__(self) -> None:
         super().__post_init__()
         require(len(self.stages) > 0, "stages", self.stages, "one or more")
-        of_kind = not any(isinstance(stage, FirstOrder) for stage in self.stages)
-        require(of_kind, "stages", self.stages, "stages of the surface solver (no FirstOrder)")
+        of_kind = not any(isinstance(stage, FirstOrder | AlignRegions) for stage in self.stages)
+        require(of_kind, "stages", self.stages, "stages of the surface solver (no FirstOrder or AlignRegions)")
 
     @property
     def needs_background(self) -> bool:

@@ -110,6 +110,29 @@ class AlignEdges(Ranged):
 
 
 @dataclass(frozen=True)
+class AlignRegions(Ranged):
+    """Move the outlines of the arms to where colours, learnt in earlier frames, and edges of the image indicate them,
+    without the network. Only for frames between two looks of the network, in `SequenceSettings.between`."""
+
+    steps: Annotated[int, Range(1, 1000)] = 6
+    """Number of steps [1]."""
+    weight: Annotated[float, Range(0, 100, above=True)] = 0.5
+    """Weight of a squared distance, per outline pixel [1/px^2]."""
+    reach: Annotated[float, Range(0.1, 100, "px")] = 2.0
+    """Standard deviation of the expected distance between outline and image [px]; smaller for the last steps."""
+    odds: Annotated[float, Range(0, 10)] = 0.3
+    """Exponent of the odds of colours [1]; below 1, since colours of neighbouring pixels are correlated."""
+    edges: Annotated[float, Range(0, 10)] = 1.0
+    """Exponent of the squared strength of edges [1]."""
+    floor: Annotated[float, Range(1e-3, 1e5)] = 200.0
+    """Squared difference of colours (8 bits) across an edge that counts as noise [1]."""
+    spread: Annotated[float, Range(0.1, 100, "px")] = 1.0
+    """Standard deviation of the distance along a line at which its weight is halved [px]."""
+    robust: Annotated[float, Range(0.1, 100, "px")] = 2.0
+    """Distance at which the weight of a line is reduced to a quarter [px]."""
+
+
+@dataclass(frozen=True)
 class PreferStart(Ranged):
     """Return to the start if it explains the image as well as the estimate; skipped if a calibration is free."""
 
@@ -172,6 +195,7 @@ Stage = (
     | RandomRestart
     | SilhouetteSearch
     | AlignEdges
+    | AlignRegions
     | PreferStart
     | RetryOtherBackground
     | IgnoreOccluders
@@ -255,6 +279,9 @@ WARM: tuple[Stage, ...] = (
 )
 """Stages for a frame of a sequence or stream whose state is near its prediction: one small observation, one step, and
 edge alignment."""
+
+BETWEEN: tuple[Stage, ...] = (AlignRegions(),)
+"""Stage for a frame of a sequence or stream between two looks of the network."""
 
 LIVE_SEARCH: tuple[Stage, ...] = reduced(SEARCH[: SEARCH.index(_RESTART) + 1], 1.0)
 """Stages for a frame of a live stream with lost arms; `WARM` follows."""

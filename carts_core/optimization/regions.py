@@ -1,0 +1,312 @@
+"""Lines across the outlines of arms: colours and edges of an image, compared without a network.
+
+Between two looks of the network, the outlines of the predicted pose are aligned with the image. Along the normal of
+each outline pixel, the colours of the parts and of their surroundings, learnt in earlier frames, and the edges of the
+image give a distribution of the position of the outline. The colours follow Stoiber, Sundermeyer and Triebel, Iterative
+Corresponding Geometry (CVPR 2022).
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, UInt8
+from torch import Tensor
+
+from ..arrays import as_array
+from ..compiled import compiled
+from ..imaging.working_image import pixel_weights, resized_images, working_size
+from ..model.parts import PARTS
+from ..model.scene import Scene, SceneState
+from ..rendering import Outline, Renderer
+from ..rendering.jacobian import Tangents
+from ..settings import SurfaceSolver
+from ..settings.stages import AlignRegions
+from .factors import Linearization, bounded_step
+from .image_factors import EDGE_SHARE
+from .variables import DIFFERENCE_SPAN, Variables
+
+_SCALE = 2.0
+"""Size of the images relative to the working image, limited to the camera's resolution [1]."""
+_BITS = 4
+"""Bits per colour channel of a histogram."""
+_BINS = 1 << 3 * _BITS
+_DEEP = 8
+"""Distance from an outline within which colours are learnt and compared [px]."""
+_SPARSE = 2
+"""Every n-th pixel of an outline has a line [1]."""
+_NARROW = 0.35
+"""Factor of `AlignRegions.reach` and `robust` in the second half of the steps [1]."""
+_LAST = 0.25
+"""Factor of `AlignRegions.odds` in the second half of the steps, since the odds of mixed colours are biased [1]."""
+_LEAST = 20
+"""Minimum number of lines of an arm in view [1]."""
+_FEW = 0.5
+"""Pixels that are added to each bin of a histogram [px], relative to a uniform distribution of all bins."""
+_ODDS = 2.0
+"""Maximum absolute log odds of a pixel [1]."""
+
+
+@compiled
+def _bin(pixel):
+    shift = 8 - _BITS
+    return (int(pixel[0]) >> shift) << 2 * _BITS | (int(pixel[1]) >> shift) << _BITS | int(pixel[2]) >> shift
+
+
+@compiled
+def count_colours(images, labels, shown, camera, position, normal, parts, deep, counts):
+    """Count the colours of pixels on both sides of outlines.
+
+    Args:
+        images [cameras, height, width, 3], labels, shown [cameras, height, width]: 8-bit images, visible part (-1 for
+            none), and whether a pixel is compared.
+        counts [parts, 2, bins]: output: numbers of pixels of each part (0), and beside it (1).
+    """
+    height, width = labels.shape[1:]
+    for k in range(len(camera)):
+        for step in range(-deep, deep + 1):
+            x = round(position[0, k] + step * normal[0, k])
+            y = round(position[1, k] + step * normal[1, k])
+            if step == 0 or x < 0 or y < 0 or x >= width or y >= height or not shown[camera[k], y, x]:
+                continue
+            inside = labels[camera[k], y, x] == parts[k]
+            if inside == (step < 0):
+                counts[parts[k], 0 if inside else 1, _bin(images[camera[k], y, x])] += 1.0
+
+
+@compiled
+def _sample(image, visible, odds_of_bins, x0, y0, nx, ny, deep, odds, colours):
+    """Fill log odds [samples] and colours [samples, 3] along a line, half a pixel apart; returns the number of visible
+    samples."""
+    height, width = visible.shape
+    seen = 0
+    for s in range(len(odds)):
+        away = np.float32(0.5) * (s - 2 * deep)
+        # Beyond the image border, the colours of the border continue.
+        x = min(max(x0 + away * nx, np.float32(0.0)), np.float32(width - 1))
+        y = min(max(y0 + away * ny, np.float32(0.0)), np.float32(height - 1))
+        column, row = min(int(x), width - 2), min(int(y), height - 2)
+        u, v = np.float32(x - column), np.float32(y - row)
+        upper, lower = image[row], image[row + 1]
+        for c in range(3):
+            above = upper[column, c] + u * (np.float32(upper[column + 1, c]) - upper[column, c])
+            below = lower[column, c] + u * (np.float32(lower[column + 1, c]) - lower[column, c])
+            colours[s, c] = above + v * (below - above)
+        near_column, near_row = int(x + np.float32(0.5)), int(y + np.float32(0.5))
+        odds[s] = 0.0
+        if visible[near_row, near_column]:
+            seen += 1
+            odds[s] = odds_of_bins[_bin(image[near_row, near_column])]
+    return seen
+
+
+_TAPS = 3
+"""Half the width of the filter for edges [samples]."""
+
+
+@compiled
+def _edge(colours, s):
+    """Squared derivative of the colours along a line, under a blur of about one pixel."""
+    squared = np.float32(0.0)
+    for c in range(3):
+        change = colours[s + 2, c] - colours[s - 2, c]
+        change += np.float32(0.6) * (colours[s + 1, c] - colours[s - 1, c] + colours[s + 3, c] - colours[s - 3, c])
+        squared += change * change
+    return squared
+
+
+@compiled
+def find_contours(
+    images, shown, camera, position, normal, parts, log_odds, deep, reach, odds_weight, edge_weight, floor, out
+):
+    """Distribution of the position of an outline along each line.
+
+    The likelihood of a distance is the product of the odds of the colours, for a boundary there, and of the strength
+    of the edge there.
+
+    Args:
+        images, shown: see `count_colours`.
+        camera [K], position, normal [2, K], parts [K]: outline pixels.
+        log_odds [parts, bins]: of each part against its surroundings.
+        deep: length of a line on either side [px].
+        reach: standard deviation of the expected distance [px].
+        odds_weight: exponent of the odds, since colours of neighbouring pixels are correlated [1].
+        edge_weight: exponent of the squared strength of edges [1].
+        floor: squared difference of colours that counts as noise [1].
+        out [4, K]: mean and variance of the distance along the normal [px, px^2], mean log odds of both sides for the
+            present outline [1], and 1 if most of the line is visible, else 0.
+    """
+    samples, half = 4 * deep + 1, np.float32(0.5)
+    odds, colours = np.empty(samples, np.float32), np.empty((samples, 3), np.float32)
+    score = np.empty(samples, np.float32)
+    for k in range(len(camera)):
+        lines = position[0, k], position[1, k], normal[0, k], normal[1, k]
+        seen = _sample(images[camera[k]], shown[camera[k]], log_odds[parts[k]], *lines, deep, odds, colours)
+        inside, outside = odds[: 2 * deep].sum(), odds[2 * deep + 1 :].sum()
+        # Odds of the samples inside an outline at a sample, minus those outside.
+        difference, best = -odds.sum(), np.float32(-np.inf)
+        for s in range(samples):
+            difference += odds[s]
+            away = half * (s - 2 * deep)
+            score[s] = half * odds_weight * difference - half * (away / reach) ** 2
+            difference += odds[s]
+            if _TAPS <= s < samples - _TAPS:
+                score[s] += edge_weight * np.log(_edge(colours, s) + floor)
+                best = max(best, score[s])
+        mass, mean, square = np.float32(0.0), np.float32(0.0), np.float32(0.0)
+        for s in range(_TAPS, samples - _TAPS):
+            away, weight = half * (s - 2 * deep), np.exp(score[s] - best)
+            mass += weight
+            mean += weight * away
+            square += weight * away * away
+        mean /= mass
+        out[0, k], out[1, k] = mean, max(square / mass - mean * mean, np.float32(0.0))
+        out[2, k] = (inside - outside) / max(seen, 1)
+        out[3, k] = 1.0 if 2 * seen > samples else 0.0
+
+
+@dataclass(frozen=True)
+class ColourModel:
+    """Histograms of the colours of each part and of its surroundings, near the outlines."""
+
+    counts: Float[np.ndarray, "parts 2 bins"]
+    """Numbers of pixels of each colour, inside and outside [px]."""
+
+    def log_odds(self) -> Float[np.ndarray, "parts bins"]:
+        """Log odds of each part against its surroundings for each colour [1]."""
+        sums = self.counts.sum(-1, keepdims=True)
+        shares = (self.counts + _FEW) / (sums + _FEW * _BINS)
+        odds = np.log(shares[:, 0] / shares[:, 1]).clip(-_ODDS, _ODDS)
+        return odds.astype(np.float32)
+
+    def updated(self, other: "ColourModel", share: float) -> "ColourModel":
+        """Average with a newer model of the given weight in [0, 1]."""
+        return ColourModel((1.0 - share) * self.counts + share * other.counts)
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """Result of an alignment of outlines with colours and edges."""
+
+    offsets: Float[Tensor, " n"]
+    model: Linearization
+    """Quadratic model of the lines around the result."""
+    likelihood: Float[np.ndarray, " arms"]
+    """Mean log odds of the colours on both sides of each arm's outlines [1]: about 0 if the image does not show the arm
+    there, `_ODDS` if its colours occur nowhere else; NaN for an arm without outlines."""
+
+
+class RegionImages:
+    """Images of a frame at the size at which lines are drawn, without other preparation.
+
+    Args:
+        ignore: camera name -> pixels that show an occluder.
+
+    Raises:
+        SettingsError: an image is missing, or the size of an image or mask differs from that of its camera.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        images: Mapping[str, UInt8[np.ndarray, "h w 3"]],
+        ignore: Mapping[str, Bool[np.ndarray, "h w"]],
+        settings: SurfaceSolver,
+    ) -> None:
+        size = working_size(scene, round(settings.working_width * _SCALE), 1)
+        self.renderer = Renderer(scene, width=size[0], height=size[1])
+        self.images = resized_images(scene, images, size, "image")
+        hidden = 1.0 - pixel_weights(scene, ignore, size)
+        self.shown: Bool[np.ndarray, "cameras h w"] = (hidden == 0.0).numpy()[:, 0]
+
+    def learnt(self, state: SceneState) -> ColourModel:
+        """Colours at the outlines of a state."""
+        labels = self.renderer.segment_parts(state).astype(np.int8)
+        links, cameras = sum(len(arm.robot.link_names) for arm in self.renderer.scene.arms), len(self.images)
+        nothing = Tangents(torch.zeros(0, cameras, links, 4, 4), torch.zeros(0, cameras, 4))
+        outline = self.renderer.outline(state, nothing)
+        counts = np.zeros((len(PARTS), 2, _BINS), np.float32)
+        values = outline.camera, outline.position, outline.normal, outline.parts
+        count_colours(self.images, labels, self.shown, *map(as_array, values), _DEEP, counts)
+        return ColourModel(counts)
+
+
+class RegionFactor:
+    """Half the weighted squared distances of outlines from the positions that colours and edges indicate."""
+
+    def __init__(self, images: RegionImages, variables: Variables, colours: ColourModel, stage: AlignRegions) -> None:
+        self._images, self._variables, self._stage = images, variables, stage
+        self._log_odds, self._arms = colours.log_odds(), len(images.renderer.scene.arms)
+        self.likelihood = np.full(self._arms, np.nan)
+
+    def render(self, offsets: Float[Tensor, " n"]) -> None:
+        """Draw lines across the outlines of a point."""
+        renderer, variables = self._images.renderer, self._variables
+        tangents = renderer.tangents(variables.around(offsets), DIFFERENCE_SPAN)
+        self._outline = renderer.outline(variables.state(offsets), tangents, share=1.0 / _SPARSE)
+        self._rendered_at = offsets
+
+    def linearize(self, offsets: Float[Tensor, " n"], narrow: float = 1.0) -> Linearization:
+        """Quadratic model around a point.
+
+        Args:
+            narrow: factor of the expected distance between outline and image [1].
+        """
+        outline: Outline = self._outline.at(offsets - self._rendered_at)
+        found = np.zeros((4, len(outline.parts)), np.float32)
+        values = outline.camera, outline.position, outline.normal, outline.parts
+        arrays = tuple(map(as_array, values))
+        stage = self._stage
+        find_contours(
+            self._images.images,
+            self._images.shown,
+            *arrays,
+            self._log_odds,
+            _DEEP,
+            np.float32(stage.reach * narrow),
+            np.float32(stage.odds * (_LAST if narrow < 1.0 else 1.0)),
+            np.float32(stage.edges),
+            np.float32(stage.floor),
+            found,
+        )
+        mean, variance, support, seen = found
+        weight = EDGE_SHARE[arrays[3]] * seen / (1.0 + variance / stage.spread**2)
+        arms = as_array(outline.arms)
+        sums, counts = (np.bincount(arms, values, self._arms) for values in (support * seen, seen))
+        self.likelihood = np.where(counts >= _LEAST, sums / np.maximum(counts, 1.0), np.nan)
+        # Smoke reduces the odds, and hides the true edges.
+        weight *= np.nan_to_num(self.likelihood).clip(0.0, 1.0)[arms] ** 2
+        weight /= (1.0 + (mean / (stage.robust * narrow)) ** 2) ** 2
+        motion = as_array(outline.motion)
+        weighted = stage.weight * _SPARSE * weight * motion
+        gradient, hessian = (
+            torch.from_numpy(values.astype(np.float32)) for values in (-weighted @ mean, weighted @ motion.T)
+        )
+        cost = 0.5 * stage.weight * _SPARSE * float((weight * mean**2).sum())
+        return Linearization(cost, gradient, hessian)
+
+
+@torch.no_grad()
+def align_regions(
+    factor: RegionFactor, prior: Linearization, stage: AlignRegions, offsets: Float[Tensor, " n"], variables: Variables
+) -> Alignment:
+    """Minimize the sum of the region factor and a quadratic model.
+
+    Args:
+        prior: quadratic model of all other factors at `offsets`.
+    """
+    origin = offsets
+    factor.render(offsets)
+    found = None
+    step = torch.zeros_like(offsets)
+    for turn in range(stage.steps):
+        narrow = 1.0 if turn < stage.steps // 2 else _NARROW
+        found, before = factor.linearize(offsets, narrow), offsets
+        gradient = prior.gradient + prior.hessian @ (before - origin) + found.gradient
+        step = bounded_step(before, gradient, prior.hessian + found.hessian, variables.lower, variables.upper)
+        offsets = variables.clamp(before + step.to(offsets))
+        step = offsets - before
+    assert found is not None
+    model = Linearization(found.cost, found.gradient + found.hessian @ step, found.hessian)
+    return Alignment(offsets, model, factor.likelihood)
