@@ -16,7 +16,14 @@ from torch import Tensor
 
 from ..arrays import as_array
 from ..compiled import compiled
-from ..imaging.working_image import pixel_weights, resized_images, working_size
+from ..imaging.working_image import (
+    certainty,
+    pixel_weights,
+    resized_images,
+    stacked_images,
+    transmission,
+    working_size,
+)
 from ..model.parts import PARTS
 from ..model.scene import Scene, SceneState
 from ..rendering import Outline, Renderer
@@ -215,10 +222,19 @@ class RegionImages:
         settings: SurfaceSolver,
     ) -> None:
         size = working_size(scene, round(settings.working_width * _SCALE), 1)
+        self._scene, self._given, self._settings = scene, images, settings
         self.renderer = Renderer(scene, width=size[0], height=size[1])
         self.images = resized_images(scene, images, size, "image")
         hidden = 1.0 - pixel_weights(scene, ignore, size)
         self.shown: Bool[np.ndarray, "cameras h w"] = (hidden == 0.0).numpy()[:, 0]
+
+    def certainty(self, state: SceneState) -> float:
+        """Mean information of the arms' pixels, relative to an image without haze [1]; 0 without arms in view."""
+        size = working_size(self._scene, self._settings.working_width, 1)
+        images = stacked_images(self._scene, self._given, size, "image")
+        found = as_array(certainty(transmission(images, self._settings.dehaze))[:, 0])
+        arms = Renderer(self._scene, width=size[0], height=size[1]).segment(state) >= 0
+        return float(found[arms].mean()) if arms.any() else 0.0
 
     def learnt(self, state: SceneState) -> ColourModel:
         """Colours at the outlines of a state."""

@@ -193,10 +193,10 @@ class SequenceFrameSolver:
         measurement = Measurement(correction, seen.scaled(self._share), math.nan, stage.steps, True)
         return measurement, found.likelihood
 
-    def colours(self, frame: Frame, variables: Variables, correction: np.ndarray) -> ColourModel:
-        """Colours at the outlines of a correction [n]."""
-        state = variables.state(_offsets(correction, variables))
-        return self._region_images(frame).learnt(state)
+    def colours(self, frame: Frame, variables: Variables, correction: np.ndarray) -> ColourModel | None:
+        """Colours at the outlines of a correction [n]; None if haze hides the arms."""
+        state, images = variables.state(_offsets(correction, variables)), self._region_images(frame)
+        return images.learnt(state) if images.certainty(state) > _CLEAR else None
 
     def masked(self, frame: Frame) -> bool:
         """Whether given masks are the target in a frame."""
@@ -330,9 +330,11 @@ class ColourTracker:
         elif good and self._model.between and self._model.look_every > 1 and not solver.masked(frame):
             self._pause = 0
             new = solver.colours(frame, variables, found.correction)
-            self._colours = new if self._colours is None else self._colours.updated(new, _NEWEST)
+            self._colours = self._colours.updated(new, _NEWEST) if self._colours and new else new
 
 
+_CLEAR = 0.5
+"""Information of the arms' pixels relative to an image without haze, below which colours are not used [1]."""
 _NEWEST = 0.3
 """Weight of the newest frame in averages of colours and likelihoods [1]."""
 _SHORTEST = 1
