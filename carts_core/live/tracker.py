@@ -19,7 +19,7 @@ from ..networks.extractor import FeatureExtractor
 from ..optimization.kalman import ErrorModel, Gaussian, combined
 from ..optimization.observation import Backgrounds
 from ..optimization.predictor import SurfacePredictor, predictor_of
-from ..optimization.sequence_frame import Measurement, Origin, SequenceFrameSolver, Visit
+from ..optimization.sequence_frame import ColourTracker, Measurement, Origin, SequenceFrameSolver, Visit
 from ..optimization.variables import Variables
 from ..optimization.verdict import arm_is_elsewhere
 from ..recording import Frame
@@ -161,6 +161,7 @@ class LiveTracker:
             for effort, stages in ((Effort.SMALL, self.live.small), (Effort.FULL, self.live.full))
             for moving in (False, True)
         }
+        self._colours = ColourTracker(self._model)
         self._moving = False
         self._errors: ErrorModel | None = None
         self._filtered: Gaussian | None = None
@@ -251,8 +252,14 @@ class LiveTracker:
         self._drop_outdated(frame)
         if self._filtered is not None or self._pool is not None:
             attempt = self._known(errors, now)
+            if self.verdict is LiveVerdict.GOOD:
+                between = self._colours.measured(small, frame, variables, attempt.expected)
+                if between is not None:
+                    return attempt, between
             found = attempt, small.warm(frame, variables, attempt.expected, attempt.expected.mean)
-            if self._fits(*found):
+            fits = self._fits(*found)
+            self._colours.looked(small, frame, variables, found[1], fits)
+            if fits:
                 return found
         effort = self._further(now)
         if found and (effort is Effort.SMALL or self._recovery):
@@ -318,7 +325,8 @@ class LiveTracker:
         share = math.tanh(0.5 * attempt.gap / self._model.correlation_seconds)
         self._filtered = errors.updated(attempt.state, measurement.information.scaled(share))
         self._seen = attempt.time
-        self._losses.append(measurement.loss)
+        if not measurement.by_colours:
+            self._losses.append(measurement.loss)
 
     def _solver(self, warm: tuple[Stage, ...], backgrounds: Backgrounds | None) -> SequenceFrameSolver:
         model = replace(self._model, warm=warm, cold=self.live.search)

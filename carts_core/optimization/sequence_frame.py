@@ -311,7 +311,7 @@ class ColourTracker:
         usual = likelihood if self._usual is None else self._usual
         least = np.maximum(self._model.min_likelihood, _USUAL_SHARE * np.nan_to_num(usual))
         if np.isnan(likelihood).all() or (likelihood < least).any() or found.information.contradicts(expected):
-            self._pause, self._pauses = _SHORTEST << min(self._pauses, _MOST_PAUSES), self._pauses + 1
+            self._wait()
             return None
         mean = (1.0 - _NEWEST) * usual + _NEWEST * likelihood
         self._usual = np.where(np.isnan(mean), likelihood, mean)
@@ -331,6 +331,12 @@ class ColourTracker:
             self._pause = 0
             new = solver.colours(frame, variables, found.correction)
             self._colours = self._colours.updated(new, _NEWEST) if self._colours and new else new
+            if new is None:
+                self._wait()
+
+    def _wait(self) -> None:
+        """Let the network look at the next frames."""
+        self._pause, self._pauses = _SHORTEST << min(self._pauses, _MOST_PAUSES), self._pauses + 1
 
 
 _CLEAR = 0.5
