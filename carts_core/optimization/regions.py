@@ -20,13 +20,12 @@ from ..imaging.working_image import (
     certainty,
     pixel_weights,
     resized_images,
-    stacked_images,
     transmission,
     working_size,
 )
 from ..model.parts import PARTS
 from ..model.scene import Scene, SceneState
-from ..rendering import Outline, Renderer
+from ..rendering import Renderer
 from ..rendering.jacobian import Tangents
 from ..settings import SurfaceSolver
 from ..settings.stages import AlignRegions
@@ -51,6 +50,8 @@ _LEAST = 20
 """Minimum number of lines of an arm in view [1]."""
 _FEW = 0.5
 """Pixels that are added to each bin of a histogram [px], relative to a uniform distribution of all bins."""
+_CLEAR = 0.5
+"""Information of the arms' pixels relative to an image without haze, below which colours are not learnt [1]."""
 _ODDS = 2.0
 """Maximum absolute log odds of a pixel [1]."""
 
@@ -124,53 +125,65 @@ def _edge(colours, s):
 
 
 @compiled
-def find_contours(
-    images, shown, camera, position, normal, parts, log_odds, deep, reach, odds_weight, edge_weight, floor, out
-):
-    """Distribution of the position of an outline along each line.
-
-    The likelihood of a distance is the product of the odds of the colours, for a boundary there, and of the strength
-    of the edge there.
+def sample_lines(images, shown, camera, position, normal, parts, log_odds, deep, floor, difference, edges, seen):
+    """Sample colours and edges along lines across outlines, half a pixel apart.
 
     Args:
         images, shown: see `count_colours`.
         camera [K], position, normal [2, K], parts [K]: outline pixels.
         log_odds [parts, bins]: of each part against its surroundings.
         deep: length of a line on either side [px].
+        floor: squared difference of colours that counts as noise [1].
+        difference [K, samples]: output: log odds of the samples inside an outline at a sample, minus those outside.
+        edges [K, samples]: output: logarithm of the squared strength of the edge at a sample.
+        seen [K]: output: number of visible samples.
+    """
+    samples = 4 * deep + 1
+    odds, colours = np.empty(samples, np.float32), np.empty((samples, 3), np.float32)
+    for k in range(len(camera)):
+        lines = position[0, k], position[1, k], normal[0, k], normal[1, k]
+        seen[k] = _sample(images[camera[k]], shown[camera[k]], log_odds[parts[k]], *lines, deep, odds, colours)
+        sum_ = -odds.sum()
+        for s in range(samples):
+            difference[k, s] = sum_ + odds[s]
+            sum_ += np.float32(2.0) * odds[s]
+            if _TAPS <= s < samples - _TAPS:
+                edges[k, s] = np.log(_edge(colours, s) + floor)
+
+
+@compiled
+def find_contours(difference, edges, shift, deep, reach, odds_weight, edge_weight, out):
+    """Distribution of the position of an outline along each line.
+
+    The likelihood of a distance is the product of the odds of the colours, for a boundary there, and of the strength
+    of the edge there.
+
+    Args:
+        difference, edges [K, samples]: see `sample_lines`.
+        shift [K]: positions of the outlines along the lines [px].
         reach: standard deviation of the expected distance [px].
         odds_weight: exponent of the odds, since colours of neighbouring pixels are correlated [1].
         edge_weight: exponent of the squared strength of edges [1].
-        floor: squared difference of colours that counts as noise [1].
-        out [4, K]: mean and variance of the distance along the normal [px, px^2], mean log odds of both sides for the
-            present outline [1], and 1 if most of the line is visible, else 0.
+        out [3, K]: mean and variance of the distance along the normal [px, px^2], and log odds of both sides of the
+            outline [1].
     """
-    samples, half = 4 * deep + 1, np.float32(0.5)
-    odds, colours = np.empty(samples, np.float32), np.empty((samples, 3), np.float32)
+    samples, half = difference.shape[1], np.float32(0.5)
     score = np.empty(samples, np.float32)
-    for k in range(len(camera)):
-        lines = position[0, k], position[1, k], normal[0, k], normal[1, k]
-        seen = _sample(images[camera[k]], shown[camera[k]], log_odds[parts[k]], *lines, deep, odds, colours)
-        inside, outside = odds[: 2 * deep].sum(), odds[2 * deep + 1 :].sum()
-        # Odds of the samples inside an outline at a sample, minus those outside.
-        difference, best = -odds.sum(), np.float32(-np.inf)
-        for s in range(samples):
-            difference += odds[s]
-            away = half * (s - 2 * deep)
-            score[s] = half * odds_weight * difference - half * (away / reach) ** 2
-            difference += odds[s]
-            if _TAPS <= s < samples - _TAPS:
-                score[s] += edge_weight * np.log(_edge(colours, s) + floor)
-                best = max(best, score[s])
+    for k in range(len(difference)):
+        best = np.float32(-np.inf)
+        for s in range(_TAPS, samples - _TAPS):
+            away = half * (s - 2 * deep) - shift[k]
+            score[s] = half * (odds_weight * difference[k, s] - (away / reach) ** 2) + edge_weight * edges[k, s]
+            best = max(best, score[s])
         mass, mean, square = np.float32(0.0), np.float32(0.0), np.float32(0.0)
         for s in range(_TAPS, samples - _TAPS):
-            away, weight = half * (s - 2 * deep), np.exp(score[s] - best)
+            away, weight = half * (s - 2 * deep) - shift[k], np.exp(score[s] - best)
             mass += weight
             mean += weight * away
             square += weight * away * away
         mean /= mass
         out[0, k], out[1, k] = mean, max(square / mass - mean * mean, np.float32(0.0))
-        out[2, k] = (inside - outside) / max(seen, 1)
-        out[3, k] = 1.0 if 2 * seen > samples else 0.0
+        out[2, k] = difference[k, min(max(2 * deep + round(2 * shift[k]), 0), samples - 1)]
 
 
 @dataclass(frozen=True)
@@ -222,25 +235,22 @@ class RegionImages:
         settings: SurfaceSolver,
     ) -> None:
         size = working_size(scene, round(settings.working_width * _SCALE), 1)
-        self._scene, self._given, self._settings = scene, images, settings
+        self._dehaze = settings.dehaze
         self.renderer = Renderer(scene, width=size[0], height=size[1])
         self.images = resized_images(scene, images, size, "image")
-        hidden = 1.0 - pixel_weights(scene, ignore, size)
-        self.shown: Bool[np.ndarray, "cameras h w"] = (hidden == 0.0).numpy()[:, 0]
+        shape = len(self.images), size[1], size[0]
+        hidden = as_array(pixel_weights(scene, ignore, size))[:, 0] < 1.0 if ignore else np.zeros(shape, bool)
+        self.shown: Bool[np.ndarray, "cameras h w"] = ~hidden
 
-    def certainty(self, state: SceneState) -> float:
-        """Mean information of the arms' pixels, relative to an image without haze [1]; 0 without arms in view."""
-        size = working_size(self._scene, self._settings.working_width, 1)
-        images = stacked_images(self._scene, self._given, size, "image")
-        found = as_array(certainty(transmission(images, self._settings.dehaze))[:, 0])
-        arms = Renderer(self._scene, width=size[0], height=size[1]).segment(state) >= 0
-        return float(found[arms].mean()) if arms.any() else 0.0
-
-    def learnt(self, state: SceneState) -> ColourModel:
-        """Colours at the outlines of a state."""
-        labels = self.renderer.segment_parts(state).astype(np.int8)
+    def learnt(self, state: SceneState) -> ColourModel | None:
+        """Colours at the outlines of a state; None without arms in view, or if haze hides them."""
         links, cameras = sum(len(arm.robot.link_names) for arm in self.renderer.scene.arms), len(self.images)
         nothing = Tangents(torch.zeros(0, cameras, links, 4, 4), torch.zeros(0, cameras, 4))
+        labels = self.renderer.segment_parts(state).astype(np.int8)
+        through = transmission(torch.from_numpy(self.images[:, ::2, ::2]).permute(0, 3, 1, 2) / 255.0, self._dehaze)
+        arms = labels[:, ::2, ::2] >= 0
+        if not arms.any() or float(certainty(through).numpy()[:, 0][arms].mean()) < _CLEAR:
+            return None
         outline = self.renderer.outline(state, nothing)
         counts = np.zeros((len(PARTS), 2, _BINS), np.float32)
         values = outline.camera, outline.position, outline.normal, outline.parts
@@ -260,7 +270,25 @@ class RegionFactor:
         """Draw lines across the outlines of a point."""
         renderer, variables = self._images.renderer, self._variables
         tangents = renderer.tangents(variables.around(offsets), DIFFERENCE_SPAN)
-        self._outline = renderer.outline(variables.state(offsets), tangents, share=1.0 / _SPARSE)
+        outline = renderer.outline(variables.state(offsets), tangents, share=1.0 / _SPARSE)
+        self._motion, self._lines_arms, parts = map(as_array, (outline.motion, outline.arms, outline.parts))
+        shape = len(parts), 4 * _DEEP + 1
+        self._difference, self._edges, seen = (np.empty(size, np.float32) for size in (shape, shape, len(parts)))
+        sample_lines(
+            self._images.images,
+            self._images.shown,
+            *map(as_array, (outline.camera, outline.position, outline.normal)),
+            parts,
+            self._log_odds,
+            _DEEP,
+            np.float32(self._stage.floor),
+            self._difference,
+            self._edges,
+            seen,
+        )
+        self._seen = np.maximum(seen, 1.0)
+        self._shown = (2.0 * seen > shape[1]).astype(np.float32)
+        self._share = EDGE_SHARE[parts] * self._shown
         self._rendered_at = offsets
 
     def linearize(self, offsets: Float[Tensor, " n"], narrow: float = 1.0) -> Linearization:
@@ -269,32 +297,29 @@ class RegionFactor:
         Args:
             narrow: factor of the expected distance between outline and image [1].
         """
-        outline: Outline = self._outline.at(offsets - self._rendered_at)
-        found = np.zeros((4, len(outline.parts)), np.float32)
-        values = outline.camera, outline.position, outline.normal, outline.parts
-        arrays = tuple(map(as_array, values))
-        stage = self._stage
+        stage, motion = self._stage, self._motion
+        shift = as_array(offsets - self._rendered_at) @ motion
+        found = np.empty((3, len(shift)), np.float32)
         find_contours(
-            self._images.images,
-            self._images.shown,
-            *arrays,
-            self._log_odds,
+            self._difference,
+            self._edges,
+            shift,
             _DEEP,
             np.float32(stage.reach * narrow),
             np.float32(stage.odds * (_LAST if narrow < 1.0 else 1.0)),
             np.float32(stage.edges),
-            np.float32(stage.floor),
             found,
         )
-        mean, variance, support, seen = found
-        weight = EDGE_SHARE[arrays[3]] * seen / (1.0 + variance / stage.spread**2)
-        arms = as_array(outline.arms)
-        sums, counts = (np.bincount(arms, values, self._arms) for values in (support * seen, seen))
+        mean, variance, support = found
+        support = support / self._seen
+        weight = self._share / (1.0 + variance / stage.spread**2)
+        sums, counts = (
+            np.bincount(self._lines_arms, values, self._arms) for values in (support * self._shown, self._shown)
+        )
         self.likelihood = np.where(counts >= _LEAST, sums / np.maximum(counts, 1.0), np.nan)
         # Smoke reduces the odds, and hides the true edges.
-        weight *= np.nan_to_num(self.likelihood).clip(0.0, 1.0)[arms] ** 2
+        weight *= np.nan_to_num(self.likelihood).clip(0.0, 1.0)[self._lines_arms] ** 2
         weight /= (1.0 + (mean / (stage.robust * narrow)) ** 2) ** 2
-        motion = as_array(outline.motion)
         weighted = stage.weight * _SPARSE * weight * motion
         gradient, hessian = (
             torch.from_numpy(values.astype(np.float32)) for values in (-weighted @ mean, weighted @ motion.T)

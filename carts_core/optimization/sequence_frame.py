@@ -194,9 +194,8 @@ class SequenceFrameSolver:
         return measurement, found.likelihood
 
     def colours(self, frame: Frame, variables: Variables, correction: np.ndarray) -> ColourModel | None:
-        """Colours at the outlines of a correction [n]; None if haze hides the arms."""
-        state, images = variables.state(_offsets(correction, variables)), self._region_images(frame)
-        return images.learnt(state) if images.certainty(state) > _CLEAR else None
+        """Colours at the outlines of a correction [n]; see `RegionImages.learnt`."""
+        return self._region_images(frame).learnt(variables.state(_offsets(correction, variables)))
 
     def masked(self, frame: Frame) -> bool:
         """Whether given masks are the target in a frame."""
@@ -339,8 +338,6 @@ class ColourTracker:
         self._pause, self._pauses = _SHORTEST << min(self._pauses, _MOST_PAUSES), self._pauses + 1
 
 
-_CLEAR = 0.5
-"""Information of the arms' pixels relative to an image without haze, below which colours are not used [1]."""
 _NEWEST = 0.3
 """Weight of the newest frame in averages of colours and likelihoods [1]."""
 _SHORTEST = 1

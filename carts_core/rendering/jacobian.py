@@ -252,7 +252,7 @@ def keep_outline(face_ids, inverse_depth, nearness, border, share):
         for row in range(border, height - border):
             for column in range(border, width - border):
                 least = nearness * near[row, column]
-                if (
+                if least > 0.0 and (
                     near[row - 1, column] < least
                     or near[row + 1, column] < least
                     or near[row, column - 1] < least
