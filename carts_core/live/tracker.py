@@ -258,7 +258,7 @@ class LiveTracker:
                     return attempt, between
             found = attempt, small.warm(frame, variables, attempt.expected, attempt.expected.mean)
             fits = self._fits(*found)
-            self._colours.looked(small, frame, variables, found[1], fits)
+            self._colours.learn(small, frame, variables, found[1], fits)
             if fits:
                 return found
         effort = self._further(now)

@@ -1,6 +1,6 @@
 """Lines across the outlines of arms: colours and edges of an image, compared without a network.
 
-Between two looks of the network, the outlines of the predicted pose are aligned with the image. Along the normal of
+Between two frames with the network, the outlines of the predicted pose are aligned with the image. Along the normal of
 each outline pixel, the colours of the parts and of their surroundings, learnt in earlier frames, and the edges of the
 image give a distribution of the position of the outline. The colours follow Stoiber, Sundermeyer and Triebel, Iterative
 Corresponding Geometry (CVPR 2022).

@@ -306,10 +306,10 @@ class SequenceOptimizer:
         failed, corrections = [], self._smoother.smoothed()
         looked = [index for index, visit in self._visits.items() if not visit.measurement.by_colours]
         known: dict[int, Assessment] = {}
-        # Frames without the network come last, since the looks before and after them decide.
+        # Frames without the network come last, since the frames with it before and after them decide.
         for index in sorted(self._visits, key=lambda index: self._visits[index].measurement.by_colours):
             began, estimate = time.perf_counter(), self.estimates[index]
-            found = self._between_good_looks(index, sorted(looked), known)
+            found = self._between_good_frames(index, sorted(looked), known)
             if found is None:
                 frame, variables = self._open(index)
                 found = assess(self._solver.evidence(frame, variables, corrections[index].mean, estimate.loss))
@@ -335,10 +335,11 @@ class SequenceOptimizer:
             if in_vain == _IN_VAIN:
                 return
 
-    def _between_good_looks(
+    def _between_good_frames(
         self, index: int, looked: Sequence[int], known: Mapping[int, Assessment]
     ) -> Assessment | None:
-        """Verdict on a frame whose colours agree with the fit: the less certain one of the looks before and after it,
+        """Verdict on a frame whose colours agree with the fit: the less certain one of the
+        network's frames before and after it,
         if both are good; None for other frames."""
         if not self._visits[index].measurement.by_colours:
             return None
@@ -392,7 +393,7 @@ class SequenceOptimizer:
             start, measurement, lost = self._measure(frame, variables, expected)
             contradicts = bool(self._visits) and measurement.information.contradicts(expected)
             usual = not (lost or contradicts) and measurement.loss <= self._unusual_loss()
-            self._tracker.looked(self._solver, frame, variables, measurement, usual)
+            self._tracker.learn(self._solver, frame, variables, measurement, usual)
             if contradicts:
                 # If the image fits badly, it is ignored; otherwise the prediction is wrong, and the filter restarts.
                 if lost:

@@ -52,7 +52,7 @@ class Measurement:
     information: Information
     """Information of the image alone, linearized at the correction and scaled for correlated pixels."""
     loss: float
-    """Loss of the surface factor; that of the last look of the network if the network did not look at the frame."""
+    """Loss of the surface factor; that of the last frame with the network if this frame is measured without it."""
     iterations: int
     by_colours: bool = False
     """Whether the outlines were aligned with colours and edges, without the network."""
@@ -278,10 +278,10 @@ class SequenceFrameSolver:
 
 
 class ColourTracker:
-    """Measures frames between two looks of the network by the colours of earlier frames.
+    """Measures frames without the network, by the colours of earlier frames.
 
-    If the colours do not identify the arms (such as in smoke), the network looks at the next frames: at first at one,
-    then twice as many each time.
+    If the colours do not identify the arms (such as in smoke), the network is evaluated in the next frames: in one at
+    first, then in twice as many each time.
 
     Args:
         model: settings `between`, `look_every` and `min_likelihood`.
@@ -294,14 +294,14 @@ class ColourTracker:
         """Usual likelihood of each arm [1]."""
         self._loss = math.nan
         self._since = 0
-        """Number of frames since the last look."""
+        """Number of frames since the last one with the network."""
         self._pause, self._pauses = 0, 0
-        """Number of further frames at which the network looks anyway, and of pauses since the last good frame."""
+        """Number of further frames with the network, and of such pauses since the last frame without it."""
 
     def measured(
         self, solver: SequenceFrameSolver, frame: Frame, variables: Variables, expected: Gaussian
     ) -> Measurement | None:
-        """Measurement of a frame without the network; None if the network must look at it."""
+        """Measurement of a frame without the network; None if the network is needed."""
         if self._colours is None or self._pause > 0 or self._since + 1 >= self._model.look_every:
             return None
         (stage,) = self._model.between
@@ -317,10 +317,10 @@ class ColourTracker:
         self._since, self._pauses = self._since + 1, 0
         return replace(found, loss=self._loss)
 
-    def looked(
+    def learn(
         self, solver: SequenceFrameSolver, frame: Frame, variables: Variables, found: Measurement, good: bool
     ) -> None:
-        """Learn the colours of a frame at which the network has looked, if the fit is good."""
+        """Learn the colours of a frame that was measured with the network, if the fit is good."""
         self._since, self._loss = 0, found.loss
         if not good:
             self._colours = self._usual = None
@@ -334,16 +334,16 @@ class ColourTracker:
                 self._wait()
 
     def _wait(self) -> None:
-        """Let the network look at the next frames."""
+        """Evaluate the network in the next frames."""
         self._pause, self._pauses = _SHORTEST << min(self._pauses, _MOST_PAUSES), self._pauses + 1
 
 
 _NEWEST = 0.3
 """Weight of the newest frame in averages of colours and likelihoods [1]."""
 _SHORTEST = 1
-"""Number of frames at which the network looks after an alignment was rejected."""
+"""Number of frames with the network after an alignment was rejected."""
 _USUAL_SHARE = 0.5
-"""Share of the usual likelihood below which the network looks at a frame [1]."""
+"""Share of the usual likelihood below which the network is needed [1]."""
 _MOST_PAUSES = 5
 """Number of times a pause is doubled."""
 

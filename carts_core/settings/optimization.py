@@ -69,11 +69,11 @@ class SequenceSettings(Ranged):
     wide: tuple[Stage, ...] = WARM_WIDE
     """Stages after `warm` ends with an unusual loss, before a cold start."""
     between: tuple[Stage, ...] = BETWEEN
-    """`AlignRegions`, for frames between two looks of the network; empty to let the network look at every frame."""
+    """`AlignRegions`, for frames without the network; empty to evaluate the network in every frame."""
     look_every: Annotated[int, Range(1, 1000)] = 8
-    """Number of frames from one look of the network to the next while `between` fits well [1]."""
+    """Number of frames from one evaluation of the network to the next while `between` fits well [1]."""
     min_likelihood: Annotated[float, Range(-2, 2)] = 0.4
-    """Mean log odds of the colours at the outlines of an arm below which the network looks at a frame [1]."""
+    """Mean log odds of the colours at the outlines of an arm below which the network is needed [1]."""
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -112,7 +112,7 @@ class AlignEdges(Ranged):
 @dataclass(frozen=True)
 class AlignRegions(Ranged):
     """Move the outlines of the arms to where colours, learnt in earlier frames, and edges of the image indicate them,
-    without the network. Only for frames between two looks of the network, in `SequenceSettings.between`."""
+    without the network. Only for frames without the network, in `SequenceSettings.between`."""
 
     steps: Annotated[int, Range(1, 1000)] = 6
     """Number of steps [1]."""
@@ -281,7 +281,7 @@ WARM: tuple[Stage, ...] = (
 edge alignment."""
 
 BETWEEN: tuple[Stage, ...] = (AlignRegions(),)
-"""Stage for a frame of a sequence or stream between two looks of the network."""
+"""Stage for a frame of a sequence or stream without the network."""
 
 LIVE_SEARCH: tuple[Stage, ...] = reduced(SEARCH[: SEARCH.index(_RESTART) + 1], 1.0)
 """Stages for a frame of a live stream with lost arms; `WARM` follows."""

@@ -10,7 +10,8 @@ from carts_core.optimization import SequenceOptimizer, SequenceSettings
 from carts_core.recording import Frame, Sequence
 
 FRAMES = 6
-ALONE = SequenceSettings(initial_frames=1)
+ALONE = SequenceSettings(initial_frames=1, between=())
+"""Settings of one initial frame, in which the predictor looks at every frame."""
 ARM = "PSM1"
 
 
