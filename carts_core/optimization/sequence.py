@@ -338,9 +338,8 @@ class SequenceOptimizer:
     def _between_good_frames(
         self, index: int, looked: Sequence[int], known: Mapping[int, Assessment]
     ) -> Assessment | None:
-        """Verdict on a frame whose colours agree with the fit: the less certain one of the
-        network's frames before and after it,
-        if both are good; None for other frames."""
+        """Verdict on a frame whose colours agree with the fit: the less certain one of the network's
+        frames before and after it, if both are good; None for other frames."""
         if not self._visits[index].measurement.by_colours:
             return None
         place = bisect(looked, index)
