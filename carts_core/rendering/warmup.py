@@ -36,7 +36,9 @@ def main() -> None:
     settings, state = SurfaceSolver(), around.map(lambda values: values[0])
     images = RegionImages(scene, {"camera": np.zeros((48, 64, 3), np.uint8)}, {}, settings)
     variables = Variables(scene, state, FreeParameters(), settings.length_scale)
-    factor = RegionFactor(images, variables, images.learnt(state), AlignRegions())
+    colours = images.learnt(state)
+    assert colours is not None
+    factor = RegionFactor(images, variables, colours, AlignRegions())
     factor.render(0.0 * variables.lower)
     factor.linearize(0.0 * variables.lower)
 

@@ -27,7 +27,9 @@ def sample() -> Sequence:
 
 def learnt(sample: Sequence, index: int) -> ColourModel:
     frame = sample.frame(index)
-    return RegionImages(sample.scene, frame.images, {}, SETTINGS).learnt(sample.scene.state(frame.truth or {}))
+    found = RegionImages(sample.scene, frame.images, {}, SETTINGS).learnt(sample.scene.state(frame.truth or {}))
+    assert found is not None
+    return found
 
 
 def aligned(sample: Sequence, frame: Frame, colours: ColourModel) -> tuple[Variables, torch.Tensor, Alignment]:
@@ -56,6 +58,11 @@ def test_the_likelihood_of_a_hidden_arm_is_low(sample: Sequence) -> None:
     image[:, :320] = image[240, 320]
     _, _, found = aligned(sample, replace(frame, images={"left": image}), colours)
     assert found.likelihood.min() < 0.2 and found.likelihood.max() > 0.4
+
+
+def test_no_colours_are_learnt_in_smoke(sample: Sequence) -> None:
+    frame = sample.frame(4, "smoke")
+    assert RegionImages(sample.scene, frame.images, {}, SETTINGS).learnt(sample.scene.state(frame.truth or {})) is None
 
 
 def test_smoke_lowers_the_likelihood(sample: Sequence) -> None:
