@@ -216,6 +216,7 @@ def test_nothing_is_lost_when_the_process_is_killed_while_the_page_is_used(
             noted[frame] = note
             put(intents.ShowFrame(frame))
             put(intents.SetNote(note))
+            put(intents.Released())
             app._optimizers.prepare().result()
             seconds.append(time.monotonic() - began)
             said = eventually(lambda: app.state.error, lambda error: error is not None, timeout=60)
