@@ -9,7 +9,9 @@ from typing import Any, Unpack
 from carts_core.errors import CartsError
 from carts_core.model.camera import Camera
 from carts_core.model.parts import part_classes
-from carts_core.recording import Sequence
+from carts_core.model.scene import SceneState
+from carts_core.project.state import corrected_state
+from carts_core.recording import Frame, Sequence
 from carts_viewer.actions import intents
 from carts_viewer.actions.shortcuts import key_sheet
 from carts_viewer.jobs.optimizers import NetworkOptions, OptimizerFactory
@@ -203,7 +205,7 @@ class ViewerApp:
         self.url = self.page.url
         self.page.keys = key_sheet()
         self.page.project = sequence.name
-        self._thumbnails = Thumbnails(sequence)
+        self._thumbnails = Thumbnails(sequence, self._saved_pose)
         self.page.thumbnail = self._thumbnails.answer
         self._worker = Worker(queue, self.tabs, lambda: self._solver.busy)
         self._listener = _SolverListener(self._worker, self._say)
@@ -308,6 +310,10 @@ class ViewerApp:
             if self._own_solver:
                 stack.callback(self._solver.close)
             stack.callback(self.tabs.close)
+
+    def _saved_pose(self, frame: Frame) -> SceneState:
+        """The frame's pose in the project, without unsaved edits."""
+        return corrected_state(self.scene, frame, self.project.state)
 
     def wait_until_shown(self, timeout: float = 120.0) -> ViewState:
         """Wait until all intents so far are carried out and their results are sent to the page.

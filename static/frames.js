@@ -63,7 +63,7 @@
     return {
       name: row.name, verdict: chip(row.verdict), failure: row.failure === null ? "" : `${number(100 * row.failure, 0)} %`,
       loss: row.loss === null ? "" : Number(row.loss.toPrecision(3)).toString(), dice: number(row.dice, 3), review: row.review,
-      who: row.who, note: row.note, picture: make("img", { src: window.carts.thumbnailOf(row.index), alt: "", loading: "lazy" }),
+      who: row.who, note: row.note, picture: make("img", { src: window.carts.thumbnailOf(row.index, row.pose), alt: "", loading: "lazy" }),
     };
   }
 
@@ -135,13 +135,13 @@
   Object.assign(window.carts, {
     /** Ask the server for the frames, which it sends again with every change until the sheet is closed. */
     openFrames() { window.carts.report("Pressed", { key: "frames" }); },
-    /** Values of frames with a record: [loss, Dice, probability of failure, note, place from the worst], by index; people by frame. */
-    setFrames({ values, who }) {
+    /** Values of frames with a record: [loss, Dice, probability of failure, note, place from the worst], by index; people by frame; numbers of poses, -1 for frames without a record. */
+    setFrames({ values, who, poses }) {
       rows = Array.from({ length: window.carts.timeline().frames }, (_, index) => {
         const [loss, dice, failure, note, worst] = values[index] ?? [null, null, null, "", null];
         const code = window.carts.timeline().code(index) ?? 0;
         return {
-          index, loss, dice, failure, note, worst, who: who[index] ?? "", name: window.carts.nameOf(index),
+          index, loss, dice, failure, note, worst, pose: poses[index] ?? poses[-1], who: who[index] ?? "", name: window.carts.nameOf(index),
           verdict: VERDICTS[(code >> 3) & 3], review: window.carts.reviewNames[code & 7],
         };
       });

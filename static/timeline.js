@@ -394,7 +394,7 @@
     showFrames: show,
     reviewNames: NAMES,
     nameOf: (frame) => name(frame),
-    thumbnailOf: (frame) => `thumbnail/${shown.active ?? 0}/${Math.max(known.domains.indexOf(shown.domain), 0)}/${frame}.jpg`,
+    thumbnailOf: (frame, pose) => `thumbnail/${shown.active ?? 0}/${Math.max(known.domains.indexOf(shown.domain), 0)}/${frame}-${pose}.jpg`,
   });
   everyFrame();
 })();

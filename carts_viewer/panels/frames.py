@@ -4,8 +4,11 @@ import threading
 from typing import Any
 
 from carts_core.project import ProjectState, worst_first
+from carts_core.project.values import WHOLE_PROJECT
 from carts_viewer.state import ViewState
 from carts_viewer.transport.page import TabPage
+
+_NUMBERS = 10**9
 
 
 class FramesData:
@@ -42,7 +45,17 @@ class FramesData:
         who: dict[int, str] = {}
         for name, index in state.others:
             who[index] = f"{who[index]}, {name}" if index in who else name
-        self._page.call("setFrames", {"values": frame_values(state.project), "who": who})
+        self._page.call(
+            "setFrames", {"values": frame_values(state.project), "who": who, "poses": _pose_numbers(state.project)}
+        )
+
+
+def _pose_numbers(project: ProjectState) -> dict[int, int]:
+    """Numbers in the addresses of thumbnails, which change with the poses of frames with a record, and of all others
+    (`WHOLE_PROJECT`)."""
+    whole = id(project.records.get(WHOLE_PROJECT))
+    found = {index: (id(record) ^ whole) % _NUMBERS for index, record in project.records.items() if index >= 0}
+    return {**found, WHOLE_PROJECT: whole % _NUMBERS}
 
 
 def frame_values(project: ProjectState) -> dict[int, list[Any]]:

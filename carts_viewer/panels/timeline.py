@@ -5,26 +5,28 @@ import http
 import re
 import threading
 from collections import OrderedDict
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
+import cv2
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 from websockets.http11 import Response
 
 from carts_core.errors import CartsError
-from carts_core.model.scene import Scene
+from carts_core.model.scene import Scene, SceneState
 from carts_core.optimization import undetermined_joints
 from carts_core.project import ProjectState, ReviewState, Source
 from carts_core.project.state import Record
 from carts_core.project.values import VERDICTS, WHOLE_PROJECT
-from carts_core.recording import Sequence
+from carts_core.recording import Frame, Sequence
 from carts_core.recording.images import ImageSource
 from carts_core.recording.video import Video
+from carts_core.rendering import ImageRenderer
 from carts_viewer.actions.frame_filter import BY_HAND, SOLVED, review_name
 from carts_viewer.panels.inputs import humanized
-from carts_viewer.picture.layers import small_jpeg
+from carts_viewer.picture.layers import mask, small_jpeg
 from carts_viewer.session import Session
 from carts_viewer.state import ViewState
 from carts_viewer.transport.events import Trace
@@ -114,14 +116,20 @@ THUMBNAIL_HEIGHT = 64
 _MAX_THUMBNAILS = 4000
 """Maximum number of cached thumbnails of about 3 kB; the least recently used are removed first."""
 _QUALITY = 70
-_PATH = re.compile(r"(\d{1,4})/(\d{1,4})/(\d{1,9})\.jpg")
+_OPACITY = 0.5
+_PATH = re.compile(r"(\d{1,4})/(\d{1,4})/(\d{1,9})(-\d{1,9})?\.jpg")
 
 
 class Thumbnails:
-    """Thumbnails of one sequence."""
+    """Thumbnails of one sequence.
 
-    def __init__(self, sequence: Sequence) -> None:
-        self._sequence = sequence
+    Args:
+        pose: the pose of a frame, which is read without images.
+    """
+
+    def __init__(self, sequence: Sequence, pose: Callable[[Frame], SceneState]) -> None:
+        self._sequence, self._pose = sequence, pose
+        self._renderers: dict[int, ImageRenderer] = {}
         self._cameras = [camera.name for camera in sequence.scene.cameras]
         self._sources: dict[tuple[int, int], ImageSource] = {}
         self._kept: OrderedDict[str, bytes] = OrderedDict()
@@ -130,7 +138,8 @@ class Thumbnails:
         self._thread = ThreadPoolExecutor(1, "carts-thumbnails")
 
     async def answer(self, path: str) -> Response:
-        """The picture at `CAMERA/DOMAIN/FRAME.jpg`, given by indices; status 404 if there is none."""
+        """The picture at `CAMERA/DOMAIN/FRAME.jpg`, given by indices, or with the overlay of the frame's pose at
+        `CAMERA/DOMAIN/FRAME-NUMBER.jpg`, with any number; status 404 if there is none."""
         content = self._find(path)
         if content is None:
             try:
@@ -162,7 +171,7 @@ class Thumbnails:
         found = _PATH.fullmatch(path)
         if found is None:
             return None
-        camera, domain, frame = map(int, found.groups())
+        camera, domain, frame = map(int, found.groups()[:3])
         known = camera < len(self._cameras) and domain < len(self._sequence.domains) and frame < len(self._sequence)
         if not known:
             return None
@@ -170,12 +179,27 @@ class Thumbnails:
             image = self._source(camera, domain).read(frame)
         except CartsError:
             return None
+        if found[4] is not None:
+            return small_jpeg(self._overlaid(image, camera, domain, frame), height=THUMBNAIL_HEIGHT, quality=_QUALITY)
         content = small_jpeg(image, height=THUMBNAIL_HEIGHT, quality=_QUALITY)
         with self._lock:
             self._kept[path] = content
             while len(self._kept) > _MAX_THUMBNAILS:
                 self._kept.popitem(last=False)
         return content
+
+    def _overlaid(self, image: UInt8[np.ndarray, "h w 3"], camera: int, domain: int, frame: int) -> np.ndarray:
+        """The image at twice the height of thumbnails, with the masks of the arms."""
+        height = 2 * THUMBNAIL_HEIGHT
+        size = 2 * max(1, round(image.shape[1] * THUMBNAIL_HEIGHT / image.shape[0])), height
+        if camera not in self._renderers:
+            scene, name = self._sequence.scene, self._cameras[camera]
+            self._renderers[camera] = ImageRenderer(scene, width=size[0], height=height, cameras=[name])
+        state = self._pose(self._sequence.frame(frame, self._sequence.domains[domain], []))
+        overlay = mask(self._renderers[camera].segment(state)[0], 1.0)
+        opacity = overlay[..., 3:] / np.float32(255) * _OPACITY
+        small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+        return (small + (overlay[..., :3] - small.astype(np.float32)) * opacity).astype(np.uint8)
 
 
 _REVIEWS = (

@@ -108,6 +108,8 @@ def painted(rendered: ArmIds, correction: MaskCorrection | None, camera: str, op
 
 def legend(state: ViewState, poses: Mapping[ComparedPose, SceneState | None]) -> list[dict[str, object]]:
     """Entries of the legend over the image: name, colour, and dashes or stripes."""
+    if state.camera in state.frame.missing:
+        return [{"name": "This camera has no image of this frame.", "color": "transparent"}]
     if state.compare.mode is CompareMode.OUTLINES:
         return [
             {

@@ -1,5 +1,7 @@
 """Comparisons of poses and masks: their pictures, and the line between two states in headless Chromium."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -64,6 +66,13 @@ def test_the_accepted_pose_is_that_of_the_last_acceptance(desk: Desk) -> None:
     assert accepted() == []
     state = desk.do(intents.ShowFrame(0), intents.GoToStep(1))
     assert accepted() == [] and "none" in str(legend(state, {ComparedPose.ACCEPTED: None}))
+
+
+def test_a_missing_image_is_named(desk: Desk) -> None:
+    state = desk.do(intents.CompareWith(None))
+    assert legend(state, {}) == []
+    missing = replace(state, frame=replace(state.frame, missing=(state.camera,)))
+    assert "no image" in str(legend(missing, {}))
 
 
 @pytest.mark.browser

@@ -126,6 +126,11 @@ def test_a_frame_of_which_the_fit_is_not_known_has_no_height_and_one_that_fits_w
 def test_thumbnails_are_served_of_frames_that_there_are(shared_viewer: ViewerApp) -> None:
     answer = get(shared_viewer.url, "/thumbnail/0/0/2.jpg")
     assert answer.status == 200 and decoded(answer.read()).shape == (THUMBNAIL_HEIGHT, THUMBNAIL_HEIGHT * 96 // 72, 3)
+    outlined = get(shared_viewer.url, "/thumbnail/0/0/2-7.jpg")
+    plain = decoded(get(shared_viewer.url, "/thumbnail/0/0/2.jpg").read())
+    assert outlined.status == 200
+    changed = np.abs(decoded(outlined.read()).astype(int) - plain).max(axis=2) > 40
+    assert 0.02 < changed.mean() < 0.5, "the arm is overlaid, and the rest is the image"
     for path in (
         "0/0/3.jpg",
         "1/0/0.jpg",
