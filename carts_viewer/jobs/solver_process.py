@@ -58,9 +58,9 @@ class Reply(Generic[T]):
         """The result or the error of a function, which is called at once."""
         reply = cls()
         try:
-            reply._set(function())
+            reply.set(function())
         except Exception as error:
-            reply._set(error=error)
+            reply.set(error=error)
         return reply
 
     @property
@@ -98,7 +98,8 @@ class Reply(Generic[T]):
             yield self
         return self.result()
 
-    def _set(self, value: Any = None, error: Exception | None = None) -> None:
+    def set(self, value: Any = None, error: Exception | None = None) -> None:
+        """Set the result or the error."""
         self._value, self._error = value, error
         self._done.set()
         self._call_back()
@@ -269,7 +270,7 @@ class SolverProcess:
         packed = _packed(number, request)
         with self._changing:
             if self._closed:
-                reply._set(error=SolverStopped("The solver process is closed."))
+                reply.set(error=SolverStopped("The solver process is closed."))
                 return reply
             self._waiting[number] = reply
             self._unsent.append(packed)
@@ -311,7 +312,7 @@ class SolverProcess:
             here.close()
             error = SolverStopped("The viewer was closed." if closed else _description(status, failures))
             for reply in lost:
-                reply._set(error=error)
+                reply.set(error=error)
             if closed:
                 return
             for listener in tuple(self.listeners):
@@ -347,7 +348,7 @@ class SolverProcess:
             with self._changing:
                 reply = self._waiting.pop(number, None)
             if reply is not None:
-                reply._set(value, None if error is None else _raised(*error))
+                reply.set(value, None if error is None else _raised(*error))
             for listener in tuple(self.listeners):
                 listener.solver_replied()
 
@@ -469,4 +470,4 @@ def _read(pipe: Connection, requests: SimpleQueue[bytes]) -> None:
         while True:
             requests.put(pipe.recv_bytes())
     except (EOFError, OSError):
-        os._exit(0)
+        os.kill(os.getpid(), signal.SIGKILL)  # Without waiting for the computation on the main thread.
