@@ -122,6 +122,7 @@ def take(work: Photographer) -> None:
     work.run()
     work.do(intents.SetKeyframe(True), intents.ShowFrame(5), intents.Solve())
     work.wait(lambda: not app.state.solving)
+    work.tab("Review")
     work.picture("solve")
     work.do(
         intents.ShowFrame(2),
