@@ -202,7 +202,8 @@ class SequenceFrameSolver:
         return self._predictor.for_frame(frame, [camera.name for camera in self._scene.cameras]).masked
 
     def _region_images(self, frame: Frame) -> RegionImages:
-        return RegionImages(self._scene, frame.images, self._ignore(frame.index), self._settings)
+        ignore = frame.ignoring(self._ignore(frame.index))
+        return RegionImages(self._scene, frame.images, ignore, self._settings)
 
     @_checkpointed
     def at(self, frame: Frame, variables: Variables, expected: Gaussian, correction: np.ndarray) -> Measurement:

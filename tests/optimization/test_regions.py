@@ -5,16 +5,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from perfect_predictor import PerfectPredictor
 
 from carts_core.errors import SettingsError
 from carts_core.evaluation import dice
 from carts_core.optimization.factors import Prior
 from carts_core.optimization.regions import Alignment, ColourModel, RegionFactor, RegionImages, align_regions
+from carts_core.optimization.sequence_frame import SequenceFrameSolver
 from carts_core.optimization.variables import Variables
 from carts_core.recording import Frame, Sequence
 from carts_core.rendering import Renderer
 from carts_core.resources import sample_sequence
-from carts_core.settings import FreeParameters, SurfaceSolver
+from carts_core.settings import FreeParameters, SequenceSettings, SurfaceSolver
 from carts_core.settings.stages import AlignRegions
 
 SETTINGS, STAGE, OFF = SurfaceSolver(), AlignRegions(), np.deg2rad(0.2)
@@ -79,3 +81,12 @@ def test_ignored_pixels_and_missing_images(sample: Sequence) -> None:
     assert not RegionImages(sample.scene, frame.images, everything, SETTINGS).shown.any()
     with pytest.raises(SettingsError, match="the image of camera 'left' is missing"):
         RegionImages(sample.scene, {}, {}, SETTINGS)
+
+
+def test_no_colours_are_learnt_from_a_missing_image(sample: Sequence) -> None:
+    frame = replace(sample.frame(4), missing=("left",))
+    predictor = PerfectPredictor(sample, sample.scene.state(frame.truth or {}))
+    solver = SequenceFrameSolver(sample.scene, predictor, SETTINGS, SequenceSettings(), lambda _: {})
+    variables = Variables(sample.scene, sample.scene.state(frame.truth or {}), FreeParameters(), SETTINGS.length_scale)
+    found = solver.colours(frame, variables, np.zeros(len(variables)))
+    assert found is not None and found.counts.sum() == 0
