@@ -143,10 +143,10 @@ def sample_lines(images, shown, camera, position, normal, parts, log_odds, deep,
     for k in range(len(camera)):
         lines = position[0, k], position[1, k], normal[0, k], normal[1, k]
         seen[k] = _sample(images[camera[k]], shown[camera[k]], log_odds[parts[k]], *lines, deep, odds, colours)
-        sum_ = -odds.sum()
+        balance = -odds.sum()
         for s in range(samples):
-            difference[k, s] = sum_ + odds[s]
-            sum_ += np.float32(2.0) * odds[s]
+            difference[k, s] = balance + odds[s]
+            balance += np.float32(2.0) * odds[s]
             if _TAPS <= s < samples - _TAPS:
                 edges[k, s] = np.log(_edge(colours, s) + floor)
 

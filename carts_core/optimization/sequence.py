@@ -304,12 +304,12 @@ class SequenceOptimizer:
         """Assess all estimates, then solve failed frames individually if only joints are free; yield each new
         estimate."""
         failed, corrections = [], self._smoother.smoothed()
-        looked = [index for index, visit in self._visits.items() if not visit.measurement.by_colours]
+        looked = sorted(index for index, visit in self._visits.items() if not visit.measurement.by_colours)
         known: dict[int, Assessment] = {}
         # Frames without the network come last, since the frames with it before and after them decide.
         for index in sorted(self._visits, key=lambda index: self._visits[index].measurement.by_colours):
             began, estimate = time.perf_counter(), self.estimates[index]
-            found = self._between_good_frames(index, sorted(looked), known)
+            found = self._between_good_frames(index, looked, known)
             if found is None:
                 frame, variables = self._open(index)
                 found = assess(self._solver.evidence(frame, variables, corrections[index].mean, estimate.loss))
@@ -338,8 +338,8 @@ class SequenceOptimizer:
     def _between_good_frames(
         self, index: int, looked: Sequence[int], known: Mapping[int, Assessment]
     ) -> Assessment | None:
-        """Verdict on a frame whose colours agree with the fit: the less certain one of the network's
-        frames before and after it, if both are good; None for other frames."""
+        """Verdict on a frame whose colours agree with the fit: the less certain one of the network's frames
+        before and after it, if both are good; None for other frames."""
         if not self._visits[index].measurement.by_colours:
             return None
         place = bisect(looked, index)
