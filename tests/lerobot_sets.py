@@ -22,6 +22,17 @@ POSES = [
 ]
 JOINTS = [*(f"PSM2_joint_{n}" for n in range(1, 7)), "PSM2_jaw", *(f"PSM2_ee_{a}" for a in "xyz")]
 JOINTS += ["PSM2_roll", "PSM2_pitch", "PSM2_yaw"]
+PATHS = {
+    "v2.1": {
+        "data_path": "data/chunk-{episode_chunk:03d}/episode_{episode_index:06d}.parquet",
+        "video_path": "videos/chunk-{episode_chunk:03d}/{video_key}/episode_{episode_index:06d}.mp4",
+    },
+    "v3.0": {
+        "data_path": "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet",
+        "video_path": "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4",
+    },
+}
+STATISTICS = {"min": [0.0], "max": [1.0], "mean": [0.5], "std": [0.1], "count": [4]}
 
 
 def states(names: list[str], start: int, count: int) -> list[list[float]]:
@@ -35,35 +46,63 @@ def write_parquet(path: Path, columns: dict) -> None:
     """As the package `datasets` writes it, with its description of the columns in the metadata."""
     path.parent.mkdir(parents=True, exist_ok=True)
     table = pyarrow.table(columns)
-    features = {
-        name: {"feature": {"dtype": "float32", "_type": "Value"}, "length": len(values[0]), "_type": "Sequence"}
-        if isinstance(values[0], list)
-        else {"dtype": "int64", "_type": "Value"}
-        for name, values in columns.items()
-        if len(values)
-    }
+    features: dict[str, Any] = {}
+    for field in table.schema:
+        values = columns[field.name]
+        one = field.type.value_type if (listed := pyarrow.types.is_list(field.type)) else field.type
+        feature = {"dtype": {"float": "float32", "double": "float64"}.get(str(one), str(one)), "_type": "Value"}
+        length = len(values[0]) if listed and len(values) else -1
+        features[field.name] = {"feature": feature, "length": length, "_type": "Sequence"} if listed else feature
     described = json.dumps({"info": {"features": features}})
     pyarrow.parquet.write_table(table.replace_schema_metadata({"huggingface": described}), path)
 
 
 def write_meta(folder: Path, version: str) -> None:
-    """Tasks and statistics, as the version stores them."""
-    one: dict[str, Any] = {"observation.state": {"mean": [0.5], "count": [4]}}
+    """Tasks, statistics and, in v2.1, lengths of the episodes."""
+    one: dict[str, Any] = {"observation.state": STATISTICS}
     if version == "v2.1":
-        entries = [{"episode_index": number, "stats": one} for number in range(len(LENGTHS))]
-        (folder / "meta/episodes_stats.jsonl").write_text("".join(json.dumps(entry) + "\n" for entry in entries))
-        (folder / "meta/tasks.jsonl").write_text('{"task_index": 0, "task": "suture"}\n')
-    else:
-        (folder / "meta/stats.json").write_text(json.dumps(one))
-        write_parquet(folder / "meta/tasks.parquet", {"task_index": [0]})
+        numbers = range(len(LENGTHS))
+        write_lines(folder / "meta/episodes_stats.jsonl", [{"episode_index": n, "stats": one} for n in numbers])
+        write_lines(folder / "meta/tasks.jsonl", [{"task_index": 0, "task": "suture"}])
+        write_lines(
+            folder / "meta/episodes.jsonl",
+            [{"episode_index": n, "tasks": ["suture"], "length": LENGTHS[n]} for n in numbers],
+        )
+        return
+    (folder / "meta/stats.json").write_text(json.dumps(one))
+    table = pyarrow.table({"task_index": [0], "task": ["suture"]})
+    columns = [
+        {"name": name, "field_name": name, "pandas_type": kind, "numpy_type": numpy, "metadata": None}
+        for name, kind, numpy in (("task_index", "int64", "int64"), ("task", "unicode", "object"))
+    ]
+    index = json.dumps({"index_columns": ["task"], "column_indexes": [], "columns": columns})
+    pyarrow.parquet.write_table(table.replace_schema_metadata({"pandas": index}), folder / "meta/tasks.parquet")
+
+
+def write_lines(path: Path, entries: list[dict]) -> None:
+    path.write_text("".join(json.dumps(entry) + "\n" for entry in entries))
 
 
 def dataset(folder: Path, version: str = "v2.1", names: list[str] = POSES, kind: str = "float64") -> Path:
     """Two episodes; the second one's times go on where the first one's end."""
     video = {"dtype": "video", "shape": [72, 96, 3], "names": ["height", "width", "channel"]}
     state = {"dtype": kind, "shape": [len(names)], "names": [names] if version == "v2.1" else names}
-    features = {"observation.state": state, **dict.fromkeys(CAMERAS, video)}
-    info = {"codebase_version": version, "fps": 30, "total_episodes": 2, "chunks_size": 1000, "features": features}
+    indices = dict.fromkeys(("frame_index", "episode_index", "index", "task_index"), "int64")
+    added = {
+        name: {"dtype": kind, "shape": [1], "names": None} for name, kind in {"timestamp": "float32", **indices}.items()
+    }
+    info = {
+        "codebase_version": version,
+        "robot_type": None,
+        "fps": 30,
+        "total_episodes": len(LENGTHS),
+        "total_frames": sum(LENGTHS),
+        "total_tasks": 1,
+        "chunks_size": 1000,
+        "splits": {"train": f"0:{len(LENGTHS)}"},
+        **PATHS[version],
+        "features": {"observation.state": state, **dict.fromkeys(CAMERAS, video), **added},
+    }
     (folder / "meta").mkdir(parents=True)
     (folder / "meta/info.json").write_text(json.dumps(info))
     write_meta(folder, version)
@@ -71,8 +110,11 @@ def dataset(folder: Path, version: str = "v2.1", names: list[str] = POSES, kind:
     tables = [
         {
             "observation.state": np.array(states(names, starts[episode], count), kind).tolist(),
-            "episode_index": [episode] * count,
-            "frame_index": list(range(count)),
+            "timestamp": (np.arange(count) / 30).astype("float32"),
+            "frame_index": np.arange(count),
+            "episode_index": np.full(count, episode),
+            "index": starts[episode] + np.arange(count),
+            "task_index": np.zeros(count, int),
         }
         for episode, count in enumerate(LENGTHS)
     ]
@@ -88,11 +130,15 @@ def dataset(folder: Path, version: str = "v2.1", names: list[str] = POSES, kind:
             write_parquet(folder / f"data/chunk-000/episode_{episode:06d}.parquet", table)
         return folder
     write_parquet(
-        folder / "data/chunk-000/file-000.parquet", {key: tables[0][key] + tables[1][key] for key in tables[0]}
+        folder / "data/chunk-000/file-000.parquet", {key: [*tables[0][key], *tables[1][key]] for key in tables[0]}
     )
-    episodes: dict[str, list] = {"episode_index": [0, 1], "data/chunk_index": [0, 0], "data/file_index": [0, 0]}
+    episodes: dict[str, list] = {"episode_index": [0, 1], "tasks": [["suture"]] * 2, "length": list(LENGTHS)}
+    episodes |= {"dataset_from_index": starts[:2], "dataset_to_index": starts[1:]}
+    for key in ("data", "meta/episodes"):
+        episodes |= {f"{key}/chunk_index": [0, 0], f"{key}/file_index": [0, 0]}
     for key in CAMERAS:
         episodes |= {f"videos/{key}/chunk_index": [0, 0], f"videos/{key}/file_index": [0, 0]}
-        episodes[f"videos/{key}/from_timestamp"] = [0.0, LENGTHS[0] / 30]
+        episodes[f"videos/{key}/from_timestamp"] = [start / 30 for start in starts[:2]]
+        episodes[f"videos/{key}/to_timestamp"] = [end / 30 for end in starts[1:]]
     write_parquet(folder / "meta/episodes/chunk-000/file-000.parquet", episodes)
     return folder

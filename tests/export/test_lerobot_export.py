@@ -9,7 +9,7 @@ import numpy as np
 import pyarrow.parquet
 import pytest
 from corrected_frames import corrected
-from lerobot_sets import JOINTS, LENGTHS, POSES, dataset
+from lerobot_sets import JOINTS, LENGTHS, POSES, STATISTICS, dataset
 from recordings import digests, pose_of
 
 from carts_core.cli import main
@@ -134,7 +134,7 @@ def test_statistics_of_the_new_features_join_those_of_the_data_set(tmp_path, ver
     else:
         stats = json.loads((out / "meta/stats.json").read_text())
         rows = {key: values + episode_rows(out, 1)[key] for key, values in episode_rows(out, 0).items()}
-    assert stats["observation.state"] == {"mean": [0.5], "count": [4]}
+    assert stats["observation.state"] == STATISTICS
     np.testing.assert_allclose(stats[STATE]["mean"], np.mean(rows[STATE], axis=0), atol=1e-12)
     assert stats[STATE]["count"] == [len(rows[STATE])]
     pictures = [pixels(one) for one in rows[MASK]]
