@@ -134,6 +134,7 @@ class Tab:
         self.session = session
         self._shown: ViewState | None = None
         self._pictured: ViewState | None = None
+        self._scored = True
         self._left_at: float | None = None
         """Time at which the page was closed [s, monotonic]; None while the page is open and after the run was ended."""
         self._gone = False
@@ -191,18 +192,27 @@ class Tab:
             return None
         return self.view.display.ready_in()
 
-    def publish(self, attempt: Callable[[Callable[[], None]], None]) -> None:
-        """Show a changed state; `attempt` calls a function and shows its errors."""
+    def show_picture(self, attempt: Callable[[Callable[[], None]], None]) -> None:
+        """Show a changed picture if it is due; `attempt` calls a function and shows its errors."""
         controller, display = self.controller, None if self.view is None else self.view.display
         due = not self._gone if display is None else display.ready_in() <= 0.0
         if due and self._pictured is not controller.state:
             attempt(controller.map)
             if display is not None:
                 attempt(lambda: display.show_picture(controller.state))
-            # Scores come after the picture, which matters more during a drag.
-            attempt(controller.score)
             # Set also after an error, which would otherwise recur endlessly.
-            self._pictured = controller.state
+            self._pictured, self._scored = controller.state, False
+
+    def publish(self, attempt: Callable[[Callable[[], None]], None]) -> None:
+        """Show a changed state; `attempt` as in `show_picture`."""
+        self.show_picture(attempt)
+        if not self._scored:
+            # Scores come after the picture, which matters more during a drag.
+            pictured = self._pictured is self.controller.state
+            attempt(self.controller.score)
+            self._scored = True
+            if pictured:
+                self._pictured = self.controller.state
         self.show_panels()
 
     def show_panels(self) -> None:

@@ -112,6 +112,9 @@ class Worker:
             self._handle(queued)
         for tab in self._tabs:
             self._attempt(tab.leave, tab)
+            # Pictures of edits do not wait for other work.
+            tab.show_picture(lambda work, tab=tab: self._attempt(work, tab))
+        for tab in self._tabs:
             self._attempt(tab.controller.advance, tab, stop=True)
         self._advance_background()
         for tab in self._tabs:

@@ -17,7 +17,7 @@ from ..errors import SequenceError
 from ..files import csv_cell, text_of_cell
 from ..files.reading import TABLE, open_regular
 from ..model.scene import Scene
-from ..optimization.indications import undetermined_joints
+from ..optimization.results import undetermined_joints
 from ..reprs import short_repr
 from ..wording import shortened
 

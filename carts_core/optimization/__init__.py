@@ -11,14 +11,14 @@ from ..settings import SequenceSettings as SequenceSettings
 from ..settings import SolverSettings as SolverSettings
 from ..settings import SurfaceSolver as SurfaceSolver
 from .given_masks import GivenMasks as GivenMasks
-from .indications import BASE_FRAME_GAIN as BASE_FRAME_GAIN
-from .indications import Verdict as Verdict
-from .indications import fit_words as fit_words
-from .indications import joint_words as joint_words
-from .indications import undetermined_joints as undetermined_joints
-from .iterate import Iterate as Iterate
-from .iterate import Progress as Progress
-from .iterate import StopReason as StopReason
+from .results import BASE_FRAME_GAIN as BASE_FRAME_GAIN
+from .results import Iterate as Iterate
+from .results import Progress as Progress
+from .results import StopReason as StopReason
+from .results import Verdict as Verdict
+from .results import fit_words as fit_words
+from .results import joint_words as joint_words
+from .results import undetermined_joints as undetermined_joints
 
 if TYPE_CHECKING:
     from .calibration import CalibrationIterate as CalibrationIterate

@@ -20,10 +20,10 @@ from .factors import Factor, bounded_step
 from .feature_problem import FeatureProblem
 from .frame_problem import FrameProblem
 from .image_factors import SurfaceFactor
-from .iterate import Iterate, Progress, StopReason
 from .observability import Evaluation
 from .observation import Backgrounds
 from .predictor import SurfacePredictor, predictor_of
+from .results import Iterate, Progress, StopReason
 from .stages import Fit, Point, run_stages
 from .variables import Variables
 from .verdict import Assessment

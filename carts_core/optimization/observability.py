@@ -7,7 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from .factors import Prior
-from .indications import Uncertainty
+from .results import Uncertainty
 from .variables import Variables
 
 

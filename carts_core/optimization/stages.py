@@ -32,9 +32,9 @@ from .calibration_problem import CalibrationProblem
 from .factors import REJECTIONS, FirstOrderDescent, LevenbergMarquardt, Linearization
 from .feature_problem import FeatureProblem
 from .frame_problem import FrameProblem
-from .iterate import StopReason
 from .observability import Evaluation
 from .observation import MIN_AREA_RATIO
+from .results import StopReason
 from .variables import Variables
 from .verdict import Assessment, Verdict, assess
 

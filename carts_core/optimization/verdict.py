@@ -18,10 +18,10 @@ from ..networks.extractor import FeatureExtractor
 from ..recording import Frame
 from ..settings import SurfaceSolver
 from ..threads import total
-from .indications import LIKELY, POSSIBLE, Verdict
 from .observability import Uncertainty
 from .observation import MIN_AREA_RATIO, FrameImages
 from .predictor import FramePredictor, SurfacePredictor, predictor_of
+from .results import LIKELY, POSSIBLE, Verdict
 
 
 @dataclass(frozen=True)

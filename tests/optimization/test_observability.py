@@ -16,8 +16,8 @@ from carts_core.model.robot import Robot
 from carts_core.model.scene import Scene
 from carts_core.optimization import BASE_FRAME_GAIN, FrameOptimizer, FreeParameters, SurfaceSolver
 from carts_core.optimization.factors import Prior
-from carts_core.optimization.indications import Uncertainty
 from carts_core.optimization.observability import expected_scale, uncertainty_after
+from carts_core.optimization.results import Uncertainty
 from carts_core.optimization.variables import Variables
 from carts_core.recording import Sequence
 from carts_core.settings.stages import CALIBRATION_STAGES

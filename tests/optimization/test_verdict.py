@@ -30,8 +30,8 @@ from carts_core.optimization import (
     Verdict,
     check_domain,
 )
-from carts_core.optimization.indications import Uncertainty
 from carts_core.optimization.observation import FrameImages
+from carts_core.optimization.results import Uncertainty
 from carts_core.optimization.verdict import (
     _SHOWN,
     assess,

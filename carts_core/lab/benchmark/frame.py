@@ -29,7 +29,7 @@ from ...optimization import (
     SequenceOptimizer,
     SurfaceSolver,
 )
-from ...optimization.indications import Uncertainty
+from ...optimization.results import Uncertainty
 from ...recording import Frame
 from ...recording.background import evenly_spaced
 from ...rendering import Renderer
