@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property, partial
 from typing import Annotated
 
 import cv2
@@ -65,10 +66,16 @@ class View:
     """Position of a point landmark, or the other end of an axis [m]."""
     pixels: Float[np.ndarray, "points 2"]
 
-    @property
+    @cached_property
     def is_point(self) -> np.ndarray:
         """Mask of the point landmarks, as opposed to lines [points]."""
         return np.array([landmark.kind is LandmarkKind.POINT for landmark in self.landmarks])
+
+    @cached_property
+    def _radii(self) -> np.ndarray:
+        """Radius of the shaft for edges [m], NaN for axes [lines]."""
+        lines = (landmark for landmark in self.landmarks if landmark.kind is not LandmarkKind.POINT)
+        return np.array([line.radius if line.kind is LandmarkKind.EDGE else np.nan for line in lines])
 
     def distances(
         self, T_camera_base: Float[np.ndarray, "4 4"], intrinsics: Float[np.ndarray, "4"], side: int = 0
@@ -83,11 +90,30 @@ class View:
         ends = self.ends @ T_camera_base[:3, :3].T + T_camera_base[:3, 3]
         seen = intrinsics[:2] * starts[:, :2] / np.maximum(starts[:, 2:], NEAREST) + intrinsics[2:]
         found = seen - self.pixels
-        for row, landmark in enumerate(self.landmarks):
-            if landmark.kind is not LandmarkKind.POINT:
-                distance = _line_distance(starts[row], ends[row], self.pixels[row], intrinsics, landmark, side)
-                found[row] = distance, 0.0
+        lines = ~self.is_point
+        if lines.any():
+            found[lines] = 0.0
+            found[lines, 0] = self._line_distances(starts[lines], ends[lines], self.pixels[lines], intrinsics, side)
         return found
+
+    def _line_distances(
+        self, starts: np.ndarray, ends: np.ndarray, pixels: np.ndarray, intrinsics: np.ndarray, side: int
+    ) -> np.ndarray:
+        """Distances between the rays through pixels and the axes of cylinders, for edges minus the radius [px at the
+        depth of the nearest point]."""
+        rays = np.column_stack([(pixels - intrinsics[2:]) / intrinsics[:2], np.ones(len(pixels))])
+        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+        axes = (ends - starts) / np.linalg.norm(ends - starts, axis=1, keepdims=True)
+        across = np.cross(rays, axes)
+        lengths = np.maximum(np.linalg.norm(across, axis=1), 1e-9)
+        # Points on the axes nearest to the rays from the origin.
+        dot = partial(np.einsum, "ij,ij->i")
+        along = (dot(starts, axes) - dot(rays, axes) * dot(starts, rays)) / lengths**2
+        depths = np.maximum(starts[:, 2] - along * axes[:, 2], NEAREST)
+        away = dot(starts, across) / lengths
+        edges = np.isfinite(self._radii)
+        away[edges] = (side * away[edges] if side else np.abs(away[edges])) - self._radii[edges]
+        return away * intrinsics[:2].mean() / depths
 
 
 def views_of(
@@ -125,25 +151,6 @@ def views_of(
         pixels = np.array([point.pixel for point in chosen], np.float64)
         views.append(View(camera, arm, tuple(rows), frames, found, starts, last, pixels))
     return views
-
-
-def _line_distance(
-    start: np.ndarray, end: np.ndarray, pixel: np.ndarray, intrinsics: np.ndarray, landmark: Landmark, side: int
-) -> float:
-    """Distance between the ray through a pixel and a cylinder's axis, minus its radius [px at the depth of the nearest
-    point]."""
-    ray = np.array([*((pixel - intrinsics[2:]) / intrinsics[:2]), 1.0])
-    ray /= np.linalg.norm(ray)
-    axis = (end - start) / np.linalg.norm(end - start)
-    across = np.cross(ray, axis)
-    length = max(float(np.linalg.norm(across)), 1e-9)
-    # Point on the axis nearest to the ray from the origin.
-    along = float(np.dot(np.cross(ray, start), across)) / length**2
-    depth = max(float((start - along * axis)[2]), NEAREST)
-    away = float(start @ across) / length
-    if landmark.kind is LandmarkKind.EDGE:
-        away = (side * away if side else abs(away)) - landmark.radius
-    return away * float(intrinsics[:2].mean()) / depth
 
 
 MIN_POINTS = 4
