@@ -386,6 +386,8 @@ class LiveState:
     """Verdict on the shown frame: good, doubtful or lost."""
     age: float = 0.0
     """Latency of the shown result [s]."""
+    current: bool = True
+    """Whether the latency is at most two frame intervals of the stream."""
 
 
 @dataclass(frozen=True)

@@ -19,6 +19,9 @@ _USUAL = 75
 _FRESH = 0.01
 """Lower bound of the `patience` with which a frame is taken [s]."""
 
+_CURRENT = 2.0
+"""Maximum age of a current result [frame intervals]."""
+
 
 @dataclass(frozen=True)
 class Tracked:
@@ -28,6 +31,8 @@ class Tracked:
     estimate: LiveEstimate
     age: float
     """Time since the arrival of the frame [s]."""
+    current: bool = True
+    """Whether the age is at most two frame intervals of the stream."""
 
 
 Sink = Callable[[Tracked], None]
@@ -98,7 +103,8 @@ def follow(
                 break
             estimate = tracker.track(stream_frame.frame, stream_frame.camera_poses)
             taken.append(estimate.seconds)
-            tracked = Tracked(stream_frame, estimate, time.monotonic() - stream_frame.arrived)
+            age = time.monotonic() - stream_frame.arrived
+            tracked = Tracked(stream_frame, estimate, age, age <= _CURRENT * latest.interval)
             statistics.add(tracked)
             statistics.arrived, statistics.dropped = latest.arrived, latest.dropped
             for sink in sinks:
@@ -144,6 +150,7 @@ class Results:
             verdict=estimate.verdict.value,
             effort=estimate.effort.value,
             loss=estimate.loss,
+            current=tracked.current,
             joints=joints,
             base_frames=frames,
             masks=encoded_masks(found),

@@ -5,6 +5,7 @@ import socket
 import struct
 import threading
 import time
+from collections import deque
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Literal, Protocol
@@ -71,6 +72,8 @@ class ResultMessage(msgspec.Struct, tag="result"):
     """Arm -> joint -> corrected position and its standard deviation [rad, m]."""
     base_frames: dict[str, dict[str, list[list[float]]]]
     """Arm -> camera -> T_camera_base [4 x 4, m]."""
+    current: bool = True
+    """Whether the age is at most two frame intervals of the stream."""
     masks: dict[str, bytes] = {}
     """Camera -> PNG mask, 255 for arms; base64 in JSON lines."""
 
@@ -290,12 +293,16 @@ class LatestFrame:
         arrived, dropped: numbers of frames that arrived and were dropped.
     """
 
+    _RECENT = 20
+    """Number of frames over which the interval is averaged."""
+
     def __init__(self, source: Source) -> None:
         self._source = source
         self._moment: StreamFrame | None = None
         self._ended, self._error = False, None
         self._changed = threading.Condition()
         self.arrived = self.dropped = 0
+        self._times = deque[float](maxlen=self._RECENT)
         self._thread = threading.Thread(target=self._read, name="carts-live-source", daemon=True)
         self._thread.start()
 
@@ -320,6 +327,12 @@ class LatestFrame:
                     return None
                 self._changed.wait(0.5)
 
+    @property
+    def interval(self) -> float:
+        """Mean time between recent frames [s]; infinite before the second frame."""
+        times = tuple(self._times)
+        return (times[-1] - times[0]) / (len(times) - 1) if len(times) > 1 else math.inf
+
     def close(self) -> None:
         """Close the source and wait for its thread."""
         self._source.close()
@@ -331,6 +344,7 @@ class LatestFrame:
             for moment in self._source:
                 with self._changed:
                     self.arrived += 1
+                    self._times.append(moment.arrived)
                     self.dropped += self._moment is not None
                     self._moment = moment
                     self._changed.notify()

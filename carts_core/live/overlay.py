@@ -97,9 +97,11 @@ class KeyedOverlay:
         with self._held:
             try:
                 while (tracked := self._waiting.get()) is not None:
-                    state = tracked.estimate.state.to("cpu")
+                    state, verdict = tracked.estimate.state.to("cpu"), tracked.estimate.verdict
+                    if verdict is LiveVerdict.GOOD and not tracked.current:
+                        verdict = LiveVerdict.DOUBTFUL
                     for pipe in self._pipes:
-                        pipe.draw(state, tracked.estimate.verdict)
+                        pipe.draw(state, verdict)
             except BrokenPipeError:
                 _log.warning("The reader of the overlay has ended; tracking continues without an overlay.")
                 while self._waiting.get() is not None:

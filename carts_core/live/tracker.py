@@ -7,7 +7,7 @@ import time
 from collections import deque
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 
 import cv2
@@ -19,6 +19,7 @@ from ..networks.extractor import FeatureExtractor
 from ..optimization.kalman import ErrorModel, Gaussian, combined
 from ..optimization.observation import Backgrounds
 from ..optimization.predictor import SurfacePredictor, predictor_of
+from ..optimization.regions import ColourModel
 from ..optimization.sequence_frame import ColourTracker, Measurement, Origin, SequenceFrameSolver, Visit
 from ..optimization.variables import Variables
 from ..optimization.verdict import arm_is_elsewhere
@@ -121,6 +122,19 @@ class _Recovery:
     """Event that cancels the attempt when set."""
 
 
+@dataclass(frozen=True)
+class _Look:
+    """Measurement of a frame with the network, on a separate thread; meanwhile, frames are measured without it."""
+
+    attempt: _Attempt
+    frame: Frame
+    variables: Variables
+    found: Future[tuple[Measurement, ColourModel | None]]
+    """The measurement, and the colours of the frame."""
+    later: list[tuple[float, Measurement]] = field(default_factory=list)
+    """Timestamps [s] and measurements of later frames."""
+
+
 class LiveTracker:
     """Tracker of the arms of a scene, frame by frame; frames may be dropped, and times may be irregular.
 
@@ -133,8 +147,8 @@ class LiveTracker:
         free: free parameters.
         backgrounds: backgrounds of the cameras; detections in them are false positives.
         cameras: names of the cameras to use, all by default.
-        concurrent: whether recovery runs on a separate thread, while later frames are doubtful or lost; otherwise
-            recovery delays the result. `close` ends the thread.
+        concurrent: whether recovery runs on a separate thread, while later frames are doubtful or lost, and the network
+            while later frames are measured by colours; otherwise both delay the result. `close` ends the thread.
 
     Attributes:
         verdict: verdict of the last frame; lost before the first frame.
@@ -174,6 +188,7 @@ class LiveTracker:
         self._losses: deque[float] = deque(maxlen=_REMEMBERED)
         self._pool = ThreadPoolExecutor(1, "recovery") if concurrent else None
         self._recovery: _Recovery | None = None
+        self._look: _Look | None = None
         self._gave_up = False
         """Whether the last search was cancelled."""
 
@@ -198,9 +213,12 @@ class LiveTracker:
         self._moving = bool(camera_poses or frame.mounts)
         errors, now = self._error_model(variables), frame.timestamp or 0.0
         recovered = self._take_recovered(errors)
+        self._take_look(errors, now)
         attempt, measurement = self._measured(frame, variables, errors, now)
         if self._fits(attempt, measurement):
             self._take(errors, attempt, measurement)
+            if self._look is not None and self._look.attempt is not attempt:
+                self._look.later.append((now, measurement))
             self.verdict = LiveVerdict.GOOD
             correction = combined(errors.correction(attempt.state), measurement.information)
             if self._arm_is_elsewhere(frame, variables, correction.mean, measurement.loss, now):
@@ -253,8 +271,11 @@ class LiveTracker:
         if self._filtered is not None or self._pool is not None:
             attempt = self._known(errors, now)
             if self.verdict is LiveVerdict.GOOD:
-                between = self._colours.measured(small, frame, variables, attempt.expected)
+                overdue = self._pool is not None and self._recovery is None
+                between = self._colours.measured(small, frame, variables, attempt.expected, overdue=overdue)
                 if between is not None:
+                    if overdue and self._look is None and self._colours.due:
+                        self._start_look(small, frame, variables, attempt)
                     return attempt, between
             found = attempt, small.warm(frame, variables, attempt.expected, attempt.expected.mean)
             fits = self._fits(*found)
@@ -308,6 +329,34 @@ class LiveTracker:
             return None
         self._take(errors, attempt, measurement)
         return attempt.effort
+
+    def _start_look(self, solver: SequenceFrameSolver, frame: Frame, variables: Variables, attempt: _Attempt) -> None:
+        def look() -> tuple[Measurement, ColourModel | None]:
+            found = solver.warm(frame, variables, attempt.expected, attempt.expected.mean)
+            return found, solver.colours(frame, variables, found.correction)
+
+        assert self._pool is not None
+        self._look = _Look(attempt, frame, variables, self._pool.submit(look))
+
+    def _take_look(self, errors: ErrorModel, now: float) -> None:
+        """Repeat the filter from a frame whose measurement with the network is done, with the later measurements.
+
+        After a bad fit, the colours are dropped, so the next frame is measured with the network. If the measurement
+        takes longer than `lost_seconds`, the result waits for it.
+        """
+        look = self._look
+        if look is None or not (look.found.done() or now - look.attempt.time > self.live.lost_seconds):
+            return
+        self._look = None
+        measurement, colours = look.found.result()
+        fits = self._fits(look.attempt, measurement)
+        solver = self._solvers[Effort.SMALL, self._moving]
+        self._colours.learn(solver, look.frame, look.variables, measurement, fits, colours)
+        # A recovery or a search since then is newer.
+        if fits and self._seen == (look.later[-1][0] if look.later else look.attempt.time):
+            self._take(errors, look.attempt, measurement)
+            for time_, later in look.later:
+                self._take(errors, self._known(errors, time_), later)
 
     def _fits(self, attempt: _Attempt, measurement: Measurement) -> bool:
         """Whether a measurement is reliable; without a filtered state, only a search is reliable."""

@@ -299,11 +299,26 @@ class ColourTracker:
         self._pause, self._pauses = 0, 0
         """Number of further frames with the network, and of such pauses since the last frame without it."""
 
+    @property
+    def due(self) -> bool:
+        """Whether the next frame is to be measured with the network though the colours fit well."""
+        return self._since + 1 >= self._model.look_every
+
     def measured(
-        self, solver: SequenceFrameSolver, frame: Frame, variables: Variables, expected: Gaussian
+        self,
+        solver: SequenceFrameSolver,
+        frame: Frame,
+        variables: Variables,
+        expected: Gaussian,
+        *,
+        overdue: bool = False,
     ) -> Measurement | None:
-        """Measurement of a frame without the network; None if the network is needed."""
-        if self._colours is None or self._pause > 0 or self._since + 1 >= self._model.look_every:
+        """Measurement of a frame without the network; None if the network is needed.
+
+        Args:
+            overdue: whether the frame is also measured without the network if one with it is due.
+        """
+        if self._colours is None or self._pause > 0 or (self.due and not overdue):
             return None
         (stage,) = self._model.between
         assert isinstance(stage, AlignRegions)
@@ -319,9 +334,19 @@ class ColourTracker:
         return replace(found, loss=self._loss)
 
     def learn(
-        self, solver: SequenceFrameSolver, frame: Frame, variables: Variables, found: Measurement, good: bool
+        self,
+        solver: SequenceFrameSolver,
+        frame: Frame,
+        variables: Variables,
+        found: Measurement,
+        good: bool,
+        colours: ColourModel | None = None,
     ) -> None:
-        """Learn the colours of a frame that was measured with the network, if the fit is good."""
+        """Learn the colours of a frame that was measured with the network, if the fit is good.
+
+        Args:
+            colours: the colours, if known already.
+        """
         self._since, self._loss = 0, found.loss
         if not good:
             self._colours = self._usual = None
@@ -329,7 +354,7 @@ class ColourTracker:
             self._pause -= 1
         elif good and self._model.between and self._model.look_every > 1 and not solver.masked(frame):
             self._pause = 0
-            new = solver.colours(frame, variables, found.correction)
+            new = colours or solver.colours(frame, variables, found.correction)
             self._colours = self._colours.updated(new, _NEWEST) if self._colours and new else new
             if new is None:
                 self._wait()

@@ -18,6 +18,7 @@ from carts_core.recording import Sequence as Recording
 from carts_core.segmentation import Prompt, Segmenter
 from carts_core.settings.optimization import Inference
 from carts_core.settings.serialization import to_plain
+from carts_viewer.jobs.live_stream import LiveEnded, LiveStep, LiveTask
 from carts_viewer.jobs.solver import (
     Advanced,
     Calibrated,
@@ -142,7 +143,7 @@ class OptimizerFactory:
         self._choice = replace(self._choice, surface=surface)
 
     def extractor(self) -> "FeatureExtractor":
-        """The networks in this process, for live streams.
+        """The networks in this process.
 
         Raises:
             WeightsError: the networks cannot be loaded.
@@ -197,6 +198,10 @@ class OptimizerFactory:
     def calibration(self, task: CalibrationTask) -> Run[Started | CalibrationStep | Calibrated]:
         """A calibration on many frames."""
         return Run(self._requests, self._choice, "calibration", task)
+
+    def live(self, task: LiveTask) -> Run[LiveStep | LiveEnded]:
+        """A tracked stream."""
+        return Run(self._requests, self._choice, "live", task)
 
     def _call(self, method: str, *arguments: Any) -> Reply[Any]:
         return self._requests.ask("call", self._choice, method, *arguments)

@@ -25,6 +25,7 @@ from carts_core.settings import CALIBRATION_SETTINGS, SequenceSettings
 from carts_core.settings.optimization import Inference
 from carts_core.settings.stages import NONE
 from carts_core.wording import duration_text
+from carts_viewer.jobs.live_stream import LiveEnded, LiveStep, LiveTask, tracked_stream
 from carts_viewer.state import Pose, Target
 
 if TYPE_CHECKING:
@@ -386,6 +387,10 @@ class Solver:
             optimizer.cancel()
         yield Smoothed({index: _estimate(found) for index, found in optimizer.estimates.items()})
         yield optimizer.base_frame_gain()
+
+    def live(self, task: LiveTask) -> Generator[LiveStep | LiveEnded, bool | None, None]:
+        """Track a stream; see `tracked_stream`."""
+        return tracked_stream(task, scene_at(task.sequence.scene, task.state), self.extractor())
 
     def _predictor(self, target: Target) -> "FeatureExtractor | MaskPredictor":
         """Predictor of a target; if only masks are fitted, no network is loaded."""

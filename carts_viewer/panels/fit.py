@@ -82,7 +82,8 @@ def live_text(live: LiveState) -> str:
         "lost": "The arms were not found; the measured joints with the last correction are shown.",
     }[live.verdict]
     style = {"good": "good", "doubtful": "doubtful", "lost": "failed"}[live.verdict]
-    age = f"latency {1000.0 * live.age:.0f} ms"
+    age = f"latency {1000.0 * live.age:.0f} ms{'' if live.current else ', outdated'}"
+    style = style if live.current or style != "good" else "doubtful"
     return f'<div class="carts-verdict {style}" role="status"><b>Live: {live.verdict}</b> {reason} <i>{age}</i></div>'
 
 

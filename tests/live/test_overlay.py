@@ -3,6 +3,7 @@
 import os
 import threading
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import BinaryIO
 
@@ -42,14 +43,18 @@ def eroded(mask: np.ndarray, size: int) -> np.ndarray:
     return cv2.erode(mask.astype(np.uint8), square, borderType=cv2.BORDER_CONSTANT, borderValue=0) > 0
 
 
-@pytest.mark.parametrize("verdict", list(LiveVerdict))
-def test_another_program_reads_outlines_on_green(sequence: Sequence, tmp_path: Path, verdict: LiveVerdict) -> None:
+@pytest.mark.parametrize(
+    ("verdict", "current"), [*((verdict, True) for verdict in LiveVerdict), (LiveVerdict.GOOD, False)]
+)
+def test_another_program_reads_outlines_on_green(
+    sequence: Sequence, tmp_path: Path, verdict: LiveVerdict, current: bool
+) -> None:
     pipes = {name: tmp_path / name for name in ("left", "right")}
     pictures: dict[str, list[np.ndarray]] = {name: [] for name in pipes}
     for pipe in pipes.values():
         os.mkfifo(pipe)
     ends = {name: os.fdopen(os.open(pipe, os.O_RDONLY | os.O_NONBLOCK), "rb") for name, pipe in pipes.items()}
-    overlay, result = KeyedOverlay(sequence, pipes), tracked(sequence, 1, verdict)
+    overlay, result = KeyedOverlay(sequence, pipes), replace(tracked(sequence, 1, verdict), current=current)
     threads = [threading.Thread(target=read, args=(ends[name], pictures[name])) for name in pipes]
     for thread in threads:
         thread.start()
@@ -65,7 +70,7 @@ def test_another_program_reads_outlines_on_green(sequence: Sequence, tmp_path: P
         # Colours come back from YUV to a few grey levels.
         np.testing.assert_allclose(picture[inner | ~outer], np.broadcast_to(KEY, picture[inner | ~outer].shape), atol=3)
         rim = mask & ~smaller
-        wanted = COLOURS.get(verdict, KEY)
+        wanted = COLOURS.get(verdict if current else LiveVerdict.DOUBTFUL, KEY)
         np.testing.assert_allclose(picture[rim], np.broadcast_to(wanted, picture[rim].shape), atol=3)
         assert rim.sum() > 50 and inner.any()
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence as Items
 from copy import copy
 from dataclasses import replace
 from pathlib import Path
-from threading import Event
+from threading import Event, current_thread, main_thread
 from typing import Any
 
 import numpy as np
@@ -64,11 +64,11 @@ class Stream:
         self.renderer = Renderer(self.sequence.scene, width=640, height=512)
         self.camera = Renderer(self.sequence.scene)
         self.tracker = LiveTracker(self.sequence.scene, self.predictor, concurrent=concurrent)
-        self.count, self.slip = 0, 0.0
+        self.count, self.slip, self.wall = 0, 0.0, (140, 140, 140)
 
     def picture(self) -> np.ndarray:
-        """What the camera sees, before a grey wall."""
-        wall = np.full((128, 160, 3), 140, np.uint8)
+        """What the camera sees, before a wall."""
+        wall = np.full((128, 160, 3), self.wall, np.uint8)
         if self.predictor.hidden:
             return wall
         with torch.no_grad():
@@ -208,6 +208,37 @@ def test_an_arm_that_jumps_is_found_again_beside_the_stream(concurrent: Stream) 
     concurrent.come_round(0.02)
     after = [concurrent.next() for _ in range(10)]
     assert after[-1][0] is LiveVerdict.GOOD and concurrent.overlap() > 0.97
+
+
+@pytest.mark.parametrize("fits", [True, False])
+def test_the_network_keeps_no_frame_waiting(concurrent: Stream, monkeypatch: pytest.MonkeyPatch, fits: bool) -> None:
+    looking, go_on, waited_for = Event(), Event(), []
+    warm = SequenceFrameSolver.warm
+
+    def slow(*arguments: Any, **options: Any) -> Measurement:
+        found = warm(*arguments, **options)
+        if current_thread() is main_thread():
+            waited_for.append(concurrent.count)
+            return found
+        looking.set()
+        assert go_on.wait(60)
+        return found if fits else replace(found, loss=1.0)
+
+    concurrent.wall = (140, 50, 40)  # Grey is taken for haze.
+    while concurrent.next(0.02)[0] is not LiveVerdict.GOOD:
+        time.sleep(0.02)
+    monkeypatch.setattr(SequenceFrameSolver, "warm", slow)
+    while not looking.is_set() and concurrent.count < 200:
+        concurrent.next(0.02)
+        time.sleep(0.02)
+    waited_for.clear()
+    during = [concurrent.next(0.01) for _ in range(8)]
+    assert {verdict for verdict, _, _ in during} == {LiveVerdict.GOOD} and not waited_for
+    go_on.set()
+    time.sleep(0.2)
+    after = concurrent.next(0.01)
+    assert after[0] is LiveVerdict.GOOD and after[2] < 0.7, "within the stated deviation"
+    assert bool(waited_for) is not fits, "colours of a bad fit are not used"
 
 
 def test_an_arm_that_is_out_of_view_and_yet_in_the_image_is_not_called_good(sample_sequence_path: Path) -> None:

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 
 import cv2
 import numpy as np
+import psutil
 import pytest
 from playwright.sync_api import expect
 from viewer_tab import OpenTab
@@ -68,7 +69,7 @@ def test_another_program_sends_frames_and_gets_results(app: ViewerApp) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         free = taken.getsockname()[1]
     app.queue.put(intents.StartLive(f"socket:{free}"))
-    eventually(lambda: app.state.live, lambda live: live is not None and live.on, SECONDS)
+    eventually(lambda: app.state.live and app.state.live.text, lambda text: f"port {free}" in (text or ""), SECONDS)
     frame = sequence.frame(0)
     images = {name: _png(image) for name, image in frame.images.items()}
     joints = {
@@ -86,6 +87,21 @@ def test_another_program_sends_frames_and_gets_results(app: ViewerApp) -> None:
     app.queue.put(intents.StopLive())
     eventually(lambda: app.state.streaming, lambda on: not on)
     assert app.state.frame.frame_id == sequence.frame_ids[0]
+
+
+def test_the_recording_is_shown_again_if_the_solver_process_ends(app: ViewerApp) -> None:
+    app.queue.put(intents.StartLive("replay", rate=10.0, repeat=True))
+    eventually(lambda: app.state.live, lambda live: live is not None and live.on and not live.busy, SECONDS)
+    (solver,) = (child for child in psutil.Process().children() if "serve()" in " ".join(child.cmdline()))
+    solver.kill()
+    eventually(lambda: app.state.error or "", lambda error: "ended unexpectedly (SIGKILL" in error, SECONDS)
+    eventually(lambda: app.state.streaming, lambda on: not on)
+    assert app.state.frame.frame_id == app.sequence.frame_ids[0]
+    app.queue.put(intents.DismissError())
+    app.queue.put(intents.StartLive("replay", rate=10.0))
+    eventually(lambda: app.state.live, lambda live: live is not None and live.on and not live.busy, SECONDS)
+    app.queue.put(intents.StopLive())
+    eventually(lambda: app.state.streaming, lambda on: not on)
 
 
 def test_a_port_in_use_and_a_source_that_the_page_does_not_open_are_refused(app: ViewerApp) -> None:

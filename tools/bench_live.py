@@ -1,0 +1,93 @@
+"""Throughput and latency of live tracking on the shipped sequence, replayed in real time.
+
+    python -m tools.bench_live [--rate 60] [--arms 2] [--domain regular] [--seconds 20]
+
+A long run also measures drift: memory and latency of its first and its last tenth.
+"""
+
+import argparse
+import json
+import os
+from dataclasses import replace
+
+import numpy as np
+
+from carts_core.evaluation import dice
+from carts_core.live import LiveStatistics, LiveTracker, Replay, follow
+from carts_core.networks import FeatureExtractor
+from carts_core.optimization import Backgrounds
+from carts_core.process import tune_process
+from carts_core.recording import Sequence
+from carts_core.rendering import Renderer
+from carts_core.resources import sample_sequence
+from tools.memory import resident_megabytes
+
+_WARM_UP = 20
+"""Number of results at the start that are not counted; kernels are compiled and the arms are found."""
+
+
+def measured(rate: float, arms: int, domain: str, seconds: float) -> dict[str, object]:
+    """Track a replay for some time; returns what was measured, times in milliseconds."""
+    sequence = Sequence.open(sample_sequence())
+    camera = sequence.scene.cameras[0].name
+    scene = replace(sequence.scene, arms=sequence.scene.arms[:arms])
+    extractor = FeatureExtractor.load(inference="onnx")
+    backgrounds = Backgrounds.of(sequence, (camera,), domain)
+    tracker = LiveTracker(scene, extractor, backgrounds=backgrounds, cameras=(camera,), concurrent=True)
+    renderer, memory, scores, states = Renderer(scene, cameras=[camera]), [], [], {}
+    ages: list[float] = []
+    ends: list[float] = []
+
+    def take(tracked) -> None:
+        ends.append(tracked.estimate.time + tracked.age)
+        ages.append(1e3 * tracked.age)
+        if len(ages) % 100 == 0:
+            memory.append(resident_megabytes())
+        states[len(states)] = tracked.estimate.frame_id, tracked.estimate.state
+        states.pop(len(states) - 500, None)
+
+    statistics = LiveStatistics()
+    loops = round(seconds * rate / len(sequence))
+    try:
+        follow(Replay(sequence, (camera,), domain, rate=rate, loops=loops), tracker, [take], statistics)
+    finally:
+        tracker.close()
+    for frame_id, state in list(states.values())[_WARM_UP:]:
+        index = sequence.frame_ids.index(frame_id)
+        masks = sequence.frame(index, domain, (camera,)).masks
+        assert masks is not None
+        if arms == len(sequence.scene.arms):
+            scores.append(dice(renderer.segment(state)[0] >= 0, masks[camera]))
+    del ages[:_WARM_UP], ends[:_WARM_UP]
+    tenth = max(len(ages) // 10, 1)
+    return {
+        "arrived": statistics.arrived,
+        "results_per_second": round((len(ends) - 1) / (ends[-1] - ends[0]), 2),
+        "age_median": round(float(np.median(ages)), 1),
+        "age_p95": round(float(np.percentile(ages, 95)), 1),
+        "age_max": round(max(ages), 1),
+        "age_median_first_last_tenth": [round(float(np.median(part)), 1) for part in (ages[:tenth], ages[-tenth:])],
+        "memory_mb_first_last": [round(value, 1) for value in (memory[len(memory) // 10], memory[-1])]
+        if memory
+        else [],
+        "verdicts": {str(verdict): count for verdict, count in statistics.verdicts.items()},
+        "dice": round(float(np.mean(scores)), 4) if scores else None,
+    }
+
+
+def main() -> None:
+    """Print the figures as a line of JSON, with the load of the machine."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--rate", type=float, default=60.0)
+    parser.add_argument("--arms", type=int, default=2)
+    parser.add_argument("--domain", default="regular")
+    parser.add_argument("--seconds", type=float, default=20.0)
+    arguments = parser.parse_args()
+    tune_process()
+    load = os.getloadavg()[0]
+    found = measured(arguments.rate, arguments.arms, arguments.domain, arguments.seconds)
+    print(json.dumps({**vars(arguments), **found, "load": [round(load, 1), round(os.getloadavg()[0], 1)]}))
+
+
+if __name__ == "__main__":
+    main()
