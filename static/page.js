@@ -280,8 +280,8 @@
       in: () => zoomAt(1.25, 0.5, 0.5), out: () => zoomAt(0.8, 0.5, 0.5),
     };
     for (const button of bar.querySelectorAll("button")) {
-      // The button loses the focus; otherwise, the space bar would press it again.
-      button.addEventListener("click", () => { actions[button.dataset.do](); button.blur(); });
+      // A clicked button loses the focus; otherwise, the space bar would press it again.
+      button.addEventListener("click", ({ detail }) => { actions[button.dataset.do](); if (detail) button.blur(); });
     }
     for (const kind of ["pointerdown", "pointermove", "pointerup", "wheel", "dblclick"]) {
       bar.addEventListener(kind, (event) => event.stopPropagation());
@@ -291,6 +291,7 @@
     hint.textContent = "Drag: orbit · right-drag: move · wheel: zoom · grid 1 cm";
     const parent = canvas.parentElement;
     if (getComputedStyle(parent).position === "static") parent.style.position = "relative";
+    parent.classList.add("carts-canvas");
     parent.append(bar, hint);
     drawBar();
   }

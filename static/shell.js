@@ -207,6 +207,9 @@
       set(heading, "aria-expanded", String(heading.nextElementSibling?.getAttribute("aria-hidden") !== "true"));
     }
     set(document.querySelector(".mantine-ActionIcon-root:has(+ .mantine-ActionIcon-root)"), "aria-label", "Find an action (Ctrl+K)");
+    set(document.querySelector("[role=dialog]:has(.mantine-Spotlight-search)"), "aria-label", "Actions");
+    // Closed panels of a small screen: viser names only the first of their tabs.
+    for (const one of document.querySelectorAll("[aria-label^='Expand panel']")) set(one, "aria-label", one.textContent.trim());
   }
   setInterval(() => (window.requestIdleCallback ?? setTimeout)(nameWidgets), 1000);
   window.addEventListener("keydown", (event) => {

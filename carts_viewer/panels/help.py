@@ -61,7 +61,8 @@ HINTS = {
     "Next worst": "Show the next frame, in the order from worst to best, that is neither accepted nor rejected; frames "
     "without a verdict come last ({ShowWorst 1})",
     "Next unreviewed": "Show the next frame without a review ({ShowUnreviewed 1})",
-    "Solve between": "Fit all frames between the nearest kept frames together ({Solve False})",
+    "Solve between": "Fit all frames between the nearest kept frames together; kept frames (accepted, moved by "
+    "hand, or keyframes) do not change ({Solve False})",
     "Solve all": "Fit all frames, or those in the timeline's range, together; kept frames do not change",
     "Begin at": "Frame from which solving starts",
     "Take solved pose": "Use the solved pose of this frame, although it fits worse",
@@ -84,7 +85,8 @@ HINTS = {
     "Accept network": "Use these weights now and in the future",
     "Refuse network": "Do not use these weights",
     "Which frames": "Frames of the job",
-    "Optimize individually": "Run on each of these frames from its current pose; worse results are discarded",
+    "Optimize individually": "Run on each of these frames separately, from its current pose; worse results are "
+    "discarded. Solve all (Review) fits neighbouring frames together",
     "Calibrate": "Fit base frames, or the parameters ticked under Free parameters, jointly to these frames. All masks "
     "change, so accepted frames become unreviewed; one undo step",
     "Job": "Job to which the buttons and the log below refer",
@@ -103,7 +105,8 @@ HINTS = {
     "Export": "Write the frames to a new folder beside the project, as a job",
     "Cancel export": "Cancel the export and remove its files",
     "Download": "Send the last export to this browser",
-    "Export mask": "Download this frame's mask of the shown camera as PNG",
+    "Export mask": "Download this frame's mask of the shown camera as PNG (255 is arm), refined if the layer "
+    "Refined mask is shown",
 }
 """Hints of controls by label; {NAME} is the key of an action (`Shortcut.name`)."""
 
@@ -153,6 +156,7 @@ class HelpPanel:
         self._page, self._perturb = page, perturb
         self._keys: Keys | None = None
         self._commands: dict[str, viser.CommandHandle] = {}
+        self._of_buttons: list[tuple[viser.GuiButtonHandle, viser.CommandHandle]] = []
         for name, shortcut in shortcuts().items():
             if shortcut.action == "peek":  # lasts while its key is held
                 continue
@@ -161,8 +165,10 @@ class HelpPanel:
         known = [shortcut.action for shortcut in shortcuts().values()]
         for handle, intent in page.buttons:
             if intent not in known:
+                known.append(intent)  # one entry for buttons with the same function
                 command = page.gui.add_command(handle.label)
                 self._commands[element_id(handle)] = command
+                self._of_buttons.append((handle, command))
                 self._listen(command, lambda client, intent=intent: page.emit_from(intent, client))
         for label, (name, *arguments) in _SCRIPTS.items():
             self._listen(page.gui.add_command(label), lambda _, call=(name, *arguments): page.call(*call))
@@ -170,7 +176,10 @@ class HelpPanel:
         self._add_guide(page)
 
     def show(self, state: ViewState) -> None:
-        """Name the current keys in the list of actions and in the hints."""
+        """Name the current keys in the list of actions and in the hints; list only actions that are possible."""
+        for button, command in self._of_buttons:
+            if command.disabled != (impossible := button.disabled or not button.visible):
+                command.disabled = impossible
         if state.keys == self._keys:
             return
         self._keys, keys = state.keys, keys_of(state.keys)

@@ -30,11 +30,7 @@ _WITHOUT_PARTS = (
     "recorded-csv",
 )
 """Formats without categories, or with a fixed choice of categories."""
-_WRITTEN = (
-    "Masks, keypoints and poses are those of the arms at the current joint positions; masks include "
-    "painted corrections, and may be refined. The recording's own masks are not exported."
-)
-_THIS_FRAME = "Mask of the shown camera: 255 is arm, 0 is background. It is refined if the layer Refined mask is shown."
+_WRITTEN = "Masks of the shown arms with painted corrections, not the recording's own masks."
 _NOT_KEPT = "This project is temporary: download its exports before you close the viewer."
 
 
@@ -72,7 +68,6 @@ class ExportPanel:
             self._result = gui.add_html("", visible=False)
             self._download = page.button("Download", intents.Download, icon=viser.Icon.DOWNLOAD, visible=False)
         with gui.add_folder("This frame"):
-            gui.add_html(f'<p class="carts-caption">{_THIS_FRAME}</p>')
             page.button("Export mask", intents.ExportMask, icon=viser.Icon.PHOTO_DOWN)
         for widget in (self._format, self._frames, self._within, self._cameras):
             page.on_input(widget, lambda _: intents.Refresh())

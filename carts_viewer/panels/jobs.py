@@ -75,13 +75,6 @@ class JobsPanel:
                 icon=viser.Icon.SCHOOL,
                 hint="Train the network for this recording's robots, cameras, distances and backgrounds",
             )
-            gui.add_html(
-                '<p class="carts-caption"><b>Optimize individually</b> fits every frame separately; to fit '
-                "neighbouring frames jointly, see Review, <b>Solve</b>. <b>Calibrate</b> fits the poses of the arms' "
-                "bases (base frames), or the parameters ticked under Free parameters, to frames of the whole "
-                "sequence. This changes all masks: afterwards, solve and accept frames again. Solving and exports are "
-                "also queued here.</p>"
-            )
         self._network = gui.add_dropdown(
             "Network", [STARTED], visible=False, hint="Network of all tabs; the choice is saved"
         )
@@ -128,8 +121,12 @@ class JobsPanel:
         now = time.time()
         self._list.content = (
             f'<ul class="carts-jobs" aria-label="Jobs">{"".join(job_line(job, now) for job in jobs)}</ul>'
+            if jobs
+            else '<p class="carts-caption">No jobs</p>'
         )
         job = next((job for job in jobs if job.number == self._number()), None)
+        for handle in (self._chosen, self._cancel, self._again, self._forget, self._log):
+            handle.visible = bool(jobs)
         self._cancel.disabled = job is None or job.over
         self._again.disabled = job is None or not job.over
         self._forget.disabled = not any(job.over for job in jobs)

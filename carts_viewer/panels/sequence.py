@@ -76,10 +76,6 @@ def calibration_line(gain: float | None) -> str:
 
 
 _MAX_LISTED = 200
-_MEANING = (
-    "Solving fits neighbouring frames jointly; <b>Run</b> fits a single frame. Frames that you accepted, moved by "
-    "hand or marked as keyframes do not change."
-)
 _DIRECTIONS: dict[str, Direction] = {"First frame": "forward", "Last frame": "backward"}
 
 
@@ -130,7 +126,7 @@ class KeyframesPanel:
         bright = self._between if self._solvable and state.range is None else self._all
         for button in (self._between, self._all):
             button.color = "teal" if button is bright else "gray"
-        lines = [] if state.solving else [self._plan, _MEANING]
+        lines = [] if state.solving else [self._plan]
         if state.solve is not None:
             done, total = state.solve.progress
             self._progress.value = 100.0 * done / total

@@ -59,7 +59,8 @@ def curves(arm: FoundArm) -> list[Curve]:
         y = _HEIGHT - 6 - (values - low) / max(high - low, 1e-9) * (_HEIGHT - 12)
         points = " ".join(f"{a:.1f},{b:.1f}" for a, b in zip(x, y, strict=True) if np.isfinite(b))
         scale, unit = (1e3, "mm") if name == JOINT_NAMES[2] else (180 / np.pi, "°")
-        label = f"{name.replace('_', ' ')} {scale * low:.0f} to {scale * high:.0f} {unit}"
+        least, most = np.round([scale * low, scale * high]) + 0.0  # no minus before 0
+        label = f"{name.replace('_', ' ')} {least:.0f} to {most:.0f} {unit}"
         found.append(Curve(points, color, label))
     return found
 

@@ -8,8 +8,8 @@ from contextlib import closing
 from pathlib import Path
 
 import pytest
-from playwright.sync_api import Browser, expect
-from viewer_tab import new_context
+from playwright.sync_api import Browser, FloatRect, Page, expect
+from viewer_tab import box_of, new_context
 from waiting import eventually
 from websockets.asyncio.client import connect
 from websockets.exceptions import InvalidStatus
@@ -106,8 +106,18 @@ def test_only_the_start_page_accepts_uploads_of_its_own_origin(tmp_path: Path) -
         eventually(lambda: [entry.name for entry in root.iterdir()] == ["a"])
 
 
+def drop(page: Page, path: Path, box: FloatRect) -> None:
+    """Drag a file or folder from outside of the browser, and drop it in the middle of a box of the window."""
+    at = {"x": box["x"] + box["width"] / 2, "y": box["y"] + box["height"] / 2}
+    dragged = {"items": [], "files": [str(path)], "dragOperationsMask": 1}
+    session = page.context.new_cdp_session(page)
+    for kind in ("dragEnter", "dragOver", "drop"):
+        session.send("Input.dispatchDragEvent", {"type": kind, **at, "data": dragged})
+
+
 @pytest.mark.browser
-def test_a_chosen_folder_becomes_a_new_recording(tmp_path: Path, browser: Browser) -> None:
+@pytest.mark.parametrize("dropped", [False, True])
+def test_a_chosen_or_dropped_folder_becomes_a_new_recording(tmp_path: Path, browser: Browser, dropped: bool) -> None:
     root, source = tmp_path / "labs", tmp_path / "day 3"
     root.mkdir()
     (source / "left").mkdir(parents=True)
@@ -116,9 +126,13 @@ def test_a_chosen_folder_becomes_a_new_recording(tmp_path: Path, browser: Browse
     with Site([root], port=0) as site, closing(new_context(browser)) as context:
         page = context.new_page()
         page.goto(site.url)
-        with page.expect_file_chooser() as chooser:
-            page.get_by_role("button", name="Choose a folder").click(timeout=60_000)
-        chooser.value.set_files(source)
+        button = page.get_by_role("button", name="Choose a folder")
+        if dropped:
+            drop(page, source, box_of(button))
+        else:
+            with page.expect_file_chooser() as chooser:
+                button.click(timeout=60_000)
+            chooser.value.set_files(source)
         expect(page.get_by_role("heading", name="day 3")).to_be_visible(timeout=60_000)
         assert content_of(root) == {"day 3/left/001.png": (source / "left" / "001.png").read_bytes()}
 
