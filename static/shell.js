@@ -220,6 +220,14 @@
     setTimeout(nameWidgets, 50);
   }, { capture: true });
 
+  // A field beside a slider would clamp a typed number to the slider's ends when it is left; the server instead extends the
+  // ends to the number, up to the limits of the joint.
+  window.addEventListener("focusout", (event) => {
+    const slider = event.target.closest?.(".mantine-Slider-root + *")?.previousElementSibling.querySelector("[role=slider]");
+    const typed = Number.parseFloat(event.target.value);
+    if (slider && (typed < slider.ariaValueMin || typed > slider.ariaValueMax)) event.stopPropagation();
+  }, { capture: true });
+
   // ---- Show the compared pose while a key is held --------------------------------------------------------------------------
 
   let peeking = false;

@@ -1,5 +1,7 @@
 """Controls of the page in headless Chromium: legible, within the window, explained, and usable by keys."""
 
+import math
+
 import pytest
 from cut_off import cut_off, hardly_legible
 from playwright.sync_api import Page, expect
@@ -223,8 +225,14 @@ def test_keys_fields_lists_and_errors_leave_the_page_usable_and_no_other_host_is
     assert slider.max - slider.min <= 12
     tab.put(intents.ShowFrame(11))
     assert slider.max - slider.min <= 12 and slider.min <= slider.value <= slider.max
-    tab.type_value(slider, round(slider.value - 15.0, 2))
+    typed = round(slider.value - 15.0, 2)
+    tab.type_value(slider, typed)
     eventually(lambda: (slider.min, slider.max, slider.value), lambda now: now[0] <= now[2] and now[1] - now[0] > 18)
+    assert slider.value == pytest.approx(typed, abs=0.01)
+    # Beyond the joint's limits, the limit is shown.
+    tab.type_value(slider, -1000.0)
+    limit = math.degrees(app.scene.arms[0].robot.joint_limits[0][0])
+    expect(tab.field(slider)).to_have_value(f"{limit:.2f}".rstrip("0").rstrip("."))
     tab.button("Back to measured")
     eventually(lambda: slider.max - slider.min, lambda wide: wide <= 12)
     track = page.locator(f"{tab.element(slider)} [role=slider]")
