@@ -184,9 +184,10 @@ class Target:
         return {**found, **{name: mask | found.get(name, False) for name, mask in of_masks.items() if name in cameras}}
 
     def seen(self, recording: Recording, index: int, domain: str, cameras: Sequence[str]) -> list[str]:
-        """Cameras that can be compared in a frame; if only masks are fitted, those with a mask."""
+        """Cameras with an image that can be compared in a frame; if only masks are fitted, those with a mask."""
+        cameras = [name for name in cameras if index in recording.frames_of(name)]
         if self.observed.what != "masks":
-            return list(cameras)
+            return cameras
         if self.given is not None:
             return [name for name in cameras if self.given.available(index, name)]
         own = [name for name in cameras if recording.has_masks(name, domain)]

@@ -156,7 +156,7 @@ class HelpPanel:
         self._page, self._perturb = page, perturb
         self._keys: Keys | None = None
         self._commands: dict[str, viser.CommandHandle] = {}
-        self._of_buttons: list[tuple[viser.GuiButtonHandle, viser.CommandHandle]] = []
+        self._of_buttons: dict[str, tuple[viser.CommandHandle, list[viser.GuiButtonHandle]]] = {}
         for name, shortcut in shortcuts().items():
             if shortcut.action == "peek":  # lasts while its key is held
                 continue
@@ -164,11 +164,12 @@ class HelpPanel:
             self._listen(command, lambda _, shortcut=shortcut: self._act(shortcut))
         known = [shortcut.action for shortcut in shortcuts().values()]
         for handle, intent in page.buttons:
-            if intent not in known:
-                known.append(intent)  # one entry for buttons with the same function
+            if handle.label in self._of_buttons:
+                self._of_buttons[handle.label][1].append(handle)
+            elif intent not in known:
                 command = page.gui.add_command(handle.label)
                 self._commands[element_id(handle)] = command
-                self._of_buttons.append((handle, command))
+                self._of_buttons[handle.label] = (command, [handle])
                 self._listen(command, lambda client, intent=intent: page.emit_from(intent, client))
         for label, (name, *arguments) in _SCRIPTS.items():
             self._listen(page.gui.add_command(label), lambda _, call=(name, *arguments): page.call(*call))
@@ -176,9 +177,9 @@ class HelpPanel:
         self._add_guide(page)
 
     def show(self, state: ViewState) -> None:
-        """Name the current keys in the list of actions and in the hints; list only actions that are possible."""
-        for button, command in self._of_buttons:
-            if command.disabled != (impossible := button.disabled or not button.visible):
+        """Name the current keys in the list of actions and in the hints, and disable impossible actions."""
+        for command, buttons in self._of_buttons.values():
+            if command.disabled != (impossible := all(one.disabled or not one.visible for one in buttons)):
                 command.disabled = impossible
         if state.keys == self._keys:
             return

@@ -16,7 +16,7 @@ from carts_core.settings import DescentSolver, SolverName, SurfaceSolver
 from carts_core.settings.serialization import field_docstrings
 from carts_viewer.actions import intents
 from carts_viewer.panels.inputs import PanelPage, humanized, write
-from carts_viewer.panels.sequence import CalibrationHint
+from carts_viewer.panels.sequence import CalibrationHint, whole_label
 from carts_viewer.session import Session
 from carts_viewer.state import PRESETS, Curves, Phase, ViewState
 from carts_viewer.transport.document import escaped
@@ -54,6 +54,8 @@ class OptimizePanel:
         self._reset = page.button("Reset", intents.Reset(), icon=viser.Icon.PLAYER_TRACK_PREV)
         icons = (self._pause, self._step, self._reset)
         page.row(self._run, *icons, weights=(3, 1, 1, 1), icons=icons)
+        self._page = page
+        self._all = page.button("Solve all", lambda _: self._solve(), icon=viser.Icon.ARROWS_HORIZONTAL)
         self._status = gui.add_html("")
         self._calibration = CalibrationHint(page, session)
         self._unfamiliar = gui.add_html("", visible=False)
@@ -66,6 +68,7 @@ class OptimizePanel:
         running = state.run.phase is Phase.RUNNING
         self._run.label = "Continue" if state.run.phase is Phase.PAUSED else "Run"
         self._run.disabled = self._step.disabled = running or state.busy is not None
+        self._all.label, self._all.disabled = whole_label(state), state.solving or state.busy is not None
         self._pause.disabled = not running
         self._reset.disabled = not state.run.curves.loss
         self._unfamiliar.content = "".join(
@@ -74,6 +77,11 @@ class OptimizePanel:
         self._unfamiliar.visible = self._adapt.visible = bool(state.unfamiliar)
         self._status.content = f'<p class="carts-status">{status_line(state)}</p>'
         self._calibration.show(state.run.base_frame_gain, state)
+
+    def _solve(self) -> intents.Solve:
+        """Solve all frames, and show the progress."""
+        self._page.call("chooseTabs", ["Review"])
+        return intents.Solve(whole=True)
 
 
 class ObjectivePanel:

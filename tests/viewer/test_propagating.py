@@ -91,6 +91,23 @@ def test_frames_between_keyframes_are_solved_in_one_step_and_keyframes_stay(desk
     assert sources(desk) == [Source.HAND, None, None, Source.HAND, None]
 
 
+def test_a_frame_without_the_image_of_one_camera_is_solved_and_compared_in_the_other(
+    tiny_sequence: Callable[..., Path],
+) -> None:
+    def sparse(text: str) -> str:
+        return text.replace('name = "right"', 'name = "right"\nsparse_images = true')
+
+    path = tiny_sequence(frames=3, cameras=("left", "right"), width=128, height=96, edit=sparse)
+    (path.parent / "regular" / "right" / "002.png").unlink()
+    desk = opened(path)
+    desk.do(intents.Solve(whole=True))
+    desk.finish()
+    assert desk.state.error is None and desk.state.solve is not None and desk.state.solve.listed == ()
+    verdicts = [desk.saved.get(Key.verdict(frame)) for frame in range(3)]
+    cameras = [None if verdict is None else [name for name, _ in verdict.cameras] for verdict in verdicts]
+    assert cameras == [["left", "right"], [], ["left", "right"]]  # a verdict on one camera does not name it
+
+
 def test_between_keyframes_is_inside_the_range_where_the_frame_lies_in_one(desk: Desk) -> None:
     desk.do(intents.SetRange((1, 3)), intents.ShowFrame(4), intents.SetReview(ReviewState.ACCEPTED))
     with pytest.raises(CartsError, match="no keyframe yet"):
