@@ -16,6 +16,7 @@
   function toggleTheme() {
     const root = document.documentElement;
     const documented = root.classList.contains("carts-documented");
+    if (!documented && !window.carts.connected()) return; // the server changes the theme of viser's widgets
     const light = documented ? wanted() === "light" : root.dataset.mantineColorScheme === "light";
     localStorage.setItem("carts-theme", light ? "dark" : "light");
     dress();
