@@ -1,6 +1,7 @@
 """Painted layers of a frame, each an 8-bit PNG."""
 
 import struct
+import zlib
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Self
@@ -128,7 +129,11 @@ def _decoded(png: bytes, size: tuple[int, int]) -> UInt8[np.ndarray, "height wid
 
 
 def _png(pixels: UInt8[np.ndarray, "height width"]) -> bytes:
-    ok, data = cv2.imencode(".png", pixels)
-    if not ok:
-        raise ProjectError(f"a painted layer of shape {pixels.shape} could not be written as PNG.")
-    return data.tobytes()
+    """PNG file without filters, which for masks is encoded and decoded several times faster than OpenCV's."""
+    height, width = pixels.shape
+    rows, coder = np.pad(pixels, ((0, 0), (1, 0))), zlib.compressobj(1, strategy=zlib.Z_RLE)
+    header = struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0)
+    chunks = (b"IHDR" + header, b"IDAT" + coder.compress(rows) + coder.flush(), b"IEND")
+    return _HEADER[:8] + b"".join(
+        struct.pack(">I", len(chunk) - 4) + chunk + struct.pack(">I", zlib.crc32(chunk)) for chunk in chunks
+    )
