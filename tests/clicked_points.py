@@ -4,7 +4,7 @@ from collections.abc import Iterable, Mapping
 
 import numpy as np
 
-from carts_core.model.keypoints import Landmark, LandmarkKind, landmarks, link_transforms
+from carts_core.model.keypoints import Landmark, LandmarkKind, landmarks
 from carts_core.model.scene import Scene
 from carts_core.optimization.hand_eye import ImagePoint
 
@@ -31,7 +31,7 @@ def clicked(
         for frame in frames:
             for arm in scene.arms:
                 known = {name.removeprefix(f"{arm.name} "): mark for name, mark in landmarks(arm).items()}
-                Ts = link_transforms(arm, measured[arm.name][frame][None])[0]
+                Ts = arm.robot.forward_kinematics(measured[arm.name][frame][None])[0]
                 T_camera_base = scene.camera(camera).T_camera_world @ arm.T_world_base
                 for name in names:
                     place = _seen(known[name], Ts, T_camera_base, side or random.choice([-1.0, 1.0]))

@@ -199,15 +199,6 @@ def landmarks(arm: Arm) -> Mapping[str, Landmark]:
     return found
 
 
-def link_transforms(
-    arm: Arm, joint_positions: Float[np.ndarray, "frames dofs"]
-) -> Float[np.ndarray, "frames links 4 4"]:
-    """Transforms from the links to the base frame, in double precision [m]."""
-    import torch  # noqa: PLC0415  for hand-eye calibrations and training, not for the page
-
-    return arm.robot.forward_kinematics(torch.as_tensor(np.asarray(joint_positions, np.float64))).numpy()
-
-
 def _shaft(arm: Arm) -> tuple[int, tuple[float, float, float], tuple[float, float, float], float] | None:
     """Longest slender link: index, two ends of its axis in the link's frame, and radius [m]; None without a slender
     link."""

@@ -11,7 +11,6 @@ from scipy.spatial.transform import Rotation
 from scipy.special import ndtr, stdtrit
 
 from ..errors import SettingsError
-from ..model.keypoints import link_transforms
 from ..model.scene import Scene, SceneState
 from ..networks.extractor import FeatureExtractor
 from ..recording import Frame
@@ -367,7 +366,7 @@ class CalibrationOptimizer:
         found = {}
         for number, arm in enumerate(self._scene.arms):
             joints = np.stack([frame.measured[arm.name] for frame in self._frames])
-            middle = link_transforms(arm, joints)[:, -1, :, 3].mean(0)
+            middle = arm.robot.forward_kinematics(joints)[:, -1, :, 3].mean(0)
             for index, camera in enumerate(self._scene.cameras):
                 Ts = (around.T_camera_world[:, index] @ around.T_world_base[:, number]).double().cpu().numpy()
                 turns = Rotation.from_matrix(Ts[:, :3, :3] @ Ts[0, :3, :3].T).as_rotvec()

@@ -14,7 +14,6 @@ from carts_core.errors import CartsError, SettingsError
 from carts_core.evaluation.calibration import beyond_prior
 from carts_core.files import name_fault
 from carts_core.model.camera import rigid_transform
-from carts_core.model.keypoints import link_transforms
 from carts_core.model.scene import Scene
 from carts_core.networks import FeatureExtractor
 from carts_core.optimization import CalibrationIterate, CalibrationOptimizer, CalibrationResult
@@ -225,7 +224,7 @@ def _poses(result: CalibrationResult, clicking: Clicking, points: Rows[ImagePoin
     poses = []
     for (name, camera), deviation in result.deviations.items():
         arm = clicking.scene.arm(name)
-        middle = link_transforms(arm, clicking.sequence.measured[name][frames])[:, -1, :, 3].mean(0)
+        middle = arm.robot.forward_kinematics(clicking.sequence.measured[name][frames])[:, -1, :, 3].mean(0)
         old, new = (
             scene.camera(camera).T_camera_world @ scene.arm(name).T_world_base
             for scene in (clicking.scene, result.scene)

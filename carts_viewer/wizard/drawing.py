@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
-from carts_core.model.keypoints import LandmarkKind, landmarks, link_transforms
+from carts_core.model.keypoints import LandmarkKind, landmarks
 from carts_core.model.scene import Arm
 
 WIDTH, HEIGHT = 640, 256
@@ -49,7 +49,7 @@ def drawing_of(arm: Arm) -> Drawing | None:
         return None
     low, high = robot.joint_limits.T
     low, high = np.clip(low, -np.pi, np.pi), np.clip(high, -np.pi, np.pi)
-    Ts = link_transforms(arm, (low + _BEND * (high - low))[None])[0]
+    Ts = arm.robot.forward_kinematics((low + _BEND * (high - low))[None])[0]
     centres = np.stack([mark.positions(Ts)[0] for mark in points.values()])
     shaft = next((mark for mark in known.values() if mark.kind is not LandmarkKind.POINT), None)
     behind = centres[-1] if shaft is None else shaft.positions(Ts).mean(0)

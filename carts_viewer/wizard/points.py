@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from carts_core.errors import CartsError
-from carts_core.model.keypoints import SHAFT_EDGE, TIP, LandmarkKind, landmarks, link_transforms
+from carts_core.model.keypoints import SHAFT_EDGE, TIP, LandmarkKind, landmarks
 from carts_core.model.scene import Scene
 from carts_core.optimization.hand_eye import HandEyeResult, HandEyeSettings, ImagePoint, solve_hand_eye
 from carts_core.recording import Sequence
@@ -94,7 +94,9 @@ def _plan(sequence: Sequence) -> tuple[ClickPrompt, ...]:
     """Prompts in frames with arm positions far from each other."""
     scene = sequence.scene
     arms = [arm for arm in scene.arms if len(sequence.measured[arm.name])]
-    tips = np.concatenate([link_transforms(arm, sequence.measured[arm.name])[:, -1, :3, 3] for arm in arms], axis=-1)
+    tips = np.concatenate(
+        [arm.robot.forward_kinematics(sequence.measured[arm.name])[:, -1, :3, 3] for arm in arms], axis=-1
+    )
     unknown = unknown_cameras(scene)
     prompts = []
     for number, camera in enumerate(scene.cameras):

@@ -20,7 +20,6 @@ from ...errors import CartsError, SequenceError
 from ...evaluation import Setup
 from ...files import write_text
 from ...model.camera import HALF_PIXEL, Camera, opencv_matrix
-from ...model.keypoints import link_transforms
 from ...model.scene import Arm, Scene
 from ...networks import FeatureExtractor
 from ...optimization import FreeParameters, SurfacePredictor, SurfaceSolver
@@ -235,7 +234,7 @@ class _Projection:
     def __init__(self, sequence: Sequence, arm: Arm, points: Several[Keypoint], joints: Float[np.ndarray, "n dofs"]):
         cameras = {camera.name: camera for camera in sequence.scene.cameras}
         self.links = [arm.robot.link_names.index(_LINKS[point.dot]) for point in points]
-        self.Ts_base_link = link_transforms(arm, joints)[np.arange(len(points)), self.links]
+        self.Ts_base_link = arm.robot.forward_kinematics(joints)[np.arange(len(points)), self.links]
         self.Ts_camera_world = np.stack([cameras[point.camera].T_camera_world for point in points])
         self.intrinsics = np.array([cameras[point.camera].intrinsics for point in points])
         self.pixels = np.array([point.pixel for point in points])

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from ...errors import SettingsError
 from ...model.camera import HALF_PIXEL, opencv_matrix
-from ...model.keypoints import Landmark, LandmarkKind, landmarks, link_transforms
+from ...model.keypoints import Landmark, LandmarkKind, landmarks
 from ...model.scene import Scene
 from ...settings.ranges import Range, Ranged
 from ...wording import counted
@@ -145,7 +145,7 @@ def views_of(
                 raise SettingsError(f"{entry.name} has no {point.landmark!r}. Its landmarks are: {', '.join(known)}.")
         frames = tuple(point.frame for point in chosen)
         found = tuple(known[point.landmark] for point in chosen)
-        Ts = link_transforms(entry, np.asarray(measured[entry.name])[list(frames)])
+        Ts = entry.robot.forward_kinematics(np.asarray(measured[entry.name])[list(frames)])
         ends = [landmark.positions(T) for landmark, T in zip(found, Ts, strict=True)]
         starts, last = (np.stack([each[place] for each in ends]) for place in (0, -1))
         pixels = np.array([point.pixel for point in chosen], np.float64)

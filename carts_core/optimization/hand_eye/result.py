@@ -19,6 +19,8 @@ from .problem import HandEyeProblem, HandEyeSettings, ImagePoint, View, transfor
 
 _OUTLIER = 4.0
 """Multiple of the expected error beyond which a point contradicts the others [1]."""
+_FEW_POINTS = 6
+"""Number of points of an arm below which several poses can fit equally well."""
 _SINGULAR = 1e-12
 """Eigenvalue of the scaled curvature below which a direction is undetermined [1]."""
 _TURN, _SIDEWAYS = slice(0, 3), slice(3, 5)
@@ -68,6 +70,9 @@ class HandEyeResult:
     larger."""
     missing: Mapping[tuple[str, str], int] = field(default_factory=dict)
     """(arm, camera) -> number of missing points, for poses that could not be estimated."""
+    ambiguous: tuple[tuple[str, str], ...] = ()
+    """(arm, camera) of base frames from so few points, or points of so few landmarks, that another pose can fit
+    equally well."""
 
     @property
     def error(self) -> float:
@@ -107,7 +112,18 @@ def result_of(problem: HandEyeProblem, fit: OptimizeResult, count: int) -> HandE
         contradicting=tuple(np.flatnonzero(distances > _OUTLIER * problem.settings.pixel_error).tolist()),
         noise=_noise(problem, fit, excess),
         missing={(arms[arm], names[camera]): more for (camera, arm), more in problem.missing.items()},
+        ambiguous=tuple(
+            (arms[view.arm], names[view.camera])
+            for view in problem.views
+            if view.arm in bases and _is_ambiguous([other for other in problem.views if other.arm == view.arm])
+        ),
     )
+
+
+def _is_ambiguous(views: Sequence[View]) -> bool:
+    """Whether an arm has few points, or points of a single landmark, such as the tip, which moves little."""
+    points = [mark.name for view in views for mark in view.landmarks if mark.kind is LandmarkKind.POINT]
+    return len(points) < _FEW_POINTS or len(set(points)) == 1
 
 
 def _degrees_of_freedom(problem: HandEyeProblem, fit: OptimizeResult) -> int:

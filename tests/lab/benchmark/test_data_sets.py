@@ -20,7 +20,6 @@ from carts_core.cli import main
 from carts_core.errors import CartsError
 from carts_core.export.video import image_and_mask
 from carts_core.lab.benchmark.data_sets import ArmResult, KeypointError, bench_recording, recordings, table
-from carts_core.model.keypoints import link_transforms
 from carts_core.model.robot import Robot
 from carts_core.model.scene import Scene
 from carts_core.optimization import FramePredictor
@@ -65,7 +64,7 @@ def trajectory(folder: Path, robot: Robot) -> Truths:
     pictures = [np.where(mask[..., None], picture, texture) for picture, mask in shown]
     write_video(folder / "regular/left_video.mp4", pictures, RATE)
     write_video(folder / "regular/right_video.mp4", [texture] * FRAMES, RATE)
-    Ts = link_transforms(scene.arms[0], joints)
+    Ts = scene.arms[0].robot.forward_kinematics(joints)
     for camera in scene.cameras:
         points: dict[int, dict[int, list[float] | None]] = {
             number: {4: [1.0, 1.0], 6: None} for number in range(FRAMES)
