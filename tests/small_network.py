@@ -10,7 +10,7 @@ from carts_core.networks.weights import save_weights
 from carts_core.settings import Architecture
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def small_architecture() -> Architecture:
     return Architecture(widths=(4, 6, 8), encoder_convolutions=(1, 1, 1), decoder_convolutions=(1, 1))
 

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -17,22 +18,38 @@ from carts_core.networks.weights import save_weights
 from carts_core.settings import Architecture
 
 
-@pytest.fixture(autouse=True)
-def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.setenv("CARTS_CACHE", str(tmp_path / "cache"))
-    return tmp_path / "cache"
-
-
-@pytest.fixture
-def weights(small_architecture: Architecture, tmp_path: Path) -> Path:
+@pytest.fixture(scope="module")
+def weights(small_architecture: Architecture, tmp_path_factory: pytest.TempPathFactory) -> Path:
     torch.manual_seed(3)
     network = UNetSurface(small_architecture)
     with torch.no_grad():
         for _ in range(5):
             network(torch.rand(4, 3, 32, 48), torch.rand(4, 6, 32, 48))
-    path = tmp_path / "surface.safetensors"
+    path = tmp_path_factory.mktemp("weights") / "surface.safetensors"
     save_weights(network.eval(), path, {}, (320, 240))
     return path
+
+
+@pytest.fixture(scope="module")
+def graphs(weights: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A cache with the graphs of both networks, which take seconds to export."""
+    folder = tmp_path_factory.mktemp("graphs")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("CARTS_CACHE", str(folder))
+        FeatureExtractor.load(inference="onnx")
+        FeatureExtractor.load(weights, inference="onnx")
+    return folder
+
+
+@pytest.fixture(autouse=True)
+def cache(graphs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The cache, with exported graphs."""
+    folder = tmp_path / "cache"
+    folder.mkdir()
+    for graph in graphs.glob("surface-*.onnx"):
+        shutil.copy(graph, folder)
+    monkeypatch.setenv("CARTS_CACHE", str(folder))
+    return folder
 
 
 @pytest.mark.parametrize("size", [(16, 16), (112, 208), (240, 320)])
@@ -63,24 +80,23 @@ def test_a_gpu_predicts_what_a_cpu_predicts_and_gives_it_back_where_the_images_a
 
 
 def test_a_damaged_graph_is_exported_again(weights: Path, cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    FeatureExtractor.load(weights, inference="onnx")
-    (graph,) = cache.glob("surface-*.onnx")
-    whole = graph.read_bytes()
+    graphs = {path: path.read_bytes() for path in cache.glob("surface-*.onnx")}
     monkeypatch.setattr("carts_core.networks.extractor._exported", lambda network: pytest.fail("exported again"))
     assert FeatureExtractor.load(weights, inference="onnx").engine == "onnx"
     monkeypatch.undo()
     monkeypatch.setenv("CARTS_CACHE", str(cache))
-    graph.write_bytes(whole[:1000])
-    assert FeatureExtractor.load(weights, inference="onnx").engine == "onnx" and len(graph.read_bytes()) == len(whole)
+    for path, whole in graphs.items():
+        path.write_bytes(whole[:1000])
+    assert FeatureExtractor.load(weights, inference="onnx").engine == "onnx"
+    # The graph of the other network is not touched.
+    assert sorted(path.read_bytes() == whole for path, whole in graphs.items()) == [False, True]
 
 
 def test_another_networks_graph_is_not_used(weights: Path, cache: Path) -> None:
-    FeatureExtractor.load(inference="onnx")
-    (other,) = cache.glob("surface-*.onnx")
-    content = other.read_bytes()
-    FeatureExtractor.load(weights, inference="onnx")
-    (own,) = set(cache.glob("surface-*.onnx")) - {other}
-    own.write_bytes(content)
+    one, other = cache.glob("surface-*.onnx")
+    contents = one.read_bytes(), other.read_bytes()
+    one.write_bytes(contents[1])
+    other.write_bytes(contents[0])
     assert FeatureExtractor.load(weights, inference="auto").engine == "torch"
     with pytest.raises(SettingsError, match=r"cannot be used: (its surface maps differ|ONNX Runtime cannot run)"):
         FeatureExtractor.load(weights, inference="onnx")
@@ -106,15 +122,15 @@ def test_without_onnx_runtime_torch_runs(weights: Path, monkeypatch: pytest.Monk
 
 
 def test_a_cache_that_cannot_be_written_is_no_error(weights: Path, cache: Path) -> None:
+    shutil.rmtree(cache)
     cache.write_text("a file where the folder should be")
     assert FeatureExtractor.load(weights, inference="onnx").engine == "onnx"
 
 
 @pytest.mark.parametrize("ours", [True, False])
-def test_onnx_runtime_collects_nothing_about_whoever_uses_it(weights: Path, tmp_path: Path, ours: bool) -> None:
+def test_onnx_runtime_collects_nothing_about_whoever_uses_it(cache: Path, tmp_path: Path, ours: bool) -> None:
     """What it would send it keeps in a database in the user's cache first; without our import it does."""
-    FeatureExtractor.load(weights, inference="onnx")
-    (graph,) = (tmp_path / "cache").glob("surface-*.onnx")
+    graph = next(cache.glob("surface-*.onnx"))
     session = f"import onnxruntime; onnxruntime.InferenceSession({str(graph)!r}, providers=['CPUExecutionProvider'])"
     if ours:
         session = f"from carts_core.onnx_runtime import *; inference_session(open({str(graph)!r}, 'rb').read())"
