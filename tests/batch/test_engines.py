@@ -22,7 +22,7 @@ def jobs(count: int) -> list[Job]:
     ("engine", "given_up"),
     [
         pytest.param(lambda work: Pool(work, 2, 1), True, id="pool"),
-        pytest.param(lambda work: Cluster(work, "local", 2, 1), False, id="dask"),
+        pytest.param(lambda work: Cluster(work, "local", 2, 1), False, id="dask", marks=pytest.mark.slow),
     ],
 )
 def test_jobs_of_a_killed_worker_are_done_by_another_one_until_they_are_given_up(

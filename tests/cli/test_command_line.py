@@ -82,7 +82,7 @@ def test_optimize_writes_masks_and_kinematics_and_resumes(
     assert not list(folder.rglob(".*"))
 
 
-@pytest.mark.parametrize("mode", ["frame", "sequence"])
+@pytest.mark.parametrize("mode", ["frame", pytest.param("sequence", marks=pytest.mark.slow)])
 def test_cameras_that_look_together_share_a_table_and_have_masks_of_their_own(
     tiny_sequence: Callable[..., Path], tmp_path: Path, said: Callable[[], str], mode: str
 ) -> None:

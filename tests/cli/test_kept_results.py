@@ -171,6 +171,7 @@ def test_other_weights_have_all_frames_redone(optimize: Outcome, tmp_path: Path)
     assert "3 of 3 frames redone: the weights changed" in optimize("--weights", str(tmp_path / "mine.safetensors"))
 
 
+@pytest.mark.slow
 def test_in_sequence_mode_one_changed_image_has_all_frames_redone(
     sequence: Path, tmp_path: Path, said: Outcome
 ) -> None:

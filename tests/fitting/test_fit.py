@@ -377,6 +377,7 @@ def test_a_recording_with_a_damaged_image_is_shown_without_a_picture(tiny_sequen
     assert "data:image" not in text and "is damaged" in text and "<table>" in text
 
 
+@pytest.mark.slow
 def test_the_network_and_a_background_give_the_result_of_the_frame_optimizer(sample_sequence_path: Path) -> None:
     sequence = carts.open(sample_sequence_path)
     camera, frame = sequence.scene.cameras[0], sequence.frame(0)

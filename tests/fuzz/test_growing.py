@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-QUICK = ["npz/false small size", "mat/bomb", "parquet/dictionary of texts", "bag/endless view", "dae/instances"]
+QUICK = ["npz/false small size", "mat/bomb", "bag/endless view"]
 
 
 def check(*cases: str, seconds: float) -> str:

@@ -164,6 +164,7 @@ def instrument_of(urdf: Path, *meshes: str) -> Path:
     return urdf
 
 
+@pytest.mark.slow
 def test_decimation_keeps_to_the_tolerance_of_an_instrument(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("CARTS_CACHE", str(tmp_path))
     urdf = instrument_of(tmp_path / "instrument.urdf", "shaft_tube", "shaft_clevis")

@@ -129,6 +129,7 @@ def test_arms_that_never_leave_say_so_once_and_nothing_is_explained_away(tiny_se
     assert set(Backgrounds.of(sequence, ["left"], "regular", required=True).images) == {"left"}
 
 
+@pytest.mark.slow
 def test_a_real_instrument_is_found_in_a_room_that_deceives_the_network(shared_dir: Path) -> None:
     sequence = Sequence.open(DVRK)
     room = next(room for room in synthetic_rooms() if room.name == "rods 1")

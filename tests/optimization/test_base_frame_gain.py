@@ -30,6 +30,7 @@ def test_base_frames_that_are_right_are_not_suspected(domain: str) -> None:
     assert gain(sequence, 5, domain, sequence.scene.cameras[0].name, 2.0) < BASE_FRAME_GAIN
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("shared_dir")
 def test_a_sequence_tells_which_camera_contradicts_its_base_frame() -> None:
     sequence, extractor = Sequence.open(REAL), FeatureExtractor.load()

@@ -127,6 +127,7 @@ def test_failed_calibrations_keep_the_start(sequence: Sequence, frames: list[Fra
     assert np.array_equal(result.scene.arms[0].T_world_base, wrong.arms[0].T_world_base)
 
 
+@pytest.mark.slow
 def test_deviations_of_few_frames_are_wider(sequence: Sequence, frames: list[Frame], predictor: NumberedTruths) -> None:
     free = FreeParameters(joints=False, base_frames=True)
 
@@ -160,6 +161,7 @@ def test_few_frames_within_deviations(
     assert angle < 4 * known.rotation_deg and distance < 4 * np.hypot(known.sideways_mm, known.depth_mm)
 
 
+@pytest.mark.slow
 def test_backgrounds_count_in_a_calibration(sequence: Sequence, frames: list[Frame], predictor: NumberedTruths) -> None:
     renderer = Renderer(sequence.scene, cameras=["left"])
     bright = []
@@ -183,6 +185,7 @@ def test_backgrounds_count_in_a_calibration(sequence: Sequence, frames: list[Fra
     assert overlap is not None and overlap > 0.9
 
 
+@pytest.mark.slow
 def test_freed_joints_absorb_frame_errors(sequence: Sequence, frames: list[Frame], predictor: NumberedTruths) -> None:
     signs = np.random.default_rng(1).choice([-1.0, 1.0], (FRAMES, 2))
     shaken = [
@@ -203,6 +206,7 @@ def test_freed_joints_absorb_frame_errors(sequence: Sequence, frames: list[Frame
     assert loss(FreeParameters(joints=True, base_frames=True)) < 0.5 * held
 
 
+@pytest.mark.slow
 def test_outlier_frames_hardly_matter(sequence: Sequence, frames: list[Frame], predictor: NumberedTruths) -> None:
     broken = {"PSM1": frames[0].measured["PSM1"] + np.deg2rad([4, -4, 0, 0, 0, 0, 0])}
     mixed = [replace(frames[0], measured=broken), *frames[1:]]

@@ -142,6 +142,7 @@ def test_an_image_of_another_size_is_named(sequence: Sequence, extractor: Featur
         optimizer_of(sequence, extractor, frame=frame, cameras=["left"])
 
 
+@pytest.mark.slow
 def test_losses_of_all_iterates_compare_in_the_end(sequence: Sequence, extractor: FeatureExtractor) -> None:
     optimizer = FrameOptimizer(sequence.scene, sequence.frame(0), {}, extractor, settings=SurfaceSolver())
     iterates = list(optimizer)

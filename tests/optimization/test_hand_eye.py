@@ -247,6 +247,7 @@ def test_a_further_camera_is_found_from_four_points_that_nearly_lie_in_a_plane(s
         assert sideways < 4.0 * said.sideways_mm < 3.0 and depth < 4.0 * said.depth_mm and result.error < 1.5
 
 
+@pytest.mark.slow
 def test_a_refinement_keeps_to_what_the_points_left_open_and_to_known_cameras(
     tiny_sequence: Callable[..., Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -80,6 +80,7 @@ def test_constant_errors_are_recovered(truths: Truths, forward: tuple[SequenceOp
     assert max(step.iterations for step in steps[1:] if step.assessment is None) < steps[0].iterations
 
 
+@pytest.mark.slow
 def test_a_joint_that_is_hidden_now_and_then_is_carried_by_the_other_frames(truths: Truths) -> None:
     hidden = {2, 3}
     ignore = wrist_hidden(truths, hidden)
@@ -132,6 +133,7 @@ def test_keyframes_stay_and_inform_their_neighbours(truths: Truths, drawn: Calla
         assert (estimates[index].joint_std[ARM] > 0).all()
 
 
+@pytest.mark.slow
 def test_uncertain_keyframes_inform_others_less(truths: Truths, drawn: Callable[..., SequenceOptimizer]) -> None:
     std, roll = (1e-3, 1e-3, np.nan, 0.03, 1e-3, 1e-3, 1e-3), 3
     exact, uncertain = drawn(), drawn(*std)
@@ -197,6 +199,7 @@ def test_backward_ends_as_forward(truths: Truths, forward: tuple[SequenceOptimiz
         assert np.abs(there - back)[:2].max() < np.deg2rad(0.1)
 
 
+@pytest.mark.slow
 def test_a_jump_of_the_error_begins_anew(truths: Truths) -> None:
     """From frame 3 on the encoders are off by other amounts, as after homing."""
     jump = np.deg2rad([2.5, -2.5, 0.0, 0.0, 0.0, 0.0, 0.0])

@@ -152,7 +152,7 @@ def test_a_doubtful_fit_widens_the_deviations_and_of_a_failed_one_the_expected_o
     assert assess(CONTRADICTED).of(known).std == pytest.approx(known.expected)
 
 
-@pytest.mark.parametrize("shown", ["black", "background"])
+@pytest.mark.parametrize("shown", ["black", pytest.param("background", marks=pytest.mark.slow)])
 def test_without_an_arm_in_view_the_frame_fails(shipped: Sequence, extractor: FeatureExtractor, shown: str) -> None:
     frame, scene = shipped.frame(0, cameras=["left"]), shipped.scene.with_cameras(["left"])
     empty = shipped.background("left")

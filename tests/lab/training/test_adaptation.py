@@ -116,6 +116,7 @@ def config(tiny_sequence: Callable[..., Path], tmp_path: Path) -> TrainingConfig
     return adapted_to(tiny_sequence(), tmp_path / "adapted", given)
 
 
+@pytest.mark.slow
 def test_early_stopping_keeps_the_best_weights(config: TrainingConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(SurfaceTask, "worse", lambda *_: False)
     # At so small a rate only the batch statistics change.
@@ -138,7 +139,9 @@ FIGURES = {"dice": 0.8, "dice_given": 0.5, "part_accuracy": 0.9, "normal_error_d
 FIGURES |= dict.fromkeys(("dice_shaft", "dice_wrist", "dice_jaws"), 0.7)
 
 
-@pytest.mark.parametrize(("worse", "kept"), [({}, 1), ({"tip_error": 10.9}, 0), ({"dice_jaws": 0.6}, 0)])
+@pytest.mark.parametrize(
+    ("worse", "kept"), [({}, 1), ({"tip_error": 10.9}, 0), pytest.param({"dice_jaws": 0.6}, 0, marks=pytest.mark.slow)]
+)
 def test_weights_with_better_masks_and_worse_tips_or_parts_are_not_kept(
     config: TrainingConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, worse: dict[str, float], kept: int
 ):
@@ -214,6 +217,7 @@ def test_weights_are_offered_only_where_nothing_is_worse(
     )
 
 
+@pytest.mark.slow
 def test_made_images_to_judge_by_are_whole_and_always_the_same(tmp_path: Path):
     config = adapted_to(sample_sequence(), tmp_path, TrainingConfig())
     (first,), (again,) = (list(synthetic_images(config, 1)) for _ in range(2))

@@ -98,6 +98,7 @@ def test_a_killed_run_resumes_from_its_last_checkpoint(tmp_path: Path, sent: sig
     assert read_weights(result.weights).training["step"] == steps
 
 
+@pytest.mark.slow
 def test_a_run_ends_in_time_with_its_learning_rate_down_and_is_not_gone_on_with(tmp_path: Path):
     events: list[TrainingProgress] = []
     config = small_config(steps=100_000, minutes=0.02, validation_every=1_000)
@@ -119,6 +120,7 @@ def test_going_on_with_other_settings_is_refused_by_name(tmp_path: Path):
         train(small_config(steps=10, learning_rate=0.5), tmp_path)
 
 
+@pytest.mark.slow
 def test_fine_tuning_takes_the_architecture_of_the_weights(tmp_path: Path, small_weights: Path):
     config = small_config(start=small_weights, architecture=Architecture(), steps=1)
     train(config, tmp_path)
@@ -160,6 +162,7 @@ def test_the_stream_of_batches_goes_on_where_a_run_was_stopped(workers_before: i
         assert all(torch.equal(a, b) for a, b in zip(left, right, strict=True))
 
 
+@pytest.mark.slow
 def test_a_run_in_parts_ends_with_the_bytes_of_one_in_one_go(tmp_path: Path):
     whole = train(small_config(steps=12), tmp_path / "whole")
     config = small_config(steps=12)
@@ -203,6 +206,7 @@ def test_settings_out_of_range_are_refused(changes: dict):
         small_config(**changes)
 
 
+@pytest.mark.slow
 def test_a_surface_network_learns_and_reports(tmp_path: Path):
     architecture = SurfaceArchitecture(decoder=(4, 4, 4, 4), conditioning=(4, 4, 4))
     config = small_config(network="surface", surface_architecture=architecture, learning_rate=3e-3, steps=15)
