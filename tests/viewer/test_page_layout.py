@@ -233,6 +233,8 @@ def test_keys_fields_lists_and_errors_leave_the_page_usable_and_no_other_host_is
     tab.type_value(slider, -1000.0)
     limit = math.degrees(app.scene.arms[0].robot.joint_limits[0][0])
     expect(tab.field(slider)).to_have_value(f"{limit:.2f}".rstrip("0").rstrip("."))
+    tab.field(slider).focus()
+    expect(tab.field(slider)).to_have_css("outline-style", "solid")
     tab.button("Back to measured")
     eventually(lambda: slider.max - slider.min, lambda wide: wide <= 12)
     track = page.locator(f"{tab.element(slider)} [role=slider]")
