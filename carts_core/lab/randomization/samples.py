@@ -20,14 +20,13 @@ from .arms import (
     RobotGeometry,
     Variant,
     perturbed,
+    random_chain,
     random_intrinsics,
     random_placement,
     random_variant,
 )
 from .backgrounds import Photographs, random_background
-from .blood import bleed
-from .chains import random_chain
-from .clutter import add_clutter, add_objects, cast_shadow, contact_shadow, occlude
+from .clutter import add_clutter, add_objects, bleed, cast_shadow, contact_shadow, occlude
 from .shading import GBuffer, photograph, render_gbuffer, shade, tone
 
 SUPERSAMPLING = 2
