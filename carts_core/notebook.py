@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, UInt8
 
 MAX_WIDTH = 720
-"""Maximum width of a picture [px]; larger ones are reduced."""
+"""Maximum width of a picture [px]; wider pictures are downscaled."""
 _QUALITY = 88
 """JPEG quality."""
 
@@ -48,7 +48,7 @@ class Picture:
         return Picture(cv2.resize(self.image, size, interpolation=cv2.INTER_AREA), masks)
 
     def data_uri(self) -> str:
-        """The drawn picture as a `data:` URI, reduced."""
+        """The drawn picture as a `data:` URI, downscaled if necessary."""
         drawn = cv2.cvtColor(self.reduced().drawn(), cv2.COLOR_RGB2BGR)
         _, data = cv2.imencode(".jpg", drawn, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
         return "data:image/jpeg;base64," + base64.b64encode(data.tobytes()).decode("ascii")
@@ -59,7 +59,7 @@ def display(title: str, picture: Picture | None, sentences: Sequence[str], rows:
 
     Args:
         title: heading.
-        picture: picture above the sentences; None for none.
+        picture: picture above the sentences; may be None.
         sentences: paragraphs; empty ones are left out.
         rows: rows of the table; their keys are its headings.
     """

@@ -91,7 +91,7 @@ def stopped_by_signals() -> Iterator[None]:
     before = {number: signal.getsignal(number) for number in _SIGNALS}
     taken = [number for number, handler in before.items() if handler is not signal.SIG_IGN]
     owner, repeated, since = os.getpid(), _Repeated(), None
-    # Frames of the context manager, of contextlib, and of the caller that runs the block.
+    # Stack frame of the caller; those of this generator and of contextlib are skipped.
     begin = sys._getframe(2)
 
     def stop(number: int, frame: FrameType | None) -> None:

@@ -350,7 +350,7 @@ class RunState:
     phase: Phase = Phase.IDLE
     curves: Curves = field(default_factory=Curves)
     reason: str | None = None
-    """Reason for the end of the run, as text for the user."""
+    """Termination reason of the run, as text for the user."""
     start: SceneState | None = None
     """Pose at the start of the run."""
     base_frame_gain: float | None = None

@@ -89,7 +89,7 @@ class Worker:
             if self._startup is not None and any(tab.pictured for tab in self._tabs):
                 self._attempt(self._startup, *self._tabs)
                 self._startup = None
-        # Edits that arrived just before the end are saved too, but no long work is started.
+        # Edits that arrived just before the end are also saved, but no long work is started.
         for queued in self._queue.take(0.0):
             if not isinstance(queued.intent, _STARTS_LONG_WORK):
                 self._handle(queued)

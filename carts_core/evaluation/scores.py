@@ -253,7 +253,7 @@ class Setup:
         return Backgrounds.of(self.sequence, self.cameras, self.domain, required=self.settings.needs_background)
 
     def solved(self, frame: Frame) -> FrameOptimizer:
-        """Single-frame optimizer of a frame, run to its end."""
+        """Single-frame optimizer of a frame, run to completion."""
         optimizer = FrameOptimizer(
             self.sequence.scene,
             frame,

@@ -313,7 +313,7 @@ def write_yolo(dataset: Dataset, folder: OutputPath, progress: ExportProgress) -
     """Write the dataset in YOLO format; each connected visible region of an arm is an object.
 
     Datumaro reads YOLO boxes, but no polygons: `obj.names` and `annotations/` hold a box per category for it. Only
-    visible categories get a file, since Datumaro reads empty files of `labels/` too.
+    visible categories get a file, since Datumaro also reads empty files of `labels/`.
     """
     for view in dataset.views(progress):
         stem = dataset.stems[view.id - 1]

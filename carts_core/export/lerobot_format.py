@@ -246,7 +246,7 @@ def _earlier(
         earlier = np.array(recorded[name], np.float64)
         if earlier.shape != shape:
             raise ValueError(
-                f"its column {name} is of an export with other joints: {earlier.shape} values instead of {shape}"
+                f"its column {name} comes from an export with other joints: {earlier.shape} values instead of {shape}"
             )
         values = earlier
         values[own] = default

@@ -30,9 +30,9 @@ from .video import frame_rate
 
 _NAME = "corrected"
 _VERSION = 8
-"""Version of the bag's metadata, which ROS 2 reads from Humble on."""
+"""Version of the bag's metadata, supported by ROS 2 Humble and later."""
 _SAME_LINK = 1e-5
-"""Maximum distance of a link from the tip frame of the PSM whose geometry it has [m]."""
+"""Tolerance for the distance between a link's origin and the tip of the closed-form PSM kinematics [m]."""
 _NANOSECONDS = 10**9
 
 

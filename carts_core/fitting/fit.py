@@ -56,17 +56,16 @@ def fit(
 ) -> Fit:
     """Correct the joint positions of robot arms so that their rendering matches an image.
 
-    **Pixels.** `K` is in OpenCV's convention: the centre of the first pixel is at (0, 0). This is what
-    `cv2.calibrateCamera`, ROS and Kalibr give. If the centre of the first pixel of `K` is at (0.5, 0.5), as in COLMAP,
-    most renderers and `Camera.K`, give `pixel_center=0.5`; otherwise all results are wrong by half a pixel. A `Camera`
-    as `K` needs no convention.
+    **Pixels.** `K` is in OpenCV's convention, as from `cv2.calibrateCamera`, ROS and Kalibr: the centre of the first
+    pixel is at (0, 0). If it is at (0.5, 0.5), as in COLMAP, most renderers and `Camera.K`, give `pixel_center=0.5`;
+    otherwise all results are wrong by half a pixel. A `Camera` as `K` needs no convention.
 
     **Several arms.** Give `T_camera_base` and `joints`, and `urdf` for different robots, as mappings from arm name.
 
     Args:
         image: RGB image [height, width, 3] of type uint8, or a path. OpenCV reads BGR: pass `image[..., ::-1]`.
-        K: intrinsic matrix [3, 3], or fx, fy, cx, cy [px], or a `Camera`, of which size, intrinsics and distortion are
-            used.
+        K: intrinsic matrix [3, 3], or fx, fy, cx, cy [px], or a `Camera`, whose size, intrinsics and distortion
+            are used.
         T_camera_base: transform from an arm's base to the camera [4, 4] [m] (OpenCV's axes: x right, y down,
             z forward).
         urdf: path of the arm's URDF, `builtin:NAME` (see `carts robots`), or a `Robot`.
@@ -147,7 +146,7 @@ def fit_frame(
         mask, ignore, settings, free, networks: as in `fit`; masks refer to the undistorted image.
 
     Returns:
-        Result of which the image is undistorted, and joint positions are dictionaries of arrays by arm.
+        Result with the undistorted image; joint positions are dictionaries of arrays, by arm.
 
     Raises:
         SequenceError: there is no such frame, camera or domain, or an image is missing or damaged.
@@ -235,7 +234,7 @@ class _Problem:
     def solved(
         self, backgrounds: Backgrounds, ignore: Bool[np.ndarray, "height width"] | None, free: FreeParameters | None
     ) -> Fit:
-        """Run the optimizer to its end."""
+        """Run the optimizer to completion."""
         (camera,) = self.scene.cameras
         optimizer = FrameOptimizer(
             self.scene,

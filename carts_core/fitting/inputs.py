@@ -75,7 +75,7 @@ def binary_mask(value: MaskInput, what: str) -> Bool[np.ndarray, "height width"]
         return mask.astype(bool)
     raise SettingsError(
         f"the {what} is an array of type {mask.dtype} and shape {list(mask.shape)}. Give bool values, or two whole "
-        "numbers such as 0 and 255, [height, width]; of an image of labels, compare with the label first."
+        "numbers such as 0 and 255, [height, width]; convert a label image with `labels == label`."
     )
 
 
@@ -84,8 +84,8 @@ def check_size(array: np.ndarray, what: str, camera: Camera) -> None:
     height, width = array.shape[:2]
     if (width, height) != (camera.width, camera.height):
         raise SettingsError(
-            f"the {what} has {width} x {height} pixels, but the image {camera.width} x {camera.height}. Give both in "
-            "the same size."
+            f"the {what} has {width} x {height} pixels, but the image has {camera.width} x {camera.height}. Give "
+            "both at the same size."
         )
 
 
@@ -124,8 +124,8 @@ def camera_of(
             )
         if (K.width, K.height) != (width, height):
             raise SettingsError(
-                f"camera {K.name!r} has {K.width} x {K.height} pixels, but the image {width} x {height}. Give the "
-                "camera of this image, or K.resized(width, height)."
+                f"camera {K.name!r} has {K.width} x {K.height} pixels, but the image has {width} x {height}. Give "
+                "the camera of this image, or K.resized(width, height)."
             )
         return Camera(CAMERA, width, height, K.intrinsics, np.eye(4), K.distortion), []
     intrinsics = pinhole_intrinsics(K, 0.0 if pixel_center is None else pixel_center)

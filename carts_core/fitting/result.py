@@ -47,7 +47,7 @@ class Fit:
     """
 
     image: UInt8[np.ndarray, "height width 3"]
-    """The image, RGB, with its distortion."""
+    """The image as given, RGB, not undistorted."""
     scene: Scene
     """Arms, and the camera of the undistorted image."""
     camera: Camera
@@ -59,7 +59,7 @@ class Fit:
     result: Iterate
     """Corrected state of the scene, losses and uncertainty."""
     stop_reason: StopReason
-    """Reason for the end of the optimization."""
+    """Termination reason of the optimization."""
     assessment: Assessment | None
     """Verdict with its evidence; None for solvers without a verdict."""
     single: bool = False
@@ -157,13 +157,13 @@ class Fit:
     def plot(self, ax: "Axes | None" = None) -> "Axes":
         """Draw the image with the outlines of the measured arms (orange) and of the corrected arms (green).
 
-        Axes are in pixels of OpenCV's convention, as in `Axes.imshow`: pixel centres at integers.
+        Coordinates are pixels in OpenCV's convention, as in `Axes.imshow`: pixel centres are at integers.
 
         Args:
             ax: axes to draw on; by default those of a new figure.
 
         Returns:
-            The axes, of which `figure` is the figure to show or to write to a file.
+            The axes; their attribute `figure` is the figure to show or to write to a file.
         """
         if ax is None:
             import matplotlib.pyplot as plt  # noqa: PLC0415 - takes half a second

@@ -68,7 +68,7 @@ class KeyedOverlay:
         pipes: camera -> named pipe, whose reader is already running.
 
     Raises:
-        OutputError: a pipe is missing, is no pipe or has no reader.
+        OutputError: a pipe is missing, is not a pipe, or has no reader.
     """
 
     def __init__(self, sequence: Sequence, pipes: Mapping[str, Path]) -> None:
@@ -82,13 +82,13 @@ class KeyedOverlay:
         self._thread.start()
 
     def __call__(self, tracked: Tracked) -> None:
-        """Draw a result in place of one that is still waiting."""
+        """Queue a result; it replaces a result that is still queued."""
         with suppress(queue.Empty):
             self._waiting.get_nowait()
         self._waiting.put(tracked)
 
     def close(self) -> None:
-        """End the video after the last result; a picture that its reader does not take within a second is abandoned."""
+        """End the video after the last result; a picture that is not read within a second is dropped."""
         with suppress(queue.Full):
             self._waiting.put(None, timeout=_PATIENCE)
         self._thread.join(_PATIENCE)
@@ -103,6 +103,6 @@ class KeyedOverlay:
                     for pipe in self._pipes:
                         pipe.draw(state, verdict)
             except BrokenPipeError:
-                _log.warning("The reader of the overlay has ended; tracking continues without an overlay.")
+                _log.warning("The reader of the overlay has exited; tracking continues without an overlay.")
                 while self._waiting.get() is not None:
                     pass

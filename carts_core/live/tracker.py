@@ -302,7 +302,7 @@ class LiveTracker:
     def _drop_outdated(self, frame: Frame) -> None:
         """Cancel a search in a frame that no longer resembles the current frame."""
         running = self._recovery
-        # A search after a cancelled search runs to its end, so that fast motion does not cancel all searches.
+        # A search after a cancelled search runs to completion, so that fast motion does not cancel all searches.
         if running is None or running.attempt.effort is not Effort.SEARCH or self._gave_up:
             return
         picture = small_picture(frame)

@@ -94,7 +94,7 @@ def pinhole_intrinsics(K: ArrayLike, pixel_center: float, what: str = "K") -> tu
             integers (OpenCV, ROS, MATLAB minus 1), 0.5 for an image that spans [0, width] (COLMAP, OpenGL).
 
     Raises:
-        SettingsError: `K` is neither of both, not finite, has skew or is transposed, or `pixel_center` is another
+        SettingsError: `K` has neither form, is not finite, has skew or is transposed, or `pixel_center` is another
             number.
     """
     if pixel_center not in PIXEL_CENTERS:

@@ -135,7 +135,7 @@ _JOINT_PARTS = ("parent", "child", "origin", "axis", "mimic")
 
 
 def _links_and_joints(root: Element) -> str:
-    """Text of a URDF with what pytorch-kinematics needs, without elements that it warns about."""
+    """URDF with only the elements that pytorch-kinematics requires, since it warns about others."""
     robot = Element("robot", root.attrib)
     for child in root:
         if child.tag == "link":
@@ -201,7 +201,7 @@ class Kinematics:
         return Ts
 
     def _Ts_root_of_tensor(self, joint_positions: Float[Array, "n joints"]) -> Float[Array, "links n 4 4"]:
-        """The same by pytorch-kinematics, from the positions of all joints in the order of `_joints`."""
+        """Transforms of all links to the root, by pytorch-kinematics; joint positions are in the order of `_joints`."""
         device = joint_positions.device
         if device not in self._chains:
             import pytorch_kinematics  # noqa: PLC0415
@@ -240,13 +240,13 @@ class Kinematics:
 
 
 def _from_root(links: list[str], above: Mapping[str, _Joint]) -> list[str]:
-    """Links such that each follows its parent; `above` is the joint above each link but the root."""
+    """Links in topological order, parents first; `above` is the parent joint of each link except the root."""
     ordered = [link for link in links if link not in above]
     children: dict[str, list[str]] = {}
     for link in links:
         if link in above:
             children.setdefault(above[link].parent, []).append(link)
-    for link in ordered:  # grows in the loop
+    for link in ordered:  # the list is extended in the loop
         ordered += children.get(link, [])
     return ordered
 

@@ -115,7 +115,7 @@ class Evaluation:
     """Loss per arm pixel, without the prior; comparable within one observation and, unless the problem is live, one
     blur."""
     stage_loss: float
-    """Loss under the blur of the descent."""
+    """Loss evaluated with the blur of the current descent."""
     gradient: Float[Tensor, " n"]
     """Gradient of `value`; zero if not requested."""
     hessian: Float[Tensor, "n n"] | None

@@ -1,4 +1,4 @@
-"""Lines across the outlines of arms: colours and edges of an image, compared without a network.
+"""Correspondence lines across the outlines of arms: comparison with colours and edges of an image, without a network.
 
 Between two frames with the network, the outlines of the predicted pose are aligned with the image. Along the normal of
 each outline pixel, the colours of the parts and of their surroundings, learnt in earlier frames, and the edges of the
@@ -41,7 +41,7 @@ _BINS = 1 << 3 * _BITS
 _DEEP = 8
 """Distance from an outline within which colours are learnt and compared [px]."""
 _SPARSE = 2
-"""Every n-th pixel of an outline has a line [1]."""
+"""Number of outline pixels per line [1]."""
 _NARROW = 0.35
 """Factor of `AlignRegions.reach` and `robust` in the second half of the steps [1]."""
 _LAST = 0.25
@@ -49,7 +49,7 @@ _LAST = 0.25
 _LEAST = 20
 """Minimum number of lines of an arm in view [1]."""
 _FEW = 0.5
-"""Pixels that are added to each bin of a histogram [px], relative to a uniform distribution of all bins."""
+"""Pseudocount of each bin of a histogram [px], relative to a uniform distribution over all bins."""
 _CLEAR = 0.5
 """Information of the arms' pixels relative to an image without haze, below which colours are not learnt [1]."""
 _ODDS = 2.0

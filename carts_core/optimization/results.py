@@ -133,7 +133,7 @@ def joint_words(undetermined: Sequence[str] | None) -> str:
 
 
 class StopReason(StrEnum):
-    """Reason for the end of an optimization."""
+    """Termination reason of an optimization."""
 
     CONVERGED = "converged"
     ITERATIONS = "iterations"

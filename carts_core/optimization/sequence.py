@@ -306,7 +306,7 @@ class SequenceOptimizer:
         failed, corrections = [], self._smoother.smoothed()
         looked = sorted(index for index, visit in self._visits.items() if not visit.measurement.by_colours)
         known: dict[int, Assessment] = {}
-        # Frames without the network come last, since the frames with it before and after them decide.
+        # Frames without the network come last, since their verdicts depend on the neighbouring frames with it.
         for index in sorted(self._visits, key=lambda index: self._visits[index].measurement.by_colours):
             began, estimate = time.perf_counter(), self.estimates[index]
             found = self._between_good_frames(index, looked, known)

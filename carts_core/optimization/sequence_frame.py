@@ -297,11 +297,11 @@ class ColourTracker:
         self._since = 0
         """Number of frames since the last one with the network."""
         self._pause, self._pauses = 0, 0
-        """Number of further frames with the network, and of such pauses since the last frame without it."""
+        """Number of following frames that require the network, and of such pauses since the last frame without it."""
 
     @property
     def due(self) -> bool:
-        """Whether the next frame is to be measured with the network though the colours fit well."""
+        """Whether the next frame requires the network even if the colours fit well."""
         return self._since + 1 >= self._model.look_every
 
     def measured(
@@ -316,7 +316,7 @@ class ColourTracker:
         """Measurement of a frame without the network; None if the network is needed.
 
         Args:
-            overdue: whether the frame is also measured without the network if one with it is due.
+            overdue: whether the frame is measured without the network even if the network is due.
         """
         if self._colours is None or self._pause > 0 or (self.due and not overdue):
             return None
@@ -345,7 +345,7 @@ class ColourTracker:
         """Learn the colours of a frame that was measured with the network, if the fit is good.
 
         Args:
-            colours: the colours, if known already.
+            colours: the colours of the frame; computed if None.
         """
         self._since, self._loss = 0, found.loss
         if not good:
@@ -360,7 +360,7 @@ class ColourTracker:
                 self._wait()
 
     def _wait(self) -> None:
-        """Evaluate the network in the next frames."""
+        """Require the network in the next frames."""
         self._pause, self._pauses = _SHORTEST << min(self._pauses, _MOST_PAUSES), self._pauses + 1
 
 
@@ -371,7 +371,7 @@ _SHORTEST = 1
 _USUAL_SHARE = 0.5
 """Share of the usual likelihood below which the network is needed [1]."""
 _MOST_PAUSES = 5
-"""Number of times a pause is doubled."""
+"""Maximum number of doublings of a pause."""
 
 
 def _prior(expected: Gaussian, variables: Variables) -> Prior:

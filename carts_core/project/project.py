@@ -228,7 +228,7 @@ class Project:
         Undo and redo restore figures together with the state of the frames.
 
         Raises:
-            ProjectError: a frame does not exist, or the figures could not be saved.
+            ProjectError: a frame does not exist, or the quality figures could not be saved.
         """
         with self._edit:
             known = by_revision(state, figures)

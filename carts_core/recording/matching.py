@@ -17,7 +17,7 @@ from .toml_table import TomlTable
 def neighbours(
     times: Float[np.ndarray, " rows"], wanted: Float[np.ndarray, " wanted"]
 ) -> tuple[Int[np.ndarray, " wanted"], Int[np.ndarray, " wanted"]]:
-    """Indices of the rows before and after each wanted time; equal at the time of a row and outside the range."""
+    """Indices of the rows before and after each query time; equal at the time of a row and outside the range."""
     after = np.searchsorted(times, wanted).clip(0, len(times) - 1)
     return np.where(times[after] > wanted, after - 1, after).clip(0), after
 
@@ -25,7 +25,7 @@ def neighbours(
 def at_times(
     wanted: Float[np.ndarray, " wanted"], times: Float[np.ndarray, " rows"], values: Float[np.ndarray, "rows columns"]
 ) -> Float[np.ndarray, "wanted columns"]:
-    """Interpolate values linearly at wanted times; NaN outside the range of the rows."""
+    """Interpolate values linearly at query times; NaN outside the range of the rows."""
     return np.stack([np.interp(wanted, times, column, left=np.nan, right=np.nan) for column in values.T], axis=1)
 
 

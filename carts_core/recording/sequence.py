@@ -383,7 +383,7 @@ class Sequence:
         if (width, height) != (wanted.width, wanted.height):
             raise SequenceError(
                 f"{what} has {width} x {height} pixels, but camera {camera!r} has {wanted.width} x {wanted.height} "
-                f"({self.path}). Correct `size` and K there, or export the file in the size of the camera."
+                f"({self.path}). Correct `size` and K there, or export the file at the size of the camera."
             )
 
     def _domain(self, domain: str | None) -> str:

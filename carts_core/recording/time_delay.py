@@ -440,7 +440,7 @@ def _basis(values: Float[np.ndarray, "rows columns"]) -> Float[np.ndarray, "colu
 def _link_points(
     sequence: Sequence, arm: str, wanted: Float[np.ndarray, " steps"], reach: float
 ) -> tuple[Float[np.ndarray, " rows"], Float[np.ndarray, "rows coordinates"]]:
-    """Centres of the links of an arm in its base frame [m], and their times [s], within `reach` of wanted times [s]."""
+    """Centres of the links of an arm in its base frame [m], and their times [s], within `reach` of query times [s]."""
     times, joints = sequence.logged_rows(arm)
     assert times is not None
     robot = sequence.scene.arm(arm).robot

@@ -307,7 +307,7 @@ class ShowLoupe(Intent):
 
 
 class SetTarget(Latest):
-    """Choose the painted layer; None toggles it. With a tool that does not paint, the brush is selected, too."""
+    """Choose the painted layer; None toggles it. If the selected tool does not paint, the brush is selected as well."""
 
     target: Target | None = None
 

@@ -50,7 +50,7 @@ class _Check:
 
 
 class OptimizingHandler(Handler):
-    """Handler that runs the optimizer, one iteration at a time, and shows what the solver replies."""
+    """Handler that runs the optimizer, one iteration at a time, and shows the replies of the solver."""
 
     def __init__(self, context: Context, optimizers: OptimizerFactory) -> None:
         super().__init__(context)
@@ -81,7 +81,7 @@ class OptimizingHandler(Handler):
         return min(waits, default=None)
 
     def advance(self) -> None:
-        """Perform an iteration, if one is due, and show what the solver has replied.
+        """Perform an iteration, if one is due, and show the replies of the solver.
 
         Raises:
             CartsError: the solver has failed.
@@ -157,7 +157,7 @@ class OptimizingHandler(Handler):
         )
 
     def _request(self, inputs: tuple[object, ...], ask: Callable[[], Reply[Any]], show: Callable[[Any], None]) -> None:
-        """Ask for what the layer shows, unless this was asked already; one request is made at a time."""
+        """Request the data of the shown layer, unless already requested; one request is pending at a time."""
         if self._mapping is None:
             self._mapping = _Request(inputs, ask(), show)
         elif self._mapping.reply.done and not _same(self._mapping.inputs, inputs):
@@ -170,7 +170,7 @@ class OptimizingHandler(Handler):
         if asked is None or not asked.reply.done:
             return
         if inputs is None:
-            # It is called again with the current inputs, if the layer still shows maps.
+            # `map` calls this method again with the current inputs, if the layer still shows maps.
             self.map()
             self._mapping = None if self._mapping is asked else self._mapping
             return
@@ -179,7 +179,7 @@ class OptimizingHandler(Handler):
             try:
                 asked.show(asked.reply.result())
             except CartsError:
-                # For example, the weights are missing. The layer is changed to avoid an attempt for every picture.
+                # The layer is changed, since otherwise the request would be repeated for every picture.
                 self._context.change(layer=Layer.MASK)
                 raise
             self._context.change(busy=None)

@@ -28,7 +28,7 @@ _END_OF_SEQUENCE = 1_000_000
 _BEGIN, _END = "<!-- keys: written by python -m carts_viewer.actions.shortcuts -->", "<!-- end of keys -->"
 
 Local = Literal["perturb", "view", "loupe", "peek", "sheet"]
-"""Actions that are no intents: `perturb` depends on fields of the page, and the page's scripts handle the others."""
+"""Actions that are not intents: `perturb` depends on fields of the page, and the page's scripts handle the others."""
 
 
 @dataclass(frozen=True)

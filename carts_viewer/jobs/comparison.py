@@ -38,7 +38,7 @@ def worse_than(fit: Fit, other: Fit) -> str | None:
 
 
 Waiting = Reply[Any] | None
-"""What a generator of this module yields: a reply that it waits for, or None after a step."""
+"""Item yielded by the generators of this module: a pending reply, or None after a step."""
 
 
 @dataclass(frozen=True)

@@ -69,7 +69,7 @@ class Networks:
         return max(self._numbers(), default=0) + 1
 
     def use(self, name: str) -> None:
-        """Use a network from now on and save the choice; weights of another user have to be accepted first.
+        """Use a network from now on and save the choice; weights of another user must be accepted first.
 
         Raises:
             CartsError: the name is unknown, or the weights cannot be used.

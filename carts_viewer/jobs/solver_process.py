@@ -290,7 +290,7 @@ class SolverProcess:
             self._thread.join()
 
     def _serve(self) -> None:
-        """Start the process whenever it is wanted, and receive its results."""
+        """Start the process when it is needed, and receive its results."""
         failures, urgent = 0, False
         while True:
             self._wanted.wait()
@@ -319,7 +319,7 @@ class SolverProcess:
                 listener.solver_stopped(error)
 
     def _send(self) -> None:
-        """Send the unsent requests to a process that is ready, which always reads; the lock is held."""
+        """Send queued requests if the process, which always reads, is ready. The lock must be held."""
         while self._pipe is not None and self._unsent:
             try:
                 self._pipe.send_bytes(self._unsent.pop(0))
@@ -470,4 +470,4 @@ def _read(pipe: Connection, requests: SimpleQueue[bytes]) -> None:
         while True:
             requests.put(pipe.recv_bytes())
     except (EOFError, OSError):
-        os.kill(os.getpid(), signal.SIGKILL)  # Without waiting for the computation on the main thread.
+        os.kill(os.getpid(), signal.SIGKILL)  # does not wait for the main thread

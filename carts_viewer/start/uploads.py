@@ -30,12 +30,12 @@ _FOLDER = "upload"
 
 
 class Listing(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Part of the list of files."""
+    """Chunk of the list of files."""
 
     files: list[tuple[Annotated[str, msgspec.Meta(max_length=4096)], Annotated[int, msgspec.Meta(ge=0, le=MAX_BYTES)]]]
     """Path relative to the dropped folder, and size [bytes]."""
     more: bool = False
-    """Whether another part follows."""
+    """Whether another chunk follows."""
 
 
 def sanitized(path: str) -> tuple[str, ...]:
@@ -88,7 +88,7 @@ def _check(root: Path, listed: list[tuple[tuple[str, ...], int]]) -> None:
     if total > min(MAX_BYTES, free):
         raise SettingsError(
             f"the upload has {total / 1e9:.1f} GB; at most {max(min(MAX_BYTES, free), 0) / 1e9:.1f} GB are allowed "
-            f"({root} has to keep 1 GB free). Copy it to the computer of the viewer instead."
+            f"({root} must keep 1 GB free). Copy it to the computer of the viewer instead."
         )
     seen: dict[str, tuple[str, ...]] = {}
     for names, _ in listed:

@@ -25,7 +25,7 @@ class Document:
     def __init__(self, page: Page) -> None:
         self.page = page
         self._shown = ("", "")
-        # Tabs that connect later get the document, too.
+        # Tabs that connect later also receive the document.
         page.server.on_client_connect(lambda client: self._send(client) if self._shown[0] else None)
 
     def show(self, content: str, place: str = "page") -> None:

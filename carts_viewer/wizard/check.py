@@ -118,7 +118,7 @@ class Guess:
     """Kinematics table, if its columns have names."""
     meanings: ColumnMeanings | None = None
     trials: tuple[Path, ...] = ()
-    """Recordings in the folder, if one of several has to be chosen."""
+    """Recordings in the folder, if there are several to choose from."""
 
     @property
     def columns(self) -> dict[str, str]:

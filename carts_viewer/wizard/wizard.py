@@ -43,7 +43,7 @@ class RecordingWizard:
         self._delay: Delays | None = None
         self._estimating: DelayJob | None = None
         self._estimated = ""
-        """Source of which the delay has been estimated."""
+        """Source whose delay has been estimated."""
         self._pictures: dict[str, list[tuple[str, str]]] = {}
         self._step: HandEyeStep | None = None
         try:
@@ -103,7 +103,7 @@ class RecordingWizard:
         self.show()
 
     def _browsed(self, name: str, value: str) -> bool:
-        """Apply a choice of the file browser; returns whether it is one."""
+        """Apply a choice of the file browser; returns False for other choices."""
         browser = self._browser
         match name:
             case "change":

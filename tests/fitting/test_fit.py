@@ -170,7 +170,7 @@ def test_wrong_intrinsics_are_refused(tiny: dict[str, Any], changed: dict[str, A
 def test_a_camera_has_its_own_size_and_convention(tiny: dict[str, Any], fitted: carts.Fit) -> None:
     with pytest.raises(SettingsError, match="Leave out pixel_center"):
         fitted_with(tiny, K=fitted.camera, pixel_center=0)
-    with pytest.raises(SettingsError, match=r"has 64 x 48 pixels, but the image 128 x 96"):
+    with pytest.raises(SettingsError, match=r"has 64 x 48 pixels, but the image has 128 x 96"):
         fitted_with(tiny, K=fitted.camera.resized(64, 48))
 
 
@@ -214,7 +214,7 @@ GREY = np.zeros((HEIGHT, WIDTH), np.uint8)
         ({"image": None}, SettingsError, "the image is None. Give an array or a path"),
         ({"image": np.zeros((0, 0, 3), np.uint8)}, SettingsError, "the image is 0 x 0 pixels"),
         ({"image": "missing.png"}, SequenceError, r"image missing\.png is missing"),
-        ({"mask": GREY[:-1]}, SettingsError, "the mask has 128 x 95 pixels, but the image 128 x 96"),
+        ({"mask": GREY[:-1]}, SettingsError, "the mask has 128 x 95 pixels, but the image has 128 x 96"),
         ({"mask": GREY.astype(float)}, SettingsError, "the mask is an array of type float64"),
         ({"mask": np.arange(HEIGHT * WIDTH).reshape(HEIGHT, WIDTH)}, SettingsError, "of an image of labels"),
         ({"background": GREY}, SettingsError, "the background is an array"),

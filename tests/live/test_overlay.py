@@ -86,7 +86,7 @@ def test_tracking_continues_if_the_reader_ends(
         overlay(tracked(sequence, index, LiveVerdict.GOOD))
     overlay.close()
     assert [record.message for record in caplog.records] == [
-        "The reader of the overlay has ended; tracking continues without an overlay."
+        "The reader of the overlay has exited; tracking continues without an overlay."
     ]
 
 

@@ -1,4 +1,4 @@
-"""Synthetic or photographed backgrounds without instruments, and compositing of recorded instruments."""
+"""Rooms (synthetic or photographed backgrounds without instruments), and compositing of recorded instruments."""
 
 import dataclasses
 import zlib

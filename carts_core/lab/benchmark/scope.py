@@ -75,7 +75,7 @@ class Scope:
     room_consecutive: int = 8
     """Number of frames corrected together in each room."""
     room_share: int = 1
-    """Every n-th room is measured, where n is this number."""
+    """Stride over the rooms: every n-th room is measured."""
     family_frames: int = 6
     """Number of frames of each instrument absent from the training data; may be 0."""
     hand_eye_starts: int = 10

@@ -58,8 +58,8 @@ class Measurements:
     ) -> list[Measurement]:
         """Measurements that match all given arguments; `error_deg=None` selects starts at the measured joints.
 
-        Frames with occluders or in other rooms, and instruments absent from the training data, match only if their
-        domain or source is given.
+        Measurements of frames with occluders or in other rooms, and of instruments absent from the training data, are
+        returned only if their domain or source is given.
         """
         return [
             measurement
@@ -84,12 +84,12 @@ class Measurements:
         return list(dict.fromkeys(measurement.run.domain for measurement in self.of(source=source)))
 
     def sources(self, kind: str = "") -> list[str]:
-        """Sources of a kind (`ROOMS` or `FAMILY`), by default all other sources."""
+        """Sources of a kind (`ROOMS` or `FAMILY`); by default, the sources of neither kind."""
         found = dict.fromkeys(measurement.run.source for measurement in self.all)
         return [source for source in found if (source.startswith(kind) if kind else _usual(source))]
 
     def in_rooms(self, source: str, half: Half, method: str) -> list[Measurement]:
-        """Measurements of the frames of a source in the rooms of one half."""
+        """Measurements of a source and method in the rooms for tuning or in the held-out rooms."""
         runs = ((measurement, measurement.run) for measurement in self.all)
         return [m for m, run in runs if run.source == source and run.domain.startswith(half) and run.method == method]
 

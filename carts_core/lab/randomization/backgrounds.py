@@ -366,7 +366,7 @@ def _wet_relief(rng: np.random.Generator, image: np.ndarray) -> np.ndarray:
     facing = np.clip(facing, 0, 1)
     shininess = np.exp(rng.uniform(np.log(15), np.log(300)))
     highlight = rng.uniform(0, 1.3) * facing**shininess
-    if rng.random() < 0.5:  # glisten
+    if rng.random() < 0.5:  # specular highlights
         highlight = highlight * np.clip(1 + smooth_noise(rng, width, height, width / rng.uniform(3, 10), 1), 0, 3)
     shade = 1 + rng.uniform(0.2, 0.8) * (facing - facing.mean())
     return image * shade[..., None] + highlight[..., None]

@@ -22,12 +22,12 @@ _IMAGE = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".gif")
 _UPLOAD_PREFIX = re.compile(r"[0-9a-f]{8}-(?=.)")
 """Prefix of the names of uploaded files."""
 _CHANNELS, _WORD_BITS, _HEADER_BITS = 4, 8, 53
-"""Brush masks encode red, green, blue and opacity of each pixel, in words of eight bits; the header has the number of
-words (32 bits), bits of a word less one (5), and four lengths of counts less one (4 each)."""
+"""Brush masks encode red, green, blue and opacity of each pixel, in words of eight bits. The header contains the number
+of words (32 bits), the bits per word minus one (5 bits), and four bit lengths of counts minus one (4 bits each)."""
 _LENGTH_BITS = 0x237F
-"""Counts of 3, 4, 8 and 16 bits, less one each, as Label Studio writes them."""
+"""The four bit lengths of counts (3, 4, 8 and 16) minus one, as written by Label Studio."""
 _LONGEST, _RUN_BITS, _REPEATED_LONG = 2**16, 27, 0b111 << 24
-"""Words in a run with a count of 16 bits, bits of such a run, and its first three bits: repeated, fourth length."""
+"""Maximum number of words of a run with a 16-bit count, bits of such a run, and its prefix: repeated, fourth length."""
 
 
 def is_label_studio(content: Any) -> bool:
@@ -102,7 +102,7 @@ def _image_name(data: dict[str, Any], control: str) -> str:
         chosen = next(iter(images))
     elif control not in images and len(images) > 1:
         raise ValueError(
-            f"its task has the images {listed(images, 4)}, and none has the name of the control; name them equally"
+            f"its task has the images {listed(images, 4)}, and none has the name of its control; rename one of them"
         )
     if chosen is None:
         raise ValueError(f"its task has no image file in the fields {listed(data, 4)}")

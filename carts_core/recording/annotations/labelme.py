@@ -17,7 +17,7 @@ from .images import ForeignImage, Part, check_keypoints, named_keypoints, or_lef
 from .shapes import check_shapes, check_size, checked_points, corners_of_box, mask_of_ellipse, mask_of_polygon
 
 _POLYGONS = ("polygon", "oriented_rectangle", "rotation", "quadrilateral")
-"""Shape types with a list of vertices; the last two are of X-AnyLabeling."""
+"""Shape types with a list of vertices; the last two are specific to X-AnyLabeling."""
 _UNKNOWN = -1
 """Width and height of an image whose size X-AnyLabeling does not know."""
 _BOX_TOLERANCE = 1
@@ -118,7 +118,7 @@ def _mask(shape: dict[str, Any], height: int, width: int) -> Bool[np.ndarray, "h
 def _stored_mask(text: Any, points: np.ndarray, height: int, width: int) -> Bool[np.ndarray, "height width"]:
     """Mask stored as a base64 PNG, whose first pixel is at the first corner of a box; pixels outside the image are
     omitted."""
-    (left, top), (right, bottom) = points.astype(int)  # LabelMe truncates, too.
+    (left, top), (right, bottom) = points.astype(int)  # LabelMe also truncates.
     if not isinstance(text, str):
         raise ValueError("its mask is missing")
     wanted = (int(bottom - top + 1), int(right - left + 1))

@@ -92,7 +92,7 @@ def episode_times(episode: Episode, rate: float, job: Import) -> np.ndarray:
     if (late := np.abs(times - even).max()) > 0.5 / rate:
         job.warning(
             f"the column timestamp deviates by up to {late:.3f} s from a constant rate of {rate:g} images/s. It is "
-            "used nevertheless; row n is assigned to image n of the episode."
+            "still used; row n is assigned to image n of the episode."
         )
         return times
     # Single-precision times are not more accurate than the frame rate.
