@@ -36,8 +36,13 @@ _GRID = 0.02
 """Spacing of the initial grid of delays [s]."""
 _NEAR = 0.05
 """Range of the refinement around a delay of the grid [s]."""
-_EQUAL, _APART = 0.1, 0.15
-"""Maximum relative difference in unexplained share, and minimum distance [s], of equally good delays."""
+_EQUAL, _SIMILAR = 0.1, 0.25
+"""Maximum relative excess of unexplained flow of equally good delays, and of candidates before all predictors are
+used."""
+_MIN_SHARE = 0.5
+"""Minimum explained share of such a delay, as a fraction of that of the best delay."""
+_APART = 0.15
+"""Minimum distance of equally good delays [s]."""
 _SIGNIFICANT = 2.0
 """Minimum gain by separate clocks, in standard errors of the mean over blocks."""
 _ROUNDS = 4
@@ -285,7 +290,7 @@ class _Delays:
         common = self._estimate([0.0 for _ in every], every, together)
         if len(moving) == 1:
             return (common,)
-        same = _best(together)
+        same = common.seconds - common.present
         starts = (
             [same if n in moving else None for n in every],
             [self._alone(n) if n in moving else None for n in every],
@@ -300,12 +305,12 @@ class _Delays:
         return (replace(common, alone={each.arm: (each.seconds, *each.others) for each in apart}),)
 
     def _is_better(self, shifts: list[float | None], others: list[float | None]) -> bool:
-        """Whether shifts explain significantly more of the flow than others, in a paired test over held-out blocks."""
-        parts = [self._parts(each, constant=True) for each in (shifts, others)]
-        if parts[0] is None or parts[1] is None:
-            return parts[0] is not None
-        gain = _unexplained(*parts[1]) - _unexplained(*parts[0])
-        return float(gain.mean()) > _SIGNIFICANT * float(gain.std(ddof=1)) / np.sqrt(_BLOCKS)
+        """Whether shifts explain more of the flow than others: much more, or significantly in a paired test over
+        held-out blocks."""
+        own, other = self._compared(shifts, others)
+        gain = other - own
+        significant = float(gain.mean()) > _SIGNIFICANT * float(gain.std(ddof=1)) / np.sqrt(_BLOCKS)
+        return significant or bool((1.0 + _EQUAL) * own.sum() < other.sum())
 
     def _alone(self, clock: int) -> float | None:
         """Best shift of a clock without the motion of the others."""
@@ -322,78 +327,136 @@ class _Delays:
                     shifts[clock] = _best(curve)
             if shifts == before:
                 break
-        return shifts, self._share(shifts, constant=True)
+        return shifts, self._share(shifts)
 
     def _curve(self, shifts: list[float | None], moved: list[int]) -> dict[float, float]:
         """Share explained at each common shift of the clocks `moved`; without shifts at which rows are missing.
 
         Predictors are those of a constant posture: they are less accurate and less ambiguous in periodic motion.
         """
-        shares = {shift: self._share(_with(shifts, moved, shift), constant=True) for shift in self._grid}
+        shares = {shift: self._share(_with(shifts, moved, shift)) for shift in self._grid}
         return {shift: share for shift, share in shares.items() if np.isfinite(share)}
 
-    def _share(self, shifts: list[float | None], *, constant: bool = False) -> float:
-        """Share of the flow explained in held-out blocks; minus infinity if rows are missing."""
-        parts = self._parts(shifts, constant=constant)
-        return -np.inf if parts is None else 1.0 - float(_unexplained(*parts).sum()) / max(float(parts[2].sum()), 1e-12)
+    def _share(self, shifts: list[float | None]) -> float:
+        """Share of the flow in held-out blocks explained with a constant posture; minus infinity without rows."""
+        logged = self._logged(shifts)
+        if logged.mean() < _MIN_KNOWN_FRACTION:
+            return -np.inf
+        parts = self._equations(shifts, logged.astype(float), constant=True)
+        return 1.0 - float(_unexplained(*parts).sum()) / max(float(parts[2].sum()), 1e-12)
 
     def _estimate(
         self, shifts: list[float | None], moved: list[int], curve: dict[float, float] | None = None
     ) -> TimeOffsetEstimate:
         """Estimate of the common shift of the clocks `moved`, given the shifts of the others."""
         curve = curve or self._curve(shifts, moved)
-        best = _best(curve)
-        shift = self._refined(shifts, moved, best)
-        base = max(self._share(_with(shifts, moved, None)), 0.0)
-        explained, now = ((self._share(_with(shifts, moved, at)) - base) / (1.0 - base) for at in (shift, 0.0))
+        shift, *others = self._peaks(shifts, moved, curve)
+        explained, now = (self._explained(shifts, moved, at) for at in (shift, 0.0))
         parts = np.array([self._refined(shifts, moved, shift, left) for left in range(_BLOCKS)])
         deviation = float(np.sqrt((_BLOCKS - 1) / _BLOCKS * np.square(parts - np.mean(parts)).sum()))
         clock = self._clocks[moved[0]] if len(moved) == 1 < len(self._clocks) else None
         present, arm = (self._shared, "") if clock is None else (clock.present, clock.name)
-        others = tuple(present + self._refined(shifts, moved, other) for other in _as_good(curve, best))
-        gain = 1.0 - (1.0 - curve[best]) / (1.0 - float(np.median([*curve.values()])))
-        at_end = abs(best) > self._largest - 1.5 * _GRID
-        problem = _problem(explained, gain, at_end, deviation, present + shift, others)
+        gain = 1.0 - (1.0 - max(curve.values())) / (1.0 - float(np.median([*curve.values()])))
+        at_end = abs(shift) > self._largest - 1.5 * _GRID
+        as_good = tuple(present + other for other in others)
+        problem = _problem(explained, gain, at_end, deviation, present + shift, as_good)
         deviation = max(deviation, _MIN_DEVIATION)
-        return TimeOffsetEstimate(present, present + shift, deviation, explained, now, problem, others, arm)
+        return TimeOffsetEstimate(present, present + shift, deviation, explained, now, problem, as_good, arm)
+
+    def _peaks(self, shifts: list[float | None], moved: list[int], curve: dict[float, float]) -> list[float]:
+        """Refined common shifts that explain nearly the same share [s], the best first.
+
+        Peaks of the curve are compared by the product of the unexplained flows with the predictors of a constant
+        posture, which are less ambiguous in periodic motion, and with all predictors, whose model error is smaller, at
+        common steps. The first is the peak that explains most at its own steps.
+        """
+        maxima = _maxima(curve)
+        constant = self._ratios(shifts, moved, maxima, _best(curve), constant=True)
+        enough = (1.0 + _SIMILAR) * min(constant)
+        unexplained = {
+            self._refined(shifts, moved, at): own for at, own in zip(maxima, constant, strict=True) if own <= enough
+        }
+        gains = {peak: self._explained(shifts, moved, peak) for peak in unexplained}
+        best = max(gains, key=lambda peak: gains[peak])
+        peaks = [peak for peak in gains if gains[peak] >= _MIN_SHARE * gains[best]]
+        ratios = self._ratios(shifts, moved, peaks, best)
+        product = {peak: unexplained[peak] * ratio for peak, ratio in zip(peaks, ratios, strict=True)}
+        enough = (1.0 + _EQUAL) * min(product.values())
+        others = sorted((peak for peak in peaks if product[peak] <= enough), key=lambda peak: product[peak])
+        peaks = list(dict.fromkeys([best, *others]))
+        return [peak for n, peak in enumerate(peaks) if all(abs(peak - other) > _APART for other in peaks[:n])]
+
+    def _ratios(
+        self, shifts: list[float | None], moved: list[int], peaks: list[float], best: float, *, constant: bool = False
+    ) -> list[float]:
+        """Unexplained flow at each peak relative to that at `best`, over the steps with rows logged at both."""
+        pairs = (
+            self._compared(_with(shifts, moved, peak), _with(shifts, moved, best), constant=constant) for peak in peaks
+        )
+        return [float(own.sum() / max(other.sum(), 1e-12)) for own, other in pairs]
+
+    def _explained(self, shifts: list[float | None], moved: list[int], at: float) -> float:
+        """Share explained by the clocks `moved` at a common shift, of the flow that the others do not explain."""
+        own, other = self._compared(_with(shifts, moved, at), _with(shifts, moved, None))
+        return 1.0 - float(own.sum() / max(other.sum(), 1e-12)) if other.any() else -np.inf
+
+    def _compared(
+        self, shifts: list[float | None], others: list[float | None], *, constant: bool = False
+    ) -> tuple[Float[np.ndarray, " blocks"], Float[np.ndarray, " blocks"]]:
+        """Unexplained squared flow in held-out blocks at two sets of shifts, over the steps logged at both."""
+        common = np.asarray(self._logged(shifts) & self._logged(others), float)
+        own, other = (_unexplained(*self._equations(each, common, constant=constant)) for each in (shifts, others))
+        return own, other
 
     def _refined(self, shifts: list[float | None], moved: list[int], around: float, left: int | None = None) -> float:
-        """Refine a common shift [s]; without one block of steps if given."""
+        """Refine a common shift by robust regression [s]; without one block of steps if given.
+
+        The steps and their weights are the same at all shifts, because a step whose rows end within the range would
+        cause a jump. Weights are those of the Cauchy loss, since the model errors of fast steps are large.
+        """
         blocks = np.arange(_BLOCKS) != (-1 if left is None else left)
-
-        def unexplained(shift: float) -> float:
-            parts = self._parts(_with(shifts, moved, shift))
-            if parts is None:
-                return 1.0
-            XX, XY, YY = (part[blocks].sum(0) for part in parts)
-            return 1.0 - float((XY * _fitted(XX, XY)).sum() / max(float(YY), 1e-12))
-
-        bounds = around - _NEAR, around + _NEAR
+        logged = [self._logged(_with(shifts, moved, around + end)) for end in (-_NEAR, 0.0, _NEAR)]
+        weights = self._weights(_with(shifts, moved, around), np.all(logged, axis=0))
         from scipy.optimize import minimize_scalar  # noqa: PLC0415  takes 0.3 s
 
-        found: Any = minimize_scalar(unexplained, bounds=bounds, method="bounded", options={"xatol": 2e-4})
+        def explained(shift: float) -> float:
+            XX, XY, _ = (part[blocks].sum(0) for part in self._equations(_with(shifts, moved, shift), weights))
+            return -float((XY * _fitted(XX, XY)).sum())
+
+        bounds = around - _NEAR, around + _NEAR
+        found: Any = minimize_scalar(explained, bounds=bounds, method="bounded", options={"xatol": 2e-4})
         return float(found.x)
 
-    def _parts(
-        self, shifts: list[float | None], *, constant: bool = False
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
-        """Normal equations of motion X and flow Y, by block: X^T X, X^T Y, |Y|^2; None if rows are missing.
+    def _logged(self, shifts: list[float | None]) -> Bool[np.ndarray, " steps"]:
+        known = [clock.at(shift)[1] for clock, shift in zip(self._clocks, shifts, strict=True) if shift is not None]
+        return np.all([np.ones(len(self._flows), bool), *known], axis=0)
+
+    def _predictors(self, shifts: list[float | None], *, constant: bool = False) -> Float[np.ndarray, "steps inputs"]:
+        found = [clock.at(shift)[0] for clock, shift in zip(self._clocks, shifts, strict=True) if shift is not None]
+        none = np.empty((len(self._flows), 0))
+        return np.concatenate([none, *(X for all_X in found for X in all_X[: 1 if constant else None])], 1)
+
+    def _weights(self, shifts: list[float | None], steps: Bool[np.ndarray, " steps"]) -> Float[np.ndarray, " steps"]:
+        """Cauchy weights of the given steps for the fit at some shifts; 0 for other steps."""
+        X = self._predictors(shifts)
+        XX, XY, _ = (part.sum(0) for part in self._equations(shifts, steps.astype(float)))
+        errors = np.square(self._flows - X @ _fitted(XX, XY)).sum(1)
+        return steps / (1.0 + errors / max(float(np.median(errors[steps])), 1e-12)) if steps.any() else 0.0 * errors
+
+    def _equations(
+        self, shifts: list[float | None], weights: Float[np.ndarray, " steps"], *, constant: bool = False
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Normal equations of motion X and flow Y with weights W, by block: X^T W X, X^T W Y, trace(Y^T W Y).
 
         Args:
             constant: use only the predictors of a constant posture.
         """
-        found = [clock.at(shift) for clock, shift in zip(self._clocks, shifts, strict=True) if shift is not None]
-        there = np.all([known for _, known in found], axis=0) if found else np.zeros(1, bool)
-        if there.mean() < _MIN_KNOWN_FRACTION:
-            return None
-        X = np.where(
-            there[:, None], np.concatenate([X for all_X, _ in found for X in all_X[: 1 if constant else None]], 1), 0.0
-        )
-        Y = np.where(there[:, None], self._flows, 0.0)
+        X, Y = self._predictors(shifts, constant=constant), self._flows
+        XW, YW = X * weights[:, None], Y * weights[:, None]
         return (
-            np.stack([X[rows].T @ X[rows] for rows in self._inside]),
-            np.stack([X[rows].T @ Y[rows] for rows in self._inside]),
-            np.array([np.square(Y[rows]).sum() for rows in self._inside]),
+            np.stack([X[rows].T @ XW[rows] for rows in self._inside]),
+            np.stack([XW[rows].T @ Y[rows] for rows in self._inside]),
+            np.array([(Y[rows] * YW[rows]).sum() for rows in self._inside]),
         )
 
 
@@ -416,18 +479,15 @@ def _differ(found: tuple[TimeOffsetEstimate, ...]) -> bool:
     )
 
 
-def _as_good(curve: dict[float, float], best: float) -> tuple[float, ...]:
-    """Other local maxima of the explained share that are nearly as high, as for periodic motion, the best first."""
-    shifts = sorted(curve)
-    shares = [curve[shift] for shift in shifts]
-    peaks = [
-        shift
-        for index, shift in enumerate(shifts[1:-1], start=1)
-        if shares[index] >= max(shares[index - 1], shares[index + 1])
+def _maxima(curve: dict[float, float]) -> list[float]:
+    """Shifts at the maximum and at local maxima of the explained share."""
+    best, shifts = _best(curve), sorted(curve)
+    local = [
+        at
+        for low, at, high in zip(shifts, shifts[1:], shifts[2:], strict=False)
+        if curve[at] >= max(curve[low], curve[high])
     ]
-    enough = 1.0 - (1.0 + _EQUAL) * (1.0 - curve[best])
-    good = [shift for shift in peaks if abs(shift - best) > _APART and curve[shift] >= enough]
-    return tuple(sorted(good, key=lambda shift: -curve[shift]))
+    return list(dict.fromkeys([best, *local]))
 
 
 def _basis(values: Float[np.ndarray, "rows columns"]) -> Float[np.ndarray, "columns directions"]:

@@ -192,5 +192,7 @@ def test_delays_of_two_arms_are_found_or_named(periodic: str, tmp_path: Path, sh
             named = (each.seconds, *each.others, *each.alone.get(arm, ()))
             assert min(abs(offset - delay) for offset in named) < 0.010 and len(named) <= 20, (arm, delays, each)
             assert all(f"{offset:.3f} s" in each.sentence() for offset in named)
+            for listed in ((each.seconds, *each.others), each.alone.get(arm, ())):
+                assert np.diff(np.sort(listed)).min(initial=1.0) > 0.1
             found += each.problem is None
     assert found >= (PAIRS if periods[0] is None else 0)
