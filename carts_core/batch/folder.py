@@ -5,6 +5,7 @@ import os
 import socket
 import threading
 import time
+from array import array
 from collections.abc import Iterator, Mapping
 from collections.abc import Sequence as Rows
 from contextlib import ExitStack, contextmanager, suppress
@@ -20,7 +21,8 @@ from ..errors import CartsError, SettingsError
 from ..export import KinematicsRow, outlined, read_kinematics_csv
 from ..export.kinematics import joint_columns, joint_units, position_values, std_values
 from ..files import BusyError, OutputPath, check_name, holds_file, locked_folder, set_aside, write_bytes, write_text
-from ..files.reading import IMAGE, TABLE, VALUES, parse_json, read_bytes, typed
+from ..files.reading import IMAGE, TABLE, VALUES, read_bytes, typed_json
+from ..package_imports import gc_paused
 from ..project import FitVerdict, JointCorrection, Key, Project, Provenance
 from ..provenance import Record, fingerprint, read_records
 from ..recording import Sequence
@@ -75,7 +77,7 @@ def _read(folder: OutputPath) -> JobState:
     path = folder / JOB_FILE
     if not holds_file(path):
         return JobState()
-    return typed(parse_json(read_bytes(path.path, VALUES)), JobState)
+    return typed_json(read_bytes(path.path, VALUES), JobState)
 
 
 def write_state(folder: OutputPath, state: JobState) -> None:
@@ -185,7 +187,7 @@ def read_findings(folder: OutputPath) -> Findings | None:
     path = folder / FINDINGS_FILE
     if not holds_file(path):
         return None
-    found = typed(parse_json(read_bytes(path.path, VALUES)), Findings)
+    found = typed_json(read_bytes(path.path, VALUES), Findings)
     if any(len(rows) != 4 or {len(row) for row in rows} != {4} for rows in found.base_frames.values()):
         raise ValueError("a base frame is not a 4 x 4 matrix")
     return found
@@ -261,6 +263,8 @@ _MAX_ERROR_LENGTH = 1000
 """Maximum length of a stored error [characters]."""
 ORDER = ("failed", "lost", "stopped", "running", "waiting", "done")
 """Statuses, most urgent first."""
+_ENDED = ("failed", "stopped", "done")
+"""Statuses that change only with the file of the state."""
 
 
 @dataclass(frozen=True)
@@ -274,6 +278,8 @@ class KnownJob:
     findings: Findings | None
     damage: str = ""
     """Reason why the results cannot be read."""
+    written: tuple[int, ...] = ()
+    """Times [ns] and sizes [bytes] of the files of state and results."""
 
     @property
     def error(self) -> str:
@@ -282,22 +288,51 @@ class KnownJob:
         return lines[-1][:_MAX_ERROR_LENGTH] if lines else self.damage
 
 
-def known_jobs(batch: OutputPath, jobs: Rows[Job]) -> list[KnownJob]:
-    """States and results of jobs, in the given order."""
-    return [_known(batch / "jobs" / job.name, job) for job in jobs]
+JointErrors = dict[str, tuple[array, array]]
+"""`ARM.JOINT` -> corrections and deviations of all jobs, as in `Findings`."""
 
 
-def _known(folder: OutputPath, job: Job) -> KnownJob:
-    if not folder.path.is_dir():
+def known_jobs(
+    batch: OutputPath, jobs: Rows[Job], before: Rows[KnownJob] = (), joints: JointErrors | None = None
+) -> list[KnownJob]:
+    """States and results of jobs, in the given order, without corrections and deviations of joints.
+
+    Args:
+        before: earlier result; its jobs are kept if their files have not changed.
+        joints: to which corrections and deviations are added, except those of kept jobs.
+    """
+    folder, earlier = batch / "jobs", {entry.job.name: entry for entry in before if entry.status in _ENDED}
+    with gc_paused():
+        return [_known(folder, job, earlier.get(job.name), {} if joints is None else joints) for job in jobs]
+
+
+def _known(jobs: OutputPath, job: Job, before: KnownJob | None, joints: JointErrors) -> KnownJob:
+    place = os.path.join(jobs.path, job.name)
+    if not os.path.isdir(place):
         return KnownJob(job, "waiting", JobState(), None)
+    written: list[int] = []
+    for name in (JOB_FILE, FINDINGS_FILE):
+        with suppress(OSError):
+            found = os.lstat(os.path.join(place, name))
+            written += [found.st_mtime_ns, found.st_size]
+    if before is not None and before.written == tuple(written):
+        return before
+    folder = jobs / job.name
     status, state = present_status(folder)
     try:
-        return KnownJob(job, status, state, read_findings(folder))
+        found = read_findings(folder)
+        if found is not None:
+            for name, values in found.corrections.items():
+                corrections, deviations = joints.setdefault(name, (array("d"), array("d")))
+                corrections.extend(values)
+                deviations.extend(found.deviations.get(name, []))
+            found = replace(found, corrections={}, deviations={})
+        return KnownJob(job, status, state, found, written=tuple(written))
     except (OSError, ValueError) as error:
         damage = (
             f"{FINDINGS_FILE} cannot be read: {str(error)[:_MAX_ERROR_LENGTH]}. Run the batch again to recreate it."
         )
-        return KnownJob(job, status, state, None, damage)
+        return KnownJob(job, status, state, None, damage, tuple(written))
 
 
 def most_urgent_first(known: Rows[KnownJob]) -> list[KnownJob]:
@@ -330,7 +365,7 @@ def read_jobs(folder: Path) -> list[Job]:
     """Read the jobs of a batch folder, without options; `SettingsError` if the folder is not a batch folder or its list
     is damaged."""
     try:
-        jobs = typed(parse_json(read_bytes(folder / BATCH_FILE, VALUES)), _Batch).jobs
+        jobs = typed_json(read_bytes(folder / BATCH_FILE, VALUES), _Batch).jobs
         for job in jobs:
             check_name(job.name, f"a job of {folder}")
             if not job.recording.is_absolute():

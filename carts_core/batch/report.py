@@ -2,7 +2,7 @@
 
 import json
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import matplotlib
@@ -14,7 +14,7 @@ from ..evaluation.calibration import pose_distance
 from ..files import OutputPath, output_stream, write_bytes, write_text
 from ..files.reading import IMAGE, read_bytes
 from ..html import Table, render_page
-from .folder import ORDER, KnownJob, known_jobs, most_urgent_first
+from .folder import ORDER, JointErrors, KnownJob, known_jobs, most_urgent_first
 from .manifest import Job
 
 matplotlib.use("Agg")
@@ -27,8 +27,9 @@ _VERDICTS = ("good", "doubtful", "failed")
 
 def write_batch_report(batch: OutputPath, title: str, jobs: Sequence[Job]) -> Path:
     """Write `report/report.html`, `report/report.json` and images; returns the page's path."""
-    folder, known = batch / "report", known_jobs(batch, jobs)
-    drifts, joints = _drifts(known), _joints(known)
+    joints: JointErrors = {}
+    folder, known = batch / "report", known_jobs(batch, jobs, joints=joints)
+    drifts = _drifts(known)
     page = render_page(
         "batch.html",
         title=title,
@@ -149,21 +150,6 @@ def _drift_table(drifts: list[dict[str, object]]) -> Table | None:
     )
 
 
-_Values = tuple[list[float], list[float]]
-"""Corrections and reported standard deviations of a joint [deg, mm]."""
-
-
-def _joints(known: Sequence[KnownJob]) -> dict[str, _Values]:
-    found: dict[str, _Values] = {}
-    for entry in known:
-        if entry.findings is not None:
-            for name, values in entry.findings.corrections.items():
-                corrections, deviations = found.setdefault(name, ([], []))
-                corrections += values
-                deviations += entry.findings.deviations.get(name, [])
-    return found
-
-
 def _statistics(corrections: Sequence[float], deviations: Sequence[float]) -> dict[str, float | int | None]:
     values = np.asarray(corrections)
     return {
@@ -176,7 +162,7 @@ def _statistics(corrections: Sequence[float], deviations: Sequence[float]) -> di
     }
 
 
-def _joint_table(joints: Mapping[str, _Values]) -> Table | None:
+def _joint_table(joints: JointErrors) -> Table | None:
     headings = {
         "mean": "mean",
         "deviation": "standard deviation",
@@ -195,7 +181,7 @@ def _joint_table(joints: Mapping[str, _Values]) -> Table | None:
     return Table.of("Error of measured joints", caption, rows)
 
 
-def _joint_figure(folder: OutputPath, joints: Mapping[str, _Values]) -> tuple[str, str] | None:
+def _joint_figure(folder: OutputPath, joints: JointErrors) -> tuple[str, str] | None:
     """Draw the plot of corrections and standard deviations; returns its caption and file."""
     if not joints:
         return None

@@ -436,6 +436,15 @@ def typed(value: Any, kind: type[T]) -> T:
         raise ValueError(str(error)) from error
 
 
+def typed_json(content: bytes, kind: type[T]) -> T:
+    """Parse JSON to a dataclass or another type without `Any`; `ValueError` if it is not JSON of this type. Faster than
+    `typed(parse_json(...))`, whose limits the type makes unnecessary: it bounds the depth, and numbers are finite."""
+    try:
+        return msgspec.json.decode(content, type=kind, dec_hook=_path)
+    except (msgspec.MsgspecError, RecursionError) as error:
+        raise ValueError(str(error)) from error
+
+
 def _path(kind: type, value: Any) -> Any:
     if kind is Path and isinstance(value, str):
         return Path(value)

@@ -46,11 +46,12 @@ class BatchPage:
         self._batch = output_path(folder)
         self._jobs = read_jobs(folder)
         self._problem = ""
+        self._known: list[KnownJob] = []
         self._closed = threading.Event()
 
     def show(self) -> None:
         """Update the document, and repeat the update while jobs run."""
-        known = most_urgent_first(known_jobs(self._batch, self._jobs))
+        self._known = known = most_urgent_first(known_jobs(self._batch, self._jobs, self._known))
         counts = Counter(entry.status for entry in known)
         content = render(
             "batch.html",

@@ -4,9 +4,11 @@ from pathlib import Path
 
 import pytest
 
-from carts_core.batch.manifest import read_manifest, shard
+from carts_core.batch.folder import JobState, known_jobs, write_state
+from carts_core.batch.manifest import Job, read_manifest, shard
 from carts_core.cli.batch_job import check_options
 from carts_core.errors import SettingsError
+from carts_core.files import output_path
 
 JOBS = '[[jobs]]\nrecordings = ["*/sequence.toml"]\nsteps = ["sequence", "export"]\n'
 
@@ -103,3 +105,12 @@ def test_an_option_that_its_command_does_not_have_is_refused_before_anything_run
     text = JOBS.replace(', "export"', "") + f'[jobs.options]\nsequence = ["{option}"]'
     with pytest.raises(SettingsError, match=message):
         check_options(read_manifest(manifest(archive, text)))
+
+
+def test_unchanged_jobs_are_not_read_again(tmp_path: Path) -> None:
+    batch, jobs = output_path(tmp_path), [Job("a", tmp_path / "a.bag", "all", "", ("import",))]
+    write_state(batch / "jobs" / "a", JobState("done"))
+    known = known_jobs(batch, jobs)
+    assert known_jobs(batch, jobs, known)[0] is known[0]
+    write_state(batch / "jobs" / "a", JobState("failed", error="No space left."))
+    assert known_jobs(batch, jobs, known)[0].error == "No space left."
