@@ -1,13 +1,13 @@
-# Everything starts here; `make` alone lists it. Settings:
-#   PYTHON       the interpreter that .venv is created with (3.11 or newer)
-#   TORCH_INDEX  where torch comes from: an index URL, or `pypi`; see .ci/setup.py for the default
-#   SEQUENCE     what `make view` opens, the shipped sample by default; `make view SEQUENCE=` shows the start page
+# Entry points of the project; `make` without a target lists them. Variables:
+#   PYTHON       interpreter for .venv (3.11 or newer)
+#   TORCH_INDEX  package index of torch: a URL, or `pypi`; see .ci/setup.py for the default
+#   SEQUENCE     sequence of `make view`, by default the shipped sample; `make view SEQUENCE=` shows the start page
 #   ARGS         further arguments of `carts view` or pytest
 
 PYTHON ?= python3
 SEQUENCE ?= sample_data/sequence/sequence.toml
 BIN := .venv/bin
-# pyright asks the network for a newer version of itself, unless told not to.
+# Disable pyright's check for updates.
 export PYRIGHT_PYTHON_IGNORE_WARNINGS := 1
 
 .DEFAULT_GOAL := help
@@ -23,7 +23,7 @@ test: lint docs ## Check style and types, build the documentation, and run the t
 	chromium=$$($(BIN)/python .ci/chromium.py) && \
 	export CARTS_CHROMIUM=$$chromium && { \
 	$(BIN)/python -m pytest -n 3 --dist loadfile -m "not slow and not gpu" $(ARGS) || \
-	{ echo "Once more, one at a time, what failed beside other tests:"; \
+	{ echo "Repeating failed tests one at a time:"; \
 	$(BIN)/python -m pytest --last-failed --last-failed-no-failures none -m "not slow and not gpu" $(ARGS); }; }
 
 lint: setup-dev ## Check style, formatting and types
@@ -35,7 +35,7 @@ docs: setup-dev ## Build the documentation into docs/_build/html, with warnings 
 	$(BIN)/python -m sphinx -b html -W --keep-going -q docs docs/_build/html
 	@echo "open docs/_build/html/index.html"
 
-format: setup-dev ## Format the code and fix what can be fixed
+format: setup-dev ## Format the code and apply automatic fixes
 	$(BIN)/ruff format
 	$(BIN)/ruff check --fix
 
@@ -45,7 +45,7 @@ bench: setup-dev ## Print the measurements, then run the slow tests and the benc
 	{ $(BIN)/python -m pytest -m slow $(ARGS) || failed=1; } && \
 	{ $(BIN)/carts bench --quick || failed=1; } && exit $$failed
 
-pictures: setup-dev ## Take the pictures of the README, the tutorial and the examples again
+pictures: setup-dev ## Regenerate the pictures of the README, the tutorial and the examples
 	chromium=$$($(BIN)/python .ci/chromium.py) && CARTS_CHROMIUM=$$chromium $(BIN)/python docs/pictures.py
 	$(BIN)/python docs/run_pictures.py
 	$(BIN)/python docs/example_pictures.py
@@ -53,24 +53,24 @@ pictures: setup-dev ## Take the pictures of the README, the tutorial and the exa
 wheel: setup-dev ## Build the sdist and the wheel into dist/
 	$(BIN)/python -m hatchling build -t sdist -t wheel
 
-lock: ## Pin all packages but PyTorch by their hashes, after a change of constraints.txt (needs a network)
+lock: ## Pin all packages except PyTorch by hash, after a change of constraints.txt (needs a network)
 	$(PYTHON) -m venv .lock && .lock/bin/pip install -q uv
 	$(call locked,requirements.lock,)
 	$(call locked,requirements-dev.lock,--all-extras)
 	rm -rf .lock
 
-# For every system and Python; what is in the file already stays as it is where it can. The build backend is among it.
-# PyTorch, and what its build for CUDA brings, is left out: its hashes depend on the index, see .ci/setup.py.
+# Lock for all systems and Python versions, including the build backend; existing pins are kept if possible. PyTorch and
+# the packages of its CUDA build are omitted, since their hashes depend on the index; see .ci/setup.py.
 define locked
 	printf 'hatchling\neditables\n' | .lock/bin/uv pip compile -q --universal --python-version 3.11.5 --generate-hashes \
 	--no-annotate --no-header -c constraints.txt $(2) pyproject.toml - -o $(1)
 	awk '/^[^ ]/ { kept = !/^(torch=|triton=|nvidia-|cuda-)/ } kept' $(1) > $(1).new && mv $(1).new $(1)
 endef
 
-setup: ## Install into .venv, if that was not done yet
+setup: ## Install into .venv, unless already installed
 	@$(PYTHON) .ci/setup.py
 
-setup-dev: ## The same with the development tools
+setup-dev: ## Install into .venv with the development tools
 	@$(PYTHON) .ci/setup.py --dev
 
 clean: ## Remove built packages and tool caches (.venv stays)

@@ -1,13 +1,13 @@
-"""Create .venv and install the project into it, once: a stamp file decides, so that a second run needs no network.
+"""Create .venv and install the project into it; a stamp file marks a finished installation, which is not repeated.
 
 Usage: python3 .ci/setup.py [--dev]
 
-Only the standard library is used, and the first lines run on any Python 3, so that an interpreter that is too old
-gets a sentence instead of a syntax error.
+Only the standard library is used, and the syntax is valid in any Python 3, so that an old interpreter causes a clear
+message instead of a syntax error.
 
-TORCH_INDEX chooses where torch comes from: a package index URL, or `pypi`. Without it, a Linux machine with no NVIDIA
-driver takes the CPU build from PyTorch's own index, because the one on PyPI brings gigabytes of CUDA libraries.
-All other packages are those of requirements.lock (--dev: requirements-dev.lock), whose hashes pip checks.
+TORCH_INDEX selects the package index of torch: a URL, or `pypi`. By default, the CPU build from PyTorch's index is
+installed on Linux without an NVIDIA driver, since the build on PyPI requires gigabytes of CUDA libraries. All other
+packages are those of requirements.lock (--dev: requirements-dev.lock), whose hashes pip verifies.
 """
 
 import hashlib
@@ -35,14 +35,14 @@ def say(text):
 
 
 def run(*command):
-    """Run a command; stop with its status, and without a traceback, where it fails."""
+    """Run a command; exit without a traceback if it fails."""
     status = subprocess.call([str(part) for part in command], cwd=str(ROOT))
     if status != 0:
         sys.exit("[setup] failed (exit status {}): {}".format(status, " ".join(str(part) for part in command)))
 
 
 def output(*command):
-    """What a command prints, or None where it cannot be run."""
+    """Output of a command; None if it fails."""
     try:
         return subprocess.check_output([str(part) for part in command], stderr=subprocess.DEVNULL).decode().strip()
     except (OSError, subprocess.CalledProcessError):
@@ -50,7 +50,7 @@ def output(*command):
 
 
 def require_a_recent_python():
-    """Hand over to a newer interpreter on the PATH where this one is too old."""
+    """Restart with a newer interpreter on the PATH if this one is too old."""
     if sys.version_info >= OLDEST:
         return
     for name in ("python3.13", "python3.12", "python3.11", "python3.14"):
@@ -59,19 +59,19 @@ def require_a_recent_python():
             say("{} is Python {}; using {}".format(sys.executable, platform.python_version(), newer))
             os.execv(newer, [newer] + sys.argv)
     sys.exit(
-        "[setup] Python {} was found at {}, but CaRTS needs {}.{} or newer. Install one and name it, for example:\n"
+        "[setup] Python {} was found at {}, but CaRTS needs {}.{} or newer. Install it and run, for example:\n"
         "        make view PYTHON=python3.12".format(platform.python_version(), sys.executable, *OLDEST)
     )
 
 
 def create_venv():
-    """Create .venv, or create it anew where its interpreter is gone or too old (an upgraded system)."""
+    """Create .venv, or recreate it if its interpreter is missing or too old, as after a system upgrade."""
     version = output(VENV_PYTHON, "-c", "import sys; print(*sys.version_info[:2])")
     if version is not None and tuple(int(part) for part in version.split()) >= OLDEST:
         return
     say("creating {} with Python {}".format(VENV, platform.python_version()))
     if output(sys.executable, "-c", "import ensurepip") is None:
-        # Debian and Ubuntu package venv's half of Python apart from the interpreter.
+        # Debian and Ubuntu have a separate package for venv.
         package = "python{}.{}-venv".format(*sys.version_info[:2])
         if subprocess.call([str(ROOT / ".ci" / "apt"), package]) != 0:
             sys.exit("[setup] this Python cannot create virtual environments; run: sudo apt-get install " + package)
@@ -79,7 +79,7 @@ def create_venv():
 
 
 def stamp(extras):
-    """The file whose presence says that exactly this was installed, by this interpreter, from this folder."""
+    """File that marks a finished installation of these packages by this interpreter in this folder."""
     digest = hashlib.sha256()
     for name in ("pyproject.toml", "constraints.txt", LOCKS[extras]):
         digest.update((ROOT / name).read_bytes())
@@ -89,19 +89,19 @@ def stamp(extras):
 
 
 def is_installed(stamp_file):
-    """Whether the stamp is there, and from the index that is asked for, if one is."""
+    """Whether the installation is finished and, if an index was requested, used that index."""
     return stamp_file.exists() and TORCH_INDEX in ("", stamp_file.read_text())
 
 
 def torch_index():
-    """The index to take torch from, or None for pip's own default."""
+    """Package index of torch; None for pip's default."""
     if TORCH_INDEX:
         return None if TORCH_INDEX == "pypi" else TORCH_INDEX
     has_nvidia = Path("/proc/driver/nvidia").exists() or shutil.which("nvidia-smi")
     if sys.platform != "linux" or has_nvidia:
         return None
     try:
-        # Asked for first, since pip would retry an index that is out of reach for minutes.
+        # Checked first, since pip retries an unreachable index for minutes.
         urllib.request.urlopen(TORCH_CPU_INDEX + "/torch/", timeout=5).close()
     except (OSError, ValueError):
         say("{} cannot be reached; torch comes from pip's default index".format(TORCH_CPU_INDEX))
@@ -110,7 +110,7 @@ def torch_index():
 
 
 def announce(pip, index):
-    """Say before any large download whether torch's build is for CPUs or for CUDA; pip reads the package's metadata."""
+    """Print before the download whether torch's build is for CPUs or for CUDA, according to the package's metadata."""
     chosen = output(
         *pip, "--dry-run", "--quiet", "--no-deps", "--ignore-installed", "--report", "-",
         "-c", "constraints.txt", *(("--index-url", index) if index else ()), "torch",
@@ -131,18 +131,18 @@ def install(extras):
     pip = (VENV_PYTHON, "-m", "pip", "install", "--disable-pip-version-check", "--no-input")
     index = torch_index()
     announce(pip, index)
-    # Everything but torch, by its hashes; the lists are complete, so no dependency is looked for.
+    # All packages except torch, pinned by hash; the list is complete, so dependencies are not resolved.
     run(*pip, "--no-deps", "--require-hashes", "-r", LOCKS[extras])
     pinned = (*pip, "-c", "constraints.txt")
     if index is not None or TORCH_INDEX:
-        # Builds differ in what follows the + of their version only, so pip would be content with the one that is there.
+        # Builds differ only in the local version (after +), which pip does not compare.
         anew = ("--force-reinstall",) if TORCH_INDEX else ()
         say("torch comes from {}".format(index or "pip's default index"))
         run(*pinned, "--no-deps", *anew, *(("--index-url", index) if index else ()), "torch")
     run(*pinned, "torch")
     run(*pip, "--no-deps", "--no-build-isolation", *(("-e", ".") if extras else (".",)))
     if (ROOT / (WARMUP.replace(".", "/") + ".py")).is_file():
-        say("compiling the kernels, so that the first page does not wait for them")
+        say("compiling the kernels")
         run(VENV_PYTHON, "-m", WARMUP)
 
 
@@ -152,7 +152,7 @@ def main():
     extras = "dev" if "--dev" in sys.argv else ""
     require_a_recent_python()
     create_venv()
-    # Whoever has the development tools has everything else as well.
+    # The development installation includes all other packages.
     if is_installed(stamp("dev")) or is_installed(stamp(extras)):
         return
     say("installing CaRTS into {} (some minutes and about 2 GB, only this once)".format(VENV))

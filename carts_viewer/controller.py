@@ -58,7 +58,7 @@ class JobRunner:
             CartsError: the intent cannot be carried out.
         """
         self._context.refresh()
-        # Long work is queued; the rest is done at once.
+        # Long work is queued; other work is done immediately.
         if self._jobs.takes(intent):
             self._jobs.ask(intent, JobRequester(person, state))
         else:
@@ -120,7 +120,7 @@ WATCH_INTERVAL = 1.0
 
 
 class Controller(Handler):
-    """Holds the state and changes it: at once in `handle`, step by step in `advance`."""
+    """Holds the state and changes it: immediately in `handle`, step by step in `advance`."""
 
     def __init__(
         self,

@@ -29,7 +29,7 @@ class Worker:
     """
 
     def __init__(self, queue: IntentQueue[Tab], tabs: Tabs, computing: Callable[[], bool] = lambda: False) -> None:
-        """`computing`: returns whether the solver is at work, so that texts about its preparation stay."""
+        """`computing`: returns whether the solver is busy; texts about its preparation are then kept."""
         self._queue, self._computing = queue, computing
         self._tabs = tabs
         self._calls: SimpleQueue[Callable[[], None]] = SimpleQueue()

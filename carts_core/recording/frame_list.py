@@ -156,7 +156,7 @@ def take_frame_list(section: TomlTable) -> FrameList:
         return _frames_of_video(section)
     if "table" not in section:
         raise section.error(
-            "table", "is missing. Name a CSV file with the time of every frame, or a `video` with frame times."
+            "table", "is missing. Give a CSV file with the time of every frame, or a `video` with frame times."
         )
     table = read_table(section.path(section.take("table", str)), take_delimiter(section), "table of frames")
     timestamp = section.take("timestamp", str, "timestamp")
@@ -200,7 +200,7 @@ def _frames_of_video(section: TomlTable) -> FrameList:
     index = index_video(path)
     if index.timestamps is None:
         raise section.error(
-            "video", f"is {path}, whose frames have no times. Name a `table` with the time of every frame instead."
+            "video", f"is {path}, whose frames have no times. Give a `table` with the time of every frame instead."
         )
     numbers = tuple(range(index.count))
     ids = tuple(expand(pattern, section.name("frame_id"), frame=FrameId(number)) for number in numbers)

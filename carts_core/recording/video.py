@@ -75,7 +75,7 @@ def index_video(path: Path) -> VideoIndex:
     except (OSError, ValueError) as error:
         raise SequenceError(f"video {path} is missing. Restore it, or correct the path.") from error
     if not is_regular(path):
-        raise SequenceError(f"video {path} is a folder, pipe or device. Name a video file.")
+        raise SequenceError(f"video {path} is a folder, pipe or device. Give a video file.")
     try:
         check_regular(path, VIDEO)
     except OSError as error:

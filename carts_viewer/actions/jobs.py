@@ -198,7 +198,7 @@ class JobsHandler(Handler):
         if self._requester is not None:
             self._asked[job.number] = self._requester
         if self._running() is None and not any(j.state is JobState.WAITING and j is not job for j in self._list.jobs):
-            # The job is started at once, so that errors of the request are shown immediately.
+            # The job is started immediately, so that errors of the request are shown to the user.
             self._begin(job)
         self._publish()
 

@@ -97,7 +97,7 @@ def groups() -> dict[str, tuple[Shortcut, ...]]:
             Shortcut("Ctrl+Shift+Z", "Redo", intents.Redo()),
         ),
         "Tools": (
-            Shortcut("Escape", "Close what is open, or return to Select", intents.SetTool(Tool.SELECT)),
+            Shortcut("Escape", "Close the open panel, or return to Select", intents.SetTool(Tool.SELECT)),
             Shortcut("Shift+H", "Drag link: on or off", intents.ToggleTool(Tool.DRAG)),
             Shortcut("Shift+N", "Keypoint: on or off", intents.ToggleTool(Tool.KEYPOINT)),
             Shortcut("H", "Show or hide the keypoints", intents.ShowKeypoints()),

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from carts_core.networks import FeatureExtractor
 
 _WAIT = 0.1
-"""Maximum time until an answer without a result, so that other requests are answered [s]."""
+"""Maximum waiting time for a result, so that other requests are answered in the meantime [s]."""
 
 
 @dataclass(frozen=True, eq=False)

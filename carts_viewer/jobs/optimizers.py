@@ -163,7 +163,7 @@ class OptimizerFactory:
 
     def forget_images(self, sequence: Recording) -> None:
         """Drop values computed from the images of a recording."""
-        # Without this module, there are none in this process.
+        # No such values exist before this module is imported.
         if "carts_core.optimization.observation" in sys.modules:
             optimization.Backgrounds.forget(sequence)
         self._call("forget_images", sequence)

@@ -55,7 +55,7 @@ class Reply(Generic[T]):
 
     @classmethod
     def of(cls, function: Callable[[], T]) -> "Reply[T]":
-        """The result or the error of a function, which is called at once."""
+        """Completed reply with the result or the error of a function, which is called immediately."""
         reply = cls()
         try:
             reply.set(function())
@@ -204,7 +204,7 @@ class _Desk:
 
 
 class SolverInProcess:
-    """The solver in the calling process, which imports PyTorch: every reply is done at once. See `Requests`."""
+    """The solver in the calling process, which imports PyTorch: replies are already complete. See `Requests`."""
 
     busy = False
 

@@ -319,9 +319,9 @@ def test_a_calibration_that_moves_within_the_errors_of_points_and_joints_says_wh
     monkeypatch.setattr(calibration, "CalibrationOptimizer", Moved)
     place = place_of(site)
     site.post(lambda: place.choose(*CALIBRATE))
-    report = ended(site, "The result follows the images").report
+    report = ended(site, "The calibration fits the images of many frames").report
     assert report is not None and not report.objection and report.rms_limit is not None
-    assert f"within the {report.rms_limit:.1f} px RMS" in site.document.content
+    assert f"explain up to {report.rms_limit:.1f} px RMS" in site.document.content
     before, after = (np.sqrt(np.mean(np.square(np.array(each, float)))) for each in (report.before, report.after))
     assert before + 0.1 < after < report.rms_limit
 

@@ -110,7 +110,7 @@ def recordings(folder: Path, data_set: str) -> list[Path]:
     """Recordings of a data set: the folder itself, or the folders below it.
 
     Raises:
-        CartsError: there are none.
+        CartsError: the folder contains no recording.
     """
     detect = SOURCES[data_set].detect
     found = [folder] if detect(folder) else sorted(path for path in folder.glob("**/") if detect(path))

@@ -264,7 +264,7 @@ def _files(folder: Path) -> list[Path]:
         chosen = [name for name in names if name.lower().endswith((*_SUFFIXES, *_OTHER_SUFFIXES))]
         found += [Path(place) / name for name in chosen if not name.startswith(".")]
         if len(found) > MAX_IMAGES:
-            raise SequenceError(f"{folder} has more than {MAX_IMAGES} masks. Name a folder with fewer.")
+            raise SequenceError(f"{folder} has more than {MAX_IMAGES} masks. Give a folder with fewer.")
     # Sorted by frame: each tool has its own sibling folder.
     files = [file for file in found if is_regular(file)]
     return sorted(files, key=lambda file: (file.stem, file.parent.parent.as_posix(), file.as_posix()))

@@ -157,7 +157,7 @@ def _json_files(folder: Path, confined: bool) -> list[Path]:
         chosen = (name for name in names if name.lower().endswith(".json") and name not in MEANINGS)
         found += [Path(place) / name for name in chosen if not name.startswith(".")]
         if len(found) > MAX_IMAGES:
-            raise SequenceError(f"{folder} has more than {MAX_IMAGES} JSON files. Name a folder with fewer.")
+            raise SequenceError(f"{folder} has more than {MAX_IMAGES} JSON files. Give a folder with fewer.")
     files = [file for file in found if is_regular(file) and not (confined and file.is_symlink())]
     return sorted(files, key=lambda file: (file.stem, file.as_posix()))
 

@@ -46,7 +46,7 @@ def label_files(folder: Path, *, confined: bool = False) -> list[Path]:
             folders.clear()
         found += [Path(place) / name for name in names if name.lower().endswith(".txt") and not name.startswith(".")]
         if len(found) > MAX_IMAGES:
-            raise SequenceError(f"{folder} has more than {MAX_IMAGES} label files. Name a folder with fewer.")
+            raise SequenceError(f"{folder} has more than {MAX_IMAGES} label files. Give a folder with fewer.")
     named = [file for file in found if _FOLDER in file.relative_to(folder.parent).parts[:-1]]
     files = [file for file in named or found if file.name not in _OTHER_TEXTS and is_regular(file)]
     files = [file for file in files if not (confined and file.is_symlink())]

@@ -240,7 +240,7 @@ def find_images(path: Path, only: str = "") -> Images:
     files = [file for file in image_files(path) if file.name.endswith(only)]
     if not files:
         kinds = ", ".join(IMAGE_SUFFIXES)
-        raise SequenceError(f"{path} is neither a video nor a folder with images ({kinds}). Name another one.")
+        raise SequenceError(f"{path} is neither a video nor a folder with images ({kinds}). Give another one.")
     pattern, ids = _numbered(files, path)
     source = ImageFiles(tuple(path / pattern.format(frame=name) for name in ids))
     first, remarks = source.read(0), (*image_remarks(source.files), *bits_remark(source.files))

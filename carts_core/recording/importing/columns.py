@@ -187,7 +187,7 @@ def _joints_by_name(
         raise PartError(
             "columns",
             f"{table.path} has no column of {', '.join(missing)}; its columns are {', '.join(table.columns)}.",
-            f"Name them: --columns {missing[0]} COLUMN ...",
+            f"Give them: --columns {missing[0]} COLUMN ...",
         )
     return found
 

@@ -368,7 +368,7 @@ def _base_frame(log: ArmLog, geometry: PsmGeometry, job: Import) -> tuple[np.nda
         chosen = [frame for frame in frames if frame.arm == log.name] or ([frames[0]] if len(frames) == 1 else [])
         if not chosen:
             known = ", ".join(frame.arm for frame in frames)
-            raise SequenceError(f"{path} has no base frame of {log.name}. It has: {known}. Name another file.")
+            raise SequenceError(f"{path} has no base frame of {log.name}. It has: {known}. Give another file.")
         job.found(f"base frame from {path}.", log.name)
         return chosen[0].T_camera_base, str(path)
     if log.poses is not None and (log.joints is not None or log.local_poses is not None):

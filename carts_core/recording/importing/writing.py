@@ -119,7 +119,7 @@ def completed(recording: FoundRecording, options: ImportOptions) -> FoundRecordi
         raise PartError(
             "images",
             f"{recording.name}: no images were found ({recording.kind}).",
-            "Name them: --images left FOLDER_OR_VIDEO.",
+            "Give them: --images left FOLDER_OR_VIDEO.",
         )
     if not recording.frame_ids:
         raise SequenceError(f"{recording.name}: no frames were found ({recording.kind}). Choose other images.")

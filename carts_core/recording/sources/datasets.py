@@ -256,7 +256,7 @@ def _read_surgsync(path: Path, job: Import) -> FoundRecording:
     places = {side: path / f"video_raw/stereo_{side}.mkv" if packed else path / "image" / side for side in _SIDES}
     images = {side: find_images(place) for side, place in places.items() if place.exists()}
     if not images:
-        raise SequenceError(f"{path} has neither video_raw/stereo_left.mkv nor image/left. Copy all of it again.")
+        raise SequenceError(f"{path} has neither video_raw/stereo_left.mkv nor image/left. Copy the recording again.")
     calibrations = {side: [path / folder / f"{side}.yaml" for folder in _CALIBRATION_FOLDERS] for side in images}
     cameras = cameras_of(
         images, job, {side: file for side, files in calibrations.items() for file in files if file.is_file()}
@@ -274,7 +274,7 @@ def _read_surgsync(path: Path, job: Import) -> FoundRecording:
         if any(found is not None for found in tracks.values()):
             arms.append(arm_from_log(ArmLog(name, **tracks), job))
     if not arms:
-        raise SequenceError(f"{path} has no kinematics of {', '.join(SURGSYNC_ARMS)}. Copy all of it again.")
+        raise SequenceError(f"{path} has no kinematics of {', '.join(SURGSYNC_ARMS)}. Copy the recording again.")
     times = frame_times(next(iter(images.values())), ids, job).times
     found, kept_ids, kept = by_rows(arms, ids, job, times)
     if packed:

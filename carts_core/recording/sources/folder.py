@@ -158,7 +158,7 @@ def _kinematics(path: Path, job: Import) -> list[tuple[ForeignTable, ColumnMeani
                     "columns",
                     f"{table.path} has {len(table)} rows with the columns {samples(table)}, among which neither six "
                     "joints nor a tip pose are recognized.",
-                    "Name them: --columns yaw COLUMN pitch COLUMN insertion COLUMN roll COLUMN wrist_pitch COLUMN "
+                    "Give them: --columns yaw COLUMN pitch COLUMN insertion COLUMN roll COLUMN wrist_pitch COLUMN "
                     "wrist_yaw COLUMN. If the robot is not a PSM, give it: --robot NAME FILE.urdf. To leave the table "
                     "out: --kinematics none.",
                 )

@@ -56,7 +56,7 @@ def read_episode(path: Path, info: dict[str, Any]) -> Episode:
     ]
     episode = _episode(root, info, cameras, int(wanted.group(1)) if wanted else 0)
     if not len(episode.table):
-        raise SequenceError(f"{root}: episode {episode.index} has no rows. Name another one.")
+        raise SequenceError(f"{root}: episode {episode.index} has no rows. Give another one.")
     return episode
 
 
@@ -168,7 +168,7 @@ def _arms(root: Path, features: dict[str, Any], episode: Episode, job: Import) -
             "columns",
             f"{root}: {STATE} has the columns {samples(table)}, among which neither six joints of a PSM nor a tip "
             "pose are recognized.",
-            "Name them: --columns yaw COLUMN ..., or give the robot: --robot NAME FILE.urdf.",
+            "Give them: --columns yaw COLUMN ..., or give the robot: --robot NAME FILE.urdf.",
         )
     times = np.arange(len(table), dtype=float)
     arms = []

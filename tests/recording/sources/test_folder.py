@@ -195,7 +195,7 @@ def shorten(folder: Path) -> None:
 MUTATIONS: dict[str, tuple[Callable[[Path], object], dict, str]] = {
     "fewer rows than images": (shorten, {}, "has 5 images and log.csv has 3 rows.*--frame-rate"),
     "ragged rows": (write("log.csv", "a,b\n1\n"), {"kinematics": Path("log.csv")}, "cells"),
-    "no joints": (rewrite("log.csv", "Joint3", "Motor"), {"kinematics": Path("log.csv")}, "are recognized. Name them"),
+    "no joints": (rewrite("log.csv", "Joint3", "Motor"), {"kinematics": Path("log.csv")}, "are recognized. Give them"),
     "text in a cell": (rewrite("log.csv", "\n1.0,", "\n1.0,x"), {}, "cells that are not numbers"),
     "empty table": (write("log.csv", ""), {"kinematics": Path("log.csv")}, "has no rows"),
     "binary table": (write("log.csv", b"\xff\xfe"), {"kinematics": Path("log.csv")}, "cannot be read"),
