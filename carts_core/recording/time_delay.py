@@ -378,7 +378,7 @@ class _Delays:
         }
         gains = {peak: self._explained(shifts, moved, peak) for peak in unexplained}
         best = max(gains, key=lambda peak: gains[peak])
-        peaks = [peak for peak in gains if gains[peak] >= _MIN_SHARE * gains[best]]
+        peaks = [peak for peak in gains if peak == best or gains[peak] >= _MIN_SHARE * gains[best]]
         ratios = self._ratios(shifts, moved, peaks, best)
         product = {peak: unexplained[peak] * ratio for peak, ratio in zip(peaks, ratios, strict=True)}
         enough = (1.0 + _EQUAL) * min(product.values())
