@@ -133,6 +133,8 @@ class ExportFormat:
     """Suffix of the file; empty for a folder."""
     images: bool = False
     """Whether the format refers to images."""
+    categories: bool = False
+    """Whether arms, parts or links can be its categories."""
     refines: bool = False
     """Whether masks can be refined; formats that describe poses contain rendered masks."""
     source: str = ""
@@ -151,13 +153,13 @@ def _imported(name: str, module: str = "annotation_formats") -> Callable[[Datase
 
 FORMATS: dict[FormatName, ExportFormat] = {
     "masks": ExportFormat("PNG masks", _imported("write_masks"), refines=True),
-    "coco": ExportFormat("COCO", _imported("write_coco"), images=True, refines=True),
+    "coco": ExportFormat("COCO", _imported("write_coco"), images=True, categories=True, refines=True),
     "coco-keypoints": ExportFormat("COCO keypoints", _imported("write_coco_keypoints"), images=True),
     "bop": ExportFormat("BOP poses", _imported("write_bop"), images=True),
-    "yolo": ExportFormat("YOLO segmentation", _imported("write_yolo"), images=True, refines=True),
-    "voc": ExportFormat("Pascal VOC", _imported("write_voc"), images=True, refines=True),
-    "cvat": ExportFormat("CVAT for images", _imported("write_cvat"), images=True, refines=True),
-    "datumaro": ExportFormat("Datumaro", _imported("write_datumaro"), images=True, refines=True),
+    "yolo": ExportFormat("YOLO segmentation", _imported("write_yolo"), images=True, categories=True, refines=True),
+    "voc": ExportFormat("Pascal VOC", _imported("write_voc"), images=True, categories=True, refines=True),
+    "cvat": ExportFormat("CVAT for images", _imported("write_cvat"), images=True, categories=True, refines=True),
+    "datumaro": ExportFormat("Datumaro", _imported("write_datumaro"), images=True, categories=True, refines=True),
     "csv": ExportFormat("Kinematics, CSV", write_kinematics_csv, ".csv"),
     "npz": ExportFormat("Kinematics, NumPy", write_kinematics_npz, ".npz"),
     "json": ExportFormat("Kinematics, JSON", write_kinematics_json, ".json"),

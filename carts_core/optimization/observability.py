@@ -42,7 +42,7 @@ def uncertainty_after(
     """Uncertainty under a prior that is rescaled by the size of the corrections.
 
     The fit is the optimum under the original prior, so part of an error e of the start remains:
-    (P + a I) (I + P)^-1 e, where I is the image's information, P the prior's precision and a the share of the start in
+    (I + P)^-1 (P + a I) e, where I is the image's information, P the prior's precision and a the share of the start in
     the network's prediction. The noise of the image is added.
 
     Args:

@@ -3,6 +3,7 @@
 No module of this package imports torch, so that the command line starts quickly.
 """
 
+from .interchange import ANNOTATION_FORMATS as ANNOTATION_FORMATS
 from .interchange import AnnotationFormat as AnnotationFormat
 from .interchange import FormatName as FormatName
 from .interchange import Images as Images

@@ -17,6 +17,16 @@ Axes = Literal["opencv", "dvrk"]
 
 AnnotationFormat = Literal["coco", "cvat", "label-studio", "labelme", "masks", "surgpose", "yolo"]
 """Formats of imported annotations; X-AnyLabeling is an extension of LabelMe, and `masks` a folder of mask images."""
+ANNOTATION_FORMATS: dict[AnnotationFormat, str] = {
+    "coco": "COCO",
+    "cvat": "CVAT for images",
+    "label-studio": "Label Studio",
+    "labelme": "LabelMe",
+    "masks": "a folder of masks",
+    "surgpose": "keypoints of SurgPose",
+    "yolo": "YOLO",
+}
+"""Format -> name in texts."""
 
 NO_TABLE = Path("none")
 """Value of `kinematics` for images without joint data."""

@@ -4,7 +4,7 @@ import viser
 
 from carts_core.export import FORMATS, FormatName, formats_of
 from carts_core.project import Key, ProjectState, ReviewState
-from carts_core.settings import AnnotationFormat
+from carts_core.settings import ANNOTATION_FORMATS, AnnotationFormat
 from carts_viewer.actions import intents
 from carts_viewer.actions.import_export import FRAME_CHOICES, export_warnings, frames_within
 from carts_viewer.panels.inputs import PanelPage
@@ -14,22 +14,6 @@ from carts_viewer.transport.document import escaped
 
 _PARTS = {"Arm": "arms", "Part": "parts", "Link": "links"}
 _MASKS = {"Refined if good": "auto", "Refined": "refined", "As rendered": "rendered"}
-_DVRK = ("dvrk", "dvrk-2.3", "dvrk-suj")
-_WITHOUT_PARTS = (
-    "masks",
-    "coco-keypoints",
-    "bop",
-    "csv",
-    "npz",
-    "json",
-    *_DVRK,
-    "video",
-    "rosbag2",
-    "lerobot",
-    "surgsync",
-    "recorded-csv",
-)
-"""Formats without categories, or with a fixed choice of categories."""
 _WRITTEN = "Masks of the shown arms with painted corrections, not the recording's own masks."
 _NOT_KEPT = "This project is temporary: download its exports before you close the viewer."
 
@@ -75,7 +59,7 @@ class ExportPanel:
     def show(self, state: ViewState) -> None:
         """Update the widgets."""
         name = self._formats.get(self._format.value)
-        self._parts.visible = name not in _WITHOUT_PARTS
+        self._parts.visible = name is not None and FORMATS[name].categories
         self._masks.visible = name is not None and FORMATS[name].refines
         self._images.visible = name is not None and (
             FORMATS[name].images or name == "masks" or bool(FORMATS[name].source)
@@ -139,13 +123,7 @@ _HINT = (
 _BY_CONTENT = "By content"
 _FORMATS: dict[str, AnnotationFormat | None] = {
     _BY_CONTENT: None,
-    "COCO": "coco",
-    "CVAT": "cvat",
-    "Label Studio": "label-studio",
-    "LabelMe": "labelme",
-    "Mask images": "masks",
-    "SurgPose": "surgpose",
-    "YOLO": "yolo",
+    **{name[0].upper() + name[1:]: format for format, name in ANNOTATION_FORMATS.items()},
 }
 """Choices of the format of imported annotations."""
 

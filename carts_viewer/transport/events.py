@@ -26,7 +26,7 @@ class Hello(Event):
     camera: _Text | None = None
     domain: _Text | None = None
     settings: dict[str, Any] = {}
-    """Choices that the browser has stored, see `page_state.stored_choices`."""
+    """Choices that the browser has stored, see `stored_choices` in `panels/script_state.py`."""
 
 
 class Theme(Event):

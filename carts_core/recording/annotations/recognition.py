@@ -8,7 +8,7 @@ from typing import Any
 
 from ...errors import SequenceError
 from ...files.reading import VALUES, is_regular, parse_yaml, read_text
-from ...settings import AnnotationFormat
+from ...settings import ANNOTATION_FORMATS, AnnotationFormat
 from ...wording import listed
 from ..images import read_labels
 from ..importing.found import read_json, well_formed
@@ -18,16 +18,6 @@ from .label_studio import is_label_studio, is_minimal, read_label_studio
 from .labelme import is_labelme, is_xanylabeling, read_labelme
 from .yolo import is_label_file, is_yolo_yaml, label_files, read_yolo, yaml_of
 
-NAMES: dict[AnnotationFormat, str] = {
-    "coco": "COCO",
-    "cvat": "CVAT for images",
-    "label-studio": "Label Studio",
-    "labelme": "LabelMe",
-    "masks": "a folder of masks",
-    "surgpose": "keypoints of SurgPose",
-    "yolo": "YOLO",
-}
-"""Format -> name in reports."""
 _OF_FOLDERS: tuple[AnnotationFormat, ...] = ("labelme", "yolo", "masks")
 _SAMPLED = 5
 """Maximum number of files of a folder that are read to recognize its format."""
@@ -55,8 +45,8 @@ def recognized(place: Path, format: AnnotationFormat | None, remarks: Counter[st
     Raises:
         SequenceError: the format is not supported, or a folder has annotations of several formats.
     """
-    if format is not None and format not in NAMES:
-        raise SequenceError(f"{format!r} is not a format of annotations. Choose one of: {listed(NAMES)}.")
+    if format is not None and format not in ANNOTATION_FORMATS:
+        raise SequenceError(f"{format!r} is not a format of annotations. Choose one of: {listed(ANNOTATION_FORMATS)}.")
     if place.is_dir():
         return _read_folder(place, format, remarks, confined)
     suffix = place.suffix.lower()
@@ -64,15 +54,15 @@ def recognized(place: Path, format: AnnotationFormat | None, remarks: Counter[st
         return _read_json(place, format, remarks)
     if suffix == ".xml":
         _check(place, format, "cvat")
-        return NAMES["cvat"], read_cvat(place, remarks)
+        return ANNOTATION_FORMATS["cvat"], read_cvat(place, remarks)
     if suffix in (".yaml", ".yml"):
         with well_formed(f"{place} cannot be read", "Correct it."):
             content = parse_yaml(read_text(place, VALUES))
         if is_yolo_yaml(content):
             _check(place, format, "yolo")
-            return NAMES["yolo"], read_yolo(place.parent, _labels(place.parent, confined), place, remarks)
+            return ANNOTATION_FORMATS["yolo"], read_yolo(place.parent, _labels(place.parent, confined), place, remarks)
         _check(place, format, "surgpose")
-        return NAMES["surgpose"], read_surgpose(place, content, remarks)
+        return ANNOTATION_FORMATS["surgpose"], read_surgpose(place, content, remarks)
     raise SequenceError(f"{place} has no masks or keypoints in a supported format. {_SUPPORTED}")
 
 
@@ -88,12 +78,12 @@ def _read_json(place: Path, format: AnnotationFormat | None, remarks: Counter[st
         return _labelme_name(content), read_labelme([(place, "")], remarks)
     if is_label_studio(content):
         _check(place, format, "label-studio")
-        return NAMES["label-studio"], read_label_studio(place, content, remarks)
+        return ANNOTATION_FORMATS["label-studio"], read_label_studio(place, content, remarks)
     if is_minimal(content):
         raise SequenceError(f"{place} is an export of Label Studio as JSON-MIN. Export it as JSON.")
     if isinstance(content, dict) and {"images", "annotations"} <= content.keys():
         _check(place, format, "coco")
-        return NAMES["coco"], read_coco(place, content, remarks)
+        return ANNOTATION_FORMATS["coco"], read_coco(place, content, remarks)
     raise SequenceError(
         f"{place} is not a file of COCO (`images`, `annotations`), LabelMe or X-AnyLabeling (`shapes`, `imagePath`), "
         "or Label Studio (a list of tasks with `data` and `annotations`). Export it in one of these formats."
@@ -101,7 +91,7 @@ def _read_json(place: Path, format: AnnotationFormat | None, remarks: Counter[st
 
 
 def _labelme_name(content: Any) -> str:
-    return "X-AnyLabeling" if is_xanylabeling(content) else NAMES["labelme"]
+    return "X-AnyLabeling" if is_xanylabeling(content) else ANNOTATION_FORMATS["labelme"]
 
 
 def _read_folder(place: Path, format: AnnotationFormat | None, remarks: Counter[str], confined: bool) -> _Read:
@@ -132,8 +122,10 @@ def _read_folder(place: Path, format: AnnotationFormat | None, remarks: Counter[
         folders = [(file, file.parent.relative_to(place.parent).as_posix()) for file in json_files]
         return _labelme_name(samples[0]), read_labelme(folders, remarks)
     if chosen == "yolo":
-        return NAMES["yolo"], read_yolo(place, _labels(place, confined), _names_above(place, confined), remarks)
-    return NAMES["masks"], read_mask_folder(place, remarks, confined=confined)
+        return ANNOTATION_FORMATS["yolo"], read_yolo(
+            place, _labels(place, confined), _names_above(place, confined), remarks
+        )
+    return ANNOTATION_FORMATS["masks"], read_mask_folder(place, remarks, confined=confined)
 
 
 def _labels(folder: Path, confined: bool) -> list[Path]:
