@@ -215,12 +215,8 @@ def check_keys(tab: Tab) -> None:
         eventually(check)
 
 
-def test_keys_fields_lists_and_errors_leave_the_page_usable_and_no_other_host_is_asked(open_tab: OpenTab) -> None:
-    asked: list[str] = []
-    tab = open_tab(asked=asked, frames=12, domains=("regular", "smoke"), width=160, height=120, masks=False)
-    check_keys(tab)
+def check_slider(tab: Tab) -> None:
     app, page, slider = tab.app, tab.page, tab.slider("PSM1", 0)
-    tab.put(intents.DismissError(), intents.GoToStep(0), intents.ShowFrame(0))
     # A slider's ends are near the joint of the shown frame; they reach as far as the joint goes, and come back.
     assert slider.max - slider.min <= 12
     tab.put(intents.ShowFrame(11))
@@ -240,6 +236,15 @@ def test_keys_fields_lists_and_errors_leave_the_page_usable_and_no_other_host_is
     track = page.locator(f"{tab.element(slider)} [role=slider]")
     for name, end in (("aria-valuemin", slider.min), ("aria-valuemax", slider.max)):
         expect(track).to_have_attribute(name, f"{end:g}")
+
+
+def test_keys_fields_lists_and_errors_leave_the_page_usable_and_no_other_host_is_asked(open_tab: OpenTab) -> None:
+    asked: list[str] = []
+    tab = open_tab(asked=asked, frames=12, domains=("regular", "smoke"), width=160, height=120, masks=False)
+    check_keys(tab)
+    app, page = tab.app, tab.page
+    tab.put(intents.DismissError(), intents.GoToStep(0), intents.ShowFrame(0))
+    check_slider(tab)
     # Keys go on working after a list was used, and after a field was left with a key.
     tab.choose("Domain", "Smoke")
     eventually(lambda: app.state.domain, lambda domain: domain == "smoke")
