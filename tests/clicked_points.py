@@ -1,4 +1,4 @@
-"""Points as a person would click them: landmarks projected by a known calibration, with noise."""
+"""Simulated clicks: landmarks projected by a known calibration, with noise."""
 
 from collections.abc import Iterable, Mapping
 
@@ -10,7 +10,7 @@ from carts_core.optimization.hand_eye import ImagePoint
 
 NAMES = ("tip", "wrist yaw joint", "wrist pitch joint", "shaft edge")
 _FROM_THE_WRIST = 0.015
-"""[m] How far up the shaft its edge is clicked."""
+"""Maximum distance of clicked shaft edges from the wrist [m]."""
 
 
 def clicked(
@@ -24,7 +24,7 @@ def clicked(
     names: tuple[str, ...] = NAMES,
     side: float | None = None,
 ) -> list[ImagePoint]:
-    """Points of all arms [px], in the order in which a person would click them; edges of shafts on one side or any."""
+    """Points of all arms [px], in the recommended order; shaft edges are on one side or on either side."""
     random = np.random.default_rng(seed)
     frames, points = tuple(frames), []
     for camera in cameras:
@@ -43,7 +43,7 @@ def clicked(
 
 
 def _seen(mark: Landmark, Ts: np.ndarray, T_camera_base: np.ndarray, side: float) -> np.ndarray:
-    """The point in the camera's frame [m]; of a shaft, one on its outline."""
+    """Position of a landmark in the camera's frame [m]; for a shaft, a point on its outline."""
     ends = mark.positions(Ts) @ T_camera_base[:3, :3].T + T_camera_base[:3, 3]
     if mark.kind is LandmarkKind.POINT:
         return ends[0]

@@ -1,4 +1,4 @@
-"""What several tests need: reference data where it is present, and small sequences made on the spot."""
+"""Shared fixtures: reference data, if available, and small generated sequences."""
 
 import csv
 import signal
@@ -30,7 +30,7 @@ signal.signal(signal.SIGHUP, signal.SIG_DFL)
 def _nothing_in_the_home_folder(
     pytestconfig: pytest.Config, tmp_path_factory: pytest.TempPathFactory
 ) -> Iterator[None]:
-    """Decimated meshes are cached between test runs, but not in the home folder; neither are the user's data there."""
+    """Cache of decimated meshes, kept between test runs, and user data outside of the home folder."""
     assert pytestconfig.cache is not None
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("CARTS_CACHE", str(pytestconfig.cache.mkdir("meshes")))
@@ -50,7 +50,7 @@ def _tuned_as_the_command() -> None:
 
 @pytest.fixture(autouse=True)
 def _threads_as_before() -> Iterator[None]:
-    """A test that trains, or compares numbers of threads, leaves none that others would wait for."""
+    """Restore the number of threads after tests that train or compare numbers of threads."""
     threads = torch.get_num_threads()
     yield
     torch.set_num_threads(threads)
@@ -61,7 +61,7 @@ _LOADED: dict[tuple[object, ...], FeatureExtractor] = {}
 
 @pytest.fixture(scope="module", autouse=True)
 def _networks_loaded_once(request: pytest.FixtureRequest) -> Iterator[None]:
-    """Networks from the same files are loaded once, but for tests of the networks themselves."""
+    """Load networks from the same files once, except in tests of the networks."""
     if request.path.parent.name == "networks":
         yield
         return
@@ -164,9 +164,9 @@ def write_tiny_sequence(
     truth: bool = True,
     edit: Callable[[str], str] = str,
 ) -> Path:
-    """Write a small valid sequence of the shipped robot; gives its file.
+    """Write a small valid sequence of the shipped robot; returns its file.
 
-    Every domain is darker than the one before. `edit` gets the sequence file's text and returns what is written.
+    Each domain is darker than the previous one. `edit` converts the text of the sequence file before it is written.
     Files: `sequence.toml`, `kinematics.csv`, `truth.csv`, `DOMAIN/CAMERA/001.png`, `masks/CAMERA/001.png`.
     """
     tiny = tiny_scene(robot, frames, cameras, width, height)
@@ -180,11 +180,11 @@ def write_tiny_sequence(
 
 @pytest.fixture
 def tiny_sequence(tmp_path: Path, shipped_psm: Robot) -> Callable[..., Path]:
-    """Writes a tiny sequence into the test's own folder, see `write_tiny_sequence`."""
+    """Function that writes a tiny sequence into the test's folder, see `write_tiny_sequence`."""
     return partial(write_tiny_sequence, tmp_path, shipped_psm)
 
 
 @pytest.fixture(scope="module")
 def shared_sequence(tmp_path_factory: pytest.TempPathFactory, shipped_psm: Robot) -> Callable[..., Path]:
-    """Writes a tiny sequence that tests of one module share and do not change, see `write_tiny_sequence`."""
+    """Function that writes a tiny sequence for all tests of a module, see `write_tiny_sequence`."""
     return lambda **options: write_tiny_sequence(tmp_path_factory.mktemp("tiny"), shipped_psm, **options)

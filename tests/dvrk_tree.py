@@ -1,4 +1,4 @@
-"""A small tree of robots laid out as dvrk_model."""
+"""Small model tree with the layout of dvrk_model."""
 
 from pathlib import Path
 
@@ -10,7 +10,7 @@ TURN = "-1.5708 -1.5708 0.0"
 
 
 def arm(instrument: str) -> str:
-    """An arm whose shapes must go, and an instrument whose shapes must stay."""
+    """Arm whose shapes are omitted, and instrument whose shapes are kept."""
     joints = [
         JOINT.format(name="yaw", parent="world", child="PSM1_yaw_link", rest=AXIS),
         JOINT.format(name="insertion", parent="PSM1_yaw_link", child="PSM1_adaptor_link", rest=AXIS),

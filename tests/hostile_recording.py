@@ -1,4 +1,4 @@
-"""Names that try to lead elsewhere, a recording that carries one, and commands that are run with them."""
+"""Hostile names, a recording with such a name, and commands that are run on it."""
 
 import json
 import os
@@ -13,7 +13,7 @@ from planted import contents, treasure
 from carts_core.cli.command_line import BAD_INPUT, main
 
 Attack = Callable[[Path, int, str], tuple[list[list[str]], tuple[str, ...]]]
-"""Prepares a working folder with a numbered hostile name; gives command lines, and where they may write."""
+"""Function that prepares a working folder with a hostile name; returns command lines and their allowed outputs."""
 
 PARTS = [
     *("..", ".", "/", "//", "\\", "~", "home", "out", "tmp", "\0", "\n", "\t", "\x1b[2J", "\x7f", "\u2028", "\u202e"),
@@ -25,7 +25,7 @@ WHERE = ("sequence", "camera", "domain", "arm", "frame")
 
 
 def hostile_names(count: int, sandbox: Path) -> Iterator[str]:
-    """Names from a seed: paths into the sandbox first, then mixtures of all that paths, consoles and tables know."""
+    """Names from a seed: paths into the sandbox, then mixtures of special characters of paths, consoles and tables."""
     dice = random.Random(21)
     for number in range(count):
         if number % 4 == 0:
@@ -36,7 +36,7 @@ def hostile_names(count: int, sandbox: Path) -> Iterator[str]:
 
 
 def with_name(text: str, where: str, name: str) -> str:
-    """The sequence file with a hostile name in it; images are found by a glob, so that they are there."""
+    """Sequence file with a hostile name; images are given by a glob, so that they exist."""
     before, after = {
         "sequence": ('name = "tiny"', f"name = {json.dumps(name, ensure_ascii=False)}"),
         "camera": ('name = "left"', f"name = {json.dumps(name, ensure_ascii=False)}"),
@@ -49,7 +49,7 @@ def with_name(text: str, where: str, name: str) -> str:
 
 
 def campaign(sandbox: Path, monkeypatch: pytest.MonkeyPatch, count: int, attack: Attack) -> int:
-    """Run commands with hostile names: nothing outside their outputs is written; how many runs were accepted."""
+    """Run commands with hostile names and check that nothing else is written; returns the number of accepted runs."""
     treasure(sandbox / "home")
     work, accepted = sandbox / "work", 0
     for number, name in enumerate(hostile_names(count, sandbox)):

@@ -1,4 +1,4 @@
-"""Small robots with the joint names and limits of others than the PSM."""
+"""Small robots with joint names and limits of robots other than the PSM."""
 
 from pathlib import Path
 

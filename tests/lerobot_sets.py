@@ -1,4 +1,4 @@
-"""LeRobot data sets of both versions, written with pyarrow and PyAV in the layouts of their owners."""
+"""LeRobot data sets of both versions, written with pyarrow and PyAV in their official layouts."""
 
 import json
 from pathlib import Path
@@ -43,7 +43,7 @@ def states(names: list[str], start: int, count: int) -> list[list[float]]:
 
 
 def write_parquet(path: Path, columns: dict) -> None:
-    """As the package `datasets` writes it, with its description of the columns in the metadata."""
+    """Table as written by the package `datasets`, with its description of the columns in the metadata."""
     path.parent.mkdir(parents=True, exist_ok=True)
     table = pyarrow.table(columns)
     features: dict[str, Any] = {}
@@ -84,7 +84,7 @@ def write_lines(path: Path, entries: list[dict]) -> None:
 
 
 def dataset(folder: Path, version: str = "v2.1", names: list[str] = POSES, kind: str = "float64") -> Path:
-    """Two episodes; the second one's times go on where the first one's end."""
+    """Two episodes with consecutive times."""
     video = {"dtype": "video", "shape": [72, 96, 3], "names": ["height", "width", "channel"]}
     state = {"dtype": kind, "shape": [len(names)], "names": [names] if version == "v2.1" else names}
     indices = dict.fromkeys(("frame_index", "episode_index", "index", "task_index"), "int64")

@@ -5,7 +5,7 @@ from hypothesis.stateful import RuleBasedStateMachine, invariant, run_state_mach
 
 
 def check_after_each_of_10000_actions(machine: type[RuleBasedStateMachine]) -> None:
-    """Run a machine until its invariants were checked after at least so many actions."""
+    """Run a machine until its invariants were checked after a minimum number of actions."""
     checks = 0
 
     class CountingMachine(machine):

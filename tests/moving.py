@@ -1,4 +1,4 @@
-"""A camera that moves before the arm of a tiny sequence."""
+"""Camera that moves in front of the arm of a tiny sequence."""
 
 import csv
 from dataclasses import dataclass
@@ -15,12 +15,12 @@ from carts_core.rendering import Renderer
 
 @dataclass(frozen=True)
 class Motion:
-    """Where the mount of the camera is in each frame."""
+    """Pose of the camera mount in each frame."""
 
     Ts_world_mount: np.ndarray
 
     def write(self, path: Path, times: np.ndarray | None = None) -> None:
-        """As a table of poses; with times, as a log."""
+        """Table of poses; with times, a log."""
         with path.open("w", newline="") as handle:
             table = csv.writer(handle)
             table.writerow(["frame" if times is None else "time", "x", "y", "z", "qx", "qy", "qz", "qw"])
@@ -31,7 +31,7 @@ class Motion:
 
 
 def swing(frames: int, degrees: float = 6.0, metres: float = 0.008) -> Motion:
-    """Turns and shifts to and fro, from where the mount is at the world's origin."""
+    """Oscillating rotations and translations, starting with the mount at the world's origin."""
     Ts = np.tile(np.eye(4), (frames, 1, 1))
     for frame in range(frames):
         phase = 2 * np.pi * frame / max(frames, 2)
@@ -42,7 +42,7 @@ def swing(frames: int, degrees: float = 6.0, metres: float = 0.008) -> Motion:
 
 
 def let_camera_move(path: Path, motion: Motion) -> Path:
-    """Have the camera of a tiny sequence move, with the images and masks that it then has.
+    """Add camera motion to a tiny sequence, with the corresponding images and masks.
 
     The motion is small against the distance, about an axis through the tip, so that the instrument stays in view.
     """

@@ -1,4 +1,4 @@
-"""Links and special files where a program writes, processes killed while they write, and comparison of what is left."""
+"""Links and special files at output paths, processes killed while writing, and comparison of the resulting files."""
 
 import hashlib
 import os
@@ -11,7 +11,7 @@ PRECIOUS = "years of work"
 
 
 def treasure(folder: Path) -> Path:
-    """A folder of somebody's own files, which nothing may change."""
+    """Folder of unrelated files that must not change."""
     (folder / "thesis").mkdir(parents=True)
     (folder / "thesis" / "thesis.tex").write_text(PRECIOUS)
     (folder / "bashrc").write_text(PRECIOUS)
@@ -19,7 +19,7 @@ def treasure(folder: Path) -> Path:
 
 
 def contents(folder: Path) -> dict[str, str]:
-    """Everything below a folder, links not followed: name -> kind, and a file's content or a link's target."""
+    """Entries below a folder, without following links: name -> kind, and content of a file or target of a link."""
     found = {}
     for path in sorted(folder.rglob("*")):
         if path.is_symlink():
@@ -49,10 +49,10 @@ PLANTED: dict[str, Callable[[Path, Path], None]] = {
     "pipe": lambda place, home: os.mkfifo(place),
     "folder": _folder_instead,
 }
-"""Kind -> lays it at a place; links lead into the home folder."""
+"""Kind -> function that creates such an entry at a path; links point into the home folder."""
 
 SPECIAL = ("pipe", "folder", "dangling link", "link to a folder", "link to a device", "link to itself")
-"""What no input can be."""
+"""Kinds that are invalid for any input."""
 PLANTED_INPUTS: dict[str, Callable[[Path, Path], None]] = {
     "link to a device": lambda place, home: place.symlink_to("/dev/zero"),
     "link to itself": lambda place, home: place.symlink_to(place.name),
@@ -60,7 +60,7 @@ PLANTED_INPUTS: dict[str, Callable[[Path, Path], None]] = {
 
 
 def plant(kind: str, place: Path, home: Path) -> None:
-    """Lay something at a place, in place of what lies there."""
+    """Create an entry at a path, replacing an existing one."""
     if place.is_dir() and not place.is_symlink():
         shutil.rmtree(place)
     else:
@@ -70,7 +70,7 @@ def plant(kind: str, place: Path, home: Path) -> None:
 
 
 def killed(work: Callable[[], object]) -> bool:
-    """Do some work in a forked process; whether it was killed, as `die` does, before its end."""
+    """Run a function in a forked process; returns whether it was killed by `die`."""
     if (child := os.fork()) == 0:
         try:
             work()

@@ -1,4 +1,4 @@
-"""Processes of a process, and waiting for conditions."""
+"""Descendants of a process, and waiting for conditions."""
 
 import time
 from collections.abc import Callable
@@ -6,7 +6,7 @@ from pathlib import Path
 
 
 def descendants(process: int) -> set[int]:
-    """Processes that a process has started, and that these have started."""
+    """All descendants of a process."""
     found: set[int] = set()
     for task in Path(f"/proc/{process}/task").glob("*/children"):
         for child in map(int, task.read_text().split()):
@@ -15,7 +15,7 @@ def descendants(process: int) -> set[int]:
 
 
 def command(process: int) -> str:
-    """The command line of a process that runs; empty for one that has ended."""
+    """Command line of a running process; empty if it has ended."""
     try:
         return Path(f"/proc/{process}/cmdline").read_text().replace("\0", " ").strip()
     except OSError:
@@ -23,7 +23,7 @@ def command(process: int) -> str:
 
 
 def eventually(condition: Callable[[], bool], longest: float = 120.0) -> None:
-    """Wait until a condition holds, for so long [s]."""
+    """Wait until a condition holds, with a timeout [s]."""
     end = time.monotonic() + longest
     while not condition():
         assert time.monotonic() < end

@@ -1,4 +1,4 @@
-"""Recordings of the shipped robot in foreign formats, each written by its owners' own writer where there is one."""
+"""Recordings of the shipped robot in foreign formats, each written by its official writer if available."""
 
 import atexit
 import hashlib
@@ -52,7 +52,7 @@ def endoscope_at(time: np.ndarray | float) -> np.ndarray:
 
 
 def image(number: int, camera: str = "left") -> np.ndarray:
-    """A picture that says which frame and camera it is, RGB."""
+    """RGB image that identifies its frame and camera."""
     picture = np.full((SIZE[1], SIZE[0], 3), 60 if camera == "left" else 120, np.uint8)
     picture[:, : 8 * (number % 10) + 8, 0] = 200
     return picture
@@ -97,12 +97,12 @@ def pose_of(T: np.ndarray) -> list[float]:
 
 @dataclass(frozen=True)
 class BagKind:
-    """How a bag is written."""
+    """Options of a bag."""
 
     ros: int = 2
     storage: str = "sqlite3"
     generation: str = "2.2"
-    """Of the dVRK: 1.x, 2.0 or 2.2."""
+    """Version of the dVRK: 1.x, 2.0 or 2.2."""
     compressed: bool = True
     joints: bool = True
     local: bool = True
@@ -110,13 +110,13 @@ class BagKind:
     arms: tuple[str, ...] = ("PSM1",)
     frames: int = 6
     endoscope: str = ""
-    """Topic below /ECM that says where the endoscope is; none by default."""
+    """Topic below /ECM with the pose of the endoscope; none by default."""
     names: tuple[str, ...] = ()
-    """Of the joints of arms, which are in this order then; all "outer_yaw" and in the PSM's order by default."""
+    """Joint names of the arms, in this order; by default all "outer_yaw", in the order of the PSM."""
     tool_point: float = 0.0
-    """How far the point of measured_cp is from the tip, along the tool [m]."""
+    """Distance of the point of measured_cp from the tip, along the tool [m]."""
     info: Callable[[dict[str, Any]], None] | None = None
-    """Changes the values of every camera_info."""
+    """Function that changes the values of every camera_info."""
 
 
 def write_bag(path: Path, kind: BagKind = BagKind()) -> Path:
@@ -139,7 +139,7 @@ def write_bag(path: Path, kind: BagKind = BagKind()) -> Path:
 
 
 def along_the_tool(distance: float) -> np.ndarray:
-    """T_tip_point [m] of a point further out."""
+    """T_tip_point [m] of a more distal point."""
     T = np.eye(4)
     T[2, 3] = distance
     return T
@@ -258,30 +258,30 @@ def _image_messages(make: Any, header: Any, time: int, frame: int, camera: str, 
 
 
 def assert_refused(path: Path, message: str) -> None:
-    """Importing the only thing in a folder is an error whose text matches, and leaves nothing in the folder."""
+    """Check that the import of the only entry of a folder raises a matching error and writes nothing."""
     with pytest.raises(CartsError, match=message):
         import_recording(path, path.parent / "out")
     assert list(path.parent.iterdir()) == [path]
 
 
 def write(name: str, content: str | bytes) -> Callable[[Path], object]:
-    """Replaces a file of a recording."""
+    """Function that replaces a file of a recording."""
     data = content if isinstance(content, bytes) else content.encode()
     return lambda folder: (folder / name).write_bytes(data)
 
 
 def cut(name: str, length: int) -> Callable[[Path], object]:
-    """Cuts a file of a recording off."""
+    """Function that truncates a file of a recording."""
     return lambda folder: (folder / name).write_bytes((folder / name).read_bytes()[:length])
 
 
 def remove(name: str) -> Callable[[Path], object]:
-    """Removes a file of a recording."""
+    """Function that removes a file of a recording."""
     return lambda folder: (folder / name).unlink()
 
 
 def save(name: str, values: np.ndarray) -> Callable[[Path], object]:
-    """Replaces an array of a recording."""
+    """Function that replaces an array of a recording."""
     return lambda folder: np.save(folder / name, values)
 
 
@@ -293,7 +293,7 @@ def _made(make: Callable[[Path], Path]) -> tuple[Path, Path]:
 
 
 def copied(make: Callable[[Path], Path], folder: Path) -> Path:
-    """A copy of a recording that is made once; gives what `make` gives."""
+    """Copy of a recording that is generated once; returns the result of `make`."""
     source, path = _made(make)
     shutil.copytree(source, folder)
     return folder / path.relative_to(source)

@@ -1,4 +1,4 @@
-"""A small network, for tests that need one."""
+"""Small network for tests."""
 
 from pathlib import Path
 
@@ -17,7 +17,7 @@ def small_architecture() -> Architecture:
 
 @pytest.fixture
 def small_network(small_architecture: Architecture) -> FeatureNetwork:
-    """Random weights, and batch norms that have seen something, so that folding them matters."""
+    """Random weights, and batch norms with nontrivial statistics, so that folding has an effect."""
     torch.manual_seed(1)
     network = FeatureNetwork(small_architecture)
     with torch.no_grad():

@@ -1,4 +1,4 @@
-"""A video of arms that sway, and the logs of their joints with clocks of their own."""
+"""Video of oscillating arms, and logs of their joints with separate clocks."""
 
 import csv
 from dataclasses import replace
@@ -21,7 +21,7 @@ _NOISE = 3.0
 
 
 def swaying_joints(robot: Robot, times: np.ndarray, seed: int, period: float | None = None) -> np.ndarray:
-    """Joint positions [times, dofs] of a smooth motion, the same at the same times; periodic with a period [s]."""
+    """Joint positions [times, dofs] of a smooth, reproducible motion; periodic if a period [s] is given."""
     rng = np.random.default_rng(seed)
     joints = np.tile(tiny_scene(robot, 1, ("left",), *SIZE).truth[0], (len(times), 1))
     for column, kind in enumerate(robot.joint_types):
@@ -93,7 +93,7 @@ def write_swaying(
 def write_log(
     path: Path, robot: Robot, seed: int, seconds: float, late: float = 0.0, period: float | None = None
 ) -> None:
-    """The log of a motion, resampled: what is stamped t was `late` seconds before."""
+    """Log of a motion with a delay: values stamped t were measured `late` seconds earlier."""
     stamps = np.arange(-1.0, seconds + 1.0, 0.01)
     with path.open("w", newline="") as handle:
         table = csv.writer(handle)

@@ -1,4 +1,4 @@
-"""The Dockerfile, as far as a machine without Docker can follow it."""
+"""Steps of the Dockerfile that can be run without Docker."""
 
 import os
 import re
@@ -29,7 +29,7 @@ def arguments_of(instruction: str) -> list[str]:
 
 
 def command() -> list[str]:
-    """What the container runs."""
+    """Command of the container."""
     (arguments,) = arguments_of("CMD")
     return [part.strip().strip('"') for part in arguments.strip("[]").split(",")]
 
@@ -63,7 +63,7 @@ def test_the_image_it_builds_on_is_named_by_its_digest() -> None:
 
 
 def follow(folder: Path, environment: dict[str, str], variables: Path) -> None:
-    """Do what the steps say, in `folder` in place of the image, as the present user."""
+    """Run the steps in `folder` instead of an image, as the current user."""
     (folder / "image").mkdir()
     for instruction, arguments in steps():
         if instruction == "COPY":
@@ -90,7 +90,7 @@ def status(address: str) -> int:
 @pytest.mark.slow
 @pytest.mark.timeout(900)
 def test_its_steps_install_a_command_that_starts_and_asks_for_the_token(tmp_path: Path) -> None:
-    """Packages of the present environment count as installed, so that no gigabytes are fetched."""
+    """Use the packages of the current environment, to avoid large downloads."""
     subprocess.run([sys.executable, "-m", "venv", tmp_path / "venv"], check=True, timeout=120)
     # Python before 3.12 puts an old setuptools there, which would hide the one that torch needs.
     subprocess.run([tmp_path / "venv" / "bin" / "pip", "uninstall", "-qy", "setuptools"], check=True, timeout=120)

@@ -1,4 +1,4 @@
-"""What a user installs: the wheel holds everything, works outside the checkout, and its papers agree."""
+"""Installation: the wheel is complete and works outside of the checkout, and its metadata are consistent."""
 
 import re
 import subprocess
@@ -139,7 +139,7 @@ for path in (*modules, sample_sequence(), shipped_robot(), *shipped_weights(), s
 
 
 def test_the_command_starts_without_the_extras(environment: Path, tmp_path: Path) -> None:
-    """`make view` installs no extras, so nothing that only they bring may be needed to start."""
+    """`make view` installs no extras, so the start must not require their packages."""
     hidden = [name for names in PROJECT["optional-dependencies"].values() for name in names]
     modules = {Requirement(name).name.replace("-", "_") for name in hidden} - {PROJECT["name"], "packaging"}
     program = f"""
@@ -170,7 +170,7 @@ def test_every_direct_dependency_is_pinned_within_its_bounds() -> None:
 
 @pytest.mark.parametrize("extra", ["", "dev"])
 def test_what_is_installed_is_pinned_by_hashes_but_for_torch(extra: str) -> None:
-    """A list that is out of date fails here: run `make lock`."""
+    """Fails for an outdated lock file; run `make lock`."""
     name = f"requirements-{extra}.lock" if extra else "requirements.lock"
     groups = PROJECT["optional-dependencies"]
     needed = [*PROJECT["dependencies"], *((text for group in groups.values() for text in group) if extra else ())]

@@ -1,4 +1,4 @@
-"""What a program of ours asks of the machine."""
+"""Threads and memory of the process."""
 
 import os
 import subprocess

@@ -1,5 +1,5 @@
-"""The public face of the library: every name imports, every public thing is documented, and the seam to the viewer
-and a few safety rules hold for every file."""
+"""Public interface: every name can be imported and is documented; import rules and safety rules hold in every
+file."""
 
 import ast
 import importlib
@@ -32,7 +32,7 @@ def _module(path: Path) -> str:
 
 @cache
 def _tree(path: Path) -> ast.Module:
-    """A file as it is parsed; nobody changes it."""
+    """Parsed file, which must not be changed."""
     return ast.parse(path.read_text(encoding="utf-8"), filename=str(path))
 
 
@@ -112,7 +112,7 @@ _MARKUP = re.compile(
     r"(?P<sink>\.(?:innerHTML|outerHTML|srcdoc)\s*\+?=(?!=)|insertAdjacentHTML|createContextualFragment|document\.write|"
     r"\beval\(|\bnew Function|[sS]etAttribute\(\s*[\"'`]on)\s*(?P<constant>(?:`[^`$]*`|\"[^\"]*\"|'[^']*');)?"
 )
-"""Where JavaScript makes HTML or code of a text; in constants it is our own."""
+"""Places where JavaScript converts text to HTML or code; constants are allowed."""
 
 
 def _markup(source: str) -> list[str]:

@@ -1,4 +1,4 @@
-"""The same results, to the last bit, however many threads torch has."""
+"""Results are bit-identical for any number of torch threads."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -17,7 +17,7 @@ from carts_core.threads import one_thread, total
 
 
 def corrected(sequence: Sequence, index: int, threads: int, iterations: int) -> dict[str, np.ndarray]:
-    """Joint positions and their deviations that the solver finds from 5 degrees off in so many steps at most."""
+    """Joint positions and standard deviations of the solver, from an initial error of 5 degrees, after some steps."""
     torch.set_num_threads(threads)
     frame = sequence.frame(index)
     optimizer = FrameOptimizer(
@@ -36,7 +36,7 @@ def corrected(sequence: Sequence, index: int, threads: int, iterations: int) -> 
 
 
 def differing(sequence: Sequence, index: int, counts: tuple[int, ...], iterations: int) -> list[str]:
-    """What is not the same, to the last bit, with each number of threads."""
+    """Results that differ between numbers of threads."""
     first, *others = (corrected(sequence, index, threads, iterations) for threads in counts)
     return [name for name in first for other in others if first[name].tobytes() != other[name].tobytes()]
 

@@ -1,4 +1,4 @@
-"""One arm before one or two cameras: the smallest scene that shows everything."""
+"""Smallest complete scene: one arm in front of one or two cameras."""
 
 from dataclasses import dataclass
 from functools import cache
@@ -13,12 +13,12 @@ from carts_core.rendering import Renderer
 
 FOCAL_PER_WIDTH = 1.2
 BIAS = 0.01
-"""What the measured revolute joints are off by [rad]; prismatic ones are off by a tenth of the number [m]."""
+"""Error of the measured revolute joints [rad]; that of prismatic joints is a tenth of this number [m]."""
 
 
 @dataclass(frozen=True)
 class TinyScene:
-    """What the tiny sequences show: one arm before one or two cameras, and its true joint positions."""
+    """Scene of the tiny sequences: one arm in front of one or two cameras, and its true joint positions."""
 
     scene: Scene
     truth: np.ndarray
@@ -42,7 +42,7 @@ def _tip(robot: Robot, joint_positions: np.ndarray) -> np.ndarray:
 
 @cache
 def tiny_scene(robot: Robot, frames: int, cameras: tuple[str, ...], width: int, height: int) -> TinyScene:
-    """One arm whose instrument's tip is in the middle of every camera's view."""
+    """Arm whose tip is at the centre of every camera's image."""
     prismatic = np.array([kind == "prismatic" for kind in robot.joint_types])
     rest = np.where(prismatic, 0.15, 0.0)
     sway = np.linspace(-1.0, 1.0, frames)[:, None] if frames > 1 else np.zeros((1, 1))
@@ -68,7 +68,7 @@ class TinyImage:
     camera: str
     row: int
     image: np.ndarray
-    """[height, width, 3] in [0, 1]: the arm at its true joint positions, before a smooth background."""
+    """Image [height, width, 3] in [0, 1] of the arm at its true joint positions over a smooth background."""
     mask: np.ndarray
 
 

@@ -1,4 +1,4 @@
-"""Which paths a piece of code writes and reads, as the interpreter's own audit events tell."""
+"""Paths that code writes and reads, from the audit events of the interpreter."""
 
 import os
 import sys
@@ -15,12 +15,12 @@ _REMOVING = {"os.remove", "os.rmdir", "os.mkdir", "os.truncate", "shutil.rmtree"
 
 @dataclass
 class Trace:
-    """Paths that a piece of code has used."""
+    """Paths used by code."""
 
     written: set[Path] = field(default_factory=set)
-    """Opened for writing, made, renamed, linked or removed."""
+    """Paths opened for writing, created, renamed, linked or removed."""
     read: set[Path] = field(default_factory=set)
-    """Opened for reading."""
+    """Paths opened for reading."""
 
 
 _traces: list[Trace] = []
@@ -83,9 +83,9 @@ def read_places(trace: Trace, folder: Path) -> list[Path]:
 
 
 def places(trace: set[Path], folder: Path) -> list[Path]:
-    """What can be planted before the code runs: written paths below a folder, and the folders on the way to them.
+    """Paths at which entries can be planted in advance: written paths below a folder, and their parent folders.
 
-    Names that are random at every run cannot be.
+    Random names are excluded.
     """
     found = {part for path in trace if path.is_relative_to(folder) for part in (path, *path.parents)}
     inside = {path.relative_to(folder) for path in found if path != folder and path.is_relative_to(folder)}

@@ -3,8 +3,8 @@
     python tools/ablate.py run RESULTS.jsonl --synthetic FOLDER ... --real tests/sequences/dvrk_stereo.toml
     python tools/ablate.py report RESULTS.jsonl
 
-`run` resumes where it stopped. Several processes share the work with `--share 0/2` and `--share 1/2`, each with a file
-of its own. Times are processor time [s]. `report` prints mean differences from the default solver.
+Rerun `run` to resume. Several processes can share the work with `--share 0/2` and `--share 1/2`, each with its own
+file. Times are processor time [s]. `report` prints mean differences from the default solver.
 """
 
 import argparse
@@ -31,27 +31,27 @@ from carts_core.settings import SurfaceSolver
 from carts_core.settings.stages import AlignEdges, Descend, Given, Observe, PreferStart, RandomRestart, Stage
 
 AS_IS = SurfaceSolver()
-"""What variants are compared with."""
+"""Settings that variants are compared with."""
 
 
 @dataclass(frozen=True)
 class Variant:
-    """The solver with one thing left out or changed."""
+    """Solver with one stage omitted, or one setting changed."""
 
     name: str
     change: Callable[[SurfaceSolver], SurfaceSolver] = lambda solver: solver
-    """Of the settings."""
+    """Changed fields of the settings."""
     constants: Mapping[str, Any] = field(default_factory=dict)
-    """Names below `carts_core` -> values."""
+    """Changed module constants: name below `carts_core` -> value."""
 
 
 def _without(*places: int) -> Callable[[SurfaceSolver], SurfaceSolver]:
-    """Without the stages at these places."""
+    """Settings without the stages at these indices."""
     return lambda solver: replace(solver, stages=tuple(s for i, s in enumerate(solver.stages) if i not in places))
 
 
 def _at(place: int, **fields: Any) -> Callable[[SurfaceSolver], SurfaceSolver]:
-    """With other fields of the stage at one place."""
+    """Settings with changed fields of the stage at an index."""
 
     def change(solver: SurfaceSolver) -> SurfaceSolver:
         stages = list(solver.stages)
@@ -62,7 +62,7 @@ def _at(place: int, **fields: Any) -> Callable[[SurfaceSolver], SurfaceSolver]:
 
 
 def _every(kind: type[Stage], **fields: Any) -> Callable[[SurfaceSolver], SurfaceSolver]:
-    """With other fields of all stages of a kind."""
+    """Settings with changed fields of all stages of a kind."""
     return lambda solver: replace(
         solver, stages=tuple(replace(s, **fields) if isinstance(s, kind) else s for s in solver.stages)
     )
@@ -154,7 +154,7 @@ _SYNTHETIC = (
     ("simulated_smoke", 5.0),
     ("regular", 1.0),
 )
-"""Domain, and how far off a run starts [deg]."""
+"""Domain and initial joint error [deg]."""
 
 
 @dataclass(frozen=True)
@@ -169,7 +169,7 @@ class Job:
 
     @property
     def condition(self) -> str:
-        """What results are averaged over."""
+        """Key of the conditions over which results are averaged."""
         return f"{self.domain} {self.degrees:g}°" if self.degrees else f"real {self.camera}"
 
 
@@ -195,7 +195,7 @@ def run_one(job: Job, variant: Variant, sequence: Sequence, extractor: FeatureEx
 
 
 def jobs(args: argparse.Namespace) -> Iterator[Job]:
-    """All jobs; every condition early, so that an unfinished run says something of each."""
+    """All jobs, ordered so that an unfinished run covers every condition."""
     lengths = {str(folder): len(_open(folder)) for folder in args.synthetic}
     real = len(_open(args.real)) if args.real else 0
     for index in range(max([*lengths.values(), real], default=0)):
@@ -217,7 +217,7 @@ def _open(path: str | Path) -> Sequence:
 
 
 def run(args: argparse.Namespace) -> None:
-    """Measure what is not in the file yet."""
+    """Measure the jobs that are missing in the file."""
     torch.set_num_threads(1)
     share, shares = map(int, args.share.split("/"))
     wanted = {VARIANTS[0].name, *(args.variants or (variant.name for variant in VARIANTS))} - set(args.skip)
@@ -241,7 +241,7 @@ def run(args: argparse.Namespace) -> None:
 
 
 def report(args: argparse.Namespace) -> None:
-    """A Markdown table: the mean Dice of the solver as it is, and what each variant adds to it."""
+    """Markdown table of the mean Dice of the default solver, and of its change by each variant."""
     found: dict[str, dict[str, dict[tuple, dict]]] = defaultdict(lambda: defaultdict(dict))
     for row in _read(args.results):
         found[row["variant"]][row["condition"]][row["recording"], row["frame"], row["camera"]] = row
@@ -274,7 +274,7 @@ def _read(paths: list[Path]) -> list[dict]:
 
 
 def main() -> None:
-    """Parse the arguments, and do it."""
+    """Parse the arguments and run the command."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     commands = parser.add_subparsers(required=True)
     measure = commands.add_parser("run", help="measure")

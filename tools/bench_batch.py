@@ -92,7 +92,7 @@ def timed(name: str, function: Callable[[], Any]) -> Any:
 
 
 def main() -> None:
-    """Print the figures."""
+    """Print the measurements."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--jobs", type=int, default=10_000)
     parser.add_argument("--frames", type=int, default=20)

@@ -1,6 +1,6 @@
 """`python -m tools.bench_core`: times and ratios of the core on the shipped sequence, measured on this machine.
 
-Every figure is the median of repeated runs in one process; speed is a matter of the machine, the ratios less so.
+Each value is the median of repeated runs in one process; ratios depend less on the machine than times.
 """
 
 import argparse

@@ -23,11 +23,11 @@ from carts_core.resources import sample_sequence
 from tools.memory import resident_megabytes
 
 _WARM_UP = 20
-"""Number of results at the start that are not counted; kernels are compiled and the arms are found."""
+"""Number of initial results that are ignored, during the compilation of kernels and the search for the arms."""
 
 
 def measured(rate: float, arms: int, domain: str, seconds: float) -> dict[str, object]:
-    """Track a replay for some time; returns what was measured, times in milliseconds."""
+    """Track a replay for some time; returns the measurements, times in milliseconds."""
     sequence = Sequence.open(sample_sequence())
     camera = sequence.scene.cameras[0].name
     scene = replace(sequence.scene, arms=sequence.scene.arms[:arms])
@@ -76,7 +76,7 @@ def measured(rate: float, arms: int, domain: str, seconds: float) -> dict[str, o
 
 
 def main() -> None:
-    """Print the figures as a line of JSON, with the load of the machine."""
+    """Print the measurements as a line of JSON, with the load of the machine."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--rate", type=float, default=60.0)
     parser.add_argument("--arms", type=int, default=2)

@@ -1,10 +1,10 @@
-"""Measures the page on what is large: an hour at 30 frames/s with two cameras, and sliders with four cameras.
+"""Benchmark of the page with large recordings: one hour at 30 frames/s with two cameras, and sliders with four cameras.
 
     python -m tools.bench_page [--frames 108000] [--moves 200]
 
-The recordings are made first, in a temporary folder, from the pictures and the arms of the shipped sequence. Times of
-the hour go from what a tab sends to the arrival of frame and overlay, which come together; cached are frames that were
-shown shortly before, not cached are jumps to anywhere.
+The recordings are generated in a temporary folder, from the images and the arms of the shipped sequence. Times are
+measured from the request of a tab to the arrival of frame and overlay, which are sent together, for cached frames
+(shown shortly before) and for jumps to random frames.
 """
 
 import argparse
@@ -36,36 +36,36 @@ from tools.memory import resident_megabytes
 from tools.raw_tab import RawTab
 
 RATE = 30
-"""[frames/s]"""
+"""Frame rate [frames/s]."""
 _HOLD = 10
-"""Frames that each picture of the shipped sequence lasts."""
+"""Number of consecutive frames with the same image of the shipped sequence."""
 _APART = 0.004
-"""From one camera to the next [m]."""
+"""Distance between neighbouring cameras [m]."""
 _SWAY = 0.003
-"""Of every joint [rad, m]."""
+"""Amplitude of the motion of each joint [rad, m]."""
 _LONGEST = 20.0
-"""That a picture may take [s]."""
+"""Timeout for a picture [s]."""
 
 
 @dataclass(frozen=True)
 class Hour:
-    """What was measured on the long recording."""
+    """Measurements on the long recording."""
 
     open_seconds: float
-    """From opening the sequence file to the first overlay in a tab [s]."""
+    """Time from opening the sequence file to the first overlay in a tab [s]."""
     open_processor: float
-    """Processor time of that [s]."""
+    """Processor time until the first overlay [s]."""
     cached: list[float]
-    """From picking a frame to its arrival [ms]."""
+    """Time from the selection of a frame to its arrival [ms]."""
     jumps: list[float]
     dragged: list[float]
-    """Intervals between pictures while somebody drags over the whole timeline, 30 places a second [ms]."""
+    """Intervals between pictures during a drag over the whole timeline with 30 positions per second [ms]."""
     megabytes: list[float]
-    """Memory after opening, and after each of the above."""
+    """Memory after opening, and after each of the measurements above."""
 
 
 def make_recording(folder: Path, frames: int, cameras: int) -> Path:
-    """Write a recording of the shipped arms with a video per camera; gives its sequence file."""
+    """Write a recording of the shipped arms with a video per camera; returns its sequence file."""
     sample = Sequence.open(sample_sequence())
     output = output_path(folder, draft=True)
     pictures = [sample.frame(index).images[sample.scene.cameras[0].name] for index in range(len(sample))]
@@ -88,7 +88,7 @@ def make_recording(folder: Path, frames: int, cameras: int) -> Path:
 
 
 def _write_video(file: BinaryIO, pictures: list[np.ndarray], frames: int) -> None:
-    """Encode the pictures once, and write what came out again and again."""
+    """Encode the images once, and write the packets repeatedly."""
     with av.open(file, "w", format="mp4") as container:
         options = {"preset": "ultrafast", "crf": "33", "bf": "0", "g": "60", "sc_threshold": "0"}
         stream = container.add_stream("libx264", rate=RATE, options=options)
@@ -112,7 +112,7 @@ def _write_video(file: BinaryIO, pictures: list[np.ndarray], frames: int) -> Non
 
 
 def _sequence_file(sample: Sequence, names: list[str]) -> str:
-    """The shipped sequence's arms, before cameras beside one another."""
+    """The arms of the shipped sequence in front of cameras in a row."""
     arms = sample.path.read_text(encoding="utf-8").partition("[[arms]]")
     camera = sample.scene.cameras[0]
     lines = ['format = "carts-sequence/1"', 'name = "hour"', "[kinematics]", 'table = "kinematics.csv"']
@@ -126,7 +126,7 @@ def _sequence_file(sample: Sequence, names: list[str]) -> str:
 
 
 def measure_hour(path: Path, moves: int) -> Hour:
-    """Open a recording, show frames that were shown before, jump about, and drag over the timeline."""
+    """Open a recording, show cached frames, jump to random frames, and drag over the timeline."""
     began, worked = time.perf_counter(), time.process_time()
     with (
         tempfile.TemporaryDirectory() as folder,
@@ -153,7 +153,7 @@ def measure_hour(path: Path, moves: int) -> Hour:
 
 
 def _go(app: ViewerApp, tab: RawTab, element: str, frames: Iterable[int]) -> list[float]:
-    """Show these frames one after the other; milliseconds of each."""
+    """Show frames one after the other; returns the time of each [ms]."""
     times = []
     for frame in frames:
         if frame == app.state.index:
@@ -170,7 +170,7 @@ def _go(app: ViewerApp, tab: RawTab, element: str, frames: Iterable[int]) -> lis
 
 
 def _drag(app: ViewerApp, tab: RawTab, element: str, frames: int, seconds: float = 10.0) -> list[float]:
-    """Drag over the timeline from end to end; milliseconds between pictures."""
+    """Drag over the whole timeline; returns the intervals between pictures [ms]."""
     arrivals: list[float] = []
     for step in range(int(30 * seconds)):
         tab.set(element, 1 + round((frames - 1) * step / (30 * seconds)))
@@ -196,13 +196,13 @@ def _figures(times: list[float]) -> str:
 
 
 def _made(folder: Path, frames: int, cameras: int) -> Path:
-    """A recording that another process has made, so that its memory does not count."""
+    """Recording generated in another process, whose memory is not measured."""
     with ProcessPoolExecutor(1, get_context("spawn")) as pool:
         return pool.submit(make_recording, folder, frames, cameras).result()
 
 
 def main() -> None:
-    """Print the figures, with the load of the machine before and after."""
+    """Print the measurements, with the load of the machine before and after."""
     tune_process()
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--frames", type=int, default=3600 * RATE)

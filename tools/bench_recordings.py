@@ -1,6 +1,6 @@
-"""`python -m tools.bench_recordings`: how a recording of 10,000 frames opens and browses, measured on this machine.
+"""`python -m tools.bench_recordings`: times of opening and browsing a recording of 10,000 frames on this machine.
 
-It makes the recording itself, in a temporary folder: image files, an MP4 of the same images with B-frames, and a log of
+The recording is generated in a temporary folder: image files, an MP4 of the same images with B-frames, and a log of
 joint positions at 200 Hz that is matched with the video's presentation times.
 """
 
@@ -23,15 +23,15 @@ from tools.memory import resident_megabytes
 
 WIDTH, HEIGHT = 640, 480
 RATE = 25
-"""Of the video [frames/s]."""
+"""Frame rate of the video [frames/s]."""
 LOG_RATE = 200
-"""Of the log [rows/s]."""
+"""Rate of the log [rows/s]."""
 _PICTURES = 100
 _JOINTS = ("yaw", "pitch", "insertion", "roll", "wrist_pitch", "wrist_yaw", "jaw")
 
 
 def make_recording(folder: Path, frames: int) -> dict[str, Path]:
-    """Write the same recording as image files and as a video; gives the sequence file of each."""
+    """Write the same recording as image files and as a video; returns the sequence file of each."""
     pictures = list(_pictures())
     output = output_path(folder, draft=True)
     encoded = [cv2.imencode(".jpg", picture[..., ::-1])[1].tobytes() for picture in pictures]
@@ -69,7 +69,7 @@ def open_seconds(path: Path, runs: int) -> list[float]:
 
 
 def browse(sequence: Sequence, indices: Iterable[int]) -> tuple[list[float], list[float]]:
-    """Show frames one after the other: milliseconds of each, and memory [MB] after every fifth of them."""
+    """Show frames one after the other; returns the time of each [ms], and memory at five times [MB]."""
     reader, camera = FrameReader(sequence), sequence.scene.cameras[0].name
     order = list(indices)
     times, memory = [], []
@@ -86,7 +86,7 @@ def browse(sequence: Sequence, indices: Iterable[int]) -> tuple[list[float], lis
 
 
 def _pictures() -> Iterator[np.ndarray]:
-    """Smooth pictures that drift, with some noise: about as large a file as a tissue's image."""
+    """Smooth moving images with noise, whose file size is similar to that of tissue images."""
     rng = np.random.default_rng(0)
     texture = cv2.GaussianBlur(rng.uniform(0, 255, (HEIGHT, WIDTH + _PICTURES, 3)).astype(np.float32), (0, 0), 6)
     texture = (texture - texture.min()) / (texture.max() - texture.min()) * 255

@@ -1,9 +1,9 @@
-"""Measures `carts view` from the start of its process to the first overlay in a tab.
+"""Benchmark of `carts view` from the start of its process to the first overlay in a tab.
 
     python -m tools.bench_start [SEQUENCE] [--times 5]
 
-The first start is not counted: it fills the caches of kernels and meshes. The tab speaks the page's protocol without a
-browser, and is there as soon as the address is printed.
+The first start is not counted: it fills the caches of kernels and meshes. The tab uses the page's protocol without a
+browser, and connects as soon as the address is printed.
 """
 
 import argparse
@@ -22,26 +22,26 @@ from carts_core.resources import sample_sequence
 from tools.raw_tab import RawTab
 
 _LONGEST = 120.0
-"""[s]"""
+"""Timeout [s]."""
 
 
 @dataclass(frozen=True)
 class Start:
-    """One start, in seconds from the start of the process."""
+    """Times of one start, from the start of the process [s]."""
 
     address: float
-    """Until the address was printed."""
+    """Time until the address is printed."""
     overlay: float
-    """Until the first overlay has arrived."""
+    """Time until the first overlay arrives."""
     processor: float
-    """Processor time of the process until then."""
+    """Processor time of the process until the first overlay."""
 
 
 def measured_start(sequence: Path) -> Start:
-    """Start the command with a new project, be its first tab, and end it.
+    """Start the command with a new project, connect its first tab, and end it.
 
     Raises:
-        RuntimeError: it did not start.
+        RuntimeError: the command did not start.
     """
     command = [sys.executable, "-m", "carts_core.cli", "view", str(sequence), "--port", "0", "--project"]
     with tempfile.TemporaryDirectory() as folder:
@@ -63,7 +63,7 @@ def measured_start(sequence: Path) -> Start:
 
 
 def _address(process: "subprocess.Popen[str]") -> str:
-    """What the command prints when the page is there."""
+    """Output of the command when the page is served."""
     assert process.stdout is not None
     for line in process.stdout:
         if (found := re.search(r"Open (http\S+)", line)) is not None:
@@ -72,7 +72,7 @@ def _address(process: "subprocess.Popen[str]") -> str:
 
 
 def _processor_time(process: int) -> float:
-    """Of all threads so far [s]; NaN where the system does not say."""
+    """Processor time of all threads [s]; NaN if the system does not provide it."""
     try:
         fields = Path(f"/proc/{process}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()
     except OSError:
@@ -81,7 +81,7 @@ def _processor_time(process: int) -> float:
 
 
 def print_starts(sequence: Path, times: int = 5) -> None:
-    """Measure so many starts, and print what came out, with the load of the machine before and after."""
+    """Measure several starts, and print the results, with the load of the machine before and after."""
     load = os.getloadavg()[0]
     starts = [measured_start(sequence) for _ in range(times + 1)][1:]
     print(f"carts view, {times} times, load {load:.1f} to {os.getloadavg()[0]:.1f}, from the start of the process")
@@ -94,7 +94,7 @@ def print_starts(sequence: Path, times: int = 5) -> None:
 
 
 def main() -> None:
-    """Print the figures."""
+    """Print the measurements."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("sequence", nargs="?", type=Path, default=sample_sequence())
     parser.add_argument("--times", type=int, default=5)

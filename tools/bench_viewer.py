@@ -1,5 +1,5 @@
-"""Measures the viewer: from its start to the first overlay, from a moved slider to its overlay, from a key to the next
-frame, and whether memory stays flat.
+"""Benchmark of the viewer: times from start to first overlay, from slider to overlay and from key to next frame, and
+growth of memory.
 
     python -m tools.bench_viewer [SEQUENCE]
 
@@ -34,17 +34,17 @@ _ITERATIONS = 500
 
 @dataclass(frozen=True)
 class Latency:
-    """Times from what somebody does to the picture that shows it [ms]."""
+    """Times from an action to the picture that shows its result [ms]."""
 
     median: float
     p95: float
     worst: float
     stale: bool
-    """Whether the last overlay was not the one of the last value or frame."""
+    """Whether the last overlay did not show the last value or frame."""
 
 
 _KEY = "bench"
-"""What the measuring tab calls itself, so that the next one takes its place."""
+"""Key of the measuring tab, which the next measuring tab reuses."""
 
 
 def slider_latency(
@@ -54,10 +54,10 @@ def slider_latency(
 
     Args:
         app: The viewer.
-        drags: How many drags.
+        drags: Number of drags.
         seconds: Duration of each [s].
-        draws: Whether the tab says when it has drawn; one that does not is as slow as the viewer ever waits for.
-        job: Whether all frames are optimized meanwhile.
+        draws: Whether the tab acknowledges overlays; otherwise the viewer waits for its timeout.
+        job: Whether all frames are optimized at the same time.
     """
     arm = app.state.frame.measured
     name = next(iter(arm))
@@ -100,13 +100,13 @@ def slider_latency(
 def frame_latency(app: ViewerApp, *, moves: int = 120, frames: int = 8, pause: float = 0.15) -> Latency:
     """Press the keys for the next and the previous frame, and wait for frame and overlay, which are sent together.
 
-    The frames have been read before. The times end with the arrival at the tab, so they contain the server's sending.
+    Frames are cached. Times include the transmission to the tab.
 
     Args:
         app: The viewer.
-        moves: How many keys are pressed.
-        frames: How many frames to go forth before going back.
-        pause: Between two keys [s].
+        moves: Number of key presses.
+        frames: Number of frames forwards before the direction is reversed.
+        pause: Time between two key presses [s].
     """
     count = min(frames, len(app.sequence)) - 1
     app.queue.put(intents.ShowFrame(0))
@@ -135,7 +135,7 @@ def _until(holds: Callable[[], bool], patience: float = 60.0) -> None:
     """Wait for a condition.
 
     Raises:
-        RuntimeError: it does not hold after so long [s].
+        RuntimeError: the condition does not hold after the timeout.
     """
     end = time.perf_counter() + patience
     while not holds():
@@ -150,7 +150,7 @@ def _latency(times: list[float], stale: bool) -> Latency:
 
 
 def _record_pictures(app: ViewerApp, arm: str) -> list[tuple[float, float]]:
-    """A list that fills with the time and the first joint [rad] of every picture that the worker starts to make."""
+    """List to which the time and the first joint [rad] of each started picture are appended."""
     shown: list[tuple[float, float]] = []
     show = app.view.display.show_picture
     row = [own.name for own in app.scene.arms].index(arm)
@@ -164,7 +164,7 @@ def _record_pictures(app: ViewerApp, arm: str) -> list[tuple[float, float]]:
 
 
 def _wait_for(moved: float, value: float, pictures: list[tuple[float, float]], arrivals: list[float]) -> float:
-    """From a move to the arrival of the first picture of its value or of a later one [s]; inf when none came."""
+    """Time from a move to the arrival of the first picture of this or a later value [s]; infinity without a picture."""
     made = next((at for at, shown in pictures if shown >= value - 1e-3), None)
     if made is None:
         return float("inf")
@@ -173,9 +173,9 @@ def _wait_for(moved: float, value: float, pictures: list[tuple[float, float]], a
 
 
 def memory_while_optimizing(app: ViewerApp, iterations: int = _ITERATIONS) -> list[tuple[int, float]]:
-    """Resident memory [MB] after every run of so many that they make that many iterations, as (iterations, MB).
+    """Resident memory after each of several runs, as (iterations so far, MB).
 
-    Every run starts where the first one did.
+    All runs start at the same pose.
     """
     done, samples = 0, list[tuple[int, float]]()
     while done < iterations:
@@ -197,7 +197,7 @@ def _figures(latency: Latency) -> str:
 
 
 def main() -> None:
-    """Print the figures."""
+    """Print the measurements."""
     tune_process()
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("sequence", nargs="?", type=Path, default=sample_sequence())

@@ -1,9 +1,9 @@
-"""Uses the viewer for a long time from three tabs, and says whether memory stayed flat and every picture was fresh.
+"""Long-running test of the viewer with three tabs: growth of memory, and outdated pictures.
 
     python -m tools.freshness [SEQUENCE] --minutes 60
 
 In every round the optimizer runs while other tabs watch, frames are scrubbed, a joint is dragged, and one tab is
-reloaded; then everything comes to rest and is checked. Server and tabs share one process, so its memory is theirs too.
+reloaded; then the final state is checked. Server and tabs share one process, whose memory includes that of the tabs.
 """
 
 import argparse
@@ -28,33 +28,33 @@ from tools.memory import resident_megabytes
 from tools.raw_tab import RawTab
 
 MAX_GROWTH = 0.05
-"""Of memory after warm-up that is still flat, as a share."""
+"""Maximum relative growth of memory after warm-up [1]."""
 _TABS = 3
 _STEP = 0.05
-"""Between two values of a slider that is dragged, as a browser sends them [s]."""
+"""Interval between values of a dragged slider, as sent by a browser [s]."""
 _WARM_UP = 0.2
-"""Share of the rounds after which memory counts."""
+"""Share of the rounds that are warm-up [1]."""
 
 
 @dataclass
 class Soak:
-    """What was seen."""
+    """Results of the test."""
 
     minutes: float = 0.0
     rounds: int = 0
     frames: int = 0
-    """Scrubbed to."""
+    """Number of scrubbed frames."""
     iterations: int = 0
     reloads: int = 0
     stale: list[str] = field(default_factory=list)
-    """Pictures at rest that were not those of the state, one line each."""
+    """Final pictures that did not match the state, one line each."""
     exceptions: list[str] = field(default_factory=list)
     megabytes: list[tuple[float, float]] = field(default_factory=list)
-    """Minutes since the start, and resident memory at rest [MB], one pair for each round."""
+    """Time since the start [min] and resident memory after each round [MB]."""
 
     @property
     def growth(self) -> float:
-        """Of memory after warm-up: the last tenth of the time against the first tenth after warm-up, as a share."""
+        """Relative growth of memory from the first to the last tenth of the time after warm-up [1]."""
 
         megabytes = [megabytes for _, megabytes in self.megabytes]
         begin, some = int(_WARM_UP * len(megabytes)), max(len(megabytes) // 10, 1)
@@ -62,13 +62,13 @@ class Soak:
 
     @property
     def spread(self) -> float:
-        """Greatest difference of two memories after warm-up, as a share of the least."""
+        """Range of memory after warm-up, relative to the minimum [1]."""
         settled = [megabytes for _, megabytes in self.megabytes[int(_WARM_UP * len(self.megabytes)) :]]
         return max(settled) / min(settled) - 1.0
 
 
 class _Listener(logging.Handler):
-    """Collects every error that anything logs, asyncio's unhandled ones included."""
+    """Collects all logged errors, including unhandled errors of asyncio."""
 
     def __init__(self, lines: list[str]) -> None:
         super().__init__(logging.ERROR)
@@ -79,14 +79,14 @@ class _Listener(logging.Handler):
 
 
 class Soaking:
-    """Three tabs of a viewer, and what they do all the time."""
+    """Three tabs of a viewer, and their actions."""
 
     def __init__(self, app: ViewerApp, *, run: float = 6.0, seed: int = 0) -> None:
         """
         Args:
             app: The viewer.
-            run: How long the optimizer runs in each round [s].
-            seed: Of what is done.
+            run: Duration of the optimizer's run in each round [s].
+            seed: Random seed of the actions.
         """
         self._app = app
         self._run_seconds = run
@@ -95,7 +95,7 @@ class Soaking:
         self.seen = Soak()
 
     def soak(self, minutes: float) -> Soak:
-        """Go on for so long; gives what was seen."""
+        """Run for a duration; returns the results."""
         listener, hook = _Listener(self.seen.exceptions), threading.excepthook
         logging.getLogger().addHandler(listener)
         threading.excepthook = lambda arguments: self.seen.exceptions.append(repr(arguments.exc_value))
@@ -159,7 +159,7 @@ class Soaking:
         self.seen.rounds += 1
 
     def _check(self) -> None:
-        """Wait until everything is at rest; then every tab shows its state, and nothing has gone wrong."""
+        """Wait until all work is done; check that every tab shows its state and no error was logged."""
         self._app.wait_until_shown(60.0)
         end = time.monotonic() + 10.0
         while time.monotonic() < end and any(_newest(tab) != self._view(tab).scene.sent(OVERLAY) for tab in self._tabs):
@@ -182,7 +182,7 @@ def _newest(tab: RawTab) -> bytes:
 
 
 def main() -> None:
-    """Print what was seen; ends with code 1 if that is not good."""
+    """Print the results; the exit status is 1 after a failure."""
     tune_process()
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("sequence", nargs="?", type=Path, default=sample_sequence())

@@ -1,4 +1,4 @@
-"""A tab without a browser, to measure and to attack the viewer with."""
+"""Tab without a browser, for measurements of the viewer and attacks on it."""
 
 import asyncio
 import itertools
@@ -32,11 +32,11 @@ _CAMERA = {
 
 _NUMBERS = itertools.count(1)
 _PATIENCE = 120.0
-"""Longest wait for the server, on a busy machine [s]."""
+"""Timeout for the server, for busy machines [s]."""
 
 
 class RawTab:
-    """Speaks viser's protocol, sets widgets to anything, and notes what arrives. Used as a context."""
+    """Client of viser's protocol that sets widgets to any value and records received messages; a context manager."""
 
     def __init__(
         self,
@@ -51,11 +51,11 @@ class RawTab:
         """
         Args:
             url: The page's address.
-            draws: Whether it reports that overlays are drawn.
-            keep: How many overlays to remember; None for all.
-            origin: The header of this name; None for none, as programs do.
-            hello: Whether it asks for its place in the viewer, as our page does, and waits for it.
-            key: What it calls itself then; None for a name of its own.
+            draws: Whether the tab acknowledges overlays.
+            keep: Number of overlays that are kept; None for all.
+            origin: Value of the header `Origin`; None to omit it, as programs do.
+            hello: Whether the tab sends `Hello`, as the page does, and waits for the answer.
+            key: Key of the tab; random if None.
         """
         self._url = url.replace("http://", "ws://")
         self._draws = draws
@@ -67,13 +67,13 @@ class RawTab:
         self._joined = threading.Event()
         self._hello = hello
         self.key = key or f"raw {next(_NUMBERS)}"
-        """What the tab calls itself."""
+        """Key of the tab."""
         self._channel: str | None = None
         self._saying: asyncio.Task[None] | None = None
         self.overlays: deque[tuple[float, bytes]] = deque(maxlen=keep)
-        """Time of arrival [s, perf_counter] and PNG of every overlay."""
+        """Arrival time [s, perf_counter] and PNG file of each overlay."""
         self.values: dict[str, Any] = {}
-        """Newest value of every widget that the server has set since this tab came, by id."""
+        """Newest value of each widget that the server has set since this tab connected, by id."""
         self.widgets: dict[str, dict[str, Any]] = {}
         """Newest known properties of every widget, by id."""
 
@@ -94,10 +94,10 @@ class RawTab:
         self._end()
 
     def set(self, element: str, value: Any) -> None:
-        """Set a widget's value, whatever the page would allow.
+        """Set a widget's value, without the checks of the page.
 
         Raises:
-            ConnectionClosed: the server is gone, or has had enough.
+            ConnectionClosed: the server has closed the connection.
         """
         self.send(_update(element, value))
 
@@ -126,11 +126,11 @@ class RawTab:
 
     @property
     def connected(self) -> bool:
-        """Whether the server still talks to this tab."""
+        """Whether the connection to the server is open."""
         return not self._reader.done()
 
     def close_code(self, timeout: float = _PATIENCE) -> int | None:
-        """Wait until the server ends the connection, and give its code; None when it does not in that time [s]."""
+        """Wait until the server closes the connection; returns the code, or None after the timeout [s]."""
         end = time.monotonic() + timeout
         while self.connected and time.monotonic() < end:
             time.sleep(0.02)
@@ -179,7 +179,7 @@ class RawTab:
                 await self._note(message, arrived)
 
     async def _say_hello(self) -> None:
-        """Ask for a place until there is one."""
+        """Send `Hello` until it is answered."""
         while not self._joined.is_set() and self.connected:
             if self._channel is not None:
                 await self._push(msgspec.msgpack.encode(self._report("Hello", tab=self.key)))

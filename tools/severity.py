@@ -1,6 +1,6 @@
 """Dice against the severity of each corruption, five strengths, on real frames: `run RESULTS.jsonl SEQUENCE`, `draw`.
 
-The third strength is the benchmark's. A run that was stopped goes on where it was.
+The third strength is the benchmark's. Rerun the command to resume.
 """
 
 import json
@@ -40,7 +40,7 @@ _FRAMES = 2
 
 
 def run(results: Path, path: Path, baselines: list[Path]) -> None:
-    """Measure what is not there yet."""
+    """Measure the missing runs."""
     networks = {trained.row: trained for trained in map(read_baseline, baselines)}
     sequence, extractor = Sequence.open(path), FeatureExtractor.load()
     camera = sequence.scene.cameras[0]

@@ -2,7 +2,8 @@
 
     python -m tools.soak [SEQUENCE] --minutes 10 --tabs 5 --rest 1 --only run settings
 
-Bisects by kind of action with `--only`. The server is a process of its own, so the tabs' memory does not count.
+`--only` selects kinds of actions, for bisection. The server runs in a separate process, so the memory of the tabs is
+not included.
 """
 
 import argparse
@@ -28,15 +29,15 @@ from tools.memory import resident_megabytes
 from tools.raw_tab import RawTab
 
 MAX_GROWTH, MAX_REST = 0.15, 0.2
-"""Growth after the second minute, and what stays after the last tab left beyond the start, that pass [1]."""
+"""Allowed growth after the second minute, and after the last tab has left relative to the start [1]."""
 _SETTLED = 15.0
-"""From the tabs' coming to the start of the measurement [s]."""
+"""Time from the connection of the tabs to the start of the measurement [s]."""
 _WATCHED, _IDLE, _MAX_WORK_TIME = 10.0, 0.05, 120
-"""Interval [s] and share of a core [1] below which a server is idle, and the largest number of intervals."""
+"""Interval [s], share of a core below which the server is idle [1], and maximum number of intervals."""
 _MAX_JOBS = 60
-"""Seconds during which jobs are cancelled, one a second."""
+"""Duration for which one job per second is cancelled [s]."""
 _PACE = 0.2
-"""Longest time between two actions [s]."""
+"""Maximum time between two actions [s]."""
 
 KINDS = {
     "frames": ("Frame", "Domain", "Play", "Next frame", "Previous worst", "Next worst", "Next unreviewed"),
@@ -72,7 +73,7 @@ KINDS = {
 }
 """Kind of action -> labels of the widgets that it uses; those without are gestures on the picture, or a new tab."""
 _RANGES = {"Working width [px]": (64, 640), "Iterations": (1, 60)}
-"""Of number fields without limits of their own."""
+"""Range of number fields without limits."""
 
 
 @dataclass
@@ -80,35 +81,35 @@ class Soak:
     """Resident memory of the server [MB]."""
 
     start: float
-    """With all tabs open and at rest."""
+    """Initial memory, with all tabs open and idle."""
     minutes: list[float] = field(default_factory=list)
-    """At the end of each minute of actions."""
+    """Memory at the end of each minute of actions."""
     rest: float = 0.0
-    """Some time after the last tab left and the server's work ended."""
+    """Memory some time after the last tab has left and the server's work has ended."""
     worked: float = 0.0
-    """From the last tab's leaving to the end of the server's work [s]."""
+    """Time from the closing of the last tab to the end of the server's work [s]."""
     actions: int = 0
 
     @property
     def growth(self) -> float:
-        """Of the last minute over the second one [1]; 0 where there are fewer."""
+        """Relative growth from the second to the last minute [1]; 0 for fewer minutes."""
         return self.minutes[-1] / self.minutes[1] - 1.0 if len(self.minutes) > 2 else 0.0
 
     @property
     def kept(self) -> float:
-        """What stays beyond the start [1]."""
+        """Final memory relative to the start, minus one [1]."""
         return self.rest / self.start - 1.0
 
 
 class RandomTab:
-    """A tab that does things at random, whatever the page shows."""
+    """Tab with random actions, independent of the content of the page."""
 
     def __init__(self, url: str, key: str, dice: random.Random) -> None:
         self._dice, self._count = dice, 0
         self.tab = RawTab(url, draws=True, keep=1, key=key).__enter__()
 
     def act(self, kind: str, frames: int) -> None:
-        """Do something of this kind."""
+        """Perform an action of this kind."""
         if kind in ("paint", "prompt"):
             self._paint(frames, prompt=kind == "prompt")
             return
@@ -121,7 +122,7 @@ class RandomTab:
             self.tab.press(element)
 
     def close(self) -> None:
-        """Leave."""
+        """Close the connection."""
         with suppress(ConnectionClosed, TimeoutError, RuntimeError):
             self.tab.__exit__()
 
@@ -156,7 +157,7 @@ class RandomTab:
 
 @contextmanager
 def served(sequence: Path, python: str) -> Iterator[tuple[str, int]]:
-    """Serve a copy of a sequence's folder with this interpreter; gives address and number of the process."""
+    """Serve a copy of a sequence's folder with an interpreter; returns the address and the id of the process."""
     with tempfile.TemporaryDirectory() as folder:
         copy = Path(folder) / "copy"
         shutil.copytree(sequence.parent, copy)
@@ -183,16 +184,16 @@ def soak(
     seed: int = 0,
     python: str = sys.executable,
 ) -> Soak:
-    """Use a viewer at random, then leave it alone.
+    """Perform random actions in a viewer, then wait.
 
     Args:
         sequence: Sequence file of 640x480 px with a camera `left`.
         minutes: Duration of the actions.
         tabs: Number of tabs.
-        rest: From the end of the server's work, after the last tab has left, to the last measurement [min].
-        only: Kinds of action, of `KINDS`.
-        seed: Of the actions.
-        python: Interpreter of the server; another one measures another checkout.
+        rest: Time from the end of the server's work, after the last tab has left, to the last measurement [min].
+        only: Kinds of actions, of `KINDS`.
+        seed: Random seed of the actions.
+        python: Interpreter of the server, which selects the measured checkout.
     """
     dice = random.Random(seed)
     with served(sequence, python) as (url, process):
@@ -230,7 +231,7 @@ def soak(
 
 
 def _cancel_jobs(url: str) -> None:
-    """Cancel the jobs, of which the chosen one is the next to end; they would go on for an hour without a tab."""
+    """Cancel the jobs, which would otherwise continue for an hour without a tab."""
     with suppress(ConnectionClosed, TimeoutError), RawTab(url, draws=True, keep=1, key="cancel") as tab:
         for _ in range(_MAX_JOBS):
             for element, widget in list(tab.widgets.items()):
@@ -240,7 +241,7 @@ def _cancel_jobs(url: str) -> None:
 
 
 def _wait_until_idle(process: int) -> None:
-    """Wait until a process hardly computes: clicks wait for the server, and jobs go on without a tab."""
+    """Wait until a process is idle, since queued clicks and jobs continue without a tab."""
     before = _ticks(process)
     for _ in range(_MAX_WORK_TIME):
         time.sleep(_WATCHED)
@@ -256,7 +257,7 @@ def _ticks(process: int) -> int:
 
 
 def main() -> None:
-    """Print what was seen; ends with code 1 if memory grew or was not returned."""
+    """Print the results; the exit status is 1 if memory grew or was not returned."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("sequence", nargs="?", type=Path, default=sample_sequence())
     parser.add_argument("--minutes", type=float, default=10.0)

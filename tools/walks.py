@@ -1,4 +1,4 @@
-"""Files that three calls cross, by a trace: the walks of docs/explanation/architecture.md.
+"""Modules of three call paths, found by tracing; see docs/explanation/architecture.md.
 
 `python -m tools.walks` prints the modules of both packages whose functions run (module level and imports left out)
 from a slider's value to the overlay, from a frame on disk to the result, and for an exported mask.
@@ -25,11 +25,11 @@ from tools.raw_tab import RawTab
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGES = ("carts_core", "carts_viewer")
 _SETTLE, _LONGEST = 3.0, 30.0
-"""Waits for other work of the page to end, and for an overlay [s]."""
+"""Timeouts for other work of the page, and for an overlay [s]."""
 
 
 class Trace:
-    """Modules of the packages whose functions are called while the trace is on, in all threads started after it."""
+    """Modules of the packages whose functions are called during a trace, in all threads started after it."""
 
     def __init__(self) -> None:
         self._on, self._files = False, {}
@@ -42,7 +42,7 @@ class Trace:
 
     @contextmanager
     def on(self) -> Iterator[list[str]]:
-        """Trace the block; the list has the modules, in the order of their first call, once it ends."""
+        """Trace the block; afterwards the list contains the modules, in the order of their first call."""
         found: list[str] = []
         self._files.clear()
         self._on = True
@@ -95,14 +95,14 @@ def mask(trace: Trace, sequence: Sequence, folder: Path) -> list[str]:
 
 
 def show(title: str, found: list[str]) -> None:
-    """Print a walk."""
+    """Print a call path."""
     print(f"{title}: {len(found)} files")
     for path in found:
         print(f"  {path}")
 
 
 def walks() -> None:
-    """Print the three walks."""
+    """Print the three call paths."""
     trace = Trace()
     with TemporaryDirectory() as folder:
         copy = Path(folder) / "sequence"
