@@ -1,4 +1,4 @@
-"""A manifest names every job once, and what is wrong with it is said before anything runs."""
+"""Manifests: unique job names, and errors that are reported before any job runs."""
 
 from pathlib import Path
 

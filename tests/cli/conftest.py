@@ -10,7 +10,7 @@ from carts_core.cli.command_line import BAD_INPUT, main
 
 @pytest.fixture
 def said(capsys: pytest.CaptureFixture[str]) -> Callable[[], str]:
-    """Returns what was printed on the standard output since the last call, in one line."""
+    """Function that returns the standard output since the last call, in one line."""
     return lambda: " ".join(capsys.readouterr().out.split())
 
 

@@ -1,4 +1,4 @@
-"""`carts batch`: what the plain commands write, however the jobs are shared out and whatever stops them."""
+"""`carts batch`: results of the individual commands, for any distribution of jobs and after interruptions."""
 
 import json
 import os
@@ -49,7 +49,7 @@ def manifest(sequence: Path, count: int = 1, *, steps: str = '"optimize", "expor
 
 
 def results(batch: Path) -> dict[str, bytes]:
-    """Every file of the jobs but what tells when and where they ran."""
+    """All files of the jobs except those with times and machines."""
     files = [path for path in sorted(batch.rglob("*")) if path.is_file()]
     names = {path.relative_to(batch).as_posix(): path for path in files}
     return {

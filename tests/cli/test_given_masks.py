@@ -1,4 +1,4 @@
-"""`--observe` and `--masks`: what the network sees, masks of the recording, a project or files, or both."""
+"""`--observe` and `--masks`: network predictions, masks of the recording, of a project or of files, or both."""
 
 import json
 import re

@@ -23,7 +23,7 @@ Outcome = Callable[..., str]
 
 @pytest.fixture
 def sequence(tiny_sequence: Callable[..., Path], tmp_path: Path) -> Path:
-    """Three small frames of a robot with files of its own."""
+    """Three small frames of a robot with separate files."""
     shutil.copytree(shipped_robot().parent, tmp_path / "robot")
     robot = tmp_path / "robot" / shipped_robot().name
     return tiny_sequence(
@@ -33,7 +33,7 @@ def sequence(tiny_sequence: Callable[..., Path], tmp_path: Path) -> Path:
 
 @pytest.fixture
 def optimize(sequence: Path, tmp_path: Path, said: Callable[[], str]) -> Outcome:
-    """Runs `carts optimize` without steps and returns what it prints, in one line."""
+    """Function that runs `carts optimize` without steps and returns its output in one line."""
 
     def run(*arguments: str) -> str:
         main(["optimize", str(sequence), "--output", str(tmp_path / "out"), "--solver", "none", *arguments])

@@ -1,4 +1,4 @@
-"""`carts live`: a replay on the command line, and what it leaves."""
+"""`carts live`: a replay on the command line, and its outputs."""
 
 import json
 import os

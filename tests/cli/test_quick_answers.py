@@ -1,4 +1,4 @@
-"""What `carts` says without running a command is said at once: before anything is imported that takes long."""
+"""Output of `carts` that requires no command appears before slow imports."""
 
 import json
 import os

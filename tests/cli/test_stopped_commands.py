@@ -44,7 +44,7 @@ def contents(folder: Path) -> dict[str, bytes]:
 
 
 def check_results(folder: Path) -> int:
-    """See that everything in a folder of `carts optimize` is whole; how many frames it has."""
+    """Check that all outputs of `carts optimize` in a folder are complete; returns the number of frames."""
     records = folder / "results.json"
     frames = json.loads(records.read_text())["frames"] if records.is_file() else {}
     for frame_id in frames:
@@ -54,7 +54,7 @@ def check_results(folder: Path) -> int:
 
 
 Run = Callable[..., tuple[int, str]]
-"""Runs a command that gets a signal, after some seconds or when a file changes; its status and what it printed."""
+"""Function that runs a command and sends a signal after a delay or a change of a file; returns status and output."""
 
 
 @pytest.fixture(scope="module")

@@ -1,4 +1,4 @@
-"""A LeRobot data set of a robot with meshes of its own: from motor positions and masks to a hand-eye calibration."""
+"""LeRobot data set of a robot with its own meshes: from motor positions and masks to a hand-eye calibration."""
 
 from collections.abc import Callable
 from pathlib import Path

@@ -27,10 +27,10 @@ class Block:
     line: int
     """Where it begins, counted from 1."""
     language: str
-    """`python`, `console` for commands, or what a fence says."""
+    """`python`, `console` for commands, or the language of the fence."""
     text: str
     reason: str | None
-    """Why it is not run; None where it is."""
+    """Reason why the block is not run; None if it is run."""
 
     def __str__(self) -> str:
         return f"{self.page}:{self.line}"

@@ -50,7 +50,7 @@ TO_RUN = {
 
 @pytest.fixture
 def reader(tmp_path: Path, tiny_sequence: Callable[..., Path]) -> tuple[Path, dict[str, str]]:
-    """A folder with what pages speak of, and the environment of somebody who has never used CaRTS."""
+    """Folder with the files that the pages refer to, and the environment of a new user."""
     recording = tiny_sequence(edit=lambda text: text.replace('name = "tiny"', 'name = "NAME"')).parent
     shutil.copytree(recording, tmp_path / "desk", ignore=shutil.ignore_patterns("desk", "home"))
     desk = tmp_path / "desk"
@@ -70,7 +70,7 @@ def reader(tmp_path: Path, tiny_sequence: Callable[..., Path]) -> tuple[Path, di
 
 
 def run_blocks(todo: list[list[Any]], reader: tuple[Path, dict[str, str]]) -> subprocess.CompletedProcess[str]:
-    """Run blocks, each given as where it stands, its language, and its text or commands, in a process of their own."""
+    """Run blocks (location, language, and text or commands) in a separate process."""
     desk, environment = reader
     return subprocess.run(
         [sys.executable, str(ROOT / "tests" / "documentation" / "run_doc_blocks.py")],

@@ -1,4 +1,4 @@
-"""The numbered examples run as they stand, do what they say, and have a picture in the documentation."""
+"""The numbered examples run unchanged, produce the described output, and have a picture in the documentation."""
 
 import re
 import runpy
@@ -20,7 +20,7 @@ def floats(pattern: str, text: str) -> list[float]:
 
 @pytest.fixture
 def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
-    """Run an example, by its number, in an empty folder; returns what it prints. Its picture must be one."""
+    """Run an example, by its number, in an empty folder, and check its picture; returns its output."""
 
     def run_example(number: int, *arguments: str) -> str:
         (path,) = (ROOT / "examples").glob(f"{number:02}_*.py")

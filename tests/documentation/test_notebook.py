@@ -1,4 +1,4 @@
-"""The notebook in `examples` runs as it stands, without a kernel, and shows what it says."""
+"""The notebook in `examples` runs unchanged, without a kernel, and shows the described output."""
 
 import ast
 import json

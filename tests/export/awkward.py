@@ -1,4 +1,4 @@
-"""Two arms with awkward names, what an export of them must give back, and how it is compared."""
+"""Two arms with awkward names, the expected content of their exports, and comparisons."""
 
 import numpy as np
 

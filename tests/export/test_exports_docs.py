@@ -1,4 +1,4 @@
-"""What docs/reference/exports.md says is so."""
+"""Statements of docs/reference/exports.md."""
 
 import re
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""Commands as they are run with something planted: small inputs, and what takes long is computed once and kept."""
+"""Commands for tests with planted entries: small inputs, and slow results computed once and cached."""
 
 import os
 from collections.abc import Callable

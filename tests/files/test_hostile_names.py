@@ -16,7 +16,7 @@ COMMANDS: dict[str, list[str]] = {
     "calibrate": ["calibrate", "--positions", "1", "--settings", "iterations=1"],
 }
 OUTPUTS = ("runs", "out")
-"""Where commands write: the default, and what the command lines above name."""
+"""Output folders of the commands: the default, and those of the command lines above."""
 
 
 @pytest.fixture

@@ -26,7 +26,7 @@ def recording(tiny_sequence: Callable[..., Path]) -> Path:
 
 
 def _fresh(recording: Path, folder: Path) -> tuple[Path, Path]:
-    """A folder with all inputs in it, and somebody's own files elsewhere."""
+    """Folder with all inputs, and unrelated files in another folder."""
     work = folder / "work"
     shutil.copytree(recording, work / "recording")
     shutil.copytree(recording, work / "source", ignore=shutil.ignore_patterns("sequence.toml", "truth.csv", "masks"))
@@ -35,7 +35,7 @@ def _fresh(recording: Path, folder: Path) -> tuple[Path, Path]:
 
 
 def _refused_or_done(name: str, work: Path, what: object) -> None:
-    """Run a command to its end, or until it says in words why it does not go on."""
+    """Run a command to completion, or until it ends with an error message."""
     signal.alarm(SECONDS)
     try:
         COMMANDS[name](work)

@@ -1,4 +1,4 @@
-"""Files of others: what is no regular file, too large or nested too deeply is refused before it is worked on."""
+"""Untrusted files: files that are not regular, too large or nested too deeply are refused before processing."""
 
 import os
 import resource
@@ -129,7 +129,7 @@ def png_header(width: int, height: int) -> bytes:
 
 
 def encoded_header(suffix: str, width: int, height: int) -> bytes:
-    """A small image whose header says another size."""
+    """Small image whose header gives another size."""
     content = bytearray(cv2.imencode(suffix, np.zeros((8, 16, 3), np.uint8))[1].tobytes())
     if suffix == ".jpg":
         place = content.index(b"\xff\xc0") + 5

@@ -22,7 +22,7 @@ SECONDS = 10.0
 PATIENCE = 120.0
 """How long an answer is waited for on a busy machine [s]."""
 MEMORY = 2 * 2**30
-"""Of the worker, above what it holds before its first input [bytes]."""
+"""Memory limit of the worker, above its memory before the first input [bytes]."""
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class Outcome:
     kind: str
     seed: int
     result: str
-    """`read`, `refused`, or what is wrong: `traceback`, `hang`, `memory`, `not finite`, `died`."""
+    """`read`, `refused`, or a failure: `traceback`, `hang`, `memory`, `not finite`, `died`."""
     detail: str = ""
     seconds: float = 0.0
 

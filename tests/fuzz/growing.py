@@ -24,7 +24,7 @@ from fuzz.growing_files import CASES, READERS, RIGHT, right_folder
 SECONDS = 5.0
 """Of processor time, of the process and its children [s]."""
 MEMORY = 512 * 2**20
-"""For a file that is smaller; beyond that of the interpreter and what is imported in this process [bytes]."""
+"""Memory limit for small files, in addition to the interpreter and the imports of this process [bytes]."""
 INTERPRETER = 60 * 2**20
 """Memory of a child process that has imported little [bytes]."""
 PATIENCE = 180
@@ -38,7 +38,7 @@ class Cost:
     kind: str
     name: str
     result: str
-    """`read`, `refused`, or what is wrong: `traceback`, `slow`, `memory`, `died`."""
+    """`read`, `refused`, or a failure: `traceback`, `slow`, `memory`, `died`."""
     size: int
     """Of the file [bytes]."""
     seconds: float
@@ -76,7 +76,7 @@ def measured(kind: str, name: str, make: Callable[[Path], Path]) -> Cost:
 
 
 def _forked(work: Callable[[], str]) -> dict:
-    """What became of some work in a child process, and what it took."""
+    """Result of a function in a child process, with its time and memory."""
     here, there = os.pipe()
     if (child := os.fork()) == 0:
         os.close(here)

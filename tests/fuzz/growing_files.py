@@ -1,4 +1,4 @@
-"""Small files of every kind that can be read, which are large or slow for a decoder that takes them as they are."""
+"""Small files of all readable kinds that are large or slow for an unprotected decoder."""
 
 import atexit
 import base64

@@ -11,7 +11,7 @@ QUICK = ["npz/false small size", "mat/bomb", "bag/endless view"]
 
 
 def check(*cases: str, seconds: float) -> str:
-    """Reads files in a process of its own, whose memory is not that of the tests; gives what it prints."""
+    """Function that reads files in a separate process, with separate memory; returns the output."""
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(Path(__file__).parents[1]), *sys.path])}
     command = [sys.executable, "-m", "fuzz.growing", *cases]
     done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=seconds, env=environment)

@@ -1,4 +1,4 @@
-"""Frames come from anywhere, the newest counts, and what is wrong with a message is said to who sent it."""
+"""Streams: sources, the buffer of the latest frame, and errors that are sent to the client."""
 
 import json
 import select
@@ -56,7 +56,7 @@ def assembler(sequence: Sequence) -> Assembler:
 
 
 class Repeater:
-    """In place of a tracker: says that every frame is as measured, after as many seconds as it is told to say."""
+    """Replacement of a tracker: returns measured values after a given time."""
 
     def __init__(self, sequence: Sequence, seconds: float = 0.0) -> None:
         # No machine is so slow that a frame that is not stale by intention is as old as this.

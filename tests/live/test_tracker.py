@@ -1,4 +1,4 @@
-"""The tracker follows an arm, says when it has lost it, and finds it again."""
+"""Tracking of an arm, detection of its loss, and recovery."""
 
 import time
 from collections.abc import Callable, Iterator
@@ -29,7 +29,7 @@ ERROR = 0.01
 
 
 class Seeing(ImagePredictor):
-    """Sees the arm where it is; nothing while something hides it."""
+    """Predictor of the true surface map; empty while the arm is hidden."""
 
     device = torch.device("cpu")
     stride = 16
@@ -56,7 +56,7 @@ class Seeing(ImagePredictor):
 
 
 class Stream:
-    """An arm that sways, at so many frames a second, and a tracker that follows it."""
+    """Oscillating arm at a frame rate, and a tracker that follows it."""
 
     def __init__(self, path: Path, *, concurrent: bool = False) -> None:
         self.sequence = Sequence.open(path)

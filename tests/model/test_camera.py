@@ -1,4 +1,4 @@
-"""Camera: what is refused, and where pixels go when distortion is removed or the size changes."""
+"""Cameras: invalid values, undistortion and resizing."""
 
 import cv2
 import numpy as np

@@ -1,4 +1,4 @@
-"""Robots from a small tree laid out as dvrk_model, and from the real one where it is present."""
+"""Robots from a small tree with the layout of dvrk_model, and from the real tree if available."""
 
 from dataclasses import replace
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""What the images say of a fit that is right."""
+"""Evidence of a correct fit."""
 
 from carts_core.optimization import Evidence
 

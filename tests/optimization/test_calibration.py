@@ -1,4 +1,4 @@
-"""Calibration over many frames, with a predictor that sees exactly what is there."""
+"""Calibration over many frames, with a predictor of the true surface maps."""
 
 from collections.abc import Callable
 from copy import copy

@@ -1,4 +1,4 @@
-"""Proposed ignore masks: what is taken for an occluder, and what becomes of a frame that is solved again."""
+"""Proposed ignore masks: detected occluders, and the repeated solution of a frame."""
 
 from collections.abc import Callable
 from pathlib import Path

@@ -14,7 +14,7 @@ from carts_core.model.robot import Robot
 from carts_core.optimization.keypoints import KeypointSettings, fit_keypoints
 
 TRUTH = np.array([0.1, -0.05, 0.16, 0.4, 0.3, -0.3, 0.4])
-"""[rad, m]; no joint at a limit, and the wrist bent so that its joints can be told apart."""
+"""[rad, m]; no joint at a limit, and a bent wrist, so that its joints can be distinguished."""
 
 
 @pytest.fixture

@@ -1,4 +1,4 @@
-"""Refined masks, with a predictor that sees exactly what is there."""
+"""Refined masks, with a predictor of the true surface maps."""
 
 from collections.abc import Callable
 from pathlib import Path

@@ -171,7 +171,7 @@ def test_a_frame_that_cannot_be_read_is_told_when_its_turn_comes(truths: Truths)
 
 @pytest.mark.parametrize("jumped", [False, True])
 def test_where_it_starts_suits_all_frames_that_were_solved_alone(truths: Truths, jumped: bool) -> None:
-    """What frame 0 sees suits no other frame: nothing tells it from the truth there, or the error has jumped."""
+    """The prediction for frame 0 fits no other frame: it is wrong only there, or the error has jumped."""
     scene, settings = truths.sequence.scene, SurfaceSolver()
     right, wrong = np.zeros(7), np.deg2rad([-2.0, 2.0, 0.0, 0.0, 0.0, 0.0, 0.0])
     states = [truths.sequence.frame(index).truth or {} for index in range(FRAMES)]
@@ -277,7 +277,7 @@ def test_frames_in_quick_succession_inform_others_less(truths: Truths) -> None:
 
 
 def test_deviations_count_on_no_more_than_images_that_differ(truths: Truths) -> None:
-    """A network that errs alike in all frames is not averaged out; what is estimated does not depend on that."""
+    """An error of the network common to all frames is not averaged out, and does not change the estimates."""
     ends = []
     for shared in (0.5, 5.0):
         sequence = optimizer(truths, model=replace(ALONE, correlation_seconds=0.5, shared_seconds=shared))

@@ -1,4 +1,4 @@
-"""Measurements of frames taken one after another: what they say together does not depend on when it is asked."""
+"""Consecutive measurements: the smoothed result does not depend on the time of the query."""
 
 import math
 

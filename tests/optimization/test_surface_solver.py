@@ -1,4 +1,4 @@
-"""The surface factor and the default solver, with a predictor that sees exactly what is there."""
+"""The surface factor and the default solver, with a predictor of the true surface maps."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -64,7 +64,7 @@ def test_a_start_that_explains_the_image_as_well_is_kept(
 
 
 def test_keeping_the_start_or_not_with_the_shipped_network() -> None:
-    """What it sees depends on what it is conditioned on, which must not show in an estimate that is not dropped."""
+    """Predictions depend on the condition, which must not affect an estimate that is kept."""
     sequence, extractor = Sequence.open(sample_sequence()), FeatureExtractor.load()
     scene = sequence.scene.with_cameras(["left"])
     frame = sequence.frame(4, cameras=["left"])

@@ -72,7 +72,7 @@ POSSIBLE_EDITS = _possible_edits()
 
 @dataclass
 class ProjectModel:
-    """What a project should say: the whole state after every step."""
+    """Expected content of a project: the complete state after every step."""
 
     snapshots: list[dict[Key, Any]] = field(default_factory=lambda: [{}])
     names: list[str] = field(default_factory=list)

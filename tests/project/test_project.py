@@ -1,4 +1,4 @@
-"""Edits, undo and redo: what a project says, and what it refuses."""
+"""Edits, undo and redo: state of a project, and refused edits."""
 
 import threading
 from dataclasses import replace

@@ -24,7 +24,7 @@ NOTE = {Key.review(0): Review(note="a")}
 
 
 def _all_states(path: Path) -> list[dict]:
-    """What a project says after each step of its history, with what undo brings back."""
+    """State of a project after each step of its history, including values that undo restores."""
     with Project(IDENTITY, path) as project:
         assert project.writable
         position, states = project.state.position, []
@@ -37,7 +37,7 @@ def _all_states(path: Path) -> list[dict]:
 
 
 def _make(folder: Path, *, closed: bool) -> Path:
-    """A project of many kinds of values, with undone steps; closed, or as it is left by a kill."""
+    """Project with many kinds of values and undone steps; closed, or in the state after a kill."""
     path = folder / "small.carts"
     project = Project(IDENTITY, path)
     for number in range(40):

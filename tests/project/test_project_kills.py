@@ -14,7 +14,7 @@ from carts_core.project import Project
 
 
 def _survive(path: Path, seed: int, delay: float, model: ProjectModel) -> ProjectModel:
-    """Let a process edit the project, kill it, and check what is left; gives the model that agrees with it."""
+    """Let a process edit the project, kill it, and check the file; returns the matching model."""
     here, there = CONTEXT.Pipe(duplex=False)
     process = CONTEXT.Process(target=edit_until_killed, args=(path, seed, there))
     process.start()

@@ -1,4 +1,4 @@
-"""Random actions on a real project and on a model in plain Python: both must always say the same."""
+"""Random actions on a real project and on a model in plain Python, whose states must be equal."""
 
 import shutil
 import tempfile

@@ -1,4 +1,4 @@
-"""The estimated background: what is behind a thing that moves, and a guess where it never moves away."""
+"""The estimated background: the scene behind a moving object, and interpolation where it never moves away."""
 
 import numpy as np
 import pytest

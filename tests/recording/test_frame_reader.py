@@ -1,4 +1,4 @@
-"""FrameReader: what is ahead is decoded before it is asked for, on one thread that ends."""
+"""FrameReader: the next frames are decoded in advance, on one thread that ends."""
 
 import threading
 from collections.abc import Callable

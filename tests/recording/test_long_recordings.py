@@ -1,4 +1,4 @@
-"""Long recordings: opening decodes hardly anything, and browsing keeps no more than the cache may hold."""
+"""Long recordings: opening decodes few images, and browsing stays within the limit of the cache."""
 
 from collections.abc import Iterator
 from typing import Any

@@ -1,4 +1,4 @@
-"""Frames and joint positions with clocks of their own: the rows nearest in time count, and none that are far."""
+"""Frames and joint positions with separate clocks: matching with the nearest rows, within a maximum gap."""
 
 import csv
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Sequence: what is wrong with a file is said with the file, the place in it, what is allowed and the remedy."""
+"""Errors of sequence files: each names the file, the location, the allowed values and a remedy."""
 
 import re
 import shutil

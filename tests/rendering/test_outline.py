@@ -63,7 +63,7 @@ def test_outlines_move_as_they_say(free: str, scene_and_state: tuple[Scene, Scen
     position, normal = found.position.numpy().T, found.normal.numpy().T
 
     def residual(offsets: torch.Tensor) -> tuple[np.ndarray, np.ndarray]:
-        """How far away silhouettes end, and how far along the normals."""
+        """Distance of each outline pixel from the nearest rim, and its component along the normal [px]."""
         ends = rims(fine, parameters.state(offsets))
         distance, nearest = KDTree(ends).query(position)
         return distance, ((ends[nearest] - position) * normal).sum(1)

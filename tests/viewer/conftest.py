@@ -90,7 +90,7 @@ def open_viewer(
 def shared_viewer(
     shared_sequence: Callable[..., Path], untrained_weights: Path, solver: SolverProcess
 ) -> Iterator[ViewerApp]:
-    """The viewer of a tiny sequence, for tests that leave it as it is."""
+    """Viewer of a tiny sequence, for tests that do not change it."""
     with ViewerApp.open(shared_sequence(), port=0, solver=solver, weights=(untrained_weights,)) as app:
         app.wait_until_shown()
         yield app

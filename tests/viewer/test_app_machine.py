@@ -1,4 +1,4 @@
-"""Random actions on the app's controller and on a model in plain Python: both must always say the same."""
+"""Random actions on the app's controller and on a model in plain Python, whose states must be equal."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace

@@ -1,4 +1,4 @@
-"""Recordings whose camera moves, or whose images and kinematics have clocks of their own."""
+"""Recordings with a moving camera, or with separate clocks of images and kinematics."""
 
 from collections.abc import Callable
 from pathlib import Path

@@ -65,7 +65,7 @@ CONTENTS: dict[str, bytes | None] = {
     "a link to nothing": None,
     "a link to /dev/zero": None,
 }
-"""Of whole files; None for what is no file."""
+"""Contents of whole files; None for a special file."""
 REMOVED = "removed"
 Steps = tuple[str | int, ...]
 

@@ -53,7 +53,7 @@ ENDING_A_RUN = (
     intents.SetSetting("iterations", 9),
     intents.ShowDomain("smoke"),
 )
-"""Intents that change what a run works on."""
+"""Intents that change the inputs of a run."""
 
 
 def test_every_intent_has_a_handler() -> None:

@@ -200,7 +200,7 @@ def _seen(scene: Scene, state: ViewState, point: Keypoint) -> tuple[float, float
 
 
 def _taken(desk: Desk) -> tuple[tuple[float, float], Keypoint]:
-    """A place of the image where the arm is, and what is there."""
+    """Position in the image on the arm, and the point of the arm there."""
     rows, columns = np.nonzero(desk.renderer.arm_ids(desk.state.pose.scene, desk.state.camera) == 0)
     place = float(np.median(columns)) + 0.5, float(rows[np.abs(columns - np.median(columns)).argmin()]) + 0.5
     point = desk.renderer.pick(desk.state.pose.scene, desk.state.camera, place, 15.0)

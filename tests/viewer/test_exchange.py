@@ -1,4 +1,4 @@
-"""Exports of the page, masks and keypoints of others, and what a run fits."""
+"""Exports of the page, imported masks and keypoints, and the target of a run."""
 
 import json
 import zipfile
@@ -195,12 +195,12 @@ def test_who_looks_on_read_only_can_export(desk: Desk) -> None:
 
 @pytest.fixture
 def plain(tiny_sequence: Callable[..., Path], untrained_weights: Path) -> Desk:
-    """A desk for a recording without masks of its own."""
+    """A desk for a recording without masks."""
     return Desk.open(tiny_sequence(frames=3, masks=False), weights=(untrained_weights,))
 
 
 def write_theirs(folder: Path, frames: tuple[int, ...] = (1, 2)) -> np.ndarray:
-    """A COCO file of others beside the recording, with a rectangle and a keypoint in some frames; gives the mask."""
+    """COCO file beside the recording, with a rectangle and a keypoint in some frames; returns the mask."""
     images = [{"id": n, "file_name": f"{n:03d}.png", "width": 96, "height": 72} for n in frames]
     square = [[30, 20, 60, 20, 60, 50, 30, 50]]
     marked = [

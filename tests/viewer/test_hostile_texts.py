@@ -45,7 +45,7 @@ SHOWN = "((document.title + document.body.innerHTML).match(/ran\\.push\\(\\d+\\)
 
 
 class Texts:
-    """Hostile texts, each with a number of its own by which a script that it runs says where it came from."""
+    """Hostile texts, each with a number that identifies the origin of an executed script."""
 
     def __init__(self) -> None:
         self._numbers, self.places = count(1), dict[int, str]()

@@ -1,4 +1,4 @@
-"""Jobs: one after the other, with progress and a log, and after the viewer has ended; the adaptation of the network."""
+"""Jobs: queue, progress and log, also after a restart of the viewer; adaptation of the network."""
 
 import json
 import shutil

@@ -58,7 +58,7 @@ class Lives:
         self.tally = Tally()
 
     def live(self, seed: int, least: int = 0) -> None:
-        """Work in a new process until a signal ends it, after so many edits at least; look what is left."""
+        """Run edits in a new process until a signal ends it, after a minimum number of edits; check the files."""
         number, dice = SIGNALS[seed % len(SIGNALS)], random.Random(seed)
         victim, told = begin(serve_until_signal, self._path, self._weights)
         with RawTab(told.recv(), keep=1) as tab:
@@ -219,7 +219,7 @@ class JobLives:
         self._check()
 
     def _check(self) -> None:
-        """The list as the next viewer will read it, the project, and what was exported."""
+        """List of jobs as read by the next viewer, the project, and the exports."""
         identity = SequenceIdentity.of(self._sequence)
         path = self._path.with_suffix(".carts")
         recording = {"frame_ids": identity.frame_ids, "recording": identity.kinematics_sha256}

@@ -50,7 +50,7 @@ def place_of(visitor: Visitor) -> RecordingWizard:
 
 
 def click_what_is_asked_for(visitor: Visitor, scene: Scene, measured: dict[str, np.ndarray], noise: float) -> None:
-    """Click each landmark where a calibration says that it is, until no more is asked for."""
+    """Click each landmark at its position under a calibration, until there are no more prompts."""
     for number in range(60):
         place = place_of(visitor)
         prompt = place.prompt

@@ -43,7 +43,7 @@ def go_through_the_tour(page: Page, window: tuple[int, int]) -> list[str]:
 
 
 def check_note(tab: Tab) -> None:
-    """A note covers neither the names of the pictures nor what is pressed."""
+    """A note covers neither the names of the images nor the pressed control."""
     tab.put(intents.Download(1))
     note = tab.page.get_by_role("alert").filter(has_text="Nothing has been exported yet")
     expect(note).to_be_visible()
@@ -184,7 +184,7 @@ def test_a_phone_shows_what_reading_and_reviewing_needs_and_the_rest_in_a_sheet(
 
 
 def check_keys(tab: Tab) -> None:
-    """Keys do what their sheet says."""
+    """Keys have the functions that the sheet lists."""
     app, page = tab.app, tab.page
     tab.press("?")
     expect(page.get_by_role("dialog", name="Keys")).to_contain_text("Accept, and show the next")

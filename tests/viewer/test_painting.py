@@ -1,4 +1,4 @@
-"""Painting: strokes as browsers send them, layers of the project, classes, prompts, and what the optimizer gets."""
+"""Painting: strokes from browsers, layers of the project, classes, prompts, and inputs of the optimizer."""
 
 import json
 from collections.abc import Callable

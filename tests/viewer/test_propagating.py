@@ -59,7 +59,7 @@ def hand_made(desk: Desk, *frames: int) -> dict[int, float]:
 
 
 def solve_some(desk: Desk, frames: int) -> None:
-    """Advance until so many frames are solved; some are looked at before the first one."""
+    """Advance until a number of frames are solved; some are visited before the first one."""
     assert desk.state.solve is not None
     while desk.state.solve.done < frames:
         desk.advance()
@@ -67,7 +67,7 @@ def solve_some(desk: Desk, frames: int) -> None:
 
 
 def sources(desk: Desk) -> list[Source | None]:
-    """Who made each frame's joints."""
+    """Source of each frame's joints."""
     found = [desk.saved.joints(frame).get("PSM1") for frame in range(FRAMES)]
     return [None if correction is None else correction.provenance.source for correction in found]
 

@@ -71,7 +71,7 @@ def _running(command: list[str], port: int, **options) -> Iterator[None]:
 
 @contextmanager
 def nginx(folder: Path, viewer: int, port: int, *, keeps_path: bool) -> Iterator[str]:
-    """nginx with a certificate of its own, which keeps or removes the sub path; gives the address of the page."""
+    """nginx with a self-signed certificate, which keeps or removes the base path; returns the address of the page."""
     if (program := shutil.which("nginx") or shutil.which("nginx", path="/usr/sbin")) is None:
         pytest.skip("nginx is not installed: apt-get install nginx-light")
     if shutil.which("openssl") is None:
@@ -89,7 +89,7 @@ def nginx(folder: Path, viewer: int, port: int, *, keeps_path: bool) -> Iterator
 def open_behind(
     tiny_sequence: Callable[..., Path], untrained_weights: Path
 ) -> Iterator[Callable[[Proxy], tuple[ViewerApp, int]]]:
-    """Opens a viewer behind a proxy; gives its port too."""
+    """Function that opens a viewer behind a proxy; also returns its port."""
     with ExitStack() as stack:
 
         def make(proxy: Proxy) -> tuple[ViewerApp, int]:

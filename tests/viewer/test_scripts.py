@@ -21,7 +21,7 @@ pytestmark = pytest.mark.browser
 
 @dataclass
 class OtherSite:
-    """A web server of somebody else, at another origin."""
+    """Web server of another origin."""
 
     address: str
     page: str = ""
@@ -30,7 +30,7 @@ class OtherSite:
 
 @pytest.fixture(scope="module")
 def other_site() -> Iterator[OtherSite]:
-    """Serves one page, and keeps what it was asked for."""
+    """Handler that serves one page, and records requests."""
 
     class Handler(http.server.BaseHTTPRequestHandler):
         def do_GET(self) -> None:
@@ -59,7 +59,7 @@ def page() -> Iterator[Page]:
 
 @contextmanager
 def opened(browser: Browser, page: Page) -> Iterator[Tab]:
-    """A page that notes what has run and what was blocked."""
+    """Page that records executed scripts and blocked requests."""
     with closing(new_context(browser)) as context:
         tab = context.new_page()
         tab.add_init_script(

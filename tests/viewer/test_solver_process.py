@@ -1,4 +1,4 @@
-"""The solver in a process of its own: the same results as in this process, and what survives its end."""
+"""The solver in a separate process: results equal to those of this process, and recovery after its end."""
 
 import os
 import random
@@ -180,7 +180,7 @@ def _runs(pid: int) -> bool:
 def test_nothing_is_lost_when_the_process_is_killed_while_the_page_is_used(
     tiny_sequence: Callable[..., Path], tmp_path: Path
 ) -> None:
-    """`CARTS_KILLS` kills, 5 by default, at random moments of random work; prints how long each restart takes."""
+    """`CARTS_KILLS` kills (5 by default) at random times during random work; prints the time of each restart."""
     kills, dice = int(os.environ.get("CARTS_KILLS", "5")), random.Random(7)
     path, project = tiny_sequence(frames=6, cameras=("left", "right")), tmp_path / "killed.carts"
     noted: dict[int, str] = {}

@@ -231,12 +231,12 @@ new MutationObserver((changes) => {
   }
 }).observe(document, { childList: true, subtree: true });
 """
-"""Keeps what short notes say, which go away by themselves."""
+"""Record the texts of short notes, which disappear automatically."""
 
 
 @pytest.fixture(scope="module")
 def done_batch(shared_sequence: Callable[..., Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Of one job that is done and one that has failed."""
+    """Batch with a finished and a failed job."""
     sequence = shared_sequence(frames=2)
     manifest = sequence.parent / "archive.toml"
     job = f'[[jobs]]\nrecordings = ["{sequence.name}"]\nsteps = ["optimize"]\n'

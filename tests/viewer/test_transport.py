@@ -38,7 +38,7 @@ def local() -> Guard:
 
 @pytest.fixture
 def shared() -> Guard:
-    """Of a server that everybody reaches."""
+    """Guard of a server that other computers can reach."""
     return Guard(EVERYWHERE)
 
 

@@ -58,7 +58,7 @@ def _is_output(name: str) -> bool:
 
 
 def view_hostile_names(recording: Path, sandbox: Path, count: int) -> int:
-    """View recordings with hostile names; how many could be opened."""
+    """View recordings with hostile names; returns the number of opened recordings."""
     treasure(sandbox / "home")
     work, accepted = sandbox / "work", 0
     for number, name in enumerate(hostile_names(count, sandbox)):

@@ -160,7 +160,7 @@ CALIBRATE, STOP = ("calibrate", ""), ("cancel", "")
 
 
 class OneStep:
-    """Stands for `CalibrationOptimizer`: one step, and the scene as it is for a result."""
+    """Replacement of `CalibrationOptimizer`: one step, with the unchanged scene as result."""
 
     def __init__(self, scene: Scene, *_: object, **__: object) -> None:
         self._scene = scene
@@ -195,7 +195,7 @@ def jobs(monkeypatch: pytest.MonkeyPatch) -> list[CalibrationJob]:
 
 
 def open_calibration(folder: Path, made: Sequence, seen: Scene) -> tuple[Path, str]:
-    """Write a recording whose points were clicked as in a scene, and its draft; gives the root and the draft's key."""
+    """Write a recording whose points were clicked as in a scene, and its draft; returns root and key of the draft."""
     (folder / "labs" / "day" / "left").mkdir(parents=True)
     for number in range(len(made)):
         image = np.full((240, 320, 3), 200 * np.eye(3)[2 - number], np.uint8)

@@ -1,4 +1,4 @@
-"""Viewers in processes of their own that are killed, the clients that work with them, and what must be left."""
+"""Viewers in separate processes that are killed, their clients, and the expected files."""
 
 import html
 import io
@@ -62,7 +62,7 @@ class Widgets(NamedTuple):
 
 
 def begin(target: Callable[..., None], *arguments: Any) -> tuple[ForkServerProcess, Connection]:
-    """Start a process that is forked from one that has imported everything and done nothing; and what it tells."""
+    """Start a process forked from one with all imports; returns the process and its pipe."""
     processes = multiprocessing.get_context("forkserver")
     processes.set_forkserver_preload(["carts_viewer.app"])
     ours, theirs = processes.Pipe(duplex=False)
@@ -75,7 +75,7 @@ def begin(target: Callable[..., None], *arguments: Any) -> tuple[ForkServerProce
 
 
 def serve_until_signal(sequence: Path, weights: Path, tell: Connection) -> None:
-    """`carts view` as it is, but for a page whose widgets a test knows; tells its address, its widgets and "ready"."""
+    """`carts view` with known widgets of the page; sends its address, its widgets and "ready"."""
     signal.signal(signal.SIGHUP, signal.SIG_DFL)
     signal.signal(signal.SIGINT, signal.default_int_handler)
     torch.set_num_threads(1)
@@ -272,7 +272,7 @@ class Client:
         self._ask(lambda: self.tab.set(element, value), name, holds, optional=optional)
 
     def _ask(self, edit: Callable[[], None], name: str, holds: Holds, *, optional: bool = False) -> None:
-        """Edit the frame, let go, and wait until the page says that it is saved."""
+        """Edit the frame, release, and wait until the page shows that it is saved."""
         before, _ = self._position() or (0, "")
         expected = f"{name}, frame {self.frame + 1:03d}"
         edit()
@@ -284,7 +284,7 @@ class Client:
             assert optional, f"the page never called {expected} saved; it says {self._position()}, it was at {before}"
 
     def _saved(self, before: int, name: str) -> int | None:
-        """The number of the newest step, if it has this name, is a new one, and the page says that it is saved."""
+        """Number of the newest step, if it has this name, is new, and the page shows that it is saved."""
         saved = "<b>Saved</b>" in self.tab.widgets.get(self.ids.saved, {}).get("content", "")
         number, newest = self._position() or (0, "")
         return number if saved and number > before and newest == name else None

@@ -19,7 +19,7 @@ from carts_viewer.state import ViewState
 
 
 class Desk:
-    """A controller and what it delivered."""
+    """A controller and its outputs."""
 
     def __init__(self, sequence: Sequence, project: Project, factory: OptimizerFactory) -> None:
         people = People(project)
@@ -71,7 +71,7 @@ class Desk:
         return self.controller.state
 
     def do(self, *asked: intents.Intent) -> ViewState:
-        """Handle intents, one after the other."""
+        """Handle intents in order."""
         for intent in asked:
             self.controller.handle(intent)
         return self.state
@@ -88,7 +88,7 @@ class Desk:
         return min((wait for wait in waits if wait is not None), default=None)
 
     def advance(self) -> None:
-        """Do one bit of what goes on here, and one in the background."""
+        """Do one step of the work in the foreground, and one in the background."""
         try:
             self.controller.advance()
             self.job_runner.advance()
@@ -96,13 +96,13 @@ class Desk:
             self.controller.follow()
 
     def fail(self, error: Exception) -> None:
-        """An error of what goes on, as the worker hands it on."""
+        """Pass an error to the controller, as the worker does."""
         self.controller.fail(error, stop=True)
         self.job_runner.fail(str(error))
         self.controller.follow()
 
     def close(self) -> None:
-        """Save everything that is under way."""
+        """Save all unfinished work."""
         self.job_runner.close()
         self.controller.close()
 

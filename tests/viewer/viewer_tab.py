@@ -268,7 +268,7 @@ class Canvas:
         return image
 
     def _hidden(self) -> tuple[int, int]:
-        """Heights of what the tool bar and the timeline hide of the picture [px]."""
+        """Heights of the image that the tool bar and the timeline cover [px]."""
         bar, box = (box_of(self._page.locator(name)) for name in (".carts-bar", "canvas"))
         strip = self._page.locator(".carts-strip").first.bounding_box()
         return int(bar["y"] + bar["height"] - box["y"]) + 1, 1 if strip is None else int(strip["height"]) + 1
@@ -288,7 +288,7 @@ class Canvas:
         return map_.T if np.abs(wanted @ map_ - found).max() < 0.5 else None
 
     def misregistration(self) -> float:
-        """95th percentile of the distance [px of the screen] between the overlay's outline and where it should be."""
+        """95th percentile of the distance of the overlay's outline from its expected position [px of the screen]."""
         image = self.screenshot()
         map_ = self.screen_from_image(image)
         if map_ is None:
@@ -323,7 +323,7 @@ class Canvas:
         return map_
 
     def wait_until_registered(self, limit: float = 1.5) -> None:
-        """Wait until the overlay lies where it should, up to a distance [px of the screen]."""
+        """Wait until the overlay is at its expected position, within a distance [px of the screen]."""
         eventually(self.misregistration, lambda distance: distance <= limit)
 
 
@@ -372,7 +372,7 @@ class Hand:
         eventually(lambda: self._tab.page.evaluate("carts.brush()"), lambda brush: brush | wanted == brush)
 
     def steps(self, count: int) -> None:
-        """Wait until the project has so many steps that are done, and all strokes are seen in the overlay."""
+        """Wait until the project has a number of steps in effect, and all strokes are visible in the overlay."""
         eventually(lambda: self._tab.app.state.project.position, lambda position: position == count)
         eventually(lambda: self._tab.page.evaluate("carts.pendingStrokes()"), lambda pending: pending == 0)
 

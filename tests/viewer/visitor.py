@@ -47,7 +47,7 @@ def write_lab_files(
 
 
 class Visitor:
-    """A user with a browser window; `clicks` counts what was clicked."""
+    """A user with a browser window; `clicks` counts the clicks."""
 
     def __init__(self, site: Site, page: Page) -> None:
         self.site, self.page = site, page
@@ -59,7 +59,7 @@ class Visitor:
         return self.page.locator("main").get_by_role("button", name=name, exact=True)
 
     def press(self, name: str, timeout: float = 60.0) -> None:
-        """Press a button as soon as it is there; `timeout` in [s]."""
+        """Press a button as soon as it exists; `timeout` in [s]."""
         self.button(name).click(timeout=1e3 * timeout)
         self.clicks += 1
 

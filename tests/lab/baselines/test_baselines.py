@@ -27,7 +27,7 @@ def _smallest(name: BaselineName) -> BaselineNetwork:
 
 
 class _Frames(TrainingFrames):
-    """Frames with a bright square, which is the instrument, and rendered where it is."""
+    """Frames with a bright square as instrument, rendered at the same position."""
 
     def __init__(self, count: int) -> None:
         rng = np.random.default_rng(0)

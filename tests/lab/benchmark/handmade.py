@@ -15,7 +15,7 @@ def make_measurement(
     seconds: float = 1.0,
     stopped: str = "converged",
 ) -> Measurement:
-    """A run whose loss falls as its Dice rises, with `seconds` per step; the last Dice is what it returns."""
+    """Run whose loss falls as its Dice rises, with `seconds` per step; the last Dice is the result."""
     trace = tuple(
         Score(
             loss=round(1.0 - value, 6),

@@ -1,4 +1,4 @@
-"""A whole small benchmark: runs, stops, goes on, and reports."""
+"""Complete small benchmark: runs, interruption, resumption and report."""
 
 import io
 from collections.abc import Callable
@@ -22,7 +22,7 @@ occluders, 4 with both cameras, 2 with masks as the target, 4 in sequence mode, 
 
 @pytest.fixture
 def count_runs(monkeypatch: pytest.MonkeyPatch) -> list[Measurement]:
-    """Fills with what is really measured."""
+    """List of the runs that were measured."""
     measured: list[Measurement] = []
     measure = SourceBench.measure
 

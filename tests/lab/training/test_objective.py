@@ -4,7 +4,7 @@ from carts_core.lab.training.tasks import consistency_loss, soft_dice_loss
 
 
 def _scene() -> tuple[torch.Tensor, torch.Tensor]:
-    """Classes of an image with a shaft and a head, and features that tell the three apart."""
+    """Classes of an image with a shaft and a head, and features that distinguish the three."""
     classes = torch.zeros(1, 32, 32, dtype=torch.uint8)
     classes[:, 10:20, 5:15] = 1
     classes[:, 10:20, 15:20] = 2

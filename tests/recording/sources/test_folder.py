@@ -1,4 +1,4 @@
-"""Images, tables and calibrations of nobody's format: guesses that are right, shown, and can be changed."""
+"""Generic recordings of images, tables and calibrations: correct guesses that are shown and can be changed."""
 
 import csv
 import json
@@ -38,7 +38,7 @@ def folder(tmp_path: Path) -> Path:
 
 
 def lab(source: Path) -> Path:
-    """Two cameras, joints in degrees and millimetres under names of their own, and a ROS calibration."""
+    """Two cameras, joints in degrees and millimetres with custom names, and a ROS calibration."""
     write_images(source / "imgs_left", FRAMES, "img_{:04d}.png")
     write_images(source / "imgs_right", FRAMES, "img_{:04d}.png", "right")
     q = joints_at(np.arange(FRAMES) / 10)

@@ -1,4 +1,4 @@
-"""Calibrations as laboratories have them: each gives the right camera, or an error or remark that says what to do."""
+"""Calibrations as used in laboratories: each gives the correct camera, or an error or remark with a remedy."""
 
 import json
 import struct

@@ -105,7 +105,7 @@ def file_names_of_one_side(folder: Path) -> dict:
 
 
 def file_names(name: Callable[[int], str], image_name: str = "frame_{:04d}.png") -> Callable[[Path], dict]:
-    """Rows in another order than the images, each with the name of its own."""
+    """Rows in another order than the images, each with the name of its image."""
 
     def write(folder: Path) -> dict:
         times = frames(folder / "images", image_name)
@@ -133,7 +133,7 @@ def video_counted_from_one(folder: Path) -> dict:
 
 
 def video_of_another_rate(folder: Path) -> dict:
-    """One row for each image, at 4 Hz; the video says 25 images/s."""
+    """One row per image, at 4 Hz, and a video with a nominal rate of 25 images/s."""
     write_video(folder / "scope.mp4", [image(number) for number in range(FRAMES)], 25)
     times = np.arange(FRAMES) / RATE
     table(folder / "log.csv", {"time": times, **joints(times)})

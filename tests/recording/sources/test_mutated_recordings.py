@@ -56,7 +56,7 @@ def _bag(folder: Path, name: str, kind: BagKind) -> Path:
 
 
 def mutate(folder: Path, rng: random.Random) -> str:
-    """Change one file of a recording, or take it away; gives what was done."""
+    """Change or remove one file of a recording; returns a description of the change."""
     files = sorted(path for path in folder.rglob("*") if path.is_file())
     # Tables and descriptions more often than the many images.
     others = [path for path in files if path.suffix not in (".png", ".jpg")]
@@ -80,7 +80,7 @@ def mutate(folder: Path, rng: random.Random) -> str:
 
 
 def campaign(name: str, count: int, sandbox: Path) -> tuple[int, int]:
-    """Import mutated recordings of one kind; how many were imported and how many refused."""
+    """Import mutated recordings of one kind; returns the numbers of imported and refused recordings."""
     right = sandbox / "right"
     source = MAKERS[name](right / "source")
     imported = refused = 0
