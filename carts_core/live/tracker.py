@@ -91,6 +91,8 @@ def change(before: Picture, now: Picture) -> float:
 
 _REMEMBERED = 60
 """Number of recent good fits whose median loss is the reference."""
+_LOOK_AGE = 1.0
+"""Age of an unfinished measurement with the network after which frames are measured with the network again [s]."""
 _LOOKED = 1.0
 """Interval between checks for an arm elsewhere in the image [s]."""
 
@@ -213,7 +215,7 @@ class LiveTracker:
         self._moving = bool(camera_poses or frame.mounts)
         errors, now = self._error_model(variables), frame.timestamp or 0.0
         recovered = self._take_recovered(errors)
-        self._take_look(errors, now)
+        self._take_look(errors)
         attempt, measurement = self._measured(frame, variables, errors, now)
         if self._fits(attempt, measurement):
             self._take(errors, attempt, measurement)
@@ -271,7 +273,8 @@ class LiveTracker:
         if self._filtered is not None or self._pool is not None:
             attempt = self._known(errors, now)
             if self.verdict is LiveVerdict.GOOD:
-                overdue = self._pool is not None and self._recovery is None
+                late = self._look is not None and now - self._look.attempt.time > _LOOK_AGE
+                overdue = self._pool is not None and self._recovery is None and not late
                 between = self._colours.measured(small, frame, variables, attempt.expected, overdue=overdue)
                 if between is not None:
                     if overdue and self._look is None and self._colours.due:
@@ -338,14 +341,13 @@ class LiveTracker:
         assert self._pool is not None
         self._look = _Look(attempt, frame, variables, self._pool.submit(look))
 
-    def _take_look(self, errors: ErrorModel, now: float) -> None:
+    def _take_look(self, errors: ErrorModel) -> None:
         """Repeat the filter from a frame whose measurement with the network is done, with the later measurements.
 
-        After a bad fit, the colours are dropped, so the next frame is measured with the network. If the measurement
-        takes longer than `lost_seconds`, the result waits for it.
+        After a bad fit, the colours are dropped, so the next frame is measured with the network.
         """
         look = self._look
-        if look is None or not (look.found.done() or now - look.attempt.time > self.live.lost_seconds):
+        if look is None or not look.found.done():
             return
         self._look = None
         measurement, colours = look.found.result()
