@@ -198,7 +198,7 @@ class ViewerApp:
         self._solver: Requests = solver or SolverProcess()
         self._optimizers = OptimizerFactory(report=self._say, requests=self._solver, **networks)
         self.tabs = Tabs(sequence, storage, renderer, self._optimizers, self._deliver, queue, folders)
-        # The first rendering compiles the visibility kernel, which takes seconds the very first time.
+        # The first rendering compiles the visibility kernel, which takes seconds unless the kernel is cached.
         report("Preparing the renderer (takes a few seconds the first time)")
         renderer.arm_ids(self.state.pose.scene, self.state.camera)
         self.page = page or Page(host=host, port=port, title=f"{sequence.name} · CaRTS", proxy=proxy)

@@ -1,7 +1,7 @@
 """Mesh decimation with a bound on the surface distance.
 
-Decimation runs in a child process with limited CPU time, since the library ignores signals and takes very long for some
-    meshes: more than ten minutes for 300,000 random triangles.
+Decimation runs in a child process with limited CPU time, since the library ignores signals and takes more than ten
+minutes for some meshes, such as 300,000 random triangles.
 """
 
 import numpy as np

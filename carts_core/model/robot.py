@@ -135,7 +135,7 @@ _JOINT_PARTS = ("parent", "child", "origin", "axis", "mimic")
 
 
 def _links_and_joints(root: Element) -> str:
-    """URDF with only the elements that pytorch-kinematics requires, since it warns about others."""
+    """URDF with only the elements that pytorch-kinematics requires, since it warns about other elements."""
     robot = Element("robot", root.attrib)
     for child in root:
         if child.tag == "link":

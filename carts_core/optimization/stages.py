@@ -297,7 +297,7 @@ def run_align_edges(stage: AlignEdges, fit: Fit) -> Iterator[Point]:
 
 @run_stage.register
 def run_prefer_start(stage: PreferStart, fit: Fit) -> Iterator[Point]:
-    """Return to the start if it explains the image as well."""
+    """Return to the start if it explains the image equally well."""
     if start_explains_as_well(_one_frame(fit), fit.offsets, stage):
         fit.offsets, fit.stop_reason = torch.zeros_like(fit.offsets), StopReason.START_KEPT
     yield from ()

@@ -269,8 +269,8 @@ class Project:
         return remove
 
     def close(self) -> None:
-        """Close the file, so that others can write to it; the state stays readable. `ProjectError` if saved edits are
-        lost."""
+        """Close the file, so that other programs can write to it; the state stays readable. `ProjectError` if saved
+        edits are lost."""
         with self._edit:
             if self._store is not None:
                 store, self._store = self._store, None

@@ -94,7 +94,7 @@ class TimeOffsetEstimate:
     arm: str = ""
     """Arm with an offset of its own; empty for all tables."""
     alone: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
-    """Arm -> offsets that fit as well if the arm has a clock of its own [s], for an estimate of all tables."""
+    """Arm -> offsets that fit equally well if the arm has a separate clock [s], for an estimate of all tables."""
 
     @property
     def proposed(self) -> float | None:

@@ -260,7 +260,7 @@ def hand_eye(
 ) -> tuple[Float[np.ndarray, "4 4"], float] | None:
     """Base frame `T_world_base` of an arm, and RMS residual [px]; None for too few keypoints.
 
-    The positions of the dots on their links are estimated as well, from approximate positions.
+    The positions of the dots on their links are also estimated, from approximate initial values.
     """
     frames = sorted({point.frame for point in keypoints})
     chosen = {frames[index] for index in evenly_spaced(len(frames), min(_CALIBRATION_FRAMES, len(frames)))}
