@@ -151,8 +151,8 @@ def _print(console: Console, sequence: "Sequence", points: "Points[ImagePoint]",
         console.print(f"{arm} in {camera} is not calibrated: {more} more points are needed")
     for arm, camera in result.ambiguous:
         console.print(
-            f"{arm} in {camera}: another pose, beyond the standard deviations, can fit these points equally well. Click "
-            "the tip and the wrist joints in three or more frames."
+            f"{arm} in {camera}: another pose, beyond the standard deviations, can fit these points equally well. "
+            "Click the tip and the wrist joints in three or more frames."
         )
     for index in result.contradicting:
         point = points[index]
