@@ -16,7 +16,7 @@ from carts_core.settings import DescentSolver, SolverName, SurfaceSolver
 from carts_core.settings.serialization import field_docstrings
 from carts_viewer.actions import intents
 from carts_viewer.panels.inputs import PanelPage, humanized, write
-from carts_viewer.panels.sequence import CalibrationHint, whole_label
+from carts_viewer.panels.sequence import CalibrationHint
 from carts_viewer.session import Session
 from carts_viewer.state import PRESETS, Curves, Phase, ViewState
 from carts_viewer.transport.document import escaped
@@ -55,7 +55,12 @@ class OptimizePanel:
         icons = (self._pause, self._step, self._reset)
         page.row(self._run, *icons, weights=(3, 1, 1, 1), icons=icons)
         self._page = page
-        self._all = page.button("Solve all", lambda _: self._solve(), icon=viser.Icon.ARROWS_HORIZONTAL)
+        self._all = page.button(
+            "Solve all frames",
+            lambda _: self._solve(),
+            icon=viser.Icon.ARROWS_HORIZONTAL,
+            hint="Fit all frames, or those in the timeline's range, together; kept frames do not change",
+        )
         self._status = gui.add_html("")
         self._calibration = CalibrationHint(page, session)
         self._unfamiliar = gui.add_html("", visible=False)
@@ -68,7 +73,8 @@ class OptimizePanel:
         running = state.run.phase is Phase.RUNNING
         self._run.label = "Continue" if state.run.phase is Phase.PAUSED else "Run"
         self._run.disabled = self._step.disabled = running or state.busy is not None
-        self._all.label, self._all.disabled = whole_label(state), state.solving or state.busy is not None
+        self._all.label = "Solve all frames" if state.range is None else "Solve the range"
+        self._all.disabled = state.solving or state.busy is not None
         self._pause.disabled = not running
         self._reset.disabled = not state.run.curves.loss
         self._unfamiliar.content = "".join(

@@ -126,6 +126,7 @@ def test_keys_are_changed_refused_listed_and_remembered(open_tab: OpenTab) -> No
         tab.press("Escape")
         expect(page.get_by_role("dialog", name="Keys")).to_be_hidden()
     eventually(lambda: tab.state.keys, lambda keys: keys == {"MoveFrame 1": "Shift+W"})
+    wait_in(page, "carts.keyOf('MoveFrame 1') === 'Shift+W'")
     tab.press("n")
     tab.press("Shift+W")
     eventually(lambda: tab.state.index, lambda index: index == 1)
