@@ -133,7 +133,7 @@ def _png(pixels: UInt8[np.ndarray, "height width"]) -> bytes:
     height, width = pixels.shape
     rows, coder = np.pad(pixels, ((0, 0), (1, 0))), zlib.compressobj(1, strategy=zlib.Z_RLE)
     header = struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0)
-    chunks = (b"IHDR" + header, b"IDAT" + coder.compress(rows) + coder.flush(), b"IEND")
+    chunks = (b"IHDR" + header, b"IDAT" + coder.compress(rows.tobytes()) + coder.flush(), b"IEND")
     return _HEADER[:8] + b"".join(
         struct.pack(">I", len(chunk) - 4) + chunk + struct.pack(">I", zlib.crc32(chunk)) for chunk in chunks
     )
