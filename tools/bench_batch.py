@@ -4,28 +4,31 @@ python -m tools.bench_batch [--jobs 10000] [--frames 20]
 """
 
 import argparse
+import json
 import os
 import resource
 import tempfile
 import time
 from collections.abc import Callable
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
 
 from carts_core.batch.folder import (
+    FINDINGS_FILE,
+    JOB_FILE,
     Findings,
     FrameFinding,
     JobState,
     StepState,
     known_jobs,
     write_jobs,
-    write_state,
 )
 from carts_core.batch.manifest import Job, read_manifest
 from carts_core.batch.report import write_batch_report
-from carts_core.files import OutputPath, output_path, write_text
+from carts_core.files import OutputPath, output_path
 from carts_viewer.start.batch_page import BatchPage
 from tools.memory import resident_megabytes
 
@@ -36,9 +39,6 @@ _STATUSES = ["done"] * 17 + ["failed", "stopped", "running"]
 
 def make_batch(folder: Path, jobs: int, frames: int) -> Path:
     """Write recordings, a manifest, and a batch folder with the results of all jobs; returns the manifest."""
-    import json  # noqa: PLC0415
-    from dataclasses import asdict  # noqa: PLC0415
-
     draw = np.random.default_rng(0)
     for number in range(jobs):
         recording = folder / "archive" / f"case{number:05d}"
@@ -46,7 +46,9 @@ def make_batch(folder: Path, jobs: int, frames: int) -> Path:
         (recording / "sequence.toml").write_text("# Simulated.\n")
         path = output_path(folder / "batch") / "jobs" / recording.name
         status = cast(Any, _STATUSES[number % len(_STATUSES)])
-        write_state(path, JobState(status, {"sequence": StepState("0" * 64, 12.5)}, 1, worker="node:1", heartbeat=1e9))
+        path.path.mkdir(parents=True)
+        state = JobState(status, {"sequence": StepState("0" * 64, 12.5)}, 1, worker="node:1", heartbeat=1e9)
+        (path.path / JOB_FILE).write_text(json.dumps(asdict(state)))
         if status != "done":
             continue
         verdicts = draw.choice(["good", "doubtful", "failed"], frames, p=[0.9, 0.07, 0.03])
@@ -60,7 +62,7 @@ def make_batch(folder: Path, jobs: int, frames: int) -> Path:
             {name: draw.uniform(0.1, 0.3, frames).round(6).tolist() for name in _JOINTS},
             {f"psm{arm} in left": np.eye(4).tolist() for arm in (1, 2)},
         )
-        write_text(path / "findings.json", json.dumps(asdict(found)))
+        (path.path / FINDINGS_FILE).write_text(json.dumps(asdict(found)))
     manifest = folder / "archive.toml"
     manifest.write_text(
         'format = "carts-batch/1"\n\n[[jobs]]\nrecordings = ["archive/*/sequence.toml"]\nsteps = ["sequence"]\n'
