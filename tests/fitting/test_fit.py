@@ -216,7 +216,7 @@ GREY = np.zeros((HEIGHT, WIDTH), np.uint8)
         ({"image": "missing.png"}, SequenceError, r"image missing\.png is missing"),
         ({"mask": GREY[:-1]}, SettingsError, "the mask has 128 x 95 pixels, but the image has 128 x 96"),
         ({"mask": GREY.astype(float)}, SettingsError, "the mask is an array of type float64"),
-        ({"mask": np.arange(HEIGHT * WIDTH).reshape(HEIGHT, WIDTH)}, SettingsError, "of an image of labels"),
+        ({"mask": np.arange(HEIGHT * WIDTH).reshape(HEIGHT, WIDTH)}, SettingsError, "convert a label image"),
         ({"background": GREY}, SettingsError, "the background is an array"),
         ({"ignore": GREY[:, :5]}, SettingsError, "the mask to ignore has 5 x 96 pixels"),
     ],
