@@ -146,6 +146,7 @@ def test_a_phone_shows_what_reading_and_reviewing_needs_and_the_rest_in_a_sheet(
     tab = open_tab(window=PHONE, cameras=("left", "right"), width=160, height=120)
     page, app = tab.page, tab.app
     check_note(tab)
+    expect(page.locator(".carts-tools")).to_be_visible()
     page.evaluate("carts.startTour()")
     assert len(go_through_the_tour(page, PHONE)) == 5
     place = page.evaluate("carts.imageOnScreen()")
