@@ -235,8 +235,8 @@ class Client:
     def _edit(self) -> None:
         number, dice, frame, ids = next(self.unique), self.random.random(), self.frame, self.ids
         if dice < 0.4:
-            # Never twice the same, nor what an earlier life left, so that an old value cannot pass for a new one. Setting
-            # what a slider shows, with two decimals, is no edit.
+            # Never twice the same, nor what an earlier life left: an old value cannot pass for a new one.
+            # Setting what a slider shows, with two decimals, is no edit.
             value = round(5.0 - 0.01 * (number % 5000), 2)
             self._set(ids.joint, value, "Move PSM1 yaw", lambda state: _has_joint(state, frame, value))
         elif dice < 0.6:
