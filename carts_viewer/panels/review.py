@@ -52,12 +52,18 @@ class ReviewPanel:
             clear = page.button("Clear", intents.SetReview(ReviewState.UNTOUCHED), hint=hint)
             page.row(work, reject, clear, weights=(11, 7.65, 7.35))
             self._note = gui.add_text("Note", "")
+            self._entered = ""
+            """Last note that was entered or shown; the widget's value may be ahead of the intents."""
             previous = page.button("Previous worst", intents.ShowWorst(-1))
             following = page.button("Next worst", intents.ShowWorst(1))
             page.row(previous, following, weights=(5, 4))
             page.button("Next unreviewed", intents.ShowUnreviewed(1), icon=viser.Icon.CHEVRON_RIGHT)
             self._counts = gui.add_html("")
-        page.on_input(self._note, intents.SetNote)
+        page.on_input(self._note, self._set_note)
+
+    def _set_note(self, text: str) -> intents.SetNote:
+        self._entered = text
+        return intents.SetNote(text)
 
     def show(self, state: ViewState) -> None:
         """Update the widgets."""
@@ -70,8 +76,8 @@ class ReviewPanel:
             state.verdict is not None and state.verdict.verdict == "good" and review.state is not ReviewState.ACCEPTED
         )
         self._accept.color = "teal" if good else "gray"
-        if not self._waits(intents.SetNote):
-            write(self._note, review.note)
+        if review.note != self._entered and not self._waits(intents.SetNote):
+            self._entered = self._note.value = review.note
         if self._counted is None or not (state.unsaved or state.project is self._counted):
             self._counted = state.project
             self._count(state.project)
