@@ -32,6 +32,7 @@ _log = logging.getLogger(__name__)
 _EVENTS = (
     events.Hello
     | events.Theme
+    | events.SceneShown
     | events.Trace
     | events.Pressed
     | events.Pointed
@@ -83,6 +84,8 @@ class EventDispatcher:
 
     def _act(self, client_id: int, tab: Tab, view: View, event: Any) -> None:
         match event:
+            case events.SceneShown():
+                self._worker.call(lambda: view.display.show_scene(event.on))
             case events.Trace():
                 view.layout.timeline.answer(event)
             case events.Pressed():

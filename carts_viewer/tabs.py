@@ -106,12 +106,16 @@ class View:
         state: ViewState,
         emit: Callable[[Intent], None],
         waits: Callable[[Hashable], bool],
+        *,
+        scene_shown: bool,
     ) -> None:
         self.page = PanelPage(client, emit, waits)
         with self.page.atomic():
             self.layout = Layout(self.page, session, storage, state)
             self.scene = SceneView(self.page.scene, session.scene, state.pose.scene, state.camera)
-        self.display = PageDisplay(self.page, session, renderer, self.scene, self.layout.panels)
+        self.display = PageDisplay(
+            self.page, session, renderer, self.scene, self.layout.panels, scene_shown=scene_shown
+        )
 
 
 class Tab:
@@ -153,11 +157,12 @@ class Tab:
         """Client id of the page; None without a page."""
         return None if self.view is None else self.view.page.client.client_id
 
-    def attach(self, client: viser.ClientHandle, renderer: OverlayRenderer, storage: Storage, *, light: bool) -> None:
+    def attach(self, client: viser.ClientHandle, renderer: OverlayRenderer, storage: Storage, hello: Hello) -> None:
         """Show this tab in a page, which replaces its earlier page."""
-        choose_theme(client.gui, light=light)
+        choose_theme(client.gui, light=hello.light)
         self.person.present = True
-        self.view = View(client, self.session, renderer, storage, self.controller.state, self.put, self.waits)
+        state, session = self.controller.state, self.session
+        self.view = View(client, session, renderer, storage, state, self.put, self.waits, scene_shown=hello.scene)
         self._shown = self._pictured = self._left_at = None
         self._gone = False
 
@@ -288,7 +293,7 @@ class Tabs:
         if known is None:
             self._handle_all(tab, restored_choices(hello.settings, tab.controller.state))
         self._show_address(tab, hello)
-        tab.attach(client, self._renderer, self._storage, light=hello.light)
+        tab.attach(client, self._renderer, self._storage, hello)
         self._forget_oldest()
 
     def detach(self, client_id: int) -> None:

@@ -198,6 +198,7 @@
   }
 
   function showEndoscope() {
+    if (!view.endoscope) report("SceneShown", { on: false });
     view.endoscope = true;
     Object.assign(view, { zoom: 1, x: 0.5, y: 0.5 });
     viser()?.resetCameraPose?.(false);
@@ -233,6 +234,7 @@
     const mutable = viser();
     const image = imageRectangle();
     if (!mutable?.cameraControl || !image) return;
+    if (view.endoscope) report("SceneShown", { on: true });
     view.endoscope = false;
     mutable.cameraControl.enabled = true;
     Object.assign(mutable.camera, { near: 0.1 * image.depth, far: 2000 * image.depth });

@@ -66,7 +66,7 @@
     const { problem, ...place } = linked();
     const name = localStorage.getItem("carts-name") ?? "";
     const settings = JSON.parse(localStorage.getItem("carts-settings") ?? "{}");
-    window.carts.report("Hello", { tab: key, name, light: wanted() === "light", settings, ...place });
+    window.carts.report("Hello", { tab: key, name, light: wanted() === "light", settings, scene: !window.carts.view.endoscope, ...place });
     if (problem && asked === 1) tell(problem);
   }
   setInterval(sayHello, 150);

@@ -7,7 +7,6 @@ from functools import cache
 
 from carts_core.model.scene import SceneState
 from carts_core.project import IgnoreRegion, Key, Kind, MaskCorrection
-from carts_core.project.values import WHOLE_PROJECT
 from carts_viewer.panels.inputs import Panel
 from carts_viewer.picture.comparison import compared_poses, composed, outlines, painted
 from carts_viewer.picture.layers import Layer, Rgba, imported, paint_over, parts, transparent
@@ -32,14 +31,23 @@ class PageDisplay:
     """Display of a tab; used on the worker's thread."""
 
     def __init__(
-        self, page: TabPage, session: Session, renderer: OverlayRenderer, scene_view: SceneView, panels: Sequence[Panel]
+        self,
+        page: TabPage,
+        session: Session,
+        renderer: OverlayRenderer,
+        scene_view: SceneView,
+        panels: Sequence[Panel],
+        *,
+        scene_shown: bool = False,
     ) -> None:
+        """`scene_shown`: whether the page shows the 3D view, see `show_scene`."""
         self._page = page
         self._scene = session.scene
         self._session = session
         self._renderer = renderer
         self._scene_view = scene_view
         self._panels = panels
+        self._scene_shown = scene_shown
         self._rate_limit = RateLimit()
         self._shown: ViewState | None = None
 
@@ -59,6 +67,8 @@ class PageDisplay:
         new_pose = old is None or state.pose is not old.pose or state.camera != old.camera
         if new_frame or new_pose or old is None or _picture(state) != _picture(old):
             overlays = self._overlays(state, self._shown_cameras(state))
+            # Before sending, since a tab may acknowledge the picture before `flush` is called.
+            self._rate_limit.sent()
             # Sent together, so that a new frame never appears under the old frame's overlay.
             with self._page.atomic():
                 if new_frame:
@@ -67,17 +77,19 @@ class PageDisplay:
                 self._show_others(state, old, overlays)
             self._page.flush()
             self._acknowledge({} if old is None else old.brush.painted, state.brush.painted)
-            self._rate_limit.sent()
-            # The 3D scene is hidden behind the frame most of the time, so the overlay does not wait for it.
-            if new_pose:
-                self._scene_view.show_pose(state.pose.scene, state.camera)
-            if (
-                new_frame
-                or old is None
-                or old.project.records.get(WHOLE_PROJECT) is not state.project.records.get(WHOLE_PROJECT)
-            ):
-                self._scene_view.show_measured(self._session.measured(state.frame))
+            if self._scene_shown or old is None:
+                self._show_scene(state)
         self._shown = state
+
+    def show_scene(self, on: bool) -> None:
+        """Update the arms and cameras of the 3D view with each picture; their first poses determine its viewpoint."""
+        self._scene_shown = on
+        if on and self._shown is not None:
+            self._show_scene(self._shown)
+
+    def _show_scene(self, state: ViewState) -> None:
+        self._scene_view.show_pose(state.pose.scene, state.camera)
+        self._scene_view.show_measured(self._session.measured(state.frame))
 
     def _shown_cameras(self, state: ViewState) -> list[str]:
         """The cameras whose images are shown, the active camera first."""

@@ -27,12 +27,20 @@ class Hello(Event):
     domain: _Text | None = None
     settings: dict[str, Any] = {}
     """Choices that the browser has stored, see `stored_choices` in `panels/script_state.py`."""
+    scene: bool = False
+    """Whether the page shows the 3D view."""
 
 
 class Theme(Event):
     """The light or the dark theme was chosen."""
 
     light: bool
+
+
+class SceneShown(Event):
+    """The 3D view was opened or closed."""
+
+    on: bool
 
 
 class Trace(Event):
