@@ -22,7 +22,7 @@ view: setup ## Open the shipped sample in the viewer (or SEQUENCE=path/to/sequen
 test: lint docs ## Check style and types, build the documentation, and run the tests, browser included
 	chromium=$$($(BIN)/python .ci/chromium.py) && \
 	export CARTS_CHROMIUM=$$chromium && { \
-	$(BIN)/python -m pytest -n 3 --dist loadfile -m "not slow and not gpu" $(ARGS) || \
+	$(BIN)/python -m pytest -n 3 --dist loadfile --no-loadscope-reorder -m "not slow and not gpu" $(ARGS) || \
 	{ echo "Repeating failed tests one at a time:"; \
 	$(BIN)/python -m pytest --last-failed --last-failed-no-failures none -m "not slow and not gpu" $(ARGS); }; }
 
